@@ -1,0 +1,64 @@
+"""Everything that a user can cause, as typed errors: one line each, one exit code each.
+
+The form of a message is *where: what is wrong, with the value; what would be right or what to do*,
+in lower case, without a full stop.
+"""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable
+
+EXIT_DONE = 0
+EXIT_CHECK_FAILED = 1
+EXIT_WRONG_INPUT = 2
+EXIT_INCOMPLETE = 3
+EXIT_INTERNAL = 4
+
+
+class Su3dError(Exception):
+    """Base of every error that a user can cause; the command line prints its message on one line."""
+
+    exit_code = EXIT_WRONG_INPUT
+
+
+class ConfigError(Su3dError):
+    """A configuration value, key or command-line argument that cannot be used."""
+
+
+class DataError(Su3dError):
+    """A dataset, scene or file that is missing, damaged or contradicts itself."""
+
+
+class GroundTruthMissing(DataError):
+    """The scene has no ground truth in the form that a protocol needs: it runs, unscored."""
+
+
+class PredictionError(Su3dError):
+    """A prediction that cannot be scored."""
+
+
+class ModelMissing(Su3dError):
+    """Weights or an optional package that a profile or method needs are not here."""
+
+
+class StoreError(Su3dError):
+    """The run folder cannot be written, or holds another run."""
+
+
+class RunIncomplete(Su3dError):
+    """Some scenes of the run failed."""
+
+    exit_code = EXIT_INCOMPLETE
+
+
+class CheckFailed(Su3dError):
+    """A check that was asked for did not pass."""
+
+    exit_code = EXIT_CHECK_FAILED
+
+
+def suggest(word: str, known: Iterable[str]) -> str:
+    """A clause ``; did you mean 'x'?`` for the known word nearest to ``word``, or nothing when none is near."""
+    near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
+    return f"; did you mean '{near[0]}'?" if near else ""

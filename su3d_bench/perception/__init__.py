@@ -1,0 +1,1 @@
+"""Per-image feature extraction: segmenters, encoders, the profiles that supply them, and their cache."""

@@ -1,0 +1,66 @@
+"""Names to classes: the built-in table first, then entry points, then ``file.py:Class``.
+
+A plug-in may not take a built-in's name.
+"""
+
+from __future__ import annotations
+
+import importlib
+import importlib.util
+from importlib.metadata import entry_points
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.errors import ConfigError, suggest
+
+DATASETS = {
+    "rooms": "su3d_bench.datasets.rooms:Rooms",
+    "replica": "su3d_bench.datasets.replica:Replica",
+}
+METHODS = {
+    "opensu3d": "su3d_bench.opensu3d.pipeline:OpenSU3D",
+    "oracle": "su3d_bench.baselines.oracle:Oracle",
+}
+GROUPS = {"dataset": "su3d_bench.datasets", "method": "su3d_bench.methods"}
+BUILT_IN = {"dataset": DATASETS, "method": METHODS}
+
+
+def names(kind: str) -> list[str]:
+    """Every name of ``kind`` (``dataset`` or ``method``) that can be used without a path."""
+    found = list(BUILT_IN[kind])
+    for entry in entry_points(group=GROUPS[kind]):
+        if entry.name in BUILT_IN[kind]:
+            raise ConfigError(f"plug-in {entry.value}: the {kind} name '{entry.name}' is built in; choose another name")
+        found.append(entry.name)
+    return found
+
+
+def load(kind: str, name: str) -> Any:
+    """The class behind ``name``; ``name`` may be a built-in, an entry point or ``path/to/file.py:Class``."""
+    if name in BUILT_IN[kind]:
+        return _from_module(BUILT_IN[kind][name])
+    for entry in entry_points(group=GROUPS[kind]):
+        if entry.name == name:
+            return entry.load()
+    if ".py:" in name:
+        return _from_file(kind, name)
+    known = names(kind)
+    raise ConfigError(f"unknown {kind} '{name}'{suggest(name, known) or '; known: ' + ', '.join(known)}")
+
+
+def _from_module(target: str) -> Any:
+    module, _, attribute = target.partition(":")
+    return getattr(importlib.import_module(module), attribute)
+
+
+def _from_file(kind: str, target: str) -> Any:
+    path, _, attribute = target.rpartition(":")
+    if not Path(path).is_file():
+        raise ConfigError(f"{kind} '{target}': there is no file {path}")
+    spec = importlib.util.spec_from_file_location(Path(path).stem, path)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    if not hasattr(module, attribute):
+        raise ConfigError(f"{kind} '{target}': {path} defines no '{attribute}'")
+    return getattr(module, attribute)

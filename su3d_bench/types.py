@@ -1,0 +1,340 @@
+"""What travels between the parts: frozen dataclasses, checked once at the border.
+
+Coordinates are metres in the world frame unless a name says otherwise; camera axes are OpenCV's
+(x right, y down, z forward).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal, Protocol, runtime_checkable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.errors import DataError, PredictionError
+
+BoolArray = NDArray[np.bool_]
+UInt8Array = NDArray[np.uint8]
+Int32Array = NDArray[np.int32]
+Int64Array = NDArray[np.int64]
+Float32Array = NDArray[np.float32]
+Float64Array = NDArray[np.float64]
+
+ImageDomain = Literal["rendered-rooms", "camera"]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One posed RGB-D image.
+
+    ``rgb`` (H, W, 3) uint8; ``depth_m`` (H, W) float32, along the optical axis, 0 where invalid;
+    ``camera_to_world`` (4, 4) float64; ``intrinsics`` (3, 3) float64 in pixels.
+    ``index`` counts in the sequence at full rate.
+    """
+
+    index: int
+    timestamp_s: float
+    rgb: UInt8Array
+    depth_m: Float32Array
+    camera_to_world: Float64Array
+    intrinsics: Float64Array
+
+    def __post_init__(self) -> None:
+        where = f"frame {self.index}"
+        if self.rgb.ndim != 3 or self.rgb.shape[2] != 3 or self.rgb.dtype != np.uint8:
+            raise DataError(f"{where}: colour is {self.rgb.shape} {self.rgb.dtype}; expected (height, width, 3) uint8")
+        if self.depth_m.shape != self.rgb.shape[:2]:
+            raise DataError(
+                f"{where}: depth is {_size(self.depth_m)} and colour is {_size(self.rgb)}; both must have one size"
+            )
+        if self.camera_to_world.shape != (4, 4) or not np.isfinite(self.camera_to_world).all():
+            raise DataError(f"{where}: the pose is not a finite 4x4 matrix; drop the frame or mend the trajectory")
+        if self.intrinsics.shape != (3, 3) or not np.isfinite(self.intrinsics).all():
+            raise DataError(f"{where}: the intrinsics are not a finite 3x3 matrix")
+
+
+def _size(image: NDArray[Any]) -> str:
+    return f"{image.shape[1]}x{image.shape[0]}"
+
+
+@dataclass(frozen=True)
+class SceneInfo:
+    """What a method may know of a scene before its first frame; never ground truth."""
+
+    dataset: str
+    scene: str
+    n_frames: int
+    stride: int
+    image_domain: ImageDomain
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class LabelSet:
+    """Class ids and their names in a label space such as ``replica``; id 0 is never a class."""
+
+    space: str
+    ids: tuple[int, ...]
+    names: tuple[str, ...]
+
+    def __post_init__(self) -> None:
+        if len(self.ids) != len(self.names) or len(set(self.ids)) != len(self.ids):
+            raise DataError(f"label set '{self.space}': ids and names must pair up, each id once")
+
+    def name_of(self, class_id: int) -> str:
+        return self.names[self.ids.index(class_id)]
+
+
+@dataclass(frozen=True)
+class GroundTruth:
+    """Labelled points of a scene in one ``variant`` (mesh-vertices, face-corners, conceptgraphs, ...).
+
+    ``points`` (N, 3) float32 m; ``semantic`` (N,) int32 class ids of ``labels``, 0 where unannotated;
+    ``instance`` (N,) int32 ids unique in the scene, 0 where there is none; ``source`` says how it was made.
+    ``evaluation_points`` (P, 3) float32 where a protocol scores points of another cloud than the labelled one.
+    """
+
+    points: Float32Array
+    semantic: Int32Array
+    instance: Int32Array
+    labels: LabelSet
+    variant: str
+    source: str
+    evaluation_points: Float32Array | None = None
+
+    def __post_init__(self) -> None:
+        n = len(self.points)
+        if self.points.shape != (n, 3) or self.semantic.shape != (n,) or self.instance.shape != (n,):
+            raise DataError(
+                f"ground truth '{self.variant}': points {self.points.shape}, semantic {self.semantic.shape} and "
+                f"instance {self.instance.shape} do not agree"
+            )
+
+
+@dataclass(frozen=True)
+class InstanceMesh:
+    """The annotated surface, from which the runner projects perfect masks.
+
+    ``vertices`` (V, 3) float32 m; ``triangles`` (T, 3) int32; ``instance_of_triangle`` (T,) int32, 0 for none;
+    ``class_of_instance`` maps an instance id to a class id of ``labels``.
+    """
+
+    vertices: Float32Array
+    triangles: Int32Array
+    instance_of_triangle: Int32Array
+    class_of_instance: Mapping[int, int]
+    labels: LabelSet
+
+
+@dataclass(frozen=True)
+class Detections:
+    """What perception found in one frame: K regions, strongest evidence first is not implied.
+
+    ``masks`` (K, H, W) bool, may overlap; ``boxes`` (K, 4) float32 x0 y0 x1 y1 in pixels, right and bottom exclusive;
+    ``scores`` (K,) float32 in 0..1; ``names`` and ``captions`` one text each;
+    ``crop_features`` (K, R, D) float32, L2-normalised, crop r at ``crop_ratios[r]``;
+    ``global_feature`` (D,) float32, of the whole image.
+    """
+
+    frame_index: int
+    masks: BoolArray
+    boxes: Float32Array
+    scores: Float32Array
+    names: tuple[str, ...]
+    captions: tuple[str, ...]
+    crop_ratios: tuple[float, ...]
+    crop_features: Float32Array
+    global_feature: Float32Array
+
+    def __post_init__(self) -> None:
+        n = len(self.names)
+        shapes = (len(self.masks), len(self.boxes), len(self.scores), len(self.captions), len(self.crop_features))
+        if self.masks.ndim != 3 or any(length != n for length in shapes):
+            raise DataError(f"frame {self.frame_index}: {n} names, but masks, boxes, scores, captions, features {shapes}")
+        if self.crop_features.shape[:2] != (n, len(self.crop_ratios)):
+            raise DataError(
+                f"frame {self.frame_index}: crop features {self.crop_features.shape} for {n} regions and "
+                f"{len(self.crop_ratios)} ratios"
+            )
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+
+@dataclass(frozen=True)
+class PerceptionNeeds:
+    """What a method asks of perception.
+
+    ``masks``: ``grounded`` (named objects) or ``class-agnostic`` (every region); regions whose name is in
+    ``background_names`` or whose box covers more than ``max_box_fraction`` of the image are left out before any
+    feature is computed.
+    """
+
+    masks: Literal["grounded", "class-agnostic"] = "grounded"
+    crop_ratios: tuple[float, ...] = (1.0,)
+    background_names: tuple[str, ...] = ()
+    max_box_fraction: float = 1.0
+    frames: bool = True
+
+
+@dataclass(frozen=True)
+class Instances:
+    """A map of K instances over M shared points; masks may overlap.
+
+    ``points`` (M, 3) float32 m; instance k owns points ``indices[indptr[k]:indptr[k + 1]]`` (sorted int32);
+    ``scores`` (K,) float64; ``features`` (K, D) float32 where the method has features, ``labels`` one class name each
+    where the method itself decides; ``boxes`` (K, 2, 3) float32 axis-aligned minimum and maximum corners; ``centroids``
+    (K, 3) float32; ``views`` (V, 2) int32 rows (frame index, detection index), those of instance k at
+    ``view_indptr[k]:view_indptr[k + 1]``.
+    """
+
+    points: Float32Array
+    indptr: Int64Array
+    indices: Int32Array
+    scores: Float64Array
+    features: Float32Array | None
+    labels: tuple[str, ...] | None
+    names: tuple[str, ...]
+    captions: tuple[str, ...]
+    boxes: Float32Array
+    centroids: Float32Array
+    view_indptr: Int64Array
+    views: Int32Array
+    ids: Int32Array = field(default_factory=lambda: np.zeros(0, np.int32))
+
+    def __post_init__(self) -> None:
+        k = len(self.scores)
+        if len(self.indptr) != k + 1 or len(self.names) != k or len(self.captions) != k:
+            raise PredictionError(f"instances: {k} scores, {len(self.indptr) - 1} masks, {len(self.names)} names")
+        if self.indptr[0] != 0 or self.indptr[-1] != len(self.indices) or (np.diff(self.indptr) < 0).any():
+            raise PredictionError("instances: indptr does not describe the list of point indices")
+        if len(self.indices) and (self.indices.min() < 0 or self.indices.max() >= len(self.points)):
+            worst = int(np.flatnonzero((self.indices < 0) | (self.indices >= len(self.points)))[0])
+            owner = int(np.searchsorted(self.indptr, worst, side="right") - 1)
+            raise PredictionError(
+                f"instance {owner}: mask holds index {int(self.indices[worst])}, the map has {len(self.points)} points "
+                f"(0..{len(self.points) - 1})"
+            )
+        if self.features is not None and len(self.features) != k:
+            raise PredictionError(f"instances: {k} masks and {len(self.features)} features")
+        if self.labels is not None and len(self.labels) != k:
+            raise PredictionError(f"instances: {k} masks and {len(self.labels)} labels")
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    def mask(self, k: int) -> Int32Array:
+        """Point indices of instance ``k``."""
+        return self.indices[self.indptr[k] : self.indptr[k + 1]]
+
+
+@dataclass(frozen=True)
+class Partition:
+    """One instance a point: ``instance`` (M,) int32 rows of ``features`` (K, D), -1 for none."""
+
+    points: Float32Array
+    instance: Int32Array
+    features: Float32Array
+
+
+@dataclass(frozen=True)
+class DenseFeatures:
+    """One feature a point: ``features`` (M, D) float16, usually memory-mapped; all-zero rows have no feature."""
+
+    points: Float32Array
+    features: NDArray[np.float16]
+
+
+Prediction = Instances | Partition | DenseFeatures
+
+
+class Dataset(Protocol):
+    """Where frames and ground truth come from; one file a dataset."""
+
+    name: str
+
+    def scenes(self) -> Sequence[str]:
+        """Scene names, the default ones first."""
+        ...
+
+    def files(self, scene: str) -> Sequence[Path]:
+        """What the scene is read from, for checks and digests; empty where the scene is made on demand."""
+        ...
+
+    def digest(self, scene: str) -> str:
+        """A content key: equal only where frames and ground truth are equal."""
+        ...
+
+    def info(self, scene: str, stride: int) -> SceneInfo: ...
+
+    def frames(self, scene: str, stride: int) -> Sequence[Frame]:
+        """Every ``stride``-th frame from 0, read lazily; ``len()`` and random access."""
+        ...
+
+    def ground_truth(self, scene: str, variant: str) -> GroundTruth:
+        """The truth in the form that a protocol names; raises ``GroundTruthMissing`` where there is none."""
+        ...
+
+    def instance_mesh(self, scene: str) -> InstanceMesh:
+        """The annotated mesh, for the oracle profile; raises ``GroundTruthMissing`` where there is none."""
+        ...
+
+
+class StageTimer(Protocol):
+    def stage(self, name: str) -> Any:
+        """A context manager that adds the time inside it to stage ``name`` of the current update."""
+        ...
+
+
+class Method(Protocol):
+    """A system under test: fed frame by frame, asked for a map at the end or midway."""
+
+    name: str
+    Config: type
+
+    @property
+    def needs(self) -> PerceptionNeeds: ...
+
+    def start(self, scene: SceneInfo) -> None: ...
+
+    def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None: ...
+
+    def finish(self) -> Prediction: ...
+
+
+@runtime_checkable
+class Encoder(Protocol):
+    """Two towers into one space of ``dim`` dimensions; all outputs L2-normalised float32."""
+
+    name: str
+    digest: str
+    dim: int
+
+    def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
+        """Features (N, dim) of RGB crops (h, w, 3) at their native size."""
+        ...
+
+    def encode_texts(self, texts: Sequence[str]) -> Float32Array:
+        """Features (N, dim) of texts."""
+        ...
+
+
+@dataclass(frozen=True)
+class Regions:
+    """A segmenter's answer: masks, boxes and scores as in ``Detections``; names where the segmenter itself names."""
+
+    masks: BoolArray
+    boxes: Float32Array
+    scores: Float32Array
+    names: tuple[str, ...] | None = None
+    captions: tuple[str, ...] | None = None
+
+
+class Segmenter(Protocol):
+    name: str
+    digest: str
+
+    def segment(self, frame: Frame) -> Regions: ...
