@@ -153,7 +153,9 @@ class Detections:
         n = len(self.names)
         shapes = (len(self.masks), len(self.boxes), len(self.scores), len(self.captions), len(self.crop_features))
         if self.masks.ndim != 3 or any(length != n for length in shapes):
-            raise DataError(f"frame {self.frame_index}: {n} names, but masks, boxes, scores, captions, features {shapes}")
+            raise DataError(
+                f"frame {self.frame_index}: {n} names, but masks, boxes, scores, captions, features {shapes}"
+            )
         if self.crop_features.shape[:2] != (n, len(self.crop_ratios)):
             raise DataError(
                 f"frame {self.frame_index}: crop features {self.crop_features.shape} for {n} regions and "

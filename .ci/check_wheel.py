@@ -1,0 +1,46 @@
+"""Build the wheel and compare what it holds with what git tracks: nothing missing, nothing besides."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import zipfile
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parent.parent
+LINKED = ("datasets", "baselines", "reports")
+
+
+def tracked() -> set[str]:
+    """Paths inside the wheel that the tracked files stand for."""
+    listing = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, check=True, capture_output=True, text=True).stdout
+    expected = set()
+    for path in filter(None, listing.split("\0")):
+        top = path.split("/")[0]
+        if top in LINKED:
+            expected.add(f"su3d_bench/{path}")
+        elif top == "su3d_bench" and path not in {f"su3d_bench/{name}" for name in LINKED}:
+            expected.add(path)
+    return expected
+
+
+def main() -> int:
+    with tempfile.TemporaryDirectory() as folder:
+        subprocess.run(
+            [sys.executable, "-m", "build", "--wheel", "--outdir", folder, str(ROOT)], check=True, capture_output=True
+        )
+        (wheel,) = Path(folder).glob("*.whl")
+        with zipfile.ZipFile(wheel) as archive:
+            held = {name for name in archive.namelist() if ".dist-info/" not in name}
+    expected = tracked()
+    for name in sorted(expected - held):
+        print(f"not in the wheel: {name}")
+    for name in sorted(held - expected):
+        print(f"in the wheel, but not tracked: {name}")
+    print(f"wheel: {len(held)} files, {len(expected)} tracked")
+    return int(expected != held)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,39 @@
+# `make demo` and `make test` do all set-up themselves; both need only Python 3.11 or 3.12 and make.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check install -c constraints.txt
+DEMO_SCENES := rooms/living0 rooms/bedroom0 rooms/kitchen0 rooms/office0
+
+.PHONY: demo test bench lint clean
+
+demo: $(VENV)/core
+	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods opensu3d oracle --out runs/demo
+
+test: $(VENV)/test
+	$(BIN)/python -m pytest -q -n auto
+
+bench: $(VENV)/test
+	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-group-by=group --benchmark-columns=min,median,rounds
+
+lint: $(VENV)/dev
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+
+$(VENV)/core: pyproject.toml constraints.txt
+	@$(PYTHON) -c 'import sys; v = sys.version_info[:2]; sys.exit(0 if (3, 11) <= v < (3, 13) else f"Python {v[0]}.{v[1]} found; su3d-bench needs 3.11 or 3.12: make PYTHON=python3.11 ...")'
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	$(PIP) -e .
+	@touch $@
+
+$(VENV)/test: $(VENV)/core
+	$(PIP) -e '.[models,test]'
+	@touch $@
+
+$(VENV)/dev: $(VENV)/test
+	$(PIP) -e '.[models,test,dev]'
+	@touch $@
+
+clean:
+	rm -rf $(VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
