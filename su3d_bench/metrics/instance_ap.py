@@ -1,0 +1,339 @@
+"""The ScanNet instance average precision, equal to the official evaluator in every bit.
+
+Source: BenchmarkScripts/3d_evaluation/evaluate_semantic_instance.py of ScanNet at commit 3830fce, with the one-line
+mend of its pull request 26 (a class whose predictions are all ignored scores 0 instead of raising IndexError).
+A scene gives a table of counted predictions, tables of scenes are concatenated, and only ``combine`` forms ratios.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.errors import DataError, PredictionError
+from su3d_bench.metrics.dot_product import dot
+from su3d_bench.types import BoolArray, Float64Array, Int32Array, Int64Array
+
+# arange(0.5, 0.95, 0.05) excludes its end: nine thresholds up to 0.90, as these doubles; then 0.25
+THRESHOLDS: tuple[float, ...] = (*(float(t) for t in np.arange(0.5, 0.95, 0.05)), 0.25)
+AP50_INDEX = 0
+AP25_INDEX = len(THRESHOLDS) - 1
+MIN_REGION_SIZE = 100  # points; the official script's --min_region_size, opt.min_region_sizes
+INSTANCES_PER_CLASS = 1000  # ground truth is label * 1000 + instance
+
+IntArray = NDArray[np.integer[Any]]
+
+
+@dataclass(frozen=True)
+class InstanceCounts:
+    """What one scene, or several, adds to AP: one row for each counted prediction, class and threshold.
+
+    ``class_index`` (E,) int32 and ``threshold_index`` (E,) int32 say where row e counts, ``score`` (E,) float64 its
+    confidence, ``is_true`` (E,) whether it is a true positive; ``n_missed`` (C, T) int64 counts the ground-truth
+    instances that nothing matched, ``n_truth`` (C,) those that take part, ``n_predictions`` (C,) the predictions of the
+    class with at least the minimum size, ignored ones included.
+    """
+
+    class_index: Int32Array
+    threshold_index: Int32Array
+    score: Float64Array
+    is_true: BoolArray
+    n_missed: Int64Array
+    n_truth: Int64Array
+    n_predictions: Int64Array
+
+
+@dataclass(frozen=True)
+class InstanceAP:
+    """Average precision: ``table`` (C, T) for each class and threshold, NaN where a class has no ground truth."""
+
+    table: Float64Array
+    ap: float
+    ap50: float
+    ap25: float
+
+    def class_ap(self, index: int) -> float:
+        """Mean over the nine thresholds of one class."""
+        return float(np.average(self.table[index : index + 1, :AP25_INDEX]))
+
+    def group_means(self, members: Sequence[int]) -> tuple[float, float, float]:
+        """AP, AP50 and AP25 averaged over the classes ``members`` that have ground truth; NaN where none has."""
+        per_class = np.array(
+            [[self.class_ap(i), self.table[i, AP50_INDEX], self.table[i, AP25_INDEX]] for i in members]
+        ).reshape(-1, 3)
+        return _nanmean(per_class[:, 0]), _nanmean(per_class[:, 1]), _nanmean(per_class[:, 2])
+
+
+def encode_ground_truth(semantic: IntArray, instance: IntArray) -> Int64Array:
+    """One value a point, label * 1000 + instance, and 0 (unannotated) where either is 0.
+
+    >>> encode_ground_truth(np.array([5, 5, 0, 7]), np.array([1, 2, 3, 0])).tolist()
+    [5001, 5002, 0, 0]
+    """
+    if len(instance) and (instance.min() < 0 or semantic.min() < 0):
+        worst = min(int(instance.min()), int(semantic.min()))
+        raise DataError(f"ground truth: holds the id {worst}; ids are 0 for none, else positive")
+    if len(instance) and instance.max() >= INSTANCES_PER_CLASS:
+        raise DataError(
+            f"ground truth: instance id {int(instance.max())} would spill into the next class; "
+            f"number the instances of a scene from 1 to {INSTANCES_PER_CLASS - 1}"
+        )
+    value = np.asarray(semantic, np.int64) * INSTANCES_PER_CLASS + instance
+    value[(np.asarray(instance) == 0) | (np.asarray(semantic) == 0)] = 0
+    return value
+
+
+def last_line_of_each_mask_file(files: Sequence[str]) -> list[tuple[int, int]]:
+    """Pairs (line of first occurrence, line of last occurrence), one a distinct mask file, in order of the first.
+
+    The official reader keys predictions by file path: a file named twice stays at its first position with the label and
+    confidence of its last line.
+
+    >>> last_line_of_each_mask_file(["a.txt", "b.txt", "a.txt", "c.txt"])
+    [(0, 2), (1, 1), (3, 3)]
+    """
+    first: dict[str, int] = {}
+    last: dict[str, int] = {}
+    for line, file in enumerate(files):
+        first.setdefault(file, line)
+        last[file] = line
+    return [(first[file], last[file]) for file in first]
+
+
+def per_scene(
+    ground_truth: IntArray,
+    indptr: IntArray,
+    indices: IntArray,
+    labels: IntArray,
+    scores: Float64Array,
+    class_ids: Sequence[int],
+    min_region_size: int = MIN_REGION_SIZE,
+) -> InstanceCounts:
+    """The additive counts of one scene.
+
+    ``ground_truth`` (N,) holds label * 1000 + instance a point, 0 where unannotated; prediction k covers the points
+    ``indices[indptr[k]:indptr[k + 1]]``, strictly ascending, and has ``labels[k]`` and ``scores[k]``. Their order counts
+    for AP25 alone, as in the original under Python 3. Points whose label is not in ``class_ids`` are void.
+
+    >>> truth = np.array([3001] * 200 + [0] * 50)
+    >>> counts = per_scene(truth, np.array([0, 150]), np.arange(150), np.array([3]), np.array([0.9]), [3, 4])
+    >>> combine([counts]).table[0].tolist()  # IoU 0.75: nothing above it
+    [1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
+    >>> combine([counts]).ap50, counts.n_truth.tolist()
+    (1.0, [1, 0])
+    """
+    _check_predictions(ground_truth, indptr, indices, labels, scores)
+    class_of = {class_id: index for index, class_id in enumerate(class_ids)}
+    if any(class_id < 1 for class_id in class_of):
+        raise DataError(f"class ids: {min(class_of)} cannot be scored; class ids start at 1")
+    segment_of_point, segment_value, segment_size = _segments(ground_truth)
+    segment_class = np.array([class_of.get(int(v) // INSTANCES_PER_CLASS, -1) for v in segment_value], np.int64)
+    size = np.diff(indptr)
+    prediction_class = np.array([class_of.get(int(label), -1) for label in labels], np.int64)
+    kept = np.flatnonzero((prediction_class >= 0) & (size >= min_region_size))
+    intersection = _intersections(segment_of_point, len(segment_value), indptr, indices, kept)
+    n_void = intersection[:, segment_class < 0].sum(axis=1)
+
+    n_classes, n_thresholds = len(class_of), len(THRESHOLDS)
+    counted = _CountedRows([], [], [], [])
+    n_missed = np.zeros((n_classes, n_thresholds), np.int64)
+    n_truth = np.zeros(n_classes, np.int64)
+    n_predictions = np.bincount(prediction_class[kept], minlength=n_classes).astype(np.int64)
+    for c in range(n_classes):
+        columns = np.flatnonzero(segment_class == c)  # ascending value, as the original walks them
+        rows = np.flatnonzero(prediction_class[kept] == c)
+        is_small = segment_size[columns] < min_region_size
+        is_group = segment_value[columns] < INSTANCES_PER_CLASS
+        eligible = np.flatnonzero(~is_small & ~is_group)
+        n_truth[c] = len(eligible)
+        n_points = size[kept[rows]]
+        shared = intersection[np.ix_(rows, columns)]
+        iou = shared / (segment_size[columns][None, :] + n_points[:, None] - shared)
+        n_ignored = n_void[rows] + shared[:, is_group].sum(axis=1) + shared[:, is_small].sum(axis=1)
+        for t, threshold in enumerate(THRESHOLDS):
+            n_missed[c, t] = counted.match(
+                c, t, iou > threshold, eligible, scores[kept[rows]], n_ignored / n_points <= threshold
+            )
+    return counted.freeze(n_missed, n_truth, n_predictions)
+
+
+@dataclass(frozen=True)
+class _CountedRows:
+    """The table of counted predictions while it grows."""
+
+    class_index: list[int]
+    threshold_index: list[int]
+    score: list[float]
+    is_true: list[bool]
+
+    def add(self, c: int, t: int, score: float, is_true: bool) -> None:
+        self.class_index.append(c)
+        self.threshold_index.append(t)
+        self.score.append(score)
+        self.is_true.append(is_true)
+
+    def match(
+        self,
+        c: int,
+        t: int,
+        over: BoolArray,
+        eligible: Int64Array,
+        scores: Float64Array,
+        counts_if_unmatched: BoolArray,
+    ) -> int:
+        """Add one class at one threshold, greedily in order of the ground truth; returns how much of it nothing met."""
+        visited = np.zeros(len(scores), bool)
+        n_missed = 0
+        for column in eligible:
+            found = np.flatnonzero(over[:, column] & ~visited)
+            if not len(found):
+                n_missed += 1
+                continue
+            # only the first in line is used up; the best score of all stays with the true positive
+            visited[found[0]] = True
+            ranked = np.sort(scores[found])[::-1]
+            self.add(c, t, float(ranked[0]), True)
+            for score in ranked[1:]:
+                self.add(c, t, float(score), False)
+        # a prediction that met any instance of its class, even a small or a taken one, is no false positive here
+        for row in np.flatnonzero(~over.any(axis=1) & counts_if_unmatched):
+            self.add(c, t, float(scores[row]), False)
+        return n_missed
+
+    def freeze(self, n_missed: Int64Array, n_truth: Int64Array, n_predictions: Int64Array) -> InstanceCounts:
+        return InstanceCounts(
+            class_index=np.array(self.class_index, np.int32),
+            threshold_index=np.array(self.threshold_index, np.int32),
+            score=np.array(self.score, np.float64),
+            is_true=np.array(self.is_true, bool),
+            n_missed=n_missed,
+            n_truth=n_truth,
+            n_predictions=n_predictions,
+        )
+
+
+def concatenate(counts: Sequence[InstanceCounts]) -> InstanceCounts:
+    """The counts of several scenes as one: rows one after another, numbers summed."""
+    return InstanceCounts(
+        class_index=np.concatenate([c.class_index for c in counts]),
+        threshold_index=np.concatenate([c.threshold_index for c in counts]),
+        score=np.concatenate([c.score for c in counts]),
+        is_true=np.concatenate([c.is_true for c in counts]),
+        n_missed=np.sum([c.n_missed for c in counts], axis=0),
+        n_truth=np.sum([c.n_truth for c in counts], axis=0),
+        n_predictions=np.sum([c.n_predictions for c in counts], axis=0),
+    )
+
+
+def average_precision(scores: Float64Array, is_true: BoolArray, n_missed: int) -> float:
+    """Area under the raw precision-recall polyline, one vertex a distinct score and the vertex (recall 0, precision 1).
+
+    Rows are the counted predictions of one class; 0 where there is none (pull request 26).
+
+    >>> average_precision(np.array([1.0, 1.0, 1.0]), np.array([True, True, False]), 2)  # recall (1 + precision) / 2
+    0.41666666666666663
+    """
+    if not len(scores):
+        return 0.0
+    order = np.argsort(scores, kind="stable")
+    n_true_up_to = np.cumsum(is_true[order])
+    _, first = np.unique(scores[order], return_index=True)
+    n_true_below = np.where(first > 0, n_true_up_to[first - 1], 0)
+    true_positives = n_true_up_to[-1] - n_true_below
+    precision = true_positives / (len(scores) - first)
+    # every instance is either a true positive at some score or missed, so the denominator is one constant
+    recall = true_positives / (true_positives + n_true_below + n_missed)
+    precision = np.append(precision, 1.0)
+    padded = np.concatenate([recall[:1], recall, [0.0, 0.0]])
+    # convolution with (-1/2, 0, 1/2): halving is exact, so this equals numpy.convolve in every bit
+    width = 0.5 * (padded[:-2] - padded[2:])
+    return dot(precision, width)
+
+
+def combine(counts: Sequence[InstanceCounts]) -> InstanceAP:
+    """AP of the scenes together: their predictions share one curve a class, and classes are averaged.
+
+    Classes without a ground-truth instance are NaN and leave the mean; with no class left the means are NaN.
+
+    >>> hit = per_scene(np.full(120, 7004), np.array([0, 120]), np.arange(120), np.array([7]), np.ones(1), [7])
+    >>> miss = per_scene(np.full(120, 7009), np.array([0]), np.arange(0), np.zeros(0, int), np.ones(0), [7])
+    >>> combine([hit, miss]).ap
+    0.5
+    """
+    if not counts:
+        raise ValueError("combine needs the counts of at least one scene")
+    whole = concatenate(counts)
+    n_classes, n_thresholds = whole.n_missed.shape
+    table = np.full((1, n_classes, n_thresholds), np.nan)
+    group = whole.class_index.astype(np.int64) * n_thresholds + whole.threshold_index
+    order = np.argsort(group, kind="stable")
+    bounds = np.searchsorted(group[order], np.arange(n_classes * n_thresholds + 1))
+    for c in np.flatnonzero(whole.n_truth > 0):
+        for t in range(n_thresholds):
+            cell = c * n_thresholds + t
+            rows = order[bounds[cell] : bounds[cell + 1]]
+            table[0, c, t] = average_precision(whole.score[rows], whole.is_true[rows], int(whole.n_missed[c, t]))
+    # the order in which numpy sums follows the layout that this mixed indexing yields; the last bit depends on it
+    all_but_25 = np.arange(AP25_INDEX)[None, :]
+    nine = table[np.zeros((1, 1), int), :, all_but_25]
+    return InstanceAP(table[0], _nanmean(nine), _nanmean(table[0, :, AP50_INDEX]), _nanmean(table[0, :, AP25_INDEX]))
+
+
+def _check_predictions(
+    ground_truth: IntArray, indptr: IntArray, indices: IntArray, labels: IntArray, scores: Float64Array
+) -> None:
+    n_predictions, n_points = len(labels), len(ground_truth)
+    if len(indptr) != n_predictions + 1 or len(scores) != n_predictions:
+        raise PredictionError(
+            f"{n_predictions} labels, {len(indptr) - 1} masks, {len(scores)} scores; they must pair up"
+        )
+    if not np.isfinite(scores).all():
+        bad = int(np.flatnonzero(~np.isfinite(scores))[0])
+        raise PredictionError(f"instance {bad}: its confidence is {scores[bad]}; confidences are finite numbers")
+    if len(indices):
+        starts = np.zeros(len(indices), bool)
+        starts[indptr[:-1][indptr[:-1] < len(indices)]] = True
+        unsorted = np.flatnonzero((np.diff(indices) <= 0) & ~starts[1:])
+        if len(unsorted):
+            owner = int(np.searchsorted(indptr, unsorted[0], side="right") - 1)
+            raise PredictionError(
+                f"instance {owner}: its point indices are not strictly ascending; sort them, each once"
+            )
+        if indices.min() < 0 or indices.max() >= n_points:
+            worst = int(np.flatnonzero((indices < 0) | (indices >= n_points))[0])
+            owner = int(np.searchsorted(indptr, worst, side="right") - 1)
+            raise PredictionError(
+                f"instance {owner}: mask holds index {int(indices[worst])}, the scene has {n_points} points "
+                f"(0..{n_points - 1})"
+            )
+
+
+def _segments(ground_truth: IntArray) -> tuple[Int64Array, Int64Array, Int64Array]:
+    """Each point's row in the ascending list of distinct values, that list, and how many points have each."""
+    if not len(ground_truth):
+        return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64)
+    if ground_truth.min() < 0:
+        raise DataError(f"ground truth: holds the value {int(ground_truth.min())}; values are label * 1000 + instance")
+    values, segment_of_point, sizes = np.unique(ground_truth, return_inverse=True, return_counts=True)
+    return segment_of_point, values.astype(np.int64), sizes.astype(np.int64)
+
+
+def _intersections(
+    segment_of_point: Int64Array, n_segments: int, indptr: IntArray, indices: IntArray, kept: Int64Array
+) -> Int64Array:
+    """Points that prediction ``kept[r]`` shares with each segment, (R, n_segments), by one bincount."""
+    size = np.diff(indptr)
+    row_of_prediction = np.full(len(size), -1, np.int64)
+    row_of_prediction[kept] = np.arange(len(kept))
+    row = np.repeat(row_of_prediction, size)
+    chosen = row >= 0
+    key = row[chosen] * n_segments + segment_of_point[indices[chosen]]
+    return np.bincount(key, minlength=len(kept) * n_segments).reshape(len(kept), n_segments).astype(np.int64)
+
+
+def _nanmean(values: Float64Array) -> float:
+    return float("nan") if np.isnan(values).all() else float(np.nanmean(values))
