@@ -1,0 +1,123 @@
+"""OpenSU3D: masks of single images, fused and tracked into one map of instances, incrementally."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+
+from su3d_bench.errors import DataError
+from su3d_bench.opensu3d.association import assign_ids, count_overlaps, overlap_ratios
+from su3d_bench.opensu3d.config import OpenSU3DConfig
+from su3d_bench.opensu3d.frame_cloud import FrameCloud, frame_cloud
+from su3d_bench.opensu3d.postprocess import segments_of, to_instances
+from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View, record_of
+from su3d_bench.opensu3d.voxel_map import NO_INSTANCE, VoxelMap
+from su3d_bench.types import (
+    Detections,
+    Frame,
+    Instances,
+    Int32Array,
+    Int64Array,
+    PerceptionNeeds,
+    SceneInfo,
+    StageTimer,
+)
+
+
+class OpenSU3D:
+    """The reference pipeline; ``finish`` gives the map so far and changes nothing."""
+
+    name = "opensu3d"
+    Config = OpenSU3DConfig
+
+    def __init__(self, config: OpenSU3DConfig | None = None) -> None:
+        self.config = config or OpenSU3DConfig()
+        self._clear()
+
+    def _clear(self) -> None:
+        self._map = VoxelMap(self.config.eps)
+        self._table = TrackingTable()
+        self._images: list[ImageRecord] = []
+        self._next_id = NO_INSTANCE + 1
+        self._postprocess_ms: float | None = None
+
+    @property
+    def needs(self) -> PerceptionNeeds:
+        return self.config.needs
+
+    @property
+    def n_points(self) -> int:
+        """Points of the map so far, those of no instance included."""
+        return len(self._map)
+
+    @property
+    def n_instances(self) -> int:
+        """Scene ids given so far, before post-processing."""
+        return self._next_id - 1 - NO_INSTANCE
+
+    @property
+    def postprocess_ms(self) -> float | None:
+        """Milliseconds that the last ``finish`` took; None before the first."""
+        return self._postprocess_ms
+
+    def start(self, scene: SceneInfo) -> None:
+        """Forgets the scene before; of the new one nothing needs to be known."""
+        self._clear()
+
+    def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
+        """Fuses one image into the map; costs what the view costs, however large the map is."""
+        if detections.frame_index != frame.index:
+            raise DataError(f"frame {frame.index}: the detections are those of frame {detections.frame_index}")
+        with timer.stage("backproject"):
+            cloud = frame_cloud(frame, detections.masks, self.config)
+        with timer.stage("match"):
+            in_segment = np.flatnonzero(cloud.segment >= 0)
+            matched = self._map.nearest(cloud.points[in_segment])
+        with timer.stage("track"):
+            scene_id_of = self._track(cloud, in_segment, matched, len(detections))
+        with timer.stage("insert"):
+            self._insert(cloud, in_segment, matched, scene_id_of, detections)
+
+    def _track(self, cloud: FrameCloud, in_segment: Int64Array, matched: Int64Array, n_detections: int) -> Int32Array:
+        """Scene id of each detection, NO_INSTANCE for those without a point; enters them into Q."""
+        scene_id_of = np.full(n_detections, NO_INSTANCE, np.int32)
+        if len(in_segment) == 0:
+            return scene_id_of
+        matched_id = np.where(matched >= 0, self._map.ids[matched] if len(self._map) else NO_INSTANCE, NO_INSTANCE)
+        overlaps = count_overlaps(cloud.segment[in_segment], matched_id.astype(np.int32))
+        wanted = np.unique(overlaps.best[overlaps.best > NO_INSTANCE])
+        lower, upper = cloud.points.min(axis=0) - self.config.eps, cloud.points.max(axis=0) + self.config.eps
+        inside = np.append(self._map.count_inside(lower, upper, wanted), 0)
+        n_scene = np.where(overlaps.best > NO_INSTANCE, inside[np.searchsorted(wanted, overlaps.best)], 0)
+        ratios = overlap_ratios(overlaps, n_scene, self.config.overlap_rule)
+        ids, self._next_id = assign_ids(overlaps, ratios, self.config.overlap_threshold, self._next_id)
+        scene_id_of[overlaps.segments] = ids
+        for detection, scene_id in zip(overlaps.segments, ids, strict=True):
+            self._table.add(int(scene_id), View(len(self._images), int(detection)))
+        return scene_id_of
+
+    def _insert(
+        self,
+        cloud: FrameCloud,
+        in_segment: Int64Array,
+        matched: Int64Array,
+        scene_id_of: Int32Array,
+        detections: Detections,
+    ) -> None:
+        ids = np.full(len(cloud.points), NO_INSTANCE, np.int32)
+        ids[in_segment] = scene_id_of[cloud.segment[in_segment]]
+        placed = self._map.insert(
+            cloud.points, ids, keep_density=self.config.keep_density, refill=self.config.refill_background
+        )
+        hit = np.where(placed[in_segment] >= 0, placed[in_segment], matched)
+        self._images.append(record_of(detections, self.config.fusion, cloud.segment[in_segment], hit))
+
+    def finish(self) -> Instances:
+        """The instances of the map so far, and its points of no instance."""
+        start = time.perf_counter()
+        points, ids = self._map.points, self._map.ids
+        segments = segments_of(points, ids, self._table, self._images, self._next_id, self.config)
+        instances = to_instances(points, ids, segments, self._images, self.config)
+        self._postprocess_ms = (time.perf_counter() - start) * 1e3
+        return instances

@@ -1,0 +1,182 @@
+"""From points with ids to instances: density clustering, boxes, names, captions, fused features."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from su3d_bench.opensu3d.config import InstanceScore, OpenSU3DConfig
+from su3d_bench.opensu3d.feature_fusion import fuse_views
+from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View
+from su3d_bench.types import Float32Array, Float64Array, Instances, Int32Array, Int64Array
+
+NOISE = -1
+# Spelt with a vowel but spoken with a consonant, and the other way round.
+_SPOKEN_WITH_CONSONANT = ("uni", "use", "usu", "usb", "uten", "util", "ukul", "eu", "ewe", "one", "once")
+_SPOKEN_WITH_VOWEL = ("hour", "heir", "honest", "honor", "honour")
+_LETTERS_WITH_VOWEL = "aefhilmnorsx"
+
+
+@dataclass(frozen=True)
+class Segment:
+    """One instance to be: its ``scene_id``, map points (sorted) and views in the order they came."""
+
+    scene_id: int
+    points: Int64Array
+    views: tuple[View, ...]
+
+
+def article(name: str) -> str:
+    """The English indefinite article of ``name``: "a" bed, "an" indoor-plant, "a" utensil-holder, "an" LCD screen."""
+    first = name.strip().replace("-", " ").split(" ")[0]
+    spelt_out = len(first) == 1 or (first.isupper() and len(first) <= 3)
+    word = first.lower()
+    if spelt_out:
+        return "an" if word[0] in _LETTERS_WITH_VOWEL else "a"
+    if word.startswith(_SPOKEN_WITH_VOWEL):
+        return "an"
+    return "an" if word[:1] in set("aeiou") and not word.startswith(_SPOKEN_WITH_CONSONANT) else "a"
+
+
+def caption_of(name: str) -> str:
+    """The caption of an object that nothing more is known of: "an {object} in a scene", with the right article."""
+    name = name.strip() or "object"
+    return f"{article(name)} {name} in a scene"
+
+
+def cluster(points: Float64Array, config: OpenSU3DConfig) -> Int64Array:
+    """DBSCAN label (N,) of each point: 0, 1, ... or NOISE."""
+    from sklearn.cluster import DBSCAN
+
+    if len(points) < config.dbscan_min_points:
+        return np.full(len(points), NOISE, np.int64)
+    labels = DBSCAN(eps=config.dbscan_eps, min_samples=config.dbscan_min_points, n_jobs=1).fit_predict(points)
+    return np.asarray(labels, np.int64)
+
+
+def kept_clusters(labels: Int64Array, split_fraction: float) -> list[int]:
+    """Labels of the clusters that become instances: at least ``split_fraction`` of the largest, largest first."""
+    sizes = np.bincount(labels[labels != NOISE])
+    order = np.argsort(-sizes, kind="stable")
+    return [int(label) for label in order if sizes[label] >= split_fraction * sizes[order[0]]]
+
+
+def segments_of(
+    points: Float64Array,
+    ids: Int32Array,
+    table: TrackingTable,
+    images: Sequence[ImageRecord],
+    next_id: int,
+    config: OpenSU3DConfig,
+) -> list[Segment]:
+    """Instances after clustering, split-off ones last with new ids from ``next_id`` on; what is noise is left out."""
+    order = np.argsort(ids, kind="stable")
+    kept: list[Segment] = []
+    split_off: list[Segment] = []
+    for scene_id in table.scene_ids():
+        first, last = np.searchsorted(ids, [scene_id, scene_id + 1], sorter=order)
+        own = order[first:last]
+        labels = cluster(points[own], config)
+        clusters = kept_clusters(labels, config.split_fraction)
+        views = table.views(scene_id)
+        for rank, label in enumerate(clusters):
+            members = own[labels == label]
+            hitting = views if len(clusters) == 1 else _views_that_hit(members, views, images, len(ids))
+            if rank == 0:
+                kept.append(Segment(scene_id, members, hitting))
+            else:
+                split_off.append(Segment(next_id + len(split_off), members, hitting))
+    return kept + split_off
+
+
+def _views_that_hit(
+    members: Int64Array, views: tuple[View, ...], images: Sequence[ImageRecord], n_points: int
+) -> tuple[View, ...]:
+    is_member = np.zeros(n_points, np.bool_)
+    is_member[members] = True
+    return tuple(view for view in views if is_member[images[view.position].hits_of(view.detection)].any())
+
+
+def best_views(views: tuple[View, ...], images: Sequence[ImageRecord], m: int) -> tuple[View, ...]:
+    """The ``m`` views of the highest prediction score; ties: the earlier image, then the earlier detection."""
+    return tuple(sorted(views, key=lambda v: (-images[v.position].scores[v.detection], v.position, v.detection))[:m])
+
+
+def instance_score(scores: Float64Array, rule: InstanceScore, m: int) -> float:
+    """Prediction score of an instance from the detector's scores of its views."""
+    if rule == "max":
+        return float(scores.max())
+    if rule == "mean":
+        return float(scores.mean())
+    return float(np.sort(scores)[::-1][:m].sum() / m)
+
+
+def to_instances(
+    points: Float64Array,
+    ids: Int32Array,
+    segments: Sequence[Segment],
+    images: Sequence[ImageRecord],
+    config: OpenSU3DConfig,
+) -> Instances:
+    """The map: points of instances and of no instance; points that clustering dropped as noise are left out."""
+    of_segments = _concatenated([segment.points for segment in segments])
+    is_kept = ids == 0
+    is_kept[of_segments] = True
+    row = np.cumsum(is_kept) - 1
+    described = [_described(segment, images, config) for segment in segments]
+    boxes = [_box(points[segment.points]) for segment in segments]
+    n_views = [len(segment.views) for segment in segments]
+    dimension = len(images[0].global_feature) if images else 0
+    return Instances(
+        points=points[is_kept].astype(np.float32),
+        indptr=_indptr(len(segment.points) for segment in segments),
+        indices=row[of_segments].astype(np.int32),
+        scores=np.array([each.score for each in described], np.float64),
+        features=np.array([each.feature for each in described], np.float32).reshape(len(segments), dimension),
+        labels=None,
+        names=tuple(each.name for each in described),
+        captions=tuple(each.caption for each in described),
+        boxes=np.array(boxes, np.float32).reshape(len(segments), 2, 3),
+        centroids=np.array([points[s.points].mean(axis=0) for s in segments], np.float32).reshape(len(segments), 3),
+        view_indptr=_indptr(n_views),
+        views=np.array(
+            [(images[v.position].frame_index, v.detection) for segment in segments for v in segment.views], np.int32
+        ).reshape(sum(n_views), 2),
+        ids=np.array([segment.scene_id for segment in segments], np.int32),
+    )
+
+
+@dataclass(frozen=True)
+class _Description:
+    name: str
+    caption: str
+    score: float
+    feature: Float64Array
+
+
+def _described(segment: Segment, images: Sequence[ImageRecord], config: OpenSU3DConfig) -> _Description:
+    top = best_views(segment.views, images, config.top_m)
+    best = images[top[0].position]
+    name = best.names[top[0].detection]
+    scores = np.array([images[view.position].scores[view.detection] for view in segment.views])
+    feature = fuse_views(
+        np.stack([images[view.position].multi_scale[view.detection] for view in top]),
+        np.stack([images[view.position].global_feature for view in top]),
+        config.fusion.multi_view,
+    )
+    caption = best.captions[top[0].detection].strip() or caption_of(name)
+    return _Description(name, caption, instance_score(scores, config.instance_score, config.top_m), feature)
+
+
+def _box(points: Float64Array) -> Float32Array:
+    return np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float32)
+
+
+def _indptr(lengths: Iterable[int]) -> Int64Array:
+    return np.concatenate([[0], np.cumsum(list(lengths))]).astype(np.int64)
+
+
+def _concatenated(arrays: Sequence[Int64Array]) -> Int64Array:
+    return np.concatenate(arrays) if arrays else np.zeros(0, np.int64)

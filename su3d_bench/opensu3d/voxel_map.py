@@ -1,0 +1,165 @@
+"""The scene cloud P_scene: points with instance ids in a voxel hash that grows, matches and counts without a scan."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.errors import DataError
+from su3d_bench.types import Float64Array, Int32Array, Int64Array
+
+NO_INSTANCE = 0
+# Voxel coordinates are exact integers far beyond this; a coordinate above it is a pose in the wrong unit.
+FARTHEST_M = 1e7
+
+
+class VoxelMap:
+    """Points (float64, metres) with ids, hashed by voxels of side ``eps``.
+
+    Arrays double when they are full; every other step costs what the view costs, however many points the map holds.
+    """
+
+    def __init__(self, eps: float) -> None:
+        self.eps = eps
+        self._points = np.empty((1 << 12, 3))
+        self._ids = np.empty(1 << 12, np.int32)
+        self._following = np.empty(1 << 12, np.int32)
+        self._keys = np.empty((1 << 6, 3), np.int64)
+        self._heads = np.empty((1 << 6, 512), np.int32)
+        self._table = np.full(1 << 8, -1, np.int32)
+        self._counts = np.zeros(2, np.int64)
+
+    def __len__(self) -> int:
+        return int(self._counts[0])
+
+    @property
+    def n_blocks(self) -> int:
+        """Number of occupied blocks of 16x16x16 voxels."""
+        return int(self._counts[1])
+
+    @property
+    def points(self) -> Float64Array:
+        """Points (N, 3) in the order of their index; a view."""
+        return self._points[: len(self)]
+
+    @property
+    def ids(self) -> Int32Array:
+        """Instance id of each point, NO_INSTANCE for none; a view."""
+        return self._ids[: len(self)]
+
+    def nearest(self, queries: Float64Array) -> Int64Array:
+        """Index of the nearest point strictly within eps of each query, -1 where there is none; ties: the lowest."""
+        return self.nearest_counted(queries)[0]
+
+    def nearest_counted(self, queries: Float64Array) -> tuple[Int64Array, int]:
+        """As ``nearest``, with the number of cells that were looked into."""
+        from su3d_bench.opensu3d import _kernels
+
+        found = np.empty(len(queries), np.int64)
+        visited = _kernels.nearest(
+            _checked(queries), self.eps, self._points, self._following, self._keys, self._heads, self._table, found
+        )
+        return found, int(visited)
+
+    def count_inside(self, lower: Float64Array, upper: Float64Array, wanted: Int32Array) -> Int64Array:
+        """Number of points of each wanted id inside the closed box from ``lower`` to ``upper``."""
+        return self.count_inside_counted(lower, upper, wanted)[0]
+
+    def count_inside_counted(
+        self, lower: Float64Array, upper: Float64Array, wanted: Int32Array
+    ) -> tuple[Int64Array, int]:
+        """As ``count_inside``, with the number of blocks that were looked for."""
+        from su3d_bench.opensu3d import _kernels
+
+        found = np.zeros(len(wanted), np.int64)
+        if len(wanted) == 0:
+            return found, 0
+        row_of_id = np.full(int(wanted.max()) + 1, -1, np.int64)
+        row_of_id[wanted] = np.arange(len(wanted))
+        visited = _kernels.count_inside(
+            np.asarray(lower, np.float64),
+            np.asarray(upper, np.float64),
+            row_of_id,
+            self.eps,
+            self._points,
+            self._ids,
+            self._following,
+            self._keys,
+            self._heads,
+            self._table,
+            self.n_blocks,
+            found,
+        )
+        return found, int(visited)
+
+    def insert(self, points: Float64Array, ids: Int32Array, *, keep_density: bool, refill: bool) -> Int64Array:
+        """Adds points in order; gives the map index that each took, -1 where it was not added.
+
+        With ``keep_density`` a point whose voxel is taken is not added; with ``refill`` too, it takes the voxel over
+        if it has an instance and the one that holds it has none.
+        """
+        from su3d_bench.opensu3d import _kernels
+
+        points = _checked(points)
+        self._reserve_points(len(self) + len(points))
+        placed = np.empty(len(points), np.int64)
+        done = 0
+        while True:
+            done = _kernels.insert(
+                points,
+                np.ascontiguousarray(ids, np.int32),
+                done,
+                self.eps,
+                keep_density,
+                refill,
+                self._points,
+                self._ids,
+                self._following,
+                self._keys,
+                self._heads,
+                self._table,
+                self._counts,
+                placed,
+            )
+            if done == len(points):
+                return placed
+            self._double_blocks()
+
+    def _reserve_points(self, n: int) -> None:
+        capacity = len(self._ids)
+        if n <= capacity:
+            return
+        while capacity < n:
+            capacity *= 2
+        self._points = _grown(self._points, capacity, len(self))
+        self._ids = _grown(self._ids, capacity, len(self))
+        self._following = _grown(self._following, capacity, len(self))
+
+    def _double_blocks(self) -> None:
+        from su3d_bench.opensu3d import _kernels
+
+        capacity = 2 * len(self._keys)
+        self._keys = _grown(self._keys, capacity, self.n_blocks)
+        self._heads = _grown(self._heads, capacity, self.n_blocks)
+        self._table = np.full(4 * capacity, -1, np.int32)
+        _kernels.rehash(self._table, self._keys, self.n_blocks)
+
+
+def _grown(array: NDArray[Any], capacity: int, used: int) -> NDArray[Any]:
+    larger = np.empty((capacity, *array.shape[1:]), array.dtype)
+    larger[:used] = array[:used]
+    return larger
+
+
+def _checked(points: Float64Array) -> Float64Array:
+    points = np.ascontiguousarray(points, np.float64)
+    # min and max are nan or infinite where any coordinate is
+    if len(points) and not (points.min() >= -FARTHEST_M and points.max() <= FARTHEST_M):
+        worst = points[np.argmax(~(np.abs(points) <= FARTHEST_M).all(axis=1))]
+        raise DataError(
+            f"point cloud: a point lies at {worst.tolist()} m; coordinates must be finite and within {FARTHEST_M:.0e} m"
+            " (are the poses and the depth in metres?)"
+        )
+    return points
