@@ -1,0 +1,164 @@
+"""What perception computed for a frame, kept on disk under a key of everything that moves it.
+
+An entry is an npz file without pickled objects that carries a checksum of its arrays. Entries are written under a
+temporary name and renamed, so that concurrent processes see whole entries only; a damaged entry counts as absent
+and is made anew.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import tempfile
+import zipfile
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.errors import StoreError
+from su3d_bench.perception.crops import mask_boxes
+from su3d_bench.types import BoolArray, Float32Array, Float64Array, Frame, StageTimer, UInt8Array
+
+Arrays = dict[str, NDArray[Any]]
+
+# Moves every key: raise it when what is stored, or the code that makes it, changes without any digest changing.
+CACHE_VERSION = "1"
+_CHECKSUM = "checksum"
+
+
+def content_key(*parts: str) -> str:
+    """A hex key of texts; the order counts, and no two lists of parts share a key."""
+    hasher = hashlib.sha256(CACHE_VERSION.encode())
+    for part in parts:
+        encoded = part.encode()
+        hasher.update(len(encoded).to_bytes(8, "little"))
+        hasher.update(encoded)
+    return hasher.hexdigest()
+
+
+def array_digest(*arrays: NDArray[Any]) -> str:
+    """A hex digest of the values, shapes and types of ``arrays``."""
+    hasher = hashlib.blake2b(digest_size=20)
+    for array in arrays:
+        hasher.update(f"{array.dtype.str}{array.shape}".encode())
+        hasher.update(np.ascontiguousarray(array).data)
+    return hasher.hexdigest()
+
+
+def frame_digest(frame: Frame, with_pose: bool) -> str:
+    """A digest of colour, depth and intrinsics, and of the pose where the answer depends on it."""
+    pose: tuple[Float64Array, ...] = (frame.camera_to_world,) if with_pose else ()
+    return array_digest(frame.rgb, frame.depth_m, frame.intrinsics, *pose)
+
+
+class FrameCache:
+    """Entries of named arrays below ``root``; with ``root`` None nothing is read or written."""
+
+    def __init__(self, root: Path | None) -> None:
+        self._root = None if root is None else root / "perception"
+
+    def path(self, key: str) -> Path | None:
+        """Where the entry of ``key`` lies, whether or not it is there."""
+        return None if self._root is None else self._root / key[:2] / f"{key}.npz"
+
+    def load(self, key: str) -> Arrays | None:
+        """The arrays stored under ``key``, or None where there is no whole entry."""
+        path = self.path(key)
+        if path is None or not path.is_file():
+            return None
+        try:
+            with np.load(path, allow_pickle=False) as entry:
+                arrays = {name: entry[name] for name in entry.files}
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return None
+        checksum = arrays.pop(_CHECKSUM, None)
+        if checksum is None or not np.array_equal(checksum, _checksum(arrays)):
+            return None
+        return arrays
+
+    def save(self, key: str, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Store ``arrays`` under ``key`` in one step; raises ``StoreError`` where the disk refuses."""
+        path = self.path(key)
+        if path is None:
+            return
+        temporary = ""
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
+                temporary = file.name
+                np.savez(file, allow_pickle=False, **{**arrays, _CHECKSUM: _checksum(arrays)})
+            os.replace(temporary, path)
+        except OSError as error:
+            if temporary:
+                Path(temporary).unlink(missing_ok=True)
+            raise StoreError(
+                f"{path.parent}: the perception cache cannot be written ({error.strerror or error}); "
+                "free space, choose another cache folder, or set perception.cache = false"
+            ) from error
+
+
+def _checksum(arrays: Mapping[str, NDArray[Any]]) -> UInt8Array:
+    hasher = hashlib.sha256()
+    for name in sorted(arrays):
+        hasher.update(name.encode() + b"\0" + array_digest(arrays[name]).encode())
+    return np.frombuffer(hasher.digest(), np.uint8)
+
+
+def pack_masks(masks: BoolArray) -> Arrays:
+    """``masks`` (K, H, W) as arrays that take little room: the bits of each mask inside its own box, end to end."""
+    windows = mask_boxes(masks).astype(np.int32)
+    bits = [np.packbits(mask[y0:y1, x0:x1]) for mask, (x0, y0, x1, y1) in zip(masks, windows.tolist(), strict=True)]
+    return {
+        "mask_windows": windows,
+        "mask_bits": np.concatenate(bits) if bits else np.zeros(0, np.uint8),
+        "mask_shape": np.array(masks.shape[1:], np.int32),
+    }
+
+
+def unpack_masks(arrays: Mapping[str, NDArray[Any]]) -> BoolArray:
+    """The masks (K, H, W) that ``pack_masks`` took."""
+    windows = arrays["mask_windows"]
+    height, width = (int(size) for size in arrays["mask_shape"])
+    masks = np.zeros((len(windows), height, width), bool)
+    start = 0
+    for mask, (x0, y0, x1, y1) in zip(masks, windows.tolist(), strict=True):
+        n_bits = (y1 - y0) * (x1 - x0)
+        n_bytes = -(-n_bits // 8)
+        bits = np.unpackbits(arrays["mask_bits"][start : start + n_bytes], count=n_bits)
+        mask[y0:y1, x0:x1] = bits.reshape(y1 - y0, x1 - x0)
+        start += n_bytes
+    return masks
+
+
+class CachedRows:
+    """Rows of a table (n, dim) float32 that are computed once each and kept under a key."""
+
+    def __init__(self, cache: FrameCache, dim: int) -> None:
+        self._cache = cache
+        self._dim = dim
+
+    def rows(
+        self,
+        key: str,
+        n: int,
+        wanted: NDArray[np.intp],
+        compute: Callable[[NDArray[np.intp]], Float32Array],
+        timer: StageTimer,
+    ) -> Float32Array:
+        """Rows ``wanted`` of the table of ``n`` rows under ``key``; ``compute`` is asked for the missing ones only."""
+        with timer.stage("cache"):
+            entry = self._cache.load(key)
+        if entry is None or entry["rows"].shape != (n, self._dim):
+            table, known = np.zeros((n, self._dim), np.float32), np.zeros(n, bool)
+        else:
+            table, known = entry["rows"], entry["known"]
+        missing = wanted[~known[wanted]]
+        if len(missing):
+            table[missing] = compute(missing)
+            known[missing] = True
+            with timer.stage("cache"):
+                self._cache.save(key, {"rows": table, "known": known})
+        return table[wanted]

@@ -1,0 +1,65 @@
+"""From regions to detections: which regions stay, and the features of their crops, each computed once."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.perception.cache import CachedRows, FrameCache, array_digest, content_key
+from su3d_bench.perception.crops import crop_images
+from su3d_bench.types import Encoder, Float32Array, Frame, PerceptionNeeds, StageTimer
+
+
+def regions_to_keep(
+    names: Sequence[str], boxes: Float32Array, image_shape: tuple[int, ...], needs: PerceptionNeeds
+) -> NDArray[np.intp]:
+    """Indices of the regions whose name is no background name and whose box is not too large a part of the image."""
+    background = {name.lower() for name in needs.background_names}
+    is_named = np.array([name.lower() not in background for name in names], bool)
+    areas = (boxes[:, 2] - boxes[:, 0]).astype(np.float64) * (boxes[:, 3] - boxes[:, 1])
+    is_small = areas <= needs.max_box_fraction * image_shape[0] * image_shape[1]
+    return np.flatnonzero(is_named & is_small)
+
+
+class CropEncoder:
+    """Crop and whole-image features of frames, kept in the cache one table a ratio."""
+
+    def __init__(self, encoder: Encoder, cache: FrameCache) -> None:
+        self._encoder = encoder
+        self._rows = CachedRows(cache, encoder.dim)
+
+    def crops(
+        self,
+        frame: Frame,
+        boxes: Float32Array,
+        wanted: NDArray[np.intp],
+        ratios: tuple[float, ...],
+        timer: StageTimer,
+    ) -> Float32Array:
+        """Features (W, R, D) of the crops around boxes ``wanted``, one for each of ``ratios``."""
+        with timer.stage("cache"):
+            image = array_digest(frame.rgb, boxes)
+        features = np.zeros((len(wanted), len(ratios), self._encoder.dim), np.float32)
+        for column, ratio in enumerate(ratios):
+
+            def compute(missing: NDArray[np.intp], ratio: float = ratio) -> Float32Array:
+                with timer.stage("encode"):
+                    return self._encoder.encode_images(crop_images(frame.rgb, boxes[missing], ratio))
+
+            key = content_key("crops", image, self._encoder.digest, repr(float(ratio)))
+            features[:, column] = self._rows.rows(key, len(boxes), wanted, compute, timer)
+        return features
+
+    def whole(self, frame: Frame, timer: StageTimer) -> Float32Array:
+        """The feature (D,) of the whole image."""
+
+        def compute(_: NDArray[np.intp]) -> Float32Array:
+            with timer.stage("encode"):
+                return self._encoder.encode_images([frame.rgb])
+
+        with timer.stage("cache"):
+            key = content_key("image", array_digest(frame.rgb), self._encoder.digest)
+        row: Float32Array = self._rows.rows(key, 1, np.zeros(1, np.intp), compute, timer)[0]
+        return row

@@ -1,0 +1,117 @@
+"""Names of image regions by zero-shot classification, and captions from a template."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.resources import files
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from su3d_bench.perception.cache import content_key
+from su3d_bench.types import BoolArray, Encoder, Float32Array, Float64Array, UInt8Array
+
+# Colour words with the sRGB value that each stands for; chosen to be far apart in CIELAB.
+COLOURS: tuple[tuple[str, tuple[int, int, int]], ...] = (
+    ("black", (25, 25, 25)),
+    ("grey", (128, 128, 128)),
+    ("white", (235, 235, 235)),
+    ("red", (180, 35, 35)),
+    ("orange", (225, 125, 40)),
+    ("yellow", (225, 200, 60)),
+    ("green", (60, 140, 65)),
+    ("blue", (50, 85, 170)),
+    ("purple", (115, 60, 140)),
+    ("pink", (225, 140, 170)),
+    ("brown", (110, 70, 40)),
+    ("beige", (215, 195, 160)),
+)
+
+# Spelt with a vowel and spoken with a consonant, or the other way round.
+_CONSONANT_SOUND = ("uni", "use", "usu", "uten", "eu", "one", "ukulele")
+_VOWEL_SOUND = ("hour", "honest", "heir", "honor", "honour")
+_PLURAL = frozenset({"blinds", "pants", "shoes", "curtains", "scissors", "glasses", "clothes", "jeans", "stairs"})
+
+
+class NamingConfig(BaseModel):
+    """How regions get their names: ``prompt`` with the name at ``{}``, compared at softmax ``temperature``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    prompt: str = Field(default="{} in a scene", pattern=r"\{\}")
+    temperature: float = Field(default=0.05, gt=0)
+
+
+def vocabulary() -> tuple[str, ...]:
+    """The class names that regions may be called, in the order of the list file."""
+    text = files("su3d_bench.perception").joinpath("vocabulary.txt").read_text(encoding="utf-8")
+    lines = (line.strip() for line in text.splitlines())
+    return tuple(line for line in lines if line and not line.startswith("#"))
+
+
+def with_article(noun: str) -> str:
+    """``noun`` after its English article: "a bed", "an indoor-plant", "an hourglass", "a utensil-holder"; plurals bare.
+
+    >>> with_article("indoor-plant"), with_article("utensil-holder"), with_article("blinds")
+    ('an indoor-plant', 'a utensil-holder', 'blinds')
+    """
+    first = noun.strip().lower()
+    if first in _PLURAL:
+        return noun
+    is_vowel = first[:1] in tuple("aeiou") and not first.startswith(_CONSONANT_SOUND)
+    return f"{'an' if is_vowel or first.startswith(_VOWEL_SOUND) else 'a'} {noun}"
+
+
+def scene_caption(name: str, colour: str | None = None) -> str:
+    """The template caption of a region: "a green chair in a scene"."""
+    if colour is None:
+        return f"{with_article(name)} in a scene"
+    if name.lower() in _PLURAL:
+        return f"{colour} {name} in a scene"
+    return f"{with_article(f'{colour} {name}')} in a scene"
+
+
+def colour_word(rgb: UInt8Array, mask: BoolArray) -> str | None:
+    """The colour word nearest in CIELAB to the median colour under ``mask``; None for an empty mask."""
+    import cv2
+
+    pixels = rgb[mask]
+    if not len(pixels):
+        return None
+    table = np.array([value for _, value in COLOURS], np.float32)
+    samples = np.concatenate([np.median(pixels, axis=0)[None].astype(np.float32), table]) / np.float32(255)
+    lab = cv2.cvtColor(samples[None], cv2.COLOR_RGB2LAB)[0]
+    # Shading moves lightness far more than hue, so lightness counts for half.
+    difference = (lab[1:] - lab[0]) * np.array([0.5, 1.0, 1.0], np.float32)
+    return COLOURS[int(np.argmin((difference**2).sum(axis=1)))][0]
+
+
+@dataclass(frozen=True)
+class Names:
+    """One name and its softmax confidence (K,) float64 a region."""
+
+    names: tuple[str, ...]
+    confidences: Float64Array
+
+
+class Namer:
+    """Zero-shot classifier over the embedded vocabulary."""
+
+    def __init__(self, config: NamingConfig, encoder: Encoder, words: tuple[str, ...] | None = None) -> None:
+        self._config = config
+        self._encoder = encoder
+        self._words = vocabulary() if words is None else words
+        self._text_features: Float32Array | None = None
+        self.digest = content_key("namer", config.model_dump_json(), encoder.digest, *self._words)
+
+    def name(self, features: Float32Array) -> Names:
+        """The likeliest word for each of the ``features`` (K, D) of crops at ratio 1.0."""
+        if self._text_features is None:
+            prompts = [self._config.prompt.replace("{}", with_article(word)) for word in self._words]
+            self._text_features = self._encoder.encode_texts(prompts)
+        similarity = features.astype(np.float64) @ self._text_features.astype(np.float64).T
+        logits = similarity / self._config.temperature
+        weights = np.exp(logits - logits.max(axis=1, keepdims=True)) if len(logits) else logits
+        best = weights.argmax(axis=1) if len(logits) else np.zeros(0, np.intp)
+        confidences = 1.0 / weights.sum(axis=1)
+        return Names(tuple(self._words[index] for index in best), confidences)

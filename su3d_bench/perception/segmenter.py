@@ -1,0 +1,63 @@
+"""A segmenter that needs no weights: surfaces from depth, normals and colour; objects from convexity."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from su3d_bench.perception.cache import content_key
+from su3d_bench.perception.crops import mask_boxes
+from su3d_bench.perception.segmenter_config import SegmenterConfig
+from su3d_bench.perception.segmenter_graph import Graph, IndexArray
+from su3d_bench.perception.segmenter_pixels import PixelMaps, superpixels
+from su3d_bench.perception.segmenter_rules import find_structure, join_objects, join_surfaces
+from su3d_bench.types import BoolArray, Float32Array, Frame, Regions
+
+__all__ = ["RgbdSegmenter", "SegmenterConfig"]
+
+
+class RgbdSegmenter:
+    """Regions of any RGB-D frame: whole ``objects`` without floor, walls and ceiling, or all the ``parts``."""
+
+    name = "rgbd"
+
+    def __init__(self, config: SegmenterConfig, level: Literal["objects", "parts"]) -> None:
+        self._config = config
+        self._level = level
+        self.digest = content_key("rgbd", level, config.model_dump_json())
+
+    def segment(self, frame: Frame) -> Regions:
+        """Masks that do not overlap, largest first."""
+        import cv2
+
+        cv2.setNumThreads(1)
+        maps, graph = superpixels(frame, self._config)
+        graph = join_surfaces(graph, self._config)
+        if self._level == "parts":
+            kept = np.ones(len(graph.pieces), bool)
+            return self._regions(frame, maps, graph, graph.piece_of_superpixel, kept)
+        is_structure = find_structure(graph, self._config)
+        objects, object_of_surface = join_objects(graph, is_structure, self._config)
+        kept = np.ones(len(objects.pieces), bool)
+        kept[object_of_surface[is_structure]] = False
+        return self._regions(frame, maps, objects, object_of_surface[graph.piece_of_superpixel], kept)
+
+    def _regions(
+        self, frame: Frame, maps: PixelMaps, graph: Graph, piece_of_superpixel: IndexArray, kept: BoolArray
+    ) -> Regions:
+        height, width = frame.depth_m.shape
+        labels = piece_of_superpixel[maps.labels]
+        factor = -(-width // self._config.max_width)
+        labels = np.repeat(np.repeat(labels, factor, axis=0), factor, axis=1)
+        labels = np.pad(labels, ((0, max(0, height - len(labels))), (0, max(0, width - labels.shape[1]))), mode="edge")
+        labels = labels[:height, :width]
+        sizes = np.bincount(labels.ravel(), minlength=len(graph.pieces))
+        order = np.argsort(-sizes, kind="stable")
+        chosen = [k for k in order if kept[k] and sizes[k] >= self._config.min_region_px]
+        masks = np.array([labels == k for k in chosen], bool).reshape(len(chosen), height, width)
+        return Regions(masks, mask_boxes(masks), self._scores(graph, np.array(chosen, np.intp)))
+
+    def _scores(self, graph: Graph, chosen: IndexArray) -> Float32Array:
+        coverage = graph.pieces.n_points / np.maximum(graph.pieces.n_pixels, 1)
+        return (0.5 + 0.5 * coverage[chosen]).astype(np.float32)

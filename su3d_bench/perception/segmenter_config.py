@@ -1,0 +1,51 @@
+"""Parameters of the RGB-D segmenter."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict, Field
+
+
+class SegmenterConfig(BaseModel):
+    """What is an edge, what is one surface, what is one object.
+
+    Colours are CIELAB units with lightness counted ``lightness_weight``, because shading moves lightness more than hue;
+    angles are degrees; jumps in depth are relative to the depth. Parameters are grouped by stage: larger ``*_scale``,
+    ``surface_*`` and ``object_*`` values merge more, ``min_region_px`` drops more.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    # pixels
+    max_width: int = Field(default=640, ge=32)  # wider frames are segmented at a whole fraction of their size
+    lightness_weight: float = Field(default=0.6, gt=0)
+    smoothing_colour: float = Field(default=20.0, gt=0)  # bilateral filter: colour steps above this stay sharp
+    depth_jump: float = Field(default=0.012, gt=0)
+    normal_radius: int = Field(default=4, ge=1)  # at half resolution; smaller beside jumps in depth
+
+    # superpixels
+    colour_unit: float = Field(default=8.0, gt=0)
+    normal_unit_degrees: float = Field(default=25.0, gt=0)
+    superpixel_scale: float = Field(default=12.0, gt=0)
+    min_superpixel_px: int = Field(default=16, ge=1)
+
+    # surfaces
+    surface_colour: float = Field(default=9.0, gt=0)
+    surface_contrast: float = Field(default=9.0, gt=0)
+    surface_bend_degrees: float = Field(default=22.0, gt=0)
+    surface_gap: float = Field(default=0.5, gt=0)
+
+    # structure: floor, walls, ceiling
+    structure_min_fraction: float = Field(default=0.03, gt=0, le=1)
+    structure_distance_m: float = Field(default=0.03, gt=0)
+    structure_behind_fraction: float = Field(default=0.02, ge=0, le=1)
+    structure_colour: float = Field(default=12.0, gt=0)
+
+    # objects
+    object_convex_colour: float = Field(default=60.0, gt=0)
+    object_flat_colour: float = Field(default=20.0, gt=0)
+    object_concave_colour: float = Field(default=8.0, gt=0)
+    object_bend_degrees: float = Field(default=12.0, gt=0)
+    object_gap: float = Field(default=0.4, gt=0)
+
+    # answer
+    min_region_px: int = Field(default=100, ge=1)

@@ -1,0 +1,197 @@
+"""A graph of neighbouring surface pieces that is contracted in rounds."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.types import Float32Array, Float64Array, Int32Array, Int64Array
+
+IndexArray = NDArray[np.intp]
+
+
+@dataclass(frozen=True)
+class Pieces:
+    """Sums over the pixels of N pieces; of points and normals only where depth is known.
+
+    ``n_pixels``, ``n_points`` (N,); ``colour`` (N, 3) sum of Lab; ``point`` (N, 3) sum of camera-frame points m;
+    ``scatter`` (N, 6) sums of xx, xy, xz, yy, yz, zz; ``normal`` (N, 3) sum of unit normals towards the camera.
+    """
+
+    n_pixels: Float64Array
+    n_points: Float64Array
+    colour: Float64Array
+    point: Float64Array
+    scatter: Float64Array
+    normal: Float64Array
+
+    def __len__(self) -> int:
+        return len(self.n_pixels)
+
+    def joined(self, label: IndexArray, n: int) -> Pieces:
+        """The pieces with equal ``label`` (N,) in 0..n-1 as one."""
+        return Pieces(*(_sum_by(label, values, n) for values in vars(self).values()))
+
+    def mean_colour(self) -> Float64Array:
+        return self.colour / np.maximum(self.n_pixels, 1)[:, None]
+
+    def centroid(self) -> Float64Array:
+        return self.point / np.maximum(self.n_points, 1)[:, None]
+
+    def unit_normal(self) -> Float64Array:
+        """Mean directions (N, 3), zero where no normal is known."""
+        length = np.linalg.norm(self.normal, axis=1, keepdims=True)
+        return self.normal / np.where(length > 0, length, 1)
+
+    def flatness_error(self, a: IndexArray, b: IndexArray) -> Float64Array:
+        """Root mean square distance m of the points of ``a`` and ``b`` together from their best plane."""
+        n = self.n_points[a] + self.n_points[b]
+        mean = (self.point[a] + self.point[b]) / np.maximum(n, 1)[:, None]
+        s = (self.scatter[a] + self.scatter[b]) / np.maximum(n, 1)[:, None]
+        matrix = np.empty((len(n), 3, 3))
+        for k, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
+            matrix[:, i, j] = matrix[:, j, i] = s[:, k] - mean[:, i] * mean[:, j]
+        least = np.linalg.eigvalsh(matrix)[:, 0] if len(n) else np.zeros(0)
+        return np.sqrt(np.maximum(least, 0))
+
+
+@dataclass(frozen=True)
+class Borders:
+    """Sums along the E borders between pieces ``a`` < ``b`` (E,): pixel pairs, and what was measured at each pair.
+
+    ``length`` pairs; ``contrast`` colour difference; ``n_deep`` pairs with depth on both sides; ``gap`` pairs of those
+    with a jump in depth; ``bend`` signed angle between the pieces over the pairs without a jump, convex positive.
+    """
+
+    a: IndexArray
+    b: IndexArray
+    length: Float64Array
+    contrast: Float64Array
+    n_deep: Float64Array
+    gap: Float64Array
+    bend: Float64Array
+
+    def joined(self, label: IndexArray) -> Borders:
+        """The borders that remain between pieces of different ``label``, sorted by (a, b)."""
+        a, b = label[self.a], label[self.b]
+        stays = a != b
+        low, high = np.minimum(a, b)[stays], np.maximum(a, b)[stays]
+        n = int(label.max()) + 1 if len(label) else 0
+        keys, group = np.unique(low * n + high, return_inverse=True)
+        sums = (self.length, self.contrast, self.n_deep, self.gap, self.bend)
+        return Borders(
+            keys // max(n, 1), keys % max(n, 1), *(_sum_by(group, values[stays], len(keys)) for values in sums)
+        )
+
+
+@dataclass(frozen=True)
+class Graph:
+    """Pieces and borders, and which piece each of the first superpixels is in (S,)."""
+
+    pieces: Pieces
+    borders: Borders
+    piece_of_superpixel: IndexArray
+
+
+def _sum_by(label: IndexArray, values: Float64Array, n: int) -> Float64Array:
+    if values.ndim == 1:
+        return np.bincount(label, values, n).astype(np.float64)
+    return np.stack([np.bincount(label, column, n) for column in values.T], axis=1).astype(np.float64)
+
+
+def contract(graph: Graph, pairs: tuple[IndexArray, IndexArray]) -> Graph:
+    """The graph with the two pieces of each pair joined, chains included."""
+    from scipy.sparse import coo_matrix
+    from scipy.sparse.csgraph import connected_components
+
+    n = len(graph.pieces)
+    links = coo_matrix((np.ones(len(pairs[0]), np.int8), pairs), shape=(n, n))
+    n_joined, labels = connected_components(links, directed=False)
+    label = labels.astype(np.intp)
+    return Graph(graph.pieces.joined(label, n_joined), graph.borders.joined(label), label[graph.piece_of_superpixel])
+
+
+def merge_cheapest(graph: Graph, cost: Callable[[Graph], Float64Array], max_rounds: int = 60) -> Graph:
+    """Join, round by round, the pairs that are each other's cheapest, while their ``cost`` (E,) is below 1.
+
+    Costs are computed anew in every round from the joined sums, so that the answer is close to that of joining one
+    pair at a time. Ties go to the pair that comes first by (a, b).
+    """
+    for _ in range(max_rounds):
+        price = cost(graph)
+        a, b = graph.borders.a, graph.borders.b
+        cheap = np.flatnonzero(price < 1)
+        if not len(cheap):
+            break
+        rank = np.empty(len(price), np.int64)
+        rank[np.argsort(price, kind="stable")] = np.arange(len(price))
+        best = np.full(len(graph.pieces), len(price), np.int64)
+        np.minimum.at(best, a[cheap], rank[cheap])
+        np.minimum.at(best, b[cheap], rank[cheap])
+        mutual = cheap[(best[a[cheap]] == rank[cheap]) & (best[b[cheap]] == rank[cheap])]
+        graph = contract(graph, (a[mutual], b[mutual]))
+    return graph
+
+
+def measure_borders(
+    labels: Int32Array,
+    contrast: Float32Array,
+    depth_cost: Float32Array,
+    pieces: Pieces,
+) -> Borders:
+    """The borders of the superpixels in ``labels`` (H, W), from per-pair colour and depth differences (2, H, W)."""
+    n = len(pieces)
+    keys, contrasts, depths = [], [], []
+    for axis, (first, second) in enumerate(
+        ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1, :], np.s_[1:, :])),
+    ):
+        a, b = labels[first], labels[second]
+        differs = a != b
+        low, high = np.minimum(a, b)[differs].astype(np.int64), np.maximum(a, b)[differs].astype(np.int64)
+        keys.append(low * n + high)
+        contrasts.append(contrast[axis][first][differs])
+        depths.append(depth_cost[axis][first][differs])
+    key, inverse = np.unique(np.concatenate(keys), return_inverse=True)
+    low_of, high_of = (key // max(n, 1)).astype(np.intp), (key % max(n, 1)).astype(np.intp)
+    depth = np.concatenate(depths)
+    deep = (depth >= 0).astype(np.float64)
+    gap = (depth >= 1).astype(np.float64)
+    n_deep, n_gap = _sum_by(inverse, deep, len(key)), _sum_by(inverse, gap, len(key))
+    return Borders(
+        low_of,
+        high_of,
+        _sum_by(inverse, np.ones(len(depth)), len(key)),
+        _sum_by(inverse, np.concatenate(contrasts).astype(np.float64), len(key)),
+        n_deep,
+        n_gap,
+        (n_deep - n_gap) * signed_bend(pieces, low_of, high_of),
+    )
+
+
+def signed_bend(pieces: Pieces, a: IndexArray, b: IndexArray) -> Float64Array:
+    """Angles (E,) rad between the normals of pieces ``a`` and ``b``: positive where the edge is convex."""
+    normal, centroid = pieces.unit_normal(), pieces.centroid()
+    angle = np.arccos(np.clip((normal[a] * normal[b]).sum(axis=1), -1, 1))
+    known = (pieces.n_points[a] > 0) & (pieces.n_points[b] > 0)
+    side = ((normal[a] - normal[b]) * (centroid[a] - centroid[b])).sum(axis=1)
+    return np.where(known, np.where(side >= 0, angle, -angle), 0.0)
+
+
+def sum_pixels(labels: Int32Array, lab: Float32Array, points: Float64Array, normals: Float32Array) -> Pieces:
+    """Sums over the superpixels of ``labels`` (H, W); pixels without depth have all-zero ``points`` (H, W, 3)."""
+    flat: Int64Array = labels.ravel().astype(np.int64)
+    n = int(flat.max()) + 1
+    known = points[..., 2].ravel() > 0
+    at, p = flat[known], points.reshape(-1, 3)[known]
+    columns = [p[:, i] * p[:, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
+    return Pieces(
+        np.bincount(flat, minlength=n).astype(np.float64),
+        np.bincount(at, minlength=n).astype(np.float64),
+        _sum_by(flat, lab.reshape(-1, 3).astype(np.float64), n),
+        _sum_by(at, p, n),
+        np.stack([np.bincount(at, column, n) for column in columns], axis=1),
+        _sum_by(at, normals.reshape(-1, 3)[known].astype(np.float64), n),
+    )

@@ -1,0 +1,212 @@
+"""Pixel loops of the segmenter, compiled; import this module only where a frame is segmented."""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int32Array
+
+
+@njit(cache=True)
+def discontinuities(disparity: Float32Array, jump: float, slope_factor: float) -> BoolArray:
+    """Pixels (H, W) beside a jump of the relative disparity that the slopes on its two sides do not explain."""
+    height, width = disparity.shape
+    broken = np.zeros((height, width), np.bool_)
+    for axis in range(2):
+        dv, du = (0, 1) if axis == 0 else (1, 0)
+        for v in range(height - dv):
+            for u in range(width - du):
+                here, there = disparity[v, u], disparity[v + dv, u + du]
+                if here <= 0 or there <= 0:
+                    continue
+                step = abs(there - here)
+                limit = jump * max(here, there)
+                if step <= limit:
+                    continue
+                slope = 1e30
+                if v >= dv and u >= du and disparity[v - dv, u - du] > 0:
+                    slope = min(slope, abs(here - disparity[v - dv, u - du]))
+                if v + 2 * dv < height and u + 2 * du < width and disparity[v + 2 * dv, u + 2 * du] > 0:
+                    slope = min(slope, abs(disparity[v + 2 * dv, u + 2 * du] - there))
+                if slope > 1e29:
+                    slope = 0.0
+                if step > limit + slope_factor * slope:
+                    broken[v, u] = True
+                    broken[v + dv, u + du] = True
+    return broken
+
+
+@njit(cache=True)
+def _sums(disparity: Float32Array, x: Float64Array, y: Float64Array) -> Float64Array:
+    """Integral images (9, H + 1, W + 1) of the moments of a plane fit over the valid pixels."""
+    height, width = disparity.shape
+    table = np.zeros((height + 1, width + 1, 9), np.float64)
+    row = np.zeros(9, np.float64)
+    for v in range(height):
+        row[:] = 0.0
+        for u in range(width):
+            q = np.float64(disparity[v, u])
+            if q > 0:
+                row[0] += 1.0
+                row[1] += x[u]
+                row[2] += y[v]
+                row[3] += x[u] * x[u]
+                row[4] += x[u] * y[v]
+                row[5] += y[v] * y[v]
+                row[6] += q
+                row[7] += x[u] * q
+                row[8] += y[v] * q
+            for k in range(9):
+                table[v + 1, u + 1, k] = table[v, u + 1, k] + row[k]
+    return table
+
+
+@njit(cache=True)
+def fit_planes(disparity: Float32Array, radius: Int32Array, x: Float64Array, y: Float64Array) -> Float32Array:
+    """Planes (H, W, 3): (A, B, C) with 1/z = A x + B y + C in the square window of ``radius``; zeros where unknown.
+
+    ``x`` (W,) and ``y`` (H,) are the ray coordinates (u - cx) / fx and (v - cy) / fy. As A X + B Y + C Z = 1, the
+    vector (A, B, C) is a normal of the plane, away from the camera, whose length is 1 / distance.
+    """
+    height, width = disparity.shape
+    table = _sums(disparity, x, y)
+    planes = np.zeros((height, width, 3), np.float32)
+    m = np.zeros(9, np.float64)
+    for v in range(height):
+        for u in range(width):
+            if disparity[v, u] <= 0:
+                continue
+            r = radius[v, u]
+            v0, v1 = max(v - r, 0), min(v + r + 1, height)
+            u0, u1 = max(u - r, 0), min(u + r + 1, width)
+            for k in range(9):
+                m[k] = table[v1, u1, k] - table[v0, u1, k] - table[v1, u0, k] + table[v0, u0, k]
+            n = m[0]
+            if n < 4:
+                continue
+            mx, my, mq = m[1] / n, m[2] / n, m[6] / n
+            sxx, sxy, syy = m[3] - n * mx * mx, m[4] - n * mx * my, m[5] - n * my * my
+            sxq, syq = m[7] - n * mx * mq, m[8] - n * my * mq
+            det = sxx * syy - sxy * sxy
+            if det <= 1e-9 * sxx * syy or det <= 0:
+                continue
+            a = (sxq * syy - syq * sxy) / det
+            b = (syq * sxx - sxq * sxy) / det
+            planes[v, u, 0] = a
+            planes[v, u, 1] = b
+            planes[v, u, 2] = mq - a * mx - b * my
+    return planes
+
+
+@njit(cache=True)
+def _find(parent: Int32Array, node: int) -> int:
+    while parent[node] != node:
+        parent[node] = parent[parent[node]]
+        node = parent[node]
+    return node
+
+
+@njit(cache=True)
+def pair_costs(
+    lab: Float32Array,
+    disparity: Float32Array,
+    planes: Float32Array,
+    x: Float64Array,
+    y: Float64Array,
+    colour_unit: float,
+    depth_unit: float,
+    normal_unit: float,
+) -> tuple[Float32Array, Float32Array, Float32Array]:
+    """Colour, depth and normal difference (2, H, W) of each pixel to its right (0) and lower (1) neighbour, in units.
+
+    The depth difference is that between a pixel and the neighbour's plane, relative to its depth; -1 where one of the
+    two has no depth.
+    """
+    height, width = disparity.shape
+    colour = np.zeros((2, height, width), np.float32)
+    depth = np.full((2, height, width), np.float32(-1.0))
+    normal = np.zeros((2, height, width), np.float32)
+    for axis in range(2):
+        dv, du = (0, 1) if axis == 0 else (1, 0)
+        for v in range(height - dv):
+            for u in range(width - du):
+                v1, u1 = v + dv, u + du
+                dl = lab[v1, u1, 0] - lab[v, u, 0]
+                da = lab[v1, u1, 1] - lab[v, u, 1]
+                db = lab[v1, u1, 2] - lab[v, u, 2]
+                colour[axis, v, u] = np.sqrt(dl * dl + da * da + db * db) / colour_unit
+                q0, q1 = disparity[v, u], disparity[v1, u1]
+                if q0 <= 0 or q1 <= 0:
+                    continue
+                p0, p1 = planes[v, u], planes[v1, u1]
+                length0 = np.sqrt(p0[0] * p0[0] + p0[1] * p0[1] + p0[2] * p0[2])
+                length1 = np.sqrt(p1[0] * p1[0] + p1[1] * p1[1] + p1[2] * p1[2])
+                if length0 == 0 or length1 == 0:
+                    depth[axis, v, u] = abs(q1 - q0) / max(q0, q1) / depth_unit
+                    continue
+                error0 = abs(p0[0] * x[u1] + p0[1] * y[v1] + p0[2] - q1) / q1
+                error1 = abs(p1[0] * x[u] + p1[1] * y[v] + p1[2] - q0) / q0
+                depth[axis, v, u] = min(error0, error1) / depth_unit
+                cosine = (p0[0] * p1[0] + p0[1] * p1[1] + p0[2] * p1[2]) / (length0 * length1)
+                normal[axis, v, u] = np.sqrt(max(0.0, 2.0 - 2.0 * cosine)) / normal_unit
+    return colour, depth, normal
+
+
+@njit(cache=True)
+def grow_superpixels(cost: Float32Array, scale: float, min_size: int, n_levels: int) -> Int32Array:
+    """Labels (H, W) from 0 by the predicate of Felzenszwalb and Huttenlocher (2004) over ``cost`` (2, H, W).
+
+    Costs are counted in ``n_levels`` levels of 1 / 64; pairs of equal level are visited in row-major order, right
+    neighbours first. Segments below ``min_size`` pixels then join across their cheapest pair.
+    """
+    height, width = cost.shape[1], cost.shape[2]
+    n = height * width
+    counts = np.zeros(n_levels + 1, np.int64)
+    level = np.full((2, height, width), np.int32(-1))
+    for axis in range(2):
+        dv, du = (0, 1) if axis == 0 else (1, 0)
+        for v in range(height - dv):
+            for u in range(width - du):
+                bin_ = min(n_levels - 1, int(cost[axis, v, u] * 64))
+                level[axis, v, u] = bin_
+                counts[bin_ + 1] += 1
+    starts = np.cumsum(counts)
+    order = np.empty(starts[-1], np.int32)
+    for axis in range(2):
+        for v in range(height):
+            for u in range(width):
+                bin_ = level[axis, v, u]
+                if bin_ >= 0:
+                    order[starts[bin_]] = (v * width + u) * 2 + axis
+                    starts[bin_] += 1
+    parent = np.arange(n).astype(np.int32)
+    size = np.ones(n, np.int32)
+    limit = np.full(n, np.float32(scale))
+    for step in range(2):
+        for edge in order:
+            axis, pixel = edge & 1, edge >> 1
+            other = pixel + (1 if axis == 0 else width)
+            a, b = _find(parent, pixel), _find(parent, other)
+            if a == b:
+                continue
+            weight = cost[axis, pixel // width, pixel % width]
+            joins = weight <= limit[a] and weight <= limit[b]
+            if step == 1:
+                joins = size[a] < min_size or size[b] < min_size
+            if joins:
+                low, high = min(a, b), max(a, b)
+                parent[high] = low
+                size[low] += size[high]
+                limit[low] = weight + scale / size[low]
+    labels = np.empty((height, width), np.int32)
+    number = np.full(n, np.int32(-1))
+    n_labels = 0
+    for v in range(height):
+        for u in range(width):
+            root = _find(parent, v * width + u)
+            if number[root] < 0:
+                number[root] = n_labels
+                n_labels += 1
+            labels[v, u] = number[root]
+    return labels

@@ -1,0 +1,91 @@
+"""From a frame to superpixels with colour, shape and the borders between them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from su3d_bench.perception.segmenter_config import SegmenterConfig
+from su3d_bench.perception.segmenter_graph import Graph, measure_borders, sum_pixels
+from su3d_bench.types import Float32Array, Float64Array, Frame, Int32Array, UInt8Array
+
+
+@dataclass(frozen=True)
+class PixelMaps:
+    """A frame at working resolution: ``lab`` (H, W, 3), ``points`` (H, W, 3) m in the camera frame, z 0 if unknown;
+    ``normals`` (H, W, 3) towards the camera, zero if unknown; ``labels`` (H, W) superpixels from 0."""
+
+    lab: Float32Array
+    points: Float64Array
+    normals: Float32Array
+    labels: Int32Array
+
+
+def superpixels(frame: Frame, config: SegmenterConfig) -> tuple[PixelMaps, Graph]:
+    """The superpixels of ``frame`` and the graph of their borders, at working resolution."""
+    from su3d_bench.perception import segmenter_kernels as kernels
+
+    rgb, depth_m, intrinsics = _at_working_size(frame, config.max_width)
+    height, width = depth_m.shape
+    lab = _smooth_lab(rgb, config)
+    x = (np.arange(width) - intrinsics[0, 2]) / intrinsics[0, 0]
+    y = (np.arange(height) - intrinsics[1, 2]) / intrinsics[1, 1]
+    known = np.isfinite(depth_m) & (depth_m > 0)
+    disparity = np.zeros((height, width), np.float32)
+    disparity[known] = 1 / depth_m[known]
+    planes = _planes(disparity, x, y, config)
+    normal_unit = 2 * np.sin(np.deg2rad(config.normal_unit_degrees) / 2)
+    colour, depth, normal = kernels.pair_costs(
+        lab, disparity, planes, x, y, config.colour_unit, config.depth_jump, normal_unit
+    )
+    cost = np.sqrt(colour**2 + np.maximum(depth, 0) ** 2 + normal**2)
+    labels = kernels.grow_superpixels(cost, config.superpixel_scale, config.min_superpixel_px, 2048)
+    length = np.linalg.norm(planes, axis=2, keepdims=True)
+    normals = (-planes / np.where(length > 0, length, 1)).astype(np.float32)
+    z = np.where(known, depth_m, 0).astype(np.float64)
+    points = np.stack([x[None, :] * z, y[:, None] * z, z], axis=2)
+    pieces = sum_pixels(labels, lab, points, normals)
+    borders = measure_borders(labels, colour * np.float32(config.colour_unit), depth, pieces)
+    graph = Graph(pieces, borders, np.arange(len(pieces)))
+    return PixelMaps(lab, points, normals, labels), graph
+
+
+def _at_working_size(frame: Frame, max_width: int) -> tuple[UInt8Array, Float32Array, Float64Array]:
+    """Colour averaged and depth sampled at a whole fraction of the size, with the intrinsics that fit the samples."""
+    import cv2
+
+    factor = -(-frame.rgb.shape[1] // max_width)
+    if factor == 1:
+        return frame.rgb, frame.depth_m, frame.intrinsics
+    depth_m = np.ascontiguousarray(frame.depth_m[factor // 2 :: factor, factor // 2 :: factor])
+    rgb = np.asarray(cv2.resize(frame.rgb, depth_m.shape[::-1], interpolation=cv2.INTER_AREA), np.uint8)
+    intrinsics = frame.intrinsics.copy()
+    intrinsics[:2] /= factor
+    intrinsics[:2, 2] -= (factor // 2) / factor
+    return rgb, depth_m, intrinsics
+
+
+def _smooth_lab(rgb: UInt8Array, config: SegmenterConfig) -> Float32Array:
+    import cv2
+
+    smooth = cv2.bilateralFilter(rgb, 5, config.smoothing_colour, 2.0)
+    lab = np.asarray(cv2.cvtColor(smooth.astype(np.float32) / np.float32(255), cv2.COLOR_RGB2LAB), np.float32)
+    weights: Float32Array = np.array([config.lightness_weight, 1, 1], np.float32)
+    return lab * weights
+
+
+def _planes(disparity: Float32Array, x: Float64Array, y: Float64Array, config: SegmenterConfig) -> Float32Array:
+    """Local planes of every pixel (H, W, 3), fitted at half resolution."""
+    import cv2
+
+    from su3d_bench.perception import segmenter_kernels as kernels
+
+    half = np.ascontiguousarray(disparity[::2, ::2])
+    broken = kernels.discontinuities(half, 2 * config.depth_jump, 2.0)
+    distance = cv2.distanceTransform((~broken).astype(np.uint8), cv2.DIST_C, 3)
+    radius = np.clip(distance.astype(np.int32) - 1, 1, config.normal_radius)
+    planes = kernels.fit_planes(half, radius, x[::2].copy(), y[::2].copy())
+    height, width = disparity.shape
+    full = np.repeat(np.repeat(planes, 2, axis=0), 2, axis=1)[:height, :width]
+    return np.ascontiguousarray(full)
