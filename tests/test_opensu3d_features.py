@@ -1,0 +1,177 @@
+"""The fusion equations, worked by hand, the four schemes and retrieval."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+
+from su3d_bench.errors import PredictionError
+from su3d_bench.opensu3d.config import Fusion, OpenSU3DConfig, Scheme
+from su3d_bench.opensu3d.feature_fusion import fuse_scales, fuse_views
+from su3d_bench.opensu3d.postprocess import article, caption_of
+from su3d_bench.opensu3d.retrieval import rank, rank_all
+from su3d_bench.types import Float32Array, Float64Array, Instances, UInt8Array
+
+CROPS = np.array([[[0.6, 0.8], [1.0, 0.0], [0.0, 1.0]]])  # one region, crops at ratios 0.8, 1.0, 1.2
+
+
+def test_direct_multi_scale_fusion_is_the_mean() -> None:
+    np.testing.assert_allclose(fuse_scales(CROPS, (0.8, 1.0, 1.2), "direct"), [[1.6 / 3, 1.8 / 3]])
+
+
+def test_weighted_multi_scale_fusion_weighs_by_the_cosine_with_the_crop_at_ratio_one() -> None:
+    # cosines with (1, 0): 0.6, 1, 0
+    expected = [[(0.6 * 0.6 + 1.0) / 3, 0.6 * 0.8 / 3]]
+    np.testing.assert_allclose(fuse_scales(CROPS, (0.8, 1.0, 1.2), "weighted"), expected)
+    np.testing.assert_allclose(fuse_scales(CROPS[:, [1, 0, 2]], (1.0, 0.8, 1.2), "weighted"), expected)
+
+
+def test_the_cosine_of_a_zero_feature_is_zero() -> None:
+    crops = np.array([[[0.0, 0.0], [1.0, 0.0]]])
+    np.testing.assert_array_equal(fuse_scales(crops, (1.0, 2.0), "weighted"), [[0.0, 0.0]])
+    assert np.isfinite(fuse_views(np.zeros((1, 2)), np.zeros((1, 2)), "global")).all()
+
+
+def test_direct_multi_view_fusion_is_the_mean() -> None:
+    views = np.array([[1.0, 0.0], [0.0, 2.0]])
+    np.testing.assert_allclose(fuse_views(views, np.ones((2, 2)), "direct"), [0.5, 1.0])
+
+
+def test_global_multi_view_fusion_adds_the_weighted_global_feature_inside_the_mean() -> None:
+    views, images = np.array([[1.0, 0.0], [0.0, 2.0]]), np.array([[0.6, 0.8], [0.0, 1.0]])
+    # cosines 0.6 and 1: ((1, 0) + 0.6 (0.6, 0.8) + (0, 2) + (0, 1)) / 2
+    np.testing.assert_allclose(fuse_views(views, images, "global"), [1.36 / 2, 3.48 / 2])
+
+
+@pytest.mark.parametrize(
+    ("scheme", "expected"),
+    [
+        ("scheme1", Fusion("direct", "direct", (0.8, 1.0, 1.2))),
+        ("scheme2", Fusion("direct", "global", (0.8, 1.0, 1.2))),
+        ("scheme3", Fusion("weighted", "direct", (1.0, 2.0, 4.0))),
+        ("scheme4", Fusion("weighted", "global", (1.0, 2.0, 4.0))),
+    ],
+)
+def test_the_schemes_are_the_papers(scheme: Scheme, expected: Fusion) -> None:
+    config = OpenSU3DConfig(scheme=scheme)
+    assert config.fusion == expected
+    assert config.needs.crop_ratios == expected.crop_ratios
+
+
+def test_explicit_choices_override_the_scheme() -> None:
+    config = OpenSU3DConfig(scheme="scheme4", crop_ratios=(0.5, 1.0), multi_view="direct")
+    assert config.fusion == Fusion("weighted", "direct", (0.5, 1.0))
+    assert OpenSU3DConfig.model_validate({"crop_ratios": [0.1, 1, 1.1]}).fusion.crop_ratios == (0.1, 1.0, 1.1)
+
+
+def test_defaults_are_the_papers() -> None:
+    config = OpenSU3DConfig()
+    assert (config.stride, config.border_px, config.top_m, config.eps, config.overlap_threshold) == (
+        40,
+        20,
+        5,
+        0.02,
+        0.3,
+    )
+    assert (config.dbscan_eps, config.dbscan_min_points, config.split_fraction) == (0.1, 20, 0.8)
+    assert set(config.needs.background_names) >= {"wall", "ground", "roof", "ceiling"}
+    assert config.needs.max_box_fraction == 0.95
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        {"scheme": "scheme3", "crop_ratios": (0.8, 1.2)},
+        {"scheme": "scheme5"},
+        {"strid": 10},
+        {"stride": 0},
+        {"stride": "40"},
+        {"crop_ratios": ()},
+        {"crop_ratios": (0.0, 1.0)},
+        {"overlap_rule": "largest"},
+        {"depth_min": 3.0, "depth_max": 2.0},
+        {"eps": float("inf")},
+    ],
+)
+def test_a_config_that_cannot_be_used_is_refused(wrong: dict[str, object]) -> None:
+    with pytest.raises(ValidationError):
+        OpenSU3DConfig.model_validate(wrong)
+
+
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("bed", "a"),
+        ("indoor-plant", "an"),
+        ("utensil-holder", "a"),
+        ("umbrella", "an"),
+        ("hourglass", "an"),
+        ("tv-screen", "a"),
+        ("LCD screen", "an"),
+        ("x-ray", "an"),
+        ("Office chair", "an"),
+        ("house", "a"),
+        ("urn", "an"),
+    ],
+)
+def test_the_fallback_caption_has_the_right_article(name: str, expected: str) -> None:
+    assert article(name) == expected
+    assert caption_of(name) == f"{expected} {name} in a scene"
+
+
+def test_an_object_without_a_name_has_a_caption() -> None:
+    assert caption_of("") == "an object in a scene"
+
+
+class TwoWords:
+    """An encoder of two texts."""
+
+    name = "two-words"
+    digest = "0"
+    dim = 2
+
+    def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
+        return np.zeros((len(images), 2), np.float32)
+
+    def encode_texts(self, texts: Sequence[str]) -> Float32Array:
+        return np.array([[1, 0] if text == "east" else [0, 1] for text in texts], np.float32).reshape(-1, 2)
+
+
+def instances_with(features: Float64Array | None) -> Instances:
+    n = 0 if features is None else len(features)
+    return Instances(
+        points=np.zeros((0, 3), np.float32),
+        indptr=np.zeros(n + 1, np.int64),
+        indices=np.zeros(0, np.int32),
+        scores=np.ones(n),
+        features=None if features is None else features.astype(np.float32),
+        labels=None,
+        names=("thing",) * n,
+        captions=("",) * n,
+        boxes=np.zeros((n, 2, 3), np.float32),
+        centroids=np.zeros((n, 3), np.float32),
+        view_indptr=np.zeros(n + 1, np.int64),
+        views=np.zeros((0, 2), np.int32),
+    )
+
+
+def test_retrieval_ranks_by_cosine_whatever_the_length_of_the_features() -> None:
+    found = instances_with(np.array([[0.1, 0.1], [9.0, 1.0], [0.0, 0.0], [0.5, 0.0]]))
+    east, north = rank_all(found, ["east", "north"], TwoWords())
+    assert east.order.tolist() == [3, 1, 0, 2]
+    np.testing.assert_allclose(east.similarity, [np.sqrt(0.5), 9 / np.sqrt(82), 0, 1], atol=1e-7)
+    assert north.order.tolist() == [0, 1, 2, 3]  # 2 and 3 are equal: the order of the map
+
+
+def test_retrieval_from_an_empty_map_is_an_empty_ranking() -> None:
+    assert rank(instances_with(np.zeros((0, 2))), "east", TwoWords()).order.shape == (0,)
+
+
+def test_retrieval_without_comparable_features_is_refused() -> None:
+    with pytest.raises(PredictionError, match="no features"):
+        rank(instances_with(None), "east", TwoWords())
+    with pytest.raises(PredictionError, match="3 dimensions and encoder 'two-words' gives 2"):
+        rank(instances_with(np.ones((1, 3))), "east", TwoWords())

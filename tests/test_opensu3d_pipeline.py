@@ -1,0 +1,229 @@
+"""The whole pipeline on small scenes of rectangles before a wall: tracking, splitting, provenance, anytime maps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+
+from su3d_bench.errors import DataError
+from su3d_bench.opensu3d.config import OpenSU3DConfig
+from su3d_bench.opensu3d.pipeline import OpenSU3D
+from su3d_bench.timing import Timer
+from su3d_bench.types import Detections, Frame, Instances, SceneInfo
+
+SCENE = SceneInfo("made", "wall", 4, 1, "rendered-rooms")
+WIDTH, HEIGHT, FOCAL = 160, 120, 120.0
+INTRINSICS = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1.0]])
+CONFIG = OpenSU3DConfig(border_px=1, border_reference_width=0)
+
+
+@dataclass(frozen=True)
+class Plate:
+    """A rectangle facing the camera: its lower and upper x and y and its depth, metres."""
+
+    x: tuple[float, float]
+    y: tuple[float, float]
+    z: float = 2.0
+
+
+def look(
+    plates: Mapping[int, Plate],
+    index: int,
+    camera_x: float = 0.0,
+    hidden: tuple[int, ...] = (),
+    names: Mapping[int, str] | None = None,
+    scores: Mapping[int, float] | None = None,
+) -> tuple[Frame, Detections]:
+    """A frame of plates before a wall at 3 m; detections in ascending key, without the hidden ones."""
+    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    depth, owner = np.full((HEIGHT, WIDTH), 3.0), np.zeros((HEIGHT, WIDTH), np.int64)
+    for key, plate in plates.items():
+        x = (u - INTRINSICS[0, 2]) / FOCAL * plate.z + camera_x
+        y = (v - INTRINSICS[1, 2]) / FOCAL * plate.z
+        on = (plate.x[0] <= x) & (x < plate.x[1]) & (plate.y[0] <= y) & (y < plate.y[1]) & (plate.z < depth)
+        depth[on], owner[on] = plate.z, key
+    seen = [key for key in sorted(plates) if (owner == key).any() and key not in hidden]
+    features = np.zeros((len(seen), 3, 8), np.float32)
+    for row, key in enumerate(seen):
+        features[row, :, key % 8] = 1
+    pose = np.eye(4)
+    pose[0, 3] = camera_x
+    frame = Frame(index, index / 30, np.zeros((HEIGHT, WIDTH, 3), np.uint8), depth.astype(np.float32), pose, INTRINSICS)
+    detections = Detections(
+        index,
+        np.stack([owner == key for key in seen]) if seen else np.zeros((0, HEIGHT, WIDTH), np.bool_),
+        np.zeros((len(seen), 4), np.float32),
+        np.array([(scores or {}).get(key, 0.5) for key in seen], np.float32),
+        tuple((names or {}).get(key, f"plate {key}") for key in seen),
+        ("",) * len(seen),
+        (0.8, 1.0, 1.2),
+        features,
+        np.full(8, 8**-0.5, np.float32),
+    )
+    return frame, detections
+
+
+def run(views: list[tuple[Frame, Detections]], config: OpenSU3DConfig = CONFIG) -> OpenSU3D:
+    method = OpenSU3D(config)
+    method.start(SCENE)
+    for frame, detections in views:
+        method.update(frame, detections, Timer())
+    return method
+
+
+def contents(found: Instances) -> tuple[object, ...]:
+    parts = (found.points, found.indptr, found.indices, found.scores, found.boxes, found.views, found.ids)
+    return (*(part.tobytes() for part in parts), np.asarray(found.features).tobytes(), found.names, found.captions)
+
+
+TWINS = {1: Plate((-0.6, -0.1), (-0.3, 0.3)), 2: Plate((0.1, 0.6), (-0.3, 0.3))}
+
+
+def test_two_objects_of_one_class_are_never_swapped() -> None:
+    names = {1: "chair", 2: "chair"}
+    cameras = [0.0, 0.5, -0.5, 0.9, -0.9, 0.2]
+    found = run([look(TWINS, i, x, names=names) for i, x in enumerate(cameras)]).finish()
+    assert found.names == ("chair", "chair")
+    assert found.captions[0] == "a chair in a scene"
+    for k, plate in enumerate(TWINS.values()):
+        points = found.points[found.mask(k)]
+        assert (points[:, 0] >= plate.x[0] - 1e-6).all()
+        assert (points[:, 0] <= plate.x[1] + 1e-6).all()
+        np.testing.assert_allclose(found.centroids[k], [sum(plate.x) / 2, 0, 2], atol=0.02)
+        np.testing.assert_array_equal(found.boxes[k], [points.min(axis=0), points.max(axis=0)])
+        assert np.argmax(np.asarray(found.features)[k]) == k + 1
+
+
+def test_every_view_of_an_instance_is_traced_to_its_image_and_detection() -> None:
+    views = [look(TWINS, 40 * i, x, hidden=hidden) for i, (x, hidden) in enumerate([(0.0, ()), (0.1, (1,)), (0.2, ())])]
+    found = run(views).finish()
+    rows = [found.views[found.view_indptr[k] : found.view_indptr[k + 1]].tolist() for k in range(2)]
+    assert rows == [[[0, 0], [80, 0]], [[0, 1], [40, 0], [80, 1]]]
+
+
+def test_name_and_score_come_from_the_views() -> None:
+    plates = {1: TWINS[1]}
+    views = [
+        look(plates, i, names={1: name}, scores={1: score})
+        for i, (name, score) in enumerate([("stool", 0.25), ("chair", 0.75), ("bench", 0.75)])
+    ]
+    found = run(views).finish()
+    assert found.names == ("chair",)  # the highest score, of equal ones the earliest image
+    assert found.scores.tolist() == [pytest.approx(1.75 / 3)]
+    assert run(views, CONFIG.model_copy(update={"instance_score": "max"})).finish().scores.tolist() == [0.75]
+    summed = run(views, CONFIG.model_copy(update={"instance_score": "top-m-sum"})).finish()
+    assert summed.scores.tolist() == [pytest.approx(1.75 / 5)]
+
+
+def test_only_the_top_m_views_are_fused() -> None:
+    plates = {1: TWINS[1]}
+    good, bad = look(plates, 0, scores={1: 0.9}), look({9: TWINS[1]}, 1, scores={9: 0.2})
+    bad[1].crop_features[:] = np.eye(8, dtype=np.float32)[5]
+    feature = np.asarray(run([bad, good], CONFIG.model_copy(update={"top_m": 1})).finish().features)[0]
+    np.testing.assert_array_equal(feature, np.eye(8)[1])
+    feature = np.asarray(run([bad, good]).finish().features)[0]
+    np.testing.assert_array_equal(feature, (np.eye(8)[1] + np.eye(8)[5]) / 2)
+
+
+def test_an_over_split_mask_heals_into_the_instance_it_belongs_to() -> None:
+    whole = {1: Plate((-0.5, 0.5), (-0.3, 0.3))}
+    halves = {1: Plate((-0.5, 0.0), (-0.3, 0.3)), 2: Plate((0.0, 0.5), (-0.3, 0.3))}
+    found = run([look(whole, 0), look(halves, 1)]).finish()
+    assert len(found) == 1
+    assert found.views.tolist() == [[0, 0], [1, 0], [1, 1]]
+
+
+def test_clusters_near_the_largest_split_off_with_the_views_that_hit_them_and_the_rest_is_noise() -> None:
+    """One mask over three separate plates: 0.30 m2, 0.27 m2 (90 %) and 0.06 m2 (20 %)."""
+    parts = [Plate((-0.9, -0.4), (-0.3, 0.3)), Plate((-0.2, 0.25), (-0.3, 0.3)), Plate((0.5, 0.6), (-0.3, 0.3))]
+    frame, detections = look(dict(enumerate(parts, start=1)), 0)
+    together = Detections(
+        0,
+        np.asarray(detections.masks.any(axis=0, keepdims=True)),
+        detections.boxes[:1],
+        detections.scores[:1],
+        ("set",),
+        ("three plates",),
+        detections.crop_ratios,
+        detections.crop_features[:1],
+        detections.global_feature,
+    )
+    method = run([(frame, together), look({1: parts[0]}, 1)])
+    found = method.finish()
+    assert found.ids.tolist() == [1, 2]
+    assert found.captions == ("three plates", "three plates")
+    assert found.views[found.view_indptr[0] : found.view_indptr[1]].tolist() == [[0, 0], [1, 0]]
+    assert found.views[found.view_indptr[1] : found.view_indptr[2]].tolist() == [[0, 0]]
+    assert found.boxes[0, 1, 0] < -0.39
+    assert found.boxes[1, 0, 0] > -0.21
+    assert not ((found.points[:, 0] > 0.45) & (found.points[:, 2] < 2.5)).any()
+    assert len(run([(frame, together)], CONFIG.model_copy(update={"split_fraction": 0.95})).finish()) == 1
+
+
+def test_a_segment_of_fewer_points_than_a_cluster_needs_is_noise() -> None:
+    found = run([look({1: Plate((0.0, 0.05), (0.0, 0.05)), 2: TWINS[1]}, 0)]).finish()
+    assert found.ids.tolist() == [2]
+
+
+def test_finishing_midway_changes_nothing() -> None:
+    views = [look(TWINS, i, x) for i, x in enumerate([0.0, 0.3, -0.3])]
+    undisturbed = contents(run(views).finish())
+    method = OpenSU3D(CONFIG)
+    method.start(SCENE)
+    assert len(method.finish()) == 0
+    midway = []
+    for frame, detections in views:
+        method.update(frame, detections, Timer())
+        midway.append(contents(method.finish()))
+        assert contents(method.finish()) == midway[-1]
+    assert midway[-1] == undisturbed
+    assert midway[0] == contents(run(views[:1]).finish())
+
+
+def test_start_forgets_the_scene_before() -> None:
+    method = run([look(TWINS, 0), look(TWINS, 1, 0.4)])
+    method.start(SCENE)
+    assert (method.n_points, method.n_instances) == (0, 0)
+    method.update(*look(TWINS, 0), Timer())
+    assert contents(method.finish()) == contents(run([look(TWINS, 0)]).finish())
+
+
+def test_points_of_no_instance_are_in_the_map_and_in_no_mask() -> None:
+    found = run([look(TWINS, 0)]).finish()
+    on_wall = found.points[:, 2] > 2.5
+    assert on_wall.any()
+    assert not on_wall[found.indices].any()
+    dropped = run([look(TWINS, 0)], CONFIG.model_copy(update={"background_pixels": "drop"})).finish()
+    assert not (dropped.points[:, 2] > 2.5).any()
+
+
+def test_images_without_detections_or_depth_are_no_error() -> None:
+    frame, _ = look(TWINS, 3)
+    empty = Frame(3, 0.1, frame.rgb, np.zeros_like(frame.depth_m), frame.camera_to_world, frame.intrinsics)
+    method = run([look({}, 0), (empty, look(TWINS, 3)[1]), look(TWINS, 4)])
+    assert method.n_instances == 2
+    assert method.finish().views.tolist() == [[4, 0], [4, 1]]
+
+
+def test_each_update_times_its_four_stages() -> None:
+    timer = Timer()
+    method = run([])
+    method.update(*look(TWINS, 0), timer)
+    assert list(timer.take()) == ["backproject", "match", "track", "insert"]
+    assert run([]).postprocess_ms is None
+    method.finish()
+    assert (method.postprocess_ms or 0) > 0
+
+
+def test_detections_of_another_frame_or_size_or_without_a_crop_ratio_are_refused() -> None:
+    frame, detections = look(TWINS, 0)
+    with pytest.raises(DataError, match="frame 0: the detections are those of frame 7"):
+        run([(frame, look(TWINS, 7)[1])])
+    with pytest.raises(DataError, match="features of crop ratio 2"):
+        run([(frame, detections)], OpenSU3DConfig(scheme="scheme4"))
+    small = Frame(0, 0.0, frame.rgb[::2], frame.depth_m[::2], frame.camera_to_world, frame.intrinsics)
+    with pytest.raises(DataError, match="masks are 160x120 and the image is 160x60"):
+        run([(small, detections)])

@@ -1,0 +1,173 @@
+"""The voxel map: the pairs of a KD-tree, constant density, and no step that looks at the whole map."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial import cKDTree
+
+from su3d_bench.errors import DataError
+from su3d_bench.opensu3d.voxel_map import VoxelMap
+from su3d_bench.types import Float64Array, Int64Array
+
+EPS = 0.02
+
+
+def map_of(points: Float64Array, eps: float = EPS, ids: Int64Array | None = None) -> VoxelMap:
+    filled = VoxelMap(eps)
+    labels = np.ones(len(points), np.int32) if ids is None else np.asarray(ids, np.int32)
+    filled.insert(np.asarray(points, np.float64), labels, keep_density=False, refill=False)
+    return filled
+
+
+def kd_tree_pairs(points: Float64Array, queries: Float64Array, eps: float = EPS) -> Int64Array:
+    """A KD-tree's answer, of equally near points the lowest index."""
+    tree = cKDTree(points)
+    distance, index = tree.query(queries, distance_upper_bound=eps)
+    found = np.where(np.isfinite(distance), index, -1)
+    for row in np.flatnonzero(found >= 0):
+        offset = queries[row] - points
+        squared = offset[:, 0] ** 2 + offset[:, 1] ** 2 + offset[:, 2] ** 2
+        found[row] = np.flatnonzero(squared == squared.min())[0]
+    return found.astype(np.int64)
+
+
+@pytest.mark.parametrize("offset", [0.0, -3.7, 12345.678, -250000.0])
+def test_matching_gives_the_pairs_of_a_kd_tree_on_random_surfaces(offset: float) -> None:
+    rng = np.random.default_rng(3)
+    points = rng.uniform(-0.5, 0.5, (3000, 3)) * [1, 1, 0.05] + offset
+    queries = rng.uniform(-0.6, 0.6, (2000, 3)) * [1, 1, 0.06] + offset
+    found = map_of(points).nearest(queries)
+    assert 0 < np.count_nonzero(found < 0) < len(queries)
+    np.testing.assert_array_equal(found, kd_tree_pairs(points, queries))
+
+
+# Steps of half an eps put points on cell borders, on top of each other and at exactly eps from a query.
+lattice = st.lists(st.tuples(*[st.integers(-9, 9)] * 3), min_size=1, max_size=60)
+
+
+@settings(max_examples=150, deadline=None)
+@given(lattice, lattice, st.sampled_from([0.0, -1.28, 0.32, 1e4, -0.02]), st.sampled_from([0.25, 0.02, 0.1]))
+def test_matching_gives_the_pairs_of_a_kd_tree_on_lattices(
+    points: list[tuple[int, ...]], queries: list[tuple[int, ...]], offset: float, eps: float
+) -> None:
+    placed = np.array(points, np.float64) * eps / 2 + offset
+    asked = np.array(queries, np.float64) * eps / 2 + offset
+    np.testing.assert_array_equal(map_of(placed, eps).nearest(asked), kd_tree_pairs(placed, asked, eps))
+
+
+@settings(max_examples=150, deadline=None)
+@given(
+    st.lists(st.tuples(*[st.floats(-0.1, 0.1)] * 3), min_size=1, max_size=40),
+    st.lists(st.tuples(*[st.floats(-0.1, 0.1)] * 3), min_size=1, max_size=40),
+)
+def test_matching_gives_the_pairs_of_a_kd_tree_on_any_floats(
+    points: list[tuple[float, ...]], queries: list[tuple[float, ...]]
+) -> None:
+    placed, asked = np.array(points, np.float64), np.array(queries, np.float64)
+    np.testing.assert_array_equal(map_of(placed).nearest(asked), kd_tree_pairs(placed, asked))
+
+
+def test_a_point_at_exactly_eps_does_not_match() -> None:
+    filled = map_of(np.array([[0.25, 0.0, 0.0]]), eps=0.25)
+    assert filled.nearest(np.zeros((1, 3))).tolist() == [-1]
+    assert filled.nearest(np.array([[np.nextafter(0.0, 1.0), 0.0, 0.0]])).tolist() == [-1]  # rounds to eps
+    assert filled.nearest(np.array([[1e-9, 0.0, 0.0]])).tolist() == [0]
+
+
+def test_of_equally_near_points_the_lowest_index_matches() -> None:
+    points = np.array([[0.015, 0, 0], [-0.01, 0, 0], [0, 0.01, 0], [-0.01, 0, 0]])
+    assert map_of(points).nearest(np.zeros((1, 3))).tolist() == [1]
+
+
+def test_an_empty_map_matches_nothing() -> None:
+    assert VoxelMap(EPS).nearest(np.zeros((4, 3))).tolist() == [-1] * 4
+    assert VoxelMap(EPS).nearest(np.zeros((0, 3))).shape == (0,)
+
+
+def test_matching_is_the_same_after_the_map_has_grown_many_times() -> None:
+    rng = np.random.default_rng(5)
+    points = rng.uniform(-4, 4, (40_000, 3))
+    grown = VoxelMap(0.1)
+    for part in np.array_split(points, 17):
+        grown.insert(part, np.ones(len(part), np.int32), keep_density=False, refill=False)
+    queries = rng.uniform(-4, 4, (3000, 3))
+    np.testing.assert_array_equal(grown.points, points)
+    np.testing.assert_array_equal(grown.nearest(queries), map_of(points, 0.1).nearest(queries))
+
+
+def test_a_point_whose_voxel_is_taken_is_not_added() -> None:
+    filled = VoxelMap(EPS)
+    points = np.array([[0.001, 0.001, 0.001], [0.019, 0.019, 0.019], [0.021, 0.001, 0.001], [-0.001, 0.001, 0.001]])
+    placed = filled.insert(points, np.array([1, 2, 3, 4], np.int32), keep_density=True, refill=True)
+    assert placed.tolist() == [0, -1, 1, 2]
+    assert filled.ids.tolist() == [1, 3, 4]
+
+
+def test_density_stays_constant_however_often_a_surface_is_seen() -> None:
+    rng = np.random.default_rng(0)
+    filled = VoxelMap(EPS)
+    for _ in range(20):
+        points = rng.uniform(0, 0.4, (4000, 3)) * [1, 1, 0]
+        filled.insert(points, np.ones(len(points), np.int32), keep_density=True, refill=True)
+    assert len(filled) <= 20 * 20
+    assert len(np.unique(np.floor(filled.points / EPS), axis=0)) == len(filled)
+
+
+@pytest.mark.parametrize(("refill", "expected"), [(True, [7, 5, 0]), (False, [0, 5, 0])])
+def test_an_instance_takes_over_a_voxel_of_no_instance_and_never_one_of_an_instance(
+    refill: bool, expected: list[int]
+) -> None:
+    filled = VoxelMap(EPS)
+    first = np.array([[0.01, 0, 0], [0.05, 0, 0], [0.09, 0, 0]])
+    filled.insert(first, np.array([0, 5, 0], np.int32), keep_density=True, refill=refill)
+    filled.insert(first + 0.001, np.array([7, 7, 0], np.int32), keep_density=True, refill=refill)
+    assert filled.ids.tolist() == expected
+    assert filled.points[0, 0] == pytest.approx(0.011 if refill else 0.01)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.tuples(*[st.integers(-40, 40)] * 3), min_size=1, max_size=80),
+    st.tuples(*[st.integers(-40, 40)] * 3),
+    st.tuples(*[st.integers(0, 60)] * 3),
+)
+def test_points_inside_a_box_are_counted_by_id_with_its_borders(
+    lattice_points: list[tuple[int, ...]], corner: tuple[int, ...], size: tuple[int, ...]
+) -> None:
+    points = np.array(lattice_points, np.float64) * 0.016
+    ids = np.arange(len(points), dtype=np.int64) % 4 + 1
+    lower = np.array(corner) * 0.016
+    upper = lower + np.array(size) * 0.016
+    inside = ((points >= lower) & (points <= upper)).all(axis=1)
+    wanted = np.array([4, 1, 3], np.int32)
+    counts = map_of(points, ids=ids).count_inside(lower, upper, wanted)
+    assert counts.tolist() == [np.count_nonzero(inside & (ids == one)) for one in wanted]
+
+
+def test_matching_and_counting_visit_as_much_in_a_small_map_as_in_a_large_one() -> None:
+    """Cells and blocks that are looked into, counted: the same with 40 times the points elsewhere."""
+    rng = np.random.default_rng(1)
+    room = rng.uniform(0, 2, (20_000, 3)) * [1, 1, 0.01]
+    building = rng.uniform(-60, 60, (800_000, 3)) * [1, 1, 0.01] + [0, 0, 9.0]
+    queries = rng.uniform(0, 2, (500, 3)) * [1, 1, 0.01]
+    visits = []
+    for points in (room, np.concatenate([room, building])):
+        filled = VoxelMap(EPS)
+        filled.insert(points, np.ones(len(points), np.int32), keep_density=True, refill=True)
+        _, cells = filled.nearest_counted(queries)
+        _, blocks = filled.count_inside_counted(np.zeros(3), np.array([2.0, 2.0, 0.1]), np.array([1], np.int32))
+        visits.append((cells, blocks))
+    assert visits[0][0] == visits[1][0] <= 8.1 * len(queries)
+    assert max(visits[0][1], visits[1][1]) <= 7 * 7 * 1
+
+
+def test_a_point_that_is_not_finite_or_far_out_is_refused() -> None:
+    for bad in (np.nan, np.inf, -1e9):
+        points = np.array([[0.0, 0, 0], [0.0, bad, 0]])
+        with pytest.raises(DataError, match="in metres"):
+            VoxelMap(EPS).insert(points, np.ones(2, np.int32), keep_density=True, refill=True)
+        with pytest.raises(DataError, match="in metres"):
+            VoxelMap(EPS).nearest(points)
