@@ -10,8 +10,6 @@ import numpy as np
 import pytest
 
 from su3d_bench.metrics.instance_ap import (
-    AP25_INDEX,
-    AP50_INDEX,
     THRESHOLDS,
     InstanceAP,
     InstanceCounts,
@@ -74,9 +72,8 @@ def test_the_averages_of_a_reference_case_are_equal_in_every_bit(case: str) -> N
     assert (ours.ap, ours.ap50, ours.ap25) == (answer["all_ap"], answer["all_ap50"], answer["all_ap25"])
     for index, label in enumerate(answer["class_labels"]):
         of_class = answer["classes"][label]
-        assert is_same(ours.class_ap(index), of_class["ap"])
-        assert is_same(float(ours.table[index, AP50_INDEX]), of_class["ap50"])
-        assert is_same(float(ours.table[index, AP25_INDEX]), of_class["ap25"])
+        for value, key in zip(ours.of_class(index), ("ap", "ap50", "ap25"), strict=True):
+            assert is_same(value, of_class[key])
 
 
 def test_openmask3ds_own_replica_script_gives_the_same_bits() -> None:

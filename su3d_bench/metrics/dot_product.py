@@ -44,7 +44,7 @@ def dot(left: Float64Array, right: Float64Array) -> float:
 
 
 def _chain(products: list[float], errors: list[float], start: float) -> float:
-    """``start`` plus each exact product in turn, rounded once a step: math.fsum rounds correctly, so this is a fused add."""
+    """``start`` plus each exact product in turn, rounded once a step, as a fused add does (fsum rounds right)."""
     total = start
     for product, error in zip(products, errors, strict=True):
         total = math.fsum((product, error, total))

@@ -20,8 +20,6 @@ from su3d_bench.types import BoolArray, Float64Array, Int32Array, Int64Array
 
 # arange(0.5, 0.95, 0.05) excludes its end: nine thresholds up to 0.90, as these doubles; then 0.25
 THRESHOLDS: tuple[float, ...] = (*(float(t) for t in np.arange(0.5, 0.95, 0.05)), 0.25)
-AP50_INDEX = 0
-AP25_INDEX = len(THRESHOLDS) - 1
 MIN_REGION_SIZE = 100  # points; the official script's --min_region_size, opt.min_region_sizes
 INSTANCES_PER_CLASS = 1000  # ground truth is label * 1000 + instance
 
@@ -49,23 +47,36 @@ class InstanceCounts:
 
 @dataclass(frozen=True)
 class InstanceAP:
-    """Average precision: ``table`` (C, T) for each class and threshold, NaN where a class has no ground truth."""
+    """Average precision: ``table`` (C, T) for each class and threshold, NaN where a class has no ground truth.
 
+    ``ap`` averages over all thresholds but 0.25.
+    """
+
+    thresholds: tuple[float, ...]
     table: Float64Array
     ap: float
     ap50: float
     ap25: float
 
-    def class_ap(self, index: int) -> float:
-        """Mean over the nine thresholds of one class."""
-        return float(np.average(self.table[index : index + 1, :AP25_INDEX]))
+    def of_class(self, index: int) -> tuple[float, float, float]:
+        """AP, AP50 and AP25 of one class."""
+        row = self.table[index]
+        at_50, at_25 = self.thresholds.index(0.5), self.thresholds.index(0.25)
+        return float(np.average(row[ap_columns(self.thresholds)][None, :])), float(row[at_50]), float(row[at_25])
 
-    def group_means(self, members: Sequence[int]) -> tuple[float, float, float]:
+    def of_group(self, members: Sequence[int]) -> tuple[float, float, float]:
         """AP, AP50 and AP25 averaged over the classes ``members`` that have ground truth; NaN where none has."""
-        per_class = np.array(
-            [[self.class_ap(i), self.table[i, AP50_INDEX], self.table[i, AP25_INDEX]] for i in members]
-        ).reshape(-1, 3)
-        return _nanmean(per_class[:, 0]), _nanmean(per_class[:, 1]), _nanmean(per_class[:, 2])
+        rows = np.array([self.of_class(index) for index in members]).reshape(-1, 3)
+        return _nanmean(rows[:, 0]), _nanmean(rows[:, 1]), _nanmean(rows[:, 2])
+
+
+def ap_columns(thresholds: Sequence[float]) -> Int64Array:
+    """Where the thresholds stand over which AP is averaged: all but 0.25.
+
+    >>> ap_columns((0.5, 0.75, 0.25)).tolist()
+    [0, 1]
+    """
+    return np.flatnonzero(~np.isclose(thresholds, 0.25)).astype(np.int64)
 
 
 def encode_ground_truth(semantic: IntArray, instance: IntArray) -> Int64Array:
@@ -112,12 +123,13 @@ def per_scene(
     scores: Float64Array,
     class_ids: Sequence[int],
     min_region_size: int = MIN_REGION_SIZE,
+    thresholds: Sequence[float] = THRESHOLDS,
 ) -> InstanceCounts:
     """The additive counts of one scene.
 
     ``ground_truth`` (N,) holds label * 1000 + instance a point, 0 where unannotated; prediction k covers the points
-    ``indices[indptr[k]:indptr[k + 1]]``, strictly ascending, and has ``labels[k]`` and ``scores[k]``. Their order counts
-    for AP25 alone, as in the original under Python 3. Points whose label is not in ``class_ids`` are void.
+    ``indices[indptr[k]:indptr[k + 1]]``, strictly ascending, and has ``labels[k]`` and ``scores[k]``. Their
+    order counts for AP25 alone, as in the original under Python 3. Points whose label is not in ``class_ids`` are void.
 
     >>> truth = np.array([3001] * 200 + [0] * 50)
     >>> counts = per_scene(truth, np.array([0, 150]), np.arange(150), np.array([3]), np.array([0.9]), [3, 4])
@@ -138,82 +150,83 @@ def per_scene(
     intersection = _intersections(segment_of_point, len(segment_value), indptr, indices, kept)
     n_void = intersection[:, segment_class < 0].sum(axis=1)
 
-    n_classes, n_thresholds = len(class_of), len(THRESHOLDS)
-    counted = _CountedRows([], [], [], [])
-    n_missed = np.zeros((n_classes, n_thresholds), np.int64)
-    n_truth = np.zeros(n_classes, np.int64)
-    n_predictions = np.bincount(prediction_class[kept], minlength=n_classes).astype(np.int64)
-    for c in range(n_classes):
+    parts = []
+    for c in range(len(class_of)):
         columns = np.flatnonzero(segment_class == c)  # ascending value, as the original walks them
         rows = np.flatnonzero(prediction_class[kept] == c)
-        is_small = segment_size[columns] < min_region_size
-        is_group = segment_value[columns] < INSTANCES_PER_CLASS
-        eligible = np.flatnonzero(~is_small & ~is_group)
-        n_truth[c] = len(eligible)
         n_points = size[kept[rows]]
         shared = intersection[np.ix_(rows, columns)]
-        iou = shared / (segment_size[columns][None, :] + n_points[:, None] - shared)
-        n_ignored = n_void[rows] + shared[:, is_group].sum(axis=1) + shared[:, is_small].sum(axis=1)
-        for t, threshold in enumerate(THRESHOLDS):
-            n_missed[c, t] = counted.match(
-                c, t, iou > threshold, eligible, scores[kept[rows]], n_ignored / n_points <= threshold
+        is_small = segment_size[columns] < min_region_size
+        parts.append(
+            _count_class(
+                c,
+                iou=shared / (segment_size[columns][None, :] + n_points[:, None] - shared),
+                takes_part=~is_small,
+                scores=scores[kept[rows]],
+                ignored_share=(n_void[rows] + shared[:, is_small].sum(axis=1)) / n_points,
+                thresholds=thresholds,
             )
-    return counted.freeze(n_missed, n_truth, n_predictions)
-
-
-@dataclass(frozen=True)
-class _CountedRows:
-    """The table of counted predictions while it grows."""
-
-    class_index: list[int]
-    threshold_index: list[int]
-    score: list[float]
-    is_true: list[bool]
-
-    def add(self, c: int, t: int, score: float, is_true: bool) -> None:
-        self.class_index.append(c)
-        self.threshold_index.append(t)
-        self.score.append(score)
-        self.is_true.append(is_true)
-
-    def match(
-        self,
-        c: int,
-        t: int,
-        over: BoolArray,
-        eligible: Int64Array,
-        scores: Float64Array,
-        counts_if_unmatched: BoolArray,
-    ) -> int:
-        """Add one class at one threshold, greedily in order of the ground truth; returns how much of it nothing met."""
-        visited = np.zeros(len(scores), bool)
-        n_missed = 0
-        for column in eligible:
-            found = np.flatnonzero(over[:, column] & ~visited)
-            if not len(found):
-                n_missed += 1
-                continue
-            # only the first in line is used up; the best score of all stays with the true positive
-            visited[found[0]] = True
-            ranked = np.sort(scores[found])[::-1]
-            self.add(c, t, float(ranked[0]), True)
-            for score in ranked[1:]:
-                self.add(c, t, float(score), False)
-        # a prediction that met any instance of its class, even a small or a taken one, is no false positive here
-        for row in np.flatnonzero(~over.any(axis=1) & counts_if_unmatched):
-            self.add(c, t, float(scores[row]), False)
-        return n_missed
-
-    def freeze(self, n_missed: Int64Array, n_truth: Int64Array, n_predictions: Int64Array) -> InstanceCounts:
-        return InstanceCounts(
-            class_index=np.array(self.class_index, np.int32),
-            threshold_index=np.array(self.threshold_index, np.int32),
-            score=np.array(self.score, np.float64),
-            is_true=np.array(self.is_true, bool),
-            n_missed=n_missed,
-            n_truth=n_truth,
-            n_predictions=n_predictions,
         )
+    return InstanceCounts(
+        class_index=np.concatenate([part.class_index for part in parts]),
+        threshold_index=np.concatenate([part.threshold_index for part in parts]),
+        score=np.concatenate([part.score for part in parts]),
+        is_true=np.concatenate([part.is_true for part in parts]),
+        n_missed=np.concatenate([part.n_missed for part in parts]),
+        n_truth=np.concatenate([part.n_truth for part in parts]),
+        n_predictions=np.concatenate([part.n_predictions for part in parts]),
+    )
+
+
+def _count_class(
+    class_index: int,
+    iou: Float64Array,
+    takes_part: BoolArray,
+    scores: Float64Array,
+    ignored_share: Float64Array,
+    thresholds: Sequence[float],
+) -> InstanceCounts:
+    """The counts of one class: ``iou`` (R, G) of its predictions, in line order, with its instances, ascending."""
+    at: list[int] = []
+    score: list[float] = []
+    is_true: list[bool] = []
+    n_missed = np.zeros((1, len(thresholds)), np.int64)
+    for t, threshold in enumerate(thresholds):
+        over = iou > threshold
+        hits, duplicates, n_missed[0, t] = _match(over, takes_part, scores)
+        # a prediction that met any instance of its class, even a small or a taken one, is no false positive here
+        unmatched = scores[~over.any(axis=1) & (ignored_share <= threshold)].tolist()
+        at += [t] * (len(hits) + len(duplicates) + len(unmatched))
+        score += hits + duplicates + unmatched
+        is_true += [True] * len(hits) + [False] * (len(duplicates) + len(unmatched))
+    return InstanceCounts(
+        class_index=np.full(len(at), class_index, np.int32),
+        threshold_index=np.array(at, np.int32),
+        score=np.array(score, np.float64),
+        is_true=np.array(is_true, bool),
+        n_missed=n_missed,
+        n_truth=np.array([takes_part.sum()], np.int64),
+        n_predictions=np.array([len(scores)], np.int64),
+    )
+
+
+def _match(over: BoolArray, takes_part: BoolArray, scores: Float64Array) -> tuple[list[float], list[float], int]:
+    """Scores of the true positives and of their duplicates, and how many instances nothing met: greedy, in order."""
+    hits: list[float] = []
+    duplicates: list[float] = []
+    n_missed = 0
+    visited = np.zeros(len(scores), bool)
+    for column in np.flatnonzero(takes_part):
+        found = np.flatnonzero(over[:, column] & ~visited)
+        if not len(found):
+            n_missed += 1
+            continue
+        # only the first in line is used up; the best score of all stays with the true positive
+        visited[found[0]] = True
+        *lower, best = np.sort(scores[found]).tolist()
+        hits.append(best)
+        duplicates += lower
+    return hits, duplicates, n_missed
 
 
 def concatenate(counts: Sequence[InstanceCounts]) -> InstanceCounts:
@@ -254,7 +267,7 @@ def average_precision(scores: Float64Array, is_true: BoolArray, n_missed: int) -
     return dot(precision, width)
 
 
-def combine(counts: Sequence[InstanceCounts]) -> InstanceAP:
+def combine(counts: Sequence[InstanceCounts], thresholds: Sequence[float] = THRESHOLDS) -> InstanceAP:
     """AP of the scenes together: their predictions share one curve a class, and classes are averaged.
 
     Classes without a ground-truth instance are NaN and leave the mean; with no class left the means are NaN.
@@ -278,9 +291,15 @@ def combine(counts: Sequence[InstanceCounts]) -> InstanceAP:
             rows = order[bounds[cell] : bounds[cell + 1]]
             table[0, c, t] = average_precision(whole.score[rows], whole.is_true[rows], int(whole.n_missed[c, t]))
     # the order in which numpy sums follows the layout that this mixed indexing yields; the last bit depends on it
-    all_but_25 = np.arange(AP25_INDEX)[None, :]
-    nine = table[np.zeros((1, 1), int), :, all_but_25]
-    return InstanceAP(table[0], _nanmean(nine), _nanmean(table[0, :, AP50_INDEX]), _nanmean(table[0, :, AP25_INDEX]))
+    averaged = table[np.zeros((1, 1), int), :, ap_columns(thresholds)[None, :]]
+    at_50, at_25 = tuple(thresholds).index(0.5), tuple(thresholds).index(0.25)
+    return InstanceAP(
+        thresholds=tuple(thresholds),
+        table=table[0],
+        ap=_nanmean(averaged),
+        ap50=_nanmean(table[0, :, at_50]),
+        ap25=_nanmean(table[0, :, at_25]),
+    )
 
 
 def _check_predictions(

@@ -1,0 +1,109 @@
+"""The metrics of many resamples of the scenes at once, straight from the additive counts of each scene."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from su3d_bench.metrics.instance_ap import THRESHOLDS, InstanceCounts, ap_columns
+from su3d_bench.metrics.semantic import SemanticCounts
+from su3d_bench.types import Float64Array, Int64Array
+
+_MAX_CELLS = 4_000_000  # of a (resamples, rows) block: 32 MB of float64
+
+
+def resampled_ap(
+    counts: Sequence[InstanceCounts], weights: Int64Array, thresholds: Sequence[float] = THRESHOLDS
+) -> dict[str, Float64Array]:
+    """AP, AP50 and AP25 (R,) of the scenes drawn ``weights`` (R, S) times, equal to ``combine`` up to rounding.
+
+    >>> from su3d_bench.metrics.instance_ap import per_scene
+    >>> hit = per_scene(np.full(120, 7004), np.array([0, 120]), np.arange(120), np.array([7]), np.ones(1), [7])
+    >>> miss = per_scene(np.full(120, 7009), np.array([0]), np.arange(0), np.zeros(0, int), np.ones(0), [7])
+    >>> resampled_ap([hit, miss], np.array([[2, 0], [1, 1], [0, 2]]))["AP"].tolist()
+    [1.0, 0.5, 0.0]
+    """
+    n_classes, n_thresholds = counts[0].n_missed.shape
+    scene = np.concatenate([np.full(len(c.score), s, np.int64) for s, c in enumerate(counts)])
+    score = np.concatenate([c.score for c in counts])
+    is_true = np.concatenate([c.is_true for c in counts])
+    cell = np.concatenate([c.class_index.astype(np.int64) * n_thresholds + c.threshold_index for c in counts])
+    order = np.lexsort((-score, cell))
+    bounds = np.searchsorted(cell[order], np.arange(n_classes * n_thresholds + 1))
+    n_truth = weights @ np.stack([c.n_truth for c in counts])
+    table = np.full((len(weights), n_classes, n_thresholds), np.nan)
+    for c in np.flatnonzero(n_truth.any(axis=0)):
+        for t in range(n_thresholds):
+            rows = order[bounds[c * n_thresholds + t] : bounds[c * n_thresholds + t + 1]]
+            area = _weighted_areas(score[rows], is_true[rows], scene[rows], n_truth[:, c], weights)
+            table[:, c, t] = np.where(n_truth[:, c] > 0, area, np.nan)
+    return {
+        "AP": _row_means(table[:, :, ap_columns(thresholds)].reshape(len(weights), -1)),
+        "AP50": _row_means(table[:, :, tuple(thresholds).index(0.5)]),
+        "AP25": _row_means(table[:, :, tuple(thresholds).index(0.25)]),
+    }
+
+
+def _weighted_areas(
+    score: Float64Array, is_true: Int64Array, scene: Int64Array, n_truth: Int64Array, weights: Int64Array
+) -> Float64Array:
+    """Area under each resample's precision-recall polyline; rows come with falling score.
+
+    A vertex without weight repeats its neighbour and adds no area, so all resamples share the vertices of the whole.
+    """
+    if not len(score):
+        return np.zeros(len(weights))
+    last_of_score = np.flatnonzero(np.append(np.diff(score) != 0, True))
+    areas = np.empty(len(weights))
+    step = max(1, _MAX_CELLS // len(score))
+    for start in range(0, len(weights), step):
+        drawn = weights[start : start + step][:, scene]
+        n_counted = np.cumsum(drawn, axis=1)[:, last_of_score].astype(np.float64)
+        n_hit = np.cumsum(drawn * is_true, axis=1)[:, last_of_score].astype(np.float64)
+        precision = np.divide(n_hit, n_counted, out=np.ones_like(n_hit), where=n_counted > 0)
+        recall = n_hit / np.maximum(n_truth[start : start + step, None], 1)
+        precision = np.concatenate([np.ones((len(drawn), 1)), precision], axis=1)
+        recall = np.concatenate([np.zeros((len(drawn), 1)), recall], axis=1)
+        areas[start : start + step] = (np.diff(recall, axis=1) * (precision[:, 1:] + precision[:, :-1]) / 2).sum(axis=1)
+    return areas
+
+
+def resampled_semantic(
+    counts: Sequence[SemanticCounts], weights: Int64Array, metric: Literal["conceptgraphs", "scannet"]
+) -> dict[str, Float64Array]:
+    """mAcc, mIoU and F-mIoU (R,) of the pooled confusion of the scenes drawn ``weights`` (R, S) times.
+
+    Classes that are true somewhere in the drawn scenes count; under ``scannet`` those that are only predicted join the
+    mean IoU with 0.
+
+    >>> a = SemanticCounts(np.array([[4, 0, 0], [0, 0, 0]]), np.array([True, True]))
+    >>> b = SemanticCounts(np.array([[0, 0, 0], [1, 1, 0]]), np.array([True, True]))
+    >>> resampled_semantic([a, b], np.array([[2, 0], [1, 1], [0, 2]]), "conceptgraphs")["mAcc"].tolist()
+    [1.0, 0.75, 0.5]
+    """
+    n_classes = len(counts[0].is_present)
+    drawn = weights.astype(np.float64)
+    hit = drawn @ np.stack([np.diag(c.confusion[:, :n_classes]) for c in counts]).astype(np.float64)
+    n_true = drawn @ np.stack([c.confusion.sum(axis=1) for c in counts]).astype(np.float64)
+    n_predicted = drawn @ np.stack([c.confusion[:, :n_classes].sum(axis=0) for c in counts]).astype(np.float64)
+    counted = n_true > 0
+    recall = np.where(counted, hit / np.maximum(n_true, 1), np.nan)
+    union = n_true + n_predicted - hit
+    has_iou = counted if metric == "conceptgraphs" else union > 0
+    iou = np.where(has_iou, hit / np.maximum(union, 1), np.nan)
+    n_points = n_true.sum(axis=1)
+    weighted = (n_true * np.nan_to_num(iou)).sum(axis=1) / np.maximum(n_points, 1)
+    return {
+        "mAcc": _row_means(recall),
+        "mIoU": _row_means(iou),
+        "F-mIoU": np.where(n_points > 0, weighted, np.nan),
+    }
+
+
+def _row_means(values: Float64Array) -> Float64Array:
+    """Mean of each row without its NaN; NaN for a row without any number."""
+    is_number = ~np.isnan(values)
+    n = is_number.sum(axis=1)
+    return np.where(n > 0, np.where(is_number, values, 0.0).sum(axis=1) / np.maximum(n, 1), np.nan)

@@ -1,0 +1,182 @@
+"""Semantic segmentation metrics from integer confusion matrices, as ConceptGraphs and as ScanNet compute them.
+
+Rows are the true class, columns the predicted one; a last extra column holds points whose prediction is none of the
+classes. Matrices of scenes add up; only ``conceptgraphs_metrics`` and ``scannet_metrics`` form ratios.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.types import BoolArray, Float64Array, Int64Array
+
+IntArray = NDArray[np.integer[Any]]
+
+IOU_LEVELS = (0.15, 0.25, 0.50, 0.75)  # conceptgraph/utils/eval.py counts the classes above these
+
+
+@dataclass(frozen=True)
+class SemanticCounts:
+    """What one scene, or several, adds: ``confusion`` (C, C + 1) int64 and the classes that the scenes contain (C,)."""
+
+    confusion: Int64Array
+    is_present: BoolArray
+
+
+@dataclass(frozen=True)
+class SemanticMetrics:
+    """Values for each class that counts, in the order of ``class_index``, and their means."""
+
+    class_index: Int64Array
+    recall: Float64Array
+    precision: Float64Array
+    iou: Float64Array
+    f1: Float64Array
+    f1_conceptgraphs: Float64Array
+    mean_accuracy: float
+    mean_precision: float
+    mean_iou: float
+    frequency_weighted_iou: float
+    mean_f1: float
+    mean_f1_conceptgraphs: float
+    n_classes_above: tuple[int, ...]
+
+
+def per_scene(truth: IntArray, predicted: IntArray, is_present: BoolArray) -> SemanticCounts:
+    """The additive counts of one scene: class indices a point, -1 for a true class that is not scored.
+
+    ``is_present`` (C,) marks the scored classes of the scene, with or without points. Points whose true class is not
+    among them are left out, whatever is predicted there.
+
+    >>> counts = per_scene(np.array([0, 0, 1, -1]), np.array([0, 1, -1, 0]), np.array([True, True]))
+    >>> counts.confusion.tolist()
+    [[1, 1, 0], [0, 0, 1]]
+    """
+    scored = np.where(truth >= 0, is_present[truth], False)
+    return SemanticCounts(confusion_matrix(np.where(scored, truth, -1), predicted, len(is_present)), is_present.copy())
+
+
+def confusion_matrix(truth: IntArray, predicted: IntArray, n_classes: int) -> Int64Array:
+    """Counts (C, C + 1) of pairs (true, predicted): a negative truth is skipped, a negative prediction comes last.
+
+    >>> confusion_matrix(np.array([0, 1, 1, -1]), np.array([0, 0, -1, 1]), 2).tolist()
+    [[1, 0, 0], [1, 0, 1]]
+    """
+    scored = truth >= 0
+    row = truth[scored].astype(np.int64)
+    column = predicted[scored].astype(np.int64)
+    column[column < 0] = n_classes
+    width = n_classes + 1
+    return np.bincount(row * width + column, minlength=n_classes * width).reshape(n_classes, width).astype(np.int64)
+
+
+def concatenate(counts: Sequence[SemanticCounts]) -> SemanticCounts:
+    """The counts of several scenes as one."""
+    return SemanticCounts(
+        np.sum([c.confusion for c in counts], axis=0, dtype=np.int64), np.any([c.is_present for c in counts], axis=0)
+    )
+
+
+def conceptgraphs_metrics(
+    confusion: Int64Array | Float64Array, keep: IntArray, dtype: type[np.float32] | type[np.float64] = np.float64
+) -> SemanticMetrics:
+    """mAcc, F-mIoU and their kin over the classes ``keep``, as conceptgraph/utils/eval.py (commit 5c4da70) has them.
+
+    ``confusion`` (C, C) or (C, C + 1). Rows and columns are sliced together, as in the original; what fell outside the
+    kept columns counts as missed only where it stands in the extra column. Denominators are at least 1, so a class
+    without points scores 0 and stays in the mean. ``dtype`` float32 divides as the original does. No class: all NaN.
+
+    ``f1_conceptgraphs`` is the original's F1, 2PR / max(1, P + R), which is no harmonic mean below P + R = 1.
+
+    >>> metrics = conceptgraphs_metrics(np.array([[8, 2, 0], [1, 9, 0], [0, 0, 0]]), np.array([0, 1]))
+    >>> round(metrics.mean_accuracy, 4), round(metrics.frequency_weighted_iou, 4)
+    (0.85, 0.7386)
+    """
+    kept: Int64Array = np.asarray(keep, np.int64)
+    square = confusion[np.ix_(kept, kept)]
+    n_none = confusion[kept, -1] if confusion.shape[1] > confusion.shape[0] else np.zeros(len(kept), confusion.dtype)
+    hit = np.diag(square).astype(dtype)
+    n_true = (square.sum(axis=1) + n_none).astype(dtype)
+    n_predicted = square.sum(axis=0).astype(dtype)
+    one = dtype(1)
+    recall = (hit / np.maximum(one, n_true)).astype(np.float64)
+    precision = (hit / np.maximum(one, n_predicted)).astype(np.float64)
+    iou = (hit / np.maximum(one, n_true + n_predicted - hit)).astype(np.float64)
+    both = precision + recall
+    f1 = np.divide(2 * precision * recall, both, out=np.zeros_like(both), where=both > 0)
+    quirk = 2 * precision * recall / np.maximum(1.0, both)
+    weights = n_true.astype(np.float64)
+    return _with_means(kept, recall, precision, iou, f1, quirk, weights)
+
+
+def scannet_metrics(confusion: IntArray) -> SemanticMetrics:
+    """IoU of each class as evaluate_semantic_label.py of ScanNet (commit 3830fce), with the means that it leaves out.
+
+    ``confusion`` (C, C + 1), the last column for predictions outside the classes. A class that was never true is 0
+    where it was predicted and NaN where it was not; NaN leaves the mean IoU. Recall is NaN for a class that was never true;
+    mean accuracy is over the others, as frequency-weighted IoU is. These means are ours, not the original's.
+
+    >>> metrics = scannet_metrics(np.array([[3, 1, 0], [0, 0, 0]]))
+    >>> metrics.iou.tolist(), metrics.mean_iou, metrics.mean_accuracy
+    ([0.75, 0.0], 0.375, 0.75)
+    """
+    n_classes = len(confusion)
+    hit = np.diag(confusion[:, :n_classes]).astype(np.float64)
+    n_true = confusion.sum(axis=1).astype(np.float64)
+    n_predicted = confusion[:, :n_classes].sum(axis=0).astype(np.float64)
+    iou = _ratio(hit, n_true + n_predicted - hit)
+    recall = _ratio(hit, n_true)
+    precision = _ratio(hit, n_predicted)
+    f1 = _ratio(2 * hit, n_true + n_predicted)
+    quirk = 2 * precision * recall / np.maximum(1.0, precision + recall)
+    return _with_means(np.arange(n_classes), recall, precision, iou, f1, quirk, n_true)
+
+
+def _with_means(
+    class_index: Int64Array,
+    recall: Float64Array,
+    precision: Float64Array,
+    iou: Float64Array,
+    f1: Float64Array,
+    f1_conceptgraphs: Float64Array,
+    n_true: Float64Array,
+) -> SemanticMetrics:
+    n_points = float(n_true.sum())
+    weighted = (n_true / n_points * np.nan_to_num(iou)).sum() if n_points > 0 else np.nan
+    if len(class_index) and n_points == 0 and not np.isnan(iou).any():
+        weighted = 0.0  # classes that should have points and have none: all scores are 0
+    return SemanticMetrics(
+        class_index=class_index,
+        recall=recall,
+        precision=precision,
+        iou=iou,
+        f1=f1,
+        f1_conceptgraphs=f1_conceptgraphs,
+        mean_accuracy=nan_mean(recall),
+        mean_precision=nan_mean(precision),
+        mean_iou=nan_mean(iou),
+        frequency_weighted_iou=float(weighted),
+        mean_f1=nan_mean(f1),
+        mean_f1_conceptgraphs=nan_mean(f1_conceptgraphs),
+        n_classes_above=tuple(int((iou > level).sum()) for level in IOU_LEVELS),
+    )
+
+
+def _ratio(numerator: Float64Array, denominator: Float64Array) -> Float64Array:
+    quotient = np.full(len(numerator), np.nan)
+    np.divide(numerator, denominator, out=quotient, where=denominator > 0)
+    return quotient
+
+
+def nan_mean(values: Float64Array) -> float:
+    """Mean of the values that are not NaN; NaN where there is none.
+
+    >>> nan_mean(np.array([1.0, np.nan, 0.0]))
+    0.5
+    """
+    return float(np.nanmean(values)) if len(values) and not np.isnan(values).all() else float("nan")
