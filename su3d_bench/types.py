@@ -312,8 +312,12 @@ class Encoder(Protocol):
     """Two towers into one space of ``dim`` dimensions; all outputs L2-normalised float32."""
 
     name: str
-    digest: str
     dim: int
+
+    @property
+    def digest(self) -> str:
+        """A key that moves with the weights and with everything else that moves a feature."""
+        ...
 
     def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
         """Features (N, dim) of RGB crops (h, w, 3) at their native size."""

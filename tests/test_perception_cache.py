@@ -1,0 +1,160 @@
+"""The per-frame cache: what is stored, what is made anew, and that it never changes an answer."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+from perception_fakes import CountingEncoder, still_life
+
+from su3d_bench.errors import StoreError
+from su3d_bench.perception.cache import FrameCache, content_key, frame_digest, pack_masks, unpack_masks
+from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
+from su3d_bench.timing import Timer
+from su3d_bench.types import Detections, PerceptionNeeds, SceneInfo
+
+SCENE = SceneInfo("rooms", "living0", n_frames=1, stride=1, image_domain="rendered-rooms")
+
+
+def perception(root: Path, encoder: CountingEncoder, cache: bool = True) -> Perception:
+    config = PerceptionConfig(cache=cache)
+    return build_perception("embedded", config, scene=SCENE, cache_root=root, mesh=None, encoder=encoder)
+
+
+def assert_equal_to_the_bit(a: Detections, b: Detections) -> None:
+    assert a.names == b.names and a.captions == b.captions and a.crop_ratios == b.crop_ratios
+    for name in ("masks", "boxes", "scores", "crop_features", "global_feature"):
+        first, second = getattr(a, name), getattr(b, name)
+        assert first.dtype == second.dtype and first.tobytes() == second.tobytes(), name
+
+
+def test_masks_survive_packing() -> None:
+    generator = np.random.default_rng(1)
+    masks = generator.random((7, 33, 41)) < 0.2
+    masks[3] = False
+    assert np.array_equal(unpack_masks(pack_masks(masks)), masks)
+    assert unpack_masks(pack_masks(masks[:0])).shape == (0, 33, 41)
+
+
+def test_an_entry_is_read_back_and_an_absent_one_is_none(tmp_path: Path) -> None:
+    cache = FrameCache(tmp_path)
+    key = content_key("a")
+    assert cache.load(key) is None
+    cache.save(key, {"x": np.arange(3), "names": np.array(["cup"])})
+    entry = cache.load(key)
+    assert entry is not None and entry["x"].tolist() == [0, 1, 2] and entry["names"].tolist() == ["cup"]
+
+
+def test_a_flipped_bit_a_cut_file_and_foreign_arrays_count_as_absent(tmp_path: Path) -> None:
+    cache = FrameCache(tmp_path)
+    key = content_key("a")
+    cache.save(key, {"x": np.arange(300)})
+    path = cache.path(key)
+    assert path is not None
+    whole = path.read_bytes()
+    for position in range(0, len(whole), 97):
+        damaged = bytearray(whole)
+        damaged[position] ^= 0x10
+        path.write_bytes(bytes(damaged))
+        entry = cache.load(key)
+        assert entry is None or np.array_equal(entry["x"], np.arange(300))
+    for content in (whole[: len(whole) // 2], b"", b"no archive"):
+        path.write_bytes(content)
+        assert cache.load(key) is None
+    np.savez(path, x=np.arange(300))
+    assert cache.load(key) is None
+
+
+def test_parts_of_a_key_do_not_run_together() -> None:
+    assert content_key("ab", "c") != content_key("a", "bc")
+
+
+def test_the_frame_digest_moves_with_pixels_and_with_the_pose_only_on_request() -> None:
+    frame, other = still_life(), still_life()
+    other.camera_to_world[0, 3] = 1
+    assert frame_digest(frame, False) == frame_digest(other, False)
+    assert frame_digest(frame, True) != frame_digest(other, True)
+    other.depth_m[0, 0] += 1
+    assert frame_digest(frame, False) != frame_digest(other, False)
+
+
+def test_answers_with_without_and_from_the_cache_are_equal_to_the_bit(tmp_path: Path) -> None:
+    needs = PerceptionNeeds(crop_ratios=(0.8, 1.0, 1.2))
+    answers = [
+        perception(tmp_path, CountingEncoder(), cache).detect(still_life(), needs, Timer())
+        for cache in (False, True, True)
+    ]
+    assert len(answers[0]) > 0
+    for answer in answers[1:]:
+        assert_equal_to_the_bit(answers[0], answer)
+
+
+def test_a_second_run_encodes_nothing_and_a_new_ratio_only_its_own_crops(tmp_path: Path) -> None:
+    needs = PerceptionNeeds(crop_ratios=(0.8, 1.0, 1.2))
+    first = CountingEncoder()
+    n = len(perception(tmp_path, first).detect(still_life(), needs, Timer()))
+    assert first.n_images == 3 * n + 1
+
+    second = CountingEncoder()
+    perception(tmp_path, second).detect(still_life(), needs, Timer())
+    assert second.n_images == 0
+
+    third = CountingEncoder()
+    perception(tmp_path, third).detect(still_life(), PerceptionNeeds(crop_ratios=(1.0, 2.0)), Timer())
+    assert third.n_images == n
+
+
+def test_excluded_regions_cost_one_crop_and_are_encoded_when_asked_for_later(tmp_path: Path) -> None:
+    everything = perception(tmp_path / "all", CountingEncoder()).detect(still_life(), PerceptionNeeds(), Timer())
+    background = everything.names[0]
+    n_kept = sum(name != background for name in everything.names)
+    encoder = CountingEncoder()
+    needs = PerceptionNeeds(crop_ratios=(1.0, 2.0), background_names=(background.upper(),))
+    found = perception(tmp_path / "few", encoder).detect(still_life(), needs, Timer())
+    assert len(found) == n_kept < len(everything)
+    assert encoder.n_images == len(everything) + n_kept + 1
+
+    later = CountingEncoder()
+    unfiltered = PerceptionNeeds(crop_ratios=(1.0, 2.0))
+    cached = perception(tmp_path / "few", later).detect(still_life(), unfiltered, Timer())
+    assert later.n_images == len(everything) - n_kept
+    fresh = perception(tmp_path / "none", CountingEncoder(), cache=False).detect(still_life(), unfiltered, Timer())
+    assert_equal_to_the_bit(cached, fresh)
+
+
+def test_a_damaged_cache_is_mended_without_a_change_of_the_answer(tmp_path: Path) -> None:
+    needs = PerceptionNeeds(crop_ratios=(1.0,))
+    before = perception(tmp_path, CountingEncoder()).detect(still_life(), needs, Timer())
+    files = sorted(tmp_path.rglob("*.npz"))
+    assert len(files) == 3  # regions, crops at ratio 1.0, the whole image
+    for path in files:
+        path.write_bytes(path.read_bytes()[:-40])
+    after = perception(tmp_path, CountingEncoder()).detect(still_life(), needs, Timer())
+    assert_equal_to_the_bit(before, after)
+    untouched = CountingEncoder()
+    perception(tmp_path, untouched).detect(still_life(), needs, Timer())
+    assert untouched.n_images == 0
+
+
+def test_no_temporary_files_stay_behind(tmp_path: Path) -> None:
+    perception(tmp_path, CountingEncoder()).detect(still_life(), PerceptionNeeds(), Timer())
+    assert not list(tmp_path.rglob("*.tmp"))
+
+
+def test_a_cache_that_cannot_be_written_is_an_error_and_off_it_is_not_touched(tmp_path: Path) -> None:
+    blocked = tmp_path / "file"
+    blocked.write_text("in the way")
+    with pytest.raises(StoreError, match=r"the perception cache cannot be written .* set perception\.cache = false"):
+        perception(blocked, CountingEncoder()).detect(still_life(), PerceptionNeeds(), Timer())
+    perception(blocked, CountingEncoder(), cache=False).detect(still_life(), PerceptionNeeds(), Timer())
+    assert os.listdir(tmp_path) == ["file"]
+
+
+def test_times_of_a_cached_frame_are_booked_as_cache(tmp_path: Path) -> None:
+    timer = Timer()
+    perception(tmp_path, CountingEncoder()).detect(still_life(), PerceptionNeeds(), timer)
+    assert set(timer.take()) == {"cache", "segment", "encode"}
+    perception(tmp_path, CountingEncoder()).detect(still_life(), PerceptionNeeds(), timer)
+    assert "segment" not in timer.take()

@@ -1,0 +1,201 @@
+"""Oracle masks, exact on meshes made by hand; their noise; the oracle method."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from perception_fakes import INTRINSICS, CountingEncoder, quad_mesh, still_life
+
+from su3d_bench.baselines.oracle import Oracle
+from su3d_bench.errors import ConfigError
+from su3d_bench.perception.oracle import MeshProjector, OracleConfig, OracleSegmenter
+from su3d_bench.perception.oracle_noise import OracleNoise, disturb
+from su3d_bench.perception.profiles import PerceptionConfig, build_perception
+from su3d_bench.timing import Timer
+from su3d_bench.types import Frame, Int32Array, PerceptionNeeds, SceneInfo
+
+SCENE = SceneInfo("rooms", "living0", n_frames=1, stride=1, image_domain="rendered-rooms")
+# One pixel is 1 cm at 1 m: the square covers columns 30..69 and rows 20..49 of the image at depth 1.
+SQUARE = ((30 - 80) / 100, (70 - 80) / 100, (20 - 60) / 100, (50 - 60) / 100, 1.0)
+WALL = (-3.0, 3.0, -3.0, 3.0, 2.0)
+
+
+def flat_frame(depth_m: float = 2.0, index: int = 0) -> Frame:
+    depth = np.full((120, 160), depth_m, np.float32)
+    return Frame(index, 0.0, np.zeros((120, 160, 3), np.uint8), depth, np.eye(4), INTRINSICS)
+
+
+def square_frame(index: int = 0) -> Frame:
+    frame = flat_frame(index=index)
+    frame.depth_m[20:50, 30:70] = 1.0
+    return frame
+
+
+def expected_square() -> Int32Array:
+    image = np.full((120, 160), 2, np.int32)
+    image[20:50, 30:70] = 1
+    return image
+
+
+def test_a_square_before_a_wall_is_projected_to_the_pixel() -> None:
+    projector = MeshProjector(quad_mesh(SQUARE, WALL, instance=[1, 2]), OracleConfig())
+    assert np.array_equal(projector.instance_image(square_frame()), expected_square())
+
+
+def test_the_pose_moves_the_masks() -> None:
+    frame = square_frame()
+    frame.camera_to_world[0, 3] = 0.1  # ten pixels at 1 m
+    frame.depth_m[:] = 2.0
+    frame.depth_m[20:50, 20:60] = 1.0
+    image = MeshProjector(quad_mesh(SQUARE, WALL, instance=[1, 2]), OracleConfig()).instance_image(frame)
+    assert np.array_equal(image, np.roll(expected_square(), -10, axis=1))
+
+
+def test_a_surface_that_the_sensor_did_not_see_gives_no_pixel() -> None:
+    projector = MeshProjector(quad_mesh(SQUARE, WALL, instance=[1, 2]), OracleConfig(fill_px=0))
+    image = projector.instance_image(flat_frame(2.0))
+    assert not (image == 1).any() and (image[20:50, 30:70] == 0).all() and (image == 2).sum() == 120 * 160 - 1200
+
+
+@pytest.mark.parametrize(("offset_m", "is_kept"), [(0.04, True), (0.06, False)])
+def test_depth_may_differ_by_less_than_the_tolerance(offset_m: float, is_kept: bool) -> None:
+    projector = MeshProjector(quad_mesh(WALL, instance=[2]), OracleConfig(depth_tolerance_m=0.05))
+    assert bool((projector.instance_image(flat_frame(2.0 + offset_m)) == 2).all()) is is_kept
+
+
+def test_holes_of_the_mesh_are_filled_from_near_pixels_of_like_depth_only() -> None:
+    left, right = (-3.0, -0.5, -3.0, 3.0, 2.0), (-0.42, 3.0, -3.0, 3.0, 2.0)  # a slit of four pixels
+    mesh = quad_mesh(left, right, instance=[1, 2])
+    image = MeshProjector(mesh, OracleConfig(fill_px=3)).instance_image(flat_frame())
+    assert set(np.unique(image)) == {1, 2}
+    slit = np.flatnonzero((MeshProjector(mesh, OracleConfig(fill_px=0)).instance_image(flat_frame()) == 0)[0])
+    assert len(slit) == 4
+    frame = flat_frame()
+    frame.depth_m[:, slit] = 1.5
+    assert (MeshProjector(mesh, OracleConfig(fill_px=3)).instance_image(frame)[:, slit] == 0).all()
+    frame.depth_m[:, slit] = 0.0
+    assert (MeshProjector(mesh, OracleConfig(fill_px=3)).instance_image(frame)[:, slit] == 0).all()
+
+
+def test_small_and_unannotated_surfaces_are_left_out() -> None:
+    small = (0.5, 0.55, 0.0, 0.05, 1.0)  # 5x5 pixels
+    mesh = quad_mesh(SQUARE, WALL, small, instance=[1, 0, 3])
+    frame = square_frame()
+    frame.depth_m[60:65, 130:135] = 1.0
+    regions = OracleSegmenter(mesh, OracleConfig()).segment(frame)
+    assert regions.names == ("chair",) and regions.scores.tolist() == [1.0]
+    assert np.array_equal(regions.masks[0], expected_square() == 1)
+    assert regions.boxes.tolist() == [[30, 20, 70, 50]]
+
+
+def test_an_empty_view_gives_no_regions(tmp_path: Path) -> None:
+    behind = quad_mesh((-1, 1, -1, 1, -2.0), instance=[1])
+    perception = build_perception(
+        "oracle", PerceptionConfig(), scene=SCENE, cache_root=tmp_path, mesh=behind, encoder=CountingEncoder()
+    )
+    found = perception.detect(flat_frame(), PerceptionNeeds(crop_ratios=(1.0, 2.0)), Timer())
+    assert len(found) == 0 and found.masks.shape == (0, 120, 160) and found.crop_features.shape == (0, 2, 8)
+
+
+def test_features_are_those_of_the_class_names_at_every_ratio(tmp_path: Path) -> None:
+    encoder = CountingEncoder()
+    perception = build_perception(
+        "oracle",
+        PerceptionConfig(),
+        scene=SCENE,
+        cache_root=tmp_path,
+        mesh=quad_mesh(SQUARE, WALL, instance=[1, 3]),
+        encoder=encoder,
+    )
+    needs = PerceptionNeeds(crop_ratios=(0.8, 1.0), background_names=("cup",))
+    found = perception.detect(square_frame(), needs, Timer())
+    expected = encoder.encode_texts(["a chair in a scene", "a cup in a scene"])
+    assert found.names == ("chair",) and found.captions == ("a chair in a scene",)
+    assert np.array_equal(found.crop_features[0, 0], expected[0])
+    assert np.array_equal(found.crop_features[0, 1], expected[0])
+    mean = expected.astype(np.float64).sum(axis=0)
+    assert np.allclose(found.global_feature, mean / np.linalg.norm(mean), atol=1e-6)
+    assert encoder.n_images == 0
+    assert perception.caveat is not None and "ground truth" in perception.caveat
+
+
+def test_the_oracle_profile_without_a_mesh_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="profile 'oracle' needs an annotated mesh"):
+        build_perception(
+            "oracle", PerceptionConfig(), scene=SCENE, cache_root=tmp_path, mesh=None, encoder=CountingEncoder()
+        )
+
+
+def test_cached_oracle_regions_keep_their_names(tmp_path: Path) -> None:
+    mesh = quad_mesh(SQUARE, WALL, instance=[1, 3])
+    for _ in range(2):
+        perception = build_perception(
+            "oracle", PerceptionConfig(), scene=SCENE, cache_root=tmp_path, mesh=mesh, encoder=CountingEncoder()
+        )
+        assert perception.detect(square_frame(), PerceptionNeeds(), Timer()).names == ("chair", "cup")
+
+
+def noisy(index: int = 0, **values: float) -> tuple[list[np.typing.NDArray[np.bool_]], list[str]]:
+    frame = still_life()
+    masks = [frame.depth_m == value for value in (2.0, 2.5, 3.0)]
+    noise = OracleNoise.model_validate(values)
+    return disturb(masks, ["chair", "cup", "wall"], ["chair", "cup", "wall"], noise, index)
+
+
+def test_no_noise_changes_nothing() -> None:
+    frame = still_life()
+    masks, names = noisy()
+    assert names == ["chair", "cup", "wall"]
+    assert [int(mask.sum()) for mask in masks] == [int((frame.depth_m == v).sum()) for v in (2.0, 2.5, 3.0)]
+
+
+def test_noise_is_drawn_from_seed_and_frame_alone() -> None:
+    values = {"drop_probability": 0.5, "split_probability": 0.5, "flip_probability": 0.5}
+    outcomes = []
+    for index in range(12):
+        first, again = noisy(index, **values), noisy(index, **values)
+        assert first[1] == again[1] and all(np.array_equal(a, b) for a, b in zip(first[0], again[0], strict=True))
+        outcomes.append(tuple(first[1]))
+    assert len(set(outcomes)) > 3
+    assert [noisy(i, seed=1, **values)[1] for i in range(12)] != [noisy(i, **values)[1] for i in range(12)]
+
+
+def test_each_kind_of_noise_does_what_its_name_says() -> None:
+    assert noisy(drop_probability=1.0) == ([], [])
+    eroded, _ = noisy(erode_px=2)
+    assert eroded[0].sum() == 36 * 36
+    dilated, _ = noisy(dilate_px=1)
+    assert dilated[0].sum() == 40 * 40 + 4 * 40  # a disc of radius 1 is a cross
+    split, names = noisy(split_probability=1.0)
+    assert names == ["chair", "chair", "cup", "cup", "wall", "wall"]
+    assert not (split[0] & split[1]).any() and (split[0] | split[1]).sum() == 1600 and split[0].any()
+    merged, names = noisy(merge_probability=1.0)
+    assert len(merged) == 1 and merged[0].all() and names == ["wall"]
+    _, flipped = noisy(flip_probability=1.0)
+    assert all(new != old for new, old in zip(flipped, ["chair", "cup", "wall"], strict=True))
+
+
+def test_noise_moves_the_digest() -> None:
+    mesh = quad_mesh(SQUARE, instance=[1])
+    plain, spoilt = OracleConfig(), OracleConfig(noise=OracleNoise(erode_px=1))
+    assert OracleSegmenter(mesh, plain).digest != OracleSegmenter(mesh, spoilt).digest
+    relabelled = replace(mesh, class_of_instance={1: 21})
+    assert OracleSegmenter(mesh, plain).digest != OracleSegmenter(relabelled, plain).digest
+
+
+def test_the_oracle_method_hands_back_every_instance_of_the_mesh() -> None:
+    mesh = quad_mesh(SQUARE, WALL, (0, 1, 0, 1, 3.0), instance=[1, 4, 0])
+    method = Oracle(Oracle.Config())
+    method.receive_truth(mesh)
+    method.start(SCENE)
+    found = method.finish()
+    assert method.needs.frames is False
+    assert found.labels == ("chair", "cup") and found.ids.tolist() == [1, 4] and found.scores.tolist() == [1.0, 1.0]
+    assert found.captions == ("a chair in a scene", "a cup in a scene") and found.features is None
+    assert found.mask(0).tolist() == [0, 1, 2, 3] and found.mask(1).tolist() == [4, 5, 6, 7]
+    assert np.allclose(found.boxes[0], [[-0.5, -0.4, 1.0], [-0.1, -0.1, 1.0]])
+    assert np.allclose(found.centroids[1], [0, 0, 2.0])
+    assert np.array_equal(found.points, mesh.vertices)

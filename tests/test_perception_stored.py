@@ -1,0 +1,168 @@
+"""Detections made elsewhere: read as they were written, refused with a line that says what is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from perception_fakes import CountingEncoder, still_life
+
+from su3d_bench.errors import ConfigError, DataError
+from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
+from su3d_bench.perception.stored import StoredConfig, read_stored, stored_path, write_stored
+from su3d_bench.timing import Timer
+from su3d_bench.types import Detections, PerceptionNeeds, SceneInfo
+
+SCENE = SceneInfo("replica", "room0", n_frames=1, stride=1, image_domain="camera")
+
+
+def detections(index: int = 40) -> Detections:
+    frame = still_life(index)
+    masks = np.stack([frame.depth_m == 2.0, frame.depth_m == 2.5])
+    boxes = np.array([[20, 40, 60, 80], [90.5, 50, 120, 90]], np.float32)
+    rows = CountingEncoder().encode_texts(["a", "b", "c", "d", "e"])
+    return Detections(
+        frame_index=index,
+        masks=masks,
+        boxes=boxes,
+        scores=np.array([0.9, 0.25], np.float32),
+        names=("chair", "indoor-plant"),
+        captions=("a red chair", "an indoor-plant in a scene"),
+        crop_ratios=(1.0, 1.5),
+        crop_features=rows[:4].reshape(2, 2, 8),
+        global_feature=rows[4],
+    )
+
+
+def written(folder: Path, with_features: bool) -> Path:
+    path = stored_path(folder, "replica", "room0", 40)
+    write_stored(path, detections(), CountingEncoder() if with_features else None)
+    return path
+
+
+def perception(folder: Path, encoder: CountingEncoder, tmp_path: Path) -> Perception:
+    config = PerceptionConfig(stored=StoredConfig(folder=folder))
+    return build_perception("stored", config, scene=SCENE, cache_root=tmp_path, mesh=None, encoder=encoder)
+
+
+def test_the_file_of_a_frame_is_named_after_dataset_scene_and_index(tmp_path: Path) -> None:
+    assert stored_path(tmp_path, "replica", "room0", 40) == tmp_path / "replica.room0" / "frame000040.npz"
+
+
+def test_detections_come_back_as_they_were_written(tmp_path: Path) -> None:
+    written(tmp_path, with_features=True)
+    encoder = CountingEncoder()
+    needs = PerceptionNeeds(crop_ratios=(1.5, 1.0))
+    found = perception(tmp_path, encoder, tmp_path).detect(still_life(40), needs, Timer())
+    given = detections()
+    assert found.names == given.names and found.captions == given.captions
+    assert np.array_equal(found.masks, given.masks) and np.array_equal(found.boxes, given.boxes)
+    assert np.array_equal(found.scores, given.scores)
+    assert np.array_equal(found.crop_features, given.crop_features[:, ::-1])
+    assert np.array_equal(found.global_feature, given.global_feature) and encoder.n_images == 0
+
+
+def test_missing_features_and_ratios_are_computed(tmp_path: Path) -> None:
+    written(tmp_path, with_features=False)
+    encoder = CountingEncoder()
+    perception(tmp_path, encoder, tmp_path).detect(still_life(40), PerceptionNeeds(crop_ratios=(0.8, 1.0)), Timer())
+    assert encoder.n_images == 2 * 2 + 1
+    written(tmp_path, with_features=True)
+    encoder = CountingEncoder()
+    perception(tmp_path, encoder, tmp_path / "new").detect(
+        still_life(40), PerceptionNeeds(crop_ratios=(1.0, 3.0)), Timer()
+    )
+    assert encoder.n_images == 2
+
+
+def test_captions_default_to_the_template_and_background_is_left_out(tmp_path: Path) -> None:
+    path = written(tmp_path, with_features=False)
+    arrays = dict(np.load(path))
+    del arrays["captions"]
+    np.savez(path, allow_pickle=False, **arrays)
+    needs = PerceptionNeeds(background_names=("chair",))
+    found = perception(tmp_path, CountingEncoder(), tmp_path).detect(still_life(40), needs, Timer())
+    assert found.captions == ("an indoor-plant in a scene",)
+
+
+def test_the_digest_moves_with_the_files(tmp_path: Path) -> None:
+    path = written(tmp_path, with_features=False)
+    before = perception(tmp_path, CountingEncoder(), tmp_path).digest
+    assert perception(tmp_path, CountingEncoder(), tmp_path).digest == before
+    arrays = dict(np.load(path))
+    arrays["scores"] = arrays["scores"] / 2
+    np.savez(path, allow_pickle=False, **arrays)
+    assert perception(tmp_path, CountingEncoder(), tmp_path).digest != before
+
+
+BAD: list[tuple[dict[str, Any], str]] = [
+    ({"scores": None}, r"array 'scores' is missing; needed: image_size, masks"),
+    ({"extra": np.zeros(1)}, r"unknown array 'extra'"),
+    ({"scores": np.array([0.9, 1.5])}, r"frame 40, region 1: score 1.5 is not in 0..1"),
+    ({"scores": np.array([np.nan, 0.5])}, r"region 0: score nan is not in 0..1"),
+    ({"scores": np.array([0.9])}, r"'masks' has shape \(2, 2400\); expected 2 axes and 1 rows"),
+    ({"boxes": np.array([[0, 0, 9, 9], [100, 50, 161, 90]])}, r"region 1: box .* outside the 160x120 image"),
+    ({"boxes": np.array([[0, 0, 9, 9], [9, 5, 9, 90]])}, r"region 1: box .* is empty"),
+    ({"boxes": np.zeros((2, 3))}, r"expected four columns x0 y0 x1 y1"),
+    ({"image_size": np.array([680, 1200])}, r"image_size is \[680, 1200\], the frame has height 120 and width 160"),
+    ({"masks": np.zeros((2, 2400), np.uint8)}, r"region 0: the mask is empty"),
+    ({"masks": np.ones((2, 99), np.uint8)}, r"'masks' is \(2, 99\) uint8; expected \(2, 2400\) uint8"),
+    ({"names": np.array(["chair", " "])}, r"region 1: 'names' holds an empty text"),
+    ({"names": np.array([3, 4])}, r"'names' holds int64; expected texts"),
+    ({"encoder": np.array("x")}, r"has 'encoder' but not all of crop_ratios"),
+]
+
+
+@pytest.mark.parametrize(("change", "message"), BAD, ids=[message[:24] for _, message in BAD])
+def test_what_is_wrong_in_a_file_is_said_with_frame_and_region(
+    tmp_path: Path, change: dict[str, Any], message: str
+) -> None:
+    path = written(tmp_path, with_features=False)
+    arrays: dict[str, Any] = {**dict(np.load(path)), **change}
+    np.savez(path, allow_pickle=False, **{key: value for key, value in arrays.items() if value is not None})
+    with pytest.raises(DataError, match=message) as caught:
+        read_stored(path, still_life(40), CountingEncoder())
+    assert "frame 40" in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_features_of_another_encoder_or_length_are_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, with_features=True)
+    arrays = dict(np.load(path))
+    np.savez(path, allow_pickle=False, **{**arrays, "encoder": np.array("other-2")})
+    with pytest.raises(DataError, match="features were made by encoder other-2, the run uses counting counting-1"):
+        read_stored(path, still_life(40), CountingEncoder())
+    scaled = arrays["crop_features"].copy()
+    scaled[1, 0] *= 2
+    np.savez(path, allow_pickle=False, **{**arrays, "crop_features": scaled})
+    with pytest.raises(DataError, match=r"region 1: its feature at ratio 1.0 has length 2, not 1"):
+        read_stored(path, still_life(40), CountingEncoder())
+    np.savez(path, allow_pickle=False, **{**arrays, "crop_features": scaled[..., :5]})
+    with pytest.raises(DataError, match=r"crop_features \(2, 2, 5\) .* expected \(2, 2, 8\)"):
+        read_stored(path, still_life(40), CountingEncoder())
+
+
+def test_a_missing_and_a_damaged_file_are_data_errors(tmp_path: Path) -> None:
+    path = stored_path(tmp_path, "replica", "room0", 40)
+    with pytest.raises(DataError, match=r"frame 40: there is no file .*frame000040\.npz"):
+        read_stored(path, still_life(40), CountingEncoder())
+    path.parent.mkdir()
+    path.write_bytes(b"nothing")
+    with pytest.raises(DataError, match="is not an npz file of plain arrays"):
+        read_stored(path, still_life(40), CountingEncoder())
+
+
+def test_pickled_objects_are_refused(tmp_path: Path) -> None:
+    path = written(tmp_path, with_features=False)
+    arrays = dict(np.load(path))
+    np.savez(path, **{**arrays, "names": np.array(["chair", None], object)})
+    with pytest.raises(DataError, match="is not an npz file of plain arrays"):
+        read_stored(path, still_life(40), CountingEncoder())
+
+
+def test_the_stored_profile_without_a_folder_is_an_error(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"perception\.stored\.folder is not set"):
+        build_perception(
+            "stored", PerceptionConfig(), scene=SCENE, cache_root=tmp_path, mesh=None, encoder=CountingEncoder()
+        )
