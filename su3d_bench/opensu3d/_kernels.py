@@ -100,10 +100,16 @@ def insert(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def _reach(x, eps):  # type: ignore[no-untyped-def]
-    """First and last cell of one axis that can hold a point within ``eps`` of ``x``, rounding allowed for."""
-    margin = eps * (1.0 + 1e-9) + abs(x) * 4e-16
-    return _voxel(x - margin, eps) >> 1, _voxel(x + margin, eps) >> 1
+def _squared_gap(x, cell, side, eps):  # type: ignore[no-untyped-def]
+    """Of one axis: squared distance from ``x`` to its own cell (side 0), the one below (1), the one above (2).
+
+    Rounded down, so that no cell is passed over for rounding. A cell is 2 eps wide: none further can be within eps.
+    """
+    if side == 0:
+        return 0.0
+    gap = x - cell * 2 * eps if side == 1 else (cell + 1) * 2 * eps - x
+    gap = max(gap * (1.0 - 1e-9) - abs(x) * 1e-15, 0.0)
+    return gap * gap
 
 
 @njit(cache=True)
@@ -113,18 +119,28 @@ def nearest(queries, eps, points, following, keys, heads, table, found):  # type
     Of equally near points the lowest index wins. Gives the number of cells that were looked into.
     """
     visited = 0
+    bx, by, bz, block = np.int64(0), np.int64(0), np.int64(0), np.int32(ABSENT)
+    is_known = False
     for i in range(len(queries)):
         x, y, z = queries[i, 0], queries[i, 1], queries[i, 2]
-        first_x, last_x = _reach(x, eps)
-        first_y, last_y = _reach(y, eps)
-        first_z, last_z = _reach(z, eps)
+        own_x, own_y, own_z = _voxel(x, eps) >> 1, _voxel(y, eps) >> 1, _voxel(z, eps) >> 1
         best, best_squared = ABSENT, eps * eps
-        bx, by, bz, block = first_x >> 3, first_y >> 3, first_z >> 3, np.int32(-2)
-        for cx in range(first_x, last_x + 1):
-            for cy in range(first_y, last_y + 1):
-                for cz in range(first_z, last_z + 1):
-                    if block == -2 or cx >> 3 != bx or cy >> 3 != by or cz >> 3 != bz:
-                        bx, by, bz = cx >> 3, cy >> 3, cz >> 3
+        for side_x in range(3):
+            gap_x = _squared_gap(x, own_x, side_x, eps)
+            if gap_x > best_squared:
+                continue
+            cx = own_x + (side_x == 2) - (side_x == 1)
+            for side_y in range(3):
+                gap_xy = gap_x + _squared_gap(y, own_y, side_y, eps)
+                if gap_xy > best_squared:
+                    continue
+                cy = own_y + (side_y == 2) - (side_y == 1)
+                for side_z in range(3):
+                    if gap_xy + _squared_gap(z, own_z, side_z, eps) > best_squared:
+                        continue
+                    cz = own_z + (side_z == 2) - (side_z == 1)
+                    if not is_known or cx >> 3 != bx or cy >> 3 != by or cz >> 3 != bz:
+                        bx, by, bz, is_known = cx >> 3, cy >> 3, cz >> 3, True
                         block = table[_slot(table, keys, bx, by, bz)]
                     visited += 1
                     j = heads[block, _local(cx, cy, cz)] if block != ABSENT else ABSENT
