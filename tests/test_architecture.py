@@ -24,12 +24,16 @@ LAYERS = (
     {"errors"},
     {"types"},
     {"geometry", "statistics", "timing"},
+    {"digests", "toml_text"},
     {"config", "protocols", "rules"},
     {"metrics"},
     {"registry", "store", "scoring"},
     {"perception"},
     {"opensu3d", "datasets", "baselines", "reports"},
-    {"runner", "executors"},
+    {"executors"},
+    {"scene_run"},
+    {"planning", "estimate"},
+    {"runner"},
     {"cli"},
 )
 HEAVY = {"open3d", "torch", "onnxruntime", "sklearn", "pandas", "matplotlib", "numba"}
