@@ -10,9 +10,9 @@ from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.segmenter_config import SegmenterConfig
 from su3d_bench.perception.segmenter_graph import Graph, IndexArray
-from su3d_bench.perception.segmenter_pixels import PixelMaps, superpixels
+from su3d_bench.perception.segmenter_pixels import superpixels
 from su3d_bench.perception.segmenter_rules import find_structure, join_objects, join_surfaces
-from su3d_bench.types import BoolArray, Float32Array, Frame, Regions
+from su3d_bench.types import BoolArray, Float32Array, Frame, Int32Array, Regions
 
 __all__ = ["RgbdSegmenter", "SegmenterConfig"]
 
@@ -32,22 +32,22 @@ class RgbdSegmenter:
         import cv2
 
         cv2.setNumThreads(1)
-        maps, graph = superpixels(frame, self._config)
+        labels, graph = superpixels(frame, self._config)
         graph = join_surfaces(graph, self._config)
         if self._level == "parts":
             kept = np.ones(len(graph.pieces), bool)
-            return self._regions(frame, maps, graph, graph.piece_of_superpixel, kept)
+            return self._regions(frame, labels, graph, graph.piece_of_superpixel, kept)
         is_structure = find_structure(graph, self._config)
         objects, object_of_surface = join_objects(graph, is_structure, self._config)
         kept = np.ones(len(objects.pieces), bool)
         kept[object_of_surface[is_structure]] = False
-        return self._regions(frame, maps, objects, object_of_surface[graph.piece_of_superpixel], kept)
+        return self._regions(frame, labels, objects, object_of_surface[graph.piece_of_superpixel], kept)
 
     def _regions(
-        self, frame: Frame, maps: PixelMaps, graph: Graph, piece_of_superpixel: IndexArray, kept: BoolArray
+        self, frame: Frame, superpixel: Int32Array, graph: Graph, piece_of_superpixel: IndexArray, kept: BoolArray
     ) -> Regions:
         height, width = frame.depth_m.shape
-        labels = piece_of_superpixel[maps.labels]
+        labels = piece_of_superpixel[superpixel]
         factor = -(-width // self._config.max_width)
         labels = np.repeat(np.repeat(labels, factor, axis=0), factor, axis=1)
         labels = np.pad(labels, ((0, max(0, height - len(labels))), (0, max(0, width - labels.shape[1]))), mode="edge")

@@ -21,6 +21,7 @@ class SegmenterConfig(BaseModel):
     smoothing_colour: float = Field(default=20.0, gt=0)  # bilateral filter: colour steps above this stay sharp
     depth_jump: float = Field(default=0.012, gt=0)
     normal_radius: int = Field(default=4, ge=1)  # at half resolution; smaller beside jumps in depth
+    normal_keep: float = Field(default=0.001, ge=0)  # relative depth by which a neighbour's plane must fit better
 
     # superpixels
     colour_unit: float = Field(default=8.0, gt=0)

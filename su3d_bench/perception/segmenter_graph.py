@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.types import Float32Array, Float64Array, Int32Array, Int64Array
+from su3d_bench.types import Float32Array, Float64Array, Int32Array
 
 IndexArray = NDArray[np.intp]
 
@@ -27,6 +27,11 @@ class Pieces:
     point: Float64Array
     scatter: Float64Array
     normal: Float64Array
+
+    @classmethod
+    def from_sums(cls, sums: Float64Array) -> Pieces:
+        """Pieces out of the columns of ``segmenter_kernels.sum_pixels``."""
+        return cls(sums[:, 0], sums[:, 1], sums[:, 2:5], sums[:, 5:8], sums[:, 8:14], sums[:, 14:17])
 
     def __len__(self) -> int:
         return len(self.n_pixels)
@@ -114,25 +119,26 @@ def contract(graph: Graph, pairs: tuple[IndexArray, IndexArray]) -> Graph:
     return Graph(graph.pieces.joined(label, n_joined), graph.borders.joined(label), label[graph.piece_of_superpixel])
 
 
-def merge_cheapest(graph: Graph, cost: Callable[[Graph], Float64Array], max_rounds: int = 60) -> Graph:
-    """Join, round by round, the pairs that are each other's cheapest, while their ``cost`` (E,) is below 1.
+def merge_cheapest(graph: Graph, cost: Callable[[Graph], Float64Array], n_levels: int = 8) -> Graph:
+    """Join pieces while a border's ``cost`` (E,) is below 1, cheap borders first.
 
-    Costs are computed anew in every round from the joined sums, so that the answer is close to that of joining one
-    pair at a time. Ties go to the pair that comes first by (a, b).
+    The limit rises to 1 in ``n_levels`` steps. At each step every piece joins its cheapest neighbour below the limit,
+    and costs are computed anew from the joined sums, until none is left. Ties go to the pair first by (a, b).
     """
-    for _ in range(max_rounds):
-        price = cost(graph)
-        a, b = graph.borders.a, graph.borders.b
-        cheap = np.flatnonzero(price < 1)
-        if not len(cheap):
-            break
-        rank = np.empty(len(price), np.int64)
-        rank[np.argsort(price, kind="stable")] = np.arange(len(price))
-        best = np.full(len(graph.pieces), len(price), np.int64)
-        np.minimum.at(best, a[cheap], rank[cheap])
-        np.minimum.at(best, b[cheap], rank[cheap])
-        mutual = cheap[(best[a[cheap]] == rank[cheap]) & (best[b[cheap]] == rank[cheap])]
-        graph = contract(graph, (a[mutual], b[mutual]))
+    for level in range(1, n_levels + 1):
+        while True:
+            price = cost(graph)
+            a, b = graph.borders.a, graph.borders.b
+            cheap = np.flatnonzero(price < level / n_levels)
+            if not len(cheap):
+                break
+            rank = np.empty(len(price), np.int64)
+            rank[np.argsort(price, kind="stable")] = np.arange(len(price))
+            best = np.full(len(graph.pieces), len(price), np.int64)
+            np.minimum.at(best, a[cheap], rank[cheap])
+            np.minimum.at(best, b[cheap], rank[cheap])
+            is_best = (best[a[cheap]] == rank[cheap]) | (best[b[cheap]] == rank[cheap])
+            graph = contract(graph, (a[cheap[is_best]], b[cheap[is_best]]))
     return graph
 
 
@@ -178,20 +184,3 @@ def signed_bend(pieces: Pieces, a: IndexArray, b: IndexArray) -> Float64Array:
     known = (pieces.n_points[a] > 0) & (pieces.n_points[b] > 0)
     side = ((normal[a] - normal[b]) * (centroid[a] - centroid[b])).sum(axis=1)
     return np.where(known, np.where(side >= 0, angle, -angle), 0.0)
-
-
-def sum_pixels(labels: Int32Array, lab: Float32Array, points: Float64Array, normals: Float32Array) -> Pieces:
-    """Sums over the superpixels of ``labels`` (H, W); pixels without depth have all-zero ``points`` (H, W, 3)."""
-    flat: Int64Array = labels.ravel().astype(np.int64)
-    n = int(flat.max()) + 1
-    known = points[..., 2].ravel() > 0
-    at, p = flat[known], points.reshape(-1, 3)[known]
-    columns = [p[:, i] * p[:, j] for i, j in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))]
-    return Pieces(
-        np.bincount(flat, minlength=n).astype(np.float64),
-        np.bincount(at, minlength=n).astype(np.float64),
-        _sum_by(flat, lab.reshape(-1, 3).astype(np.float64), n),
-        _sum_by(at, p, n),
-        np.stack([np.bincount(at, column, n) for column in columns], axis=1),
-        _sum_by(at, normals.reshape(-1, 3)[known].astype(np.float64), n),
-    )

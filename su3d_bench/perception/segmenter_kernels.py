@@ -100,6 +100,122 @@ def fit_planes(disparity: Float32Array, radius: Int32Array, x: Float64Array, y: 
 
 
 @njit(cache=True)
+def _misfit(plane: Float32Array, disparity: Float32Array, v: int, u: int, x: Float64Array, y: Float64Array) -> float:
+    """Mean relative error of ``plane`` at (v, u) and those of its four neighbours that lie near it in depth."""
+    height, width = disparity.shape
+    here = disparity[v, u]
+    total = abs(plane[0] * x[u] + plane[1] * y[v] + plane[2] - here)
+    n = 1
+    for dv, du in ((0, 1), (0, -1), (1, 0), (-1, 0)):
+        v1, u1 = v + dv, u + du
+        if 0 <= v1 < height and 0 <= u1 < width and abs(disparity[v1, u1] - here) < 0.03 * here:
+            total += abs(plane[0] * x[u1] + plane[1] * y[v1] + plane[2] - disparity[v1, u1])
+            n += 1
+    return total / (n * here)
+
+
+@njit(cache=True)
+def sharpen_planes(
+    planes: Float32Array, disparity: Float32Array, reach: int, own_bonus: float, x: Float64Array, y: Float64Array
+) -> Float32Array:
+    """For every pixel the plane, of its own and those ``reach`` pixels away in eight directions, that fits it best.
+
+    Windows that straddle an edge blur it; a window a step to the side lies on one surface. A pixel keeps its own plane
+    unless another misfits by ``own_bonus`` (relative depth) less.
+    """
+    height, width = disparity.shape
+    sharp = planes.copy()
+    for v in range(height):
+        for u in range(width):
+            if disparity[v, u] <= 0:
+                continue
+            own = planes[v, u]
+            best = 1e30
+            if own[0] != 0 or own[1] != 0 or own[2] != 0:
+                best = _misfit(own, disparity, v, u, x, y) - own_bonus
+                if best <= 0:
+                    continue
+            for dv in (-reach, 0, reach):
+                for du in (-reach, 0, reach):
+                    v1, u1 = v + dv, u + du
+                    if (dv == 0 and du == 0) or v1 < 0 or u1 < 0 or v1 >= height or u1 >= width:
+                        continue
+                    other = planes[v1, u1]
+                    if other[0] == 0 and other[1] == 0 and other[2] == 0:
+                        continue
+                    misfit = _misfit(other, disparity, v, u, x, y)
+                    if misfit < best:
+                        best = misfit
+                        sharp[v, u] = other
+    return sharp
+
+
+@njit(cache=True)
+def double_planes(planes: Float32Array, disparity: Float32Array, x: Float64Array, y: Float64Array) -> Float32Array:
+    """Planes at twice the resolution: of the four planes around a pixel the one that fits its ``disparity`` best."""
+    height, width = disparity.shape
+    half_height, half_width = planes.shape[0], planes.shape[1]
+    full = np.zeros((height, width, 3), np.float32)
+    for v in range(height):
+        for u in range(width):
+            if disparity[v, u] <= 0:
+                continue
+            best = 1e30
+            for v1 in (v // 2, v // 2 + 1):
+                for u1 in (u // 2, u // 2 + 1):
+                    if v1 >= half_height or u1 >= half_width:
+                        continue
+                    plane = planes[v1, u1]
+                    if plane[0] == 0 and plane[1] == 0 and plane[2] == 0:
+                        continue
+                    misfit = abs(plane[0] * x[u] + plane[1] * y[v] + plane[2] - disparity[v, u])
+                    if misfit < best:
+                        best = misfit
+                        full[v, u] = plane
+    return full
+
+
+@njit(cache=True)
+def _reach(planes: Float32Array, v: int, u: int, x: float, y: float, q: float, worst: float) -> float:
+    """How far the plane at (v, u) misses disparity ``q`` at ray (x, y); ``worst`` where there is no plane."""
+    a, b, c = planes[v, u, 0], planes[v, u, 1], planes[v, u, 2]
+    if a == 0 and b == 0 and c == 0:
+        return worst
+    return abs(a * x + b * y + c - q)
+
+
+@njit(cache=True)
+def _jump(
+    disparity: Float32Array, planes: Float32Array, v: int, u: int, dv: int, du: int, x: Float64Array, y: Float64Array
+) -> float:
+    """Relative step in depth from (v, u) to (v + dv, u + du) that no extrapolation from either side explains."""
+    height, width = disparity.shape
+    v1, u1 = v + dv, u + du
+    q0, q1 = disparity[v, u], disparity[v1, u1]
+    step = abs(q1 - q0)
+    step = min(step, _reach(planes, v, u, x[u1], y[v1], q1, step))
+    step = min(step, _reach(planes, v1, u1, x[u], y[v], q0, step))
+    if v >= dv and u >= du and disparity[v - dv, u - du] > 0:
+        step = min(step, abs(2 * q0 - disparity[v - dv, u - du] - q1))
+    if v1 + dv < height and u1 + du < width and disparity[v1 + dv, u1 + du] > 0:
+        step = min(step, abs(2 * q1 - disparity[v1 + dv, u1 + du] - q0))
+    return step / max(q0, q1)
+
+
+@njit(cache=True)
+def _chord(planes: Float32Array, v: int, u: int, v1: int, u1: int) -> float:
+    """Distance of the unit normals of two pixels; 0 where one is unknown."""
+    a0, b0, c0 = planes[v, u, 0], planes[v, u, 1], planes[v, u, 2]
+    a1, b1, c1 = planes[v1, u1, 0], planes[v1, u1, 1], planes[v1, u1, 2]
+    if a0 == a1 and b0 == b1 and c0 == c1:
+        return 0.0
+    square0, square1 = a0 * a0 + b0 * b0 + c0 * c0, a1 * a1 + b1 * b1 + c1 * c1
+    if square0 == 0 or square1 == 0:
+        return 0.0
+    return np.sqrt(max(0.0, 2.0 - 2.0 * (a0 * a1 + b0 * b1 + c0 * c1) / np.sqrt(square0 * square1)))
+
+
+@njit(cache=True)
 def _find(parent: Int32Array, node: int) -> int:
     while parent[node] != node:
         parent[node] = parent[parent[node]]
@@ -120,8 +236,7 @@ def pair_costs(
 ) -> tuple[Float32Array, Float32Array, Float32Array]:
     """Colour, depth and normal difference (2, H, W) of each pixel to its right (0) and lower (1) neighbour, in units.
 
-    The depth difference is that between a pixel and the neighbour's plane, relative to its depth; -1 where one of the
-    two has no depth.
+    The depth difference is the part of the relative step that no slope explains; -1 where one of the two has no depth.
     """
     height, width = disparity.shape
     colour = np.zeros((2, height, width), np.float32)
@@ -139,17 +254,11 @@ def pair_costs(
                 q0, q1 = disparity[v, u], disparity[v1, u1]
                 if q0 <= 0 or q1 <= 0:
                     continue
-                p0, p1 = planes[v, u], planes[v1, u1]
-                length0 = np.sqrt(p0[0] * p0[0] + p0[1] * p0[1] + p0[2] * p0[2])
-                length1 = np.sqrt(p1[0] * p1[0] + p1[1] * p1[1] + p1[2] * p1[2])
-                if length0 == 0 or length1 == 0:
-                    depth[axis, v, u] = abs(q1 - q0) / max(q0, q1) / depth_unit
-                    continue
-                error0 = abs(p0[0] * x[u1] + p0[1] * y[v1] + p0[2] - q1) / q1
-                error1 = abs(p1[0] * x[u] + p1[1] * y[v] + p1[2] - q0) / q0
-                depth[axis, v, u] = min(error0, error1) / depth_unit
-                cosine = (p0[0] * p1[0] + p0[1] * p1[1] + p0[2] * p1[2]) / (length0 * length1)
-                normal[axis, v, u] = np.sqrt(max(0.0, 2.0 - 2.0 * cosine)) / normal_unit
+                if abs(q1 - q0) < 0.1 * depth_unit * q0:
+                    depth[axis, v, u] = 0.0  # below a tenth of a jump: not worth an extrapolation
+                else:
+                    depth[axis, v, u] = _jump(disparity, planes, v, u, dv, du, x, y) / depth_unit
+                normal[axis, v, u] = _chord(planes, v, u, v1, u1) / normal_unit
     return colour, depth, normal
 
 
@@ -210,3 +319,49 @@ def grow_superpixels(cost: Float32Array, scale: float, min_size: int, n_levels: 
                 n_labels += 1
             labels[v, u] = number[root]
     return labels
+
+
+@njit(cache=True)
+def sum_pixels(
+    labels: Int32Array,
+    n_labels: int,
+    lab: Float32Array,
+    disparity: Float32Array,
+    planes: Float32Array,
+    x: Float64Array,
+    y: Float64Array,
+) -> Float64Array:
+    """Sums (N, 17) over each label's pixels.
+
+    Columns: pixels, pixels with depth, colour (3), camera-frame point (3) m, its products xx xy xz yy yz zz, unit
+    normal towards the camera (3).
+    """
+    height, width = labels.shape
+    sums = np.zeros((n_labels, 17), np.float64)
+    for v in range(height):
+        for u in range(width):
+            row = sums[labels[v, u]]
+            row[0] += 1.0
+            for k in range(3):
+                row[2 + k] += lab[v, u, k]
+            if disparity[v, u] <= 0:
+                continue
+            pz = 1.0 / disparity[v, u]
+            px, py = x[u] * pz, y[v] * pz
+            row[1] += 1.0
+            row[5] += px
+            row[6] += py
+            row[7] += pz
+            row[8] += px * px
+            row[9] += px * py
+            row[10] += px * pz
+            row[11] += py * py
+            row[12] += py * pz
+            row[13] += pz * pz
+            a, b, c = planes[v, u, 0], planes[v, u, 1], planes[v, u, 2]
+            length = np.sqrt(a * a + b * b + c * c)
+            if length > 0:
+                row[14] -= a / length
+                row[15] -= b / length
+                row[16] -= c / length
+    return sums

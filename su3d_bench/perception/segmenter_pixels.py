@@ -2,28 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from su3d_bench.perception.segmenter_config import SegmenterConfig
-from su3d_bench.perception.segmenter_graph import Graph, measure_borders, sum_pixels
+from su3d_bench.perception.segmenter_graph import Graph, Pieces, measure_borders
 from su3d_bench.types import Float32Array, Float64Array, Frame, Int32Array, UInt8Array
 
 
-@dataclass(frozen=True)
-class PixelMaps:
-    """A frame at working resolution: ``lab`` (H, W, 3), ``points`` (H, W, 3) m in the camera frame, z 0 if unknown;
-    ``normals`` (H, W, 3) towards the camera, zero if unknown; ``labels`` (H, W) superpixels from 0."""
-
-    lab: Float32Array
-    points: Float64Array
-    normals: Float32Array
-    labels: Int32Array
-
-
-def superpixels(frame: Frame, config: SegmenterConfig) -> tuple[PixelMaps, Graph]:
-    """The superpixels of ``frame`` and the graph of their borders, at working resolution."""
+def superpixels(frame: Frame, config: SegmenterConfig) -> tuple[Int32Array, Graph]:
+    """The superpixels (H, W) of ``frame`` and the graph of their borders, at working resolution."""
     from su3d_bench.perception import segmenter_kernels as kernels
 
     rgb, depth_m, intrinsics = _at_working_size(frame, config.max_width)
@@ -41,14 +28,10 @@ def superpixels(frame: Frame, config: SegmenterConfig) -> tuple[PixelMaps, Graph
     )
     cost = np.sqrt(colour**2 + np.maximum(depth, 0) ** 2 + normal**2)
     labels = kernels.grow_superpixels(cost, config.superpixel_scale, config.min_superpixel_px, 2048)
-    length = np.linalg.norm(planes, axis=2, keepdims=True)
-    normals = (-planes / np.where(length > 0, length, 1)).astype(np.float32)
-    z = np.where(known, depth_m, 0).astype(np.float64)
-    points = np.stack([x[None, :] * z, y[:, None] * z, z], axis=2)
-    pieces = sum_pixels(labels, lab, points, normals)
+    pieces = Pieces.from_sums(kernels.sum_pixels(labels, int(labels.max()) + 1, lab, disparity, planes, x, y))
     borders = measure_borders(labels, colour * np.float32(config.colour_unit), depth, pieces)
     graph = Graph(pieces, borders, np.arange(len(pieces)))
-    return PixelMaps(lab, points, normals, labels), graph
+    return labels, graph
 
 
 def _at_working_size(frame: Frame, max_width: int) -> tuple[UInt8Array, Float32Array, Float64Array]:
@@ -85,7 +68,8 @@ def _planes(disparity: Float32Array, x: Float64Array, y: Float64Array, config: S
     broken = kernels.discontinuities(half, 2 * config.depth_jump, 2.0)
     distance = cv2.distanceTransform((~broken).astype(np.uint8), cv2.DIST_C, 3)
     radius = np.clip(distance.astype(np.int32) - 1, 1, config.normal_radius)
-    planes = kernels.fit_planes(half, radius, x[::2].copy(), y[::2].copy())
-    height, width = disparity.shape
-    full = np.repeat(np.repeat(planes, 2, axis=0), 2, axis=1)[:height, :width]
-    return np.ascontiguousarray(full)
+    half_x, half_y = x[::2].copy(), y[::2].copy()
+    planes = kernels.fit_planes(half, radius, half_x, half_y)
+    reach = config.normal_radius
+    planes = kernels.sharpen_planes(planes, half, reach, config.normal_keep, half_x, half_y)
+    return np.asarray(kernels.double_planes(planes, disparity, x, y), np.float32)

@@ -1,0 +1,185 @@
+"""The RGB-D segmenter on scenes of boxes and planes whose regions are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from perception_fakes import still_life
+
+from su3d_bench.perception.segmenter import RgbdSegmenter, SegmenterConfig
+from su3d_bench.types import BoolArray, Float32Array, Float64Array, Frame, Int32Array, Regions, UInt8Array
+
+K: Float64Array = np.array([[260.0, 0, 159.5], [0, 260.0, 119.5], [0, 0, 1]])
+WIDTH, HEIGHT = 320, 240
+TABLE, LEFT, RIGHT = 1, 2, 3
+
+Box = tuple[tuple[float, float, float], tuple[float, float, float]]
+
+
+def cast(boxes: dict[int, Box], camera_height_m: float = 0.9) -> tuple[Float32Array, Int32Array, Float64Array]:
+    """Depth, ids and normals seen from above by a camera that looks down at 45 degrees; id 1 is the ground z = 0."""
+    u, v = np.meshgrid(np.arange(WIDTH), np.arange(HEIGHT))
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(K).T
+    c = np.sqrt(0.5)
+    to_world = np.array([[1, 0, 0], [0, -c, c], [0, -c, -c]])  # x right, y away, z up
+    directions = rays @ to_world.T
+    origin = np.array([0.0, 0.0, camera_height_m])
+    depth = -origin[2] / directions[..., 2]
+    ids = np.full(depth.shape, TABLE, np.int32)
+    normals = np.broadcast_to(np.array([0.0, 0, 1]), (*depth.shape, 3)).copy()
+    for key, (low, high) in boxes.items():
+        with np.errstate(divide="ignore"):
+            t0, t1 = (np.array(low) - origin) / directions, (np.array(high) - origin) / directions
+        near, far = np.minimum(t0, t1), np.maximum(t0, t1)
+        enter, leave = near.max(axis=-1), far.min(axis=-1)
+        hit = (enter < leave) & (enter > 0) & (enter < depth)
+        depth[hit], ids[hit] = enter[hit], key
+        axis = near.argmax(axis=-1)
+        normals[hit] = (-np.sign(directions) * np.eye(3)[axis])[hit]
+    return depth.astype(np.float32), ids, normals
+
+
+def view(boxes: dict[int, Box], colours: dict[int, tuple[int, int, int]], noise: int = 4) -> tuple[Frame, Int32Array]:
+    """A lit frame of ``boxes`` on the ground, with a little noise on the colours, and its ids."""
+    depth_m, ids, normals = cast(boxes)
+    light = 0.75 + 0.25 * np.abs(normals @ np.array([0.3, 0.5, 0.81]))
+    table = np.array([colours[key] for key in sorted(colours)], np.float64)
+    rgb = table[np.searchsorted(sorted(colours), ids)] * light[..., None]
+    rgb += np.random.default_rng(0).integers(-noise, noise + 1, rgb.shape)
+    return Frame(0, 0.0, np.clip(rgb, 0, 255).astype(np.uint8), depth_m, np.eye(4), K), ids
+
+
+def best_iou(regions: Regions, truth: BoolArray) -> float:
+    return max((float((m & truth).sum() / (m | truth).sum()) for m in regions.masks), default=0.0)
+
+
+def objects(frame: Frame, **values: float) -> Regions:
+    return RgbdSegmenter(SegmenterConfig.model_validate(values), "objects").segment(frame)
+
+
+TWO_BOXES: dict[int, Box] = {
+    LEFT: ((-0.25, 0.7, 0.0), (0.0, 0.95, 0.2)),
+    RIGHT: ((0.0, 0.7, 0.0), (0.25, 0.95, 0.12)),
+}
+GREY, RED, BLUE = (190, 190, 190), (170, 60, 50), (60, 80, 170)
+
+
+def test_two_boxes_that_touch_on_a_table_are_two_regions() -> None:
+    frame, ids = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
+    regions = objects(frame)
+    assert best_iou(regions, ids == LEFT) > 0.9
+    assert best_iou(regions, ids == RIGHT) > 0.9
+
+
+def test_the_faces_of_one_box_are_one_object_and_several_parts() -> None:
+    boxes = {LEFT: TWO_BOXES[LEFT]}
+    frame, ids = view(boxes, {TABLE: GREY, LEFT: RED})
+    assert best_iou(objects(frame), ids == LEFT) > 0.9
+    parts = RgbdSegmenter(SegmenterConfig(), "parts").segment(frame)
+    n_on_box = sum((mask & (ids == LEFT)).sum() > 0.5 * mask.sum() for mask in parts.masks)
+    assert n_on_box >= 2
+
+
+def test_a_box_of_the_table_s_colour_is_found_by_shape() -> None:
+    frame, ids = view({LEFT: TWO_BOXES[LEFT]}, {TABLE: GREY, LEFT: GREY})
+    assert best_iou(objects(frame), ids == LEFT) > 0.8
+
+
+def test_a_box_on_a_box_is_a_region_of_its_own() -> None:
+    boxes: dict[int, Box] = {
+        LEFT: ((-0.25, 0.6, 0.0), (0.25, 1.0, 0.15)),
+        RIGHT: ((-0.08, 0.72, 0.15), (0.08, 0.88, 0.25)),
+    }
+    frame, ids = view(boxes, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
+    regions = objects(frame)
+    assert best_iou(regions, ids == LEFT) > 0.85 and best_iou(regions, ids == RIGHT) > 0.85
+
+
+def test_coplanar_regions_are_told_apart_by_colour() -> None:
+    frame = still_life()
+    picture = np.zeros(frame.depth_m.shape, bool)
+    picture[10:30, 70:110] = True
+    assert best_iou(objects(frame), picture) > 0.85
+
+
+def test_the_wall_is_no_object_but_a_part() -> None:
+    frame = still_life()
+    wall = (frame.depth_m == 3.0) & (frame.rgb[..., 0] == 205)
+    assert best_iou(objects(frame), wall) < 0.1
+    assert best_iou(RgbdSegmenter(SegmenterConfig(), "parts").segment(frame), wall) > 0.9
+
+
+def test_a_region_of_ten_by_ten_pixels_is_kept() -> None:
+    frame = still_life()
+    frame.rgb[95:105, 20:30] = 240, 200, 40
+    truth = np.zeros(frame.depth_m.shape, bool)
+    truth[95:105, 20:30] = True
+    assert best_iou(objects(frame, min_region_px=60), truth) > 0.6
+
+
+@pytest.mark.parametrize("fraction", [0.02, 0.2])
+def test_single_holes_in_the_depth_do_not_break_regions(fraction: float) -> None:
+    frame, ids = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
+    holes = np.random.default_rng(1).random(frame.depth_m.shape) < fraction
+    frame.depth_m[holes] = 0
+    regions = objects(frame)
+    assert best_iou(regions, ids == LEFT) > 0.8 and best_iou(regions, ids == RIGHT) > 0.8
+
+
+def test_an_object_without_any_depth_is_found_by_colour() -> None:
+    frame, ids = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
+    frame.depth_m[ids == LEFT] = 0
+    assert best_iou(objects(frame), ids == LEFT) > 0.6
+
+
+@pytest.mark.parametrize("depth_m", [0.0, 2.0, np.nan])
+@pytest.mark.parametrize("level", ["objects", "parts"])
+def test_a_flat_empty_frame_gives_few_regions_and_no_error(depth_m: float, level: str) -> None:
+    rgb: UInt8Array = np.full((120, 160, 3), 90, np.uint8)
+    frame = Frame(0, 0.0, rgb, np.full((120, 160), depth_m, np.float32), np.eye(4), K)
+    regions = RgbdSegmenter(SegmenterConfig(), "parts" if level == "parts" else "objects").segment(frame)
+    assert len(regions.boxes) <= 1 and regions.masks.shape[1:] == (120, 160)
+
+
+def test_masks_do_not_overlap_boxes_fit_and_scores_are_shares() -> None:
+    frame, _ = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
+    for level in ("objects", "parts"):
+        regions = RgbdSegmenter(SegmenterConfig(), "parts" if level == "parts" else "objects").segment(frame)
+        assert regions.masks.sum(axis=0).max() == 1
+        assert ((regions.scores > 0) & (regions.scores <= 1)).all()
+        for mask, (x0, y0, x1, y1) in zip(regions.masks, regions.boxes.astype(int), strict=True):
+            rows, columns = np.nonzero(mask)
+            assert (columns.min(), rows.min(), columns.max() + 1, rows.max() + 1) == (x0, y0, x1, y1)
+
+
+def test_the_same_frame_gives_the_same_bytes() -> None:
+    frame, _ = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
+    first, second = objects(frame), objects(frame)
+    assert first.masks.tobytes() == second.masks.tobytes() and first.scores.tobytes() == second.scores.tobytes()
+
+
+def test_wide_frames_are_segmented_at_a_fraction_of_their_size() -> None:
+    frame, ids = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
+    regions = objects(frame, max_width=160, min_region_px=60)
+    assert regions.masks.shape[1:] == (HEIGHT, WIDTH)
+    assert best_iou(regions, ids == LEFT) > 0.8
+
+
+def test_sizes_that_no_fraction_divides_are_covered() -> None:
+    frame, _ = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE})
+    odd = Frame(0, 0.0, frame.rgb[:239, :317].copy(), frame.depth_m[:239, :317].copy(), np.eye(4), K)
+    parts = RgbdSegmenter(SegmenterConfig(max_width=160, min_region_px=1), "parts").segment(odd)
+    assert parts.masks.any(axis=0).all()
+
+
+def test_parameters_and_level_move_the_digest() -> None:
+    configs = [SegmenterConfig(), SegmenterConfig(min_region_px=99)]
+    digests = {RgbdSegmenter(c, level).digest for c in configs for level in ("objects", "parts")}  # type: ignore[arg-type]
+    assert len(digests) == 4
+
+
+def test_coarser_parameters_give_fewer_regions() -> None:
+    frame, _ = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE}, noise=40)
+    fine = RgbdSegmenter(SegmenterConfig(superpixel_scale=2, surface_colour=3), "parts").segment(frame)
+    coarse = RgbdSegmenter(SegmenterConfig(superpixel_scale=60, surface_colour=30), "parts").segment(frame)
+    assert len(fine.boxes) > len(coarse.boxes)
