@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import os
+import platform
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 
 class Timer:
@@ -25,3 +28,20 @@ class Timer:
     def take(self) -> dict[str, float]:
         taken, self._elapsed_ms = self._elapsed_ms, {}
         return taken
+
+
+def hardware_line() -> str:
+    """One line on the machine: processor, cores, memory, system."""
+    import psutil
+
+    memory_gib = psutil.virtual_memory().total / 2**30
+    return f"{_processor()}, {os.cpu_count()} cores, {memory_gib:.0f} GiB, {platform.system()} {platform.machine()}"
+
+
+def _processor() -> str:
+    cpu_info = Path("/proc/cpuinfo")
+    if cpu_info.is_file():
+        for line in cpu_info.read_text(errors="replace").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or "unknown processor"

@@ -1,0 +1,142 @@
+"""A point cloud as seen from above or from a corner, in software: no OpenGL, no display.
+
+Points are splatted into a depth buffer at twice the size; the shading comes from that buffer alone (eye-dome lighting,
+Boucheny 2009), so that edges read without normals. What is drawn first is the *index* of the visible point, so that one
+rendering serves any number of colourings.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+
+from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
+
+BACKGROUND = (252, 252, 250)
+OVERSAMPLING = 2
+CUT_BELOW_TOP_M = 0.3  # what hangs at the ceiling goes with it
+CUT_BEHIND_WALL_M = 0.25
+ELEVATION = np.deg2rad(38.0)
+AZIMUTHS = (np.deg2rad(-125.0), np.deg2rad(55.0))
+FIELD_OF_VIEW = np.deg2rad(38.0)
+SHADE_STRENGTH = 60.0
+SHADE_REACH = 2  # pixels of the oversampled image
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A view of a box of the world.
+
+    ``rotation`` has the camera's right, down and forward axes as rows; ``focal`` is in pixels, or pixels a metre where
+    ``is_perspective`` is false. Points outside ``box`` (2, 3) are cut away.
+    """
+
+    rotation: Float64Array
+    eye: Float64Array
+    focal: float
+    is_perspective: bool
+    box: Float64Array
+    width: int
+    height: int
+
+
+@dataclass(frozen=True)
+class View:
+    """A rendering: ``point`` (h, w) int32 is the visible point, -1 for none; ``shade`` (h, w) float32 in 0..1."""
+
+    point: Int32Array
+    shade: Float32Array
+
+
+def room_bounds(points: Float32Array) -> Float64Array:
+    """Lowest and highest corner (2, 3) of a cloud, stray points left aside."""
+    return np.percentile(points.astype(np.float64), [0.5, 99.5], axis=0)
+
+
+def view_cameras(bounds: Float64Array, width: int, height: int) -> tuple[Camera, Camera, Camera]:
+    """A top view and views from two opposite corners of ``bounds``, ceiling and near walls cut away; z is up."""
+    width, height = width * OVERSAMPLING, height * OVERSAMPLING
+    low, high = bounds[0] - 0.1, bounds[1] + 0.1
+    open_top = np.array([low, [high[0], high[1], bounds[1][2] - CUT_BELOW_TOP_M]])
+    size = high - low
+    pixels_per_m = 0.96 * min(width / size[0], height / size[1])
+    above = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, open_top[1, 2] + 4.0])
+    top = Camera(np.diag([1.0, -1.0, -1.0]), above, pixels_per_m, False, open_top, width, height)
+    first, second = (_corner_camera(open_top, azimuth, width, height) for azimuth in AZIMUTHS)
+    return top, first, second
+
+
+def _corner_camera(open_top: Float64Array, azimuth: float, width: int, height: int) -> Camera:
+    outward = np.array([np.cos(azimuth) * np.cos(ELEVATION), np.sin(azimuth) * np.cos(ELEVATION), np.sin(ELEVATION)])
+    forward = -outward
+    right = np.cross(forward, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.array([right, np.cross(forward, right), forward])
+    box = open_top.copy()
+    for axis in range(2):
+        if outward[axis] > 0:
+            box[1, axis] -= CUT_BEHIND_WALL_M + 0.1
+        else:
+            box[0, axis] += CUT_BEHIND_WALL_M + 0.1
+    focal = 0.5 * height / np.tan(FIELD_OF_VIEW / 2)
+    corners = np.array(list(itertools.product(*open_top.T)))
+    relative = (corners - open_top.mean(axis=0)) @ rotation.T
+    # The least distance at which all corners are inside the image.
+    reach = np.abs(relative[:, :2]) * focal / (0.48 * np.array([width, height])) - relative[:, 2:]
+    eye = open_top.mean(axis=0) + outward * float(reach.max())
+    return Camera(rotation, eye, float(focal), True, box, width, height)
+
+
+def render(points: Float32Array, spacing_m: float, camera: Camera) -> View:
+    """The visible point of each pixel, every point drawn as a disc of ``spacing_m`` across."""
+    inside = np.flatnonzero(_inside(points, camera.box))
+    relative = (points[inside].astype(np.float64) - camera.eye) @ camera.rotation.T
+    depth = relative[:, 2]
+    scale = camera.focal / depth if camera.is_perspective else np.full(len(depth), camera.focal)
+    column = np.floor(relative[:, 0] * scale + camera.width / 2).astype(np.int64)
+    row = np.floor(relative[:, 1] * scale + camera.height / 2).astype(np.int64)
+    order = np.argsort(-depth, kind="stable")  # far first: of equal pixels the last write wins
+    column, row, depth, inside = column[order], row[order], depth[order], inside[order]
+    radius = 0.7 * spacing_m * scale[order]
+    point = np.full(camera.width * camera.height, -1, np.int32)
+    nearest = np.full(camera.width * camera.height, np.inf)
+    reach = int(np.ceil(min(radius.max(initial=1.0), 7.0)))
+    for dy in range(-reach, reach + 1):
+        for dx in range(-reach, reach + 1):
+            x, y = column + dx, row + dy
+            drawn = (dx * dx + dy * dy <= np.maximum(radius, 0.5) ** 2) & (x >= 0) & (y >= 0)
+            drawn &= (x < camera.width) & (y < camera.height)
+            pixel = y[drawn] * camera.width + x[drawn]
+            closer = depth[drawn] < nearest[pixel]
+            nearest[pixel[closer]] = depth[drawn][closer]
+            point[pixel[closer]] = inside[drawn][closer]
+    shape = (camera.height, camera.width)
+    return View(point.reshape(shape), _shade(nearest.reshape(shape)))
+
+
+def _inside(points: Float32Array, box: Float64Array) -> BoolArray:
+    inside: BoolArray = ((points >= box[0]) & (points <= box[1])).all(axis=1)
+    return inside
+
+
+def _shade(depth: Float64Array) -> Float32Array:
+    """How much each pixel lies behind its neighbours, as a factor: 1 on open surfaces, darker at depth edges."""
+    log_depth = np.log2(np.where(np.isfinite(depth), depth, np.nan))
+    behind = np.zeros_like(depth)
+    for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)):
+        neighbour = np.roll(log_depth, (dy * SHADE_REACH, dx * SHADE_REACH), axis=(0, 1))
+        behind += np.nan_to_num(np.clip(log_depth - neighbour, 0.0, 0.02), nan=0.0)
+    return np.exp(-SHADE_STRENGTH / 8.0 * behind).astype(np.float32)
+
+
+def colour(view: View, colours: UInt8Array) -> UInt8Array:
+    """The picture (h / 2, w / 2, 3) of a view, point i in ``colours[i]``, averaged down to size."""
+    palette = np.concatenate([colours, np.array([BACKGROUND], np.uint8)]).astype(np.float32)
+    picture = palette[view.point]  # -1 is the last row, the background
+    picture *= np.where(view.point >= 0, view.shade, 1.0)[..., None]
+    height, width = picture.shape[0] // OVERSAMPLING, picture.shape[1] // OVERSAMPLING
+    small = picture.reshape(height, OVERSAMPLING, width, OVERSAMPLING, 3).mean(axis=(1, 3))
+    averaged: UInt8Array = np.clip(np.rint(small), 0, 255).astype(np.uint8)
+    return averaged

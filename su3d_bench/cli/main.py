@@ -1,0 +1,84 @@
+"""``su3d-bench``: parse, hand to the verb, turn errors into one line and an exit code."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+
+from su3d_bench import __version__
+from su3d_bench.cli import methods, protocols, query, run
+from su3d_bench.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_WRONG_INPUT, ConfigError, Su3dError, suggest
+
+EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
+DESCRIPTION = "Evaluate and benchmark open-vocabulary, instance-level 3D scene understanding from RGB-D."
+EPILOG = """examples:
+  su3d-bench run --scenes rooms/living0 --methods opensu3d oracle
+  su3d-bench query rooms/living0 "plant on shelf"
+"""
+
+
+class Parser(argparse.ArgumentParser):
+    """An argument parser whose errors are ``ConfigError``, with a suggestion for a misspelt verb or flag."""
+
+    def error(self, message: str) -> None:  # type: ignore[override]
+        raise ConfigError(f"{self.prog}: {self._with_suggestion(message)}; see {self.prog} --help")
+
+    def _with_suggestion(self, message: str) -> str:
+        if message.startswith("unrecognized arguments: "):
+            word = message.removeprefix("unrecognized arguments: ").split()[0]
+            return f"unknown argument '{word}'{suggest(word, self._option_string_actions)}"
+        if "invalid choice: " in message:
+            argument, _, rest = message.partition(": invalid choice: ")
+            word = rest.split("'")[1]
+            known = [choice for action in self._actions for choice in (action.choices or ())]
+            return f"unknown {argument.removeprefix('argument ')} '{word}'{suggest(word, map(str, known))}"
+        return message
+
+
+def build_parser() -> Parser:
+    """The parser of all verbs; nothing heavy is imported for it."""
+    parser = Parser(
+        prog="su3d-bench",
+        description=DESCRIPTION,
+        epilog=EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"su3d-bench {__version__}")
+    verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
+    for module in (run, query, methods, protocols):
+        module.add_parser(verbs)
+    return parser
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line ``argv`` and return its exit code: 0 done, 1 check failed, 2 wrong input, 3 incomplete,
+    4 internal."""
+    words = list(sys.argv[1:] if argv is None else argv)
+    is_debug = "--debug" in words
+    try:
+        arguments = build_parser().parse_args(words)
+        code: int = arguments.call(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader of stdout, such as head, has gone; keep the interpreter from complaining at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return EXIT_DONE
+    except Su3dError as error:
+        if is_debug:
+            raise
+        print(f"su3d-bench: {' '.join(str(error).split())}", file=sys.stderr)
+        return error.exit_code
+    except KeyboardInterrupt:
+        print("su3d-bench: interrupted; the same command takes it up again", file=sys.stderr)
+        return EXIT_INTERRUPTED
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else EXIT_WRONG_INPUT if stop.code else EXIT_DONE
+    except Exception as error:
+        if is_debug:
+            raise
+        text = " ".join(f"{type(error).__name__}: {error}".split())
+        print(f"su3d-bench: internal error: {text}; run again with --debug for the traceback", file=sys.stderr)
+        return EXIT_INTERNAL
+    return code

@@ -1,0 +1,124 @@
+"""``su3d-bench query``: a text -> the instances of a map by similarity, and a heat map."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.errors import ConfigError, PredictionError, StoreError
+
+if TYPE_CHECKING:
+    from su3d_bench.opensu3d.retrieval import Ranking
+    from su3d_bench.store import RunFolder
+    from su3d_bench.types import Encoder, Instances
+
+
+def add_parser(verbs: Any) -> None:
+    parser = add_verb(
+        verbs,
+        "query",
+        "Rank the instances of a scene's map by their similarity to a text and draw the heat map.",
+        (
+            'su3d-bench query rooms/living0 "plant on shelf"',
+            'su3d-bench query rooms/living0 "place to sit" --top 3 --method opensu3d --json',
+        ),
+        call,
+    )
+    parser.add_argument("scene", help="the scene's address, such as rooms/living0")
+    parser.add_argument("text", help="what to look for")
+    parser.add_argument(
+        "--run", type=Path, metavar="DIR", help="run folder (default: the latest in runs/ with the scene)"
+    )
+    parser.add_argument("--method", default="opensu3d", help="whose map (default: opensu3d)")
+    parser.add_argument("--top", type=int, default=10, metavar="N", help="how many instances to list (default: 10)")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="where the picture goes (default: beside the map)")
+
+
+def call(arguments: argparse.Namespace) -> int:
+    from su3d_bench.executors import limit_threads
+
+    limit_threads()
+    from su3d_bench.opensu3d.retrieval import rank
+    from su3d_bench.reports.pictures import draw_heat_map
+    from su3d_bench.store import RunFolder, read_prediction
+    from su3d_bench.types import Instances
+
+    if arguments.top < 1:
+        raise ConfigError(f"--top {arguments.top}: at least 1 instance must be listed")
+    run = RunFolder(arguments.run) if arguments.run is not None else _latest_run(arguments.scene, arguments.method)
+    job = run.job(arguments.scene, arguments.method)
+    if not job.prediction.is_file():
+        raise StoreError(f"{run.path}: holds no map of {arguments.scene} by {arguments.method}; {_advice(arguments)}")
+    prediction = read_prediction(job.prediction)
+    if not isinstance(prediction, Instances):
+        raise PredictionError(f"{job.prediction}: holds no instances, so there is nothing to rank")
+    ranking = rank(prediction, arguments.text, _encoder(run))
+    rows = _rows(prediction, ranking, arguments.top)
+    picture = arguments.out or job.pictures / f"query-{_file_name(arguments.text)}.png"
+    lines = [f"{row['rank']}. {row['name']}  {row['similarity']:.3f}" for row in rows]
+    draw_heat_map(prediction, ranking.similarity, picture, f'{arguments.scene}: "{arguments.text}"', lines)
+    if arguments.json:
+        answer_json({"scene": arguments.scene, "text": arguments.text, "picture": str(picture), "ranking": rows})
+        return 0
+    answer(f"{'rank':>4}  {'id':>4}  {'similarity':>10}  {'centroid (m)':<22}  name")
+    for row in rows:
+        x, y, z = row["centroid"]
+        place = f"{x:7.2f}{y:7.2f}{z:7.2f}"
+        answer(f"{row['rank']:>4}  {row['id']:>4}  {row['similarity']:>10.3f}  {place:<22}  {row['name']}")
+    remark(f"heat map: {picture}", quiet=arguments.quiet)
+    return 0
+
+
+def _rows(instances: Instances, ranking: Ranking, top: int) -> list[dict[str, Any]]:
+    rows = []
+    for place, k in enumerate(ranking.order[:top], start=1):
+        rows.append(
+            {
+                "rank": place,
+                "id": int(instances.ids[k]) if len(instances.ids) else int(k),
+                "name": instances.names[k],
+                "similarity": float(ranking.similarity[k]),
+                "centroid": [float(value) for value in instances.centroids[k]],
+            }
+        )
+    return rows
+
+
+def _latest_run(scene: str, method: str) -> RunFolder:
+    """The run folder below ``runs/`` whose map of the scene is the youngest."""
+    from su3d_bench.store import RunFolder
+
+    runs = [RunFolder(path) for path in Path("runs").glob("*") if path.is_dir()]
+    made = [(run.job(scene, method).prediction, run) for run in runs if run.job(scene, method).prediction.is_file()]
+    if not made:
+        raise StoreError(
+            f"no run in runs/ holds {scene} by {method}; run: su3d-bench run --scenes {scene} --methods {method}"
+        )
+    return max(made, key=lambda pair: pair[0].stat().st_mtime)[1]
+
+
+def _advice(arguments: argparse.Namespace) -> str:
+    return f"run: su3d-bench run --scenes {arguments.scene} --methods {arguments.method} --out {arguments.run}"
+
+
+def _encoder(run: RunFolder) -> Encoder:
+    """The text tower that the run's features go with; another version of it is an error, never a wrong ranking."""
+    from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
+    from su3d_bench.store import read_json
+
+    record = read_json(run.path / "run.json")
+    encoder: Encoder = EmbeddedEncoder()
+    made_with = record.get("encoder_digest") if isinstance(record, dict) else None
+    if made_with not in (None, encoder.digest):
+        raise PredictionError(
+            f"{run.path}: its features were made by encoder {record['encoder']} ({made_with[:12]}), here is "
+            f"{encoder.name} ({encoder.digest[:12]}); run it again"
+        )
+    return encoder
+
+
+def _file_name(text: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60] or "text"

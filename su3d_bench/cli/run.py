@@ -1,0 +1,122 @@
+"""``su3d-bench run``: methods over scenes, scored under all protocols that fit."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.errors import EXIT_DONE, EXIT_INCOMPLETE
+
+if TYPE_CHECKING:
+    from su3d_bench.config import Settings
+    from su3d_bench.planning import Plan
+    from su3d_bench.runner import RunResult
+
+FLAGS_OF_KEYS = ("scenes", "methods", "profile", "protocols", "stride", "seed", "limit", "jobs")
+
+
+def add_parser(verbs: Any) -> None:
+    parser = add_verb(
+        verbs,
+        "run",
+        "Run methods over scenes and score them; the same command again resumes.",
+        (
+            "su3d-bench run --scenes rooms/living0 --methods opensu3d oracle",
+            "su3d-bench run --scenes 'rooms/*' --limit 5 --set opensu3d.top_m=10 --dry-run",
+        ),
+        call,
+    )
+    parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="addresses or patterns (default: 'rooms/*')")
+    parser.add_argument(
+        "--methods", nargs="+", metavar="METHOD", help="names, file.py:Class, or all (default: opensu3d)"
+    )
+    parser.add_argument("--profile", help="who supplies perception: auto, embedded, oracle, stored (default: auto)")
+    parser.add_argument(
+        "--protocols", nargs="+", metavar="PROTOCOL", help="evaluations (default: those of the dataset)"
+    )
+    parser.add_argument("--stride", type=int, metavar="N", help="frames between updates (default: the method's own)")
+    parser.add_argument("--seed", type=int, metavar="N", help="seed of everything random (default: 0)")
+    parser.add_argument(
+        "--limit", type=int, metavar="N", help="only the first N updates of each scene; marks it partial"
+    )
+    parser.add_argument("--jobs", type=int, metavar="N", help="scenes side by side (default: the CPU cores)")
+    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="such as opensu3d.top_m=10")
+    parser.add_argument("--config", type=Path, metavar="FILE", help="a TOML file, such as the run.toml of a run")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="run folder (default: runs/<name made from the request>)"
+    )
+    parser.add_argument("--dry-run", action="store_true", help="print what would be done, with a time estimate")
+
+
+def call(arguments: argparse.Namespace) -> int:
+    from su3d_bench.executors import limit_threads
+
+    limit_threads()  # before numerical libraries are loaded
+    from su3d_bench.planning import make_plan
+
+    plan = make_plan(settings_of(arguments), arguments.set, arguments.out)
+    for note in plan.notes:
+        remark(note, quiet=arguments.quiet)
+    if arguments.dry_run:
+        return _show_plan(plan, arguments)
+    return _carry_out(plan, arguments)
+
+
+def settings_of(arguments: argparse.Namespace) -> Settings:
+    """The file's settings, then those of the flags, which win."""
+    from su3d_bench.config import Setting, Settings, read_file
+
+    settings = Settings() if arguments.config is None else read_file(arguments.config)
+    flags = [(name, getattr(arguments, name)) for name in FLAGS_OF_KEYS]
+    return settings + Settings(tuple(Setting((n,), value, f"--{n}") for n, value in flags if value is not None))
+
+
+def _carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
+    from su3d_bench.cli.progress import progress
+    from su3d_bench.runner import run_plan
+
+    with progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
+        result = run_plan(plan, report)
+    _answer_result(result, arguments)
+    for _, _, line in result.failures:
+        remark(f"su3d-bench: {line}")
+    if result.is_complete:
+        return EXIT_DONE
+    n_failed = len({scene for scene, _, _ in result.failures})
+    log = plan.folder.job(*result.failures[0][:2]).log
+    remark(f"su3d-bench: incomplete: {n_failed} of {len(plan.jobs)} scenes failed; traceback in {log}")
+    return EXIT_INCOMPLETE
+
+
+def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
+    from su3d_bench.reports.tables import markdown_table
+
+    if arguments.json:
+        answer_json(result.metrics)
+    else:
+        answer(markdown_table(result.metrics))
+    for scene, method, line in result.remarks:
+        remark(f"{scene}, {method}: {line}", quiet=arguments.quiet)
+    remark(f"run folder: {result.plan.folder.path}", quiet=arguments.quiet)
+
+
+def _show_plan(plan: Plan, arguments: argparse.Namespace) -> int:
+    from su3d_bench.estimate import estimate
+
+    rows = estimate(plan)
+    if arguments.json:
+        jobs = [asdict(row) for row in rows]
+        answer_json({"folder": str(plan.folder.path), "n_workers": plan.n_workers, "jobs": jobs})
+        return EXIT_DONE
+    for row in rows:
+        state = "done already" if row.is_done else f"{row.n_updates} updates, about {row.seconds:.0f} s"
+        answer(f"{row.scene:<24} {row.method:<12} {state}")
+    total = sum(row.seconds for row in rows if not row.is_done) / plan.n_workers
+    source = "measured in earlier runs" if all(row.is_measured for row in rows) else "a rough guess"
+    answer(f"about {total / 60:.1f} minutes with {plan.n_workers} jobs ({source}); folder {plan.folder.path}")
+    for job in plan.jobs[:1]:
+        answer(f"protocols: {', '.join(job.protocols) or 'none'}; profile {job.profile}")
+    return EXIT_DONE

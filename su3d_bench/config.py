@@ -1,0 +1,217 @@
+"""What a run is asked to do: defaults, then a TOML file, then the command line; every value knows where it came from.
+
+A configuration travels as *settings*: one entry a leaf, keyed by its path (``("method", "opensu3d", "top_m")``).
+``resolve`` turns the settings under a prefix into a strict model, and its errors name the file and line, or the flag.
+"""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from su3d_bench.errors import ConfigError, suggest
+from su3d_bench.toml_text import key_lines
+
+Model = TypeVar("Model", bound=BaseModel)
+KeyPath = tuple[str, ...]
+SECTIONS = ("method", "dataset", "perception")
+DEFAULT_SOURCE = "default"
+
+
+class RunConfig(BaseModel):
+    """The part of a run that belongs to no dataset, method or perception profile.
+
+    ``protocols`` empty: those of each dataset; ``stride`` 0: the method's own; ``jobs`` 0: one a scene, at most one a
+    CPU core; ``limit`` 0: all frames, otherwise the first ``limit`` frames of each scene, and the run is partial.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    scenes: tuple[str, ...] = ("rooms/*",)
+    methods: tuple[str, ...] = ("opensu3d",)
+    profile: str = "auto"
+    protocols: tuple[str, ...] = ()
+    stride: int = Field(default=0, ge=0)
+    seed: int = Field(default=0, ge=0, lt=2**31)
+    limit: int = Field(default=0, ge=0)
+    jobs: int = Field(default=0, ge=0)
+
+
+@dataclass(frozen=True)
+class Setting:
+    """One value that was asked for, and where: ``run.toml:3`` or ``--set opensu3d.top_m``."""
+
+    path: KeyPath
+    value: Any
+    source: str
+
+
+@dataclass(frozen=True)
+class Settings:
+    """Everything that was asked for, later entries winning over earlier ones of the same path."""
+
+    entries: tuple[Setting, ...] = ()
+
+    def __add__(self, other: Settings) -> Settings:
+        return Settings(self.entries + other.entries)
+
+    def under(self, prefix: KeyPath) -> list[Setting]:
+        """The settings below ``prefix``, with paths relative to it."""
+        n = len(prefix)
+        below = [entry for entry in self.entries if entry.path[:n] == prefix and len(entry.path) > n]
+        return [Setting(entry.path[n:], entry.value, entry.source) for entry in below]
+
+    def source(self, path: KeyPath) -> str:
+        """Where the value at ``path`` came from; ``default`` where nobody asked."""
+        for entry in reversed(self.entries):
+            if entry.path[: len(path)] == path or path[: len(entry.path)] == entry.path:
+                return entry.source
+        return DEFAULT_SOURCE
+
+
+def read_file(path: Path) -> Settings:
+    """The settings of a TOML file; a syntax error names file and line."""
+    try:
+        text = path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot read the configuration: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path}: not a UTF-8 text file; a configuration is TOML") from error
+    try:
+        table = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        reason, _, place = str(error).partition(" (at ")
+        line = place.split(",")[0].removeprefix("line ") if place.startswith("line ") else str(text.count("\n") + 1)
+        raise ConfigError(f"{path}:{line}: not valid TOML: {reason[:1].lower()}{reason[1:]}") from error
+    lines = key_lines(text)
+    return Settings(tuple(Setting(leaf, value, f"{path}:{_line(lines, leaf)}") for leaf, value in flatten(table)))
+
+
+def _line(lines: Mapping[KeyPath, int], path: KeyPath) -> int:
+    for n in range(len(path), 0, -1):
+        if path[:n] in lines:
+            return lines[path[:n]]
+    return 1
+
+
+def flatten(table: Mapping[str, Any], prefix: KeyPath = ()) -> list[tuple[KeyPath, Any]]:
+    """Leaves of nested tables with their paths, in order; an empty table has none."""
+    leaves: list[tuple[KeyPath, Any]] = []
+    for key, value in table.items():
+        if isinstance(value, Mapping):
+            leaves += flatten(value, (*prefix, key))
+        else:
+            leaves.append(((*prefix, key), value))
+    return leaves
+
+
+def nest(leaves: Sequence[tuple[KeyPath, Any]]) -> dict[str, Any]:
+    """The nested table of ``leaves``; the reverse of ``flatten``."""
+    table: dict[str, Any] = {}
+    for path, value in leaves:
+        inner = table
+        for key in path[:-1]:
+            below = inner.get(key)
+            if not isinstance(below, dict):
+                below = inner[key] = {}
+            inner = below
+        inner[path[-1]] = value
+    return table
+
+
+def read_assignments(texts: Sequence[str], methods: Sequence[str], datasets: Sequence[str]) -> Settings:
+    """The settings of ``--set KEY=VALUE``: KEY is ``<method>.x``, ``<dataset>.x`` or ``perception.x``.
+
+    ``methods`` and ``datasets`` are the names that the run uses; VALUE is TOML, and plain text where it is not.
+    """
+    entries = []
+    for text in texts:
+        key, equals, value = text.partition("=")
+        path = tuple(key.strip().split("."))
+        if not equals or not all(path):
+            raise ConfigError(f"--set {text}: expected KEY=VALUE, such as opensu3d.top_m=10")
+        entries.append(Setting(_full_path(text, path, methods, datasets), _parse_value(value), f"--set {key.strip()}"))
+    return Settings(tuple(entries))
+
+
+def _full_path(text: str, path: KeyPath, methods: Sequence[str], datasets: Sequence[str]) -> KeyPath:
+    if len(path) == 1 and path[0] in RunConfig.model_fields:
+        raise ConfigError(f"--set {text}: '{path[0]}' has a flag of its own: --{path[0]}")
+    for section, names in (("method", methods), ("dataset", datasets)):
+        if path[0] in names and len(path) > 1:
+            return (section, *path)
+    if path[0] == "perception" and len(path) > 1:
+        return path
+    known = [*methods, *datasets, "perception"]
+    hint = suggest(path[0], known) or "; known: " + ", ".join(known)
+    raise ConfigError(f"--set {text}: '{path[0]}' is no method or dataset of this run{hint}")
+
+
+def _parse_value(text: str) -> Any:
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text.strip()
+
+
+def check_keys(settings: Settings) -> None:
+    """Refuse a top-level key that is neither a value of ``RunConfig`` nor a section."""
+    known = [*RunConfig.model_fields, *SECTIONS]
+    for entry in settings.entries:
+        if entry.path[0] not in known:
+            raise ConfigError(f"{entry.source}: unknown key '{entry.path[0]}'{suggest(entry.path[0], known)}")
+        depth = {"perception": 2, "method": 3, "dataset": 3}.get(entry.path[0], 1)
+        if len(entry.path) < depth:
+            names = ".".join([*entry.path, "<name>"][: depth - 1])
+            raise ConfigError(
+                f"{entry.source}: '{'.'.join(entry.path)}' is a section; write [{names}] and keys below it"
+            )
+
+
+def check_names(section: str, settings: Settings, known: Sequence[str]) -> None:
+    """Refuse ``[section.name]`` where ``name`` is not ``known``."""
+    for entry in settings.under((section,)):
+        if entry.path[0] not in known:
+            hint = suggest(entry.path[0], known) or "; known: " + ", ".join(known)
+            raise ConfigError(f"{entry.source}: unknown {section} '{entry.path[0]}'{hint}")
+
+
+def resolve(settings: Settings, prefix: KeyPath, model: type[Model]) -> Model:
+    """The strict ``model`` filled from the settings under ``prefix``; the first wrong value is a one-line error."""
+    below = settings.under(prefix)
+    if not prefix:
+        below = [entry for entry in below if entry.path[0] not in SECTIONS]
+    table = nest([(entry.path, entry.value) for entry in below])
+    try:
+        # Through JSON, because strict models take a list for a tuple and a text for a path only there.
+        return model.model_validate_json(json.dumps(table, default=str))
+    except ValidationError as error:
+        raise ConfigError(_explain(error, settings, prefix, model)) from error
+
+
+def _explain(error: ValidationError, settings: Settings, prefix: KeyPath, model: type[BaseModel]) -> str:
+    first = error.errors()[0]
+    path = tuple(part for part in first["loc"] if isinstance(part, str))
+    where = settings.source((*prefix, *path)) if path else settings.source(prefix)
+    dotted = ".".join((*prefix[1:], *path)) or ".".join(prefix)
+    if first["type"] == "extra_forbidden":
+        return f"{where}: unknown key '{path[-1]}'{suggest(path[-1], _fields(model, path[:-1]))}"
+    reason = first["msg"].removeprefix("Value error, ").removeprefix("Assertion failed, ")
+    value = first["input"] if not isinstance(first["input"], Mapping) else "..."
+    return f"{where}: {dotted} = {value!r}: {reason[:1].lower()}{reason[1:]}"
+
+
+def _fields(model: type[BaseModel], path: KeyPath) -> list[str]:
+    for key in path:
+        field = model.model_fields.get(key)
+        inner = field.annotation if field is not None else None
+        if not (isinstance(inner, type) and issubclass(inner, BaseModel)):
+            return []
+        model = inner
+    return list(model.model_fields)

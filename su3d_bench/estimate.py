@@ -1,0 +1,66 @@
+"""How long a plan will take, from the timings of earlier runs beside it."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from su3d_bench.errors import DataError
+from su3d_bench.planning import Plan
+from su3d_bench.scene_run import Part, SceneJob, build_dataset, build_method, stride_of
+
+# Where no earlier run says better: an update of opensu3d under the embedded profile at 640x480, and reading, scoring
+# and drawing one room under two protocols, both on two cores of a 2020s server.
+GUESSED_UPDATE_S = 0.5
+GUESSED_SCENE_S = 15.0
+N_RECENT = 8
+
+
+@dataclass(frozen=True)
+class JobEstimate:
+    """What one scene under one method will take; ``remark`` says why where its frames cannot be read."""
+
+    scene: str
+    method: str
+    n_updates: int
+    seconds: float
+    is_measured: bool
+    is_done: bool
+    remark: str | None = None
+
+
+def estimate(plan: Plan) -> list[JobEstimate]:
+    """One estimate a scene and method, in the order of the plan; reads no frame."""
+    return [_of_job(plan, job, part) for job in plan.jobs for part in job.methods]
+
+
+def _of_job(plan: Plan, job: SceneJob, part: Part) -> JobEstimate:
+    folder = plan.folder.job(job.scene, part.name)
+    is_done = {"predict", "score"} <= set(folder.seals())
+    n_updates, remark = 0, None
+    if build_method(part).needs.frames:
+        try:
+            dataset = build_dataset(job.dataset, job.data_root)
+            n_frames = len(dataset.frames(job.scene_name, stride_of(job.stride, part.options)))
+            n_updates = min(n_frames, job.limit or n_frames)
+        except DataError as error:
+            remark = str(error)
+    measured = _recent_update_s(plan.folder.path.parent, part.name)
+    seconds = GUESSED_SCENE_S + n_updates * (GUESSED_UPDATE_S if measured is None else measured)
+    return JobEstimate(job.scene, part.name, n_updates, seconds, measured is not None, is_done, remark)
+
+
+def _recent_update_s(runs: Path, method: str) -> float | None:
+    """Mean seconds an update in the latest runs below ``runs``; None where there is none."""
+    files = [path for path in runs.glob(f"*/scenes/*/{method}/updates.csv") if path.stat().st_size > 0]
+    newest = sorted(files, key=lambda path: path.stat().st_mtime)[-N_RECENT:]
+    totals = [ms for path in newest for ms in _totals(path)]
+    return sum(totals) / len(totals) / 1e3 if totals else None
+
+
+def _totals(path: Path) -> Iterator[float]:
+    with path.open(newline="") as stream:
+        for row in csv.DictReader(stream):
+            yield float(row["total_ms"])

@@ -1,0 +1,191 @@
+"""Where units of work run: in this process, or each in a spawned process of its own.
+
+A unit that takes its process down (killed for memory, a crash in native code) fails alone. Numerical libraries are
+held to one thread everywhere, so that no result depends on how many units run side by side.
+"""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from multiprocessing.connection import Connection, wait
+from multiprocessing.process import BaseProcess
+from typing import Any, Generic, TypeVar
+
+from su3d_bench.errors import Su3dError
+
+SCENE_DONE = "scene"  # label of the event that says that a unit is finished
+Unit = TypeVar("Unit")
+Outcome = TypeVar("Outcome")
+ONE_THREAD = dict.fromkeys(
+    (
+        "OMP_NUM_THREADS",
+        "OPENBLAS_NUM_THREADS",
+        "MKL_NUM_THREADS",
+        "NUMEXPR_NUM_THREADS",
+        "VECLIB_MAXIMUM_THREADS",
+        "NUMBA_NUM_THREADS",
+    ),
+    "1",
+)
+
+
+@dataclass(frozen=True)
+class Event:
+    """Progress of one unit: ``done`` of ``total`` steps under ``label``; ``n_instances`` of the map so far."""
+
+    unit: str
+    label: str
+    done: int
+    total: int
+    n_instances: int | None = None
+
+
+Report = Callable[[Event], None]
+Work = Callable[[Unit, Report], Outcome]
+
+
+def limit_threads() -> None:
+    """Hold libraries that are loaded from now on, in this process and its children, to one thread."""
+    os.environ.update(ONE_THREAD)
+
+
+@contextmanager
+def one_thread() -> Iterator[None]:
+    """Hold the libraries that are loaded already to one thread for the time of the block."""
+    import cv2
+    from threadpoolctl import threadpool_limits
+
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        with threadpool_limits(limits=1):
+            yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def run_inline(work: Work[Unit, Outcome], units: Sequence[Unit], report: Report) -> Iterator[Outcome]:
+    """Outcomes of ``units`` one after the other, in this process."""
+    for unit in units:
+        with one_thread():
+            outcome = work(unit, report)
+        yield outcome
+
+
+@dataclass
+class _Running(Generic[Unit]):
+    unit: Unit
+    process: BaseProcess
+    connection: Connection
+
+
+def run_processes(
+    work: Work[Unit, Outcome],
+    units: Sequence[Unit],
+    report: Report,
+    *,
+    jobs: int,
+    lost: Callable[[Unit, str], Outcome],
+) -> Iterator[Outcome]:
+    """Outcomes of ``units`` as they come in, at most ``jobs`` side by side, each unit in a fresh spawned process.
+
+    ``lost`` makes the outcome of a unit whose process died, from a clause that says how. A ``Su3dError`` that leaves
+    ``work``, or an interrupt, stops all.
+    """
+    waiting = list(reversed(units))
+    running: dict[Connection, _Running[Unit]] = {}
+    try:
+        while waiting or running:
+            while waiting and len(running) < jobs:
+                started = _start(work, waiting.pop())
+                running[started.connection] = started
+            for connection in wait(list(running)):
+                assert isinstance(connection, Connection)
+                message = _receive(connection)
+                if message is not None and message[0] == "event":
+                    report(message[1])
+                    continue
+                one = running.pop(connection)
+                one.process.join()
+                connection.close()
+                yield lost(one.unit, _cause(one.process.exitcode)) if message is None else _unwrap(message)
+    finally:
+        for one in running.values():
+            one.process.terminate()
+        for one in running.values():
+            one.process.join()
+            one.connection.close()
+
+
+def _start(work: Work[Unit, Outcome], unit: Unit) -> _Running[Unit]:
+    context = multiprocessing.get_context("spawn")
+    ours, theirs = context.Pipe(duplex=False)
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    limit_threads()
+    try:
+        process = context.Process(target=_worker, args=(work, unit, theirs), daemon=True)
+        process.start()
+    finally:
+        for name, value in before.items():
+            if value is None:
+                del os.environ[name]
+            else:
+                os.environ[name] = value
+    theirs.close()
+    return _Running(unit, process, ours)
+
+
+def _receive(connection: Connection) -> tuple[str, Any] | None:
+    """The next message of a worker; None when it died, be it in the middle of a message."""
+    try:
+        message: tuple[str, Any] = connection.recv()
+    except (EOFError, OSError):
+        return None
+    return message
+
+
+def _unwrap(message: tuple[str, Any]) -> Any:
+    kind, content = message
+    if kind == "user-error":
+        raise content
+    if kind == "internal-error":
+        raise RuntimeError(f"a worker failed:\n{content}")
+    return content
+
+
+def _cause(exit_code: int | None) -> str:
+    if exit_code == -signal.SIGKILL:
+        return "the worker was killed (signal 9), most often for want of memory; try fewer --jobs"
+    if exit_code is not None and exit_code < 0:
+        return f"the worker crashed (signal {-exit_code}, {signal.Signals(-exit_code).name})"
+    return f"the worker ended early (exit code {exit_code})"
+
+
+def _worker(work: Work[Unit, Outcome], unit: Unit, connection: Connection) -> None:
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interrupt means
+    threading.Thread(target=_die_with_parent, daemon=True).start()
+    message: tuple[str, Any]
+    try:
+        with one_thread():
+            message = ("outcome", work(unit, lambda event: connection.send(("event", event))))
+    except Su3dError as error:
+        message = ("user-error", error)
+    except BaseException:
+        connection.send(("internal-error", traceback.format_exc()))
+        raise
+    connection.send(message)
+    connection.close()
+
+
+def _die_with_parent() -> None:
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+    parent.join()
+    os._exit(1)

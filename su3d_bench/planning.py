@@ -1,0 +1,273 @@
+"""From what was asked for to what will be done: one job a scene, everything resolved and checked before any work."""
+
+from __future__ import annotations
+
+import difflib
+import fnmatch
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from su3d_bench import registry
+from su3d_bench.config import RunConfig, Settings, check_keys, check_names, read_assignments, resolve
+from su3d_bench.digests import code_digest, digest_json
+from su3d_bench.errors import ConfigError, DataError, suggest
+from su3d_bench.perception.profiles import PROFILES, PerceptionConfig
+from su3d_bench.protocols import ProtocolRules, load_protocol, protocols_for
+from su3d_bench.scene_run import (
+    CEILING_METHOD,
+    FIELDS_KNOWN_LATER,
+    Part,
+    SceneJob,
+    build_dataset,
+    build_method,
+    config_key,
+    refuse_other_run,
+)
+from su3d_bench.store import RunFolder
+from su3d_bench.types import Dataset
+
+DATA_ROOT = "~/.cache/su3d-bench/data"
+CACHE_ROOT = "~/.cache/su3d-bench/cache"
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What a run will do: one job a scene; ``notes`` are remarks for whoever asked."""
+
+    config: RunConfig
+    settings: Settings
+    folder: RunFolder
+    jobs: tuple[SceneJob, ...]
+    n_workers: int
+    notes: tuple[str, ...]
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        """Names of the methods that tables show."""
+        return tuple(part.name for part in self.jobs[0].methods)
+
+    @property
+    def is_partial(self) -> bool:
+        return self.config.limit > 0
+
+
+def data_root() -> Path:
+    """Where datasets are: ``$SU3D_DATA``, else the user's cache."""
+    return Path(os.environ.get("SU3D_DATA") or DATA_ROOT).expanduser()
+
+
+def cache_root() -> Path:
+    """Where per-frame perception is kept: ``$SU3D_CACHE``, else the user's cache."""
+    return Path(os.environ.get("SU3D_CACHE") or CACHE_ROOT).expanduser()
+
+
+def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | None = None) -> Plan:
+    """The plan of what was asked for; everything wrong with the request itself is found here, before any work.
+
+    ``assignments`` are ``KEY=VALUE`` texts as ``read_assignments`` takes them. ``out`` None: a folder below ``runs/``
+    named after datasets, profile and a key of the request, so that the same command resumes its own run.
+    """
+    check_keys(settings)
+    config = resolve(settings, (), RunConfig)
+    if config.profile not in PROFILES:
+        hint = suggest(config.profile, PROFILES) or "; known: " + ", ".join(PROFILES)
+        raise ConfigError(f"unknown profile '{config.profile}'{hint}")
+    methods = _own_names("method", _method_targets(config.methods))
+    datasets = _own_names("dataset", dataset_targets(config.scenes))
+    settings += read_assignments(assignments, list(methods), list(datasets))
+    _check_sections("method", settings, methods)
+    _check_sections("dataset", settings, datasets)
+    parts = _Parts(
+        tuple(_part("method", target, settings) for target in methods.values()),
+        {target: _part("dataset", target, settings) for target in datasets.values()},
+        None if CEILING_METHOD in methods else _part("method", CEILING_METHOD, settings),
+        resolve(settings, ("perception",), PerceptionConfig).model_dump_json(),
+        protocols_of_run(config.protocols, list(datasets.values())),
+    )
+    chosen, notes = expand_scenes(config.scenes, parts.datasets)
+    folder = out or Path("runs") / _run_name(config, parts)
+    jobs = tuple(_scene_job(config, parts, folder, target, scene) for target, scene in chosen)
+    n_workers = min(config.jobs or os.cpu_count() or 1, len(jobs))
+    plan = Plan(config, settings, RunFolder(folder), jobs, n_workers, notes)
+    _refuse_other_runs(plan)
+    return plan
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """The resolved parts of a run; ``datasets`` and ``protocols`` by the dataset's target."""
+
+    methods: tuple[Part, ...]
+    datasets: dict[str, Part]
+    ceiling: Part | None
+    perception: str
+    protocols: dict[str, tuple[str, ...]]
+
+
+def _own_names(kind: str, targets: Sequence[str]) -> dict[str, str]:
+    """Name that each class itself bears -> target."""
+    return {str(registry.load(kind, target).name): target for target in targets}
+
+
+def _options_model(kind: str, target: str) -> Any:
+    return getattr(registry.load(kind, target), "Config" if kind == "method" else "Options")
+
+
+def _part(kind: str, target: str, settings: Settings) -> Part:
+    name = str(registry.load(kind, target).name)
+    options = resolve(settings, (kind, name), _options_model(kind, target))
+    return Part(target, name, options.model_dump_json())
+
+
+def _check_sections(kind: str, settings: Settings, used: Mapping[str, str]) -> None:
+    """Sections of unknown names are refused; a shared file may configure parts unused here, but its keys must exist."""
+    known = dict.fromkeys([*used, *registry.names(kind)])
+    check_names(kind, settings, list(known))
+    for name in known:
+        if name not in used and settings.under((kind, name)):
+            resolve(settings, (kind, name), _options_model(kind, name))
+
+
+def _method_targets(methods: Sequence[str]) -> list[str]:
+    targets = registry.names("method") if "all" in methods else list(dict.fromkeys(methods))
+    if not targets:
+        raise ConfigError("no method was named; known: " + ", ".join(registry.names("method")))
+    return targets
+
+
+def split_address(address: str) -> tuple[str, str]:
+    """Dataset target and scene (or pattern) of ``rooms/living0`` or ``path/to/file.py:Class/scene``."""
+    head, colon, tail = address.partition(".py:")
+    if colon:
+        name, _, scene = tail.partition("/")
+        return f"{head}.py:{name}", scene
+    target, _, scene = address.partition("/")
+    return target, scene
+
+
+def dataset_targets(addresses: Sequence[str]) -> list[str]:
+    """The datasets that ``addresses`` speak of, in order; addresses that are mere files are passed over."""
+    targets: dict[str, None] = {}
+    for address in addresses:
+        target, _ = split_address(address)
+        if target in registry.names("dataset") or ".py:" in target:
+            targets[target] = None
+        elif not os.path.exists(address):
+            raise ConfigError(f"no scene matches '{address}'{_nearest_address(address)}")
+    if not targets:
+        raise ConfigError(
+            f"no scene among {', '.join(addresses) or 'no --scenes'}; such as: rooms/living0 or 'rooms/*'"
+        )
+    return list(targets)
+
+
+def expand_scenes(
+    addresses: Sequence[str], datasets: Mapping[str, Part]
+) -> tuple[list[tuple[str, str]], tuple[str, ...]]:
+    """(dataset target, scene) of every address or pattern, each once, in the order asked; and notes.
+
+    Files among the addresses, which a shell put there by expanding ``replica/*``, are left out with a note when
+    other addresses match.
+    """
+    chosen: dict[tuple[str, str], None] = {}
+    strangers = []
+    for address in addresses:
+        target, pattern = split_address(address)
+        dataset = build_dataset(datasets[target], data_root()) if target in datasets else None
+        scenes = [] if dataset is None else _matching_scenes(dataset, pattern)
+        if not scenes and os.path.exists(address):
+            strangers.append(address)
+        elif not scenes:
+            assert dataset is not None
+            known = [f"{target}/{scene}" for scene in dataset.scenes()]
+            raise ConfigError(f"no scene matches '{address}'{suggest(address, known) or _some(known)}")
+        chosen.update(dict.fromkeys((target, scene) for scene in scenes))
+    if not chosen:
+        raise ConfigError(f"no scene matches {', '.join(addresses)}; such as: rooms/living0 or 'rooms/*'")
+    notes = (f"not scenes, left out: {' '.join(strangers)}",) if strangers else ()
+    return list(chosen), notes
+
+
+def _matching_scenes(dataset: Dataset, pattern: str) -> list[str]:
+    scenes = list(dataset.scenes())
+    if any(character in pattern for character in "*?["):
+        return [scene for scene in scenes if fnmatch.fnmatchcase(scene, pattern)]
+    if pattern in scenes:
+        return [pattern]
+    try:  # a scene that is made on demand stands in no list
+        dataset.info(pattern, 1)
+    except DataError:
+        return []
+    return [pattern]
+
+
+def _some(known: Sequence[str]) -> str:
+    return "; known: " + ", ".join(known[:8]) + (", ..." if len(known) > 8 else "") if known else ""
+
+
+def _nearest_address(address: str) -> str:
+    target, slash, pattern = address.partition("/")
+    near = difflib.get_close_matches(target, registry.names("dataset"), n=1, cutoff=0.6)
+    if not near:
+        return "; known datasets: " + ", ".join(registry.names("dataset"))
+    return f"; did you mean '{near[0]}{slash or '/'}{pattern or '*'}'?"
+
+
+def protocols_of_run(asked: Sequence[str], targets: Sequence[str]) -> dict[str, tuple[str, ...]]:
+    """Dataset target -> protocols that score it: those asked for that fit it, or its own where none is asked for."""
+    if not asked:
+        return {target: tuple(protocols_for(registry.load("dataset", target).name)) for target in targets}
+    rules = [load_protocol(name) for name in dict.fromkeys(asked)]
+    classes = {target: registry.load("dataset", target) for target in targets}
+    for one in rules:
+        reasons = [reason for cls in classes.values() if (reason := why_not_fitting(one, cls)) is not None]
+        if len(reasons) == len(classes):
+            raise ConfigError(f"protocol '{one.name}' fits no scene of this run: {reasons[0]}")
+    return {
+        target: tuple(name for name, one in zip(asked, rules, strict=True) if why_not_fitting(one, cls) is None)
+        for target, cls in classes.items()
+    }
+
+
+def why_not_fitting(rules: ProtocolRules, dataset: Any) -> str | None:
+    """Why a dataset (class or object) cannot serve a protocol; None where it can."""
+    if rules.label_space != dataset.label_space:
+        return f"it scores the labels of '{rules.label_space}', {dataset.name} has those of '{dataset.label_space}'"
+    if rules.ground_truth not in dataset.variants:
+        return f"it needs ground truth '{rules.ground_truth}', {dataset.name} has {', '.join(dataset.variants)}"
+    return None
+
+
+def _run_name(config: RunConfig, parts: _Parts) -> str:
+    request = config.model_dump(mode="json", exclude={"jobs"})
+    options = [part.options for part in (*parts.methods, *parts.datasets.values())]
+    key = digest_json([request, options, parts.perception, code_digest()])[:8]
+    return "-".join([*(part.name for part in parts.datasets.values()), config.profile, key])
+
+
+def _scene_job(config: RunConfig, parts: _Parts, folder: Path, target: str, scene: str) -> SceneJob:
+    return SceneJob(
+        scene=f"{parts.datasets[target].name}/{scene}",
+        dataset=parts.datasets[target],
+        methods=parts.methods,
+        ceiling=parts.ceiling,
+        protocols=parts.protocols[target],
+        profile=config.profile,
+        perception=parts.perception,
+        stride=config.stride,
+        seed=config.seed,
+        limit=config.limit,
+        folder=folder,
+        data_root=data_root(),
+        cache_root=cache_root(),
+    )
+
+
+def _refuse_other_runs(plan: Plan) -> None:
+    for job in plan.jobs:
+        for part in job.methods:
+            key = config_key(job, part, build_method(part))
+            refuse_other_run(plan.folder.job(job.scene, part.name), key, FIELDS_KNOWN_LATER)

@@ -1,0 +1,178 @@
+"""Carry out a plan and sum it up: plan -> predict -> score -> ``metrics.json``.
+
+``metrics.json`` holds no time, date or path: two runs of one request give the same bytes, whatever the number of
+workers and however often a run was killed and taken up again.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from su3d_bench.config import KeyPath, flatten
+from su3d_bench.digests import code_digest, git_state, package_versions
+from su3d_bench.executors import SCENE_DONE, Event, Report, run_inline, run_processes
+from su3d_bench.planning import Plan
+from su3d_bench.protocols import ProtocolRules, load_protocol
+from su3d_bench.scene_run import CEILING_METHOD, MethodOutcome, SceneJob, failed_outcomes, run_scene
+from su3d_bench.scoring import SceneScore, combine, unpack_scores
+from su3d_bench.store import SCHEMA, write_json, write_text
+from su3d_bench.timing import hardware_line
+from su3d_bench.toml_text import write_toml
+
+Scores = Mapping[tuple[str, str, str], SceneScore]
+
+
+@dataclass(frozen=True)
+class RunResult:
+    """A finished run: ``metrics`` as in ``metrics.json``; ``failures`` and ``remarks`` are (scene, method, line)."""
+
+    plan: Plan
+    metrics: dict[str, Any]
+    outcomes: tuple[MethodOutcome, ...]
+    failures: tuple[tuple[str, str, str], ...]
+    remarks: tuple[tuple[str, str, str], ...]
+
+    @property
+    def is_complete(self) -> bool:
+        return not self.failures
+
+
+def run_plan(plan: Plan, report: Report) -> RunResult:
+    """Do every job of ``plan`` that is not done yet and write the run's records."""
+    with plan.folder.locked():
+        metrics_file = plan.folder.path / "metrics.json"
+        metrics_file.unlink(missing_ok=True)
+        write_text(plan.folder.path / "run.toml", write_toml(resolved_values(plan)))
+        write_json(plan.folder.path / "run.json", _record(plan, (), "running"))
+        try:
+            outcomes = _execute(plan, report)
+        except BaseException:
+            write_json(plan.folder.path / "run.json", _record(plan, (), "interrupted"))
+            raise
+        failed = [(one.scene, one.method, one.error) for one in outcomes if one.error is not None]
+        failures = tuple(each for each in failed if each[1] in plan.methods)
+        without_ceiling = [(scene, method, f"no ceiling: {line}") for scene, method, line in failed]
+        remarks = [each for each in without_ceiling if each[1] not in plan.methods]
+        remarks += [
+            (o.scene, o.method, f"{name} not scored: {reason}") for o in outcomes for name, reason in o.unscored
+        ]
+        metrics = summarise(plan, outcomes)
+        write_json(metrics_file, metrics)
+        write_json(plan.folder.path / "run.json", _record(plan, outcomes, "incomplete" if failures else "complete"))
+    return RunResult(plan, metrics, outcomes, failures, tuple(remarks))
+
+
+def _execute(plan: Plan, report: Report) -> tuple[MethodOutcome, ...]:
+    if plan.n_workers == 1:
+        finished = run_inline(run_scene, plan.jobs, report)
+    else:
+        finished = run_processes(run_scene, plan.jobs, report, jobs=plan.n_workers, lost=failed_outcomes)
+    by_scene: dict[str, tuple[MethodOutcome, ...]] = {}
+    for outcomes in finished:
+        by_scene[outcomes[0].scene] = outcomes
+        report(Event(outcomes[0].scene, SCENE_DONE, len(by_scene), len(plan.jobs)))
+    return tuple(outcome for job in plan.jobs for outcome in by_scene[job.scene])
+
+
+def resolved_values(plan: Plan) -> list[tuple[KeyPath, Any, str]]:
+    """Every value of the run with where it came from, parts in the order of the run."""
+    leaves = flatten(plan.config.model_dump(mode="json"))
+    job_of_dataset = {job.dataset.name: job for job in plan.jobs}
+    sections: list[tuple[KeyPath, str]] = [(("method", part.name), part.options) for part in plan.jobs[0].methods]
+    sections += [(("dataset", name), job.dataset.options) for name, job in job_of_dataset.items()]
+    sections.append((("perception",), plan.jobs[0].perception))
+    for prefix, options in sections:
+        leaves += [((*prefix, *path), value) for path, value in flatten(json.loads(options))]
+    return [(path, value, plan.settings.source(path)) for path, value in leaves]
+
+
+def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> dict[str, Any]:
+    """What ``metrics.json`` holds: one result a method and protocol, with ceiling and the scenes that are missing."""
+    scores: dict[tuple[str, str, str], SceneScore] = {}
+    for one in outcomes:
+        if one.error is None:
+            counts = plan.folder.job(one.scene, one.method).counts.read_bytes()
+            scores |= {(one.method, name, one.scene): score for name, score in unpack_scores(counts).items()}
+    protocols = dict.fromkeys(name for job in plan.jobs for name in job.protocols)
+    rules = [load_protocol(name) for name in protocols]
+    return {
+        "schema": SCHEMA,
+        "is_partial": plan.is_partial,
+        "limit": plan.config.limit,
+        "seed": plan.config.seed,
+        "scenes": [job.scene for job in plan.jobs],
+        "results": [_result(plan, method, one, outcomes, scores) for one in rules for method in plan.methods],
+    }
+
+
+def _result(
+    plan: Plan, method: str, rules: ProtocolRules, outcomes: Sequence[MethodOutcome], scores: Scores
+) -> dict[str, Any]:
+    planned = [job.scene for job in plan.jobs if rules.name in _protocol_names(job)]
+    mine = {one.scene: one for one in outcomes if one.method == method and one.scene in planned}
+    scored = {scene: scores[method, rules.name, scene] for scene in planned if (method, rules.name, scene) in scores}
+    failed = [scene for scene in planned if mine[scene].error is not None]
+    ceilings = {scene: scores.get((CEILING_METHOD, rules.name, scene)) for scene in scored}
+    perfect = {scene: score for scene, score in ceilings.items() if score is not None}
+    result = combine(rules, scored).to_json() if scored else None
+    encoder = _join(one.encoder for one in mine.values() if one.profile is not None)
+    caveats = [one.caveat for one in mine.values()]
+    if rules.encoder is not None and encoder is not None and encoder != rules.encoder:
+        caveats.append(f"the protocol's encoder is {rules.encoder}, here it is {encoder}: not the original's numbers")
+    return {
+        "method": method,
+        "protocol": rules.name,
+        "version": rules.version,
+        "kind": rules.kind,
+        "headline": list(rules.headline),
+        "profile": _join(one.profile for one in mine.values()),
+        "caveat": _join(caveats, "; "),
+        "encoder": encoder,
+        "encoder_digest": _join(one.encoder_digest for one in mine.values()),
+        "n_planned": len(planned),
+        "failed": failed,
+        "unscored": [scene for scene in planned if scene not in scored and scene not in failed],
+        "ceiling": combine(rules, perfect).to_json()["metrics"] if scored and len(perfect) == len(scored) else None,
+        "result": result,
+    }
+
+
+def _protocol_names(job: SceneJob) -> list[str]:
+    return [load_protocol(name).name for name in job.protocols]
+
+
+def _join(texts: Iterable[str | None], separator: str = ", ") -> str | None:
+    """Each text once; None where there is none."""
+    return separator.join(dict.fromkeys(text for text in texts if text)) or None
+
+
+def _record(plan: Plan, outcomes: Sequence[MethodOutcome], status: str) -> dict[str, Any]:
+    """What ``run.json`` holds: where the numbers come from."""
+    rules = [load_protocol(name) for name in dict.fromkeys(name for job in plan.jobs for name in job.protocols)]
+    return {
+        "schema": SCHEMA,
+        "status": status,
+        "is_partial": plan.is_partial,
+        "code": code_digest(),
+        "git": git_state(),
+        "packages": package_versions(),
+        "hardware": hardware_line(),
+        "n_workers": plan.n_workers,
+        "seed": plan.config.seed,
+        "profile": _join(one.profile for one in outcomes) or plan.config.profile,
+        "encoder": _join(one.encoder for one in outcomes),
+        "encoder_digest": _join(one.encoder_digest for one in outcomes),
+        "data_digests": {one.scene: one.data_digest for one in outcomes if one.data_digest is not None},
+        "protocols": [{"name": one.name, "version": one.version, "digest": one.digest} for one in rules],
+        "methods": [part.name for part in plan.jobs[0].methods],
+        "scenes": [job.scene for job in plan.jobs],
+        "failed": [{"scene": o.scene, "method": o.method, "error": o.error} for o in outcomes if o.error is not None],
+        "unscored": [
+            {"scene": one.scene, "method": one.method, "protocol": protocol, "reason": reason}
+            for one in outcomes
+            for protocol, reason in one.unscored
+        ],
+    }

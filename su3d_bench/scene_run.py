@@ -1,0 +1,296 @@
+"""One scene under all methods of a run: predict, score, draw; the unit of work that executors run.
+
+The ground truth stays here: methods get frames and detections alone, except a method that asks for the truth by
+having ``receive_truth`` (the oracle, from which ceilings come).
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import logging
+import time
+import traceback
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from su3d_bench import registry
+from su3d_bench.config import flatten
+from su3d_bench.digests import NUMERIC_PACKAGES, code_digest, digest_json, package_versions
+from su3d_bench.errors import DataError, GroundTruthMissing, StoreError, Su3dError
+from su3d_bench.executors import Event, Report
+from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
+from su3d_bench.protocols import load_protocol
+from su3d_bench.reports.pictures import draw_scene
+from su3d_bench.scoring import SceneScore, pack_scores, score_scene, why_not_scorable
+from su3d_bench.store import JobFolder, RunFolder, read_prediction, write_bytes, write_prediction, write_text
+from su3d_bench.timing import Timer
+from su3d_bench.types import Dataset, GroundTruth, InstanceMesh, Method, SceneInfo
+
+CEILING_METHOD = "oracle"
+FIELDS_KNOWN_LATER = ("data", "profile", "perception")
+Row = dict[str, float | int]
+
+
+@dataclass(frozen=True)
+class Part:
+    """A dataset or method of the run: its registry target, its own name, its resolved options as JSON."""
+
+    target: str
+    name: str
+    options: str
+
+
+@dataclass(frozen=True)
+class SceneJob:
+    """Everything that a worker needs to know of one scene."""
+
+    scene: str
+    dataset: Part
+    methods: tuple[Part, ...]
+    ceiling: Part | None
+    protocols: tuple[str, ...]
+    profile: str
+    perception: str
+    stride: int
+    seed: int
+    limit: int
+    folder: Path
+    data_root: Path
+    cache_root: Path
+
+    @property
+    def scene_name(self) -> str:
+        """The scene as its dataset calls it."""
+        return self.scene.removeprefix(f"{self.dataset.name}/")
+
+
+@dataclass(frozen=True)
+class MethodOutcome:
+    """What became of one scene under one method; ``error`` is a line, ``unscored`` pairs a protocol and a reason."""
+
+    scene: str
+    method: str
+    error: str | None = None
+    profile: str | None = None
+    caveat: str | None = None
+    encoder: str | None = None
+    encoder_digest: str | None = None
+    data_digest: str | None = None
+    was_resumed: bool = False
+    unscored: tuple[tuple[str, str], ...] = ()
+
+
+def stride_of(job_stride: int, options: str) -> int:
+    """Frames between updates: the run's where it is set, else the method's own, else 1."""
+    return job_stride or int(json.loads(options).get("stride", 1))
+
+
+def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
+    """What of a prediction's key is known before any data is read, the most telling fields first."""
+    key = {"dataset": job.dataset.name, "method": part.name, "seed": str(job.seed)}
+    sections = [(f"method.{part.name}", part.options), (f"dataset.{job.dataset.name}", job.dataset.options)]
+    if method.needs.frames:
+        key |= {"stride": str(stride_of(job.stride, part.options)), "limit": str(job.limit or "none")}
+        sections.append(("perception", job.perception))
+    for prefix, options in sections:
+        for path, value in flatten(json.loads(options)):
+            key[".".join((prefix, *path))] = json.dumps(value, ensure_ascii=False)
+    key.pop("perception.cache", None)  # a cache moves no number
+    return (
+        key
+        | {f"packages.{name}": text for name, text in package_versions(NUMERIC_PACKAGES).items()}
+        | {"code": code_digest()}
+    )
+
+
+def run_scene(job: SceneJob, report: Report) -> tuple[MethodOutcome, ...]:
+    """Outcomes of all methods on one scene, that of the ceiling last; a method that fails leaves the others alone."""
+    scene = _Scene(job, report)
+    parts = job.methods if job.ceiling is None else (*job.methods, job.ceiling)
+    return tuple(_guarded(scene, part) for part in parts)
+
+
+def failed_outcomes(job: SceneJob, reason: str) -> tuple[MethodOutcome, ...]:
+    """The outcome of a scene whose worker died; what its methods finished before stays and is resumed next time."""
+    line = f"{job.scene}: {reason}"
+    return tuple(MethodOutcome(job.scene, part.name, error=line) for part in job.methods)
+
+
+def _guarded(scene: _Scene, part: Part) -> MethodOutcome:
+    """The one place where a scene's failure, of whatever kind, becomes a record instead of the end of the sweep."""
+    job = scene.job
+    folder = RunFolder(job.folder).job(job.scene, part.name)
+    folder.prepare()
+    text = io.StringIO()
+    handler = logging.StreamHandler(text)
+    handler.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
+    package = logging.getLogger("su3d_bench")
+    package.addHandler(handler)
+    try:
+        outcome = scene.run(part, folder)
+    except StoreError:
+        raise
+    except Exception as error:  # noqa: BLE001 - a plug-in may raise anything; the traceback goes to the scene's log
+        line = error_line(error)
+        line = line if line.startswith(job.scene) else f"{job.scene}: {line}"
+        text.write("".join(traceback.format_exception(error)) + f"failed: {line}\n")
+        outcome = MethodOutcome(job.scene, part.name, error=line)
+    finally:
+        package.removeHandler(handler)
+    if not outcome.was_resumed:
+        write_text(folder.log, text.getvalue() + ("" if outcome.error else "done\n"))
+    return outcome
+
+
+def error_line(error: Exception) -> str:
+    """One line for any error; one that is not ours says its type."""
+    text = " ".join(str(error).split())
+    return text if isinstance(error, Su3dError) else f"{type(error).__name__}: {text}"
+
+
+class _Scene:
+    """One scene with what its methods share: the dataset, the truth."""
+
+    def __init__(self, job: SceneJob, report: Report) -> None:
+        self.job = job
+        self.report = report
+        self._truths: dict[str, GroundTruth] = {}
+
+    @cached_property
+    def dataset(self) -> Dataset:
+        dataset: Dataset = build_dataset(self.job.dataset, self.job.data_root)
+        return dataset
+
+    @cached_property
+    def data_digest(self) -> str:
+        return self.dataset.digest(self.job.scene_name)
+
+    @cached_property
+    def mesh(self) -> InstanceMesh:
+        return self.dataset.instance_mesh(self.job.scene_name)
+
+    def truth(self, variant: str) -> GroundTruth:
+        if variant not in self._truths:
+            self._truths[variant] = self.dataset.ground_truth(self.job.scene_name, variant)
+        return self._truths[variant]
+
+    def perception(self, info: SceneInfo) -> Perception:
+        config: PerceptionConfig = PerceptionConfig.model_validate_json(self.job.perception)
+        profile = resolve_profile(self.job.profile, info.image_domain)
+        mesh = self.mesh if profile == "oracle" else None
+        return build_perception(profile, config, scene=info, cache_root=self.job.cache_root, mesh=mesh)
+
+    def run(self, part: Part, folder: JobFolder) -> MethodOutcome:
+        """Predict and score one method, each step only where its seal is missing or broken."""
+        method = build_method(part)
+        info = self.dataset.info(self.job.scene_name, stride_of(self.job.stride, part.options))
+        info = replace(info, seed=self.job.seed)
+        perception = self.perception(info)
+        key = config_key(self.job, part, method) | {"data": self.data_digest}
+        if method.needs.frames:
+            key |= {"profile": perception.profile, "perception": perception.digest}
+        refuse_other_run(folder, key)
+        was_resumed = folder.is_done("predict", key)
+        if not was_resumed:
+            self._predict(method, info, perception, folder, key)
+        score_key = {"predict": digest_json(key), "encoder": perception.encoder.digest}
+        score_key |= {f"protocol.{name}": load_protocol(name).digest for name in self.job.protocols}
+        if not folder.is_done("score", score_key):
+            self._score(part, perception, folder, score_key)
+            was_resumed = False
+        return MethodOutcome(
+            self.job.scene,
+            part.name,
+            profile=perception.profile if method.needs.frames else None,
+            caveat=perception.caveat if method.needs.frames else None,
+            encoder=perception.encoder.name,
+            encoder_digest=perception.encoder.digest,
+            data_digest=self.data_digest,
+            was_resumed=was_resumed,
+            unscored=tuple(folder.remarks("score").items()),
+        )
+
+    def _predict(
+        self, method: Method, info: SceneInfo, perception: Perception, folder: JobFolder, key: Mapping[str, str]
+    ) -> None:
+        if hasattr(method, "receive_truth"):
+            method.receive_truth(self.mesh)
+        method.start(info)
+        rows = self._update_all(method, info, perception) if method.needs.frames else []
+        write_prediction(folder.prediction, method.finish())
+        write_text(folder.updates, _csv_text(rows))
+        folder.seal("predict", key, [folder.prediction, folder.updates])
+
+    def _update_all(self, method: Method, info: SceneInfo, perception: Perception) -> list[Row]:
+        frames = self.dataset.frames(self.job.scene_name, info.stride)
+        n = min(len(frames), self.job.limit or len(frames))
+        timer, rows = Timer(), []
+        for update in range(n):
+            start = time.perf_counter()
+            with timer.stage("decode"):
+                frame = frames[update]
+            if not (frame.depth_m > 0).any():
+                raise DataError(f"{self.job.scene} frame {frame.index}: depth is empty, no pixel is above 0 m")
+            detections = perception.detect(frame, method.needs, timer)
+            method.update(frame, detections, timer)
+            total_ms = (time.perf_counter() - start) * 1e3
+            size = {name: int(getattr(method, name)) for name in ("n_points", "n_instances") if hasattr(method, name)}
+            row: Row = {"update": update, "frame": frame.index, "n_detections": len(detections), **size}
+            row |= {f"{name}_ms": round(ms, 3) for name, ms in timer.take().items()}
+            rows.append(row | {"total_ms": round(total_ms, 3)})
+            self.report(Event(self.job.scene, method.name, update + 1, n, size.get("n_instances")))
+        return rows
+
+    def _score(self, part: Part, perception: Perception, folder: JobFolder, key: Mapping[str, str]) -> None:
+        """Score under every protocol that has a truth here, draw the map, and seal; reasons for the others go along."""
+        prediction = read_prediction(folder.prediction)
+        scores: dict[str, SceneScore] = {}
+        unscored: dict[str, str] = {}
+        for rules in map(load_protocol, self.job.protocols):
+            try:
+                truth = self.truth(rules.ground_truth)
+            except GroundTruthMissing as error:
+                unscored[rules.name] = error_line(error)
+                continue
+            if (reason := why_not_scorable(rules, prediction)) is not None:
+                unscored[rules.name] = reason
+                continue
+            scores[rules.name] = score_scene(rules, truth, prediction, perception.encoder)
+        write_bytes(folder.counts, pack_scores(scores))
+        truth_to_draw = next(iter(self._truths.values()), None)
+        pictures = draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
+        folder.seal("score", key, [folder.counts, *pictures], unscored)
+
+
+def refuse_other_run(folder: JobFolder, key: Mapping[str, str], known_later: Sequence[str] = ()) -> None:
+    """A ``StoreError`` where ``folder`` was sealed under another key, fields in ``known_later`` aside."""
+    if changed := folder.changed_field("predict", key, known_later=known_later):
+        raise StoreError(
+            f"{folder.path}: holds another run ({changed}); choose another folder with --out or delete this one"
+        )
+
+
+def build_dataset(part: Part, data_root: Path) -> Any:
+    """The dataset of ``part``, reading below ``data_root``."""
+    dataset_class = registry.load("dataset", part.target)
+    return dataset_class(data_root, dataset_class.Options.model_validate_json(part.options))
+
+
+def build_method(part: Part) -> Any:
+    """A fresh method of ``part``."""
+    method_class = registry.load("method", part.target)
+    return method_class(method_class.Config.model_validate_json(part.options))
+
+
+def _csv_text(rows: Sequence[Row]) -> str:
+    columns = list(dict.fromkeys(name for row in rows for name in row if name != "total_ms"))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [*columns, "total_ms"] if rows else ["update"], restval=0, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()

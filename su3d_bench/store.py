@@ -1,0 +1,268 @@
+"""The run folder: atomic writes, content keys, one writer at a time.
+
+A job is one scene under one method. It has two *steps*, ``predict`` and ``score``; ``done.json`` seals each with the
+key of all its inputs and the SHA-256 of the files that it vouches for. A file that is damaged or missing makes its
+step run anew; a step sealed under another key is refused, naming the field that changed.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import io
+import json
+import os
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.digests import digest_file
+from su3d_bench.errors import PredictionError, StoreError
+from su3d_bench.types import DenseFeatures, Instances, Partition, Prediction
+
+SCHEMA = 1
+ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
+REASONS = {
+    errno.ENOSPC: "the disk is full; free some space and run the same command again",
+    errno.EDQUOT: "the disk quota is used up; free some space and run the same command again",
+    errno.EACCES: "the folder is read-only; choose another with --out",
+    errno.EPERM: "the folder is read-only; choose another with --out",
+    errno.EROFS: "the folder is read-only; choose another with --out",
+    errno.ENOTDIR: "a file stands where a folder should be; choose another with --out",
+    errno.EEXIST: "a file stands where a folder should be; choose another with --out",
+}
+
+
+def _store_error(path: Path, error: OSError) -> StoreError:
+    reason = REASONS.get(error.errno or 0, error.strerror or str(error))
+    return StoreError(f"cannot write {path}: {reason}")
+
+
+def make_folder(path: Path) -> None:
+    """Make ``path`` and its parents."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise _store_error(path, error) from error
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Put ``content`` at ``path``, whole or not at all, even when the process or the machine dies meanwhile."""
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    try:
+        with temporary.open("wb") as stream:
+            stream.write(content)
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    except OSError as error:
+        temporary.unlink(missing_ok=True)
+        raise _store_error(path, error) from error
+
+
+def write_text(path: Path, text: str) -> None:
+    write_bytes(path, text.encode())
+
+
+def json_text(value: Any) -> str:
+    """JSON as every file of a run has it: two spaces, full precision, no NaN."""
+    return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def write_json(path: Path, value: Any) -> None:
+    write_text(path, json_text(value))
+
+
+def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """An .npz archive without pickle whose bytes depend on the arrays alone."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in arrays.items():
+            member = io.BytesIO()
+            np.lib.format.write_array(member, np.asarray(array), version=(1, 0), allow_pickle=False)
+            entry = zipfile.ZipInfo(f"{name}.npy", date_time=ZIP_EPOCH)
+            archive.writestr(entry, member.getvalue())
+    return buffer.getvalue()
+
+
+def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    write_bytes(path, npz_bytes(arrays))
+
+
+def read_npz(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of an .npz file; a damaged file is a ``StoreError``."""
+    try:
+        with np.load(path, allow_pickle=False) as archive:
+            return {name: archive[name] for name in archive.files}
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        raise StoreError(f"{path}: not a readable .npz file ({error}); delete it and run again") from error
+
+
+def read_json(path: Path) -> Any:
+    """The value of a JSON file; a missing or damaged file is a ``StoreError``."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be read: {error.strerror}") from error
+    except ValueError as error:
+        raise StoreError(f"{path}: not readable as JSON; run the same command again to mend it") from error
+
+
+def prediction_arrays(prediction: Prediction) -> dict[str, NDArray[Any]]:
+    """A prediction as named arrays, ``kind`` among them; absent fields are left out."""
+    arrays = {"kind": np.array(type(prediction).__name__)}
+    for name in prediction.__dataclass_fields__:
+        value = getattr(prediction, name)
+        if value is not None:
+            arrays[name] = np.array(value, dtype=np.str_) if isinstance(value, tuple) else value
+    return arrays
+
+
+def prediction_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Prediction:
+    """The reverse of ``prediction_arrays``; ``where`` begins the message when the arrays are no prediction."""
+    kinds = {kind.__name__: kind for kind in (Instances, Partition, DenseFeatures)}
+    kind = kinds.get(str(arrays.get("kind")))
+    if kind is None:
+        raise PredictionError(f"{where}: holds no 'kind' out of {', '.join(kinds)}; it is not a prediction")
+    values: dict[str, Any] = {}
+    for name in kind.__dataclass_fields__:
+        value = arrays.get(name)
+        values[name] = tuple(str(item) for item in value) if value is not None and value.dtype.kind == "U" else value
+    optional = {"features", "labels"}
+    missing = [name for name, value in values.items() if value is None and name not in optional]
+    if missing:
+        raise PredictionError(f"{where}: lacks '{missing[0]}'; write it again with su3d-bench run")
+    prediction: Prediction = kind(**values)
+    return prediction
+
+
+def write_prediction(path: Path, prediction: Prediction) -> None:
+    write_npz(path, prediction_arrays(prediction))
+
+
+def read_prediction(path: Path) -> Prediction:
+    """The prediction that a run stored at ``path``."""
+    return prediction_from_arrays(read_npz(path), str(path))
+
+
+@dataclass(frozen=True)
+class RunFolder:
+    """Where one run's files are; see DESIGN for the layout."""
+
+    path: Path
+
+    def job(self, scene: str, method: str) -> JobFolder:
+        """The folder of one scene (``<dataset>/<scene>``) under one method."""
+        return JobFolder(self.path / "scenes" / scene.replace("/", ".", 1).replace("/", "_") / method)
+
+    @contextmanager
+    def locked(self) -> Iterator[None]:
+        """Hold the folder against a second run; the lock dies with the process and leaves no file behind."""
+        make_folder(self.path)
+        try:
+            handle = os.open(self.path, os.O_RDONLY)
+        except OSError as error:
+            raise _store_error(self.path, error) from error
+        try:
+            try:
+                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            except BlockingIOError as error:
+                raise StoreError(
+                    f"{self.path}: another run is writing here; wait for it or choose another folder with --out"
+                ) from error
+            yield
+        finally:
+            os.close(handle)
+
+
+@dataclass(frozen=True)
+class JobFolder:
+    """The files of one scene under one method."""
+
+    path: Path
+
+    @property
+    def prediction(self) -> Path:
+        return self.path / "prediction.npz"
+
+    @property
+    def counts(self) -> Path:
+        return self.path / "counts.npz"
+
+    @property
+    def updates(self) -> Path:
+        return self.path / "updates.csv"
+
+    @property
+    def log(self) -> Path:
+        return self.path / "log.txt"
+
+    @property
+    def pictures(self) -> Path:
+        return self.path / "pictures"
+
+    @property
+    def done(self) -> Path:
+        return self.path / "done.json"
+
+    def prepare(self) -> None:
+        """Make the folder and clear what a killed run left half written."""
+        make_folder(self.path)
+        for leftover in [*self.path.glob(".*.tmp"), *self.pictures.glob(".*.tmp")]:
+            leftover.unlink(missing_ok=True)
+
+    def seals(self) -> dict[str, Any]:
+        """The sealed steps; nothing where ``done.json`` is missing or damaged."""
+        try:
+            record = read_json(self.done)
+        except StoreError:
+            return {}
+        steps = record.get("steps") if isinstance(record, dict) and record.get("schema") == SCHEMA else None
+        return steps if isinstance(steps, dict) else {}
+
+    def seal(
+        self, step: str, key: Mapping[str, str], files: Sequence[Path], remarks: Mapping[str, str] | None = None
+    ) -> None:
+        """Vouch for ``files`` as the outcome of ``step`` under ``key``; sealing ``predict`` breaks the other seal.
+
+        ``remarks`` are kept beside them for whoever resumes.
+        """
+        steps = {} if step == "predict" else self.seals()
+        digests = {file.relative_to(self.path).as_posix(): digest_file(file) for file in files}
+        steps[step] = {"key": dict(key), "files": digests, "remarks": dict(remarks or {})}
+        write_json(self.done, {"schema": SCHEMA, "steps": steps})
+
+    def remarks(self, step: str) -> dict[str, str]:
+        """What was kept beside the seal of ``step``."""
+        return {name: str(text) for name, text in self._part(step, "remarks").items()}
+
+    def changed_field(self, step: str, key: Mapping[str, str], *, known_later: Sequence[str] = ()) -> str | None:
+        """A clause that names the first field in which the sealed key differs from ``key``; None where none does.
+
+        Fields in ``known_later`` are not compared.
+        """
+        sealed = self._part(step, "key")
+        if not sealed:
+            return None
+        for name in [*key, *(name for name in sealed if name not in key)]:
+            if name not in known_later and sealed.get(name) != key.get(name):
+                return f"{name} was {sealed.get(name, 'not set')}, now {key.get(name, 'not set')}"
+        return None
+
+    def _part(self, step: str, part: str) -> dict[str, Any]:
+        seal = self.seals().get(step)
+        found = seal.get(part) if isinstance(seal, dict) else None
+        return found if isinstance(found, dict) else {}
+
+    def is_done(self, step: str, key: Mapping[str, str]) -> bool:
+        """Whether ``step`` is sealed under exactly ``key`` and every file that it vouches for is whole."""
+        files = self._part(step, "files")
+        if not files or self._part(step, "key") != dict(key):
+            return False
+        return all((self.path / name).is_file() and digest_file(self.path / name) == sha for name, sha in files.items())
