@@ -36,9 +36,9 @@ class TransferRules(BaseModel):
 
     ``candidates``: ``object-points`` (only points that belong to an instance, as ConceptGraphs concatenates its object
     clouds) or ``map-points`` (all points of the map; the nearest being background means no instance). ``cap_m``:
-    farther neighbours do not count, no cap when absent; a point without a neighbour is predicted as nothing. Each mask is first
-    reduced to one point a voxel of ``evaluation_voxel_m`` where that is above 0. Predictions on the scored points
-    themselves are taken as they are.
+    farther neighbours do not count, no cap when absent; a point without a neighbour is predicted as nothing. Each mask
+    is first reduced to one point a voxel of ``evaluation_voxel_m`` where that is above 0. Predictions on the scored
+    points themselves are taken as they are.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)

@@ -42,10 +42,18 @@ def bootstrap_interval(
     """
     if n_scenes < 2:
         return None
-    values = statistic(resample_weights(n_scenes, n_resamples, seed))
-    values = values[~np.isnan(values)]
-    if not len(values):
+    return percentile_interval(statistic(resample_weights(n_scenes, n_resamples, seed)), level)
+
+
+def percentile_interval(values: Float64Array, level: float = LEVEL) -> tuple[float, float] | None:
+    """The central ``level`` of resampled values, without their NaN; ``None`` where nothing is left.
+
+    >>> percentile_interval(np.array([0.0, 1.0, np.nan]), level=0.5)
+    (0.25, 0.75)
+    """
+    numbers = values[~np.isnan(values)]
+    if not len(numbers):
         return None
     tail = (1.0 - level) / 2.0
-    low, high = np.quantile(values, [tail, 1.0 - tail])
+    low, high = np.quantile(numbers, [tail, 1.0 - tail])
     return float(low), float(high)

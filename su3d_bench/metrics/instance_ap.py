@@ -32,8 +32,8 @@ class InstanceCounts:
 
     ``class_index`` (E,) int32 and ``threshold_index`` (E,) int32 say where row e counts, ``score`` (E,) float64 its
     confidence, ``is_true`` (E,) whether it is a true positive; ``n_missed`` (C, T) int64 counts the ground-truth
-    instances that nothing matched, ``n_truth`` (C,) those that take part, ``n_predictions`` (C,) the predictions of the
-    class with at least the minimum size, ignored ones included.
+    instances that nothing matched, ``n_truth`` (C,) those that take part, ``n_small_truth`` (C,) those below the
+    minimum size, ``n_predictions`` (C,) the predictions of at least that size, ignored ones included.
     """
 
     class_index: Int32Array
@@ -42,6 +42,7 @@ class InstanceCounts:
     is_true: BoolArray
     n_missed: Int64Array
     n_truth: Int64Array
+    n_small_truth: Int64Array
     n_predictions: Int64Array
 
 
@@ -174,6 +175,7 @@ def per_scene(
         is_true=np.concatenate([part.is_true for part in parts]),
         n_missed=np.concatenate([part.n_missed for part in parts]),
         n_truth=np.concatenate([part.n_truth for part in parts]),
+        n_small_truth=np.concatenate([part.n_small_truth for part in parts]),
         n_predictions=np.concatenate([part.n_predictions for part in parts]),
     )
 
@@ -206,6 +208,7 @@ def _count_class(
         is_true=np.array(is_true, bool),
         n_missed=n_missed,
         n_truth=np.array([takes_part.sum()], np.int64),
+        n_small_truth=np.array([(~takes_part).sum()], np.int64),
         n_predictions=np.array([len(scores)], np.int64),
     )
 
@@ -238,6 +241,7 @@ def concatenate(counts: Sequence[InstanceCounts]) -> InstanceCounts:
         is_true=np.concatenate([c.is_true for c in counts]),
         n_missed=np.sum([c.n_missed for c in counts], axis=0),
         n_truth=np.sum([c.n_truth for c in counts], axis=0),
+        n_small_truth=np.sum([c.n_small_truth for c in counts], axis=0),
         n_predictions=np.sum([c.n_predictions for c in counts], axis=0),
     )
 

@@ -118,8 +118,8 @@ def scannet_metrics(confusion: IntArray) -> SemanticMetrics:
     """IoU of each class as evaluate_semantic_label.py of ScanNet (commit 3830fce), with the means that it leaves out.
 
     ``confusion`` (C, C + 1), the last column for predictions outside the classes. A class that was never true is 0
-    where it was predicted and NaN where it was not; NaN leaves the mean IoU. Recall is NaN for a class that was never true;
-    mean accuracy is over the others, as frequency-weighted IoU is. These means are ours, not the original's.
+    where it was predicted and NaN where it was not; NaN leaves the mean IoU. Recall is NaN for a class that was never
+    true; mean accuracy is over the others, as frequency-weighted IoU is. These means are ours, not the original's.
 
     >>> metrics = scannet_metrics(np.array([[3, 1, 0], [0, 0, 0]]))
     >>> metrics.iou.tolist(), metrics.mean_iou, metrics.mean_accuracy

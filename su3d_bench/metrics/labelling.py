@@ -1,0 +1,93 @@
+"""From features to labels, with a protocol's vocabulary, prompt and encoder: argmax, the first maximum wins."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from su3d_bench.errors import PredictionError
+from su3d_bench.protocols import ProtocolRules
+from su3d_bench.types import BoolArray, Encoder, Float64Array, Int64Array, Prediction
+
+_BLOCK_ROWS = 8192  # 34 MB of float64 at 512 dimensions, whatever the size of the map
+
+
+def candidate_classes(rules: ProtocolRules, is_present: BoolArray) -> Int64Array:
+    """Indices of the classes among which the classifier may choose in a scene that contains ``is_present`` (C,)."""
+    if rules.vocabulary == "all":
+        return np.arange(len(rules.classes))
+    is_scored = np.array([not rules.is_ignored(entry.name) for entry in rules.classes])
+    return np.flatnonzero(is_scored & is_present if rules.vocabulary == "scene" else is_scored)
+
+
+def classes_of_prediction(
+    rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None, candidates: Int64Array
+) -> Int64Array:
+    """A class index for each instance, row of features or point; -1 where it is none of the protocol's classes.
+
+    Labels that the method itself decided are taken as they are; otherwise features are classified among ``candidates``.
+    """
+    labels = getattr(prediction, "labels", None)
+    if labels is not None:
+        index_of = {entry.name: index for index, entry in enumerate(rules.classes)}
+        return np.array([index_of.get(label, -1) for label in labels], np.int64)
+    features = prediction.features
+    if features is None:
+        if getattr(prediction, "scores", np.zeros(1)).size == 0:
+            return np.zeros(0, np.int64)
+        raise PredictionError(
+            f"{rules.name}: the prediction has neither labels nor features; give each instance one of them"
+        )
+    if encoder is None:
+        raise PredictionError(f"{rules.name}: the prediction has features, but there is no encoder to name them with")
+    if not len(candidates) or not len(features):
+        return np.full(len(features), -1, np.int64)
+    text = encoder.encode_texts([rules.prompt_of(rules.classes[index].name) for index in candidates])
+    if text.shape[1] != features.shape[1]:
+        raise PredictionError(
+            f"{rules.name}: features have {features.shape[1]} dimensions, the encoder '{encoder.name}' has "
+            f"{text.shape[1]}; name them with the encoder that made them"
+        )
+    return candidates[most_similar(features, text)]
+
+
+def most_similar(features: np.ndarray, text: np.ndarray) -> Int64Array:
+    """For each row of ``features`` (K, D) the row of ``text`` (C, D) of highest cosine, the first of equals.
+
+    A row of zeros, or of anything that is no number, has no direction: all its cosines count 0, so it gets row 0.
+
+    >>> most_similar(np.array([[0.0, 2.0], [3.0, 1.0], [0.0, 0.0]]), np.array([[1.0, 0.0], [0.0, 1.0]])).tolist()
+    [1, 0, 0]
+    """
+    directions = _normalised(np.asarray(text, np.float64))
+    best = np.empty(len(features), np.int64)
+    # one thread and blocks of one size: the last bit of a cosine may not depend on the machine's number of cores
+    with threadpool_limits(1, user_api="blas"):
+        for start in range(0, len(features), _BLOCK_ROWS):
+            block = np.asarray(features[start : start + _BLOCK_ROWS], np.float64)
+            best[start : start + _BLOCK_ROWS] = (_normalised(block) @ directions.T).argmax(axis=1)
+    return best
+
+
+def _normalised(rows: Float64Array) -> Float64Array:
+    rows = np.where(np.isfinite(rows).all(axis=1, keepdims=True), rows, 0.0)
+    length = np.sqrt((rows * rows).sum(axis=1, keepdims=True))
+    return rows / np.where(length > 0, length, 1.0)
+
+
+def encoder_warning(rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None) -> str | None:
+    """A sentence where another encoder than the protocol's named the features."""
+    if getattr(prediction, "labels", None) is not None or encoder is None or rules.encoder in (None, encoder.name):
+        return None
+    return f"labels come from the encoder '{encoder.name}', the protocol's is '{rules.encoder}'"
+
+
+def class_index_of_ids(rules: ProtocolRules, ids: Sequence[int] | np.ndarray) -> Int64Array:
+    """The class index of each class id, -1 for ids that are none of the protocol's classes."""
+    values = np.asarray(ids, np.int64)
+    index_of = {entry.id: index for index, entry in enumerate(rules.classes)}
+    distinct, inverse = np.unique(values, return_inverse=True)
+    table = np.array([index_of.get(int(value), -1) for value in distinct], np.int64)
+    return table[inverse] if len(values) else np.zeros(0, np.int64)

@@ -1,0 +1,232 @@
+"""From the points of a prediction to the points of the truth: nearest neighbours, the lowest index of equals."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.geometry import voxel_coordinates
+from su3d_bench.types import BoolArray, Float32Array, Float64Array, Instances, Int32Array, Int64Array
+
+IntArray = NDArray[np.integer[Any]]
+Points = Float32Array | Float64Array
+
+COVERAGE_RADII_M = (0.025, 0.05, 0.1)
+_MAX_NEIGHBOURS = 4_000_000  # candidates held at once while ties are broken
+
+
+@dataclass(frozen=True)
+class Masks:
+    """K sets of points in CSR form: set k is ``indices[indptr[k]:indptr[k + 1]]``, ascending."""
+
+    indptr: Int64Array
+    indices: Int32Array
+
+    def __len__(self) -> int:
+        return len(self.indptr) - 1
+
+
+def nearest(candidates: Points, queries: Points, cap_m: float = np.inf) -> tuple[Float64Array, Int64Array]:
+    """Distance in metres and index of each query's nearest candidate; infinity and -1 where none is within ``cap_m``.
+
+    Exact in float64; among candidates at the same squared distance the lowest index wins, so the answer depends on
+    neither the tree nor the number of threads.
+
+    >>> distance, index = nearest(np.array([[0.0, 0, 0], [2, 0, 0], [2, 0, 0]]), np.array([[1.0, 0, 0], [2, 0, 1]]))
+    >>> distance.tolist(), index.tolist()
+    ([1.0, 1.0], [0, 1])
+    """
+    n = len(candidates)
+    if not n or not len(queries):
+        return np.full(len(queries), np.inf), np.full(len(queries), -1, np.int64)
+    from scipy.spatial import cKDTree
+
+    held = np.asarray(candidates, np.float64)
+    asked = np.asarray(queries, np.float64)
+    tree = cKDTree(held, balanced_tree=False, compact_nodes=False)
+    # the tree takes only neighbours nearer than its bound; the cap itself still counts
+    bound = np.nextafter(cap_m, np.inf)
+    distances, indices = tree.query(asked, k=min(2, n), distance_upper_bound=bound, workers=1)
+    distances, indices = distances.reshape(len(asked), -1), indices.reshape(len(asked), -1)
+    distance, index = distances[:, 0].copy(), indices[:, 0].astype(np.int64)
+    if n > 1:
+        tied = np.flatnonzero((distances[:, 0] == distances[:, 1]) & np.isfinite(distances[:, 0]))
+        index[tied] = _lowest_of_equals(tree, held, asked[tied])
+    too_far = ~np.isfinite(distance) | (distance > cap_m)
+    distance[too_far], index[too_far] = np.inf, -1
+    return distance, index
+
+
+def _lowest_of_equals(tree: Any, candidates: Float64Array, queries: Float64Array) -> Int64Array:
+    """The lowest index among the nearest candidates of queries that have several."""
+    answer = np.empty(len(queries), np.int64)
+    open_rows = np.arange(len(queries))
+    k = 8
+    while len(open_rows):
+        k = min(k, len(candidates))
+        unfinished = []
+        step = max(1, _MAX_NEIGHBOURS // k)
+        for start in range(0, len(open_rows), step):
+            rows = open_rows[start : start + step]
+            _, found = tree.query(queries[rows], k=k, workers=1)
+            offset = candidates[found] - queries[rows][:, None, :]
+            squared = offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2
+            is_nearest = squared == squared.min(axis=1, keepdims=True)
+            answer[rows] = np.where(is_nearest, found, len(candidates)).min(axis=1)
+            # more equals may lie beyond the last neighbour that was asked for
+            unfinished.append(rows[is_nearest[:, -1]] if k < len(candidates) else rows[:0])
+        open_rows = np.concatenate(unfinished)
+        k *= 8
+    return answer
+
+
+def are_same_points(left: Points, right: Points) -> bool:
+    """Whether two clouds are one and the same list of points."""
+    return left is right or (left.shape == right.shape and bool(np.array_equal(left, right)))
+
+
+def reduce_to_voxels(points: Points, masks: Masks, voxel_m: float) -> Int64Array:
+    """Indices, ascending, of the points that stay when each mask, and the background, keeps its first point a voxel."""
+    _, voxel = np.unique(voxel_coordinates(points, voxel_m), axis=0, return_inverse=True)
+    voxel = voxel.reshape(-1).astype(np.int64)
+    n_voxels = int(voxel.max()) + 1 if len(voxel) else 0
+    background = np.ones(len(points), bool)
+    background[masks.indices] = False
+    outside = np.flatnonzero(background)
+    members = np.concatenate([masks.indices.astype(np.int64), outside])
+    owner = np.concatenate([owners(masks), np.full(len(outside), len(masks), np.int64)])
+    _, first = np.unique(owner * n_voxels + voxel[members], return_index=True)
+    return np.unique(members[first])
+
+
+def owners(masks: Masks) -> Int64Array:
+    """The mask of each entry of ``masks.indices``."""
+    return np.repeat(np.arange(len(masks)), np.diff(masks.indptr))
+
+
+def transfer_masks(
+    points: Points, masks: Masks, targets: Points, cap_m: float | None = None, voxel_m: float = 0.0
+) -> Masks:
+    """The masks on ``targets``: a target belongs to mask k where the nearest of all ``points`` within the cap does.
+
+    Masks that overlap stay overlapping; a target whose nearest point is in no mask is in none. On ``points`` themselves
+    the masks stay as they are.
+
+    >>> masks = Masks(np.array([0, 1, 3]), np.array([0, 0, 1]))
+    >>> points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]])
+    >>> moved = transfer_masks(points, masks, np.array([[0.1, 0, 0], [1.9, 0, 0]]))
+    >>> moved.indptr.tolist(), moved.indices.tolist()
+    ([0, 1, 2], [0, 0])
+    """
+    if are_same_points(points, targets):
+        return masks
+    kept = reduce_to_voxels(points, masks, voxel_m) if voxel_m > 0 else np.arange(len(points))
+    _, found = nearest(points[kept], targets, np.inf if cap_m is None else cap_m)
+    reached = np.flatnonzero(found >= 0)
+    from scipy.sparse import csr_array
+
+    of_point = csr_array(
+        (np.ones(len(masks.indices), np.int8), masks.indices, masks.indptr), shape=(len(masks), len(points))
+    ).tocsc()
+    moved = of_point[:, kept[found[reached]]].tocsr()
+    moved.sort_indices()
+    return Masks(moved.indptr.astype(np.int64), reached[moved.indices].astype(np.int32))
+
+
+def first_owner(masks: Masks, n_points: int) -> Int64Array:
+    """For each point the first mask that holds it, -1 where none does.
+
+    >>> first_owner(Masks(np.array([0, 2, 4]), np.array([0, 1, 1, 2])), 4).tolist()
+    [0, 0, 1, -1]
+    """
+    owner = np.full(n_points, -1, np.int64)
+    owner[masks.indices[::-1]] = owners(masks)[::-1]
+    return owner
+
+
+def transfer_values(
+    points: Points, values: Int64Array, rank: Int64Array, targets: Points, wanted: BoolArray
+) -> tuple[Int64Array, Float64Array]:
+    """Value and distance in metres of the nearest point with a rank, for each wanted target; -1 and infinity elsewhere.
+
+    Points of rank -1 take no part. At equal distance the lower ``rank`` wins, then the lower index. On ``points``
+    themselves a point with a rank keeps its own value, also where others share its place.
+
+    >>> points = np.array([[0.0, 0, 0], [1, 0, 0]])
+    >>> values, distance = transfer_values(
+    ...     points, np.array([7, 8]), np.array([0, -1]), points, np.array([True, True])
+    ... )
+    >>> values.tolist(), distance.tolist()
+    ([7, 7], [0.0, 1.0])
+    """
+    order = np.flatnonzero(rank >= 0)
+    order = order[np.argsort(rank[order], kind="stable")]
+    value, distance = np.full(len(targets), -1, np.int64), np.full(len(targets), np.inf)
+    missing = wanted
+    if are_same_points(points, targets):
+        own = wanted & (rank >= 0)
+        value[own], distance[own] = values[own], 0.0
+        missing = wanted & ~own
+    asked = np.flatnonzero(missing)
+    distance[asked], found = nearest(points[order], targets[asked])
+    reached = asked[found >= 0]
+    value[reached] = values[order][found[found >= 0]]
+    return value, distance
+
+
+def n_farther(distance: Float64Array) -> Int64Array:
+    """How many distances are above each coverage radius.
+
+    >>> n_farther(np.array([0.0, 0.03, 0.2])).tolist()
+    [2, 1, 1]
+    """
+    return np.array([(distance > radius).sum() for radius in COVERAGE_RADII_M], np.int64)
+
+
+def duplicate_pairs(masks: Masks, n_points: int, iou: float) -> list[tuple[int, int]]:
+    """Pairs of masks, the lower first, whose IoU is above ``iou``."""
+    from scipy.sparse import csr_array
+
+    member = csr_array(
+        (np.ones(len(masks.indices), np.int32), masks.indices, masks.indptr), shape=(len(masks), n_points)
+    )
+    shared = (member @ member.T).tocoo()
+    size = np.diff(masks.indptr)
+    union = size[shared.row] + size[shared.col] - shared.data
+    found = (shared.row < shared.col) & (shared.data > iou * union)
+    return sorted(zip(shared.row[found].tolist(), shared.col[found].tolist(), strict=True))
+
+
+def masks_of(instances: Instances) -> Masks:
+    """The masks of a map, in its order."""
+    return Masks(instances.indptr, instances.indices)
+
+
+def select(masks: Masks, keep: IntArray) -> Masks:
+    """The masks ``keep``, in that order.
+
+    >>> select(Masks(np.array([0, 2, 3]), np.array([4, 5, 6])), np.array([1])).indices.tolist()
+    [6]
+    """
+    sizes = np.diff(masks.indptr)[keep]
+    indices = [masks.indices[masks.indptr[k] : masks.indptr[k + 1]] for k in keep]
+    return Masks(
+        np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+        np.concatenate([masks.indices[:0], *indices]),
+    )
+
+
+def masks_of_partition(instance: IntArray, n_instances: int) -> Masks:
+    """The masks of one instance id a point, -1 for none.
+
+    >>> masks = masks_of_partition(np.array([1, -1, 0, 1]), 2)
+    >>> masks.indptr.tolist(), masks.indices.tolist()
+    ([0, 1, 3], [2, 0, 3])
+    """
+    order = np.argsort(instance, kind="stable")
+    order = order[instance[order] >= 0]
+    sizes = np.bincount(instance[order], minlength=n_instances)
+    return Masks(np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64), order.astype(np.int32))

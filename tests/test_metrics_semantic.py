@@ -1,0 +1,141 @@
+"""The semantic metrics answer what the original evaluators answer."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from su3d_bench.metrics.semantic import (
+    SemanticCounts,
+    SemanticMetrics,
+    concatenate,
+    conceptgraphs_metrics,
+    confusion_matrix,
+    per_scene,
+    scannet_metrics,
+)
+
+CASES = Path(__file__).parent / "cases"
+GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())
+POOLING = GOLDEN["cg_pooling"]
+CONCEPTGRAPHS_CASES = {
+    "all five classes": (GOLDEN["cg"]["conf"], range(5), GOLDEN["cg"]["all5"]),
+    "four kept classes": (GOLDEN["cg"]["conf"], GOLDEN["cg"]["keep"], GOLDEN["cg"]["kept"]),
+    "F1 quirk": (GOLDEN["cg_f1_quirk"]["conf"], range(3), GOLDEN["cg_f1_quirk"]["metrics"]),
+    "zero rows": (GOLDEN["cg_zero_rows"]["conf"], range(3), GOLDEN["cg_zero_rows"]["metrics"]),
+    "scene A": (POOLING["A"], POOLING["keepA"], POOLING["metricsA"]),
+    "scene B": (POOLING["B"], POOLING["keepB"], POOLING["metricsB"]),
+    "pooled": (POOLING["all"], POOLING["keep_all"], POOLING["metrics_all"]),
+}
+SCANNET_CASES = ("sem01_all_classes", "sem02_missing_classes", "sem03_no_valid_gt", "sem04_perfect")
+
+
+def as_golden(metrics: SemanticMetrics) -> dict[str, Any]:
+    return {
+        "iou": metrics.iou.tolist(),
+        "miou": metrics.mean_iou,
+        "fmiou": metrics.frequency_weighted_iou,
+        "num_classes": len(metrics.class_index),
+        "acc0.15": metrics.n_classes_above[0],
+        "acc0.25": metrics.n_classes_above[1],
+        "acc0.50": metrics.n_classes_above[2],
+        "acc0.75": metrics.n_classes_above[3],
+        "precision": metrics.precision.tolist(),
+        "recall": metrics.recall.tolist(),
+        "f1score": metrics.f1_conceptgraphs.tolist(),
+    }
+
+
+@pytest.mark.parametrize("case", CONCEPTGRAPHS_CASES)
+def test_conceptgraphs_golden_values_are_equal_in_every_bit_in_float32(case: str) -> None:
+    confusion, keep, expected = CONCEPTGRAPHS_CASES[case]
+    assert as_golden(conceptgraphs_metrics(np.array(confusion), np.array(keep), np.float32)) == expected
+
+
+@pytest.mark.parametrize("case", CONCEPTGRAPHS_CASES)
+def test_float64_differs_from_the_golden_values_by_less_than_float32_rounding(case: str) -> None:
+    confusion, keep, expected = CONCEPTGRAPHS_CASES[case]
+    ours = as_golden(conceptgraphs_metrics(np.array(confusion), np.array(keep)))
+    for key, value in expected.items():
+        np.testing.assert_allclose(ours[key], value, rtol=0, atol=6e-8)
+
+
+def test_the_printed_golden_figures_come_out() -> None:
+    kept = conceptgraphs_metrics(np.array(GOLDEN["cg"]["conf"]), np.array([0, 1, 3, 4]))
+    assert round(kept.mean_iou, 7) == 0.4989157
+    assert round(kept.frequency_weighted_iou, 7) == 0.6476767
+    pooled = conceptgraphs_metrics(np.array(POOLING["all"]), np.array([0, 1, 2]))
+    assert round(pooled.mean_accuracy, 5) == 0.73889
+
+
+def test_the_f1_of_conceptgraphs_has_its_own_name_beside_the_harmonic_mean() -> None:
+    metrics = conceptgraphs_metrics(np.array(GOLDEN["cg_f1_quirk"]["conf"]), np.arange(3))
+    np.testing.assert_allclose(metrics.f1, [0.1379, 0.1818, 0.2979], atol=5e-5)
+    np.testing.assert_allclose(metrics.f1_conceptgraphs, [0.0444, 0.0667, 0.1815], atol=5e-5)
+
+
+def test_points_in_the_extra_column_lower_recall_and_no_precision() -> None:
+    metrics = conceptgraphs_metrics(np.array([[6, 0, 2], [0, 4, 0]]), np.arange(2))
+    assert metrics.recall.tolist() == [0.75, 1.0]
+    assert metrics.precision.tolist() == [1.0, 1.0]
+    assert metrics.iou.tolist() == [0.75, 1.0]
+
+
+@pytest.mark.parametrize("case", SCANNET_CASES)
+def test_scannet_cases_are_equal_in_every_bit(case: str) -> None:
+    expected = json.loads((CASES / f"{case}.json").read_text())
+    official = expected["official_py3"]
+    ids = official["class_ids"]
+    index_of = np.full(100_000, -1)
+    index_of[ids] = np.arange(len(ids))
+    with np.load(CASES / f"{case}.npz") as archive:
+        counts = [
+            per_scene(index_of[archive[f"gt_{s}"]], index_of[archive[f"pred_{s}"]], np.ones(len(ids), bool))
+            for s in range(len(archive["scene_names"]))
+        ]
+    whole = concatenate(counts)
+    assert whole.confusion.tolist() == official["confusion_valid_plus_unknown"]
+    metrics = scannet_metrics(whole.confusion)
+    iou = [np.nan if value is None else value for value in official["iou"].values()]
+    assert np.array_equal(metrics.iou, iou, equal_nan=True)
+    for ours, key in (
+        (metrics.mean_iou, "mean_iou_nanmean"),
+        (metrics.mean_accuracy, "derived_mean_acc_over_classes_with_gt"),
+    ):
+        assert ours == expected[key] or (np.isnan(ours) and expected[key] is None)
+
+
+def test_scannet_counts_a_predicted_only_class_as_zero_and_leaves_out_one_that_never_occurs() -> None:
+    metrics = scannet_metrics(np.array([[3, 1, 0, 0], [0, 0, 0, 0], [0, 0, 0, 0]]))
+    assert metrics.iou[1] == 0.0
+    assert np.isnan(metrics.iou[2])
+
+
+@given(st.data())
+def test_counts_of_parts_add_up_to_the_whole(data: st.DataObject) -> None:
+    n = data.draw(st.integers(0, 60))
+    cut = data.draw(st.integers(0, n))
+    truth = data.draw(hnp.arrays(np.int64, n, elements=st.integers(-1, 4)))
+    predicted = data.draw(hnp.arrays(np.int64, n, elements=st.integers(-1, 4)))
+    present = np.ones(5, bool)
+    parts = [per_scene(truth[:cut], predicted[:cut], present), per_scene(truth[cut:], predicted[cut:], present)]
+    assert np.array_equal(concatenate(parts).confusion, per_scene(truth, predicted, present).confusion)
+    assert per_scene(truth, predicted, present).confusion.sum() == (truth >= 0).sum()
+
+
+def test_points_of_a_class_that_the_scene_does_not_score_are_left_out() -> None:
+    counts = per_scene(np.array([0, 1, 1]), np.array([0, 0, 1]), np.array([True, False]))
+    assert counts.confusion.tolist() == [[1, 0, 0], [0, 0, 0]]
+
+
+def test_concatenated_scenes_contain_the_classes_of_each() -> None:
+    empty = confusion_matrix(np.zeros(0, int), np.zeros(0, int), 2)
+    a, b = SemanticCounts(empty, np.array([True, False])), SemanticCounts(empty, np.array([False, True]))
+    assert concatenate([a, b]).is_present.tolist() == [True, True]
