@@ -32,7 +32,8 @@ LAYERS = (
     {"opensu3d", "datasets", "baselines", "reports"},
     {"executors"},
     {"scene_run"},
-    {"planning", "estimate"},
+    {"planning"},
+    {"estimate"},
     {"runner"},
     {"cli"},
 )

@@ -1,0 +1,52 @@
+"""Is the table in the README what the tool writes?  ``--write`` puts it there.
+
+Words, rows and columns must be equal; numbers may differ by ``TOLERANCE`` points, for ONNX Runtime, Embree and BLAS
+round differently on other processors and a region that falls on the other side of a threshold moves a metric a little.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from pathlib import Path
+
+from su3d_bench.reports.tables import markdown_table
+
+README = Path(__file__).resolve().parent.parent / "README.md"
+BEGIN = "<!-- demo table: written by `su3d-bench run`, checked by .ci/check_readme.py -->\n"
+END = "<!-- demo table ends -->"
+TOLERANCE = 3.0
+NUMBER = re.compile(r"-?\d+\.\d+")
+
+
+def table_in(readme: str) -> str:
+    return readme.split(BEGIN)[1].split(END)[0].strip()
+
+
+def shape_of(table: str) -> str:
+    """The table without its decimals and without the spaces that align them."""
+    return re.sub(r"[ -]{2,}", " ", NUMBER.sub("#", table))
+
+
+def differences(shown: str, written: str) -> list[str]:
+    if shape_of(shown) != shape_of(written):
+        return ["the README's table has other rows, columns or words than the one that the tool writes:", written]
+    pairs = zip(NUMBER.findall(shown), NUMBER.findall(written), strict=True)
+    return [f"README says {a}, the run {b}" for a, b in pairs if abs(float(a) - float(b)) > TOLERANCE]
+
+
+def main(arguments: list[str]) -> int:
+    run = Path(next(one for one in arguments if not one.startswith("--")))
+    written = markdown_table(json.loads((run / "metrics.json").read_text())).strip()
+    readme = README.read_text()
+    if "--write" in arguments:
+        README.write_text(readme.replace(table_in(readme) or END, written if table_in(readme) else f"{written}\n{END}"))
+        return 0
+    found = differences(table_in(readme), written)
+    print("\n".join(found) or "the README's table is what the tool writes")
+    return int(bool(found))
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
