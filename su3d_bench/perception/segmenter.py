@@ -11,7 +11,7 @@ from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.segmenter_config import SegmenterConfig
 from su3d_bench.perception.segmenter_graph import Graph, IndexArray
 from su3d_bench.perception.segmenter_pixels import superpixels
-from su3d_bench.perception.segmenter_rules import find_structure, join_objects, join_surfaces
+from su3d_bench.perception.segmenter_rules import join_objects, join_surfaces, take_out_structure
 from su3d_bench.types import BoolArray, Float32Array, Frame, Int32Array, Regions
 
 __all__ = ["RgbdSegmenter", "SegmenterConfig"]
@@ -33,28 +33,23 @@ class RgbdSegmenter:
 
         cv2.setNumThreads(1)
         labels, graph = superpixels(frame, self._config)
-        graph = join_surfaces(graph, self._config)
         if self._level == "parts":
-            kept = np.ones(len(graph.pieces), bool)
-            return self._regions(frame, labels, graph, graph.piece_of_superpixel, kept)
-        is_structure = find_structure(graph, self._config)
-        objects, object_of_surface = join_objects(graph, is_structure, self._config)
-        kept = np.ones(len(objects.pieces), bool)
-        kept[object_of_surface[is_structure]] = False
-        return self._regions(frame, labels, objects, object_of_surface[graph.piece_of_superpixel], kept)
+            surfaces = join_surfaces(graph, self._config)
+            return self._regions(frame, labels, surfaces, np.zeros(len(surfaces.pieces), bool))
+        surfaces, is_structure = take_out_structure(graph, self._config)
+        objects, is_structure = join_objects(surfaces, is_structure, self._config)
+        return self._regions(frame, labels, objects, is_structure)
 
-    def _regions(
-        self, frame: Frame, superpixel: Int32Array, graph: Graph, piece_of_superpixel: IndexArray, kept: BoolArray
-    ) -> Regions:
+    def _regions(self, frame: Frame, superpixel: Int32Array, graph: Graph, is_left_out: BoolArray) -> Regions:
         height, width = frame.depth_m.shape
-        labels = piece_of_superpixel[superpixel]
+        labels = graph.piece_of_superpixel[superpixel]
         factor = -(-width // self._config.max_width)
         labels = np.repeat(np.repeat(labels, factor, axis=0), factor, axis=1)
         labels = np.pad(labels, ((0, max(0, height - len(labels))), (0, max(0, width - labels.shape[1]))), mode="edge")
         labels = labels[:height, :width]
         sizes = np.bincount(labels.ravel(), minlength=len(graph.pieces))
         order = np.argsort(-sizes, kind="stable")
-        chosen = [k for k in order if kept[k] and sizes[k] >= self._config.min_region_px]
+        chosen = [k for k in order if not is_left_out[k] and sizes[k] >= self._config.min_region_px]
         masks = np.array([labels == k for k in chosen], bool).reshape(len(chosen), height, width)
         return Regions(masks, mask_boxes(masks), self._scores(graph, np.array(chosen, np.intp)))
 

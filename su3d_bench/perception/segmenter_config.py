@@ -39,7 +39,11 @@ class SegmenterConfig(BaseModel):
     structure_min_fraction: float = Field(default=0.03, gt=0, le=1)
     structure_distance_m: float = Field(default=0.03, gt=0)
     structure_behind_fraction: float = Field(default=0.02, ge=0, le=1)
+    structure_flush_m: float = Field(default=0.005, gt=0)
+    structure_flush_relative: float = Field(default=0.003, gt=0)
     structure_colour: float = Field(default=12.0, gt=0)
+    structure_lightness_weight: float = Field(default=0.4, ge=0)
+    structure_patch_fraction: float = Field(default=0.01, ge=0, le=1)  # smaller flush patches are its pattern
 
     # objects
     object_convex_colour: float = Field(default=60.0, gt=0)

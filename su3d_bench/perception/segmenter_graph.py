@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.types import Float32Array, Float64Array, Int32Array
+from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int32Array
 
 IndexArray = NDArray[np.intp]
 
@@ -51,16 +51,14 @@ class Pieces:
         length = np.linalg.norm(self.normal, axis=1, keepdims=True)
         return self.normal / np.where(length > 0, length, 1)
 
-    def flatness_error(self, a: IndexArray, b: IndexArray) -> Float64Array:
-        """Root mean square distance m of the points of ``a`` and ``b`` together from their best plane."""
-        n = self.n_points[a] + self.n_points[b]
-        mean = (self.point[a] + self.point[b]) / np.maximum(n, 1)[:, None]
-        s = (self.scatter[a] + self.scatter[b]) / np.maximum(n, 1)[:, None]
-        matrix = np.empty((len(n), 3, 3))
-        for k, (i, j) in enumerate(((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))):
-            matrix[:, i, j] = matrix[:, j, i] = s[:, k] - mean[:, i] * mean[:, j]
-        least = np.linalg.eigvalsh(matrix)[:, 0] if len(n) else np.zeros(0)
-        return np.sqrt(np.maximum(least, 0))
+    def plane_of(self, piece: int) -> tuple[Float64Array, float]:
+        """The unit normal, towards the camera, of a piece's best plane, and the rms distance m of its points."""
+        n = max(float(self.n_points[piece]), 1.0)
+        mean, s = self.point[piece] / n, self.scatter[piece] / n
+        matrix = np.array([[s[0], s[1], s[2]], [s[1], s[3], s[4]], [s[2], s[4], s[5]]]) - np.outer(mean, mean)
+        values, vectors = np.linalg.eigh(matrix)
+        axis: Float64Array = vectors[:, 0]
+        return (-axis if axis @ mean > 0 else axis), float(np.sqrt(max(values[0], 0.0)))
 
 
 @dataclass(frozen=True)
@@ -119,15 +117,24 @@ def contract(graph: Graph, pairs: tuple[IndexArray, IndexArray]) -> Graph:
     return Graph(graph.pieces.joined(label, n_joined), graph.borders.joined(label), label[graph.piece_of_superpixel])
 
 
-def merge_cheapest(graph: Graph, cost: Callable[[Graph], Float64Array], n_levels: int = 8) -> Graph:
+def merge_cheapest(
+    graph: Graph, cost: Callable[[Graph], Float64Array], is_apart: BoolArray | None = None, n_levels: int = 8
+) -> Graph:
     """Join pieces while a border's ``cost`` (E,) is below 1, cheap borders first.
 
     The limit rises to 1 in ``n_levels`` steps. At each step every piece joins its cheapest neighbour below the limit,
     and costs are computed anew from the joined sums, until none is left. Ties go to the pair first by (a, b).
+    Pieces that stand ``is_apart`` (N,) join nothing.
     """
+    if is_apart is not None:
+        apart_first = is_apart[graph.piece_of_superpixel]
     for level in range(1, n_levels + 1):
         while True:
             price = cost(graph)
+            if is_apart is not None:
+                apart = np.zeros(len(graph.pieces), bool)
+                apart[graph.piece_of_superpixel] = apart_first
+                price = np.where(apart[graph.borders.a] | apart[graph.borders.b], np.inf, price)
             a, b = graph.borders.a, graph.borders.b
             cheap = np.flatnonzero(price < level / n_levels)
             if not len(cheap):

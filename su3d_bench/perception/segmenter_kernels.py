@@ -100,17 +100,24 @@ def fit_planes(disparity: Float32Array, radius: Int32Array, x: Float64Array, y: 
 
 
 @njit(cache=True)
-def _misfit(plane: Float32Array, disparity: Float32Array, v: int, u: int, x: Float64Array, y: Float64Array) -> float:
-    """Mean relative error of ``plane`` at (v, u) and those of its four neighbours that lie near it in depth."""
+def _misfit(
+    a: float, b: float, c: float, disparity: Float32Array, v: int, u: int, x: Float64Array, y: Float64Array
+) -> float:
+    """Mean relative error of a plane at (v, u) and those of its four neighbours that lie near it in depth."""
     height, width = disparity.shape
     here = disparity[v, u]
-    total = abs(plane[0] * x[u] + plane[1] * y[v] + plane[2] - here)
+    base = a * x[u] + b * y[v] + c
+    total = abs(base - here)
     n = 1
-    for dv, du in ((0, 1), (0, -1), (1, 0), (-1, 0)):
-        v1, u1 = v + dv, u + du
-        if 0 <= v1 < height and 0 <= u1 < width and abs(disparity[v1, u1] - here) < 0.03 * here:
-            total += abs(plane[0] * x[u1] + plane[1] * y[v1] + plane[2] - disparity[v1, u1])
-            n += 1
+    for axis in range(2):
+        for sign in (-1, 1):
+            v1, u1 = (v, u + sign) if axis == 0 else (v + sign, u)
+            if v1 < 0 or v1 >= height or u1 < 0 or u1 >= width:
+                continue
+            there = disparity[v1, u1]
+            if abs(there - here) < 0.03 * here:
+                total += abs(a * x[u1] + b * y[v1] + c - there)
+                n += 1
     return total / (n * here)
 
 
@@ -129,24 +136,23 @@ def sharpen_planes(
         for u in range(width):
             if disparity[v, u] <= 0:
                 continue
-            own = planes[v, u]
+            a, b, c = planes[v, u, 0], planes[v, u, 1], planes[v, u, 2]
             best = 1e30
-            if own[0] != 0 or own[1] != 0 or own[2] != 0:
-                best = _misfit(own, disparity, v, u, x, y) - own_bonus
+            if a != 0 or b != 0 or c != 0:
+                best = _misfit(a, b, c, disparity, v, u, x, y) - own_bonus
                 if best <= 0:
                     continue
-            for dv in (-reach, 0, reach):
-                for du in (-reach, 0, reach):
-                    v1, u1 = v + dv, u + du
-                    if (dv == 0 and du == 0) or v1 < 0 or u1 < 0 or v1 >= height or u1 >= width:
-                        continue
-                    other = planes[v1, u1]
-                    if other[0] == 0 and other[1] == 0 and other[2] == 0:
-                        continue
-                    misfit = _misfit(other, disparity, v, u, x, y)
-                    if misfit < best:
-                        best = misfit
-                        sharp[v, u] = other
+            for step in range(9):
+                v1, u1 = v + (step // 3 - 1) * reach, u + (step % 3 - 1) * reach
+                if step == 4 or v1 < 0 or u1 < 0 or v1 >= height or u1 >= width:
+                    continue
+                a, b, c = planes[v1, u1, 0], planes[v1, u1, 1], planes[v1, u1, 2]
+                if a == 0 and b == 0 and c == 0:
+                    continue
+                misfit = _misfit(a, b, c, disparity, v, u, x, y)
+                if misfit < best:
+                    best = misfit
+                    sharp[v, u, 0], sharp[v, u, 1], sharp[v, u, 2] = a, b, c
     return sharp
 
 
@@ -161,17 +167,17 @@ def double_planes(planes: Float32Array, disparity: Float32Array, x: Float64Array
             if disparity[v, u] <= 0:
                 continue
             best = 1e30
-            for v1 in (v // 2, v // 2 + 1):
-                for u1 in (u // 2, u // 2 + 1):
-                    if v1 >= half_height or u1 >= half_width:
-                        continue
-                    plane = planes[v1, u1]
-                    if plane[0] == 0 and plane[1] == 0 and plane[2] == 0:
-                        continue
-                    misfit = abs(plane[0] * x[u] + plane[1] * y[v] + plane[2] - disparity[v, u])
-                    if misfit < best:
-                        best = misfit
-                        full[v, u] = plane
+            for step in range(4):
+                v1, u1 = v // 2 + step // 2, u // 2 + step % 2
+                if v1 >= half_height or u1 >= half_width:
+                    continue
+                a, b, c = planes[v1, u1, 0], planes[v1, u1, 1], planes[v1, u1, 2]
+                if a == 0 and b == 0 and c == 0:
+                    continue
+                misfit = abs(a * x[u] + b * y[v] + c - disparity[v, u])
+                if misfit < best:
+                    best = misfit
+                    full[v, u, 0], full[v, u, 1], full[v, u, 2] = a, b, c
     return full
 
 

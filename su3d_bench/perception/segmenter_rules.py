@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from su3d_bench.perception.segmenter_config import SegmenterConfig
-from su3d_bench.perception.segmenter_graph import Graph, IndexArray, merge_cheapest
+from su3d_bench.perception.segmenter_graph import Graph, IndexArray, Pieces, contract, merge_cheapest
 from su3d_bench.types import BoolArray, Float64Array
 
 
-def join_surfaces(graph: Graph, config: SegmenterConfig) -> Graph:
-    """Superpixels of like colour across borders without jump or crease, joined."""
+def join_surfaces(graph: Graph, config: SegmenterConfig, is_apart: BoolArray | None = None) -> Graph:
+    """Superpixels of like colour across borders without jump or crease, joined; what ``is_apart`` joins nothing."""
 
     def cost(current: Graph) -> Float64Array:
         colour, contrast, bend, gap = _differences(current)
@@ -22,7 +24,7 @@ def join_surfaces(graph: Graph, config: SegmenterConfig) -> Graph:
         )
         return np.sqrt(sum(term**2 for term in terms))
 
-    return merge_cheapest(graph, cost)
+    return merge_cheapest(graph, cost, is_apart)
 
 
 def _differences(graph: Graph) -> tuple[Float64Array, Float64Array, Float64Array, Float64Array]:
@@ -35,42 +37,94 @@ def _differences(graph: Graph) -> tuple[Float64Array, Float64Array, Float64Array
     return colour, borders.contrast / borders.length, bend, gap
 
 
-def find_structure(graph: Graph, config: SegmenterConfig) -> BoolArray:
-    """Which pieces (N,) are floor, wall or ceiling: large planes with nothing behind, in the colour of most of each."""
-    pieces = graph.pieces
-    centroid, normal = pieces.centroid(), pieces.unit_normal()
-    total = float(pieces.n_points.sum())
-    is_structure = np.zeros(len(pieces), bool)
-    is_seen = np.zeros(len(pieces), bool)
-    colour = pieces.mean_colour()
+@dataclass(frozen=True)
+class StructuralPlane:
+    """A floor, wall or ceiling: points p on it have ``normal`` . p = ``offset``; ``colour`` is its mean."""
+
+    normal: Float64Array
+    offset: float
+    colour: Float64Array
+
+
+def structural_planes(surfaces: Graph, config: SegmenterConfig) -> list[StructuralPlane]:
+    """Large planes with nothing behind, largest first: floor, walls, ceiling."""
+    pieces = surfaces.pieces
+    centroid, normal, colour = pieces.centroid(), pieces.unit_normal(), pieces.mean_colour()
+    total = max(float(pieces.n_pixels.sum()), 1.0)
+    planes: list[StructuralPlane] = []
+    is_taken = np.zeros(len(pieces), bool)
     for seed in np.argsort(-pieces.n_points, kind="stable"):
         if pieces.n_points[seed] < 0.25 * config.structure_min_fraction * total:
             break
-        if is_seen[seed]:
+        axis, rms = pieces.plane_of(int(seed))
+        if is_taken[seed] or rms > config.structure_distance_m:
             continue
-        offset = (centroid - centroid[seed]) @ normal[seed]
-        is_parallel = normal @ normal[seed] > np.cos(np.deg2rad(12))
+        offset = float(axis @ centroid[seed])
+        distance = centroid @ axis - offset
         tolerance = np.maximum(config.structure_distance_m, 0.015 * centroid[:, 2])
-        on_plane = is_parallel & (np.abs(offset) < tolerance) & (pieces.n_points > 0)
-        behind = (offset < -2 * tolerance) & (pieces.n_points > 0)
+        has_depth = pieces.n_points > 0
+        on_plane = has_depth & (normal @ axis > np.cos(np.deg2rad(12))) & (np.abs(distance) < tolerance)
+        behind = has_depth & (distance < -2 * tolerance)
         is_large = pieces.n_points[on_plane].sum() >= config.structure_min_fraction * total
-        if not is_large or pieces.n_points[behind].sum() > config.structure_behind_fraction * total:
-            continue
-        is_like = np.linalg.norm(colour - colour[seed], axis=1) < config.structure_colour
-        is_structure |= on_plane & is_like
-        is_seen |= on_plane
-    return is_structure
+        if is_large and pieces.n_points[behind].sum() <= config.structure_behind_fraction * total:
+            planes.append(StructuralPlane(axis, offset, colour[seed]))
+            is_taken |= on_plane
+    return planes
 
 
-def join_objects(graph: Graph, is_structure: BoolArray, config: SegmenterConfig) -> tuple[Graph, IndexArray]:
-    """Surfaces joined to objects across convex borders; also the piece (S,) of every first surface."""
-    # Structure is kept out of every join by a mark that travels with the pieces: its count of pixels is negative.
-    structural = np.zeros(len(graph.pieces), bool)
-    structural[:] = is_structure
-    blocked = structural[graph.borders.a] | structural[graph.borders.b]
-    keep = ~blocked
-    borders = type(graph.borders)(*(values[keep] for values in vars(graph.borders).values()))
-    inner = Graph(graph.pieces, borders, np.arange(len(graph.pieces)))
+def plane_of_flush(pieces: Pieces, planes: list[StructuralPlane], config: SegmenterConfig) -> IndexArray:
+    """The structural plane (N,) that a piece lies flush with, -1 for none."""
+    found = np.full(len(pieces), -1, np.intp)
+    centroid, normal = pieces.centroid(), pieces.unit_normal()
+    tolerance = np.maximum(config.structure_flush_m, config.structure_flush_relative * centroid[:, 2])
+    for number, plane in enumerate(planes):
+        distance = np.abs(centroid @ plane.normal - plane.offset)
+        is_flush = (distance < tolerance) & (normal @ plane.normal > np.cos(np.deg2rad(12))) & (pieces.n_points > 0)
+        found[is_flush & (found < 0)] = number
+    return found
+
+
+def take_out_structure(graph: Graph, config: SegmenterConfig) -> tuple[Graph, BoolArray]:
+    """The surfaces of superpixels ``graph``, with the pieces of floor, walls and ceiling joined and marked (N,)."""
+    surfaces = join_surfaces(graph, config)
+    planes = structural_planes(surfaces, config)
+    if not planes:
+        return surfaces, np.zeros(len(surfaces.pieces), bool)
+    colours = np.stack([plane.colour for plane in planes])
+    flush = plane_of_flush(graph.pieces, planes, config)
+    # Shading moves lightness: it counts less for what lies flush with a wall.
+    weights = np.array([config.structure_lightness_weight, 1, 1])
+    off_colour = np.linalg.norm((graph.pieces.mean_colour() - colours[flush]) * weights, axis=1)
+    flush[off_colour > config.structure_colour] = -1
+    graph, of_plane = _join_marked(graph, flush, len(planes))
+    is_structure = of_plane >= 0
+    rest = join_surfaces(graph, config, is_structure)
+    of_plane = _marks_after(rest, graph, of_plane)
+    flush = plane_of_flush(rest.pieces, planes, config)
+    small = rest.pieces.n_pixels < config.structure_patch_fraction * rest.pieces.n_pixels.sum()
+    of_plane = np.where((of_plane < 0) & small, flush, of_plane)
+    joined, of_plane = _join_marked(rest, of_plane, len(planes))
+    return joined, of_plane >= 0
+
+
+def _join_marked(graph: Graph, mark: IndexArray, n_marks: int) -> tuple[Graph, IndexArray]:
+    """The graph with all pieces of equal ``mark`` (N,) >= 0 as one, and the marks of its pieces."""
+    n = len(graph.pieces)
+    first = np.full(n_marks, n, np.intp)
+    marked = np.flatnonzero(mark >= 0)
+    np.minimum.at(first, mark[marked], marked)
+    joined = contract(graph, (marked, first[mark[marked]]))
+    return joined, _marks_after(joined, graph, mark)
+
+
+def _marks_after(joined: Graph, before: Graph, mark: IndexArray) -> IndexArray:
+    after = np.full(len(joined.pieces), -1, np.intp)
+    after[joined.piece_of_superpixel] = mark[before.piece_of_superpixel]
+    return after
+
+
+def join_objects(graph: Graph, is_structure: BoolArray, config: SegmenterConfig) -> tuple[Graph, BoolArray]:
+    """Surfaces joined to objects across convex borders; structure joins nothing and stays marked."""
 
     def cost(current: Graph) -> Float64Array:
         colour, _, bend, gap = _differences(current)
@@ -82,5 +136,6 @@ def join_objects(graph: Graph, is_structure: BoolArray, config: SegmenterConfig)
         )
         return np.sqrt((colour / unit) ** 2 + (gap / config.object_gap) ** 2)
 
-    joined = merge_cheapest(inner, cost)
-    return joined, joined.piece_of_superpixel
+    joined = merge_cheapest(graph, cost, is_structure)
+    mark = _marks_after(joined, graph, np.where(is_structure, 0, -1).astype(np.intp))
+    return joined, mark >= 0
