@@ -1,0 +1,67 @@
+"""The tokenizer of the embedded text tower."""
+
+from __future__ import annotations
+
+import doctest
+
+import numpy as np
+import pytest
+
+from su3d_bench.perception import embedded_text
+from su3d_bench.perception.embedded_text import N_IDS, N_ROWS, N_WORDS, PADDING, fnv1a, token_ids, words
+
+
+def test_examples_in_docstrings_run() -> None:
+    assert doctest.testmod(embedded_text).failed == 0
+
+
+@pytest.mark.parametrize(
+    ("one", "other"),
+    [
+        ("tv-screen", "tv screen"),
+        ("Indoor-Plant", "indoor plants"),
+        ("an image of a chair", "image of the chair"),
+        ("computer's picture", "computers picture"),
+        ("shelves", "shelf"),
+    ],
+)
+def test_spellings_of_one_thing_have_the_same_ids(one: str, other: str) -> None:
+    ids = token_ids([one, other])
+    assert np.array_equal(ids[0], ids[1])
+
+
+@pytest.mark.parametrize(
+    ("one", "other"), [("plant on table", "table on plant"), ("glass", "glas"), ("cup", "cups of tea"), ("pan", "pot")]
+)
+def test_different_texts_have_different_ids(one: str, other: str) -> None:
+    ids = token_ids([one, other])
+    assert not np.array_equal(ids[0], ids[1])
+
+
+def test_ids_have_the_documented_shape_and_range() -> None:
+    ids = token_ids(["chair", "", "one two three four five six seven eight nine ten " * 3])
+    assert ids.shape == (3, N_WORDS, N_IDS)
+    assert ids.dtype == np.int64
+    assert (ids[1] == PADDING).all()
+    assert (ids[2, :, 0] != PADDING).all()
+    assert ids.min() >= 0
+    assert ids.max() < N_ROWS
+    assert token_ids([]).shape == (0, N_WORDS, N_IDS)
+
+
+def test_related_spellings_share_rows() -> None:
+    ids = token_ids(["trashcan", "trash", "umbrella"])
+    rows = [set(part[part != PADDING].tolist()) for part in ids]
+    assert len(rows[0] & rows[1]) >= 3
+    assert not rows[1] & rows[2]
+
+
+def test_hash_is_fnv1a() -> None:
+    # Test vectors of the FNV reference, http://www.isthe.com/chongo/tech/comp/fnv
+    assert fnv1a("") == 0x811C9DC5
+    assert fnv1a("a") == 0xE40C292C
+    assert fnv1a("foobar") == 0xBF9CF968
+
+
+def test_long_texts_keep_their_first_words() -> None:
+    assert words("word " * 40) == ("word",) * N_WORDS
