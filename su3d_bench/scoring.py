@@ -306,7 +306,7 @@ def unpack_scores(data: bytes) -> dict[str, SceneScore]:
             arrays = {key: archive[key] for key in archive.files}
         names = [key.removesuffix("/about") for key in arrays if key.endswith("/about")]
         return {name: _unpack_one(name, arrays) for name in names}
-    except (ValueError, KeyError, TypeError, OSError, zipfile.BadZipFile) as error:
+    except (ValueError, KeyError, TypeError, EOFError, OSError, zipfile.BadZipFile) as error:
         raise DataError(f"counts: are damaged or of another version ({error}); score the scene again") from error
 
 

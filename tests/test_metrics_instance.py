@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 import json
+from fractions import Fraction
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from su3d_bench.errors import DataError, PredictionError
+from su3d_bench.metrics.dot_product import dot
 from su3d_bench.metrics.instance_ap import (
     THRESHOLDS,
     InstanceAP,
     InstanceCounts,
     combine,
+    concatenate,
+    encode_ground_truth,
     last_line_of_each_mask_file,
     per_scene,
 )
+from su3d_bench.protocols import load_protocol
 
 CASES = Path(__file__).parent / "cases"
 INSTANCE_CASES = sorted(p.stem for p in CASES.glob("inst*.json")) + sorted(p.stem for p in CASES.glob("replica*.json"))
@@ -89,3 +97,264 @@ def test_the_scannet200_case_is_equal_in_every_bit() -> None:
     assert ours.ap == averages["all_ap"]
     assert ours.ap50 == averages["all_ap_50%"]
     assert ours.ap25 == averages["all_ap_25%"]
+    for group in ("head", "common", "tail"):
+        scored = load_protocol("scannet200-instance").scored
+        assert [entry.id for entry in scored] == answer["class_ids"]
+        members = [index for index, entry in enumerate(scored) if entry.group == group]
+        expected = tuple(averages[f"{group}_{key}"] for key in ("ap", "ap50%", "ap25%"))
+        assert ours.of_group(members) == expected
+
+
+# ---- hand-worked values
+
+
+def one_scene(
+    truth: Any, masks: list[Any], labels: list[int], scores: list[float], class_ids: tuple[int, ...] = (5, 7)
+) -> InstanceAP:
+    return combine([counts_of(truth, masks, labels, scores, class_ids)])
+
+
+def counts_of(
+    truth: Any, masks: list[Any], labels: list[int], scores: list[float], class_ids: tuple[int, ...] = (5, 7)
+) -> InstanceCounts:
+    indptr = np.concatenate([[0], np.cumsum([len(m) for m in masks])]).astype(np.int64)
+    indices = np.concatenate([np.zeros(0, np.int64), *masks])
+    return per_scene(
+        np.asarray(truth), indptr, indices, np.array(labels, np.int64), np.array(scores, np.float64), class_ids
+    )
+
+
+TWO = np.repeat([5001, 5002, 0], [200, 200, 100])  # two instances of class 5, then void
+FIRST, SECOND, VOID = np.arange(200), np.arange(200, 400), np.arange(400, 500)
+
+
+def test_a_perfect_prediction_is_exactly_one_and_a_class_without_truth_is_nan() -> None:
+    ours = one_scene(TWO, [FIRST, SECOND], [5, 5], [0.9, 0.8])
+    assert (ours.ap, ours.ap50, ours.ap25) == (1.0, 1.0, 1.0)
+    assert np.isnan(ours.table[1]).all()
+
+
+def test_an_iou_equal_to_the_threshold_is_no_match() -> None:
+    assert one_scene(np.full(200, 5001), [np.arange(100)], [5], [1.0]).ap50 == 0.0
+    assert one_scene(np.full(200, 5001), [np.arange(101)], [5], [1.0]).ap50 == 1.0
+
+
+def test_with_constant_confidences_ap_is_recall_times_one_plus_precision_by_two() -> None:
+    masks = [FIRST, np.concatenate([FIRST[:60], SECOND[:60]])]
+    assert one_scene(TWO, masks, [5, 5], [1.0, 1.0]).ap50 == 0.5 * (1 + 0.5) / 2
+
+
+def test_a_duplicate_is_a_false_positive_with_the_lower_of_the_two_scores() -> None:
+    counts = counts_of(np.full(200, 5001), [np.arange(150), np.arange(200)], [5, 5], [0.3, 0.8])
+    at_50 = counts.threshold_index == 0
+    assert counts.score[at_50].tolist() == [0.8, 0.3]
+    assert counts.is_true[at_50].tolist() == [True, False]
+
+
+def test_a_prediction_with_more_void_than_the_threshold_is_ignored_and_with_as_much_counted() -> None:
+    half_void = np.concatenate([SECOND[:100], VOID])
+    assert one_scene(TWO, [FIRST, half_void], [5, 5], [0.5, 0.9]).ap50 < 0.5
+    more_void = np.concatenate([SECOND[:99], VOID])
+    assert one_scene(TWO, [FIRST, more_void], [5, 5], [0.5, 0.9]).ap50 == 0.5
+
+
+def test_a_class_whose_predictions_are_all_ignored_is_zero() -> None:
+    assert one_scene(TWO, [VOID], [5], [1.0]).table[0].tolist() == [0.0] * 10
+
+
+def test_small_predictions_and_labels_outside_the_set_are_dropped() -> None:
+    masks = [FIRST, SECOND, FIRST[:99], FIRST, FIRST]
+    ours = one_scene(TWO, masks, [5, 5, 5, 6, 0], [0.5, 0.4, 0.9, 0.9, 0.9])
+    assert ours.ap == 1.0
+
+
+def test_a_small_instance_is_neither_found_nor_missed() -> None:
+    truth = np.repeat([5001, 5002], [200, 99])
+    assert one_scene(truth, [FIRST], [5], [1.0]).ap == 1.0
+    assert one_scene(truth, [FIRST, np.arange(199, 299)], [5, 5], [0.5, 1.0]).ap50 == 1.0
+
+
+def test_overlap_with_another_class_is_a_false_positive() -> None:
+    truth = np.repeat([5001, 7001], [200, 200])
+    ours = one_scene(truth, [FIRST, SECOND], [5, 5], [0.5, 0.9])
+    assert ours.table[0, 0] == 0.25
+    assert ours.table[1, 0] == 0.0
+
+
+def test_scenes_share_one_curve() -> None:
+    hit = counts_of(TWO, [FIRST, SECOND], [5, 5], [0.5, 0.5])
+    false = counts_of(np.repeat([7001, 0], [200, 200]), [FIRST], [5], [0.9])
+    assert combine([hit]).ap50 == 1.0
+    assert combine([hit, false]).table[0, 0] == pytest.approx((2 / 3) / 2)
+
+
+def test_pooled_ap_differs_from_scene_mean() -> None:
+    arrays, expected = load("inst01_basic")
+    ids = expected["official_py3_pr26"]["class_ids"]
+    counts = [scene_counts(arrays, s, ids) for s in range(4)]
+    assert combine(counts).ap != np.mean([combine([c]).ap for c in counts])
+
+
+def test_a_scene_without_predictions_counts_its_truth_as_missed() -> None:
+    hit = counts_of(TWO, [FIRST, SECOND], [5, 5], [0.5, 0.5])
+    assert combine([hit, counts_of(TWO, [], [], [])]).ap == 0.5
+
+
+def test_no_truth_at_all_is_nan_and_warns_of_nothing(recwarn: pytest.WarningsRecorder) -> None:
+    ours = one_scene(np.zeros(300, np.int64), [FIRST], [5], [1.0])
+    assert np.isnan([ours.ap, ours.ap50, ours.ap25]).all()
+    assert not recwarn.list
+
+
+# ---- properties
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    case=st.sampled_from(["inst02_ties", "inst04_missing_classes_void", "inst06_empty_scenes"]), seed=st.integers(0, 99)
+)
+def test_the_order_of_scenes_and_classes_changes_no_bit(case: str, seed: int) -> None:
+    arrays, expected = load(case)
+    answer = expected["official_py3_pr26"]
+    rng = np.random.default_rng(seed)
+    classes = rng.permutation(len(answer["class_ids"]))
+    ids = [answer["class_ids"][c] for c in classes]
+    scenes = rng.permutation(len(arrays["scene_names"]))
+    ours = combine([scene_counts(arrays, int(s), ids) for s in scenes])
+    assert np.array_equal(ours.table, as_table(answer)[classes], equal_nan=True)
+
+
+@settings(max_examples=30, deadline=None)
+@given(case=st.sampled_from(["inst01_basic", "inst12_float32_scores_8scenes", "replica02_scores"]), data=st.data())
+def test_counts_of_parts_combine_to_the_whole(case: str, data: st.DataObject) -> None:
+    arrays, expected = load(case)
+    answer = expected["official_py3_pr26"]
+    counts = [scene_counts(arrays, s, answer["class_ids"]) for s in range(len(arrays["scene_names"]))]
+    cut = data.draw(st.integers(1, len(counts) - 1))
+    halves = [concatenate(counts[:cut]), concatenate(counts[cut:])]
+    assert np.array_equal(combine(halves).table, as_table(answer), equal_nan=True)
+
+
+@settings(max_examples=25, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_random_scenes_agree_with_a_plain_reading_of_the_rules(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth = np.repeat(rng.choice([0, 1, 5, 7], 9) * 1000 + np.arange(1, 10), rng.integers(60, 160, 9))
+    masks, labels = [], []
+    for _ in range(rng.integers(0, 14)):
+        start = int(rng.integers(0, len(truth) - 60))
+        mask = np.arange(start, min(len(truth), start + int(rng.integers(60, 260))))
+        masks.append(mask[rng.random(len(mask)) < rng.choice([0.6, 0.9, 1.0])])
+        labels.append(int(rng.choice([1, 5, 7])))
+    scores = (rng.integers(1, 5, len(masks)) / 4).tolist()
+    counts = counts_of(truth, masks, labels, scores)
+    for c, class_id in enumerate((5, 7)):
+        for t, threshold in enumerate(THRESHOLDS):
+            here = (counts.class_index == c) & (counts.threshold_index == t)
+            rows = sorted(zip(counts.score[here].tolist(), counts.is_true[here].tolist(), strict=True))
+            expected_rows, n_missed = plain_counts(truth, masks, labels, scores, class_id, threshold)
+            assert rows == sorted(expected_rows)
+            assert counts.n_missed[c, t] == n_missed
+
+
+def plain_counts(
+    truth: Any, masks: list[Any], labels: list[int], scores: list[float], class_id: int, threshold: float
+) -> tuple[list[tuple[float, bool]], int]:
+    """The rules word by word, one pair at a time, for one class and one threshold; classes 5 and 7 are valid."""
+    void = {x for x, value in enumerate(truth) if value // 1000 not in (5, 7)}
+    members: dict[int, set[int]] = {}
+    for x, value in enumerate(truth):
+        if value // 1000 == class_id:
+            members.setdefault(int(value), set()).add(x)
+    predictions = [(set(m.tolist()), s) for m, label, s in zip(masks, labels, scores, strict=True) if label == class_id]
+    predictions = [(mask, score) for mask, score in predictions if len(mask) >= 100]
+
+    def over(mask: set[int], value: int) -> bool:
+        return len(mask & members[value]) / len(mask | members[value]) > threshold
+
+    rows: list[tuple[float, bool]] = []
+    visited: set[int] = set()
+    n_missed = 0
+    for value in sorted(v for v, points in members.items() if len(points) >= 100):
+        best: float | None = None
+        for p, (mask, score) in enumerate(predictions):
+            if p in visited or not over(mask, value):
+                continue
+            if best is None:
+                best = score
+                visited.add(p)
+            else:
+                rows.append((min(best, score), False))
+                best = max(best, score)
+        if best is None:
+            n_missed += 1
+        else:
+            rows.append((best, True))
+    for mask, score in predictions:
+        if any(over(mask, value) for value in members):
+            continue
+        n_ignored = len(mask & void) + sum(len(mask & points) for points in members.values() if len(points) < 100)
+        if n_ignored / len(mask) <= threshold:
+            rows.append((score, False))
+    return rows, n_missed
+
+
+def test_the_dot_product_adds_in_the_order_of_the_reference_answers() -> None:
+    rng = np.random.default_rng(0)
+    for n in (*range(1, 70), 129):
+        left, right = rng.random(n), rng.random(n) - 0.3
+        assert dot(left, right) == avx512_dot(left.tolist(), right.tolist())
+
+
+def avx512_dot(x: list[float], y: list[float]) -> float:
+    """OpenBLAS's ddot for AVX-512 with exact fractions: 32 lanes, folded to 16, a tail of fused multiply-adds."""
+
+    def fused(a: float, b: float, c: float) -> float:
+        return float(Fraction(a) * Fraction(b) + Fraction(c))
+
+    n16, n32 = len(x) - len(x) % 16, len(x) - len(x) % 32
+    wide = [0.0] * 32
+    for i in range(n32):
+        wide[i % 32] = fused(x[i], y[i], wide[i % 32])
+    lanes = [wide[8 * r + i] + wide[8 * r + i + 4] for r in range(4) for i in range(4)]
+    for i in range(n32, n16):
+        lanes[i % 16] = fused(x[i], y[i], lanes[i % 16])
+    four = [((lanes[i] + lanes[i + 4]) + lanes[i + 8]) + lanes[i + 12] for i in range(4)]
+    total = (four[0] + four[2]) + (four[1] + four[3])
+    for i in range(n16, len(x)):
+        total = fused(x[i], y[i], total)
+    return total
+
+
+# ---- what is refused
+
+
+def test_a_confidence_that_is_no_number_is_refused() -> None:
+    with pytest.raises(PredictionError, match="instance 1: its confidence is nan"):
+        one_scene(TWO, [FIRST, SECOND], [5, 5], [0.5, float("nan")])
+
+
+def test_an_index_outside_the_scene_is_refused() -> None:
+    with pytest.raises(PredictionError, match=r"instance 1: mask holds index 500, the scene has 500 points \(0..499\)"):
+        one_scene(TWO, [FIRST, np.arange(350, 501)], [5, 5], [0.5, 0.5])
+
+
+def test_a_point_that_stands_twice_in_a_mask_is_refused() -> None:
+    with pytest.raises(PredictionError, match="instance 0: its point indices are not strictly ascending"):
+        one_scene(TWO, [np.repeat(np.arange(100), 2), FIRST], [5, 5], [0.5, 0.5])
+
+
+def test_masks_that_do_not_pair_up_with_labels_are_refused() -> None:
+    with pytest.raises(PredictionError, match="2 labels, 1 masks, 1 scores"):
+        one_scene(TWO, [FIRST], [5, 5], [0.5])
+
+
+def test_truth_that_the_encoding_cannot_hold_is_refused() -> None:
+    with pytest.raises(DataError, match="instance id 1000 would spill into the next class"):
+        encode_ground_truth(np.array([5]), np.array([1000]))
+    with pytest.raises(DataError, match="holds the id -1"):
+        encode_ground_truth(np.array([5]), np.array([-1]))
+    with pytest.raises(DataError, match="holds the value -5"):
+        one_scene(np.array([-5] * 200), [FIRST], [5], [1.0])
+    with pytest.raises(DataError, match="class ids start at 1"):
+        one_scene(TWO, [FIRST], [5], [1.0], class_ids=(0, 5))

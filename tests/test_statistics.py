@@ -10,6 +10,7 @@ import pytest
 import su3d_bench.statistics
 from su3d_bench.metrics import instance_ap, resampling, semantic
 from su3d_bench.statistics import bootstrap_interval, percentile_interval, resample_weights
+from su3d_bench.types import Float64Array, Int64Array
 
 
 def test_the_examples_in_the_docstrings_run() -> None:
@@ -20,8 +21,8 @@ def test_the_examples_in_the_docstrings_run() -> None:
 def test_the_same_seed_gives_the_same_interval_and_another_seed_another() -> None:
     values = np.random.default_rng(5).random(8)
 
-    def mean(weights: np.ndarray) -> np.ndarray:
-        return weights @ values / 8
+    def mean(weights: Int64Array) -> Float64Array:
+        return np.asarray(weights @ values / 8, np.float64)
 
     assert bootstrap_interval(mean, 8) == bootstrap_interval(mean, 8)
     assert bootstrap_interval(mean, 8, seed=0) != bootstrap_interval(mean, 8, seed=1)

@@ -7,7 +7,7 @@ classes. Matrices of scenes add up; only ``conceptgraphs_metrics`` and ``scannet
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -89,7 +89,8 @@ def conceptgraphs_metrics(
 
     ``confusion`` (C, C) or (C, C + 1). Rows and columns are sliced together, as in the original; what fell outside the
     kept columns counts as missed only where it stands in the extra column. Denominators are at least 1, so a class
-    without points scores 0 and stays in the mean. ``dtype`` float32 divides as the original does. No class: all NaN.
+    without points scores 0 and stays in the mean. ``dtype`` float32 computes as the original does, to the last bit.
+    No class: all NaN.
 
     ``f1_conceptgraphs`` is the original's F1, 2PR / max(1, P + R), which is no harmonic mean below P + R = 1.
 
@@ -110,8 +111,12 @@ def conceptgraphs_metrics(
     both = precision + recall
     f1 = np.divide(2 * precision * recall, both, out=np.zeros_like(both), where=both > 0)
     quirk = 2 * precision * recall / np.maximum(1.0, both)
-    weights = n_true.astype(np.float64)
-    return _with_means(kept, recall, precision, iou, f1, quirk, weights)
+    n_points = n_true.astype(np.float64)
+    metrics = _with_means(kept, recall, precision, iou, f1, quirk, n_points)
+    if dtype is np.float32 and n_points.sum() > 0:
+        # the original rounds each weight, and a perfect prediction may then end in 0.9999999999999999
+        return replace(metrics, frequency_weighted_iou=float((n_points / n_points.sum() * iou).sum()))
+    return metrics
 
 
 def scannet_metrics(confusion: IntArray) -> SemanticMetrics:
@@ -147,7 +152,7 @@ def _with_means(
     n_true: Float64Array,
 ) -> SemanticMetrics:
     n_points = float(n_true.sum())
-    weighted = (n_true / n_points * np.nan_to_num(iou)).sum() if n_points > 0 else np.nan
+    weighted = (n_true * np.nan_to_num(iou)).sum() / n_points if n_points > 0 else np.nan
     if len(class_index) and n_points == 0 and not np.isnan(iou).any():
         weighted = 0.0  # classes that should have points and have none: all scores are 0
     return SemanticMetrics(

@@ -1,0 +1,114 @@
+"""From the prediction's points to the truth's: exact, the lowest index of equals, overlaps kept."""
+
+from __future__ import annotations
+
+import doctest
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from su3d_bench.metrics import (
+    dot_product,
+    instance_ap,
+    labelling,
+    resampling,
+    results,
+    semantic,
+    transfer,
+)
+from su3d_bench.metrics.labelling import most_similar
+from su3d_bench.metrics.transfer import Masks, duplicate_pairs, nearest, reduce_to_voxels, transfer_masks
+
+
+@pytest.mark.parametrize(
+    "module", [dot_product, instance_ap, labelling, resampling, results, semantic, transfer], ids=lambda m: m.__name__
+)
+def test_the_examples_in_the_docstrings_run(module: object) -> None:
+    assert doctest.testmod(module).failed == 0  # type: ignore[arg-type]
+
+
+def brute_force(candidates: np.ndarray, queries: np.ndarray) -> np.ndarray:
+    offset = candidates[None].astype(np.float64) - queries[:, None].astype(np.float64)
+    return np.asarray((offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2).argmin(axis=1))
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 300), on_a_grid=st.booleans())
+def test_nearest_equals_brute_force_with_the_lowest_index_of_equals(seed: int, n: int, on_a_grid: bool) -> None:
+    rng = np.random.default_rng(seed)
+    candidates, queries = rng.random((n, 3)).astype(np.float32), rng.random((50, 3)).astype(np.float32)
+    if on_a_grid:  # few places, many points on each, queries half-way between
+        candidates = rng.integers(0, 3, (n, 3)).astype(np.float32)
+        queries = rng.integers(0, 5, (50, 3)).astype(np.float32) / 2
+    distance, index = nearest(candidates, queries)
+    assert np.array_equal(index, brute_force(candidates, queries))
+    exact = np.sqrt(((candidates[index].astype(np.float64) - queries) ** 2).sum(axis=1))
+    np.testing.assert_allclose(distance, exact, rtol=1e-12, atol=0)
+
+
+def test_the_lowest_index_wins_among_more_equals_than_are_asked_for_at_once() -> None:
+    candidates = np.zeros((5000, 3), np.float32)
+    candidates[:4000] += 1
+    assert nearest(candidates, np.zeros((3, 3), np.float32))[1].tolist() == [4000] * 3
+
+
+def test_a_neighbour_at_the_cap_counts_and_one_beyond_it_does_not() -> None:
+    candidates = np.array([[0.0, 0, 0], [0.5, 0, 0]])
+    queries = np.array([[1.0, 0, 0], [1.0 + 1e-9, 0, 0]])
+    distance, index = nearest(candidates, queries, cap_m=0.5)
+    assert index.tolist() == [1, -1]
+    assert distance.tolist() == [0.5, np.inf]
+
+
+def test_no_candidates_means_no_neighbours() -> None:
+    distance, index = nearest(np.zeros((0, 3)), np.zeros((2, 3)))
+    assert (index.tolist(), distance.tolist()) == ([-1, -1], [np.inf, np.inf])
+
+
+def test_overlapping_masks_stay_overlapping_and_background_competes() -> None:
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]])
+    masks = Masks(np.array([0, 2, 4]), np.array([0, 1, 1, 2], np.int32))
+    targets = np.array([[0.1, 0, 0], [1.1, 0, 0], [2.6, 0, 0], [2.1, 0, 0], [9.0, 0, 0]])
+    moved = transfer_masks(points, masks, targets, cap_m=1.0)
+    assert moved.indptr.tolist() == [0, 2, 4]
+    assert moved.indices.tolist() == [0, 1, 1, 3]
+
+
+def test_voxel_reduction_keeps_the_first_point_of_each_mask_and_of_the_background_in_a_voxel() -> None:
+    points = np.array([[0.01, 0, 0], [0.02, 0, 0], [0.03, 0, 0], [0.04, 0, 0], [0.2, 0, 0], [0.21, 0, 0]])
+    masks = Masks(np.array([0, 2, 4]), np.array([1, 2, 2, 4], np.int32))
+    assert reduce_to_voxels(points, masks, 0.1).tolist() == [0, 1, 2, 4, 5]
+    assert reduce_to_voxels(points[:0], Masks(np.zeros(1, np.int64), np.zeros(0, np.int32)), 0.1).tolist() == []
+
+
+def test_a_reduced_map_gives_the_same_masks_where_they_are_farther_apart_than_a_voxel() -> None:
+    rng = np.random.default_rng(1)
+    points = np.concatenate([rng.random((500, 3)), rng.random((500, 3)) + np.array([3, 0, 0])])
+    masks = Masks(np.array([0, 500]), np.arange(500, dtype=np.int32))
+    targets = points + 0.003
+    whole = transfer_masks(points, masks, targets, cap_m=0.3)
+    reduced = transfer_masks(points, masks, targets, cap_m=0.3, voxel_m=0.1)
+    assert len(reduce_to_voxels(points, masks, 0.1)) < 900
+    assert np.array_equal(whole.indices, reduced.indices)
+
+
+def test_duplicates_are_pairs_strictly_above_the_iou() -> None:
+    tens = np.arange(10, dtype=np.int32)
+    masks = Masks(np.array([0, 10, 19, 28]), np.concatenate([tens, tens[:9], tens[1:]]))
+    assert duplicate_pairs(masks, 10, 0.9) == []
+    assert duplicate_pairs(masks, 10, 0.89) == [(0, 1), (0, 2)]
+
+
+def test_the_first_class_wins_ties_and_features_without_direction() -> None:
+    text = np.array([[1.0, 0], [0, 1], [0, 1]])
+    features = np.array([[0.0, 5], [1, 1], [0, 0], [np.nan, 1]])
+    assert most_similar(features, text).tolist() == [1, 0, 0, 0]
+
+
+def test_labels_do_not_depend_on_the_number_of_rows_named_at_once() -> None:
+    rng = np.random.default_rng(0)
+    features, text = rng.normal(size=(20_000, 16)).astype(np.float16), rng.normal(size=(9, 16))
+    whole = most_similar(features, text)
+    assert np.array_equal(whole[15_000:15_100], most_similar(features[15_000:15_100], text))

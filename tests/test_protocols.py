@@ -1,0 +1,160 @@
+"""Protocols: what the built-in ones fix, and one clear line for a file that cannot be used."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from su3d_bench.datasets.rooms_classes import CLASSES
+from su3d_bench.errors import ConfigError
+from su3d_bench.metrics.instance_ap import MIN_REGION_SIZE, THRESHOLDS
+from su3d_bench.protocols import RULES, load_protocol, protocol_names, protocols_for
+
+CASES = Path(__file__).parent / "cases"
+NAMES = {
+    "replica-conceptgraphs-ex1", "replica-conceptgraphs-ex4", "replica-conceptgraphs-ex6", "replica-mesh-ex6",
+    "replica-openmask3d", "rooms-instance", "rooms-semantic", "scannet-instance", "scannet-semantic",
+    "scannet200-instance",
+}  # fmt: skip
+
+
+def test_the_built_in_protocols_are_there() -> None:
+    assert set(protocol_names()) == NAMES
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_a_protocol_is_named_as_its_file_and_names_others_that_exist(name: str) -> None:
+    rules = load_protocol(name)
+    assert rules.name == name
+    assert set(rules.not_comparable_with) <= NAMES - {name}
+    assert set(rules.ignore) <= {entry.name for entry in rules.classes}
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_every_rule_that_is_taken_from_an_original_says_from_where(name: str) -> None:
+    text = (RULES / f"{name}.toml").read_text()
+    assert "Source" in text or "ConceptGraphs' rules" in text
+
+
+def test_each_dataset_has_its_default_protocols() -> None:
+    assert protocols_for("rooms") == ["replica-mesh-ex6", "replica-openmask3d", "rooms-instance", "rooms-semantic"]
+    assert protocols_for("scannet") == ["scannet-instance", "scannet-semantic", "scannet200-instance"]
+    assert {"replica-conceptgraphs-ex6", "replica-mesh-ex6", "replica-openmask3d"} <= set(protocols_for("replica"))
+    assert protocols_for("nowhere") == []
+
+
+def test_conceptgraphs_exclusions_leave_51_48_and_46_classes() -> None:
+    assert [len(load_protocol(f"replica-conceptgraphs-ex{n}").scored) for n in (1, 4, 6)] == [51, 48, 46]
+    scored = {entry.name for entry in load_protocol("replica-conceptgraphs-ex6").scored}
+    assert {"wall-plug", "blinds", "panel"} <= scored
+
+
+@pytest.mark.parametrize(
+    ("name", "case", "oracle"),
+    [
+        ("replica-openmask3d", "replica01_all_ones", "replica_script"),
+        ("scannet-instance", "inst01_basic", "official_py3_pr26"),
+        ("scannet200-instance", "scannet200_01", "openmask3d"),
+        ("scannet-semantic", "sem01_all_classes", "official_py3"),
+    ],
+)
+def test_class_ids_are_those_of_the_original(name: str, case: str, oracle: str) -> None:
+    expected = json.loads((CASES / f"{case}.json").read_text())[oracle]
+    assert [entry.id for entry in load_protocol(name).scored] == expected["class_ids"]
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_instance_protocols_use_the_original_thresholds_and_size(name: str) -> None:
+    rules = load_protocol(name)
+    if rules.kind == "instance":
+        assert (rules.thresholds, rules.min_region_size) == (THRESHOLDS, MIN_REGION_SIZE)
+    else:
+        assert (rules.thresholds, rules.min_region_size, rules.confidence) == ((), None, None)
+
+
+def test_scannet200_groups_have_64_68_and_66_classes() -> None:
+    groups = [entry.group for entry in load_protocol("scannet200-instance").scored]
+    assert [groups.count(name) for name in ("head", "common", "tail")] == [64, 68, 66]
+
+
+def test_the_rooms_classes_are_those_that_the_rooms_generate() -> None:
+    ours = {(entry.id, entry.name) for entry in load_protocol("rooms-instance").classes}
+    assert ours == {(known.id, known.name) for known in CLASSES}
+
+
+def test_prompts_take_the_class_name_as_it_is_unless_the_rules_replace_it() -> None:
+    assert load_protocol("replica-conceptgraphs-ex6").prompt_of("tv-screen") == "an image of tv-screen"
+    assert load_protocol("scannet-instance").prompt_of("otherfurniture") == "a other in a scene"
+
+
+def test_the_substring_rule_ignores_names_that_contain_the_word() -> None:
+    rules = load_protocol("replica-mesh-ex6").model_copy(update={"ignore_rule": "substring"})
+    ignored = {entry.name for entry in rules.classes if rules.is_ignored(entry.name)}
+    assert ignored == {"other", "floor", "wall", "ceiling", "door", "window", "indoor-plant", "wall-plug"}
+
+
+def test_the_digest_moves_with_every_rule() -> None:
+    rules = load_protocol("rooms-semantic")
+    changed = rules.model_copy(update={"prompt": "a picture of {}"})
+    assert rules.digest == load_protocol("rooms-semantic").digest
+    assert changed.digest != rules.digest
+
+
+def test_a_misspelt_name_is_told_with_the_likely_one() -> None:
+    with pytest.raises(ConfigError, match="unknown protocol 'rooms-semantics'; did you mean 'rooms-semantic'\\?"):
+        load_protocol("rooms-semantics")
+
+
+def edited(tmp_path: Path, base: str, old: str, new: str) -> str:
+    text = (RULES / f"{base}.toml").read_text().replace(f'name = "{base}"', 'name = "mine"')
+    assert old in text
+    path = tmp_path / "mine.toml"
+    path.write_text(text.replace(old, new))
+    return str(path)
+
+
+def test_a_protocol_may_be_a_file(tmp_path: Path) -> None:
+    assert load_protocol(edited(tmp_path, "rooms-semantic", "version = 1", "version = 7")).version == 7
+
+
+def test_a_file_may_list_its_own_classes(tmp_path: Path) -> None:
+    rows = '[[40, "floor"], [93, "wall"], [31, "ceiling"], [20, "chair"]]'
+    path = edited(tmp_path, "rooms-semantic", 'classes = "rooms"', f"classes = {rows}")
+    assert [entry.name for entry in load_protocol(path).scored] == ["chair"]
+
+
+FAULTS = (
+    ("semantic", "vocabulary =", "vocabluary =", "mine.toml:14: unknown key 'vocabluary'; did you mean 'vocabulary'?"),
+    ("semantic", "candidates =", "candidate =", "unknown key 'transfer.candidate'; did you mean 'candidates'?"),
+    ("semantic", "version = 1", 'version = "1"', "mine.toml:4: version: input should be a valid integer, not '1'"),
+    ("semantic", "version = 1", "", "mine.toml: the key 'version' is missing"),
+    ("semantic", '"rooms"  #', '"room"  #', "unknown class table 'room'; did you mean 'rooms'?"),
+    ("semantic", '"rooms"  #', "[1]  #", "classes must be a table's name or rows of [id, name]"),
+    ("semantic", '"rooms"  #', '[[1, "a"], [1, "b"]]  #', "each id and each name may stand there once"),
+    ("semantic", '"an image of {}"', '"an image"', "prompt: 'an image' has no {} for the class name"),
+    ("semantic", '["floor", "wall"', '["flor", "wall"', "'flor' is no class; did you mean 'floor'?"),
+    ("semantic", '["mAcc", "F-mIoU"]', '["AP"]', "a protocol of kind 'semantic' has mAcc, mIoU, F-mIoU"),
+    ("semantic", "version = 1", "version = 1\nmin_region_size = 3", "belong to kind 'instance'"),
+    ("instance", "min_region_size = 100", "", "kind 'instance' needs metric 'scannet', min_region_size"),
+    ("instance", "0.9000000000000004, 0.25,", "0.9", "thresholds: 0.25 and 0.5 must be among them"),
+    ("instance", '"map-points"', '"object-points"', "kind 'instance' takes 'map-points'"),
+    ("instance", "version = 1", "version = ", "mine.toml: is no valid TOML"),
+    ("instance", 'name = "mine"', 'name = "rooms-instance"', "the protocol name 'rooms-instance' is built in"),
+)
+
+
+@pytest.mark.parametrize(("kind", "old", "new", "message"), FAULTS, ids=[fault[3] for fault in FAULTS])
+def test_a_file_that_cannot_be_used_is_told_in_one_line(
+    tmp_path: Path, kind: str, old: str, new: str, message: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_protocol(edited(tmp_path, f"rooms-{kind}", old, new))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_missing_file_is_told(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="cannot be read"):
+        load_protocol(str(tmp_path / "none.toml"))
