@@ -136,7 +136,7 @@ def colour(view: View, colours: UInt8Array) -> UInt8Array:
     palette = np.concatenate([colours, np.array([BACKGROUND], np.uint8)]).astype(np.float32)
     picture = palette[view.point]  # -1 is the last row, the background
     picture *= np.where(view.point >= 0, view.shade, 1.0)[..., None]
-    height, width = picture.shape[0] // OVERSAMPLING, picture.shape[1] // OVERSAMPLING
-    small = picture.reshape(height, OVERSAMPLING, width, OVERSAMPLING, 3).mean(axis=(1, 3))
-    averaged: UInt8Array = np.clip(np.rint(small), 0, 255).astype(np.uint8)
+    steps = range(OVERSAMPLING)
+    total = sum((picture[y::OVERSAMPLING, x::OVERSAMPLING] for y in steps for x in steps), np.float32(0))
+    averaged: UInt8Array = np.rint(total / OVERSAMPLING**2).astype(np.uint8)
     return averaged

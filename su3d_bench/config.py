@@ -41,6 +41,7 @@ class RunConfig(BaseModel):
     seed: int = Field(default=0, ge=0, lt=2**31)
     limit: int = Field(default=0, ge=0)
     jobs: int = Field(default=0, ge=0)
+    pictures: bool = True
 
 
 @dataclass(frozen=True)

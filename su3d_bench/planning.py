@@ -242,7 +242,7 @@ def why_not_fitting(rules: ProtocolRules, dataset: Any) -> str | None:
 
 
 def _run_name(config: RunConfig, parts: _Parts) -> str:
-    request = config.model_dump(mode="json", exclude={"jobs"})
+    request = config.model_dump(mode="json", exclude={"jobs", "pictures"})
     options = [part.options for part in (*parts.methods, *parts.datasets.values())]
     key = digest_json([request, options, parts.perception, code_digest()])[:8]
     return "-".join([*(part.name for part in parts.datasets.values()), config.profile, key])
@@ -260,6 +260,7 @@ def _scene_job(config: RunConfig, parts: _Parts, folder: Path, target: str, scen
         stride=config.stride,
         seed=config.seed,
         limit=config.limit,
+        pictures=config.pictures,
         folder=folder,
         data_root=data_root(),
         cache_root=cache_root(),

@@ -59,6 +59,7 @@ class SceneJob:
     stride: int
     seed: int
     limit: int
+    pictures: bool
     folder: Path
     data_root: Path
     cache_root: Path
@@ -199,6 +200,7 @@ class _Scene:
         if not was_resumed:
             self._predict(method, info, perception, folder, key)
         score_key = {"predict": digest_json(key), "encoder": perception.encoder.digest}
+        score_key |= {"pictures": str(self.job.pictures)}
         score_key |= {f"protocol.{name}": load_protocol(name).digest for name in self.job.protocols}
         if not folder.is_done("score", score_key):
             self._score(part, perception, folder, score_key)
@@ -262,8 +264,10 @@ class _Scene:
                 continue
             scores[rules.name] = score_scene(rules, truth, prediction, perception.encoder)
         write_bytes(folder.counts, pack_scores(scores))
-        truth_to_draw = next(iter(self._truths.values()), None)
-        pictures = draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
+        pictures: list[Path] = []
+        if self.job.pictures:
+            truth_to_draw = next(iter(self._truths.values()), None)
+            pictures = draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
         folder.seal("score", key, [folder.counts, *pictures], unscored)
 
 

@@ -176,9 +176,15 @@ class RunFolder:
                 raise StoreError(
                     f"{self.path}: another run is writing here; wait for it or choose another folder with --out"
                 ) from error
+            _clear_half_written(self.path)
             yield
         finally:
             os.close(handle)
+
+
+def _clear_half_written(folder: Path) -> None:
+    for leftover in folder.glob(".*.tmp"):
+        leftover.unlink(missing_ok=True)
 
 
 @dataclass(frozen=True)
@@ -214,8 +220,8 @@ class JobFolder:
     def prepare(self) -> None:
         """Make the folder and clear what a killed run left half written."""
         make_folder(self.path)
-        for leftover in [*self.path.glob(".*.tmp"), *self.pictures.glob(".*.tmp")]:
-            leftover.unlink(missing_ok=True)
+        for folder in (self.path, self.pictures):
+            _clear_half_written(folder)
 
     def seals(self) -> dict[str, Any]:
         """The sealed steps; nothing where ``done.json`` is missing or damaged."""

@@ -252,7 +252,15 @@ class ColourPerception:
         features = self.encoder.encode_texts(names)
         boxes = np.tile(np.array([0, 0, WIDTH, HEIGHT], np.float32), (len(found), 1))
         return Detections(
-            frame.index, masks, boxes, np.ones(len(found), np.float32), names, names, (1.0,), features[:, None], features[0]
+            frame.index,
+            masks,
+            boxes,
+            np.ones(len(found), np.float32),
+            names,
+            names,
+            (1.0,),
+            features[:, None],
+            features[0],
         )
 
 

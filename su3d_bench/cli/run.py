@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from su3d_bench.planning import Plan
     from su3d_bench.runner import RunResult
 
-FLAGS_OF_KEYS = ("scenes", "methods", "profile", "protocols", "stride", "seed", "limit", "jobs")
+FLAGS_OF_KEYS = ("scenes", "methods", "profile", "protocols", "stride", "seed", "limit", "jobs", "pictures")
 
 
 def add_parser(verbs: Any) -> None:
@@ -43,6 +43,9 @@ def add_parser(verbs: Any) -> None:
         "--limit", type=int, metavar="N", help="only the first N updates of each scene; marks it partial"
     )
     parser.add_argument("--jobs", type=int, metavar="N", help="scenes side by side (default: the CPU cores)")
+    parser.add_argument(
+        "--pictures", action=argparse.BooleanOptionalAction, help="draw the maps into the run folder (default: yes)"
+    )
     parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="such as opensu3d.top_m=10")
     parser.add_argument("--config", type=Path, metavar="FILE", help="a TOML file, such as the run.toml of a run")
     parser.add_argument(

@@ -1,0 +1,269 @@
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from painted import colour_perception
+
+from su3d_bench import scene_run
+from su3d_bench.cli import query
+from su3d_bench.cli.main import build_parser, main
+from su3d_bench.errors import EXIT_INTERNAL
+
+HERE = Path(__file__).parent
+PAINTED = f"{HERE}/painted.py:Painted"
+COLLECTOR = f"{HERE}/painted.py:Collector"
+RUN = ["run", "--scenes", f"{PAINTED}/*", "--methods", COLLECTOR, "--protocols", "rooms-semantic", "--no-pictures"]
+HEAVY = ("torch", "open3d", "numba", "sklearn", "pandas", "matplotlib", "onnxruntime", "cv2", "scipy")
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
+
+
+def verbs() -> dict[str, argparse.ArgumentParser]:
+    actions = build_parser()._actions
+    return next(dict(action.choices) for action in actions if isinstance(action, argparse._SubParsersAction))
+
+
+def examples(parser: argparse.ArgumentParser) -> list[str]:
+    assert parser.epilog is not None
+    return [line.strip() for line in parser.epilog.splitlines() if line.strip().startswith("su3d-bench ")]
+
+
+@pytest.mark.parametrize("words", [["--help"], ["--version"], ["methods"], ["protocols"], ["datasets", "list"]])
+def test_answers_that_need_nothing_load_nothing_heavy(words: list[str]) -> None:
+    code = (
+        "import sys; from su3d_bench.cli.main import main\n"
+        f"code = main({words!r})\n"
+        f"heavy = sorted(set({HEAVY!r}) & set(sys.modules))\n"
+        "print('\\nheavy:', ' '.join(heavy), code)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1].split() == ["heavy:", "0"], done.stderr
+
+
+def test_the_module_is_the_command() -> None:
+    done = subprocess.run([sys.executable, "-m", "su3d_bench", "--version"], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (0, "su3d-bench 0.1.0\n")
+
+
+@pytest.mark.parametrize("verb", ["run", "query", "datasets", "methods", "protocols"])
+def test_the_help_of_every_verb_ends_with_two_examples(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    parser = verbs()[verb]
+    assert len(examples(parser)) == 2
+    assert main([verb, "--help"]) == 0
+    assert capsys.readouterr().out.rstrip().endswith(examples(parser)[-1])
+
+
+@pytest.mark.parametrize("verb", ["run", "query", "datasets", "methods", "protocols"])
+def test_the_examples_of_every_verb_parse(verb: str) -> None:
+    for example in examples(verbs()[verb]):
+        arguments = build_parser().parse_args(shlex.split(example)[1:])
+        assert arguments.verb == verb
+
+
+@pytest.mark.parametrize("verb", ["methods", "protocols"])
+def test_the_examples_of_verbs_that_only_tell_run(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for example in examples(verbs()[verb]):
+        words = shlex.split(example)[1:]
+        assert main(words) == 0
+        assert capsys.readouterr().out
+        assert main([*words, "--json"]) == 0
+        assert json.loads(capsys.readouterr().out)
+
+
+def test_methods_tell_their_settings_as_a_file_would_have_them(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["methods"]) == 0
+    assert {line.split()[0] for line in capsys.readouterr().out.splitlines()} >= {"opensu3d", "oracle"}
+    assert main(["methods", "opensu3d"]) == 0
+    text = capsys.readouterr().out
+    assert "[method.opensu3d]" in text
+    assert "top_m = 5" in text
+
+
+def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None:
+    from su3d_bench.protocols import load_protocol
+
+    assert main(["protocols", "show", "rooms-semantic"]) == 0
+    text = capsys.readouterr().out
+    rules = load_protocol("rooms-semantic")
+    for name in rules.model_dump(exclude={"transfer", "prompt_names", "classes"}):
+        assert f"\n{name} " in f"\n{text}"
+    assert "transfer.candidates" in text
+    assert all(entry.name in text for entry in rules.classes)
+    assert rules.digest in text
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["rum"], "su3d-bench: unknown VERB 'rum'; did you mean 'run'?; see su3d-bench --help"),
+        ([], "su3d-bench: the following arguments are required: VERB; see su3d-bench --help"),
+        (["run", "--scene-s", "x"], "su3d-bench: unknown argument '--scene-s'"),
+        (["run", "--jobs", "x"], "su3d-bench run: argument --jobs: invalid int value: 'x'; see su3d-bench run --help"),
+        (["run", "--scenes", "replcia/*"], "no scene matches 'replcia/*'; did you mean 'replica/*'?"),
+        (["run", "--scenes", f"{PAINTED}/e"], f"no scene matches '{PAINTED}/e'; did you mean '{PAINTED}/d'?"),
+        (["run", "--scenes", "nothing"], "no scene matches 'nothing'; known datasets: rooms, replica"),
+        ([*RUN, "--methods", "opensu3"], "unknown method 'opensu3'; did you mean 'opensu3d'?"),
+        ([*RUN, "--methods", f"{HERE}/painted.py:Colector"], f"method '{HERE}/painted.py:Colector': "),
+        ([*RUN, "--methods", f"{HERE}/none.py:X"], f"method '{HERE}/none.py:X': there is no file {HERE}/none.py"),
+        ([*RUN, "--profile", "orcale"], "unknown profile 'orcale'; did you mean 'oracle'?"),
+        ([*RUN, "--protocols", "room-semantic"], "unknown protocol 'room-semantic'; did you mean 'rooms-semantic'?"),
+        (
+            [*RUN, "--protocols", "scannet-instance"],
+            "protocol 'scannet-instance' fits no scene of this run: it scores the labels of 'scannet', painted has "
+            "those of 'replica'",
+        ),
+        ([*RUN, "--set", "colector.drop=1"], "--set colector.drop=1: 'colector' is no method or dataset of this run"),
+        ([*RUN, "--set", "collector.dorp=1"], "--set collector.dorp: unknown key 'dorp'; did you mean 'drop'?"),
+        ([*RUN, "--set", "collector.drop=x"], "--set collector.drop: collector.drop = 'x': input should be a valid"),
+        ([*RUN, "--stride", "-1"], "--stride: stride = -1: input should be greater than or equal to 0"),
+        ([*RUN, "--config", "none.toml"], "none.toml: cannot read the configuration: No such file or directory"),
+        (["protocols", "shwo"], "protocols: unknown action 'shwo'; did you mean 'show'?"),
+        (
+            ["protocols", "show", "rooms-semantics"],
+            "unknown protocol 'rooms-semantics'; did you mean 'rooms-semantic'?",
+        ),
+        (["methods", "orcle"], "unknown method 'orcle'; did you mean 'oracle'?"),
+        (
+            ["query", f"{PAINTED}/a", "x"],
+            f"no run in runs/ holds {PAINTED}/a by opensu3d; run: su3d-bench run --scenes",
+        ),
+        (["query", "rooms/living0", "x", "--top", "0"], "--top 0: at least 1 instance must be listed"),
+        (
+            ["query", "rooms/living0", "x", "--run", "r"],
+            "r: holds no map of rooms/living0 by opensu3d; run: su3d-bench",
+        ),
+    ],
+)
+def test_wrong_input_is_one_line_and_exit_code_2(
+    words: list[str], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(words) == 2
+    answer = capsys.readouterr()
+    assert answer.out == ""
+    assert answer.err.startswith(f"su3d-bench: {line}")
+    assert answer.err.count("\n") == 1
+
+
+def test_a_misspelt_key_in_a_file_is_named_with_its_line(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("run.toml").write_text('scenes = ["rooms/living0"]\nmetod = ["opensu3d"]\n')
+    assert main(["run", "--config", "run.toml"]) == 2
+    assert capsys.readouterr().err == "su3d-bench: run.toml:2: unknown key 'metod'; did you mean 'method'?\n"
+
+
+def test_debug_shows_the_traceback() -> None:
+    from su3d_bench.errors import ConfigError
+
+    with pytest.raises(ConfigError):
+        main(["run", "--debug", "--scenes", "nothing"])
+
+
+def test_an_internal_error_is_one_line_and_exit_code_4(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from su3d_bench import registry
+
+    def fail(kind: str) -> list[str]:
+        raise RuntimeError("a mistake\nof ours")
+
+    monkeypatch.setattr(registry, "names", fail)
+    assert main(["methods"]) == EXIT_INTERNAL
+    line = "su3d-bench: internal error: RuntimeError: a mistake of ours; run again with --debug for the traceback\n"
+    assert capsys.readouterr().err == line
+
+
+def test_a_closed_pipe_is_no_error() -> None:
+    command = f"{shlex.quote(sys.executable)} -m su3d_bench protocols show scannet200-instance | head -1; echo ${{PIPESTATUS[0]}}"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1] == "0"
+    assert done.stderr == ""
+
+
+def test_scenes_may_be_expanded_by_the_shell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "cam_params.json").write_text("{}")
+    words = ["--scenes", f"{PAINTED}/a", f"{PAINTED}/b", "cam_params.json"]
+    assert main([*RUN, *words, "--dry-run", "--json"]) == 0
+    answer = capsys.readouterr()
+    assert [one["scene"] for one in json.loads(answer.out)["jobs"]] == ["painted/a", "painted/b"]
+    assert answer.err == "not scenes, left out: cam_params.json\n"
+
+
+def test_a_dry_run_says_what_would_be_done_and_does_nothing(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*RUN, "--dry-run"]) == 0
+    text = capsys.readouterr().out
+    assert text.count("6 updates, about") == 4
+    assert "minutes with" in text
+    assert "protocols: rooms-semantic; profile auto" in text
+    assert not Path("runs").exists()
+
+
+def test_a_dry_run_over_a_finished_run_knows_what_is_done(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a", "--out", "runs/x"]) == 0
+    capsys.readouterr()
+    assert main([*RUN, "--scenes", f"{PAINTED}/[ab]", "--out", "runs/x", "--dry-run", "--json"]) == 0
+    jobs = json.loads(capsys.readouterr().out)["jobs"]
+    assert [(one["is_done"], one["is_measured"]) for one in jobs] == [(True, True), (False, True)]
+
+
+def test_the_same_request_has_the_same_folder_and_another_one_another() -> None:
+    from su3d_bench.cli.run import settings_of
+    from su3d_bench.planning import make_plan
+
+    def folder(*more: str) -> Path:
+        arguments = build_parser().parse_args([*RUN, *more])
+        return make_plan(settings_of(arguments), arguments.set, arguments.out).folder.path
+
+    assert folder() == folder("--jobs", "1") == folder("--quiet")
+    assert len({folder(), folder("--seed", "1"), folder("--set", "collector.drop=1"), folder("--limit", "3")}) == 4
+    assert folder().parent == Path("runs")
+    assert folder().name.startswith("painted-auto-")
+
+
+def test_json_answers_are_the_metrics_file(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*RUN, "--jobs", "1", "--json", "--quiet", "--out", "out"]) == 0
+    answer = capsys.readouterr()
+    assert answer.out == Path("out/metrics.json").read_text()
+    assert answer.err == ""
+
+
+def test_a_query_ranks_the_map_and_draws_it(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(query, "_encoder", lambda run: colour_perception().encoder)
+    assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a"]) == 0
+    capsys.readouterr()
+    words = ["query", "painted/a", "a red sofa", "--method", "collector"]
+    assert main(words) == 0
+    answer = capsys.readouterr()
+    assert answer.out.splitlines()[1].split()[0] == "1"
+    assert answer.out.splitlines()[1].endswith("  sofa")
+    picture = answer.err.removeprefix("heat map: ").strip()
+    assert picture.endswith("collector/pictures/query-a-red-sofa.png")
+    assert Path(picture).read_bytes().startswith(b"\x89PNG")
+    assert main([*words, "--json", "--top", "2", "--out", "here/heat.png"]) == 0
+    ranking: list[dict[str, Any]] = json.loads(capsys.readouterr().out)["ranking"]
+    assert [one["name"] for one in ranking][0] == "sofa"
+    assert ranking[0]["similarity"] == pytest.approx(1.0)
+    assert len(ranking) == 2
+    assert Path("here/heat.png").is_file()
+
+
+def test_a_map_without_features_cannot_be_queried(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(query, "_encoder", lambda run: colour_perception().encoder)
+    assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a", "--quiet"]) == 0
+    capsys.readouterr()
+    assert main(["query", "painted/a", "sofa", "--method", "oracle"]) == 2
+    assert "query: this map has no features to compare a text with" in capsys.readouterr().err

@@ -1,0 +1,169 @@
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+from pydantic import BaseModel, ConfigDict
+
+from su3d_bench.config import (
+    RunConfig,
+    Setting,
+    Settings,
+    check_keys,
+    check_names,
+    flatten,
+    nest,
+    read_assignments,
+    read_file,
+    resolve,
+)
+from su3d_bench.errors import ConfigError
+from su3d_bench.toml_text import key_lines, toml_value, write_toml
+
+
+class Inner(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+    depth: float = 1.0
+
+
+class Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", strict=True)
+    top_m: int = 5
+    ratios: tuple[float, ...] = (1.0,)
+    folder: Path | None = None
+    inner: Inner = Inner()
+
+
+def file_settings(tmp_path: Path, text: str) -> Settings:
+    path = tmp_path / "run.toml"
+    path.write_text(text)
+    return read_file(path)
+
+
+def test_a_later_source_wins_and_each_value_knows_its_own(tmp_path: Path) -> None:
+    settings = file_settings(tmp_path, "[method.opensu3d]\ntop_m = 7\nratios = [1, 2]\n")
+    settings += read_assignments(["opensu3d.top_m=10"], ["opensu3d"], [])
+    model = resolve(settings, ("method", "opensu3d"), Model)
+    assert (model.top_m, model.ratios) == (10, (1.0, 2.0))
+    assert settings.source(("method", "opensu3d", "top_m")) == "--set opensu3d.top_m"
+    assert settings.source(("method", "opensu3d", "ratios")) == f"{tmp_path}/run.toml:3"
+    assert settings.source(("method", "opensu3d", "folder")) == "default"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("seed = 1\nmetod = 2\n", "run.toml:2: unknown key 'metod'; did you mean 'method'?"),
+        ("seed = 1\n\n[metod.opensu3d]\ntop_m = 2\n", "run.toml:4: unknown key 'metod'; did you mean 'method'?"),
+        (
+            "[method]\nopensu3d = 2\n",
+            "run.toml:2: 'method.opensu3d' is a section; write [method.opensu3d] and keys below it",
+        ),
+        ("seed = 1\nseed\n", "run.toml:2: not valid TOML: expected '=' after a key in a key/value pair"),
+        ("limit = \n", "run.toml:1: not valid TOML: invalid value"),
+    ],
+)
+def test_a_wrong_file_is_named_with_its_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        check_keys(file_settings(tmp_path, text))
+    assert str(error.value) == f"{tmp_path}/{message}"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("[method.x]\ntop_n = 3\n", "run.toml:2: unknown key 'top_n'; did you mean 'top_m'?"),
+        ("[method.x.inner]\ndeph = 3\n", "run.toml:2: unknown key 'deph'; did you mean 'depth'?"),
+        ("[method.x]\n\ntop_m = '3'\n", "run.toml:3: x.top_m = '3': input should be a valid integer"),
+        ("[method.x]\nratios = [1, 'a']\n", "run.toml:2: x.ratios = 'a': input should be a valid number"),
+    ],
+)
+def test_a_wrong_value_is_named_with_its_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        resolve(file_settings(tmp_path, text), ("method", "x"), Model)
+    assert str(error.value) == f"{tmp_path}/{message}"
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("opensu3d.top_m", "--set opensu3d.top_m: expected KEY=VALUE, such as opensu3d.top_m=10"),
+        ("opensu3.top_m=1", "--set opensu3.top_m=1: 'opensu3' is no method or dataset of this run; "),
+        ("seed=3", "--set seed=3: 'seed' has a flag of its own: --seed"),
+        ("rooms=3", "--set rooms=3: 'rooms' is no method or dataset of this run"),
+    ],
+)
+def test_a_wrong_assignment_is_explained(text: str, message: str) -> None:
+    with pytest.raises(ConfigError) as error:
+        read_assignments([text], ["opensu3d"], ["rooms"])
+    assert str(error.value).startswith(message)
+
+
+def test_a_misspelt_assignment_key_names_the_flag() -> None:
+    settings = read_assignments(["opensu3d.topm=1"], ["opensu3d"], [])
+    with pytest.raises(ConfigError, match=r"^--set opensu3d.topm: unknown key 'topm'; did you mean 'top_m'\?$"):
+        resolve(settings, ("method", "opensu3d"), Model)
+
+
+def test_assignments_take_toml_values_and_plain_text() -> None:
+    settings = read_assignments(
+        ["a.x=[1, 2.5]", "a.y=plain text", "a.z=true", "perception.q.r=-1e-3", 'rooms.s="12"'], ["a"], ["rooms"]
+    )
+    assert [(entry.path, entry.value) for entry in settings.entries] == [
+        (("method", "a", "x"), [1, 2.5]),
+        (("method", "a", "y"), "plain text"),
+        (("method", "a", "z"), True),
+        (("perception", "q", "r"), -1e-3),
+        (("dataset", "rooms", "s"), "12"),
+    ]
+
+
+def test_a_section_of_an_unknown_name_is_refused() -> None:
+    settings = Settings((Setting(("method", "opensu3", "top_m"), 3, "run.toml:2"),))
+    with pytest.raises(ConfigError, match=r"^run.toml:2: unknown method 'opensu3'; did you mean 'opensu3d'\?$"):
+        check_names("method", settings, ["opensu3d", "oracle"])
+
+
+def test_run_values_out_of_range_are_refused() -> None:
+    settings = Settings((Setting(("stride",), -1, "--stride"),))
+    with pytest.raises(ConfigError, match=r"^--stride: stride = -1: input should be greater than or equal to 0$"):
+        resolve(settings, (), RunConfig)
+
+
+def test_an_unreadable_file_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"none.toml: cannot read the configuration: No such file"):
+        read_file(tmp_path / "none.toml")
+    (tmp_path / "binary.toml").write_bytes(b"\xff\xfe\x00")
+    with pytest.raises(ConfigError, match="not a UTF-8 text file"):
+        read_file(tmp_path / "binary.toml")
+
+
+def test_lines_of_keys_follow_tables_and_dotted_keys() -> None:
+    lines = key_lines("a = 1\n\n[b.c]  # remark\nd = 2\ne.f = 3\n[ g . \"h i\" ]\n'j k' = 4\n")
+    assert lines[("a",)] == 1
+    assert lines[("b", "c")] == 3
+    assert lines[("b", "c", "d")] == 4
+    assert lines[("b", "c", "e", "f")] == 5
+    assert lines[("g", "h i", "j k")] == 7
+
+
+def test_written_toml_reads_back_as_it_was() -> None:
+    table = {
+        "seed": 3,
+        "scenes": ["rooms/*", 'quote " and \\ back'],
+        "is_on": True,
+        "size": {"width m": 0.1, "big": 1e300, "none": []},
+        "deep": {"er": {"x": -1, "text": "tab\tnew\nline ü"}},
+        "limit": float("inf"),
+    }
+    text = write_toml([(path, value, "default") for path, value in flatten(table)])
+    assert tomllib.loads(text) == table
+    assert "seed = 3  # default" in text
+    assert nest(flatten(table)) == table
+
+
+def test_a_value_that_is_not_set_is_written_as_a_remark() -> None:
+    assert write_toml([(("folder",), None, "default")]) == "# folder is not set  # default\n"
+    with pytest.raises(TypeError):
+        toml_value(object())

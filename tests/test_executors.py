@@ -1,0 +1,99 @@
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import time
+
+import pytest
+
+from su3d_bench.errors import StoreError
+from su3d_bench.executors import ONE_THREAD, Event, Report, run_inline, run_processes
+
+
+def work(unit: str, report: Report) -> str:
+    if unit == "kill":
+        os.kill(os.getpid(), signal.SIGKILL)
+    if unit == "segfault":
+        os.kill(os.getpid(), signal.SIGSEGV)
+    if unit == "exit":
+        os._exit(7)
+    if unit == "disk":
+        raise StoreError("cannot write x: the disk is full")
+    if unit == "bug":
+        raise KeyError("a mistake")
+    if unit == "sleep":
+        time.sleep(60)
+    if unit == "threads":
+        return " ".join(os.environ[name] for name in sorted(ONE_THREAD))
+    if unit == "pid":
+        return str(os.getpid())
+    report(Event(unit, "work", 1, 1))
+    return unit.upper()
+
+
+def lost(unit: str, reason: str) -> str:
+    return f"{unit}: {reason}"
+
+
+def in_processes(units: list[str], jobs: int = 2) -> list[str]:
+    return list(run_processes(work, units, lambda event: None, jobs=jobs, lost=lost))
+
+
+def test_inline_and_processes_give_the_same_outcomes_and_events() -> None:
+    events: list[Event] = []
+    inline = list(run_inline(work, ["a", "b", "c"], events.append))
+    n_inline = len(events)
+    spawned = list(run_processes(work, ["a", "b", "c"], events.append, jobs=2, lost=lost))
+    assert sorted(inline) == sorted(spawned) == ["A", "B", "C"]
+    assert sorted(event.unit for event in events[:n_inline]) == sorted(event.unit for event in events[n_inline:])
+
+
+@pytest.mark.parametrize(
+    ("unit", "reason"),
+    [
+        ("kill", "kill: the worker was killed (signal 9), most often for want of memory; try fewer --jobs"),
+        ("segfault", "segfault: the worker crashed (signal 11, SIGSEGV)"),
+        ("exit", "exit: the worker ended early (exit code 7)"),
+    ],
+)
+def test_a_unit_that_takes_its_process_down_fails_alone(unit: str, reason: str) -> None:
+    assert sorted(in_processes(["a", unit, "b"])) == sorted(["A", reason, "B"])
+
+
+def test_an_error_of_the_user_stops_all_at_once() -> None:
+    start = time.monotonic()
+    with pytest.raises(StoreError, match="the disk is full"):
+        in_processes(["disk", "sleep"])
+    assert time.monotonic() - start < 30
+
+
+def test_a_bug_in_a_worker_shows_its_traceback() -> None:
+    with pytest.raises(RuntimeError, match=r"(?s)a worker failed:.*KeyError: 'a mistake'"):
+        in_processes(["bug"])
+
+
+def test_workers_hold_libraries_to_one_thread_and_the_parent_keeps_its_own() -> None:
+    before = {name: os.environ.get(name) for name in ONE_THREAD}
+    assert in_processes(["threads"]) == [" ".join("1" for _ in ONE_THREAD)]
+    assert {name: os.environ.get(name) for name in ONE_THREAD} == before
+
+
+def test_each_unit_has_a_process_of_its_own() -> None:
+    pids = in_processes(["pid", "pid", "pid"])
+    assert len({*pids, str(os.getpid())}) == 4
+
+
+def test_inline_holds_loaded_libraries_to_one_thread_and_lets_go() -> None:
+    import cv2
+    import numpy  # noqa: F401 - loads the BLAS that is counted
+    from threadpoolctl import threadpool_info
+
+    def count(unit: str, report: Report) -> list[int]:
+        return [cv2.getNumThreads(), *(pool["num_threads"] for pool in threadpool_info())]
+
+    before = cv2.getNumThreads()
+    (counts,) = run_inline(count, ["a"], lambda event: None)
+    assert set(counts) == {1}
+    assert cv2.getNumThreads() == before
+    assert sys.modules["cv2"] is cv2

@@ -1,0 +1,365 @@
+from __future__ import annotations
+
+import csv
+import json
+import os
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import time
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from painted import ColourPerception, colour_perception
+
+from su3d_bench import scene_run
+from su3d_bench.cli.main import main
+
+HERE = Path(__file__).parent
+PAINTED = f"{HERE}/painted.py:Painted"
+COLLECTOR = f"{HERE}/painted.py:Collector"
+PROTOCOLS = ["--protocols", "rooms-semantic", "rooms-instance"]
+
+
+@pytest.fixture(autouse=True)
+def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    monkeypatch.chdir(tmp_path)
+
+
+def words(*more: str, scenes: str = "*", out: str = "out") -> list[str]:
+    base = ["run", "--scenes", f"{PAINTED}/{scenes}", "--methods", COLLECTOR, *PROTOCOLS, "--no-pictures"]
+    return [*base, "--jobs", "1", "--out", out, *more]
+
+
+def run(*more: str, scenes: str = "*", out: str = "out") -> int:
+    return main(words(*more, scenes=scenes, out=out))
+
+
+def in_process(*more: str, out: str = "out") -> list[str]:
+    return [sys.executable, str(HERE / "painted_cli.py"), *words(*more, out=out)]
+
+
+def metrics(out: str = "out") -> dict[str, Any]:
+    loaded: dict[str, Any] = json.loads(Path(out, "metrics.json").read_text())
+    return loaded
+
+
+def job(scene: str = "a", method: str = "collector", out: str = "out") -> Path:
+    return Path(out, "scenes", f"painted.{scene}", method)
+
+
+def test_a_run_leaves_the_folder_that_the_design_promises() -> None:
+    assert run() == 0
+    names = {path.relative_to("out").as_posix() for path in Path("out").rglob("*") if path.is_file()}
+    per_job = ("prediction.npz", "counts.npz", "updates.csv", "log.txt", "done.json")
+    expected = {f"scenes/painted.{s}/{m}/{f}" for s in "abcd" for m in ("collector", "oracle") for f in per_job}
+    assert names == expected | {"run.toml", "run.json", "metrics.json"}
+    record = json.loads(Path("out/run.json").read_text())
+    assert record["status"] == "complete"
+    assert record["encoder_digest"] == "words-1"
+    assert set(record["data_digests"]) == {f"painted/{scene}" for scene in "abcd"}
+
+
+def test_perfect_perception_gives_a_perfect_score_and_its_ceiling() -> None:
+    assert run() == 0
+    for one in metrics()["results"]:
+        assert one["method"] == "collector"
+        assert one["n_planned"] == one["result"]["n_scenes"] == 4
+        for name in one["headline"]:
+            assert one["result"]["metrics"][name] == 1.0
+            assert one["ceiling"][name] == 1.0
+
+
+def test_a_method_that_misses_an_object_scores_less_under_the_same_ceiling() -> None:
+    assert run("--set", "collector.drop=1") == 0
+    semantic = metrics()["results"][0]
+    assert semantic["result"]["metrics"]["mAcc"] < 1.0
+    assert semantic["ceiling"]["mAcc"] == 1.0
+
+
+def test_the_order_of_scenes_and_their_repetition_change_nothing_but_the_order() -> None:
+    assert run(scenes="[ab]") == 0
+    first = metrics()
+    scenes = ["--scenes", f"{PAINTED}/b", f"{PAINTED}/a", f"{PAINTED}/[ab]"]
+    assert run(*scenes, out="other") == 0
+    second = metrics("other")
+    assert second["scenes"] == ["painted/b", "painted/a"]
+    assert first["results"] == second["results"]
+
+
+def test_updates_hold_a_row_a_frame_with_its_stages() -> None:
+    assert run("--set", "painted.n_frames=5", "--stride", "2", scenes="a") == 0
+    rows = list(csv.DictReader((job() / "updates.csv").open()))
+    assert [row["frame"] for row in rows] == ["0", "2", "4"]
+    assert list(rows[0])[:5] == ["update", "frame", "n_detections", "n_points", "n_instances"]
+    assert list(rows[0])[5:] == ["decode_ms", "segment_ms", "collect_ms", "total_ms"]
+    assert [int(row["n_points"]) for row in rows] == [768, 1536, 2304]
+
+
+def test_metrics_hold_no_path_date_or_time() -> None:
+    assert run() == 0
+    text = Path("out/metrics.json").read_text()
+    assert str(HERE) not in text
+    assert "202" not in text.replace("0.", "")
+
+
+def test_the_same_command_again_does_nothing_and_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run() == 0
+    before = Path("out/metrics.json").read_bytes()
+    monkeypatch.setattr(scene_run, "write_prediction", None)
+    monkeypatch.setattr(scene_run, "pack_scores", None)
+    assert run() == 0
+    assert Path("out/metrics.json").read_bytes() == before
+
+
+def test_a_seed_gives_its_bytes_and_another_seed_others() -> None:
+    noise = ("--set", "collector.noise_m=0.02")
+    assert run(*noise, out="one") == 0
+    assert run(*noise, out="two") == 0
+    assert run(*noise, "--seed", "1", out="three") == 0
+    assert (job(out="one") / "prediction.npz").read_bytes() == (job(out="two") / "prediction.npz").read_bytes()
+    assert Path("one/metrics.json").read_bytes() == Path("two/metrics.json").read_bytes()
+    assert (job(out="one") / "prediction.npz").read_bytes() != (job(out="three") / "prediction.npz").read_bytes()
+
+
+@pytest.mark.parametrize("name", ["prediction.npz", "counts.npz", "updates.csv", "done.json"])
+def test_a_damaged_file_is_made_again(name: str) -> None:
+    assert run(scenes="a") == 0
+    before, counts = Path("out/metrics.json").read_bytes(), (job() / "counts.npz").read_bytes()
+    (job() / name).write_bytes((job() / name).read_bytes()[:-7])
+    assert run(scenes="a") == 0
+    assert Path("out/metrics.json").read_bytes() == before
+    assert (job() / "counts.npz").read_bytes() == counts
+
+
+@pytest.mark.parametrize(
+    ("more", "field"),
+    [
+        (["--set", "collector.drop=1"], "method.collector.drop was 0, now 1"),
+        (["--set", "painted.n_frames=4"], "dataset.painted.n_frames was 6, now 4"),
+        (["--stride", "3"], "stride was 1, now 3"),
+        (["--limit", "2"], "limit was none, now 2"),
+        (["--seed", "5"], "seed was 0, now 5"),
+        (["--set", "perception.naming.temperature=0.5"], "perception.naming.temperature was 0.05, now 0.5"),
+    ],
+)
+def test_another_key_in_the_same_folder_is_refused_by_name(
+    more: list[str], field: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(scenes="a") == 0
+    before = Path("out/metrics.json").read_bytes()
+    capsys.readouterr()
+    assert run(*more, scenes="a") == 2
+    line = f"out/scenes/painted.a/collector: holds another run ({field}); choose another folder with --out"
+    assert capsys.readouterr().err.startswith(f"su3d-bench: {line}")
+    assert Path("out/metrics.json").read_bytes() == before
+
+
+def test_changed_perception_is_refused_by_name(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(scenes="a") == 0
+    other = colour_perception()
+    other.digest = "colours-2"
+    monkeypatch.setattr(scene_run, "build_perception", lambda *_, **__: other)
+    assert run(scenes="a") == 2
+    assert "perception was colours-1, now colours-2" in capsys.readouterr().err
+
+
+def test_other_protocols_score_the_same_predictions_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run(scenes="a") == 0
+    made = (job() / "prediction.npz").stat().st_mtime_ns
+    assert run("--protocols", "replica-mesh-ex6", scenes="a") == 0
+    assert [one["protocol"] for one in metrics()["results"]] == ["replica-mesh-ex6"]
+    assert (job() / "prediction.npz").stat().st_mtime_ns == made
+
+
+@pytest.mark.parametrize(
+    ("fault", "line"),
+    [
+        ("missing-frame", "painted/b: frame 2 is missing; copy it again"),
+        ("nan-pose", "painted/b: frame 2: the pose is not a finite 4x4 matrix; drop the frame or mend the trajectory"),
+        ("depth-size", "painted/b: frame 2: depth is 32x23 and colour is 32x24; both must have one size"),
+        ("empty-depth", "painted/b frame 2: depth is empty, no pixel is above 0 m"),
+        ("unknown-class", "painted/b: class id 777 is unknown; the label set ends at 101"),
+        ("crash", "painted/b: ZeroDivisionError: a mistake in a plug-in"),
+    ],
+)
+def test_a_scene_that_fails_leaves_the_others_unharmed(
+    fault: str, line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run("--set", f"painted.fault={fault}") == 3
+    answer = capsys.readouterr()
+    assert f"su3d-bench: {line}\n" in answer.err
+    assert "su3d-bench: incomplete: 1 of 4 scenes failed" in answer.err
+    assert "| 3/4 " in answer.out
+    assert "INCOMPLETE: collector failed on painted/b" in answer.out
+    assert "Traceback" in (job("b") / "log.txt").read_text()
+    assert f"failed: {line}\n" in (job("b") / "log.txt").read_text()
+    assert json.loads(Path("out/run.json").read_text())["status"] == "incomplete"
+    for one in metrics()["results"]:
+        assert one["failed"] == ["painted/b"]
+        assert one["result"]["scenes"] == ["painted/a", "painted/c", "painted/d"]
+
+
+def test_a_scene_that_failed_is_taken_up_again_once_it_is_mended(monkeypatch: pytest.MonkeyPatch) -> None:
+    class Broken(ColourPerception):
+        def detect(self, frame: Any, *rest: Any) -> Any:
+            if frame.index == 3:
+                raise ValueError("no such thing")
+            return super().detect(frame, *rest)
+
+    assert run(out="whole") == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", lambda *_, **__: Broken())
+        assert run() == 3
+    assert run() == 0
+    assert Path("out/metrics.json").read_bytes() == Path("whole/metrics.json").read_bytes()
+
+
+def test_a_scene_without_truth_runs_unscored(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--set", "painted.fault=no-truth") == 0
+    answer = capsys.readouterr()
+    assert "collector is unscored on painted/b" in answer.out
+    assert "painted/b, collector: rooms-semantic not scored: painted/b: has no ground truth" in answer.err
+    assert (job("b") / "prediction.npz").is_file()
+    before = Path("out/metrics.json").read_bytes()
+    assert run("--set", "painted.fault=no-truth") == 0
+    assert Path("out/metrics.json").read_bytes() == before
+
+
+def test_a_limit_marks_the_run_partial_in_every_table(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--limit", "2") == 0
+    text = capsys.readouterr().out
+    assert text.count("PARTIAL, only the first 2 frames of each scene") == 2
+    assert metrics()["is_partial"] is True
+    assert json.loads(Path("out/run.json").read_text())["is_partial"] is True
+
+
+def test_resolved_values_say_where_they_came_from_and_run_again() -> None:
+    Path("my.toml").write_text("[method.collector]\nstride = 2\n")
+    assert run("--config", "my.toml", "--set", "painted.n_frames=5", scenes="a") == 0
+    text = Path("out/run.toml").read_text()
+    assert "stride = 2  # my.toml:2\n" in text
+    assert "n_frames = 5  # --set painted.n_frames\n" in text
+    assert "drop = 0  # default\n" in text
+    assert tomllib.loads(text)["method"]["collector"] == {"stride": 2, "drop": 0, "noise_m": 0.0}
+    assert main(["run", "--config", "out/run.toml", "--out", "again"]) == 0
+    assert Path("out/metrics.json").read_bytes() == Path("again/metrics.json").read_bytes()
+
+
+def test_pictures_are_drawn_and_vouched_for() -> None:
+    assert run("--pictures", scenes="a") == 0
+    pictures = {path.name for path in (job() / "pictures").iterdir()}
+    assert pictures == {"instances.png", "classes.png"}
+    (job() / "pictures" / "classes.png").unlink()
+    assert run("--pictures", scenes="a") == 0
+    assert (job() / "pictures" / "classes.png").is_file()
+
+
+def test_a_read_only_folder_is_one_line(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    # Root may write anywhere, so the refusal is made here instead of by permissions.
+    def refuse(self: Path, *_: Any, **__: Any) -> None:
+        raise PermissionError(13, "Permission denied", str(self))
+
+    monkeypatch.setattr(Path, "mkdir", refuse)
+    assert run() == 2
+    line = "su3d-bench: cannot write out: the folder is read-only; choose another with --out\n"
+    assert capsys.readouterr().err == line
+
+
+def test_a_full_disk_is_one_line_and_the_run_resumes(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run(out="whole") == 0
+    n_writes = 0
+    write = os.fsync
+
+    def full_after_twelve(descriptor: int) -> None:
+        nonlocal n_writes
+        n_writes += 1
+        if n_writes > 12:
+            raise OSError(28, "No space left on device")
+        write(descriptor)
+
+    capsys.readouterr()
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "fsync", full_after_twelve)
+        assert run() == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert ": the disk is full; free some space and run the same command again" in error
+    assert run() == 0
+    assert Path("out/metrics.json").read_bytes() == Path("whole/metrics.json").read_bytes()
+
+
+def test_worker_processes_give_the_same_bytes_as_one() -> None:
+    noise = ("--set", "collector.noise_m=0.02")
+    for jobs in ("1", "2"):
+        subprocess.run(in_process(*noise, "--jobs", jobs, out=f"jobs{jobs}"), check=True, capture_output=True)
+    assert Path("jobs1/metrics.json").read_bytes() == Path("jobs2/metrics.json").read_bytes()
+    for scene in "abcd":
+        one, two = ((job(scene, out=f"jobs{n}") / "prediction.npz").read_bytes() for n in (1, 2))
+        assert one == two
+
+
+def test_a_killed_worker_fails_its_scene_alone() -> None:
+    done = subprocess.run(in_process("--jobs", "2", "--set", "painted.fault=kill"), capture_output=True, text=True)
+    assert done.returncode == 3
+    assert "painted/b: the worker was killed (signal 9), most often for want of memory; try fewer --jobs" in done.stderr
+    assert metrics()["results"][0]["result"]["scenes"] == ["painted/a", "painted/c", "painted/d"]
+
+
+def test_an_interrupt_ends_cleanly_and_the_run_resumes() -> None:
+    command = in_process("--jobs", "2", "--set", "painted.frame_ms=100")
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    for _ in wait_for(job("a")):
+        pass
+    os.killpg(process.pid, signal.SIGINT)
+    _, error = process.communicate(timeout=20)
+    assert process.returncode == 130
+    assert error == "su3d-bench: interrupted; the same command takes it up again\n"
+    assert json.loads(Path("out/run.json").read_text())["status"] == "interrupted"
+
+
+def test_killed_at_any_moment_and_taken_up_again_it_gives_the_same_bytes() -> None:
+    slow = ("--set", "painted.frame_ms=20", "--set", "collector.noise_m=0.01", "--jobs", "2")
+    started = time.monotonic()
+    subprocess.run(in_process(*slow, out="whole"), check=True, capture_output=True)
+    whole_s = time.monotonic() - started
+    expected = Path("whole/metrics.json").read_bytes()
+    moments = random.Random(0)
+    for _ in range(10):
+        process = subprocess.Popen(in_process(*slow), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+        time.sleep(moments.uniform(0.1, 0.9) * whole_s)
+        process.kill()
+        process.wait()
+        if moments.random() < 0.3:
+            shutil.rmtree("out/scenes/painted.a", ignore_errors=True)
+    subprocess.run(in_process(*slow), check=True, capture_output=True)
+    assert Path("out/metrics.json").read_bytes() == expected
+    assert not list(Path("out").rglob("*.tmp"))
+
+
+def wait_for(path: Path, timeout_s: float = 20.0) -> Iterator[None]:
+    """Yields until ``path`` exists."""
+    end = time.monotonic() + timeout_s
+    while not path.exists():
+        assert time.monotonic() < end, f"{path} did not come in {timeout_s} s"
+        time.sleep(0.02)
+        yield
+
+
+def test_the_second_of_two_runs_on_one_folder_is_refused() -> None:
+    process = subprocess.Popen(in_process("--set", "painted.frame_ms=200"), stdout=subprocess.DEVNULL)
+    for _ in wait_for(Path("out/run.json")):
+        pass
+    assert run("--set", "painted.frame_ms=200") == 2
+    process.kill()
+    process.wait()
