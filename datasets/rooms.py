@@ -1,0 +1,176 @@
+"""Built-in procedural indoor scenes: made on demand from a name, rendered by ray casting, fully known."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from su3d_bench.datasets.rooms_classes import CLASSES
+from su3d_bench.datasets.rooms_kinds import KINDS, furnish
+from su3d_bench.datasets.rooms_layout import Plan
+from su3d_bench.datasets.rooms_mesh import RoomMesh, build_mesh, gather_patches
+from su3d_bench.datasets.rooms_noise import LEVELS, add_noise
+from su3d_bench.datasets.rooms_render import RenderedFrame, Renderer, camera_intrinsics
+from su3d_bench.datasets.rooms_trajectory import walk
+from su3d_bench.datasets.rooms_truth import RoomObject, RoomTruth, truth_of
+from su3d_bench.errors import DataError, suggest
+from su3d_bench.types import Float64Array, Frame, ImageDomain, LabelSet, SceneInfo
+
+GENERATOR_VERSION = 1  # raise it whenever a scene of the same name comes out different
+DEFAULT_SCENES = ("living0", "bedroom0", "kitchen0", "office0", "bathroom0", "studio0", "living1", "office1")
+TRAINING_FROM = 10_000  # numbers from here on are kept for training the embedded encoder; no benchmark uses them
+FRAMES_PER_SECOND = 30.0
+N_STRUCTURE = 6  # floor, ceiling and four walls have the ids 1..6
+ROOMS_IN_MEMORY = 2
+LABELS = LabelSet("replica", tuple(c.id for c in CLASSES), tuple(c.name for c in CLASSES))
+
+
+class RoomOptions(BaseModel):
+    """Image size, length of the walk, sensor noise (0 none, 1 mild, 2 strong), density of the scan."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    width: int = Field(640, ge=16, le=4096)
+    height: int = Field(480, ge=16, le=4096)
+    n_frames: int = Field(1600, ge=1, le=100_000)
+    noise: int = Field(0, ge=0, lt=len(LEVELS))
+    mesh_spacing_m: float = Field(0.015, ge=0.004, le=0.2)
+    seed_offset: int = Field(0, ge=0)
+
+
+def scene_name_parts(scene: str) -> tuple[str, int]:
+    """Kind and number of a scene name; raises ``DataError`` for what is no scene."""
+    match = re.fullmatch(r"([a-z]+)(0|[1-9]\d{0,5})", scene)
+    if match is None or match[1] not in KINDS:
+        hint = suggest(scene, DEFAULT_SCENES) or f"; kinds: {', '.join(KINDS)}"
+        raise DataError(f"rooms: no scene '{scene}'; a scene is a kind and a number such as office3{hint}")
+    return match[1], int(match[2])
+
+
+def _generator(*words: object) -> np.random.Generator:
+    """A random stream that the words fix, on every machine."""
+    digest = hashlib.sha256("/".join(str(word) for word in words).encode()).digest()
+    return np.random.default_rng(int.from_bytes(digest[:8], "little"))
+
+
+@dataclass
+class BuiltRoom:
+    """A furnished room; what is costly is made when first asked for."""
+
+    scene: str
+    options: RoomOptions
+    plan: Plan
+    truth: RoomTruth
+    _poses: dict[str, Float64Array] = field(default_factory=dict)
+
+    @cached_property
+    def mesh(self) -> RoomMesh:
+        exposure = float(_generator("exposure", self.scene, self.options.seed_offset).uniform(0.58, 0.72))
+        return build_mesh(gather_patches(self.plan.placed), self.plan.lights, exposure)
+
+    @cached_property
+    def renderer(self) -> Renderer:
+        return Renderer(self.mesh, self.options.width, self.options.height)
+
+    @cached_property
+    def trajectory(self) -> Float64Array:
+        plan = self.plan
+        size = plan.width, plan.depth, plan.height
+        rng = _generator("walk", self.scene, self.options.seed_offset)
+        return walk(self.mesh, list(plan.boxes.values()), size, N_STRUCTURE, self.options.n_frames, rng)
+
+
+class Rooms:
+    """The dataset ``rooms``; ``root`` holds its cache."""
+
+    name = "rooms"
+    label_space = "replica"
+    variants: tuple[str, ...] = ("mesh-vertices", "face-corners")
+    image_domain: ImageDomain = "rendered-rooms"
+    Options = RoomOptions
+
+    def __init__(self, root: Path, options: RoomOptions | None = None) -> None:
+        self.root = root
+        self.options = options or RoomOptions()
+        self._rooms: OrderedDict[str, BuiltRoom] = OrderedDict()
+
+    @property
+    def intrinsics(self) -> Float64Array:
+        return camera_intrinsics(self.options.width, self.options.height)
+
+    def scenes(self) -> Sequence[str]:
+        return DEFAULT_SCENES
+
+    def files(self, scene: str) -> Sequence[Path]:
+        scene_name_parts(scene)
+        return ()
+
+    def digest(self, scene: str) -> str:
+        scene_name_parts(scene)
+        words = f"rooms/{GENERATOR_VERSION}/{scene}/{self.options.model_dump_json()}"
+        return hashlib.sha256(words.encode()).hexdigest()
+
+    def info(self, scene: str, stride: int) -> SceneInfo:
+        scene_name_parts(scene)
+        n_frames = len(range(0, self.options.n_frames, stride))
+        return SceneInfo(self.name, scene, n_frames, stride, self.image_domain)
+
+    def truth(self, scene: str) -> RoomTruth:
+        return self._room(scene).truth
+
+    def objects(self, scene: str) -> tuple[RoomObject, ...]:
+        return self._room(scene).truth.objects
+
+    def trajectory(self, scene: str) -> Float64Array:
+        """Camera-to-world poses (n_frames, 4, 4), OpenCV axes, z up, metres."""
+        return self._room(scene).trajectory
+
+    def render(self, scene: str, view: int | Float64Array) -> RenderedFrame:
+        """The noise-free images at a frame of the walk or at any camera-to-world pose."""
+        room = self._room(scene)
+        pose = room.trajectory[view] if isinstance(view, int | np.integer) else np.asarray(view, np.float64)
+        return room.renderer.render(pose)
+
+    def frames(self, scene: str, stride: int) -> Sequence[Frame]:
+        """Every ``stride``-th frame, rendered when asked for."""
+        scene_name_parts(scene)
+        return RoomFrames(self, scene, range(0, self.options.n_frames, stride))
+
+    def frame(self, scene: str, index: int) -> Frame:
+        room = self._room(scene)
+        pose = room.trajectory[index]
+        image = room.renderer.render(pose)
+        rng = _generator("noise", scene, self.options.seed_offset, index)
+        rgb, depth_m = add_noise(image.rgb, image.depth_m, self.options.noise, rng)
+        return Frame(index, index / FRAMES_PER_SECOND, rgb, depth_m, pose, self.intrinsics)
+
+    def _room(self, scene: str) -> BuiltRoom:
+        if scene not in self._rooms:
+            kind, _ = scene_name_parts(scene)
+            plan = furnish(kind, _generator("room", scene, self.options.seed_offset))
+            self._rooms[scene] = BuiltRoom(scene, self.options, plan, truth_of(scene, kind, plan))
+            while len(self._rooms) > ROOMS_IN_MEMORY:
+                self._rooms.popitem(last=False)
+        self._rooms.move_to_end(scene)
+        return self._rooms[scene]
+
+
+class RoomFrames(Sequence[Frame]):
+    """Frames of one room, each rendered when it is asked for."""
+
+    def __init__(self, rooms: Rooms, scene: str, indices: range) -> None:
+        self._rooms, self._scene, self._indices = rooms, scene, indices
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def __getitem__(self, position: int) -> Frame:  # type: ignore[override]
+        return self._rooms.frame(self._scene, self._indices[position])
