@@ -198,7 +198,8 @@ def _score_instances(
     wanted = np.isin(values // instance_ap.INSTANCES_PER_CLASS, scored_ids)
     covered = np.zeros(len(prediction.points), np.int64) - 1
     covered[masks.indices] = 0
-    _, distance = transfer.transfer_values(prediction.points, covered, covered, truth.points, wanted)
+    reach = max(transfer.COVERAGE_RADII_M)
+    _, distance = transfer.transfer_values(prediction.points, covered, covered, truth.points, wanted, reach)
     return SceneScore(
         protocol=rules.name,
         version=rules.version,

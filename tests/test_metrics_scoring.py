@@ -52,7 +52,9 @@ class OneHotEncoder:
     def feature(self, text: str) -> Float32Array:
         inside = [name for name in LABELS.names if name in text]
         axis = LABELS.names.index(max(inside, key=len)) if inside else self.dim - 1
-        return np.eye(self.dim, dtype=np.float32)[axis]
+        direction = np.zeros(self.dim, np.float32)
+        direction[axis] = 1
+        return direction
 
 
 ENCODER: Encoder = OneHotEncoder()

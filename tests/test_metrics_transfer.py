@@ -38,10 +38,11 @@ def brute_force(candidates: np.ndarray, queries: np.ndarray) -> np.ndarray:
 @given(seed=st.integers(0, 10_000), n=st.integers(1, 300), on_a_grid=st.booleans())
 def test_nearest_equals_brute_force_with_the_lowest_index_of_equals(seed: int, n: int, on_a_grid: bool) -> None:
     rng = np.random.default_rng(seed)
-    candidates, queries = rng.random((n, 3)).astype(np.float32), rng.random((50, 3)).astype(np.float32)
     if on_a_grid:  # few places, many points on each, queries half-way between
-        candidates = rng.integers(0, 3, (n, 3)).astype(np.float32)
-        queries = rng.integers(0, 5, (50, 3)).astype(np.float32) / 2
+        candidates = rng.integers(0, 3, (n, 3)).astype(np.float64)
+        queries = rng.integers(0, 5, (50, 3)) / 2
+    else:
+        candidates, queries = rng.random((n, 3)), rng.random((50, 3))
     distance, index = nearest(candidates, queries)
     assert np.array_equal(index, brute_force(candidates, queries))
     exact = np.sqrt(((candidates[index].astype(np.float64) - queries) ** 2).sum(axis=1))

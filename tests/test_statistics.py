@@ -19,10 +19,10 @@ def test_the_examples_in_the_docstrings_run() -> None:
 
 
 def test_the_same_seed_gives_the_same_interval_and_another_seed_another() -> None:
-    values = np.random.default_rng(5).random(8)
+    values: Float64Array = np.random.default_rng(5).random(8)
 
     def mean(weights: Int64Array) -> Float64Array:
-        return np.asarray(weights @ values / 8, np.float64)
+        return np.array([float(row @ values) / 8 for row in weights])
 
     assert bootstrap_interval(mean, 8) == bootstrap_interval(mean, 8)
     assert bootstrap_interval(mean, 8, seed=0) != bootstrap_interval(mean, 8, seed=1)

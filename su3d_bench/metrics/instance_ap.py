@@ -22,6 +22,7 @@ from su3d_bench.types import BoolArray, Float64Array, Int32Array, Int64Array
 THRESHOLDS: tuple[float, ...] = (*(float(t) for t in np.arange(0.5, 0.95, 0.05)), 0.25)
 MIN_REGION_SIZE = 100  # points; the official script's --min_region_size, opt.min_region_sizes
 INSTANCES_PER_CLASS = 1000  # ground truth is label * 1000 + instance
+_MAX_VALUE = 10_000 * INSTANCES_PER_CLASS  # ScanNet's largest label is 1357
 
 IntArray = NDArray[np.integer[Any]]
 
@@ -339,10 +340,14 @@ def _segments(ground_truth: IntArray) -> tuple[Int64Array, Int64Array, Int64Arra
     """Each point's row in the ascending list of distinct values, that list, and how many points have each."""
     if not len(ground_truth):
         return np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros(0, np.int64)
-    if ground_truth.min() < 0:
-        raise DataError(f"ground truth: holds the value {int(ground_truth.min())}; values are label * 1000 + instance")
-    values, segment_of_point, sizes = np.unique(ground_truth, return_inverse=True, return_counts=True)
-    return segment_of_point, values.astype(np.int64), sizes.astype(np.int64)
+    if ground_truth.min() < 0 or ground_truth.max() > _MAX_VALUE:
+        worst = int(ground_truth.min() if ground_truth.min() < 0 else ground_truth.max())
+        raise DataError(f"ground truth: holds the value {worst}; values are label * 1000 + instance")
+    n_points_of_value = np.bincount(ground_truth)
+    values = np.flatnonzero(n_points_of_value)
+    row_of_value = np.zeros(len(n_points_of_value), np.int64)
+    row_of_value[values] = np.arange(len(values))
+    return row_of_value[ground_truth], values, n_points_of_value[values]
 
 
 def _intersections(

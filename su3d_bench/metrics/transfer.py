@@ -148,11 +148,11 @@ def first_owner(masks: Masks, n_points: int) -> Int64Array:
 
 
 def transfer_values(
-    points: Points, values: Int64Array, rank: Int64Array, targets: Points, wanted: BoolArray
+    points: Points, values: Int64Array, rank: Int64Array, targets: Points, wanted: BoolArray, cap_m: float = np.inf
 ) -> tuple[Int64Array, Float64Array]:
     """Value and distance in metres of the nearest point with a rank, for each wanted target; -1 and infinity elsewhere.
 
-    Points of rank -1 take no part. At equal distance the lower ``rank`` wins, then the lower index. On ``points``
+    Points of rank -1 take no part, nor do those farther than ``cap_m``. At equal distance the lower ``rank`` wins, then the lower index. On ``points``
     themselves a point with a rank keeps its own value, also where others share its place.
 
     >>> points = np.array([[0.0, 0, 0], [1, 0, 0]])
@@ -171,7 +171,7 @@ def transfer_values(
         value[own], distance[own] = values[own], 0.0
         missing = wanted & ~own
     asked = np.flatnonzero(missing)
-    distance[asked], found = nearest(points[order], targets[asked])
+    distance[asked], found = nearest(points[order], targets[asked], cap_m)
     reached = asked[found >= 0]
     value[reached] = values[order][found[found >= 0]]
     return value, distance
