@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from su3d_bench.opensu3d.config import OpenSU3DConfig
-from su3d_bench.opensu3d.id_image import BACKGROUND, BORDER, paint
+from su3d_bench.opensu3d.id_image import NO_DETECTION, paint
 from su3d_bench.types import BoolArray
 
 
@@ -19,10 +19,10 @@ def rectangle(rows: slice, columns: slice, height: int = 40, width: int = 60) ->
 def test_a_smaller_mask_shows_over_a_larger_one_whatever_their_order() -> None:
     large, small = rectangle(slice(5, 35), slice(5, 55)), rectangle(slice(10, 20), slice(10, 20))
     for masks, of_large, of_small in (([large, small], 0, 1), ([small, large], 1, 0)):
-        image = paint(np.stack(masks), 0, "disc")
+        image = paint(np.stack(masks), 0, "disc").ids
         assert (image[small] == of_small).all()
         assert (image[large & ~small] == of_large).all()
-        assert (image[~large] == BACKGROUND).all()
+        assert (image[~large] == NO_DETECTION).all()
 
 
 def test_the_ring_of_a_small_mask_erases_the_large_one_around_it_and_no_other_pixel() -> None:
@@ -30,35 +30,39 @@ def test_the_ring_of_a_small_mask_erases_the_large_one_around_it_and_no_other_pi
     image = paint(np.stack([large, small]), 3, "disc")
     rows, columns = np.mgrid[:40, :60]
     distance_squared = (rows - 20) ** 2 + (columns - 30) ** 2
-    np.testing.assert_array_equal(image == BORDER, (distance_squared <= 9) & (distance_squared > 0))
-    assert image[20, 30] == 1
-    assert (image[distance_squared > 9] == 0).all()
+    np.testing.assert_array_equal(image.ids == NO_DETECTION, (distance_squared <= 9) & (distance_squared > 0))
+    assert image.ids[20, 30] == 1
+    assert (image.ids[distance_squared > 9] == 0).all()
+    assert image.owner[20, 30] == 1
+    assert (image.owner[distance_squared > 0] == 0).all()
 
 
 def test_a_square_ring_reaches_its_width_in_the_corners() -> None:
     masks = np.stack([rectangle(slice(0, 40), slice(0, 60)), rectangle(slice(20, 21), slice(30, 31))])
-    assert np.count_nonzero(paint(masks, 3, "square") == BORDER) == 7 * 7 - 1
+    assert np.count_nonzero(paint(masks, 3, "square").ids == NO_DETECTION) == 7 * 7 - 1
 
 
 def test_two_instances_never_touch() -> None:
     rng = np.random.default_rng(0)
     masks = np.stack([rectangle(slice(r, r + 12), slice(c, c + 15)) for r, c in rng.integers(0, 40, (9, 2))])
-    image = np.pad(paint(masks, 2, "disc"), 2, constant_values=BACKGROUND)
+    image = np.pad(paint(masks, 2, "disc").ids, 2, constant_values=NO_DETECTION)
     for shift in [(0, 1), (1, 0), (0, 2), (2, 0), (1, 1), (-1, 1)]:
         other = np.roll(image, shift, (0, 1))
         assert not ((image >= 0) & (other >= 0) & (image != other)).any()
 
 
-def test_a_ring_over_no_mask_stays_background_and_is_clipped_at_the_image() -> None:
-    mask = rectangle(slice(0, 5), slice(0, 5))
-    image = paint(mask[None], 4, "disc")
-    assert (image[~mask] == BACKGROUND).all()
-    assert (image[mask] == 0).all()
+def test_rings_change_the_ids_alone_and_are_clipped_at_the_image() -> None:
+    rng = np.random.default_rng(1)
+    masks = np.stack([rectangle(slice(r, r + 12), slice(c, c + 15)) for r, c in rng.integers(0, 40, (9, 2))])
+    with_rings, without = paint(masks, 4, "square"), paint(masks, 0, "square")
+    np.testing.assert_array_equal(with_rings.owner, without.ids)
+    in_ids = with_rings.ids != NO_DETECTION
+    np.testing.assert_array_equal(with_rings.ids[in_ids], with_rings.owner[in_ids])
 
 
-def test_without_masks_all_is_background() -> None:
-    assert (paint(np.zeros((0, 4, 6), np.bool_), 3, "disc") == BACKGROUND).all()
-    assert (paint(np.zeros((2, 4, 6), np.bool_), 3, "disc") == BACKGROUND).all()
+def test_without_masks_no_pixel_has_a_detection() -> None:
+    assert (paint(np.zeros((0, 4, 6), np.bool_), 3, "disc").ids == NO_DETECTION).all()
+    assert (paint(np.zeros((2, 4, 6), np.bool_), 3, "disc").owner == NO_DETECTION).all()
 
 
 @pytest.mark.parametrize(("width", "reference", "expected"), [(1200, 1200, 20), (640, 1200, 11), (640, 0, 20)])

@@ -112,10 +112,10 @@ def test_name_and_score_come_from_the_views() -> None:
     ]
     found = run(views).finish()
     assert found.names == ("chair",)  # the highest score, of equal ones the earliest image
-    assert found.scores.tolist() == [pytest.approx(1.75 / 3)]
-    assert run(views, CONFIG.model_copy(update={"instance_score": "max"})).finish().scores.tolist() == [0.75]
-    summed = run(views, CONFIG.model_copy(update={"instance_score": "top-m-sum"})).finish()
-    assert summed.scores.tolist() == [pytest.approx(1.75 / 5)]
+    assert found.scores.tolist() == [pytest.approx(1.75 / 5)]  # three views of the five that the top m could hold
+    for rule, expected in (("mean", 1.75 / 3), ("max", 0.75)):
+        scored = run(views, CONFIG.model_copy(update={"instance_score": rule})).finish()
+        assert scored.scores.tolist() == [pytest.approx(expected)]
 
 
 def test_only_the_top_m_views_are_fused() -> None:
@@ -198,6 +198,24 @@ def test_points_of_no_instance_are_in_the_map_and_in_no_mask() -> None:
     assert not on_wall[found.indices].any()
     dropped = run([look(TWINS, 0)], CONFIG.model_copy(update={"background_pixels": "drop"})).finish()
     assert not (dropped.points[:, 2] > 2.5).any()
+
+
+def test_a_ring_keeps_out_of_the_matching_and_falls_to_its_owner_to_no_instance_or_nowhere() -> None:
+    """A small plate lies on a large one, 1 mm before it; the ring around it is 10 px, 17 cm there."""
+    plates = {1: Plate((-0.8, 0.8), (-0.6, 0.6)), 2: Plate((-0.1, 0.1), (-0.1, 0.1), 1.999)}
+    n_points = {}
+    for choice in ("owner", "background", "drop"):
+        config = CONFIG.model_copy(update={"border_px": 10.0, "border_pixels": choice})
+        found = run([look(plates, 0)], config).finish()
+        x, y, _ = np.abs(found.points).T
+        is_ring = (x < 0.2) & (y < 0.2) & ((x > 0.13) | (y > 0.13)) & (found.points[:, 2] < 2.5)
+        owner = np.full(len(found.points), -1)
+        for k in range(len(found)):
+            owner[found.mask(k)] = k
+        n_points[choice] = int(np.count_nonzero(is_ring))
+        assert (owner[is_ring] == (0 if choice == "owner" else -1)).all()
+    assert n_points["owner"] == n_points["background"] > 100
+    assert n_points["drop"] == 0
 
 
 def test_images_without_detections_or_depth_are_no_error() -> None:

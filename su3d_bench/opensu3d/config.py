@@ -54,7 +54,10 @@ class OpenSU3DConfig(BaseModel):
     # The paper's 20 px belong to 1200x680 images; other widths take the same share of the image. 0: pixels as they are.
     border_reference_width: int = Field(default=1200, ge=0)
     border_shape: Literal["disc", "square"] = "disc"
-    border_pixels: Literal["drop", "background"] = "drop"
+    # What a ring's pixels that lie in another mask become in the map, once the matching has gone without them: points
+    # of that mask's instance, points of no instance, or none at all. The paper leaves it open.
+    border_pixels: Literal["owner", "background", "drop"] = "owner"
+    # Points of pixels in no mask: the paper back-projects every pixel.
     background_pixels: Literal["keep", "drop"] = "keep"
     background_names: Annotated[tuple[str, ...], Field(strict=False)] = ("wall", "floor", "ceiling", "ground", "roof")
     max_box_fraction: Fraction = 0.95
@@ -70,11 +73,13 @@ class OpenSU3DConfig(BaseModel):
     overlap_threshold: float = Field(default=0.3, ge=0)
     overlap_rule: OverlapRule = "smaller-segment"
     keep_density: bool = True
+    # A point of an instance takes over a voxel that a point of no instance holds; the paper leaves it open.
     refill_background: bool = True
     dbscan_eps: Metres = 0.1
     dbscan_min_points: int = Field(default=20, ge=1)
     split_fraction: Fraction = 0.8
-    instance_score: InstanceScore = "mean"
+    # The paper ranks views, not instances; the sum of the top m scores over m puts what was seen once behind the rest.
+    instance_score: InstanceScore = "top-m-sum"
 
     @model_validator(mode="after")
     def _best_fit_crop_exists(self) -> OpenSU3DConfig:

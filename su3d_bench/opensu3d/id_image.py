@@ -2,34 +2,46 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from su3d_bench.types import BoolArray, Int32Array, UInt8Array
 
-BACKGROUND = -1
-BORDER = -2
+NO_DETECTION = -1
 
 
-def paint(masks: BoolArray, border_px: int, shape: Literal["disc", "square"]) -> Int32Array:
-    """ID image (H, W) int32 of ``masks`` (K, H, W): a detection's index, BACKGROUND in no mask, BORDER in a ring.
+@dataclass(frozen=True)
+class IdImage:
+    """``ids`` (H, W) int32: the detection of each pixel, NO_DETECTION in a ring and in no mask; this is M'.
+
+    ``owner`` (H, W) int32 is the same before the rings were cut: it differs from ``ids`` in the rings alone.
+    """
+
+    ids: Int32Array
+    owner: Int32Array
+
+
+def paint(masks: BoolArray, border_px: int, shape: Literal["disc", "square"]) -> IdImage:
+    """The ID image of ``masks`` (K, H, W).
 
     Larger masks are painted first, equal ones in order, so that where masks overlap the smaller one shows. Each mask
-    takes the ring of ``border_px`` around it from what was painted before; a ring over no mask stays BACKGROUND.
+    takes the ring of ``border_px`` around it from what was painted before.
     """
-    image = np.full(masks.shape[1:], BACKGROUND, np.int32)
+    ids = np.full(masks.shape[1:], NO_DETECTION, np.int32)
+    owner = ids.copy()
     areas = np.count_nonzero(masks, axis=(1, 2))
     element = _structuring_element(border_px, shape)
     for k in np.argsort(-areas, kind="stable"):
         if areas[k] == 0:
             continue
-        rows, columns = _window(masks[k], border_px)
-        mask, window = masks[k, rows, columns], image[rows, columns]
-        ring = _dilate(mask, element) & ~mask
-        window[ring & (window != BACKGROUND)] = BORDER
-        window[mask] = k
-    return image
+        window = _window(masks[k], border_px)
+        mask = masks[k][window]
+        ids[window][_dilate(mask, element)] = NO_DETECTION
+        ids[window][mask] = k
+        owner[window][mask] = k
+    return IdImage(ids, owner)
 
 
 def _window(mask: BoolArray, margin: int) -> tuple[slice, slice]:

@@ -10,6 +10,7 @@ from su3d_bench.errors import DataError
 from su3d_bench.opensu3d.association import assign_ids, count_overlaps, overlap_ratios
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.frame_cloud import FrameCloud, frame_cloud
+from su3d_bench.opensu3d.id_image import NO_DETECTION
 from su3d_bench.opensu3d.postprocess import segments_of, to_instances
 from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View, record_of
 from su3d_bench.opensu3d.voxel_map import NO_INSTANCE, VoxelMap
@@ -72,20 +73,20 @@ class OpenSU3D:
         with timer.stage("backproject"):
             cloud = frame_cloud(frame, detections.masks, self.config)
         with timer.stage("match"):
-            in_segment = np.flatnonzero(cloud.segment >= 0)
-            matched = self._map.nearest(cloud.points[in_segment])
+            matched = self._map.nearest(cloud.points[: cloud.n_inside])
         with timer.stage("track"):
-            scene_id_of = self._track(cloud, in_segment, matched, len(detections))
+            scene_id_of = self._track(cloud, matched, len(detections))
         with timer.stage("insert"):
-            self._insert(cloud, in_segment, matched, scene_id_of, detections)
+            self._insert(cloud, matched, scene_id_of, detections)
 
-    def _track(self, cloud: FrameCloud, in_segment: Int64Array, matched: Int64Array, n_detections: int) -> Int32Array:
+    def _track(self, cloud: FrameCloud, matched: Int64Array, n_detections: int) -> Int32Array:
         """Scene id of each detection, NO_INSTANCE for those without a point; enters them into Q."""
         scene_id_of = np.full(n_detections, NO_INSTANCE, np.int32)
-        if len(in_segment) == 0:
+        if cloud.n_inside == 0:
             return scene_id_of
-        matched_id = np.where(matched >= 0, self._map.ids[matched] if len(self._map) else NO_INSTANCE, NO_INSTANCE)
-        overlaps = count_overlaps(cloud.segment[in_segment], matched_id.astype(np.int32))
+        matched_id = np.zeros(cloud.n_inside, np.int32)
+        matched_id[matched >= 0] = self._map.ids[matched[matched >= 0]]
+        overlaps = count_overlaps(cloud.owner[: cloud.n_inside], matched_id)
         wanted = np.unique(overlaps.best[overlaps.best > NO_INSTANCE])
         lower, upper = cloud.points.min(axis=0) - self.config.eps, cloud.points.max(axis=0) + self.config.eps
         inside = np.append(self._map.count_inside(lower, upper, wanted), 0)
@@ -97,21 +98,15 @@ class OpenSU3D:
             self._table.add(int(scene_id), View(len(self._images), int(detection)))
         return scene_id_of
 
-    def _insert(
-        self,
-        cloud: FrameCloud,
-        in_segment: Int64Array,
-        matched: Int64Array,
-        scene_id_of: Int32Array,
-        detections: Detections,
-    ) -> None:
-        ids = np.full(len(cloud.points), NO_INSTANCE, np.int32)
-        ids[in_segment] = scene_id_of[cloud.segment[in_segment]]
+    def _insert(self, cloud: FrameCloud, matched: Int64Array, scene_id_of: Int32Array, detections: Detections) -> None:
+        ids = np.append(scene_id_of, NO_INSTANCE).astype(np.int32)[cloud.owner]  # NO_DETECTION is the last
         placed = self._map.insert(
             cloud.points, ids, keep_density=self.config.keep_density, refill=self.config.refill_background
         )
-        hit = np.where(placed[in_segment] >= 0, placed[in_segment], matched)
-        self._images.append(record_of(detections, self.config.fusion, cloud.segment[in_segment], hit))
+        hit = placed.copy()
+        hit[: cloud.n_inside] = np.where(placed[: cloud.n_inside] >= 0, placed[: cloud.n_inside], matched)
+        hit[cloud.owner == NO_DETECTION] = -1
+        self._images.append(record_of(detections, self.config.fusion, cloud.owner, hit))
 
     def finish(self) -> Instances:
         """The instances of the map so far, and its points of no instance."""
