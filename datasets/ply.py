@@ -1,0 +1,268 @@
+"""PLY files, read and written whole: every element and every property, lists of any length among them.
+
+Libraries that show meshes keep vertices and faces and drop the rest in silence, a face's ``object_id`` first of all.
+Formats ascii, binary_little_endian and binary_big_endian, version 1.0, with the eight scalar types under both their
+names (``uchar``, ``uint8``). Source: Greg Turk, The PLY Polygon File Format, 1994.
+
+Nothing is allocated on the word of the header: what it promises is held against the size of the file first.
+"""
+
+from __future__ import annotations
+
+from array import array
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.datasets.ply_body import BinaryBody, Body, TextBody, UnfitValueError
+from su3d_bench.datasets.ply_header import BYTE_ORDERS, NAMES_OF_TYPES, ByteOrder, Promise, Property, clip, read_header
+from su3d_bench.errors import DataError
+from su3d_bench.store import write_bytes
+from su3d_bench.types import Int64Array
+
+AnyArray = NDArray[Any]
+
+
+@dataclass(frozen=True)
+class ListColumn:
+    """A list property: row i is ``values[indptr[i]:indptr[i + 1]]``; ``count_type`` is the type of its lengths."""
+
+    indptr: Int64Array
+    values: AnyArray
+    count_type: np.dtype[Any] = field(default_factory=lambda: np.dtype(np.uint8))
+
+    def __len__(self) -> int:
+        return len(self.indptr) - 1
+
+    @property
+    def lengths(self) -> Int64Array:
+        return np.diff(self.indptr)
+
+
+Column = NDArray[Any] | ListColumn
+
+
+@dataclass(frozen=True)
+class PlyElement:
+    """One element: its name, its number of rows, and its properties in the order of the file."""
+
+    name: str
+    n_rows: int
+    columns: Mapping[str, Column]
+
+
+@dataclass(frozen=True)
+class PlyFile:
+    """A PLY file: ``format``, comments, and elements in the order of the file."""
+
+    format: str
+    comments: tuple[str, ...]
+    elements: tuple[PlyElement, ...]
+
+    def element(self, name: str) -> PlyElement | None:
+        """The element of that name, None where there is none."""
+        return next((element for element in self.elements if element.name == name), None)
+
+
+def read_ply(path: Path, where: str | None = None) -> PlyFile:
+    """Every element of a PLY file, in native byte order; ``where`` (default: the path) begins each message.
+
+    Raises ``DataError`` for a file that is missing, damaged, cut short or longer than its header says.
+    """
+    where = where or str(path)
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{where}: cannot be read: {error.strerror or error}") from error
+    header = read_header(content, where)
+    body = TextBody(content, header, where) if header.format == "ascii" else BinaryBody(content, header)
+    at, elements = body.start, []
+    for promised in header.elements:
+        element, at = _read_element(promised, body, at, where)
+        elements.append(element)
+    if left := body.n_left_over(at):
+        raise DataError(
+            f"{where}: {left} {body.unit} stand after the last element that the header names; it is damaged"
+        )
+    return PlyFile(header.format, header.comments, tuple(elements))
+
+
+def _read_element(promise: Promise, body: Body, at: int, where: str) -> tuple[PlyElement, int]:
+    """The element whose first row is at ``at``, and where the next element begins."""
+    where = f"{where}: element '{clip(promise.name)}'"
+    smallest = sum(body.size(one.count_type or one.type) for one in promise.properties)
+    if promise.n_rows * smallest > body.n_units - at:
+        raise DataError(
+            f"{where}: the header promises {promise.n_rows} rows of {smallest} or more {body.unit}, but only "
+            f"{body.n_units - at} are left; the file is cut short or damaged"
+        )
+    if not promise.properties:
+        return PlyElement(promise.name, promise.n_rows, {}), at
+    columns, end = _equal_columns(promise, body, at) or _walked_columns(promise, body, at, where)
+    return PlyElement(promise.name, promise.n_rows, columns), end
+
+
+def _equal_columns(promise: Promise, body: Body, at: int) -> tuple[dict[str, Column], int] | None:
+    """The columns where each list is in all rows as long as in the first; None where one is not or a value is unfit."""
+    columns: dict[str, Column] = {}
+    n, lengths = promise.n_rows, _first_lengths(promise, body, at)
+    stride = sum(_n_units(one, body, length) for one, length in zip(promise.properties, lengths, strict=False))
+    if len(lengths) < len(promise.properties) or n * stride > body.n_units - at:
+        return None
+    offset = at
+    try:
+        for one, length in zip(promise.properties, lengths, strict=True):
+            if one.count_type is None:
+                columns[one.name] = body.strided(offset, stride, n, 1, one.type)[:, 0]
+            elif (body.strided(offset, stride, n, 1, one.count_type) != length).any():
+                return None
+            else:
+                values = body.strided(offset + body.size(one.count_type), stride, n, length, one.type)
+                columns[one.name] = ListColumn(np.arange(n + 1) * length, values.reshape(-1), one.count_type)
+            offset += _n_units(one, body, length)
+    except UnfitValueError:
+        return None
+    return columns, at + n * stride
+
+
+def _n_units(one: Property, body: Body, length: int) -> int:
+    """Units that a property takes up in a row, a list of ``length`` items."""
+    return body.size(one.type) if one.count_type is None else body.size(one.count_type) + length * body.size(one.type)
+
+
+def _first_lengths(promise: Promise, body: Body, at: int) -> list[int]:
+    """Items of each list (0 for scalars) in the row at ``at``; fewer entries where they cannot be read."""
+    lengths: list[int] = []
+    for one in promise.properties:
+        length = 0
+        if one.count_type is not None and promise.n_rows > 0:
+            is_there = at + body.size(one.count_type) <= body.n_units
+            length = body.count(at, one.count_type) if is_there else -1
+        if length < 0:
+            break
+        lengths.append(length)
+        at += _n_units(one, body, length)
+    return lengths
+
+
+def _walked_columns(promise: Promise, body: Body, at: int, where: str) -> tuple[dict[str, Column], int]:
+    """The columns of rows that differ in size, found by going through them one by one."""
+    starts, lengths, end = _walk(promise, body, at, where)
+    columns: dict[str, Column] = {}
+    for one, n_items in zip(promise.properties, lengths, strict=True):
+        try:
+            if one.count_type is None:
+                indptr = np.arange(promise.n_rows + 1)
+                columns[one.name] = body.gathered(starts, one.type)
+                starts = starts + body.size(one.type)
+                continue
+            indptr = np.concatenate([[0], np.cumsum(n_items)])
+            starts = starts + body.size(one.count_type)
+            step = body.size(one.type)
+            items = np.repeat(starts - indptr[:-1] * step, n_items) + np.arange(indptr[-1]) * step
+            columns[one.name] = ListColumn(indptr, body.gathered(items, one.type), one.count_type)
+            starts = starts + n_items * step
+        except UnfitValueError as error:
+            row = int(np.searchsorted(indptr, error.index, side="right")) - 1
+            raise DataError(
+                f"{where} row {row}: '{clip(one.name)}' is {error}, which {one.type} cannot hold"
+            ) from error
+    return columns, end
+
+
+def _walk(promise: Promise, body: Body, at: int, where: str) -> tuple[Int64Array, list[Int64Array], int]:
+    """Where each row begins, the list lengths of each property (none for scalars), and where the last row ends."""
+    starts = array("q")
+    lengths = [array("q") for _ in promise.properties]
+    sizes = [body.size(one.type) for one in promise.properties]
+    for row in range(promise.n_rows):
+        starts.append(at)
+        for one, size, known in zip(promise.properties, sizes, lengths, strict=True):
+            if one.count_type is None:
+                at += size
+                continue
+            behind = at + body.size(one.count_type)
+            length = body.count(at, one.count_type) if behind <= body.n_units else 0
+            if length < 0:
+                raise DataError(f"{where} row {row}: list '{clip(one.name)}' has no valid length; the file is damaged")
+            known.append(length)
+            at = behind + length * size
+        if at > body.n_units:
+            raise DataError(
+                f"{where} row {row} of {promise.n_rows}: the file ends in the middle of it; it is cut short or damaged"
+            )
+    return np.array(starts, np.int64), [np.array(known, np.int64) for known in lengths], at
+
+
+def write_ply(
+    path: Path, elements: Sequence[PlyElement], *, format: str = "binary_little_endian", comments: Sequence[str] = ()
+) -> None:
+    """Write ``elements``, whole or not at all; the types of the arrays become those of the properties."""
+    assert format in BYTE_ORDERS, format
+    lines = ["ply", f"format {format} 1.0", *(f"comment {comment}" for comment in comments)]
+    for element in elements:
+        lines.append(f"element {element.name} {element.n_rows}")
+        lines += [_property_line(name, column) for name, column in element.columns.items()]
+        assert all(len(column) == element.n_rows for column in element.columns.values()), element.name
+    header = "\n".join([*lines, "end_header", ""]).encode()
+    write = _text_rows if format == "ascii" else _binary_rows
+    write_bytes(path, header + b"".join(write(element, BYTE_ORDERS[format]) for element in elements))
+
+
+def _property_line(name: str, column: Column) -> str:
+    if isinstance(column, ListColumn):
+        return f"property list {_type_name(column.count_type)} {_type_name(column.values.dtype)} {name}"
+    return f"property {_type_name(column.dtype)} {name}"
+
+
+def _type_name(kind: np.dtype[Any]) -> str:
+    return NAMES_OF_TYPES[kind.newbyteorder("=").str[1:]][0]
+
+
+def _binary_rows(element: PlyElement, order: ByteOrder) -> bytes:
+    """The rows of an element, each value scattered to its place."""
+    sizes = np.zeros(element.n_rows, np.int64)
+    for column in element.columns.values():
+        if isinstance(column, ListColumn):
+            sizes += column.count_type.itemsize + column.lengths * column.values.itemsize
+        else:
+            sizes += column.itemsize
+    starts = np.cumsum(sizes) - sizes
+    out = np.empty(int(sizes.sum()), np.uint8)
+    for column in element.columns.values():
+        if isinstance(column, ListColumn):
+            lengths, step = column.lengths, column.values.itemsize
+            assert lengths.max(initial=0) <= np.iinfo(column.count_type).max, "the count type cannot hold the lengths"
+            _scatter(out, starts, lengths.astype(column.count_type), order)
+            starts = starts + column.count_type.itemsize
+            items = np.repeat(starts - column.indptr[:-1] * step, lengths) + np.arange(len(column.values)) * step
+            _scatter(out, items, column.values, order)
+            starts = starts + lengths * step
+        else:
+            _scatter(out, starts, column, order)
+            starts = starts + column.itemsize
+    return out.tobytes()
+
+
+def _scatter(out: NDArray[np.uint8], starts: Int64Array, values: AnyArray, order: ByteOrder) -> None:
+    raw = np.ascontiguousarray(values, values.dtype.newbyteorder(order)).view(np.uint8).reshape(-1, values.itemsize)
+    for byte in range(values.itemsize):
+        out[starts + byte] = raw[:, byte]
+
+
+def _text_rows(element: PlyElement, _: ByteOrder) -> bytes:
+    texts = [_texts(column) for column in element.columns.values()]
+    return "".join(" ".join(row) + "\n" for row in zip(*texts, strict=True)).encode()
+
+
+def _texts(column: Column) -> list[str]:
+    """The text of each row: the shortest digits that give the value back."""
+    if not isinstance(column, ListColumn):
+        return [str(value) for value in column]
+    items = [str(value) for value in column.values]
+    bounds = zip(column.indptr[:-1].tolist(), column.indptr[1:].tolist(), strict=True)
+    return [" ".join([str(end - begin), *items[begin:end]]) for begin, end in bounds]
