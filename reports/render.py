@@ -17,6 +17,7 @@ from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int32Array, 
 BACKGROUND = (252, 252, 250)
 OVERSAMPLING = 2
 CUT_BELOW_TOP_M = 0.3  # what hangs at the ceiling goes with it
+ROOM_HEIGHT_M = 1.8  # a lower cloud has no ceiling to cut away
 CUT_BEHIND_WALL_M = 0.25
 ELEVATION = np.deg2rad(38.0)
 AZIMUTHS = (np.deg2rad(-125.0), np.deg2rad(55.0))
@@ -59,8 +60,9 @@ def view_cameras(bounds: Float64Array, width: int, height: int) -> tuple[Camera,
     """A top view and views from two opposite corners of ``bounds``, ceiling and near walls cut away; z is up."""
     width, height = width * OVERSAMPLING, height * OVERSAMPLING
     low, high = bounds[0] - 0.1, bounds[1] + 0.1
-    open_top = np.array([low, [high[0], high[1], bounds[1][2] - CUT_BELOW_TOP_M]])
     size = high - low
+    top_z = bounds[1][2] - CUT_BELOW_TOP_M if size[2] >= ROOM_HEIGHT_M else high[2]
+    open_top = np.array([low, [high[0], high[1], top_z]])
     pixels_per_m = 0.96 * min(width / size[0], height / size[1])
     above = np.array([(low[0] + high[0]) / 2, (low[1] + high[1]) / 2, open_top[1, 2] + 4.0])
     top = Camera(np.diag([1.0, -1.0, -1.0]), above, pixels_per_m, False, open_top, width, height)

@@ -184,7 +184,8 @@ def test_an_internal_error_is_one_line_and_exit_code_4(
 
 
 def test_a_closed_pipe_is_no_error() -> None:
-    command = f"{shlex.quote(sys.executable)} -m su3d_bench protocols show scannet200-instance | head -1; echo ${{PIPESTATUS[0]}}"
+    python = shlex.quote(sys.executable)
+    command = f"{python} -m su3d_bench protocols show scannet200-instance | head -1; echo ${{PIPESTATUS[0]}}"
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True)
     assert done.stdout.splitlines()[-1] == "0"
     assert done.stderr == ""
@@ -253,7 +254,7 @@ def test_a_query_ranks_the_map_and_draws_it(
     assert Path(picture).read_bytes().startswith(b"\x89PNG")
     assert main([*words, "--json", "--top", "2", "--out", "here/heat.png"]) == 0
     ranking: list[dict[str, Any]] = json.loads(capsys.readouterr().out)["ranking"]
-    assert [one["name"] for one in ranking][0] == "sofa"
+    assert ranking[0]["name"] == "sofa"
     assert ranking[0]["similarity"] == pytest.approx(1.0)
     assert len(ranking) == 2
     assert Path("here/heat.png").is_file()

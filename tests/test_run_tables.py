@@ -1,0 +1,80 @@
+from __future__ import annotations
+
+from typing import Any
+
+from su3d_bench.reports.tables import headline, markdown_table
+
+
+def result(method: str = "opensu3d", **more: Any) -> dict[str, Any]:
+    scored = {
+        "n_scenes": 8,
+        "metrics": {"mAcc": 0.40833, "F-mIoU": 0.3124},
+        "intervals": {"mAcc": [0.3889, 0.4256], "F-mIoU": None},
+        "coverage": {"0.025": 0.009, "0.05": 0.002, "0.1": 0.0},
+        "warnings": ["rooms/a: 3 classes have no points", "rooms/b: 3 classes have no points"],
+    }
+    base = {
+        "method": method,
+        "protocol": "rooms-semantic",
+        "version": 2,
+        "headline": ["mAcc", "F-mIoU"],
+        "caveat": None,
+        "n_planned": 8,
+        "failed": [],
+        "unscored": [],
+        "ceiling": {"mAcc": 0.971, "F-mIoU": 1.0},
+        "result": scored,
+    }
+    return base | more
+
+
+def table(*results: dict[str, Any], is_partial: bool = False) -> str:
+    return markdown_table({"is_partial": is_partial, "limit": 3, "results": list(results)})
+
+
+def test_a_row_shows_value_interval_ceiling_scenes_and_coverage() -> None:
+    row = next(line for line in table(result()).splitlines() if "opensu3d" in line)
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    assert cells == ["opensu3d", "40.8 [38.9, 42.6]", "31.2", "97.1 / 100.0", "8", "99.1 / 99.8 / 100.0"]
+
+
+def test_a_headline_reads_as_the_house_style_has_it() -> None:
+    one = result(headline=["mAcc"])
+    assert headline(one) == "mAcc 40.8 [38.9, 42.6] (8 scenes, ceiling 97.1)"
+
+
+def test_columns_line_up_as_plain_text() -> None:
+    lines = [line for line in table(result(), result("oracle")).splitlines() if line.startswith("|")]
+    assert len({len(line) for line in lines}) == 1
+    assert len(lines) == 4
+
+
+def test_missing_scenes_are_counted_and_named() -> None:
+    few = result()["result"] | {"n_scenes": 7}
+    text = table(result(result=few, failed=["rooms/c"], caveat="labels mean little here"))
+    assert "| 7/8 " in text
+    assert "- INCOMPLETE: opensu3d failed on rooms/c" in text
+    assert "- opensu3d: labels mean little here" in text
+
+
+def test_a_partial_run_is_shouted() -> None:
+    assert "**rooms-semantic (version 2): PARTIAL, only the first 3 frames of each scene**" in table(
+        result(), is_partial=True
+    )
+    assert "PARTIAL" not in table(result())
+
+
+def test_a_warning_of_many_scenes_stands_once() -> None:
+    assert table(result()).count("3 classes have no points") == 1
+    assert "- opensu3d: 3 classes have no points (rooms/a, rooms/b)" in table(result())
+
+
+def test_what_was_not_measured_is_a_dash() -> None:
+    text = table(result(result=None, ceiling=None, unscored=["rooms/a"]))
+    row = next(line for line in text.splitlines() if line.startswith("| opensu3d"))
+    assert [cell.strip() for cell in row.strip("|").split("|")] == ["opensu3d", "-", "-", "-", "0/8", "-"]
+    assert "- opensu3d is unscored on rooms/a" in text
+
+
+def test_no_protocol_is_said() -> None:
+    assert table() == "no protocol scores these scenes\n"
