@@ -256,7 +256,6 @@ def combine(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> ProtocolR
     ordered = [(scene, scores[scene]) for scene in sorted(scores)]
     n_scored = sum(score.n_scored for _, score in ordered)
     n_beyond = np.sum([score.n_farther for _, score in ordered], axis=0)
-    warnings = [f"{scene}: {sentence}" for scene, score in ordered for sentence in score.warnings]
     return form_result(
         rules,
         [scene for scene, _ in ordered],
@@ -266,8 +265,20 @@ def combine(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> ProtocolR
             for i, radius in enumerate(transfer.COVERAGE_RADII_M)
         },
         n_predictions={scene: score.n_predictions for scene, score in ordered},
-        warnings=warnings,
+        warnings=_gathered({scene: score.warnings for scene, score in ordered}),
     )
+
+
+def _gathered(warnings: Mapping[str, tuple[str, ...]]) -> list[str]:
+    """Each sentence with its scene, or once for all where every scene has it.
+
+    >>> _gathered({"a": ("x", "y"), "b": ("x",)})
+    ['every scene: x', 'a: y']
+    """
+    sentences = dict.fromkeys(sentence for of_scene in warnings.values() for sentence in of_scene)
+    shared = [s for s in sentences if len(warnings) > 1 and all(s in of_scene for of_scene in warnings.values())]
+    single = [f"{scene}: {s}" for scene, of_scene in warnings.items() for s in of_scene if s not in shared]
+    return [f"every scene: {sentence}" for sentence in shared] + single
 
 
 def pack_scores(scores: Mapping[str, SceneScore]) -> bytes:

@@ -361,6 +361,12 @@ def test_another_encoder_than_the_protocols_is_told() -> None:
     assert warnings_of("rooms-semantic", truth_as_prediction(room(), with_labels=False), ENCODER) == ""
 
 
+def test_what_every_scene_warns_of_is_told_once() -> None:
+    rules = load_protocol("replica-mesh-ex6")
+    score = score_scene(rules, room(), truth_as_prediction(room(), with_labels=False), ENCODER)
+    assert len(combine(rules, {"a": score, "b": score, "c": score}).warnings) == 1
+
+
 def test_a_class_of_the_truth_without_scored_points_is_told_and_counts_zero_in_its_scene_alone() -> None:
     rules = load_protocol("replica-conceptgraphs-ex6")
     points = room().points[room().semantic != ID["lamp"]]

@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from su3d_bench import scoring
 from su3d_bench.metrics import (
     dot_product,
     instance_ap,
@@ -23,7 +24,9 @@ from su3d_bench.metrics.transfer import Masks, duplicate_pairs, nearest, reduce_
 
 
 @pytest.mark.parametrize(
-    "module", [dot_product, instance_ap, labelling, resampling, results, semantic, transfer], ids=lambda m: m.__name__
+    "module",
+    [dot_product, instance_ap, labelling, resampling, results, scoring, semantic, transfer],
+    ids=lambda m: m.__name__,
 )
 def test_the_examples_in_the_docstrings_run(module: object) -> None:
     assert doctest.testmod(module).failed == 0  # type: ignore[arg-type]

@@ -152,8 +152,8 @@ def transfer_values(
 ) -> tuple[Int64Array, Float64Array]:
     """Value and distance in metres of the nearest point with a rank, for each wanted target; -1 and infinity elsewhere.
 
-    Points of rank -1 take no part, nor do those farther than ``cap_m``. At equal distance the lower ``rank`` wins, then the lower index. On ``points``
-    themselves a point with a rank keeps its own value, also where others share its place.
+    Points of rank -1 take no part, nor do those farther than ``cap_m``. At equal distance the lower ``rank`` wins, then
+    the lower index. On ``points`` themselves a point with a rank keeps its own value, whatever shares its place.
 
     >>> points = np.array([[0.0, 0, 0], [1, 0, 0]])
     >>> values, distance = transfer_values(
