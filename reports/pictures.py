@@ -167,7 +167,7 @@ def _cameras(points: Float32Array) -> tuple[Camera, ...]:
 
 
 def _views(cloud: Cloud, cameras: Sequence[Camera]) -> tuple[View, ...]:
-    spacing = 2.0 * DRAWN_SPACING_M
+    spacing = 2.6 * DRAWN_SPACING_M  # no gaps in a surface whose points lie up to two cells apart
     return tuple(render(cloud.points, spacing, camera) for camera in cameras)
 
 

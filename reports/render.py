@@ -1,8 +1,8 @@
 """A point cloud as seen from above or from a corner, in software: no OpenGL, no display.
 
-Points are splatted into a depth buffer at twice the size; the shading comes from that buffer alone (eye-dome lighting,
-Boucheny 2009), so that edges read without normals. What is drawn first is the *index* of the visible point, so that one
-rendering serves any number of colourings.
+Points are drawn as squares into a depth buffer at twice the size; the shading comes from that buffer alone (eye-dome
+lighting, Boucheny 2009), so that edges read without normals. What is drawn first is the *index* of the visible point,
+so that one rendering serves any number of colourings.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ CUT_BEHIND_WALL_M = 0.25
 ELEVATION = np.deg2rad(38.0)
 AZIMUTHS = (np.deg2rad(-125.0), np.deg2rad(55.0))
 FIELD_OF_VIEW = np.deg2rad(38.0)
+DEPTH_BINS = 3  # near points are drawn larger than far ones, in this many steps
+MAX_SQUARE = 15
 SHADE_STRENGTH = 60.0
 SHADE_REACH = 2  # pixels of the oversampled image
 
@@ -92,30 +94,39 @@ def _corner_camera(open_top: Float64Array, azimuth: float, width: int, height: i
 
 
 def render(points: Float32Array, spacing_m: float, camera: Camera) -> View:
-    """The visible point of each pixel, every point drawn as a disc of ``spacing_m`` across."""
+    """The visible point of each pixel, every point drawn as a square of ``spacing_m`` across."""
     inside = np.flatnonzero(_inside(points, camera.box))
     relative = (points[inside].astype(np.float64) - camera.eye) @ camera.rotation.T
     depth = relative[:, 2]
     scale = camera.focal / depth if camera.is_perspective else np.full(len(depth), camera.focal)
     column = np.floor(relative[:, 0] * scale + camera.width / 2).astype(np.int64)
     row = np.floor(relative[:, 1] * scale + camera.height / 2).astype(np.int64)
-    order = np.argsort(-depth, kind="stable")  # far first: of equal pixels the last write wins
-    column, row, depth, inside = column[order], row[order], depth[order], inside[order]
-    radius = 0.7 * spacing_m * scale[order]
-    point = np.full(camera.width * camera.height, -1, np.int32)
-    nearest = np.full(camera.width * camera.height, np.inf)
-    reach = int(np.ceil(min(radius.max(initial=1.0), 7.0)))
-    for dy in range(-reach, reach + 1):
-        for dx in range(-reach, reach + 1):
-            x, y = column + dx, row + dy
-            drawn = (dx * dx + dy * dy <= np.maximum(radius, 0.5) ** 2) & (x >= 0) & (y >= 0)
-            drawn &= (x < camera.width) & (y < camera.height)
-            pixel = y[drawn] * camera.width + x[drawn]
-            closer = depth[drawn] < nearest[pixel]
-            nearest[pixel[closer]] = depth[drawn][closer]
-            point[pixel[closer]] = inside[drawn][closer]
-    shape = (camera.height, camera.width)
-    return View(point.reshape(shape), _shade(nearest.reshape(shape)))
+    seen = (column >= 0) & (row >= 0) & (column < camera.width) & (row < camera.height)
+    order = np.flatnonzero(seen)[np.argsort(-depth[seen], kind="stable")]  # far first: of equal pixels the last stays
+    rank = np.arange(len(order), 0, -1, dtype=np.float64)  # 1 is the nearest; float64, which the filter works in
+    nearest = np.full((camera.height, camera.width), np.inf)
+    for part in np.array_split(np.arange(len(order)), DEPTH_BINS):
+        if len(part) == 0:
+            continue
+        layer = np.full((camera.height, camera.width), np.inf)
+        layer[row[order[part]], column[order[part]]] = rank[part]
+        size = int(np.clip(np.rint(spacing_m * scale[order[part]].mean()), 1, MAX_SQUARE))
+        np.minimum(nearest, _spread(layer, size), out=nearest)
+    is_drawn = np.isfinite(nearest)
+    chosen = order[len(order) - nearest[is_drawn].astype(np.int64)]
+    point = np.full(nearest.shape, -1, np.int32)
+    point[is_drawn] = inside[chosen]
+    depth_image = np.full(nearest.shape, np.nan)
+    depth_image[is_drawn] = depth[chosen]
+    return View(point, _shade(depth_image))
+
+
+def _spread(image: Float64Array, size: int) -> Float64Array:
+    """The least value within a square of ``size`` pixels around each pixel."""
+    from scipy.ndimage import minimum_filter
+
+    spread: Float64Array = minimum_filter(image, size, mode="constant", cval=np.inf)
+    return spread
 
 
 def _inside(points: Float32Array, box: Float64Array) -> BoolArray:
@@ -124,8 +135,11 @@ def _inside(points: Float32Array, box: Float64Array) -> BoolArray:
 
 
 def _shade(depth: Float64Array) -> Float32Array:
-    """How much each pixel lies behind its neighbours, as a factor: 1 on open surfaces, darker at depth edges."""
-    log_depth = np.log2(np.where(np.isfinite(depth), depth, np.nan))
+    """How much each pixel lies behind its neighbours, as a factor: 1 on open surfaces, darker at depth edges.
+
+    ``depth`` is NaN where nothing is drawn.
+    """
+    log_depth = np.log2(depth)
     behind = np.zeros_like(depth)
     for dy, dx in ((0, 1), (0, -1), (1, 0), (-1, 0), (1, 1), (-1, -1), (1, -1), (-1, 1)):
         neighbour = np.roll(log_depth, (dy * SHADE_REACH, dx * SHADE_REACH), axis=(0, 1))
