@@ -287,7 +287,7 @@ def cooktop(look: Look) -> Assembly:
             ring = lathe([(r * 0.82, 0), (r, 0), (r, 0.006), (r * 0.82, 0.006), (r * 0.82, 0)], 22)
             build.add(metal(linear((150, 60, 40)), look.rng), ring.moved(*at))
             build.add(iron, lathe([(0, 0), (r * 0.6, 0), (r * 0.6, 0.005), (0, 0.005)], 20).moved(*at))
-            build.spot((at[0] - 0.1, at[0] + 0.1), (at[1] - 0.1, at[1] + 0.1), 0.0225, role="burner")
+            build.spot((at[0] - 0.16, at[0] + 0.16), (at[1] - 0.16, at[1] + 0.16), 0.0225, role="burner")
     for i in range(4):
         build.add(chrome(look.rng), cylinder(0.016, 0.016, (i - 1.5) * 0.06, -depth / 2 + 0.03, 0.0142))
     return build

@@ -383,6 +383,21 @@ def blanket(look: Look) -> Assembly:
     return build
 
 
+def rolled_blanket(look: Look) -> Assembly:
+    """A thick roll with a fringe at one end."""
+    build = Assembly(look)
+    length, r = look.size(0.44, 0.52), look.size(0.075, 0.085)
+    spiral = [(r * 0.2, 0.004), (r * 0.3, -0.004), (r * 0.55, -0.004), (r * 0.65, 0.005), (r * 0.8, 0.005), (r, 0.014)]
+    build.add(
+        cloth(look.rgb, look.rng, large=True), lathe([(0, 0), *spiral, (r, length), (0, length)], 20).turned("y", 90)
+    )
+    fringe = plain_cloth(shade(look.rgb, 0.6), look.rng)
+    for i in range(14):
+        strand = block(0.03, 0.008, 0.006, length + 0.016, 0, r * 0.9).turned("x", 360 * i / 14)
+        build.add(fringe, strand)
+    return build
+
+
 def folded_towel(look: Look) -> Assembly:
     """A stack of folded towels with a border stripe."""
     build = Assembly(look)
@@ -545,7 +560,7 @@ def cardboard_box(look: Look) -> Assembly:
 
 def basket(look: Look) -> Assembly:
     build = Assembly(look)
-    r, h = look.size(0.18, 0.23), look.size(0.24, 0.32)
+    r, h = look.size(0.21, 0.25), look.size(0.24, 0.32)
     weave = wicker(look.rgb, look.rng)
     build.add(weave, lathe([(0, 0), (r * 0.8, 0), (r, h), (r - 0.018, h), (r * 0.8 - 0.018, 0.016), (0, 0.016)], 28))
     rim = wicker(shade(look.rgb, 0.75), look.rng)
@@ -689,7 +704,7 @@ HOUSEHOLD: Mapping[str, tuple[Builder, ...]] = {
     "sculpture": (sculpture,),
     "cushion": (cushion, flat_cushion),
     "pillow": (pillow,),
-    "blanket": (blanket,),
+    "blanket": (blanket, rolled_blanket),
     "towel": (folded_towel, rolled_towel),
     "rug": (rug,),
     "mat": (mat,),

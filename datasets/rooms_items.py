@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import cached_property
 
 import numpy as np
 
@@ -12,6 +13,7 @@ from su3d_bench.datasets.rooms_materials import Material, Rgb, of_kind, tone
 from su3d_bench.datasets.rooms_shapes import Shape, bounds
 from su3d_bench.types import Float64Array
 
+FOOT_HEIGHT_M = 0.025
 SMALL_BELOW, LARGE_ABOVE = 0.92, 1.09  # of the usual size of a class
 
 
@@ -48,6 +50,13 @@ class Item:
     parts: tuple[Part, ...]
     spots: tuple[Spot, ...]
     size: Float64Array
+
+    @cached_property
+    def foot(self) -> Float64Array:
+        """Corners (2, 2) of the rectangle on which the item stands: what it touches, without its overhang."""
+        corners = np.concatenate([part.shape.quads.reshape(-1, 3) for part in self.parts])
+        low = corners[corners[:, 2] < FOOT_HEIGHT_M]
+        return np.stack([low[:, :2].min(axis=0), low[:, :2].max(axis=0)])
 
 
 @dataclass(frozen=True)

@@ -66,15 +66,11 @@ def _floor_things(plan: Plan, names: Sequence[str]) -> None:
 
 
 def _filled_basket(plan: Plan, content: str) -> None:
+    """A basket from which a rolled towel or blanket sticks out."""
     basket = plan.somewhere(plan.new("basket"))
-    if basket is None:
-        return
-    for _ in range(12):
-        item = plan.new(content, "rolled_towel" if content == "towel" else None)
-        if content == "towel":
-            item = _stood_up(item)
-        if plan.on(item, basket, "inside"):
-            return
+    if basket:
+        for _ in range(2):
+            plan.on(_stood_up(plan.new(content, f"rolled_{content}")), basket, "inside", turn=0.0)
 
 
 def _stood_up(item: Item) -> Item:
@@ -102,17 +98,20 @@ def _seating(plan: Plan) -> Placed | None:
     if sofa is None:
         return None
     rug = plan.new("rug")
-    plan.facing(rug, sofa, 0.08, turn=0.0)
+    if plan.facing(rug, sofa, 0.08, turn=0.0) is None:
+        plan.facing(plan.new("rug"), sofa, 0.03, turn=0.0)
     low_table = plan.facing(plan.new("table", "coffee_table"), sofa, float(plan.rng.uniform(0.42, 0.52)), turn=0.0)
     for _ in range(int(plan.rng.integers(2, 4))):
         plan.on(plan.new("cushion", "cushion"), sofa, "seat", "back", turn=6.0)
-    plan.on(plan.new("blanket"), sofa, "seat", turn=6.0)
+    plan.on(plan.new("blanket", "blanket"), sofa, "seat", turn=6.0)
     side = plan.beside(plan.new("table", "side_table"), sofa)
     _stock(plan, side, [("lamp", "table_lamp")])
     _stock(
         plan,
         low_table,
-        _choose(plan, ["cup", "bowl", ("book", "book_stack"), "candle", "plate", "tissue-paper", "cup", "vase"], 4),
+        _choose(
+            plan, ["cup", "bowl", ("book", "book_stack"), "candle", "plate", "tissue-paper", "laptop", "cup", "vase"], 5
+        ),
     )
     plan.hang_above(plan.new("picture"), sofa, 1.3, float(plan.rng.uniform(-0.2, 0.2)))
     return sofa
@@ -220,6 +219,13 @@ def _before(plan: Plan, desk: Placed, item: Item, local_x: float, from_front: fl
         plan.on(item, desk, turn=3.0)
 
 
+def _bench(plan: Plan) -> None:
+    """A bench with a flat cushion on it."""
+    bench = plan.against_wall(plan.new("bench"))
+    if bench:
+        plan.on(plan.new("cushion", "flat_cushion"), bench, "seat", turn=5.0)
+
+
 def living(plan: Plan) -> None:
     sofa = _seating(plan)
     _television(plan, sofa)
@@ -229,12 +235,11 @@ def living(plan: Plan) -> None:
     plan.against_wall(plan.new("lamp", "floor_lamp"), corner=True)
     _plant_stand(plan)
     _filled_basket(plan, "blanket")
-    seat = str(plan.rng.choice(["beanbag", "stool", "bench"]))
-    place = plan.somewhere(plan.new(seat))
-    if seat == "bench" and place:
-        plan.on(plan.new("cushion", "flat_cushion"), place, "seat", turn=5.0)
+    plan.somewhere(plan.new(str(plan.rng.choice(["beanbag", "stool"]))))
+    _bench(plan)
     _floor_things(
-        plan, [str(n) for n in plan.rng.permutation(["backpack", "exercise-ball", "box", "indoor-plant"])[:2]]
+        plan,
+        [str(n) for n in plan.rng.permutation(["backpack", "exercise-ball", "box", "indoor-plant", "umbrella"])[:3]],
     )
     _wall_things(plan, 2)
 
@@ -244,7 +249,8 @@ def bedroom(plan: Plan) -> None:
     bed = plan.against_wall(item, gap=0.3) or plan.against_wall(item)
     if bed:
         rug = plan.new("rug")
-        plan.facing(rug, bed, -0.7, turn=0.0)
+        if plan.facing(rug, bed, -0.7, turn=0.0) is None:
+            plan.facing(plan.new("rug"), bed, -0.9, turn=0.0)
         for _ in range(2):
             stand = plan.beside(plan.new("nightstand"), bed, 0.07)
             _stock(
@@ -252,9 +258,9 @@ def bedroom(plan: Plan) -> None:
                 stand,
                 [("lamp", "table_lamp"), *_choose(plan, [("book", "book_stack"), "cup", "tissue-paper", "candle"], 1)],
             )
-        for _ in range(2):
-            plan.on(plan.new("pillow"), bed, "head", turn=4.0, gap=0.0)
-        plan.on(plan.new("blanket"), bed, "seat", turn=6.0)
+        for side in ("left", "right"):
+            plan.on(plan.new("pillow"), bed, "head", side, turn=3.0, gap=0.0)
+        plan.on(plan.new("blanket", "blanket"), bed, "seat", turn=6.0)
         plan.on(plan.new("cushion", "flat_cushion"), bed, "seat", turn=20.0)
         plan.hang_above(plan.new("picture"), bed, 1.35)
     wardrobe = plan.against_wall(plan.new("wardrobe"))
@@ -266,9 +272,10 @@ def bedroom(plan: Plan) -> None:
         _desk_place(plan, laptop=True)
     _filled_basket(plan, "blanket")
     _plant_stand(plan)
-    bench = plan.somewhere(plan.new(str(plan.rng.choice(["stool", "beanbag", "chair"]))))
-    del bench
-    _floor_things(plan, [str(n) for n in plan.rng.permutation(["backpack", "box", "exercise-ball", "umbrella"])[:2]])
+    plan.somewhere(plan.new(str(plan.rng.choice(["stool", "beanbag", "beanbag"]))))
+    if plan.rng.random() < 0.5:
+        _bench(plan)
+    _floor_things(plan, [str(n) for n in plan.rng.permutation(["backpack", "box", "exercise-ball", "umbrella"])[:3]])
     _wall_things(plan, 2)
 
 
@@ -277,25 +284,30 @@ def _counter_run(plan: Plan) -> None:
     rng = plan.rng
     colour = str(rng.choice(["white", "beige", "grey", "green", "blue", "brown"]))
     for wall in [int(w) for w in rng.permutation(4)]:
-        start = float(rng.uniform(0.03, 0.1))
-        run: list[Placed] = []
-        along = start
-        for _ in range(4):
-            item = plan.new("base-cabinet", colour=colour)
-            centre = along + item.size[0] / 2
-            x, y = plan.wall_point(wall, centre, item.size[1] / 2 + 0.006)
-            found = (
-                plan.try_at(item, x, y, WALL_YAW[wall]) if centre + item.size[0] / 2 < plan.wall_length(wall) else None
-            )
-            if found is None:
-                break
-            run.append(found)
-            along = centre + item.size[0] / 2 + 0.004
-        if len(run) >= 2:
-            _counter_top(plan, wall, start, along, run)
-            return
-        for placed in reversed(run):
-            _take_back(plan, placed)
+        for start in (float(rng.uniform(0.03, 0.1)), 0.6, 1.2, 1.8):
+            run, end = _cabinet_row(plan, wall, start, colour)
+            if len(run) >= 2:
+                _counter_top(plan, wall, start, end, run)
+                return
+            for placed in reversed(run):
+                _take_back(plan, placed)
+
+
+def _cabinet_row(plan: Plan, wall: int, start: float, colour: str) -> tuple[list[Placed], float]:
+    """Up to four base cabinets from ``start`` along a wall, and where they end."""
+    run: list[Placed] = []
+    along = start
+    for _ in range(4):
+        item = plan.new("base-cabinet", colour=colour)
+        centre, half = along + item.size[0] / 2, item.size[0] / 2
+        x, y = plan.wall_point(wall, centre, item.size[1] / 2 + 0.006)
+        fits = centre + half < plan.wall_length(wall)
+        found = plan.try_at(item, x, y, WALL_YAW[wall]) if fits else None
+        if found is None:
+            break
+        run.append(found)
+        along = centre + half + 0.004
+    return run, along
 
 
 def _take_back(plan: Plan, placed: Placed) -> None:
@@ -330,16 +342,14 @@ def _counter_top(plan: Plan, wall: int, start: float, end: float, run: Sequence[
     stove = _at_cabinet(plan, top, run[order[1]], plan.new("cooktop"))
     if stove:
         for name in ("pan", "pot"):
-            plan.on(plan.new(name), stove, "burner", "any", turn=25.0, gap=0.0) or plan.on(
-                _low(plan, name), stove, "burner", "centre", turn=20.0, gap=0.0
-            )
+            plan.on(plan.new(name), stove, "burner", "centre", turn=12.0, gap=0.0)
     if sink:
         _beside_on(plan, top, sink, plan.new("towel", "folded_towel"))
+    plan.on(plan.new("microwave"), top, where="back", turn=3.0)
     for name in (
-        "microwave",
-        "paper-towel",
         "chopping-board",
         "knife-block",
+        "paper-towel",
         "bottle",
         "bowl",
         "cup",
@@ -350,20 +360,6 @@ def _counter_top(plan: Plan, wall: int, start: float, end: float, run: Sequence[
     for cabinet in run:
         if plan.rng.random() < 0.8:
             plan.hang_above(plan.new("wall-cabinet", colour=run[0].item.colour), cabinet, 1.5)
-
-
-def _low(plan: Plan, name: str) -> Item:
-    """A vessel without the spread of its handle, so that it fits over a burner."""
-    item = plan.new(name)
-    return Item(
-        item.class_name,
-        item.colour,
-        item.material,
-        item.size_word,
-        item.parts,
-        item.spots,
-        np.array([0.19, 0.19, item.size[2]]),
-    )
 
 
 def _at_cabinet(plan: Plan, top: Placed, cabinet: Placed, item: Item) -> Placed | None:
@@ -398,14 +394,20 @@ def kitchen(plan: Plan) -> None:
         plan.on(plan.new("box"), fridge, turn=6.0)
     _dining(plan, 3)
     cabinet = plan.against_wall(plan.new("cabinet"))
-    _stock(plan, cabinet, _choose(plan, ["bowl", "vase", "plate", "bottle", "pot", "indoor-plant", "candle"], 4))
+    _stock(
+        plan,
+        cabinet,
+        _choose(
+            plan, ["bowl", "vase", "chopping-board", "bottle", "pot", "indoor-plant", "knife-block", "paper-towel"], 5
+        ),
+    )
     plan.against_wall(plan.new("bin"), gap=0.04)
     rack = plan.new("shelf", "wall_shelf")
     hung = plan.hang_somewhere(rack, 1.45)
     if hung:
         for name in ("cup", "bottle", "bowl", "indoor-plant"):
             plan.on(plan.new(name), hung, turn=3.0)
-    _floor_things(plan, ["stool", "mat", "box"])
+    _floor_things(plan, ["stool", "mat", "box", "umbrella"])
     _wall_things(plan, 1)
 
 
@@ -421,9 +423,7 @@ def office(plan: Plan) -> None:
             plan.on(plan.new("cushion", "cushion"), sofa, "seat", "back", turn=6.0)
             plan.on(plan.new("cushion", "cushion"), sofa, "seat", "back", turn=6.0)
     else:
-        bench = plan.against_wall(plan.new("bench"))
-        if bench:
-            plan.on(plan.new("cushion", "flat_cushion"), bench, "seat", turn=5.0)
+        _bench(plan)
     plan.against_wall(plan.new("lamp", "floor_lamp"), corner=True)
     hung = plan.hang_somewhere(plan.new("shelf", "wall_shelf"), 1.45)
     _stock(plan, hung, [("book", "books"), "sculpture", "indoor-plant"])
@@ -448,8 +448,7 @@ def bathroom(plan: Plan) -> None:
         plan.beside(plan.new("bin"), toilet, 0.12)
     if tub:
         plan.facing(plan.new("mat"), tub, 0.05, turn=0.0)
-    shelf = _bath_shelf(plan)
-    del shelf
+    _bath_shelf(plan)
     cabinet = plan.against_wall(plan.new("cabinet"))
     _stock(
         plan,
@@ -485,9 +484,9 @@ def studio(plan: Plan) -> None:
     """One room to live, sleep and work in."""
     bed = plan.against_wall(plan.new("bed"), gap=0.2, corner=True)
     if bed:
-        for _ in range(2):
-            plan.on(plan.new("pillow"), bed, "head", turn=4.0, gap=0.0)
-        plan.on(plan.new("blanket"), bed, "seat", turn=6.0)
+        for side in ("left", "right"):
+            plan.on(plan.new("pillow"), bed, "head", side, turn=3.0, gap=0.0)
+        plan.on(plan.new("blanket", "blanket"), bed, "seat", turn=6.0)
         stand = plan.beside(plan.new("nightstand"), bed, 0.07)
         _stock(plan, stand, [("lamp", "table_lamp"), "cup"])
     sofa = _seating(plan)
@@ -495,10 +494,9 @@ def studio(plan: Plan) -> None:
     _desk_place(plan, laptop=bool(plan.rng.random() < 0.5))
     plan.against_wall(plan.new("wardrobe"))
     _shelf(plan, n=6)
-    fridge = plan.against_wall(plan.new("refrigerator"))
-    del fridge
+    plan.against_wall(plan.new("refrigerator"))
     cabinet = plan.against_wall(plan.new("cabinet"))
-    _stock(plan, cabinet, ["microwave", "pot", "bottle"])
+    _stock(plan, cabinet, ["microwave", "pot", "paper-towel", "bottle"])
     _floor_things(
         plan,
         [str(n) for n in plan.rng.permutation(["backpack", "umbrella", "box", "exercise-ball", "basket", "stool"])[:3]],

@@ -11,7 +11,7 @@ from su3d_bench.datasets.rooms_catalog import make
 from su3d_bench.datasets.rooms_items import Item, Part, Spot
 from su3d_bench.datasets.rooms_materials import Material, Texture, mix, shade, stone, tone
 from su3d_bench.datasets.rooms_mesh import Light, Placed
-from su3d_bench.datasets.rooms_shapes import Shape
+from su3d_bench.datasets.rooms_shapes import Shape, rotation
 from su3d_bench.types import Float64Array
 
 GAP_M = 0.002  # between touching faces, so that neither flickers through the other
@@ -186,10 +186,10 @@ class Plan:
     def on(
         self, item: Item, anchor: Placed, role: str = "top", where: str = "any", turn: float = 8.0, gap: float = 0.015
     ) -> Placed | None:
-        """On (or in) one of the anchor's spots; ``where``: any, centre, back, front, or a sign of x ("left")."""
+        """On (or in) one of the anchor's spots; ``where``: any, centre, back, front, left, right."""
         spots = [spot for spot in anchor.item.spots if spot.role == role and spot.clearance >= item.size[2]]
         for spot in [spots[int(k)] for k in self.rng.permutation(len(spots))] if spots else []:
-            for _ in range(14):
+            for _ in range(24):
                 yaw = float(self.rng.uniform(-turn, turn))
                 local = self._within(item, spot, where, yaw)
                 if local is None:
@@ -209,22 +209,21 @@ class Plan:
         return chain
 
     def _within(self, item: Item, spot: Spot, where: str, yaw: float) -> tuple[float, float] | None:
-        turn = np.deg2rad(yaw)
-        half_x = (item.size[0] * abs(np.cos(turn)) + item.size[1] * abs(np.sin(turn))) / 2
-        half_y = (item.size[1] * abs(np.cos(turn)) + item.size[0] * abs(np.sin(turn))) / 2
-        low, high = (spot.x0 + half_x, spot.y0 + half_y), (spot.x1 - half_x, spot.y1 - half_y)
+        """A place at which what the item stands on lies in the spot."""
+        (x0, y0), (x1, y1) = item.foot
+        feet = np.array([[x0, y0, 0], [x0, y1, 0], [x1, y0, 0], [x1, y1, 0]]) @ rotation("z", yaw).T
+        low = spot.x0 - feet[:, 0].min(), spot.y0 - feet[:, 1].min()
+        high = spot.x1 - feet[:, 0].max(), spot.y1 - feet[:, 1].max()
         if low[0] > high[0] + 1e-9 or low[1] > high[1] + 1e-9:
             return None
-        x, y = (
-            float(self.rng.uniform(low[0], max(low[0], high[0]))),
-            float(self.rng.uniform(low[1], max(low[1], high[1]))),
-        )
+        x = float(self.rng.uniform(low[0], max(low[0], high[0])))
+        y = float(self.rng.uniform(low[1], max(low[1], high[1])))
         if where == "centre":
             return (low[0] + high[0]) / 2, (low[1] + high[1]) / 2
-        if where == "back":
-            return x, high[1]
-        if where == "front":
-            return x, low[1]
+        if where in ("back", "front"):
+            return x, high[1] if where == "back" else low[1]
+        if where in ("left", "right"):
+            return low[0] if where == "left" else high[0], y
         return x, y
 
     def finish_lights(self) -> None:
@@ -326,8 +325,8 @@ def _add_window(plan: Plan, wall: int, cover: str) -> None:
     plan.lights.append(Light((x, y, sill + 0.6), (0.88 * power, 0.97 * power, 1.1 * power), 0.4))
     if cover == "curtain":
         colour = str(plan.rng.choice(["red", "green", "blue", "yellow", "orange", "purple", "pink", "beige", "grey"]))
+        panel = plan.new("curtain", colour=colour)
         for side in (-1, 1):
-            panel = plan.new("curtain", colour=colour)
             plan.hang(panel, wall, along + side * (window.size[0] / 2 + panel.size[0] / 2 + 0.06), 0.04, 0.0)
     elif cover == "blinds":
         blind = plan.new("blinds")

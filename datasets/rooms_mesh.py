@@ -193,7 +193,7 @@ def _fill_buried(light: Float64Array, buried: NDArray[np.bool_], triangles: NDAr
     )
     tail, head = tail.ravel(), head.ravel()
     filled, unknown = light.copy(), buried.copy()
-    for _ in range(3):
+    for _ in range(10):
         use = unknown[tail] & ~unknown[head]
         count = np.bincount(tail[use], minlength=len(light))
         reached = count > 0

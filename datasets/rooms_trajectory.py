@@ -230,15 +230,14 @@ def _visible_shares(
     n_objects = int(mesh.instance_of_triangle.max()) + 1
     shares = np.zeros((len(stations), len(inside), n_objects))
     near = np.zeros((len(stations), len(inside)))
-    row = np.arange(len(directions))
+    row, best = np.arange(len(directions)), np.zeros(n_objects)
     for k in range(len(stations)):
         table = np.zeros((len(directions), n_objects))
-        useful = np.where((t[k] > 0.5) & (t[k] < 4.0), 1.0, 0.4)
-        table[row, ids[k]] = weight * useful
-        solid = inside @ table
-        enough = np.clip(table.sum(axis=0) * 0.9, 0.002, 0.05)
-        shares[k] = np.clip(solid / enough, 0, 1)
+        table[row, ids[k]] = weight * np.interp(t[k], [0.4, 0.7, 2.5, 5.0], [0.2, 1.0, 1.0, 0.3])
+        shares[k] = inside @ table
+        best = np.maximum(best, table.sum(axis=0))
         near[k] = inside @ ((t[k] < 0.6) * weight)
+    shares = np.clip(shares / np.clip(0.5 * best, 0.002, 0.3), 0, 1)  # half of the best view is a good view
     shares[:, :, 0] = 0.0
     shares[:, :, 1 : n_structure + 1] *= 0.25
     return shares, near
