@@ -46,6 +46,7 @@ def code_digest() -> str:
     return total.hexdigest()[:16]
 
 
+@cache
 def package_versions(names: tuple[str, ...] = RECORDED_PACKAGES) -> dict[str, str]:
     """Versions of the packages that a result depends on, and of Python; those not installed are left out."""
     found = {"python": ".".join(str(part) for part in sys.version_info[:3])}

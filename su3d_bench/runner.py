@@ -18,7 +18,7 @@ from su3d_bench.planning import Plan
 from su3d_bench.protocols import ProtocolRules, load_protocol
 from su3d_bench.scene_run import CEILING_METHOD, MethodOutcome, SceneJob, failed_outcomes, run_scene
 from su3d_bench.scoring import SceneScore, combine, unpack_scores
-from su3d_bench.store import SCHEMA, write_json, write_text
+from su3d_bench.store import SCHEMA, remove_file, write_json, write_text
 from su3d_bench.timing import hardware_line
 from su3d_bench.toml_text import write_toml
 
@@ -44,7 +44,7 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
     """Do every job of ``plan`` that is not done yet and write the run's records."""
     with plan.folder.locked():
         metrics_file = plan.folder.path / "metrics.json"
-        metrics_file.unlink(missing_ok=True)
+        remove_file(metrics_file)  # what stands there may be of another plan
         write_text(plan.folder.path / "run.toml", write_toml(resolved_values(plan)))
         write_json(plan.folder.path / "run.json", _record(plan, (), "running"))
         try:

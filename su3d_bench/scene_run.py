@@ -119,6 +119,10 @@ def run_scene(job: SceneJob, report: Report) -> tuple[MethodOutcome, ...]:
 def failed_outcomes(job: SceneJob, reason: str) -> tuple[MethodOutcome, ...]:
     """The outcome of a scene whose worker died; what its methods finished before stays and is resumed next time."""
     line = f"{job.scene}: {reason}"
+    for part in job.methods:
+        folder = RunFolder(job.folder).job(job.scene, part.name)
+        folder.prepare()
+        write_text(folder.log, f"failed: {line}\n")
     return tuple(MethodOutcome(job.scene, part.name, error=line) for part in job.methods)
 
 
@@ -232,6 +236,7 @@ class _Scene:
         frames = self.dataset.frames(self.job.scene_name, info.stride)
         n = min(len(frames), self.job.limit or len(frames))
         timer, rows = Timer(), []
+        self.report(Event(self.job.scene, method.name, 0, n))
         for update in range(n):
             start = time.perf_counter()
             with timer.stage("decode"):

@@ -66,6 +66,14 @@ def write_bytes(path: Path, content: bytes) -> None:
         raise _store_error(path, error) from error
 
 
+def remove_file(path: Path) -> None:
+    """Remove ``path`` where it exists."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise _store_error(path, error) from error
+
+
 def write_text(path: Path, text: str) -> None:
     write_bytes(path, text.encode())
 

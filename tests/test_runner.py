@@ -356,6 +356,30 @@ def wait_for(path: Path, timeout_s: float = 20.0) -> Iterator[None]:
         yield
 
 
+def test_progress_shows_scenes_and_frames_on_a_terminal_only() -> None:
+    ours, theirs = os.openpty()
+    slow = in_process("--set", "painted.frame_ms=60", "--jobs", "2", out="tty")
+    with subprocess.Popen(slow, stdout=subprocess.PIPE, stderr=theirs, text=True) as process:
+        os.close(theirs)
+        shown = b"".join(iter(lambda: read_some(ours), b"")).decode()
+        assert process.stdout is not None
+        assert process.stdout.read().startswith("**rooms-semantic")
+    assert "scenes" in shown
+    assert "painted/a collector" in shown
+    assert "frames/s" in shown
+    assert "4 instances" in shown
+    quiet = subprocess.run(slow, capture_output=True, text=True)
+    assert quiet.stderr == "run folder: tty\n"
+
+
+def read_some(descriptor: int) -> bytes:
+    """What a pseudo terminal holds; nothing once its other end is closed."""
+    try:
+        return os.read(descriptor, 65536)
+    except OSError:
+        return b""
+
+
 def test_the_second_of_two_runs_on_one_folder_is_refused() -> None:
     process = subprocess.Popen(in_process("--set", "painted.frame_ms=200"), stdout=subprocess.DEVNULL)
     for _ in wait_for(Path("out/run.json")):

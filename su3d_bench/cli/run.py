@@ -84,13 +84,13 @@ def _carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
     with progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
         result = run_plan(plan, report)
     _answer_result(result, arguments)
-    for _, _, line in result.failures:
+    for line in dict.fromkeys(line for _, _, line in result.failures):
         remark(f"su3d-bench: {line}")
     if result.is_complete:
         return EXIT_DONE
     n_failed = len({scene for scene, _, _ in result.failures})
     log = plan.folder.job(*result.failures[0][:2]).log
-    remark(f"su3d-bench: incomplete: {n_failed} of {len(plan.jobs)} scenes failed; traceback in {log}")
+    remark(f"su3d-bench: incomplete: {n_failed} of {len(plan.jobs)} scenes failed; see {log}")
     return EXIT_INCOMPLETE
 
 
@@ -116,6 +116,7 @@ def _show_plan(plan: Plan, arguments: argparse.Namespace) -> int:
         return EXIT_DONE
     for row in rows:
         state = "done already" if row.is_done else f"{row.n_updates} updates, about {row.seconds:.0f} s"
+        state = row.remark or state
         answer(f"{row.scene:<24} {row.method:<12} {state}")
     total = sum(row.seconds for row in rows if not row.is_done) / plan.n_workers
     source = "measured in earlier runs" if all(row.is_measured for row in rows) else "a rough guess"
