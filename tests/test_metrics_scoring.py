@@ -250,6 +250,52 @@ def test_points_of_another_cloud_are_labelled_by_their_nearest_truth_point() -> 
     assert combine(rules, {"room": score}).metrics == {**combine(rules, {"room": score}).metrics, "mAcc": 1.0}
 
 
+def test_a_class_that_no_truth_has_takes_points_away_from_the_true_one() -> None:
+    truth = room()
+    table = np.flatnonzero(truth.semantic == ID["table"])
+    prediction = instances(truth.points, [table[:75], table[75:]], ["table", "sofa"])
+    score = score_scene(ROOM, truth, prediction, None)
+    assert combine(ROOM, {"room": score}).per_class["table"]["recall"] == 0.5
+
+
+def test_confidences_count_where_the_protocol_says_so_and_are_all_one_elsewhere() -> None:
+    truth = room()
+    lamp, book = np.flatnonzero(truth.instance == 5), np.flatnonzero(truth.instance == 7)
+
+    def ap_of_lamp(name: str, *scores: float) -> float:
+        rules = load_protocol(name)
+        prediction = instances(truth.points, [lamp, book], ["lamp", "lamp"], scores=scores)
+        return combine(rules, {"room": score_scene(rules, truth, prediction, None)}).per_class["lamp"]["AP"]
+
+    assert ap_of_lamp("rooms-instance", 0.9, 0.1) == 1.0
+    assert ap_of_lamp("rooms-instance", 0.1, 0.9) == 0.25
+    assert ap_of_lamp("replica-openmask3d", 0.9, 0.1) == ap_of_lamp("replica-openmask3d", 0.1, 0.9) == 0.75
+
+
+def test_a_semantic_protocol_with_a_cap_takes_farther_points_for_missing() -> None:
+    rules = load_protocol("scannet-semantic")
+    labels = LabelSet("scannet", tuple(c.id for c in rules.classes), tuple(c.name for c in rules.classes))
+    points = np.random.default_rng(0).random((200, 3)).astype(np.float32)
+    semantic = np.repeat([5, 7], 100).astype(np.int32)
+    truth = GroundTruth(points, semantic, semantic, labels, "nyu40-vertices", "made for a test")
+    for offset, value in ((0.04, 1.0), (0.06, 0.0)):
+        moved = points[:1] + np.array([offset, 0, 0], np.float32)
+        alone = replace(truth, points=points[:1], semantic=semantic[:1], instance=semantic[:1])
+        score = score_scene(rules, alone, instances(moved, [np.arange(1)], ["chair"]), None)
+        assert combine(rules, {"a": score}).per_class["chair"]["recall"] == value
+    assert headline("scannet-semantic", truth, truth_as_prediction(truth, with_labels=True)) == [1.0, 1.0, 1.0]
+
+
+def test_where_two_objects_have_a_point_in_one_place_the_first_names_it() -> None:
+    truth = room()
+    chairs = np.flatnonzero(truth.semantic == ID["chair"])
+    place = np.repeat(truth.points[chairs[:1]], 40, axis=0) + np.float32(0.01)
+    masks = [np.arange(20, 40), np.arange(20)]  # the first object holds the later points of the map
+    for names, recall in ((("chair", "table"), 1.0), (("table", "chair"), 0.0)):
+        score = score_scene(ROOM, truth, instances(place, masks, names), None)
+        assert combine(ROOM, {"room": score}).per_class["chair"]["recall"] == recall
+
+
 # ---- several scenes
 
 
