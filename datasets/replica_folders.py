@@ -1,0 +1,109 @@
+"""Where the two trees of Replica are below the data root, and what their scenes are called.
+
+The *render tree* is the RGB-D render of NICE-SLAM (``Replica/room0/...``), the *original tree* the release with the
+annotated meshes (``replica_v1/room_0/habitat/...``).
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from su3d_bench.errors import DataError
+
+OFFICIAL_SCENES = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")
+RENDER_FOLDERS = ("Replica", "replica", ".")
+ORIGINAL_FOLDERS = (
+    "replica_v1",
+    "Replica_v1",
+    "Replica-Dataset/replica_v1",
+    "Replica-Dataset",
+    "Replica_Dataset",
+    "replica_dataset",
+    "Replica",
+    "replica",
+    ".",
+)
+RENDER_URL = "https://cvg-data.inf.ethz.ch/nice-slam/data/Replica.zip"
+ORIGINAL_URL = "https://github.com/facebookresearch/Replica-Dataset"
+MARKER = "rooms.json"  # stands beside cam_params.json where scenes were made by `datasets make`
+
+
+@dataclass(frozen=True)
+class RenderTree:
+    """The folder with ``cam_params.json`` and the names of its scenes, the official ones first."""
+
+    folder: Path
+    scenes: tuple[str, ...]
+
+
+def find_render_tree(root: Path) -> RenderTree | None:
+    """The first of ``RENDER_FOLDERS`` below ``root`` that holds a scene; None where none does."""
+    for name in RENDER_FOLDERS:
+        folder = root / name
+        # The data root itself holds other datasets too, whose folders are not scenes of this one.
+        parts = ("traj.txt", "results") if name == "." else ()
+        found = [child.name for child in _folders(folder) if _is_scene(child, parts)]
+        if found:
+            official = [scene for scene in OFFICIAL_SCENES if scene in found]
+            others = sorted(set(found) - set(official), key=_natural_order)
+            return RenderTree(folder, (*official, *others))
+    return None
+
+
+def _folders(folder: Path) -> list[Path]:
+    try:
+        return [child for child in folder.iterdir() if child.is_dir() and not child.name.startswith(".")]
+    except OSError:
+        return []
+
+
+def _is_scene(folder: Path, required: tuple[str, ...]) -> bool:
+    if required:
+        return all((folder / part).exists() for part in required)
+    return (folder / "traj.txt").exists() or (folder / "results").exists()
+
+
+def _natural_order(scene: str) -> tuple[str, int, str]:
+    match = re.fullmatch(r"(.*?)(\d{1,18})", scene)
+    return (match[1], int(match[2]), scene) if match else (scene, -1, scene)
+
+
+def original_name(scene: str) -> str:
+    """The scene as the original release calls it: ``room_0`` for ``room0``, ``frl_apartment_0`` for itself."""
+    return re.sub(r"(?<=[^\d_])(\d+)$", r"_\1", scene)
+
+
+def find_original_scene(root: Path, scene: str) -> Path | None:
+    """The folder of the original release with ``habitat/`` in it; None where no tree below ``root`` has it."""
+    for name in ORIGINAL_FOLDERS:
+        for scene_name in dict.fromkeys((original_name(scene), scene)):
+            if (root / name / scene_name / "habitat").is_dir():
+                return root / name / scene_name
+    return None
+
+
+def no_render_tree(root: Path) -> DataError:
+    """What to say where no scene was found: where it was looked for and how to get data."""
+    return DataError(
+        f"replica: no scene in {root} or in its folder Replica (a scene is a folder such as room0 with traj.txt and "
+        f"results/); unpack {RENDER_URL} there, set SU3D_DATA to where it is, or make rooms in this layout: "
+        f"su3d-bench datasets make rooms --layout replica --out {root}"
+    )
+
+
+def read_marker(folder: Path) -> dict[str, str]:
+    """Scene -> content key of the scenes in a render tree that ``datasets make`` rendered; empty without a marker."""
+    path = folder / MARKER
+    if not path.is_file():
+        return {}
+    try:
+        scenes = json.loads(path.read_text(encoding="utf-8"))["scenes"]
+        return {str(scene): str(key) for scene, key in scenes.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise DataError(
+            f"{path}: not the marker that `su3d-bench datasets make` writes ({error}); delete it if the scenes were "
+            "not made by it, otherwise make them again"
+        ) from error

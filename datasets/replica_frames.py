@@ -1,0 +1,235 @@
+"""Posed RGB-D frames of the render that NICE-SLAM distributes: cam_params.json, traj.txt, results/.
+
+Depth is uint16, metres are value / scale, 0 is invalid; a pose is a row-major 4x4 camera-to-world matrix with OpenCV
+axes in the z-up world of the original mesh, taken as it is. A fault in any file fails the scene: the release is
+complete, so a gap or a NaN means a damaged copy, and a number computed around it would not be the scene's.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.errors import DataError
+from su3d_bench.types import Float32Array, Float64Array, Frame, UInt8Array
+
+CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
+RIGID_TOLERANCE = 1e-2  # catches scaled, mirrored and transposed-in-place matrices, not the digits a file left out
+FRAMES_PER_SECOND = 30.0  # the release has no timestamps
+N_DEPTH_VALUES = 1 << 16
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+JPEG_END = b"\xff\xd9"
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Image size in pixels, intrinsics (3, 3), and how many depth units make a metre."""
+
+    width: int
+    height: int
+    intrinsics: Float64Array
+    scale: float
+
+
+def read_camera(path: Path, where: str) -> Camera:
+    """The camera of ``cam_params.json``; ``where`` begins each message."""
+    where = f"{where}: {path.name}"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"{where} cannot be read: {error.strerror}; it belongs into {path.parent}") from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{where}: not JSON ({error}); copy the file again") from error
+    table = content.get("camera") if isinstance(content, dict) else None
+    if not isinstance(table, dict):
+        raise DataError(f"{where}: has no table 'camera'; expected {{'camera': {{{', '.join(CAMERA_KEYS)}}}}}")
+    w, h, fx, fy, cx, cy, scale = (_number(table, key, where) for key in CAMERA_KEYS)
+    for key, value in (("w", w), ("h", h), ("fx", fx), ("fy", fy), ("scale", scale)):
+        if value <= 0:
+            raise DataError(f"{where}: '{key}' is {value:g}; it must be above 0")
+    if not (w.is_integer() and h.is_integer()):
+        raise DataError(f"{where}: the image size {w:g}x{h:g} is not in whole pixels")
+    if not (0 <= cx <= w and 0 <= cy <= h):
+        raise DataError(f"{where}: the principal point ({cx:g}, {cy:g}) lies outside the image of {w:g}x{h:g}")
+    return Camera(int(w), int(h), np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), scale)
+
+
+def _number(table: dict[str, Any], key: str, where: str) -> float:
+    if key not in table:
+        raise DataError(f"{where}: 'camera' has no '{key}'; expected {', '.join(CAMERA_KEYS)}")
+    value = table[key]
+    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+        raise DataError(f"{where}: '{key}' is {str(value)[:40]!r}; expected a number")
+    return float(value)
+
+
+def read_trajectory(path: Path, where: str) -> Float64Array:
+    """Camera-to-world poses (n, 4, 4), one a line; ``where`` begins each message."""
+    try:
+        lines = path.read_text(encoding="utf-8").rstrip().splitlines()
+    except OSError as error:
+        raise DataError(f"{where}: traj.txt cannot be read: {error.strerror}; expected it in {path.parent}") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{where}: traj.txt is not a text file; copy it again") from error
+    if not lines:
+        raise DataError(f"{where}: traj.txt is empty; expected one pose a line")
+    poses = np.array([_values(line, f"{where}: traj.txt line {n}") for n, line in enumerate(lines, 1)])
+    poses = poses.reshape(-1, 4, 4)
+    rotations, last_rows = poses[:, :3, :3], poses[:, 3]
+    products = rotations @ rotations.transpose(0, 2, 1)
+    is_rigid = np.abs(products - np.eye(3)).max(axis=(1, 2)) < RIGID_TOLERANCE
+    is_rigid &= (np.linalg.det(rotations) > 0) & (np.abs(last_rows - (0, 0, 0, 1)).max(axis=1) < RIGID_TOLERANCE)
+    if not is_rigid.all():
+        raise DataError(
+            f"{where}: traj.txt line {int(np.argmin(is_rigid)) + 1}: not a rigid motion; expected a row-major "
+            "camera-to-world matrix with last row 0 0 0 1"
+        )
+    return poses
+
+
+def _values(line: str, where: str) -> list[float]:
+    words = line.split()
+    if len(words) != 16:
+        raise DataError(f"{where} has {len(words)} values; expected 16, a row-major 4x4 camera-to-world matrix")
+    try:
+        values = [float(word) for word in words]
+    except ValueError as error:
+        raise DataError(f"{where}: {error}; expected 16 numbers") from error
+    for value, word in zip(values, words, strict=True):
+        if not math.isfinite(value):
+            raise DataError(f"{where}: the pose holds '{word[:20]}'; mend the trajectory or leave the scene out")
+    return values
+
+
+def check_frames_complete(scene_folder: Path, n_poses: int, where: str) -> None:
+    """Raise ``DataError`` unless results/ holds exactly colour and depth of frames 0 to ``n_poses`` - 1."""
+    folder = scene_folder / "results"
+    try:
+        names = [path.name for path in folder.iterdir()]
+    except OSError as error:
+        raise DataError(f"{where}: results/ cannot be read: {error.strerror}; expected it in {scene_folder}") from error
+    colours = {int(match[1]) for name in names if (match := re.fullmatch(r"frame(\d{6,9})\.jpg", name))}
+    depths = {int(match[1]) for name in names if (match := re.fullmatch(r"depth(\d{6,9})\.png", name))}
+    n_frames = max(colours | depths, default=-1) + 1
+    if n_frames == 0:
+        raise DataError(f"{where}: results/ holds no frames; expected frame000000.jpg and depth000000.png and so on")
+    for indices, file_name in ((colours, colour_name), (depths, depth_name)):
+        if len(indices) < n_frames:
+            first = next(index for index in range(n_frames) if index not in indices)
+            n_missing = n_frames - len(indices)
+            others = "" if n_missing == 1 else f", and {n_missing - 1} more"
+            raise DataError(f"{where}: {file_name(first)} is missing{others}; copy results/ again")
+    if n_frames != n_poses:
+        raise DataError(
+            f"{where}: traj.txt has {n_poses} poses but results/ has {n_frames} frames; copy the scene again"
+        )
+
+
+def colour_name(index: int) -> str:
+    return f"results/frame{index:06d}.jpg"
+
+
+def depth_name(index: int) -> str:
+    return f"results/depth{index:06d}.png"
+
+
+class ReplicaFrames(Sequence[Frame]):
+    """The frames at ``indices``, each read when it is asked for; a file that cannot be used is a ``DataError``."""
+
+    def __init__(self, folder: Path, where: str, camera: Camera, poses: Float64Array, indices: range) -> None:
+        self._folder, self._where, self._camera = folder, where, camera
+        self._poses, self._indices = poses, indices
+        self._depth_m_of_value = (np.arange(N_DEPTH_VALUES) / camera.scale).astype(np.float32)
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def __getitem__(self, position: int) -> Frame:  # type: ignore[override]
+        index = self._indices[position]
+        rgb = self._read_colour(index)
+        depth_m = self._read_depth(index, rgb)
+        return Frame(index, index / FRAMES_PER_SECOND, rgb, depth_m, self._poses[index], self._camera.intrinsics)
+
+    def _read_colour(self, index: int) -> UInt8Array:
+        import cv2
+
+        where, content = self._read(colour_name(index))
+        image = None
+        if JPEG_END in content[-1024:]:  # some decoders fill what a cut file lacks with grey
+            image = _decode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        if image is None:
+            raise DataError(f"{where}: not a readable JPEG image; copy the file again")
+        if image.shape[:2] != (self._camera.height, self._camera.width):
+            raise DataError(
+                f"{where} is {image.shape[1]}x{image.shape[0]} but cam_params.json says {self._camera.width}x"
+                f"{self._camera.height}; it belongs to another render"
+            )
+        rgb: UInt8Array = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+        return rgb
+
+    def _read_depth(self, index: int, rgb: UInt8Array) -> Float32Array:
+        import cv2
+
+        where, content = self._read(depth_name(index))
+        header = _whole_png_header(content)
+        if header is None:
+            raise DataError(f"{where}: not a readable PNG image; copy the file again")
+        height, width = rgb.shape[:2]
+        if header[:2] != (width, height):
+            raise DataError(
+                f"{where} is {header[0]}x{header[1]} and {colour_name(index)} is {width}x{height}; both must have one "
+                "size"
+            )
+        values = _decode(content, cv2.IMREAD_UNCHANGED) if header[2:] == (16, 0) else None
+        if values is None or values.dtype != np.uint16 or values.ndim != 2:
+            raise DataError(f"{where}: not a depth image; expected one channel of 16 bits, metres times the scale")
+        if not values.any():
+            raise DataError(f"{where}: empty depth, no pixel is above 0; copy the file again or leave the scene out")
+        depth_m: Float32Array = self._depth_m_of_value[values]
+        return depth_m
+
+    def _read(self, name: str) -> tuple[str, bytes]:
+        where = f"{self._where}: {name}"
+        try:
+            return where, (self._folder / name).read_bytes()
+        except FileNotFoundError as error:
+            raise DataError(f"{where} is missing; copy results/ again") from error
+        except OSError as error:
+            raise DataError(f"{where} cannot be read: {error.strerror}") from error
+
+
+def _decode(content: bytes, flags: int) -> Any:
+    """The image, or None where it cannot be decoded."""
+    import cv2
+
+    try:
+        return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error:
+        return None
+
+
+def _whole_png_header(content: bytes) -> tuple[int, int, int, int] | None:
+    """Width, height, bits and colour type of a PNG; None unless every chunk is there with its checksum right.
+
+    Checked before decoding: the decoder would speak of damage on stderr, and would allocate what the header promises.
+    """
+    if not content.startswith(PNG_SIGNATURE) or len(content) < 33:
+        return None
+    at, kind = len(PNG_SIGNATURE), b""
+    while kind != b"IEND":
+        length, kind = int.from_bytes(content[at : at + 4], "big"), content[at + 4 : at + 8]
+        end = at + 8 + length
+        if end + 4 > len(content) or zlib.crc32(content[at + 4 : end]) != int.from_bytes(content[end : end + 4], "big"):
+            return None
+        at = end + 4
+    if content[12:16] != b"IHDR":
+        return None
+    return int.from_bytes(content[16:20], "big"), int.from_bytes(content[20:24], "big"), content[24], content[25]

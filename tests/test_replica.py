@@ -1,0 +1,442 @@
+"""The Replica adapter on small scenes in the exact layout: frames, truth on hand-worked meshes, each fault once."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from su3d_bench.datasets.ply import ListColumn, PlyElement, write_ply
+from su3d_bench.datasets.replica import Replica
+from su3d_bench.datasets.replica_folders import original_name
+from su3d_bench.datasets.replica_labels import replica_label_set
+from su3d_bench.datasets.replica_truth import object_of_vertex
+from su3d_bench.errors import DataError, GroundTruthMissing
+from su3d_bench.types import Frame
+
+WIDTH, HEIGHT, SCALE = 12, 8, 6553.5
+CAMERA = {"w": WIDTH, "h": HEIGHT, "fx": 6.0, "fy": 6.5, "cx": 5.5, "cy": 3.5, "scale": SCALE}
+CHAIR, TABLE, WALL = 20, 80, 93
+Change = Callable[[Path], object]
+
+
+def pose(index: int) -> np.ndarray:
+    angle = 0.1 * index
+    matrix = np.eye(4)
+    matrix[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
+    matrix[:3, 3] = index, 1 / 3, -index
+    return matrix
+
+
+def depth_values(index: int) -> np.ndarray:
+    return np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 600 + index
+
+
+def write_render(root: Path, scene: str = "room0", n_frames: int = 3, folder: str = "Replica") -> None:
+    results = root / folder / scene / "results"
+    results.mkdir(parents=True)
+    (root / folder / "cam_params.json").write_text(json.dumps({"camera": CAMERA}))
+    lines = [" ".join(repr(float(value)) for value in pose(index).reshape(-1)) for index in range(n_frames)]
+    (results.parent / "traj.txt").write_text("\n".join(lines) + "\n")
+    for index in range(n_frames):
+        colour = np.full((HEIGHT, WIDTH, 3), (30, 120, 200), np.uint8)  # blue, green, red
+        cv2.imwrite(str(results / f"frame{index:06d}.jpg"), colour, [cv2.IMWRITE_JPEG_QUALITY, 95])
+        cv2.imwrite(str(results / f"depth{index:06d}.png"), depth_values(index))
+
+
+def info_table(objects: list[tuple[int, int]]) -> dict[str, Any]:
+    labels = replica_label_set()
+    classes = [{"id": i, "name": name} for i, name in zip(labels.ids, labels.names, strict=True)]
+    return {"classes": classes, "objects": [{"id": one, "class_id": class_id} for one, class_id in objects]}
+
+
+def write_original(
+    root: Path,
+    faces: list[list[int]],
+    object_ids: list[int],
+    objects: list[tuple[int, int]],
+    folder: str = "replica_v1/room_0",
+    n_vertices: int = 9,
+) -> Path:
+    """A mesh on a grid of points, three a row, and its table of objects."""
+    habitat = root / folder / "habitat"
+    habitat.mkdir(parents=True)
+    grid = np.array([(i % 3, i // 3, 0) for i in range(n_vertices)], np.float32)
+    corners = ListColumn(
+        np.concatenate([[0], np.cumsum([len(face) for face in faces])]),
+        np.array([corner for face in faces for corner in face], np.int32),
+    )
+    vertex = PlyElement("vertex", n_vertices, {axis: grid[:, i].copy() for i, axis in enumerate("xyz")})
+    face = PlyElement("face", len(faces), {"vertex_indices": corners, "object_id": np.array(object_ids, np.uint16)})
+    write_ply(habitat / "mesh_semantic.ply", [vertex, face])
+    (habitat / "info_semantic.json").write_text(json.dumps(info_table(objects)))
+    return habitat
+
+
+# Four quads on nine vertices:   6 7 8    two of object 0, a chair, at the left,
+#                                3 4 5    two of object 5, a table, at the right
+#                                0 1 2
+QUADS = [[0, 1, 4, 3], [3, 4, 7, 6], [1, 2, 5, 4], [4, 5, 8, 7]]
+TWO_OBJECTS = [(0, CHAIR), (5, TABLE)]
+
+
+def first_line_of(change: Change, root: Path) -> str:
+    """The message of the error that a scene with this change raises, from whatever step comes upon it."""
+    write_render(root)
+    change(root / "Replica")
+    replica = Replica(root)
+    with pytest.raises(DataError) as caught:
+        list(replica.frames("room0", 1))
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+def test_frames_hold_what_the_files_hold(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    frames = Replica(tmp_path).frames("room0", 2)
+    assert len(frames) == 2
+    last: Frame = frames[-1]
+    assert (last.index, frames[0].index, last.timestamp_s) == (2, 0, 2 / 30)
+    np.testing.assert_array_equal(last.camera_to_world, pose(2))
+    np.testing.assert_array_equal(last.depth_m, (depth_values(2) / SCALE).astype(np.float32))
+    np.testing.assert_array_equal(last.intrinsics, [[6, 0, 5.5], [0, 6.5, 3.5], [0, 0, 1]])
+    assert np.abs(last.rgb.astype(int) - (200, 120, 30)).max() <= 3
+    with pytest.raises(IndexError):
+        frames[2]
+
+
+def test_info_counts_the_frames_of_the_stride(tmp_path: Path) -> None:
+    write_render(tmp_path, n_frames=5)
+    info = Replica(tmp_path).info("room0", 2)
+    assert (info.dataset, info.scene, info.n_frames, info.stride, info.image_domain) == (
+        "replica", "room0", 3, 2, "camera",
+    )  # fmt: skip
+
+
+def test_official_scenes_come_first_and_others_in_natural_order(tmp_path: Path) -> None:
+    for scene in ("living10", "office1", "living2", "room2", "room0"):
+        write_render(tmp_path, scene, 1)
+    (tmp_path / "Replica" / ".living3.partial" / "results").mkdir(parents=True)
+    assert Replica(tmp_path).scenes() == ("room0", "room2", "office1", "living2", "living10")
+
+
+@pytest.mark.parametrize("folder", ["Replica", "replica", "."])
+def test_the_render_is_found_in_the_usual_places(tmp_path: Path, folder: str) -> None:
+    write_render(tmp_path, folder=folder)
+    (tmp_path / "rooms").mkdir()
+    assert Replica(tmp_path).scenes() == ("room0",)
+
+
+@pytest.mark.parametrize(
+    ("scene", "name"),
+    [("room0", "room_0"), ("office4", "office_4"), ("living12", "living_12"), ("frl_apartment_0", "frl_apartment_0")],
+)
+def test_scene_names_of_the_two_trees_pair_up(scene: str, name: str) -> None:
+    assert original_name(scene) == name
+
+
+@pytest.mark.parametrize(
+    "folder",
+    ["replica_v1/room_0", "Replica-Dataset/replica_v1/room_0", "Replica_Dataset/room_0", "Replica/room_0", "room_0"],
+)
+def test_the_original_is_found_in_the_usual_places(tmp_path: Path, folder: str) -> None:
+    write_render(tmp_path)
+    write_original(tmp_path, QUADS, [0, 0, 5, 5], TWO_OBJECTS, folder)
+    assert len(Replica(tmp_path).ground_truth("room0", "mesh-vertices").points) == 9
+    assert Replica(tmp_path).scenes() == ("room0",)
+
+
+def test_without_data_the_error_says_how_to_get_it(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"no scene in .*Replica\.zip.*datasets make rooms --layout replica --out"):
+        Replica(tmp_path).scenes()
+
+
+def test_a_misspelt_scene_gets_a_suggestion(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    with pytest.raises(DataError, match="no scene 'rom0'; did you mean 'room0'"):
+        Replica(tmp_path).info("rom0", 1)
+
+
+def test_vertices_take_the_object_of_most_of_their_faces_and_the_lowest_id_on_ties(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    write_original(tmp_path, QUADS, [0, 5, 5, 5], TWO_OBJECTS)
+    truth = Replica(tmp_path).ground_truth("room0", "mesh-vertices")
+    # vertex 1 and 3 have one face of each object: the chair, id 0; vertex 4 has three faces of the table
+    assert truth.semantic.tolist() == [CHAIR, CHAIR, TABLE, CHAIR, TABLE, TABLE, TABLE, TABLE, TABLE]
+    assert truth.instance.tolist() == [1, 1, 6, 1, 6, 6, 6, 6, 6]
+    assert truth.labels.name_of(CHAIR) == "chair"
+    assert truth.points[5].tolist() == [2, 1, 0]
+
+
+def test_a_vertex_without_faces_is_void_and_a_face_that_names_a_vertex_twice_counts_once() -> None:
+    corners = ListColumn(np.array([0, 4, 7, 10]), np.array([0, 0, 0, 1, 0, 1, 2, 0, 2, 1]))
+    face = object_of_vertex(4, corners, np.array([3, 9, 9]))
+    assert np.array([3, 9, 9])[face[:3]].tolist() == [9, 9, 9]
+    assert face[3] == -1
+
+
+def test_face_corners_repeat_each_vertex_in_the_order_of_the_faces(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    write_original(tmp_path, [[0, 1, 4, 3], [1, 2, 4]], [5, 0], TWO_OBJECTS)
+    truth = Replica(tmp_path).ground_truth("room0", "face-corners")
+    assert truth.points.tolist() == [[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0], [1, 0, 0], [2, 0, 0], [1, 1, 0]]
+    assert truth.semantic.tolist() == [TABLE] * 4 + [CHAIR] * 3
+    assert truth.instance.tolist() == [6] * 4 + [1] * 3
+
+
+def test_polygons_become_fans_of_triangles(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    write_original(tmp_path, [[0, 1, 4, 3], [1, 2, 4], [4, 5, 8, 7, 6]], [5, 0, 5], TWO_OBJECTS)
+    mesh = Replica(tmp_path).instance_mesh("room0")
+    assert mesh.triangles.tolist() == [[0, 1, 4], [0, 4, 3], [1, 2, 4], [4, 5, 8], [4, 8, 7], [4, 7, 6]]
+    assert mesh.instance_of_triangle.tolist() == [6, 6, 1, 6, 6, 6]
+    assert mesh.class_of_instance == {1: CHAIR, 6: TABLE}
+
+
+def test_objects_without_entry_are_void_counted_and_said_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_render(tmp_path)
+    write_original(tmp_path, QUADS, [0, 7, 7, 300], TWO_OBJECTS)
+    replica = Replica(tmp_path)
+    with caplog.at_level(logging.WARNING):
+        truth = replica.ground_truth("room0", "face-corners")
+        replica.instance_mesh("room0")
+    assert truth.semantic.tolist() == [CHAIR] * 4 + [0] * 12
+    assert truth.instance.tolist() == [1] * 4 + [0] * 12
+    assert [record.getMessage() for record in caplog.records] == [
+        "replica/room0: object ids without entry in habitat/info_semantic.json: 2 (the first: 7); faces made void: 3"
+    ]
+
+
+def test_an_unknown_class_id_is_void_and_said_but_the_undefined_ones_of_the_release_are_not(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    write_render(tmp_path)
+    write_original(tmp_path, QUADS, [1, 2, 3, 4], [(1, -1), (2, 777), (3, 256), (4, WALL)])
+    with caplog.at_level(logging.WARNING):
+        mesh = Replica(tmp_path).instance_mesh("room0")
+    assert mesh.instance_of_triangle.tolist() == [0] * 6 + [5] * 2
+    assert [record.getMessage() for record in caplog.records] == [
+        "replica/room0: objects with an unknown class id in habitat/info_semantic.json: 1 "
+        "(the first: object 2, class 777; known: 1 to 101); faces made void: 1"
+    ]
+
+
+def test_conceptgraphs_truth_is_missing_and_says_which_files_it_takes(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    with pytest.raises(GroundTruthMissing, match=r"not read by this version; .*room_0/Sequence_1/saved-maps-gt"):
+        Replica(tmp_path).ground_truth("room0", "conceptgraphs")
+
+
+def test_a_scene_without_original_has_frames_and_no_truth(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    replica = Replica(tmp_path)
+    assert len(replica.frames("room0", 1)) == 3
+    with pytest.raises(GroundTruthMissing, match=r"replica/room0: no ground truth; expected room_0/habitat/mesh_sem"):
+        replica.instance_mesh("room0")
+    (write_original(tmp_path, QUADS, [0, 0, 5, 5], TWO_OBJECTS) / "info_semantic.json").unlink()
+    with pytest.raises(GroundTruthMissing, match=r"info_semantic\.json is missing"):
+        Replica(tmp_path).ground_truth("room0", "mesh-vertices")
+
+
+def rewrite(name: str, change: Callable[[str], str]) -> Change:
+    return lambda folder: (folder / name).write_text(change((folder / name).read_text()))
+
+
+def replace_line(number: int, line: str) -> Callable[[str], str]:
+    def change(text: str) -> str:
+        lines = text.splitlines()
+        return "\n".join([*lines[: number - 1], line, *lines[number:]]) + "\n"
+
+    return change
+
+
+def camera_with(**values: object) -> Change:
+    return lambda folder: (folder / "cam_params.json").write_text(json.dumps({"camera": CAMERA | values}))
+
+
+def camera_without(key: str) -> Change:
+    table = {name: value for name, value in CAMERA.items() if name != key}
+    return lambda folder: (folder / "cam_params.json").write_text(json.dumps({"camera": table}))
+
+
+def cut(name: str, n_bytes: int) -> Change:
+    return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:-n_bytes])
+
+
+def image(name: str, array: np.ndarray) -> Change:
+    return lambda folder: cv2.imwrite(str(folder / name), array)
+
+
+TRAJECTORY = "room0/traj.txt"
+COLOUR, DEPTH = "room0/results/frame000001.jpg", "room0/results/depth000001.png"
+IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda folder: (folder / COLOUR).unlink(), "results/frame000001.jpg is missing; copy results/ again"),
+        (lambda folder: (folder / DEPTH).unlink(), "results/depth000001.png is missing; copy results/ again"),
+        (
+            lambda folder: [path.unlink() for path in folder.glob("room0/results/*2.*")],
+            "traj.txt has 3 poses but results/ has 2 frames; copy the scene again",
+        ),
+        (lambda folder: [path.unlink() for path in folder.glob("room0/results/*")], "results/ holds no frames"),
+        (lambda folder: (folder / TRAJECTORY).unlink(), "traj.txt cannot be read: No such file or directory"),
+        (rewrite(TRAJECTORY, lambda text: ""), "traj.txt is empty"),
+        (rewrite(TRAJECTORY, replace_line(2, IDENTITY[:-2])), "traj.txt line 2 has 15 values; expected 16"),
+        (rewrite(TRAJECTORY, replace_line(2, "")), "traj.txt line 2 has 0 values; expected 16"),
+        (rewrite(TRAJECTORY, replace_line(2, "x" + IDENTITY[1:])), "traj.txt line 2: could not convert string"),
+        (rewrite(TRAJECTORY, replace_line(2, "nan" + IDENTITY[1:])), "traj.txt line 2: the pose holds 'nan'; mend"),
+        (rewrite(TRAJECTORY, replace_line(3, "-inf" + IDENTITY[1:])), "traj.txt line 3: the pose holds '-inf'; mend"),
+        (rewrite(TRAJECTORY, replace_line(3, "2" + IDENTITY[1:])), "traj.txt line 3: not a rigid motion"),
+        (rewrite(TRAJECTORY, replace_line(1, "-1" + IDENTITY[1:])), "traj.txt line 1: not a rigid motion"),
+        (rewrite(TRAJECTORY, replace_line(1, IDENTITY[:-1] + "3")), "traj.txt line 1: not a rigid motion"),
+        (cut(COLOUR, 40), "results/frame000001.jpg: not a readable JPEG image; copy the file again"),
+        (cut(COLOUR, 2), "results/frame000001.jpg: not a readable JPEG image; copy the file again"),
+        (cut(DEPTH, 1), "results/depth000001.png: not a readable PNG image; copy the file again"),
+        (cut(DEPTH, 10**6), "results/depth000001.png: not a readable PNG image"),
+        (image(DEPTH, np.ones((4, 6), np.uint16)), "depth000001.png is 6x4 and results/frame000001.jpg is 12x8; both"),
+        (image(DEPTH, np.zeros((8, 12), np.uint16)), "results/depth000001.png: empty depth, no pixel is above 0"),
+        (image(DEPTH, np.ones((8, 12), np.uint8)), "results/depth000001.png: not a depth image; expected one channel"),
+        (image(DEPTH, np.ones((8, 12, 3), np.uint16)), "results/depth000001.png: not a depth image"),
+        (image(COLOUR, np.ones((8, 11, 3), np.uint8)), "frame000001.jpg is 11x8 but cam_params.json says 12x8; it"),
+        (camera_with(w=1200, h=680), "results/frame000000.jpg is 12x8 but cam_params.json says 1200x680"),
+        (camera_with(fx=0), "cam_params.json: 'fx' is 0; it must be above 0"),
+        (camera_with(scale=-1.0), "cam_params.json: 'scale' is -1; it must be above 0"),
+        (camera_with(fy="600"), "cam_params.json: 'fy' is '600'; expected a number"),
+        (camera_with(cx=float("nan")), "cam_params.json: 'cx' is 'nan'; expected a number"),
+        (camera_with(cx=100), "cam_params.json: the principal point (100, 3.5) lies outside the image"),
+        (camera_with(w=11.5), "cam_params.json: the image size 11.5x8 is not in whole pixels"),
+        (camera_without("cy"), "cam_params.json: 'camera' has no 'cy'; expected w, h, fx"),
+        (rewrite("cam_params.json", lambda text: text[:-5]), "cam_params.json: not JSON"),
+        (rewrite("cam_params.json", lambda text: "[]"), "cam_params.json: has no table 'camera'"),
+        (lambda folder: (folder / "cam_params.json").unlink(), "cam_params.json cannot be read: No such file"),
+    ],
+)  # fmt: skip
+def test_each_fault_of_the_input_is_one_clear_line(tmp_path: Path, change: Change, message: str) -> None:
+    line = first_line_of(change, tmp_path)
+    assert line.startswith("replica/room0: ")
+    assert message in line
+
+
+def write_info(content: object) -> Change:
+    text = content if isinstance(content, str) else json.dumps(content)
+    return lambda habitat: (habitat / "info_semantic.json").write_text(text)
+
+
+def write_mesh(**columns: np.ndarray | ListColumn | None) -> Change:
+    def change(habitat: Path) -> None:
+        points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], np.float32)
+        vertex = {axis: points[:, i].copy() for i, axis in enumerate("xyz")}
+        triangle = ListColumn(np.array([0, 3]), np.array([0, 1, 2], np.int32))
+        face = {"vertex_indices": triangle, "object_id": np.zeros(1, np.uint16)}
+        for name, column in columns.items():
+            table: dict[str, Any] = vertex if name in vertex else face
+            table.pop(name) if column is None else table.update({name: column})
+        write_ply(
+            habitat / "mesh_semantic.ply",
+            [PlyElement("vertex", 3, vertex), PlyElement("face", 1, face)],  # type: ignore[arg-type]
+        )
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (write_info("{"), "info_semantic.json: not JSON"),
+        (write_info("[" * 100_000), "info_semantic.json: not JSON"),
+        (write_info({"classes": []}), "info_semantic.json: has no list 'objects'"),
+        (write_info(info_table([]) | {"objects": [{"id": 1}]}), "info_semantic.json: object 1: 'class_id' is 'None'"),
+        (write_info(info_table([(-4, 20)])), "info_semantic.json: an object has the id -4"),
+        (write_info(info_table([(4, 20), (4, 21)])), "object 4 stands there twice, as class 20 and as class 21"),
+        (
+            write_info({"classes": [{"id": 20, "name": "sofa"}], "objects": []}),
+            "info_semantic.json: class 20 is 'sofa', in Replica it is 'chair'",
+        ),
+        (cut("mesh_semantic.ply", 5), "mesh_semantic.ply: element 'face' row 3 of 4: the file ends"),
+        (write_mesh(object_id=None), "mesh_semantic.ply: faces have no 'object_id'; a program that drops it"),
+        (write_mesh(object_id=np.zeros(1, np.float32)), "mesh_semantic.ply: 'object_id' is of type float32"),
+        (write_mesh(vertex_indices=None), "mesh_semantic.ply: faces have no list 'vertex_indices'"),
+        (write_mesh(x=None), "mesh_semantic.ply: element 'vertex' has no property 'x'"),
+        (write_mesh(y=np.array([0, np.nan, 1], np.float32)), "mesh_semantic.ply: vertex 1 is at [1.0, nan, 0.0]"),
+        (
+            write_mesh(vertex_indices=ListColumn(np.array([0, 3]), np.array([0, 1, 3], np.int32))),
+            "mesh_semantic.ply: face 0 names vertex 3, the mesh has 3 (0..2)",
+        ),
+    ],
+)
+def test_each_fault_of_the_truth_is_one_clear_line(tmp_path: Path, change: Change, message: str) -> None:
+    write_render(tmp_path)
+    change(write_original(tmp_path, QUADS, [0, 0, 5, 5], TWO_OBJECTS))
+    with pytest.raises(DataError) as caught:
+        Replica(tmp_path).ground_truth("room0", "mesh-vertices")
+    assert str(caught.value).startswith("replica/room0: habitat/")
+    assert "\n" not in str(caught.value)
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        rewrite("Replica/room0/traj.txt", replace_line(2, IDENTITY)),
+        rewrite("Replica/cam_params.json", lambda text: text.replace("6.5", "6.25")),
+        rewrite("replica_v1/room_0/habitat/info_semantic.json", lambda text: text.replace("80", "81")),
+        cut("replica_v1/room_0/habitat/mesh_semantic.ply", 1),
+        image("Replica/room0/results/depth000001.png", np.ones((HEIGHT, WIDTH), np.uint16)),
+        image("Replica/room0/results/frame000002.jpg", np.full((HEIGHT, WIDTH, 3), 9, np.uint8)),
+        lambda root: (root / "Replica/room0/results/depth000002.png").unlink(),
+    ],
+)
+def test_the_digest_moves_with_every_file(tmp_path: Path, change: Change) -> None:
+    write_render(tmp_path)
+    write_original(tmp_path, QUADS, [0, 0, 5, 5], TWO_OBJECTS)
+    before = Replica(tmp_path).digest("room0")
+    assert Replica(tmp_path).digest("room0") == before
+    change(tmp_path)
+    assert Replica(tmp_path).digest("room0") != before
+
+
+def test_files_are_all_that_is_read(tmp_path: Path) -> None:
+    write_render(tmp_path, n_frames=2)
+    write_original(tmp_path, QUADS, [0, 0, 5, 5], TWO_OBJECTS)
+    expected = {path for path in tmp_path.rglob("*") if path.is_file()}
+    assert set(Replica(tmp_path).files("room0")) == expected
+
+
+def test_scenes_of_the_marker_are_rendered_rooms_and_others_camera_images(tmp_path: Path) -> None:
+    write_render(tmp_path, "living0")
+    write_render(tmp_path, "room0")
+    (tmp_path / "Replica" / "rooms.json").write_text(json.dumps({"scenes": {"living0": "key"}}))
+    replica = Replica(tmp_path)
+    assert replica.info("living0", 1).image_domain == "rendered-rooms"
+    assert replica.info("room0", 1).image_domain == "camera"
+    (tmp_path / "Replica" / "rooms.json").write_text("{}")
+    with pytest.raises(DataError, match=r"rooms\.json: not the marker"):
+        replica.info("room0", 1)
+
+
+def test_a_frame_that_vanishes_meanwhile_is_missing(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    frames = Replica(tmp_path).frames("room0", 1)
+    (tmp_path / "Replica" / DEPTH).unlink()
+    with pytest.raises(DataError, match=r"replica/room0: results/depth000001\.png is missing"):
+        frames[1]
+
+
+@pytest.mark.parametrize("position", [20, 45, 60])
+def test_a_flipped_bit_in_a_depth_image_does_not_become_depth(tmp_path: Path, position: int) -> None:
+    write_render(tmp_path)
+    path = tmp_path / "Replica" / DEPTH
+    content = bytearray(path.read_bytes())
+    content[position] ^= 1
+    path.write_bytes(bytes(content))
+    with pytest.raises(DataError, match=r"depth000001\.png: not a readable PNG image"):
+        Replica(tmp_path).frames("room0", 1)[1]
