@@ -6,7 +6,7 @@ import hashlib
 import re
 from collections import OrderedDict
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
@@ -16,13 +16,23 @@ from pydantic import BaseModel, ConfigDict, Field
 from su3d_bench.datasets.rooms_classes import CLASSES
 from su3d_bench.datasets.rooms_kinds import KINDS, furnish
 from su3d_bench.datasets.rooms_layout import Plan
-from su3d_bench.datasets.rooms_mesh import RoomMesh, build_mesh, gather_patches
+from su3d_bench.datasets.rooms_mesh import Patches, RoomMesh, build_mesh, gather_patches
 from su3d_bench.datasets.rooms_noise import LEVELS, add_noise
 from su3d_bench.datasets.rooms_render import RenderedFrame, Renderer, camera_intrinsics
+from su3d_bench.datasets.rooms_scan import RoomScan, read_scan, scan_room, write_scan
 from su3d_bench.datasets.rooms_trajectory import walk
 from su3d_bench.datasets.rooms_truth import RoomObject, RoomTruth, truth_of
-from su3d_bench.errors import DataError, suggest
-from su3d_bench.types import Float64Array, Frame, ImageDomain, LabelSet, SceneInfo
+from su3d_bench.errors import DataError, GroundTruthMissing, suggest
+from su3d_bench.types import (
+    Float64Array,
+    Frame,
+    GroundTruth,
+    ImageDomain,
+    InstanceMesh,
+    Int32Array,
+    LabelSet,
+    SceneInfo,
+)
 
 GENERATOR_VERSION = 1  # raise it whenever a scene of the same name comes out different
 DEFAULT_SCENES = ("living0", "bedroom0", "kitchen0", "office0", "bathroom0", "studio0", "living1", "office1")
@@ -38,12 +48,12 @@ class RoomOptions(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    width: int = Field(640, ge=16, le=4096)
-    height: int = Field(480, ge=16, le=4096)
-    n_frames: int = Field(1600, ge=1, le=100_000)
-    noise: int = Field(0, ge=0, lt=len(LEVELS))
-    mesh_spacing_m: float = Field(0.015, ge=0.004, le=0.2)
-    seed_offset: int = Field(0, ge=0)
+    width: int = Field(default=640, ge=16, le=4096)
+    height: int = Field(default=480, ge=16, le=4096)
+    n_frames: int = Field(default=1600, ge=1, le=100_000)
+    noise: int = Field(default=0, ge=0, lt=len(LEVELS))
+    mesh_spacing_m: float = Field(default=0.015, ge=0.004, le=0.2)
+    seed_offset: int = Field(default=0, ge=0)
 
 
 def scene_name_parts(scene: str) -> tuple[str, int]:
@@ -69,12 +79,15 @@ class BuiltRoom:
     options: RoomOptions
     plan: Plan
     truth: RoomTruth
-    _poses: dict[str, Float64Array] = field(default_factory=dict)
+
+    @cached_property
+    def patches(self) -> Patches:
+        return gather_patches(self.plan.placed)
 
     @cached_property
     def mesh(self) -> RoomMesh:
         exposure = float(_generator("exposure", self.scene, self.options.seed_offset).uniform(0.58, 0.72))
-        return build_mesh(gather_patches(self.plan.placed), self.plan.lights, exposure)
+        return build_mesh(self.patches, self.plan.lights, exposure)
 
     @cached_property
     def renderer(self) -> Renderer:
@@ -151,6 +164,51 @@ class Rooms:
         rng = _generator("noise", scene, self.options.seed_offset, index)
         rgb, depth_m = add_noise(image.rgb, image.depth_m, self.options.noise, rng)
         return Frame(index, index / FRAMES_PER_SECOND, rgb, depth_m, pose, self.intrinsics)
+
+    def scan(self, scene: str) -> RoomScan:
+        """The ground-truth surface; made once, then read from the cache."""
+        path = self.root / "rooms" / self._scan_key(scene) / f"{scene}.npz"
+        found = read_scan(path)
+        if found is None:
+            room = self._room(scene)
+            found = scan_room(room.patches, room.mesh, room.trajectory, self.options.mesh_spacing_m)
+            write_scan(path, found)
+        return found
+
+    def _scan_key(self, scene: str) -> str:
+        """What a scan depends on: not the size of the images nor their noise."""
+        scene_name_parts(scene)
+        options = self.options
+        words = GENERATOR_VERSION, options.n_frames, options.mesh_spacing_m, options.seed_offset
+        return hashlib.sha256("/".join(str(word) for word in words).encode()).hexdigest()[:16]
+
+    def visible_vertices(self, scene: str) -> dict[int, int]:
+        """Scan vertices of each object id; objects that the walk never sees have none."""
+        counts = np.bincount(self.scan(scene).object_of_vertex(), minlength=len(self.objects(scene)) + 1)
+        return {object_id: int(n) for object_id, n in enumerate(counts) if object_id}
+
+    def ground_truth(self, scene: str, variant: str) -> GroundTruth:
+        """Labelled scan vertices (``mesh-vertices``) or the corners of every face in face order (``face-corners``)."""
+        if variant not in self.variants:
+            raise GroundTruthMissing(
+                f"rooms/{scene}: no ground truth '{variant}'; there is {' and '.join(self.variants)}"
+            )
+        scan = self.scan(scene)
+        if variant == "mesh-vertices":
+            points, owner = scan.vertices, scan.object_of_vertex()
+        else:
+            points, owner = scan.vertices[scan.faces.reshape(-1)], np.repeat(scan.object_id, 4)
+        source = f"rooms generator {GENERATOR_VERSION}: surface seen on the walk, {variant}"
+        return GroundTruth(points, self._class_of_object(scene)[owner], owner, LABELS, variant, source)
+
+    def _class_of_object(self, scene: str) -> Int32Array:
+        return np.array([0, *[one.class_id for one in self.objects(scene)]], np.int32)
+
+    def instance_mesh(self, scene: str) -> InstanceMesh:
+        """The rendered mesh itself, whole: hidden sides included."""
+        mesh = self._room(scene).mesh
+        classes = {one.id: one.class_id for one in self.objects(scene)}
+        return InstanceMesh(mesh.vertices, mesh.triangles, mesh.instance_of_triangle, classes, LABELS)
 
     def _room(self, scene: str) -> BuiltRoom:
         if scene not in self._rooms:

@@ -6,16 +6,19 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
+from su3d_bench.datasets.rooms_decor import DECOR
+from su3d_bench.datasets.rooms_devices import DEVICES
 from su3d_bench.datasets.rooms_dishes import DISHES
 from su3d_bench.datasets.rooms_fixtures import FIXTURES
 from su3d_bench.datasets.rooms_furniture import FURNITURE
 from su3d_bench.datasets.rooms_household import HOUSEHOLD
 from su3d_bench.datasets.rooms_items import Assembly, Builder, Item, Look, choose_look
+from su3d_bench.datasets.rooms_textiles import TEXTILES
 
 
 def _builders() -> Mapping[str, tuple[Builder, ...]]:
     table: dict[str, tuple[Builder, ...]] = {}
-    for part in (FURNITURE, FIXTURES, HOUSEHOLD, DISHES):
+    for part in (FURNITURE, FIXTURES, DEVICES, DECOR, HOUSEHOLD, TEXTILES, DISHES):
         for name, builders in part.items():
             table[name] = table.get(name, ()) + builders
     return table

@@ -9,7 +9,7 @@ import numpy as np
 
 from su3d_bench.datasets.rooms_catalog import make
 from su3d_bench.datasets.rooms_items import Item, Part, Spot
-from su3d_bench.datasets.rooms_materials import Material, Texture, mix, shade, stone, tone
+from su3d_bench.datasets.rooms_materials import Material, Texture, mix, shade, tone
 from su3d_bench.datasets.rooms_mesh import Light, Placed
 from su3d_bench.datasets.rooms_shapes import Shape, rotation
 from su3d_bench.types import Float64Array
@@ -82,7 +82,8 @@ class Plan:
         if z is None:
             under = [b for i, b in self.boxes.items() if self._flat(i) and b.meets(room)]
             lift = max([GAP_M, *[float(b.high[2]) + GAP_M / 2 for b in under]])
-            room = Box(room.low + [0, 0, lift], room.high + [0, 0, lift])
+            raised = np.array([0.0, 0.0, lift])
+            room = Box(room.low + raised, room.high + raised)
             z = lift
         limits = np.array([self.width, self.depth, self.height])
         if (room.low[:2] < GAP_M / 2).any() or (room.high > limits - GAP_M / 2).any():

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.datasets.rooms_items import Item
 from su3d_bench.datasets.rooms_materials import Material
-from su3d_bench.datasets.rooms_shapes import rotation
+from su3d_bench.datasets.rooms_shapes import Shape, rotation
 from su3d_bench.types import Float32Array, Float64Array, Int32Array
 
 LIGHT_SPACING_M = 0.13  # between the points at which light is computed
@@ -74,9 +74,10 @@ def gather_patches(placed: Sequence[Placed]) -> Patches:
     for one in placed:
         turn = rotation("z", one.yaw).T
         for part in one.item.parts:
-            corners.append(part.shape.quads @ turn + one.position)
-            normals.append(part.shape.normals @ turn)
-            texture.append(part.shape.quads)
+            shape = _wound(part.shape)
+            corners.append(shape.quads @ turn + one.position)
+            normals.append(shape.normals @ turn)
+            texture.append(shape.quads)
             ids.append(np.full(len(part.shape.quads), one.id, np.int32))
             rows.append(np.full(len(part.shape.quads), len(materials), np.int32))
             materials.append(part.material)
@@ -88,6 +89,15 @@ def gather_patches(placed: Sequence[Placed]) -> Patches:
         np.concatenate(rows),
         np.stack([material.row() for material in materials]),
     )
+
+
+def _wound(shape: Shape) -> Shape:
+    """The shape with the corners of every quad counter-clockwise seen from outside."""
+    quads = shape.quads
+    crossed = np.cross(quads[:, 2] - quads[:, 0], quads[:, 3] - quads[:, 1])
+    inside_out = (crossed * shape.normals.mean(axis=1)).sum(axis=1) < 0
+    order = np.where(inside_out[:, None], np.array([0, 3, 2, 1]), np.array([0, 1, 2, 3]))[..., None]
+    return Shape(np.take_along_axis(quads, order, 1), np.take_along_axis(shape.normals, order, 1))
 
 
 @dataclass(frozen=True)

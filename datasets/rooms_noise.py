@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.types import Float32Array, UInt8Array
+from su3d_bench.types import BoolArray, Float32Array, UInt8Array
 
 
 @dataclass(frozen=True)
@@ -46,10 +46,10 @@ def add_noise(
     return np.clip(np.round(noisy), 0, 255).astype(np.uint8), np.maximum(depth, 0.0).astype(np.float32)
 
 
-def _near_jumps(depth_m: Float32Array, reach: int) -> np.ndarray:  # type: ignore[type-arg]
+def _near_jumps(depth_m: Float32Array, reach: int) -> BoolArray:
     from scipy.ndimage import binary_dilation
 
     jump = np.zeros(depth_m.shape, bool)
     jump[:, 1:] |= np.abs(np.diff(depth_m, axis=1)) > JUMP_M
     jump[1:] |= np.abs(np.diff(depth_m, axis=0)) > JUMP_M
-    return np.asarray(binary_dilation(jump, iterations=reach))
+    return np.asarray(binary_dilation(jump, iterations=reach), bool)

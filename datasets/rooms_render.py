@@ -14,7 +14,7 @@ FOCAL_PER_WIDTH = 400.0 / 640.0  # a horizontal field of view of 77 degrees
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """``rgb`` (H, W, 3) uint8; ``depth_m`` (H, W) float32 along the axis, 0 for a miss; ``instance`` (H, W) object ids."""
+    """``rgb`` (H, W, 3); ``depth_m`` (H, W) along the axis, 0 for a miss; ``instance`` (H, W) object ids, 0 likewise."""
 
     rgb: UInt8Array
     depth_m: Float32Array

@@ -235,8 +235,8 @@ def _clock(u, v):  # type: ignore[no-untyped-def]
         return 0.8
     if 0.68 < r < 0.86:
         turn = math.atan2(v, u) * 6.0 / math.pi
-        width = 0.13 if int(round(turn)) % 3 == 0 else 0.07
-        if abs(turn - round(turn)) < width:
+        width = 0.13 if int(turn + 12.5) % 3 == 0 else 0.07
+        if abs(turn - math.floor(turn + 0.5)) < width:
             return 1.0
     return 0.0
 
@@ -431,8 +431,8 @@ def subdivide(quads, longest, points, corner):  # type: ignore[no-untyped-def]
         for k in range(3):
             u_other += (quads[q, 2, k] - quads[q, 3, k]) ** 2
             v_other += (quads[q, 2, k] - quads[q, 1, k]) ** 2
-        nu = max(1, int(math.ceil(math.sqrt(max(u_edge, u_other)) / longest[q] - 1e-6)))
-        nv = max(1, int(math.ceil(math.sqrt(max(v_edge, v_other)) / longest[q] - 1e-6)))
+        nu = max(1, math.ceil(math.sqrt(max(u_edge, u_other)) / longest[q] - 1e-6))
+        nv = max(1, math.ceil(math.sqrt(max(v_edge, v_other)) / longest[q] - 1e-6))
         if fill:
             for i in range(nu + 1):
                 for j in range(nv + 1):

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -96,7 +97,8 @@ def soft_block(
 
 def _rounded_steps(half: float, radius: float) -> Float64Array:
     rim = np.array([1.0, 0.58, 0.27, 0.0]) * radius
-    return np.unique(np.concatenate([-(half - radius) - rim, half - radius + rim]).round(9))
+    steps: Float64Array = np.unique(np.concatenate([-(half - radius) - rim, half - radius + rim]).round(9))
+    return steps
 
 
 def _from_grid(points: Float64Array, normals: Float64Array) -> Shape:
@@ -127,7 +129,7 @@ def lathe(profile: Sequence[tuple[float, float]], segments: int | None = None) -
     out = np.stack([steps[:, 1], -steps[:, 0]], axis=1)
     breaks = [0, *[i for i in range(1, len(steps)) if steps[i - 1] @ steps[i] < CREASE], len(steps)]
     shapes = []
-    for start, end in zip(breaks[:-1], breaks[1:], strict=True):
+    for start, end in pairwise(breaks):
         ring = points[start : end + 1]
         lean = np.stack([out[max(start, i - 1)] + out[min(end - 1, i)] for i in range(start, end + 1)])
         lean /= np.maximum(np.linalg.norm(lean, axis=1, keepdims=True), 1e-12)

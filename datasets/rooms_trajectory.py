@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from su3d_bench.datasets.rooms_layout import Box
 from su3d_bench.datasets.rooms_mesh import RoomMesh, caster
@@ -68,7 +69,7 @@ def _largest_part(free: BoolArray) -> BoolArray:
 def _loop(free: BoolArray, boxes: Sequence[Box], rng: np.random.Generator) -> Float64Array:
     """A closed smooth path (N, 2) m through far-apart free cells, rather over bare floor than over furniture."""
     cells = np.argwhere(free)
-    points = (cells + 0.5) * CELL_M
+    points: Float64Array = (cells + 0.5) * CELL_M
     chosen = [int(((points - points.mean(axis=0)) ** 2).sum(axis=1).argmax())]
     distance = np.full(len(points), np.inf)
     for _ in range(6):
@@ -98,7 +99,7 @@ def _cost(points: Float64Array, boxes: Sequence[Box]) -> Float64Array:
     return cost
 
 
-def _shortest_paths(free: BoolArray, cells: np.ndarray, cost: Float64Array, order: Sequence[int]) -> list[int]:  # type: ignore[type-arg]
+def _shortest_paths(free: BoolArray, cells: NDArray[np.intp], cost: Float64Array, order: Sequence[int]) -> list[int]:
     """Cell indices along the cheapest way through all ``order`` stops and back to the first."""
     from scipy.sparse import coo_matrix
     from scipy.sparse.csgraph import dijkstra
@@ -201,7 +202,7 @@ def _sphere() -> tuple[Float64Array, Float64Array]:
     turn = (np.arange(96) + 0.5) * 2 * np.pi / 96
     rise = np.deg2rad(np.linspace(-80, 50, 44))
     t, r = (grid.ravel() for grid in np.meshgrid(turn, rise, indexing="ij"))
-    weight = np.cos(r) * (2 * np.pi / 96) * np.deg2rad(130 / 43)
+    weight: Float64Array = np.cos(r) * (2 * np.pi / 96) * np.deg2rad(130 / 43)
     return np.stack([np.cos(r) * np.cos(t), np.cos(r) * np.sin(t), np.sin(r)], axis=1), weight
 
 

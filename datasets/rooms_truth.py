@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from su3d_bench.datasets.rooms_classes import AFFORDANCES, CLASS_ID
 from su3d_bench.datasets.rooms_layout import FLAT, Box, Plan, box_of
+from su3d_bench.types import Float64Array
 
 RELATIONS = ("on", "under", "next to", "in", "above")
 STRUCTURE = frozenset(("wall", "floor", "ceiling"))
@@ -73,7 +74,7 @@ def truth_of(scene: str, kind: str, plan: Plan) -> RoomTruth:
     return RoomTruth(scene, kind, objects, tuple(_relations(plan)))
 
 
-def _triple(values: Sequence[float]) -> tuple[float, float, float]:
+def _triple(values: Float64Array) -> tuple[float, float, float]:
     x, y, z = (float(value) for value in values)
     return x, y, z
 
@@ -162,7 +163,8 @@ def queries(truth: RoomTruth, n_visible_vertices: Mapping[int, int] | None = Non
     counted = {one.id for one in shown}
     for link in truth.relations:
         if link.subject in counted and link.object in counted:
-            text = f"{truth.by_id(link.subject).class_name} {link.relation} {_article(truth.by_id(link.object).class_name)}"
+            subject, holder = truth.by_id(link.subject).class_name, truth.by_id(link.object).class_name
+            text = f"{subject} {link.relation} {_article(holder)}"
             answers.setdefault(("relative", text), set()).add(link.subject)
     limit = max(1, int(len(shown) * MAX_ANSWER_SHARE))
     found = [Query(text, kind, tuple(sorted(ids))) for (kind, text), ids in answers.items() if len(ids) <= limit]
