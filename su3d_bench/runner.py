@@ -119,9 +119,6 @@ def _result(
     perfect = {scene: score for scene, score in ceilings.items() if score is not None}
     result = combine(rules, scored).to_json() if scored else None
     encoder = _join(one.encoder for one in mine.values() if one.profile is not None)
-    caveats = [one.caveat for one in mine.values()]
-    if rules.encoder is not None and encoder is not None and encoder != rules.encoder:
-        caveats.append(f"the protocol's encoder is {rules.encoder}, here it is {encoder}: not the original's numbers")
     return {
         "method": method,
         "protocol": rules.name,
@@ -129,7 +126,7 @@ def _result(
         "kind": rules.kind,
         "headline": list(rules.headline),
         "profile": _join(one.profile for one in mine.values()),
-        "caveat": _join(caveats, "; "),
+        "caveat": _join((one.caveat for one in mine.values()), "; "),
         "encoder": encoder,
         "encoder_digest": _join(one.encoder_digest for one in mine.values()),
         "n_planned": len(planned),

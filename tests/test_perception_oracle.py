@@ -15,7 +15,7 @@ from su3d_bench.perception.oracle import MeshProjector, OracleConfig, OracleSegm
 from su3d_bench.perception.oracle_noise import OracleNoise, disturb
 from su3d_bench.perception.profiles import PerceptionConfig, build_perception
 from su3d_bench.timing import Timer
-from su3d_bench.types import Frame, Int32Array, PerceptionNeeds, SceneInfo
+from su3d_bench.types import Frame, GroundTruth, Int32Array, LabelSet, PerceptionNeeds, SceneInfo
 
 SCENE = SceneInfo("rooms", "living0", n_frames=1, stride=1, image_domain="rendered-rooms")
 # One pixel is 1 cm at 1 m: the square covers columns 30..69 and rows 20..49 of the image at depth 1.
@@ -186,16 +186,20 @@ def test_noise_moves_the_digest() -> None:
     assert OracleSegmenter(mesh, plain).digest != OracleSegmenter(relabelled, plain).digest
 
 
-def test_the_oracle_method_hands_back_every_instance_of_the_mesh() -> None:
-    mesh = quad_mesh(SQUARE, WALL, (0, 1, 0, 1, 3.0), instance=[1, 4, 0])
+def test_the_oracle_method_hands_back_every_instance_of_the_truth() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(6, 3)).astype(np.float32)
+    semantic = np.array([28, 20, 0, 28, 20, 0], np.int32)
+    instance = np.array([4, 1, 0, 4, 1, 7], np.int32)
+    labels = LabelSet("replica", (20, 28), ("chair", "cup"))
     method = Oracle(Oracle.Config())
-    method.receive_truth(mesh)
+    method.receive_truth(GroundTruth(points, semantic, instance, labels, "mesh-vertices", "test"))
     method.start(SCENE)
     found = method.finish()
     assert method.needs.frames is False
     assert found.labels == ("chair", "cup") and found.ids.tolist() == [1, 4] and found.scores.tolist() == [1.0, 1.0]
     assert found.captions == ("a chair in a scene", "a cup in a scene") and found.features is None
-    assert found.mask(0).tolist() == [0, 1, 2, 3] and found.mask(1).tolist() == [4, 5, 6, 7]
-    assert np.allclose(found.boxes[0], [[-0.5, -0.4, 1.0], [-0.1, -0.1, 1.0]])
-    assert np.allclose(found.centroids[1], [0, 0, 2.0])
-    assert np.array_equal(found.points, mesh.vertices)
+    assert found.mask(0).tolist() == [1, 4] and found.mask(1).tolist() == [0, 3]
+    assert np.allclose(found.boxes[0], [points[[1, 4]].min(axis=0), points[[1, 4]].max(axis=0)])
+    assert np.allclose(found.centroids[1], points[[0, 3]].mean(axis=0))
+    assert np.array_equal(found.points, points)
