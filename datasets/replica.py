@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.datasets.replica_folders import (
     ORIGINAL_URL,
+    RENDER_FOLDERS,
     RenderTree,
     find_original_scene,
     find_render_tree,
@@ -72,6 +73,22 @@ class Replica:
     def scenes(self) -> Sequence[str]:
         """The official scenes that are here, in their order, then every other scene of the render tree."""
         return self.tree.scenes
+
+    def places(self) -> Sequence[Path]:
+        """Where the render tree is, or else would be looked for, in that order."""
+        tree = find_render_tree(self.root)
+        return [tree.folder] if tree is not None else [self.root / name for name in RENDER_FOLDERS]
+
+    def status(self, scene: str) -> str:
+        """A word on the scene from a quick look: poses and ground truth; ``info`` checks every file's presence."""
+        try:
+            n_poses = (self._folder(scene) / "traj.txt").read_bytes().rstrip().count(b"\n") + 1
+        except OSError:
+            return "traj.txt is missing"
+        try:
+            return f"{n_poses} frames, ground truth in {self._original(scene)}"
+        except GroundTruthMissing as error:
+            return f"{n_poses} frames, {str(error).partition(': ')[2]}"
 
     def info(self, scene: str, stride: int) -> SceneInfo:
         """Cheap facts and a check that the scene's frames are complete; the domain tells made scenes from scans."""
