@@ -50,7 +50,7 @@ class ReplicaOptions(BaseModel):
 
 
 class Replica:
-    """The dataset ``replica`` below the data root ``root``."""
+    """NICE-SLAM's render of Replica, with ground truth from the original release; read below the data root."""
 
     name = "replica"
     label_space = "replica"

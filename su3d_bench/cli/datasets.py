@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import Any
 
@@ -62,14 +63,19 @@ def _add_make(actions: Any) -> None:
 
 def call_list(arguments: argparse.Namespace) -> int:
     from su3d_bench import registry
-    from su3d_bench.planning import data_root
 
-    rows = [_row(name, registry.load("dataset", name), data_root()) for name in registry.names("dataset")]
+    root = data_root()
+    rows = [_row(name, registry.load("dataset", name), root) for name in registry.names("dataset")]
     if arguments.json:
-        answer_json({"data_root": str(data_root()), "datasets": rows})
+        answer_json({"data_root": str(root), "datasets": rows})
     else:
-        answer("\n".join([f"data root: {data_root()}", *(line for row in rows for line in _lines(row))]))
+        answer("\n".join([f"data root: {root}", *(line for row in rows for line in _lines(row))]))
     return EXIT_DONE
+
+
+def data_root() -> Path:
+    """Where a run looks for datasets; said here again because what plans a run takes as long to load as the list."""
+    return Path(os.environ.get("SU3D_DATA") or "~/.cache/su3d-bench/data").expanduser()
 
 
 def _row(name: str, dataset_class: Any, root: Path) -> dict[str, Any]:
@@ -77,7 +83,7 @@ def _row(name: str, dataset_class: Any, root: Path) -> dict[str, Any]:
     dataset = dataset_class(root, dataset_class.Options())
     row: dict[str, Any] = {
         "name": name,
-        "summary": (dataset_class.__doc__ or "").strip().partition("\n")[0],
+        "summary": (dataset_class.__doc__ or "").strip().partition("\n")[0].replace("`", ""),
         "places": [str(place) for place in (dataset.places() if hasattr(dataset, "places") else ())],
         "ground_truth": list(dataset_class.variants),
         "scenes": [],

@@ -1,0 +1,134 @@
+"""``su3d-bench datasets``: what is listed, what is made, and each fault of a request in one line."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from su3d_bench.cli import datasets
+from su3d_bench.cli.main import build_parser, main
+from su3d_bench.datasets.replica import Replica
+from su3d_bench.planning import data_root
+
+SMALL = ["--set", "n_frames=3", "--set", "rooms.width=64", "--set", "height=48", "--set", "mesh_spacing_m=0.15"]
+MAKE = ["datasets", "make", "rooms", "--scenes", "bathroom0", *SMALL, "--workers", "1"]
+
+
+@pytest.fixture(autouse=True)
+def _elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
+
+
+def fault(words: list[str], capsys: pytest.CaptureFixture[str]) -> str:
+    """The one line that a wrong request gets."""
+    assert main(words) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.count("\n") == 1
+    return said.err
+
+
+def test_list_tells_datasets_places_and_scenes_and_how_to_get_what_is_not_here(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main(["datasets", "list"]) == 0
+    text = capsys.readouterr().out
+    assert "rooms/living0    1600 frames" in text
+    assert f"looked for in: {tmp_path / 'data' / 'Replica'}" in text
+    assert "Replica.zip there, set SU3D_DATA to where it is, or make rooms in this layout" in text
+
+
+def test_list_tells_the_state_of_each_scene(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    for scene, traj in (("room0", "1 0\n2 0\n"), ("room1", None)):
+        (tmp_path / "data" / "Replica" / scene / "results").mkdir(parents=True)
+        if traj is not None:
+            (tmp_path / "data" / "Replica" / scene / "traj.txt").write_text(traj)
+    (tmp_path / "data/replica_v1/room_0/habitat").mkdir(parents=True)
+    assert main(["datasets", "list", "--json"]) == 0
+    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)["datasets"]}
+    assert [row["scene"] for row in rows["replica"]["scenes"]] == ["replica/room0", "replica/room1"]
+    assert rows["replica"]["scenes"][0]["status"].startswith("2 frames, no ground truth; ")
+    assert rows["replica"]["scenes"][0]["status"].endswith("mesh_semantic.ply is missing")
+    assert rows["replica"]["scenes"][1]["status"] == "traj.txt is missing"
+    assert rows["rooms"]["error"] is None
+
+
+@pytest.mark.parametrize("value", ["", "/some/where", "~/there"])
+def test_list_and_run_look_below_one_data_root(monkeypatch: pytest.MonkeyPatch, value: str) -> None:
+    monkeypatch.setenv("SU3D_DATA", value)
+    assert datasets.data_root() == data_root()
+
+
+def test_a_made_room_is_a_scene_of_replica_and_the_same_command_again_does_nothing(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    words = [*MAKE, "--layout", "replica", "--out", "made"]
+    assert main(words) == 0
+    said = capsys.readouterr()
+    assert said.out.split() == ["bathroom0", "made"]
+    assert "SU3D_DATA=made su3d-bench run --scenes 'replica/*'" in said.err
+    assert len(Replica(tmp_path / "made").frames("bathroom0", 1)) == 3
+    assert main([*words, "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["scenes"] == [{"scene": "bathroom0", "status": "was there already"}]
+
+
+def test_native_layout_puts_the_scan_into_the_data_root(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    assert main([*MAKE, "--out", "native"]) == 0
+    assert capsys.readouterr().out.split() == ["bathroom0", "made"]
+    assert len(list((tmp_path / "native").rglob("bathroom0.npz"))) == 1
+
+
+def test_one_worker_and_two_make_the_same_bytes(tmp_path: Path) -> None:
+    words = [*MAKE[:-1], "2", "--layout", "replica", "--out", "made2", "--quiet"]
+    done = subprocess.run([sys.executable, "-m", "su3d_bench", *words], capture_output=True, text=True)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert main([*MAKE, "--layout", "replica", "--out", "made1"]) == 0
+    one, two = ({path.relative_to(root): path.read_bytes() for path in root.rglob("*") if path.is_file()}
+                for root in (tmp_path / "made1", tmp_path / "made2"))  # fmt: skip
+    assert one == two
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["datasets", "make", "rooms", "--layout", "replica"], "datasets make --layout replica: say where with --out"),
+        (["datasets", "make", "replica"], "datasets make replica: its scenes are not made here; known: rooms"),
+        (["datasets", "make", "romos"], "unknown dataset 'romos'; did you mean 'rooms'?"),
+        (["datasets", "make", "rooms", "--scenes", "livng0"], "no scene matches 'rooms/livng0'; did you mean"),
+        (["datasets", "make", "rooms", "--scenes", "replica/*"], "'replica/*' is no scene of it; expected 'rooms/...'"),
+        (["datasets", "make", "rooms", "--set", "widht=3"], "unknown key 'widht'; did you mean 'width'?"),
+        (["datasets", "make", "rooms", "--set", "width=3"], "--set rooms.width: rooms.width = 3: input"),
+        (["datasets", "make", "rooms", "--workers", "0"], "--workers 0: expected 1 or more"),
+        (["datasets", "make", "rooms", "--layout", "replcia"], "unknown --layout 'replcia'; did you mean 'replica'?"),
+        (["datasets", "lsit"], "'lsit'; did you mean 'list'?"),
+        ([*MAKE, "--layout", "replica", "--out", "file/below"], "a file stands where a folder should be"),
+    ],
+)  # fmt: skip
+def test_each_wrong_request_is_one_line(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    (tmp_path / "file").write_text("")
+    assert message in fault(words, capsys)
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="the superuser may write to read-only folders")
+def test_a_read_only_folder_is_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    (tmp_path / "closed").mkdir(mode=0o500)
+    assert "the folder is read-only" in fault([*MAKE, "--layout", "replica", "--out", "closed"], capsys)
+
+
+@pytest.mark.parametrize("action", ["list", "make"])
+def test_the_help_of_both_actions_ends_with_two_examples_that_parse(
+    action: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["datasets", action, "--help"]) == 0
+    examples = capsys.readouterr().out.rstrip().splitlines()[-2:]
+    for example in examples:
+        words = example.replace("'", "").split()
+        assert words[0] == "su3d-bench"
+        assert build_parser().parse_args(words[1:]).action == action
