@@ -246,3 +246,21 @@ def test_garbage_is_a_data_error(tmp_path_factory: pytest.TempPathFactory, conte
     path.write_bytes(content)
     with pytest.raises(DataError):
         read_ply(path)
+
+
+@pytest.mark.parametrize("is_text", [False, True])
+def test_open3d_reads_our_files_and_we_read_its(tmp_path: Path, is_text: bool) -> None:
+    import open3d as o3d
+
+    triangles = ListColumn(np.arange(3) * 3, np.array([0, 1, 2, 2, 3, 7], np.int32))
+    ours = [vertices(8), PlyElement("face", 2, {"vertex_indices": triangles})]
+    write_ply(tmp_path / "ours.ply", ours, format="ascii" if is_text else "binary_little_endian")
+    mesh = o3d.io.read_triangle_mesh(str(tmp_path / "ours.ply"))
+    assert np.asarray(mesh.triangles).tolist() == [[0, 1, 2], [2, 3, 7]]
+    columns = ours[0].columns
+    np.testing.assert_allclose(np.asarray(mesh.vertices), np.stack([columns[axis] for axis in "xyz"], 1), rtol=1e-6)  # type: ignore[misc]
+    assert o3d.io.write_triangle_mesh(str(tmp_path / "theirs.ply"), mesh, write_ascii=is_text)
+    vertex, face = read_ply(tmp_path / "theirs.ply").elements
+    np.testing.assert_allclose(vertex.columns["y"], columns["y"], rtol=1e-5)  # type: ignore[arg-type]
+    assert isinstance(face.columns["vertex_indices"], ListColumn)
+    assert face.columns["vertex_indices"].values.tolist() == triangles.values.tolist()
