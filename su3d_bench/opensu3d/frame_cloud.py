@@ -27,7 +27,10 @@ class FrameCloud:
 
 
 def frame_cloud(frame: Frame, masks: BoolArray, config: OpenSU3DConfig) -> FrameCloud:
-    """P_frame of one image, reduced to one point a voxel and a detection where ``frame_voxel`` is above 0."""
+    """P_frame of one image.
+
+    Where ``frame_voxel`` is above 0 it is reduced to the first point of each voxel and detection (in and out of rings).
+    """
     if len(masks) and masks.shape[1:] != frame.depth_m.shape:
         (rows, columns), (height, width) = masks.shape[1:], frame.depth_m.shape
         raise DataError(f"frame {frame.index}: masks are {columns}x{rows} and the image is {width}x{height}")
@@ -42,11 +45,13 @@ def frame_cloud(frame: Frame, masks: BoolArray, config: OpenSU3DConfig) -> Frame
     owner = painted.owner[pixels]
     if config.border_pixels == "background":
         owner[is_ring[pixels]] = NO_DETECTION
-    rank = np.where(owner == NO_DETECTION, 2, is_ring[pixels])
-    order = np.argsort(rank, kind="stable")
+    # 0 inside a mask, 1 in a ring, 2 in no mask
+    rank = np.where(owner == NO_DETECTION, 2, is_ring[pixels]).astype(np.int8)
     if config.frame_voxel > 0:
-        order = order[_first_of_voxel(points[order], owner[order], config.frame_voxel)]
-    return FrameCloud(points[order], owner[order], int(np.count_nonzero(rank[order] == 0)))
+        kept = _first_of_voxel(points, owner * 3 + rank, config.frame_voxel)
+        points, owner, rank = points[kept], owner[kept], rank[kept]
+    order = np.argsort(rank, kind="stable")
+    return FrameCloud(points[order], owner[order], int(np.count_nonzero(rank == 0)))
 
 
 def _first_of_voxel(points: Float64Array, labels: Int32Array, voxel: float) -> Int64Array:

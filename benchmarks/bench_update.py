@@ -1,0 +1,58 @@
+"""What a whole update of OpenSU3D costs, perception aside, with 0.1 to 10 million points in the map.
+
+A 1200x680 image of a wall with 24 masks; the map holds that wall, far beyond the view, at one point a 2 cm voxel.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from pytest_benchmark.fixture import BenchmarkFixture
+
+from su3d_bench.opensu3d.pipeline import OpenSU3D
+from su3d_bench.timing import Timer
+from su3d_bench.types import Detections, Frame
+
+WIDTH, HEIGHT, FOCAL = 1200, 680, 600.0
+DISTANCE_M = 2.5
+VOXEL_M = 0.02
+
+
+def view() -> tuple[Frame, Detections]:
+    intrinsics = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]])
+    depth_m = np.full((HEIGHT, WIDTH), DISTANCE_M, np.float32)
+    rgb = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
+    masks = np.zeros((24, HEIGHT, WIDTH), np.bool_)
+    for k in range(24):
+        row, column = divmod(k, 6)
+        masks[k, 170 * row + 10 : 170 * row + 150, 200 * column + 10 : 200 * column + 180] = True
+    n = len(masks)
+    detections = Detections(
+        frame_index=0,
+        masks=masks,
+        boxes=np.zeros((n, 4), np.float32),
+        scores=np.full(n, 0.5, np.float32),
+        names=("thing",) * n,
+        captions=("",) * n,
+        crop_ratios=(0.8, 1.0, 1.2),
+        crop_features=np.ones((n, 3, 128), np.float32),
+        global_feature=np.ones(128, np.float32),
+    )
+    return Frame(0, 0.0, rgb, depth_m, np.eye(4), intrinsics), detections
+
+
+@pytest.mark.parametrize("n_points", [100_000, 1_000_000, 10_000_000])
+def test_update(benchmark: BenchmarkFixture, n_points: int) -> None:
+    benchmark.group = "update"
+    method = OpenSU3D()
+    frame, detections = view()
+    side = round(n_points**0.5)
+    for rows in np.array_split(np.arange(side), max(1, n_points // 100_000)):
+        y, x = np.meshgrid(rows, np.arange(side), indexing="ij")
+        points = (np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) + 0.5) * VOXEL_M
+        points += [-side * VOXEL_M / 2, -side * VOXEL_M / 2, DISTANCE_M - VOXEL_M / 2]
+        ids = 1 + (x.ravel() // 50) + (y.ravel() // 50) * (side // 50 + 1)
+        method._map.insert(points, ids.astype(np.int32), keep_density=True, refill=True)
+    n_before = method.n_points
+    benchmark.pedantic(lambda: method.update(frame, detections, Timer()), rounds=10, warmup_rounds=2)
+    assert n_before <= method.n_points <= n_before + 100
