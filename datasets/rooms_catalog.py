@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from su3d_bench.datasets.rooms_dishes import DISHES
 from su3d_bench.datasets.rooms_fixtures import FIXTURES
 from su3d_bench.datasets.rooms_furniture import FURNITURE
 from su3d_bench.datasets.rooms_household import HOUSEHOLD
-from su3d_bench.datasets.rooms_items import Assembly, Builder, Item, Look, choose_look
+from su3d_bench.datasets.rooms_items import Builder, Item, choose_look
 from su3d_bench.datasets.rooms_textiles import TEXTILES
 
 
@@ -37,10 +37,10 @@ def make(
     """A new instance of a class; ``model`` names one of its builders (``coffee_table``), else any of them."""
     look = choose_look(class_name, rng, colour, avoid)
     builder = _pick(class_name, rng, model)
-    return builder(look).item()
+    return builder(look).item(builder.__name__)
 
 
-def _pick(class_name: str, rng: np.random.Generator, model: str | None) -> Callable[[Look], Assembly]:
+def _pick(class_name: str, rng: np.random.Generator, model: str | None) -> Builder:
     builders = BUILDERS[class_name]
     if model is None:
         return builders[int(rng.integers(len(builders)))]

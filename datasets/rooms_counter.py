@@ -69,6 +69,7 @@ def counter_top(plan: Plan, wall: int, start: float, end: float, run: Sequence[P
     if top is None:
         return
     plan.parent[top.id] = (run[0].id, "on")
+    plan.rests_also_on.extend((top.id, cabinet.id) for cabinet in run[1:])
     order = [int(k) for k in plan.rng.permutation(len(run))]
     sink = at_cabinet(plan, top, run[order[0]], plan.new("sink", "kitchen_sink"))
     stove = at_cabinet(plan, top, run[order[1]], plan.new("cooktop"))

@@ -12,10 +12,11 @@ from su3d_bench.datasets.rooms_mesh import Placed
 
 SHELF_THINGS: tuple[str | tuple[str, str], ...] = (
     ("book", "books"), ("book", "books"), ("book", "book_stack"), "vase", "indoor-plant", "box", "sculpture", "candle",
-    "clock_", ("book", "books"), "bowl", "picture_",
+    ("book", "books"), "bowl",
 )  # fmt: skip
 SMALL_DECOR: tuple[str | tuple[str, str], ...] = (
-    "vase", "candle", "sculpture", "indoor-plant", ("book", "book_stack"), "bowl", "tissue-paper", ("lamp", "table_lamp"),
+    "vase", "candle", "sculpture", "indoor-plant", ("book", "book_stack"), "bowl", "tissue-paper",
+    ("lamp", "table_lamp"),
 )  # fmt: skip
 
 
@@ -33,9 +34,8 @@ def choose(plan: Plan, pool: Sequence[str | tuple[str, str]], n: int) -> list[st
 
 def stocked_shelf(plan: Plan, extra: Sequence[str | tuple[str, str]] = (), n: int = 7) -> Placed | None:
     shelf = plan.against_wall(plan.new("shelf", "shelf"))
-    pool = [want for want in SHELF_THINGS if want not in ("clock_", "picture_")]
     if shelf:
-        for want in [*extra, *choose(plan, pool, n)]:
+        for want in [*extra, *choose(plan, SHELF_THINGS, n)]:
             name, model = want if isinstance(want, tuple) else (want, None)
             item = plan.new(name, model)
             if plan.on(item, shelf, "board", turn=3.0) is None:
@@ -207,10 +207,13 @@ def desk_place(plan: Plan, laptop: bool = False) -> Placed | None:
 
 
 def before_screen(plan: Plan, desk: Placed, item: Item, local_x: float, from_front: float) -> None:
-    """On a desk, at a place along it, near its front edge."""
+    """On a desk, at a place along it, near its front edge; elsewhere on it where that place is taken or beyond it."""
     spot = desk.item.spots[0]
-    x, y, z = desk.to_world(np.array([local_x, spot.y0 + from_front, spot.z]))
-    found = plan.try_at(item, float(x), float(y), desk.yaw, float(z) + GAP_M, 0.005, "object", ignore=[desk.id])
+    half = item.size[0] / 2
+    found = None
+    if spot.x0 + half < local_x < spot.x1 - half:
+        x, y, z = desk.to_world(np.array([local_x, spot.y0 + from_front, spot.z]))
+        found = plan.try_at(item, float(x), float(y), desk.yaw, float(z) + GAP_M, 0.005, "object", ignore=[desk.id])
     if found:
         plan.parent[found.id] = (desk.id, "on")
     else:

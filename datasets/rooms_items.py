@@ -11,10 +11,10 @@ import numpy as np
 from su3d_bench.datasets.rooms_classes import CLASS_BY_NAME
 from su3d_bench.datasets.rooms_materials import Material, Rgb, of_kind, tone
 from su3d_bench.datasets.rooms_shapes import Shape, bounds
+from su3d_bench.datasets.rooms_sizes import size_word
 from su3d_bench.types import Float64Array
 
 FOOT_HEIGHT_M = 0.025
-SMALL_BELOW, LARGE_ABOVE = 0.92, 1.09  # of the usual size of a class
 
 
 @dataclass(frozen=True)
@@ -100,15 +100,14 @@ class Assembly:
              role: str = "top") -> None:  # fmt: skip
         self.spots.append(Spot(*x, *y, z, clearance, role))
 
-    def item(self) -> Item:
+    def item(self, model: str) -> Item:
+        """What was built, as an instance of a ``model``."""
         low, high = bounds([part.shape for part in self.parts])
         shift = np.array([-(low[0] + high[0]) / 2, -(low[1] + high[1]) / 2, -low[2]])
         parts = tuple(Part(part.shape.moved(*shift), part.material) for part in self.parts)
-        scale = self.look.scale
-        word = "small" if scale < SMALL_BELOW else "large" if scale > LARGE_ABOVE else "medium"
         spots = tuple(spot.moved(*shift) for spot in self.spots)
         look = self.look
-        return Item(look.class_name, look.colour, look.material, word, parts, spots, high - low)
+        return Item(look.class_name, look.colour, look.material, size_word(model, high - low), parts, spots, high - low)
 
 
 Builder = Callable[[Look], Assembly]

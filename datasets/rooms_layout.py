@@ -44,7 +44,8 @@ class Plan:
         self.width, self.depth, self.height = width, depth, height
         self.placed: list[Placed] = []
         self.boxes: dict[int, Box] = {}
-        self.parent: dict[int, tuple[int, str]] = {}
+        self.parent: dict[int, tuple[int, str]] = {}  # what holds an item, and how: on, in
+        self.rests_also_on: list[tuple[int, int]] = []  # where one slab lies on several
         self.mount: dict[int, str] = {}
         self.keep_free: list[Box] = []
         self.lights: list[Light] = []

@@ -26,7 +26,7 @@ LEVELS = (
     SensorNoise(0.0010, 0.0010, 1, 2.0),
     SensorNoise(0.0025, 0.0028, 2, 5.0),
 )
-JUMP_M = 0.04
+JUMP_M = 0.04  # second difference between pixels, so that a slanted plane is no edge
 
 
 def add_noise(
@@ -50,6 +50,6 @@ def _near_jumps(depth_m: Float32Array, reach: int) -> BoolArray:
     from scipy.ndimage import binary_dilation
 
     jump = np.zeros(depth_m.shape, bool)
-    jump[:, 1:] |= np.abs(np.diff(depth_m, axis=1)) > JUMP_M
-    jump[1:] |= np.abs(np.diff(depth_m, axis=0)) > JUMP_M
+    jump[:, 1:-1] = np.abs(np.diff(depth_m, 2, axis=1)) > JUMP_M
+    jump[1:-1] |= np.abs(np.diff(depth_m, 2, axis=0)) > JUMP_M
     return np.asarray(binary_dilation(jump, iterations=reach), bool)

@@ -14,7 +14,7 @@ FOCAL_PER_WIDTH = 400.0 / 640.0  # a horizontal field of view of 77 degrees
 
 @dataclass(frozen=True)
 class RenderedFrame:
-    """``rgb`` (H, W, 3); ``depth_m`` (H, W) along the axis, 0 for a miss; ``instance`` (H, W) object ids, 0 likewise."""
+    """``rgb`` (H, W, 3), ``depth_m`` (H, W) along the axis, ``instance`` (H, W) object ids; 0 where a ray misses."""
 
     rgb: UInt8Array
     depth_m: Float32Array
@@ -45,7 +45,7 @@ class Renderer:
         n, mesh = len(rays), self._mesh
         rgb, depth, instance = np.empty((n, 3), np.uint8), np.empty(n, np.float32), np.empty(n, np.int32)
         origin = camera_to_world[:3, 3].astype(np.float32)
-        shade(t_hit, primitive, uv, rays[:, 3:], origin, mesh.triangles, mesh.vertices, mesh.normals, mesh.texture,
+        shade(t_hit, primitive, uv, rays[:, 3:], origin, mesh.triangles, mesh.normals, mesh.texture,
               mesh.light, mesh.instance_of_triangle, mesh.material_of_triangle, mesh.materials, mesh.lights,
               rgb, depth, instance)  # fmt: skip
         shape = (self.height, self.width)
@@ -62,8 +62,9 @@ class Renderer:
     def _cast(self, pose: Float64Array) -> tuple[Float32Array, Float32Array, Int32Array, Float32Array]:
         import open3d as o3d
 
+        from su3d_bench.datasets.rooms_shade_kernels import aim
+
         rays = np.empty((self.width * self.height, 6), np.float32)
-        rays[:, :3] = pose[:3, 3]
-        rays[:, 3:] = self._directions @ pose[:3, :3].T
+        aim(self._directions, pose, rays)
         answer = self._scene.cast_rays(o3d.core.Tensor(rays))  # type: ignore[attr-defined]
         return rays, answer["t_hit"].numpy(), answer["primitive_ids"].numpy(), answer["primitive_uvs"].numpy()

@@ -102,7 +102,7 @@ def surface_colours(mesh: RoomMesh, points: Float32Array) -> UInt8Array:
     dull[:, 8] = 0.0  # the column of gloss
     rgb, depth, instance = np.empty((n, 3), np.uint8), np.empty(n, np.float32), np.empty(n, np.int32)
     shade(np.ones(n, np.float32), nearest["primitive_ids"].numpy(), nearest["primitive_uvs"].numpy(), points,
-          np.zeros(3, np.float32), mesh.triangles, mesh.vertices, mesh.normals, mesh.texture, mesh.light,
+          np.zeros(3, np.float32), mesh.triangles, mesh.normals, mesh.texture, mesh.light,
           mesh.instance_of_triangle, mesh.material_of_triangle, dull, mesh.lights, rgb, depth, instance)  # fmt: skip
     return rgb
 
@@ -112,7 +112,7 @@ def read_scan(path: Path) -> RoomScan | None:
     try:
         with np.load(path, allow_pickle=False) as stored:
             return RoomScan(*(stored[field.name] for field in fields(RoomScan)))
-    except (FileNotFoundError, zipfile.BadZipFile, ValueError, KeyError, EOFError):
+    except (FileNotFoundError, NotADirectoryError, zipfile.BadZipFile, ValueError, KeyError, EOFError):
         return None
 
 

@@ -30,8 +30,8 @@ def mark_seen(active, n_active, centres, normals, owner, seen, pose, focal, cx, 
         if facing > 0.0:
             z = dx * pose[0, 2] + dy * pose[1, 2] + dz * pose[2, 2]
             if z > NEAREST_M:
-                column = int(math.floor((dx * pose[0, 0] + dy * pose[1, 0] + dz * pose[2, 0]) / z * focal + cx + 0.5))
-                row = int(math.floor((dx * pose[0, 1] + dy * pose[1, 1] + dz * pose[2, 1]) / z * focal + cy + 0.5))
+                column = math.floor((dx * pose[0, 0] + dy * pose[1, 0] + dz * pose[2, 0]) / z * focal + cx + 0.5)
+                row = math.floor((dx * pose[0, 1] + dy * pose[1, 1] + dz * pose[2, 1]) / z * focal + cy + 0.5)
                 if 0 <= column < width and 0 <= row < height and instance[row, column] == owner[f]:
                     cosine = facing / math.sqrt(dx * dx + dy * dy + dz * dz)
                     loose = LOOSE_M + LOOSE_SHARE * z / max(cosine, 0.15)

@@ -1,6 +1,7 @@
 """Compiled shading: procedural textures, baked light and highlights, one pixel at a time.
 
-Imported lazily: numba takes a second to load. The numbers of the textures are those of
+Imported lazily: numba takes a second to load. One file, because numba renews a cached function only when the file of
+that function changes, not when one that it calls does. The numbers of the textures are those of
 ``rooms_materials.Texture``, the columns of a material row those of ``Material.row``.
 """
 
@@ -260,8 +261,8 @@ def _wall(x, z, scale, style, seed):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def shade(t_hit, primitive, uv, rays, origin, triangles, vertices, normals, texture, light, instance_of_triangle,
-          material_of_triangle, materials, lights, rgb, depth, instance):  # type: ignore[no-untyped-def]  # fmt: skip
+def shade(t_hit, primitive, uv, rays, origin, triangles, normals, texture, light,  # type: ignore[no-untyped-def]
+          instance_of_triangle, material_of_triangle, materials, lights, rgb, depth, instance):  # fmt: skip
     """Fills ``rgb``, ``depth`` and ``instance`` of every pixel from the ray caster's answer."""
     for i in range(t_hit.shape[0]):
         t = t_hit[i]
@@ -412,6 +413,17 @@ def _colour(kind, x, y, z, u, v, row, scale, axis, seed):  # type: ignore[no-unt
             return 0.72, 0.71, 0.68
         tone = 0.98 + 0.04 * _noise(x * 60.0, y * 60.0, z * 60.0)
     return (ar + (br - ar) * share) * tone, (ag + (bg - ag) * share) * tone, (ab + (bb - ab) * share) * tone
+
+
+@compiled
+def aim(directions, pose, rays):  # type: ignore[no-untyped-def]
+    """Fills ``rays`` (N, 6) with origin and direction in the world."""
+    for i in range(len(directions)):
+        for k in range(3):
+            rays[i, k] = pose[k, 3]
+            rays[i, 3 + k] = (
+                pose[k, 0] * directions[i, 0] + pose[k, 1] * directions[i, 1] + pose[k, 2] * directions[i, 2]
+            )
 
 
 @compiled

@@ -113,8 +113,9 @@ def _from_grid(points: Float64Array, normals: Float64Array) -> Shape:
 
 def _grid_normals(points: Float64Array) -> Float64Array:
     du, dv = np.gradient(points, axis=0), np.gradient(points, axis=1)
-    normals = np.cross(du, dv)
-    return normals / np.maximum(np.linalg.norm(normals, axis=-1, keepdims=True), 1e-12)
+    crossed = np.cross(du, dv)
+    normals: Float64Array = crossed / np.maximum(np.linalg.norm(crossed, axis=-1, keepdims=True), 1e-12)
+    return normals
 
 
 def lathe(profile: Sequence[tuple[float, float]], segments: int | None = None) -> Shape:

@@ -69,7 +69,7 @@ def _largest_part(free: BoolArray) -> BoolArray:
 def _loop(free: BoolArray, boxes: Sequence[Box], rng: np.random.Generator) -> Float64Array:
     """A closed smooth path (N, 2) m through far-apart free cells, rather over bare floor than over furniture."""
     cells = np.argwhere(free)
-    points: Float64Array = (cells + 0.5) * CELL_M
+    points = (cells.astype(np.float64) + 0.5) * CELL_M
     chosen = [int(((points - points.mean(axis=0)) ** 2).sum(axis=1).argmax())]
     distance = np.full(len(points), np.inf)
     for _ in range(6):
@@ -211,7 +211,8 @@ def _inside_view(candidates: Float64Array, directions: Float64Array) -> Float64A
     local = np.einsum("nd,cdk->cnk", directions, poses[:, :3, :3])
     ahead = local[..., 2] > 0.05
     z = np.where(ahead, local[..., 2], 1.0)
-    return (ahead & (np.abs(local[..., 0] / z) < HALF_WIDTH) & (np.abs(local[..., 1] / z) < HALF_HEIGHT)).astype(float)
+    inside = ahead & (np.abs(local[..., 0] / z) < HALF_WIDTH) & (np.abs(local[..., 1] / z) < HALF_HEIGHT)
+    return np.asarray(inside, np.float64)
 
 
 def _visible_shares(

@@ -92,6 +92,8 @@ def _object(plan: Plan, placed_id: int) -> RoomObject:
 def _relations(plan: Plan) -> Iterator[Relation]:
     for subject, (holder, relation) in sorted(plan.parent.items()):
         yield Relation(subject, relation, holder)
+    for subject, holder in plan.rests_also_on:
+        yield Relation(subject, "on", holder)
     ids = [i for i in range(1, len(plan.placed) + 1) if plan.placed[i - 1].item.class_name not in STRUCTURE]
     for a in ids:
         for b in ids:

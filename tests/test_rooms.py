@@ -1,0 +1,251 @@
+"""The built-in rooms as a dataset: determinism, agreement of images, scan and mesh, cache, options, noise."""
+
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from scipy.spatial import cKDTree
+
+from su3d_bench.datasets.rooms import DEFAULT_SCENES, N_STRUCTURE, Rooms
+from su3d_bench.datasets.rooms_scan import RoomScan
+from su3d_bench.errors import DataError, GroundTruthMissing
+from su3d_bench.geometry import back_project
+
+SMALL = Rooms.Options(width=96, height=72, n_frames=80, mesh_spacing_m=0.03)
+SCENE = "bathroom7"
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> Rooms:
+    return Rooms(tmp_path_factory.mktemp("data"), SMALL)
+
+
+def _same(first: RoomScan, second: RoomScan) -> bool:
+    return all(
+        getattr(first, field.name).tobytes() == getattr(second, field.name).tobytes() for field in fields(RoomScan)
+    )
+
+
+def test_the_same_name_gives_the_same_bytes(rooms: Rooms, tmp_path: Path) -> None:
+    again = Rooms(tmp_path, SMALL)
+    assert again.truth(SCENE) == rooms.truth(SCENE)
+    assert again.trajectory(SCENE).tobytes() == rooms.trajectory(SCENE).tobytes()
+    for index in (0, 33):
+        first, second = rooms.render(SCENE, index), again.render(SCENE, index)
+        assert first.rgb.tobytes() == second.rgb.tobytes()
+        assert first.depth_m.tobytes() == second.depth_m.tobytes()
+    assert _same(rooms.scan(SCENE), again.scan(SCENE))
+
+
+def test_names_and_seed_offsets_give_different_rooms(rooms: Rooms, tmp_path: Path) -> None:
+    other = Rooms(tmp_path, SMALL.model_copy(update={"seed_offset": 1}))
+    assert rooms.truth("bathroom8").objects != rooms.truth(SCENE).objects
+    assert other.truth(SCENE).objects != rooms.truth(SCENE).objects
+    assert len({rooms.digest(SCENE), rooms.digest("bathroom8"), other.digest(SCENE)}) == 3
+
+
+def test_frames_can_be_read_in_any_order(rooms: Rooms) -> None:
+    frames = rooms.frames(SCENE, 40)
+    last, first = frames[1], frames[0]
+    assert (len(frames), first.index, last.index) == (2, 0, 40)
+    assert rooms.info(SCENE, 40).n_frames == 2
+    assert np.array_equal(frames[0].rgb, first.rgb)
+    assert np.array_equal(last.camera_to_world, rooms.trajectory(SCENE)[40])
+    with pytest.raises(IndexError):
+        frames[2]
+
+
+@pytest.mark.parametrize("name", ["kitchn0", "living", "living-1", "living00", "cellar3", "office 1", "living1000000"])
+def test_a_name_that_is_no_scene_is_refused(rooms: Rooms, name: str) -> None:
+    with pytest.raises(DataError, match="no scene"):
+        rooms.frames(name, 40)
+
+
+def test_a_misspelt_scene_brings_a_suggestion(rooms: Rooms) -> None:
+    with pytest.raises(DataError, match="did you mean 'kitchen0'"):
+        rooms.truth("kitchn0")
+
+
+def test_the_numbers_kept_for_training_are_scenes(rooms: Rooms) -> None:
+    assert len(rooms.truth("living10000").objects) > 25
+
+
+@pytest.mark.parametrize("bad", [{"noise": 9}, {"widht": 3}, {"n_frames": 0}, {"mesh_spacing_m": -1.0}])
+def test_options_are_checked(bad: dict[str, float]) -> None:
+    with pytest.raises(ValidationError):
+        Rooms.Options.model_validate(bad)
+
+
+def test_intrinsics_scale_with_the_image(tmp_path: Path) -> None:
+    full, half = Rooms(tmp_path).intrinsics, Rooms(tmp_path, Rooms.Options(width=320, height=240)).intrinsics
+    assert full.tolist() == [[400, 0, 319.5], [0, 400, 239.5], [0, 0, 1]]
+    assert half.tolist() == [[200, 0, 159.5], [0, 200, 119.5], [0, 0, 1]]
+
+
+def test_depth_lands_on_the_scan(rooms: Rooms) -> None:
+    tree = cKDTree(rooms.scan(SCENE).vertices)
+    for frame in (rooms.frames(SCENE, 1)[k] for k in (0, 17, 60)):
+        points = back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, frame.depth_m > 0)
+        distance = tree.query(points)[0]
+        assert np.median(distance) < 0.5 * SMALL.mesh_spacing_m
+        assert np.percentile(distance, 98) < 0.02 + 0.71 * SMALL.mesh_spacing_m
+
+
+def test_instance_images_agree_with_the_instance_mesh(rooms: Rooms) -> None:
+    import open3d as o3d
+
+    mesh, image = rooms.instance_mesh(SCENE), rooms.render(SCENE, 25)
+    scene = o3d.t.geometry.RaycastingScene()
+    scene.add_triangles(o3d.core.Tensor(mesh.vertices), o3d.core.Tensor(mesh.triangles.astype(np.uint32)))
+    world_to_camera = np.linalg.inv(rooms.trajectory(SCENE)[25])
+    rays = o3d.t.geometry.RaycastingScene.create_rays_pinhole(
+        # Open3D shoots through pixel centres at +0.5
+        rooms.intrinsics + np.array([[0, 0, 0.5], [0, 0, 0.5], [0, 0, 0]]), world_to_camera, SMALL.width, SMALL.height
+    )  # fmt: skip
+    answer = scene.cast_rays(rays)
+    found = mesh.instance_of_triangle[answer["primitive_ids"].numpy()]
+    assert (found == image.instance).mean() > 0.995  # a ray on an edge may round either way
+    assert np.median(np.abs(answer["t_hit"].numpy() - image.depth_m)) < 1e-5
+
+
+def test_a_room_is_closed_seen_from_inside(rooms: Rooms) -> None:
+    for index in range(0, SMALL.n_frames, 20):
+        image = rooms.render(SCENE, index)
+        assert (image.depth_m > 0).all()
+        assert (image.instance > 0).all()
+
+
+def test_every_object_is_seen_and_counts_on_the_default_scan_density(tmp_path: Path) -> None:
+    dense = Rooms(tmp_path, Rooms.Options(n_frames=400))
+    seen = dense.visible_vertices(SCENE)
+    assert min(seen.values()) > 0
+    assert np.mean([n >= 100 for n in seen.values()]) >= 0.95
+
+
+def test_the_scan_leaves_out_what_the_walk_cannot_see(rooms: Rooms) -> None:
+    scan, mesh = rooms.scan(SCENE), rooms.instance_mesh(SCENE)
+    cabinet = next(one for one in rooms.objects(SCENE) if one.class_name == "cabinet")
+    underside = mesh.vertices[mesh.triangles[mesh.instance_of_triangle == cabinet.id]].reshape(-1, 3)[:, 2].min()
+    assert underside < 0.01  # its feet stand on the floor
+    faces = scan.vertices[scan.faces[scan.object_id == cabinet.id]].astype(np.float64)
+    normals = np.cross(faces[:, 2] - faces[:, 0], faces[:, 3] - faces[:, 1])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    thin = int(np.argmin(np.subtract(cabinet.box_max, cabinet.box_min)[:2]))
+    front, back = sorted([(normals[:, thin] > 0.9).sum(), (normals[:, thin] < -0.9).sum()], reverse=True)
+    assert front > 300
+    assert back < 0.05 * front  # the back faces the wall
+    assert (normals[:, 2] < -0.9).sum() < 0.05 * front
+
+
+def test_no_vertex_belongs_to_two_objects(rooms: Rooms) -> None:
+    scan = rooms.scan(SCENE)
+    pairs = np.unique(np.stack([scan.faces.ravel(), np.repeat(scan.object_id, 4)], axis=1), axis=0)
+    assert len(np.unique(pairs[:, 0])) == len(pairs) == len(scan.vertices)
+
+
+def test_scan_normals_are_unit_and_face_the_room(rooms: Rooms) -> None:
+    scan = rooms.scan(SCENE)
+    assert np.allclose(np.linalg.norm(scan.normals, axis=1), 1.0, atol=1e-3)
+    ceiling = scan.normals[np.unique(scan.faces[scan.object_id == 2])]
+    assert (ceiling[:, 2] < -0.99).all()
+    a, b, c, d = (scan.vertices[scan.faces[:, k]].astype(np.float64) for k in range(4))
+    wound = (np.cross(c - a, d - b) * scan.normals[scan.faces].mean(axis=1)).sum(axis=1)
+    assert (wound > 0).mean() > 0.99
+
+
+def test_face_corners_repeat_the_vertices_in_face_order(rooms: Rooms) -> None:
+    scan, corners = rooms.scan(SCENE), rooms.ground_truth(SCENE, "face-corners")
+    assert np.array_equal(corners.points, scan.vertices[scan.faces.ravel()])
+    assert np.array_equal(corners.instance, np.repeat(scan.object_id, 4))
+    names = {one.id: one.class_id for one in rooms.objects(SCENE)}
+    vertices = rooms.ground_truth(SCENE, "mesh-vertices")
+    assert all(names[int(i)] == s for i, s in zip(vertices.instance, vertices.semantic, strict=True))
+
+
+def test_an_unknown_ground_truth_is_missing(rooms: Rooms) -> None:
+    with pytest.raises(GroundTruthMissing, match="'conceptgraphs'"):
+        rooms.ground_truth(SCENE, "conceptgraphs")
+
+
+@pytest.mark.parametrize("damage", ["cut short", "flipped byte", "empty"])
+def test_a_damaged_cache_file_is_made_anew(rooms: Rooms, damage: str) -> None:
+    good = rooms.scan(SCENE)
+    (path,) = rooms.root.glob(f"rooms/*/{SCENE}.npz")
+    content = path.read_bytes()
+    middle = len(content) // 2
+    damaged = {
+        "cut short": content[:middle],
+        "flipped byte": content[:middle] + bytes([content[middle] ^ 255]) + content[middle + 1 :],
+        "empty": b"",
+    }
+    path.write_bytes(damaged[damage])
+    assert _same(rooms.scan(SCENE), good)
+    assert path.read_bytes() == content
+    assert not list(path.parent.glob("*.partial"))
+
+
+def test_a_cache_that_cannot_be_written_is_said_so(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    blocked = Rooms(tmp_path / "file", Rooms.Options(n_frames=2, mesh_spacing_m=0.1))
+    with pytest.raises(DataError, match="cannot write the scan"):
+        blocked.scan(SCENE)
+
+
+def test_image_size_and_noise_do_not_move_the_scan(rooms: Rooms) -> None:
+    noisy = Rooms(rooms.root, SMALL.model_copy(update={"width": 64, "height": 48, "noise": 2}))
+    rooms.scan(SCENE)
+    before = sorted(rooms.root.rglob("*.npz"))
+    noisy.scan(SCENE)
+    assert sorted(rooms.root.rglob("*.npz")) == before
+
+
+def test_noise_quantises_depth_and_makes_holes_at_edges(rooms: Rooms) -> None:
+    noisy = Rooms(rooms.root, SMALL.model_copy(update={"noise": 2}))
+    clean, dirty = rooms.frame(SCENE, 10), noisy.frame(SCENE, 10)
+    assert np.array_equal(dirty.depth_m, noisy.frame(SCENE, 10).depth_m)
+    holes = dirty.depth_m == 0
+    assert 0 < holes.mean() < 0.4
+    error = np.abs(dirty.depth_m - clean.depth_m)[~holes]
+    assert 0.0005 < np.median(error) < 0.02
+    assert 2 < np.abs(dirty.rgb.astype(int) - clean.rgb).mean() < 8
+    same_object = np.ones(holes.shape, bool)
+    instance = rooms.render(SCENE, 10).instance
+    for axis in (0, 1):
+        for shift in (-2, -1, 1, 2):
+            same_object &= instance == np.roll(instance, shift, axis)
+    assert holes[same_object].mean() < 0.5 * holes[~same_object].mean()
+
+
+def test_the_walk_is_smooth_and_stays_clear(tmp_path: Path) -> None:
+    full = Rooms(tmp_path, Rooms.Options(width=64, height=48))
+    poses = full.trajectory("living3")
+    rotations = poses[:, :3, :3]
+    assert np.allclose(rotations @ rotations.transpose(0, 2, 1), np.eye(3), atol=1e-9)
+    assert np.allclose(np.linalg.det(rotations), 1.0)
+    assert (rotations[:, 2, 1] < 0).all()  # image rows run downwards
+    assert poses[:, 2, 3].min() > 1.2 and poses[:, 2, 3].max() < 1.85
+    assert np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).max() < 0.05
+    turn = np.rad2deg(np.arccos(np.clip((rotations[1:, :, 2] * rotations[:-1, :, 2]).sum(axis=1), -1, 1)))
+    assert turn.max() < 6.0
+    nearest = min(float(full.render("living3", k).depth_m.min()) for k in range(0, 1600, 80))
+    assert nearest > 0.15
+
+
+def test_nearly_every_object_is_seen_again_and_again_at_stride_40(tmp_path: Path) -> None:
+    full = Rooms(tmp_path, Rooms.Options(width=160, height=120))
+    objects = full.objects("office3")
+    views = np.zeros(len(objects) + 1, int)
+    for k in range(0, 1600, 40):
+        pixels = np.bincount(full.render("office3", k).instance.ravel(), minlength=len(views))
+        views += pixels >= 15  # 240 pixels at full size
+    assert np.mean(views[N_STRUCTURE + 1 :] >= 3) > 0.9
+
+
+def test_the_default_scenes_are_furnished(rooms: Rooms) -> None:
+    assert len(DEFAULT_SCENES) == 8
+    for scene in DEFAULT_SCENES:
+        assert 25 <= len(rooms.objects(scene)) - N_STRUCTURE <= 62
