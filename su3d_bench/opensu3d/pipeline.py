@@ -123,7 +123,7 @@ class OpenSU3D:
 
 @cache
 def _warm_up(config: OpenSU3DConfig) -> None:
-    """Fuses a made-up image twice, so that no timed update waits for a compiler or an import."""
+    """Fuses a made-up image twice, so that no timed step waits for a compiler or an import."""
     size = 16
     depth_m = np.linspace(0.6, 1.0, size * size, dtype=np.float32).reshape(size, size)
     depth_m *= np.float32(config.depth_max) * np.arange(1, size + 1, dtype=np.float32) / size
@@ -144,3 +144,4 @@ def _warm_up(config: OpenSU3DConfig) -> None:
     scratch = OpenSU3D(config)
     for _ in range(2):
         scratch.update(frame, detections, Timer())
+    scratch.finish()
