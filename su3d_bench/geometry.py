@@ -8,11 +8,6 @@ from su3d_bench.errors import DataError
 from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int64Array
 
 
-def transform_points(matrix: Float64Array, points: Float64Array | Float32Array) -> Float64Array:
-    """Points (N, 3) moved by a 4x4 rigid ``matrix``, in float64."""
-    return np.asarray(points, np.float64) @ matrix[:3, :3].T + matrix[:3, 3]
-
-
 def valid_depth(depth_m: Float32Array, depth_min: float, depth_max: float) -> BoolArray:
     """Pixels whose depth is finite and in ``[depth_min, depth_max]`` metres and above 0."""
     with np.errstate(invalid="ignore"):
