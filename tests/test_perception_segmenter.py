@@ -111,10 +111,21 @@ def test_the_wall_is_no_object_but_a_part() -> None:
 
 def test_a_region_of_ten_by_ten_pixels_is_kept() -> None:
     frame = still_life()
+    patch = np.s_[95:105, 20:30]
+    frame.rgb[patch] = 240, 200, 40
+    frame.depth_m[patch] = 2.95
+    truth = np.zeros(frame.depth_m.shape, bool)
+    truth[patch] = True
+    assert best_iou(objects(frame, min_region_px=60), truth) > 0.6
+
+
+def test_a_small_patch_flush_with_the_wall_is_its_pattern_and_a_large_one_an_object() -> None:
+    frame = still_life()
     frame.rgb[95:105, 20:30] = 240, 200, 40
     truth = np.zeros(frame.depth_m.shape, bool)
     truth[95:105, 20:30] = True
-    assert best_iou(objects(frame, min_region_px=60), truth) > 0.6
+    assert best_iou(objects(frame, min_region_px=60), truth) < 0.1
+    assert best_iou(objects(frame, min_region_px=60, structure_patch_fraction=0.001), truth) > 0.6
 
 
 @pytest.mark.parametrize("fraction", [0.02, 0.2])

@@ -5,6 +5,28 @@ from __future__ import annotations
 from pydantic import BaseModel, ConfigDict, Field
 
 
+class JoinWeights(BaseModel):
+    """What speaks for (positive) and against (negative) two touching surfaces being parts of one object.
+
+    Log-odds for each unit of a cue, by logistic regression over the borders in rooms that no benchmark uses; a lower
+    ``bias`` leaves more regions apart. The cues are those of ``segmenter_rules.join_cues``.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    bias: float = 2.22
+    contrast: float = -2.31  # colour difference right at the border
+    concave: float = -1.14  # the border is an inner edge
+    concave_colour: float = -0.71  # the same, and the colours differ
+    stepped_colour: float = -2.87  # the colours differ, and the surfaces lie off each other's plane
+    gap: float = -1.84  # share of the border with a jump in depth
+    step: float = -1.68  # how far it jumps
+    contact: float = 0.5  # length of border without a jump
+    depth: float = 2.72  # share of the border where depth is known
+    smaller: float = 0.14  # sizes of the two surfaces
+    larger: float = -0.46
+
+
 class SegmenterConfig(BaseModel):
     """What is an edge, what is one surface, what is one object.
 
@@ -46,11 +68,7 @@ class SegmenterConfig(BaseModel):
     structure_patch_fraction: float = Field(default=0.01, ge=0, le=1)  # smaller flush patches are its pattern
 
     # objects
-    object_convex_colour: float = Field(default=60.0, gt=0)
-    object_flat_colour: float = Field(default=20.0, gt=0)
-    object_concave_colour: float = Field(default=8.0, gt=0)
-    object_bend_degrees: float = Field(default=12.0, gt=0)
-    object_gap: float = Field(default=0.4, gt=0)
+    join: JoinWeights = JoinWeights()
 
     # answer
     min_region_px: int = Field(default=100, ge=1)

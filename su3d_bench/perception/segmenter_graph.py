@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,21 +17,36 @@ IndexArray = NDArray[np.intp]
 class Pieces:
     """Sums over the pixels of N pieces; of points and normals only where depth is known.
 
-    ``n_pixels``, ``n_points`` (N,); ``colour`` (N, 3) sum of Lab; ``point`` (N, 3) sum of camera-frame points m;
-    ``scatter`` (N, 6) sums of xx, xy, xz, yy, yz, zz; ``normal`` (N, 3) sum of unit normals towards the camera.
+    ``n_pixels``, ``n_points`` (N,); ``colour`` (N, 3) sum of Lab; ``colour_square`` (N,) sum of its squared length;
+    ``point`` (N, 3) sum of camera-frame points m; ``scatter`` (N, 6) sums of xx, xy, xz, yy, yz, zz; ``normal`` (N, 3)
+    sum of unit normals towards the camera; ``n_pairs``, ``contrast`` (N,) neighbouring pixels inside and the sum of
+    their colour differences.
     """
 
     n_pixels: Float64Array
     n_points: Float64Array
     colour: Float64Array
+    colour_square: Float64Array
     point: Float64Array
     scatter: Float64Array
     normal: Float64Array
+    n_pairs: Float64Array
+    contrast: Float64Array
 
     @classmethod
     def from_sums(cls, sums: Float64Array) -> Pieces:
         """Pieces out of the columns of ``segmenter_kernels.sum_pixels``."""
-        return cls(sums[:, 0], sums[:, 1], sums[:, 2:5], sums[:, 5:8], sums[:, 8:14], sums[:, 14:17])
+        return cls(
+            n_pixels=sums[:, 0],
+            n_points=sums[:, 1],
+            colour=sums[:, 2:5],
+            colour_square=sums[:, 5],
+            point=sums[:, 6:9],
+            scatter=sums[:, 9:15],
+            normal=sums[:, 15:18],
+            n_pairs=sums[:, 18],
+            contrast=sums[:, 19],
+        )
 
     def __len__(self) -> int:
         return len(self.n_pixels)
@@ -42,6 +57,12 @@ class Pieces:
 
     def mean_colour(self) -> Float64Array:
         return self.colour / np.maximum(self.n_pixels, 1)[:, None]
+
+    def colour_spread(self) -> Float64Array:
+        """Root mean square distance (N,) of the pixels' colours from their mean."""
+        square = self.colour_square / np.maximum(self.n_pixels, 1) - (self.mean_colour() ** 2).sum(axis=1)
+        spread: Float64Array = np.sqrt(np.maximum(square, 0))
+        return spread
 
     def centroid(self) -> Float64Array:
         return self.point / np.maximum(self.n_points, 1)[:, None]
@@ -66,7 +87,8 @@ class Borders:
     """Sums along the E borders between pieces ``a`` < ``b`` (E,): pixel pairs, and what was measured at each pair.
 
     ``length`` pairs; ``contrast`` colour difference; ``n_deep`` pairs with depth on both sides; ``gap`` pairs of those
-    with a jump in depth; ``bend`` signed angle between the pieces over the pairs without a jump, convex positive.
+    with a jump in depth; ``jump`` relative depth steps of those; ``bend`` signed angle between the pieces over the pairs
+    without a jump, convex positive.
     """
 
     a: IndexArray
@@ -75,6 +97,7 @@ class Borders:
     contrast: Float64Array
     n_deep: Float64Array
     gap: Float64Array
+    jump: Float64Array
     bend: Float64Array
 
     def joined(self, label: IndexArray) -> Borders:
@@ -84,7 +107,7 @@ class Borders:
         low, high = np.minimum(a, b)[stays], np.maximum(a, b)[stays]
         n = int(label.max()) + 1 if len(label) else 0
         keys, group = np.unique(low * n + high, return_inverse=True)
-        sums = (self.length, self.contrast, self.n_deep, self.gap, self.bend)
+        sums = (self.length, self.contrast, self.n_deep, self.gap, self.jump, self.bend)
         return Borders(
             keys // max(n, 1), keys % max(n, 1), *(_sum_by(group, values[stays], len(keys)) for values in sums)
         )
@@ -114,7 +137,15 @@ def contract(graph: Graph, pairs: tuple[IndexArray, IndexArray]) -> Graph:
     links = coo_matrix((np.ones(len(pairs[0]), np.int8), pairs), shape=(n, n))
     n_joined, labels = connected_components(links, directed=False)
     label = labels.astype(np.intp)
-    return Graph(graph.pieces.joined(label, n_joined), graph.borders.joined(label), label[graph.piece_of_superpixel])
+    pieces, borders = graph.pieces.joined(label, n_joined), graph.borders
+    inside = label[borders.a] == label[borders.b]
+    owner = label[borders.a[inside]]
+    pieces = replace(
+        pieces,
+        n_pairs=pieces.n_pairs + np.bincount(owner, borders.length[inside], n_joined),
+        contrast=pieces.contrast + np.bincount(owner, borders.contrast[inside], n_joined),
+    )
+    return Graph(pieces, borders.joined(label), label[graph.piece_of_superpixel])
 
 
 def merge_cheapest(
@@ -150,12 +181,12 @@ def merge_cheapest(
 
 
 def measure_borders(
-    labels: Int32Array,
-    contrast: Float32Array,
-    depth_cost: Float32Array,
-    pieces: Pieces,
+    labels: Int32Array, contrast: Float32Array, depth_cost: Float32Array, depth_unit: float, pieces: Pieces
 ) -> Borders:
-    """The borders of the superpixels in ``labels`` (H, W), from per-pair colour and depth differences (2, H, W)."""
+    """The borders of the superpixels in ``labels`` (H, W), from per-pair colour and depth differences (2, H, W).
+
+    Depth differences are relative, in units of ``depth_unit``, from which on they are jumps; -1 where unknown.
+    """
     n = len(pieces)
     keys, contrasts, depths = [], [], []
     for axis, (first, second) in enumerate(
@@ -180,6 +211,7 @@ def measure_borders(
         _sum_by(inverse, np.concatenate(contrasts).astype(np.float64), len(key)),
         n_deep,
         n_gap,
+        _sum_by(inverse, np.where(gap > 0, depth.astype(np.float64) * depth_unit, 0.0), len(key)),
         (n_deep - n_gap) * signed_bend(pieces, low_of, high_of),
     )
 

@@ -28,8 +28,9 @@ def superpixels(frame: Frame, config: SegmenterConfig) -> tuple[Int32Array, Grap
     )
     cost = np.sqrt(colour**2 + np.maximum(depth, 0) ** 2 + normal**2)
     labels = kernels.grow_superpixels(cost, config.superpixel_scale, config.min_superpixel_px, 2048)
-    pieces = Pieces.from_sums(kernels.sum_pixels(labels, int(labels.max()) + 1, lab, disparity, planes, x, y))
-    borders = measure_borders(labels, colour * np.float32(config.colour_unit), depth, pieces)
+    contrast = colour * np.float32(config.colour_unit)
+    pieces = Pieces.from_sums(kernels.sum_pixels(labels, int(labels.max()) + 1, lab, contrast, disparity, planes, x, y))
+    borders = measure_borders(labels, contrast, depth, config.depth_jump, pieces)
     graph = Graph(pieces, borders, np.arange(len(pieces)))
     return labels, graph
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.perception.segmenter_config import SegmenterConfig
+from su3d_bench.perception.segmenter_config import JoinWeights, SegmenterConfig
 from su3d_bench.perception.segmenter_graph import Graph, IndexArray, Pieces, contract, merge_cheapest
 from su3d_bench.types import BoolArray, Float64Array
 
@@ -124,18 +124,58 @@ def _marks_after(joined: Graph, before: Graph, mark: IndexArray) -> IndexArray:
 
 
 def join_objects(graph: Graph, is_structure: BoolArray, config: SegmenterConfig) -> tuple[Graph, BoolArray]:
-    """Surfaces joined to objects across convex borders; structure joins nothing and stays marked."""
+    """Surfaces joined to objects where the evidence speaks for it; structure joins nothing and stays marked."""
 
     def cost(current: Graph) -> Float64Array:
-        colour, _, bend, gap = _differences(current)
-        limit = np.deg2rad(config.object_bend_degrees)
-        unit = np.where(
-            bend > limit,
-            config.object_convex_colour,
-            np.where(bend < -limit, config.object_concave_colour, config.object_flat_colour),
-        )
-        return np.sqrt((colour / unit) ** 2 + (gap / config.object_gap) ** 2)
+        return 2 / (1 + np.exp(np.clip(join_evidence(current, config.join), -30, 30)))
 
     joined = merge_cheapest(graph, cost, is_structure)
     mark = _marks_after(joined, graph, np.where(is_structure, 0, -1).astype(np.intp))
     return joined, mark >= 0
+
+
+def join_evidence(graph: Graph, weights: JoinWeights) -> Float64Array:
+    """The log-odds (E,) that the two pieces at a border are parts of one object: the weighted sum of the cues."""
+    cues = join_cues(graph)
+    evidence = np.full(len(graph.borders.a), weights.bias)
+    for name, values in cues.items():
+        evidence += float(getattr(weights, name)) * values
+    return evidence
+
+
+def join_cues(graph: Graph) -> dict[str, Float64Array]:
+    """What each weight of ``JoinWeights`` is multiplied with, at every border (E,).
+
+    Cues are combined as boundary detectors do (Martin, Fowlkes and Malik 2004); that concave edges part objects and
+    convex ones join parts is from Stein et al. (2014). Most saturate, as 1 - exp(-value / scale).
+    """
+    borders, pieces = graph.borders, graph.pieces
+    colour, contrast, bend, gap = _differences(graph)
+    sizes = np.stack([pieces.n_pixels[borders.a], pieces.n_pixels[borders.b]])
+    off_colour = _saturating(colour, 12.0)
+    concave = _saturating(np.maximum(-bend, 0), 0.5)
+    return {
+        "contrast": _saturating(contrast, 10.0),
+        "concave": concave,
+        "concave_colour": concave * off_colour,
+        "stepped_colour": _saturating(_distance_of_planes(graph), 0.03) * off_colour,
+        "gap": gap,
+        "step": _saturating(borders.jump / np.maximum(borders.gap, 1), 0.1),
+        "contact": np.log10(1 + borders.n_deep - borders.gap),
+        "depth": borders.n_deep / borders.length,
+        "smaller": np.log10(sizes.min(axis=0)) - 2,
+        "larger": np.log10(sizes.max(axis=0)) - 3,
+    }
+
+
+def _saturating(values: Float64Array, scale: float) -> Float64Array:
+    return np.asarray(1 - np.exp(-values / scale))
+
+
+def _distance_of_planes(graph: Graph) -> Float64Array:
+    """How far m (E,) the centre of either piece lies off the other's plane, the larger of the two."""
+    borders, centroid, normal = graph.borders, graph.pieces.centroid(), graph.pieces.unit_normal()
+    between = centroid[borders.a] - centroid[borders.b]
+    off_a = np.abs((between * normal[borders.a]).sum(axis=1))
+    off_b = np.abs((between * normal[borders.b]).sum(axis=1))
+    return np.asarray(np.maximum(off_a, off_b))
