@@ -27,13 +27,13 @@ Scores = Mapping[tuple[str, str, str], SceneScore]
 
 @dataclass(frozen=True)
 class RunResult:
-    """A finished run: ``metrics`` as in ``metrics.json``; ``failures`` and ``remarks`` are (scene, method, line)."""
+    """A finished run: ``metrics`` as in ``metrics.json``; ``failures`` are (scene, method, line), ``remarks`` lines."""
 
     plan: Plan
     metrics: dict[str, Any]
     outcomes: tuple[MethodOutcome, ...]
     failures: tuple[tuple[str, str, str], ...]
-    remarks: tuple[tuple[str, str, str], ...]
+    remarks: tuple[str, ...]
 
     @property
     def is_complete(self) -> bool:
@@ -54,15 +54,23 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
             raise
         failed = [(one.scene, one.method, one.error) for one in outcomes if one.error is not None]
         failures = tuple(each for each in failed if each[1] in plan.methods)
-        without_ceiling = [(scene, method, f"no ceiling: {line}") for scene, method, line in failed]
-        remarks = [each for each in without_ceiling if each[1] not in plan.methods]
-        remarks += [
-            (o.scene, o.method, f"{name} not scored: {reason}") for o in outcomes for name, reason in o.unscored
-        ]
         metrics = summarise(plan, outcomes)
         write_json(metrics_file, metrics)
         write_json(plan.folder.path / "run.json", _record(plan, outcomes, "incomplete" if failures else "complete"))
-    return RunResult(plan, metrics, outcomes, failures, tuple(remarks))
+    return RunResult(plan, metrics, outcomes, failures, _remarks(plan, outcomes))
+
+
+def _remarks(plan: Plan, outcomes: Sequence[MethodOutcome]) -> tuple[str, ...]:
+    """What is worth saying of scenes that did not fail: warnings, protocols left out, ceilings that are missing."""
+    failed = {one.scene for one in outcomes if one.error is not None and one.method in plan.methods}
+    lines = [line for one in outcomes for line in one.warnings]
+    reasons = [(one, protocol, why) for one in outcomes for protocol, why in one.unscored]
+    lines += [f"{one.scene}, {one.method}: not scored under {protocol}: {why}" for one, protocol, why in reasons]
+    said = {(one.scene, why) for one, _, why in reasons}
+    for one in outcomes:
+        if one.error is not None and one.scene not in failed and (one.scene, one.error) not in said:
+            lines.append(f"{one.scene}: no ceiling: {one.error}")
+    return tuple(dict.fromkeys(lines))
 
 
 def _execute(plan: Plan, report: Report) -> tuple[MethodOutcome, ...]:
@@ -172,4 +180,5 @@ def _record(plan: Plan, outcomes: Sequence[MethodOutcome], status: str) -> dict[
             for one in outcomes
             for protocol, reason in one.unscored
         ],
+        "warnings": list(dict.fromkeys(line for one in outcomes for line in one.warnings)),
     }

@@ -72,7 +72,10 @@ class SceneJob:
 
 @dataclass(frozen=True)
 class MethodOutcome:
-    """What became of one scene under one method; ``error`` is a line, ``unscored`` pairs a protocol and a reason."""
+    """What became of one scene under one method; ``error`` is a line, ``unscored`` pairs a protocol and a reason.
+
+    ``warnings`` are what the library said of the data on the way.
+    """
 
     scene: str
     method: str
@@ -84,6 +87,7 @@ class MethodOutcome:
     data_digest: str | None = None
     was_resumed: bool = False
     unscored: tuple[tuple[str, str], ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 def stride_of(job_stride: int, options: str) -> int:
@@ -131,24 +135,22 @@ def _guarded(scene: _Scene, part: Part) -> MethodOutcome:
     job = scene.job
     folder = RunFolder(job.folder).job(job.scene, part.name)
     folder.prepare()
-    text = io.StringIO()
-    handler = logging.StreamHandler(text)
-    handler.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
+    log = _Log()
     package = logging.getLogger("su3d_bench")
-    package.addHandler(handler)
+    package.addHandler(log)
     try:
-        outcome = scene.run(part, folder)
+        outcome = scene.run(part, folder, log)
     except StoreError:
         raise
     except Exception as error:  # noqa: BLE001 - a plug-in may raise anything; the traceback goes to the scene's log
         line = error_line(error)
         line = line if line.startswith(job.scene) else f"{job.scene}: {line}"
-        text.write("".join(traceback.format_exception(error)) + f"failed: {line}\n")
+        log.lines.append("".join(traceback.format_exception(error)) + f"failed: {line}")
         outcome = MethodOutcome(job.scene, part.name, error=line)
     finally:
-        package.removeHandler(handler)
+        package.removeHandler(log)
     if not outcome.was_resumed:
-        write_text(folder.log, text.getvalue() + ("" if outcome.error else "done\n"))
+        write_text(folder.log, "\n".join([*log.lines, *([] if outcome.error else ["done"])]) + "\n")
     return outcome
 
 
@@ -156,6 +158,20 @@ def error_line(error: Exception) -> str:
     """One line for any error; one that is not ours says its type."""
     text = " ".join(str(error).split())
     return text if isinstance(error, Su3dError) else f"{type(error).__name__}: {text}"
+
+
+class _Log(logging.Handler):
+    """Keeps what the library says while a scene runs: all ``lines`` for its log, ``warnings`` for the record too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[str] = []
+        self.warnings: list[str] = []
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(f"{record.levelname.lower()}: {record.getMessage()}")
+        if record.levelno >= logging.WARNING:
+            self.warnings.append(record.getMessage())
 
 
 class _Scene:
@@ -191,7 +207,7 @@ class _Scene:
         mesh = self.mesh if profile == "oracle" else None
         return build_perception(profile, config, scene=info, cache_root=self.job.cache_root, mesh=mesh)
 
-    def run(self, part: Part, folder: JobFolder) -> MethodOutcome:
+    def run(self, part: Part, folder: JobFolder, log: _Log) -> MethodOutcome:
         """Predict and score one method, each step only where its seal is missing or broken."""
         method = build_method(part)
         info = self.dataset.info(self.job.scene_name, stride_of(self.job.stride, part.options))
@@ -208,7 +224,7 @@ class _Scene:
         score_key |= {"pictures": str(self.job.pictures)}
         score_key |= {f"protocol.{name}": load_protocol(name).digest for name in self.job.protocols}
         if not folder.is_done("score", score_key):
-            self._score(part, perception, folder, score_key)
+            self._score(part, perception, folder, score_key, log)
             was_resumed = False
         return MethodOutcome(
             self.job.scene,
@@ -219,7 +235,8 @@ class _Scene:
             encoder_digest=perception.encoder.digest,
             data_digest=self.data_digest,
             was_resumed=was_resumed,
-            unscored=tuple(folder.remarks("score").items()),
+            unscored=tuple(folder.remarks("score")["unscored"].items()),
+            warnings=tuple(folder.remarks("score")["warnings"]),
         )
 
     def _predict(
@@ -254,7 +271,7 @@ class _Scene:
             self.report(Event(self.job.scene, method.name, update + 1, n, size.get("n_instances")))
         return rows
 
-    def _score(self, part: Part, perception: Perception, folder: JobFolder, key: Mapping[str, str]) -> None:
+    def _score(self, part: Part, perception: Perception, folder: JobFolder, key: Mapping[str, str], log: _Log) -> None:
         """Score under every protocol that has a truth here, draw the map, and seal; reasons for the others go along."""
         prediction = read_prediction(folder.prediction)
         scores: dict[str, SceneScore] = {}
@@ -274,7 +291,8 @@ class _Scene:
         if self.job.pictures:
             truth_to_draw = next(iter(self._truths.values()), None)
             pictures = draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
-        folder.seal("score", key, [folder.counts, *pictures], unscored)
+        remarks = {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings))}
+        folder.seal("score", key, [folder.counts, *pictures], remarks)
 
 
 def refuse_other_run(folder: JobFolder, key: Mapping[str, str], known_later: Sequence[str] = ()) -> None:

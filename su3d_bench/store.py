@@ -241,7 +241,7 @@ class JobFolder:
         return steps if isinstance(steps, dict) else {}
 
     def seal(
-        self, step: str, key: Mapping[str, str], files: Sequence[Path], remarks: Mapping[str, str] | None = None
+        self, step: str, key: Mapping[str, str], files: Sequence[Path], remarks: Mapping[str, Any] | None = None
     ) -> None:
         """Vouch for ``files`` as the outcome of ``step`` under ``key``; sealing ``predict`` breaks the other seal.
 
@@ -252,9 +252,9 @@ class JobFolder:
         steps[step] = {"key": dict(key), "files": digests, "remarks": dict(remarks or {})}
         write_json(self.done, {"schema": SCHEMA, "steps": steps})
 
-    def remarks(self, step: str) -> dict[str, str]:
+    def remarks(self, step: str) -> dict[str, Any]:
         """What was kept beside the seal of ``step``."""
-        return {name: str(text) for name, text in self._part(step, "remarks").items()}
+        return self._part(step, "remarks")
 
     def changed_field(self, step: str, key: Mapping[str, str], *, known_later: Sequence[str] = ()) -> str | None:
         """A clause that names the first field in which the sealed key differs from ``key``; None where none does.

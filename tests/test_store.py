@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
@@ -51,6 +51,7 @@ def sealed_job(tmp_path: Path) -> JobFolder:
     return job
 
 
+@settings(deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.dictionaries(
         st.sampled_from(["points", "names", "indptr"]),
@@ -159,9 +160,9 @@ def test_a_damaged_file_means_that_the_step_runs_anew(tmp_path: Path, damage: st
 def test_predicting_anew_breaks_the_seal_of_the_score(tmp_path: Path) -> None:
     job = sealed_job(tmp_path)
     write_bytes(job.counts, b"counts")
-    job.seal("score", {"protocol": "1"}, [job.counts], {"rooms-semantic": "no truth"})
+    job.seal("score", {"protocol": "1"}, [job.counts], {"unscored": {"rooms-semantic": "no truth"}})
     assert job.is_done("score", {"protocol": "1"})
-    assert job.remarks("score") == {"rooms-semantic": "no truth"}
+    assert job.remarks("score") == {"unscored": {"rooms-semantic": "no truth"}}
     job.seal("predict", KEY, [job.prediction])
     assert not job.is_done("score", {"protocol": "1"})
 

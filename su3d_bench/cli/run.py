@@ -101,8 +101,8 @@ def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
         answer_json(result.metrics)
     else:
         answer(markdown_table(result.metrics))
-    for scene, method, line in result.remarks:
-        remark(f"{scene}, {method}: {line}", quiet=arguments.quiet)
+    for line in result.remarks:
+        remark(line, quiet=arguments.quiet)
     remark(f"run folder: {result.plan.folder.path}", quiet=arguments.quiet)
 
 

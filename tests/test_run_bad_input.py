@@ -1,0 +1,183 @@
+"""Bad input on real files: rooms written in Replica's layout, one scene spoilt, the run as a user starts it."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from su3d_bench.cli.main import main
+
+MAKE = "datasets make rooms --layout replica --scenes bathroom0 office0 --workers 1 --quiet"
+SMALL = ["--set", "n_frames=4", "--set", "width=160", "--set", "height=120", "--set", "mesh_spacing_m=0.08"]
+RUN = "run --scenes replica/* --stride 2 --jobs 1 --protocols rooms-semantic --no-pictures"
+Spoil = Callable[[Path], Any]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two small rooms on disk."""
+    root = tmp_path_factory.mktemp("whole")
+    assert main([*MAKE.split(), *SMALL, "--out", str(root)]) == 0
+    return root
+
+
+@pytest.fixture(scope="module")
+def clean_scene(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, float]:
+    """What the scene that is never spoilt scores."""
+    out = tmp_path_factory.mktemp("clean")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SU3D_DATA", str(whole))
+        patch.setenv("SU3D_CACHE", str(tmp_path_factory.mktemp("cache")))
+        assert main([*RUN.split(), "--out", str(out), "--quiet"]) == 0
+    return scores_of_office(out)
+
+
+@pytest.fixture
+def root(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the rooms that a test may spoil."""
+    shutil.copytree(whole, tmp_path / "data")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SU3D_DATA", "data")
+    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "data"
+
+
+def scores_of_office(out: Path) -> dict[str, float]:
+    result = json.loads((out / "metrics.json").read_text())["results"][0]["result"]
+    scores: dict[str, float] = result["per_scene"]["replica/office0"]
+    return scores
+
+
+def results(root: Path) -> Path:
+    return root / "Replica" / "bathroom0" / "results"
+
+
+def remove(name: str) -> Spoil:
+    return lambda root: (root / name).unlink()
+
+
+def depth(image: Any) -> Spoil:
+    return lambda root: cv2.imwrite(str(results(root) / "depth000002.png"), image)
+
+
+def pose(text: str) -> Spoil:
+    def spoil(root: Path) -> None:
+        path = root / "Replica" / "bathroom0" / "traj.txt"
+        lines = path.read_text().splitlines()
+        path.write_text("\n".join([*lines[:2], text, *lines[3:]]) + "\n")
+
+    return spoil
+
+
+def edit_json(name: str, change: Callable[[Any], Any]) -> Spoil:
+    def spoil(root: Path) -> None:
+        value = json.loads((root / name).read_text())
+        change(value)
+        (root / name).write_text(json.dumps(value))
+
+    return spoil
+
+
+INFO = "replica_v1/bathroom_0/habitat/info_semantic.json"
+
+
+@pytest.mark.parametrize(
+    ("spoil", "line"),
+    [
+        (remove("Replica/bathroom0/results/frame000002.jpg"), "results/frame000002.jpg is missing; copy results/"),
+        (remove("Replica/bathroom0/results/depth000002.png"), "results/depth000002.png is missing; copy results/"),
+        (pose("nan " * 16), "traj.txt line 3: the pose holds 'nan'; mend the trajectory or leave the scene out"),
+        (depth(np.full((60, 80), 900, np.uint16)), "results/depth000002.png is 80x60 and results/frame000002"),
+        (depth(np.zeros((120, 160), np.uint16)), "results/depth000002.png: empty depth, no pixel is above 0"),
+        (depth(np.full((120, 160), 90, np.uint8)), "results/depth000002.png: not a depth image; expected"),
+    ],
+)  # fmt: skip
+def test_a_spoilt_scene_is_one_line_and_the_other_scene_is_unharmed(
+    spoil: Spoil, line: str, root: Path, clean_scene: dict[str, float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    spoil(root)
+    assert main([*RUN.split(), "--out", "out", "--quiet"]) == 3
+    errors = capsys.readouterr().err.splitlines()
+    assert len(errors) == 2
+    assert errors[0].startswith(f"su3d-bench: replica/bathroom0: {line}")
+    assert errors[1].startswith("su3d-bench: incomplete: 1 of 2 scenes failed; see out/scenes/replica.bathroom0/")
+    assert scores_of_office(Path("out")) == clean_scene
+
+
+@pytest.mark.parametrize(
+    ("spoil", "line"),
+    [
+        (
+            edit_json(INFO, lambda info: info["objects"][3].update(class_id=777)),
+            "objects with an unknown class id in habitat/info_semantic.json: 1 (the first: object 4, class 777;",
+        ),
+        (
+            edit_json(INFO, lambda info: info["objects"].pop(3)),
+            "object ids without entry in habitat/info_semantic.json: 1 (the first: 4); faces made void: ",
+        ),
+    ],
+)
+def test_what_the_annotation_does_not_know_is_void_and_said_in_one_line(
+    spoil: Spoil, line: str, root: Path, clean_scene: dict[str, float], capsys: pytest.CaptureFixture[str]
+) -> None:
+    spoil(root)
+    for _ in range(2):  # a run that resumes says it again
+        assert main([*RUN.split(), "--out", "out"]) == 0
+        remarks = capsys.readouterr().err.splitlines()
+        assert len(remarks) == 2
+        assert remarks[0].startswith(f"replica/bathroom0: {line}")
+        assert remarks[1] == "run folder: out"
+    assert scores_of_office(Path("out")) == clean_scene
+
+
+@pytest.mark.parametrize(
+    ("change", "line"),
+    [
+        (
+            lambda file: file["camera"].update(w=640),
+            "is 160x120 but cam_params.json says 640x120; it belongs",
+        ),
+        (lambda file: file["camera"].pop("fx"), "cam_params.json: 'camera' has no 'fx'; expected w, h, fx, fy, cx, cy"),
+        (lambda file: file["camera"].update(fx=-3), "cam_params.json: 'fx' is -3; it must be above 0"),
+    ],
+)
+def test_wrong_intrinsics_are_one_line_a_scene(
+    change: Callable[[Any], Any], line: str, root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    edit_json("Replica/cam_params.json", change)(root)
+    assert main([*RUN.split(), "--out", "out", "--quiet"]) == 3
+    errors = capsys.readouterr().err.splitlines()
+    assert len(errors) == 3
+    assert {error.split(": ")[1] for error in errors[:2]} == {"replica/bathroom0", "replica/office0"}
+    assert all(line in error for error in errors[:2])
+
+
+def test_a_misspelt_scene_names_the_nearest(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--scenes", "replica/ofice0"]) == 2
+    line = "su3d-bench: no scene matches 'replica/ofice0'; did you mean 'replica/office0'?\n"
+    assert capsys.readouterr().err == line
+
+
+def test_scenes_that_are_not_there_say_where_they_were_looked_for(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    shutil.rmtree(root)
+    assert main(["run", "--scenes", "replica/*"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("su3d-bench: replica: no scene in data")
+    assert error.count("\n") == 1
+
+
+def test_a_truth_that_is_missing_leaves_the_scene_unscored(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (root / "replica_v1" / "bathroom_0" / "habitat" / "mesh_semantic.ply").unlink()
+    assert main([*RUN.split(), "--out", "out"]) == 0
+    answer = capsys.readouterr()
+    assert "- opensu3d is unscored on replica/bathroom0" in answer.out
+    assert answer.err.startswith("replica/bathroom0, opensu3d: not scored under rooms-semantic: replica/bathroom0: no")
