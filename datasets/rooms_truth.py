@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
@@ -17,6 +18,7 @@ OPENINGS = frozenset(("door", "window"))
 NEXT_TO_M, NEXT_TO_ON_M = 0.3, 0.12  # on the floor and walls, and among things that share a support
 MIN_VISIBLE_VERTICES = 100  # ScanNet's smallest instance that counts
 MAX_ANSWER_SHARE = 1 / 3
+MIN_BEARING_RAD = 0.05  # two things nearer to one line of sight are neither left nor right of each other
 
 
 @dataclass(frozen=True)
@@ -59,6 +61,20 @@ class RoomTruth:
     def by_id(self, object_id: int) -> RoomObject:
         return self.objects[object_id - 1]
 
+    def left_of(self, eye: tuple[float, float, float] | None = None) -> tuple[Relation, ...]:
+        """Which of two neighbours stands left of the other for who looks at both from ``eye`` (the room's middle).
+
+        Apart from ``relations``, for it is the only relation that depends on where one stands.
+        """
+        if eye is None:
+            eye = next(one.centre for one in self.objects if one.class_name == "floor")
+        pairs = {(link.subject, link.object) for link in self.relations if link.relation == "next to"}
+        return tuple(
+            Relation(a, "left of", b)
+            for a, b in sorted(pairs)
+            if _bearing(eye, self.by_id(a).centre, self.by_id(b).centre) > MIN_BEARING_RAD
+        )
+
 
 @dataclass(frozen=True)
 class Query:
@@ -67,6 +83,13 @@ class Query:
     text: str
     kind: str
     answers: tuple[int, ...]
+
+
+def _bearing(eye: tuple[float, ...], a: tuple[float, ...], b: tuple[float, ...]) -> float:
+    """Angle in radians, seen from above, by which ``a`` stands left of ``b`` for who looks at them from ``eye``."""
+    angle_a = math.atan2(a[1] - eye[1], a[0] - eye[0])
+    angle_b = math.atan2(b[1] - eye[1], b[0] - eye[0])
+    return math.remainder(angle_a - angle_b, math.tau)
 
 
 def truth_of(scene: str, kind: str, plan: Plan) -> RoomTruth:

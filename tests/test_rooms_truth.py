@@ -151,3 +151,22 @@ def test_objects_that_are_hardly_visible_are_neither_asked_nor_answers() -> None
 def test_a_room_without_its_scan_is_quick_and_writes_nothing(tmp_path: Path) -> None:
     Rooms(tmp_path).truth("office10001")
     assert not list(tmp_path.iterdir())
+
+
+def test_left_of_is_judged_from_where_one_stands(truths: list[RoomTruth]) -> None:
+    for truth in truths:
+        pairs = {(link.subject, link.object) for link in truth.left_of()}
+        assert pairs
+        assert not any((b, a) in pairs for a, b in pairs)
+        a, b = sorted(pairs)[0]
+        (ax, ay, z), (bx, by, _) = truth.by_id(a).centre, truth.by_id(b).centre
+        middle, across = ((ax + bx) / 2, (ay + by) / 2), (by - ay, ax - bx)
+        length = float(np.hypot(*across))
+        seen = [
+            (middle[0] + sign * 3 * across[0] / length, middle[1] + sign * 3 * across[1] / length, z)
+            for sign in (1, -1)
+        ]
+        from_one_side = {(link.subject, link.object) for link in truth.left_of(seen[0])}
+        from_the_other = {(link.subject, link.object) for link in truth.left_of(seen[1])}
+        assert ((a, b) in from_one_side) != ((a, b) in from_the_other)
+        assert ((a, b) in from_one_side) == ((b, a) in from_the_other)
