@@ -14,17 +14,17 @@ class JoinWeights(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    bias: float = 2.22
-    contrast: float = -2.31  # colour difference right at the border
+    bias: float = 2.6
+    contrast: float = -1.49  # colour difference right at the border
     concave: float = -1.14  # the border is an inner edge
-    concave_colour: float = -0.71  # the same, and the colours differ
-    stepped_colour: float = -2.87  # the colours differ, and the surfaces lie off each other's plane
-    gap: float = -1.84  # share of the border with a jump in depth
-    step: float = -1.68  # how far it jumps
-    contact: float = 0.5  # length of border without a jump
-    depth: float = 2.72  # share of the border where depth is known
-    smaller: float = 0.14  # sizes of the two surfaces
-    larger: float = -0.46
+    concave_colour: float = -0.19  # the same, and the colours differ
+    stepped_colour: float = -3.3  # the colours differ, and the surfaces lie off each other's plane
+    gap: float = -1.1  # share of the border with a jump in depth
+    step: float = -1.13  # how far it jumps
+    contact: float = 0.84  # length of border without a jump
+    depth: float = 1.14  # share of the border where depth is known
+    smaller: float = -0.13  # sizes of the two surfaces
+    larger: float = -0.68
 
 
 class SegmenterConfig(BaseModel):
@@ -41,6 +41,9 @@ class SegmenterConfig(BaseModel):
     max_width: int = Field(default=640, ge=32)  # wider frames are segmented at a whole fraction of their size
     lightness_weight: float = Field(default=0.6, gt=0)
     smoothing_colour: float = Field(default=20.0, gt=0)  # bilateral filter: colour steps above this stay sharp
+    noise_floor: float = Field(default=1e-4, ge=0)  # 1/m: quieter disparity is not smoothed; 0.4 mm at 2 m
+    noise_smoothing: float = Field(default=4.0, gt=0)  # bilateral filter of disparity, in standard deviations
+    noise_margin: float = Field(default=4.0, ge=0)  # standard deviations that no step in depth may rest on
     depth_jump: float = Field(default=0.012, gt=0)
     normal_radius: int = Field(default=4, ge=1)  # at half resolution; smaller beside jumps in depth
     normal_keep: float = Field(default=0.001, ge=0)  # relative depth by which a neighbour's plane must fit better

@@ -9,8 +9,11 @@ from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int32Array
 
 
 @njit(cache=True)
-def discontinuities(disparity: Float32Array, jump: float, slope_factor: float) -> BoolArray:
-    """Pixels (H, W) beside a jump of the relative disparity that the slopes on its two sides do not explain."""
+def discontinuities(disparity: Float32Array, jump: float, margin: float, slope_factor: float) -> BoolArray:
+    """Pixels (H, W) beside a jump of the relative disparity that the slopes on its two sides do not explain.
+
+    Steps below ``margin`` (1/m) are noise.
+    """
     height, width = disparity.shape
     broken = np.zeros((height, width), np.bool_)
     for axis in range(2):
@@ -21,7 +24,7 @@ def discontinuities(disparity: Float32Array, jump: float, slope_factor: float) -
                 if here <= 0 or there <= 0:
                     continue
                 step = abs(there - here)
-                limit = jump * max(here, there)
+                limit = jump * max(here, there) + margin
                 if step <= limit:
                     continue
                 slope = 1e30
@@ -123,12 +126,18 @@ def _misfit(
 
 @njit(cache=True)
 def sharpen_planes(
-    planes: Float32Array, disparity: Float32Array, reach: int, own_bonus: float, x: Float64Array, y: Float64Array
+    planes: Float32Array,
+    disparity: Float32Array,
+    reach: int,
+    own_bonus: float,
+    margin: float,
+    x: Float64Array,
+    y: Float64Array,
 ) -> Float32Array:
     """For every pixel the plane, of its own and those ``reach`` pixels away in eight directions, that fits it best.
 
     Windows that straddle an edge blur it; a window a step to the side lies on one surface. A pixel keeps its own plane
-    unless another misfits by ``own_bonus`` (relative depth) less.
+    unless another misfits by ``own_bonus`` (relative depth) and a quarter of the noise ``margin`` (1/m) less.
     """
     height, width = disparity.shape
     sharp = planes.copy()
@@ -139,7 +148,7 @@ def sharpen_planes(
             a, b, c = planes[v, u, 0], planes[v, u, 1], planes[v, u, 2]
             best = 1e30
             if a != 0 or b != 0 or c != 0:
-                best = _misfit(a, b, c, disparity, v, u, x, y) - own_bonus
+                best = _misfit(a, b, c, disparity, v, u, x, y) - own_bonus - 0.25 * margin / disparity[v, u]
                 if best <= 0:
                     continue
             for step in range(9):
@@ -238,6 +247,7 @@ def pair_costs(
     y: Float64Array,
     colour_unit: float,
     depth_unit: float,
+    margin: float,
     normal_unit: float,
 ) -> tuple[Float32Array, Float32Array, Float32Array]:
     """Colour, depth and normal difference (2, H, W) of each pixel to its right (0) and lower (1) neighbour, in units.
@@ -260,10 +270,11 @@ def pair_costs(
                 q0, q1 = disparity[v, u], disparity[v1, u1]
                 if q0 <= 0 or q1 <= 0:
                     continue
-                if abs(q1 - q0) < 0.1 * depth_unit * q0:
+                unit = depth_unit + margin / max(q0, q1)
+                if abs(q1 - q0) < 0.1 * unit * q0:
                     depth[axis, v, u] = 0.0  # below a tenth of a jump: not worth an extrapolation
                 else:
-                    depth[axis, v, u] = _jump(disparity, planes, v, u, dv, du, x, y) / depth_unit
+                    depth[axis, v, u] = _jump(disparity, planes, v, u, dv, du, x, y) / unit
                 normal[axis, v, u] = _chord(planes, v, u, v1, u1) / normal_unit
     return colour, depth, normal
 

@@ -39,10 +39,14 @@ def _differences(graph: Graph) -> tuple[Float64Array, Float64Array, Float64Array
 
 @dataclass(frozen=True)
 class StructuralPlane:
-    """A floor, wall or ceiling: points p on it have ``normal`` . p = ``offset``; ``colour`` is its mean."""
+    """A floor, wall or ceiling: points p on it have ``normal`` . p = ``offset``; ``colour`` is its mean.
+
+    ``roughness_m`` is the root mean square distance of its points: the noise of the depth.
+    """
 
     normal: Float64Array
     offset: float
+    roughness_m: float
     colour: Float64Array
 
 
@@ -67,7 +71,7 @@ def structural_planes(surfaces: Graph, config: SegmenterConfig) -> list[Structur
         behind = has_depth & (distance < -2 * tolerance)
         is_large = pieces.n_points[on_plane].sum() >= config.structure_min_fraction * total
         if is_large and pieces.n_points[behind].sum() <= config.structure_behind_fraction * total:
-            planes.append(StructuralPlane(axis, offset, colour[seed]))
+            planes.append(StructuralPlane(axis, offset, rms, colour[seed]))
             is_taken |= on_plane
     return planes
 
@@ -79,7 +83,11 @@ def plane_of_flush(pieces: Pieces, planes: list[StructuralPlane], config: Segmen
     tolerance = np.maximum(config.structure_flush_m, config.structure_flush_relative * centroid[:, 2])
     for number, plane in enumerate(planes):
         distance = np.abs(centroid @ plane.normal - plane.offset)
-        is_flush = (distance < tolerance) & (normal @ plane.normal > np.cos(np.deg2rad(12))) & (pieces.n_points > 0)
+        is_flush = (
+            (distance < np.maximum(tolerance, plane.roughness_m))
+            & (normal @ plane.normal > np.cos(np.deg2rad(12)))
+            & (pieces.n_points > 0)
+        )
         found[is_flush & (found < 0)] = number
     return found
 
