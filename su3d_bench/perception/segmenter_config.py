@@ -40,7 +40,7 @@ class SegmenterConfig(BaseModel):
     # pixels
     max_width: int = Field(default=640, ge=32)  # wider frames are segmented at a whole fraction of their size
     lightness_weight: float = Field(default=0.6, gt=0)
-    smoothing_colour: float = Field(default=20.0, gt=0)  # bilateral filter: colour steps above this stay sharp
+    smoothing_colour: float = Field(default=35.0, gt=0)  # bilateral filter: colour steps above this stay sharp
     noise_floor: float = Field(default=1e-4, ge=0)  # 1/m: quieter disparity is not smoothed; 0.4 mm at 2 m
     noise_smoothing: float = Field(default=4.0, gt=0)  # bilateral filter of disparity, in standard deviations
     noise_margin: float = Field(default=4.0, ge=0)  # standard deviations that no step in depth may rest on
@@ -52,12 +52,12 @@ class SegmenterConfig(BaseModel):
     colour_unit: float = Field(default=8.0, gt=0)
     normal_unit_degrees: float = Field(default=25.0, gt=0)
     superpixel_scale: float = Field(default=12.0, gt=0)
-    min_superpixel_px: int = Field(default=16, ge=1)
+    min_superpixel_px: int = Field(default=8, ge=1)
 
     # surfaces
     surface_colour: float = Field(default=9.0, gt=0)
     surface_contrast: float = Field(default=9.0, gt=0)
-    surface_bend_degrees: float = Field(default=22.0, gt=0)
+    surface_bend_degrees: float = Field(default=12.0, gt=0)
     surface_gap: float = Field(default=0.5, gt=0)
 
     # structure: floor, walls, ceiling
@@ -65,7 +65,7 @@ class SegmenterConfig(BaseModel):
     structure_distance_m: float = Field(default=0.03, gt=0)
     structure_behind_fraction: float = Field(default=0.02, ge=0, le=1)
     structure_flush_m: float = Field(default=0.005, gt=0)
-    structure_flush_relative: float = Field(default=0.003, gt=0)
+    structure_flush_relative: float = Field(default=0.0015, gt=0)
     structure_colour: float = Field(default=12.0, gt=0)
     structure_lightness_weight: float = Field(default=0.4, ge=0)
     structure_patch_fraction: float = Field(default=0.01, ge=0, le=1)  # smaller flush patches are its pattern
