@@ -1,0 +1,271 @@
+"""What combine and the reader get: several scenes, warnings, bytes, and what cannot be scored."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scored_room import (
+    ENCODER,
+    ID,
+    INSTANCE,
+    NAMES,
+    ROOM,
+    SEMANTIC,
+    instances,
+    noisy,
+    noisy_scores,
+    room,
+    truth_as_prediction,
+)
+
+from su3d_bench.errors import DataError, PredictionError
+from su3d_bench.protocols import ProtocolRules, load_protocol
+from su3d_bench.scoring import combine, pack_scores, score_scene, unpack_scores
+from su3d_bench.types import (
+    Encoder,
+    LabelSet,
+    Prediction,
+)
+
+# ---- several scenes
+
+
+@settings(max_examples=20, deadline=None)
+@given(order=st.permutations(range(5)), name=st.sampled_from([*SEMANTIC, *INSTANCE]))
+def test_the_order_of_scenes_changes_no_bit(order: list[int], name: str) -> None:
+    scores = noisy_scores(name, 5)
+    rules = load_protocol(name)
+    shuffled = {f"rooms/{seed}": scores[f"rooms/{seed}"] for seed in order}
+    assert json.dumps(combine(rules, shuffled).to_json()) == json.dumps(combine(rules, scores).to_json())
+
+
+@settings(max_examples=20, deadline=None)
+@given(seeds=st.sets(st.integers(0, 7), min_size=1), name=st.sampled_from([*SEMANTIC, *INSTANCE]))
+def test_a_subset_of_scenes_is_scored_from_counts_alone(seeds: set[int], name: str) -> None:
+    rules = load_protocol(name)
+    packed = {scene: pack_scores({name: score}) for scene, score in noisy_scores(name, 8).items()}
+    chosen = {f"rooms/{seed}": unpack_scores(packed[f"rooms/{seed}"])[name] for seed in seeds}
+    fresh = {f"rooms/{seed}": score_scene(rules, *noisy(seed), None) for seed in seeds}
+    assert combine(rules, chosen).to_json() == combine(rules, fresh).to_json()
+
+
+@pytest.mark.parametrize("name", [*SEMANTIC, *INSTANCE])
+def test_pooled_values_differ_from_the_mean_of_the_scenes(name: str) -> None:
+    result = combine(load_protocol(name), noisy_scores(name, 5))
+    key = result.headline[0]
+    assert result.pooled[key] != result.scene_mean[key]
+    assert result.scene_mean[key] == pytest.approx(np.mean([row[key] for row in result.per_scene.values()]))
+    assert result.metrics == result.pooled
+
+
+@pytest.mark.parametrize("name", [*SEMANTIC, *INSTANCE])
+def test_the_interval_surrounds_the_value_and_is_the_same_every_time(name: str) -> None:
+    rules = load_protocol(name)
+    first, second = combine(rules, noisy_scores(name, 5)), combine(rules, noisy_scores(name, 5))
+    assert first.intervals == second.intervals
+    for key in rules.headline:
+        interval = first.intervals[key]
+        assert interval is not None
+        assert interval[0] <= first.metrics[key] <= interval[1]
+        assert interval[0] < interval[1]
+
+
+def test_a_single_scene_has_no_interval() -> None:
+    assert combine(ROOM, noisy_scores("rooms-semantic", 1)).intervals == {"mAcc": None, "F-mIoU": None}
+
+
+def test_a_protocol_may_report_the_mean_of_the_scenes() -> None:
+    rules = ROOM.model_copy(update={"aggregate": "scene-mean"})
+    result = combine(rules, noisy_scores("rooms-semantic", 5))
+    interval = result.intervals["mAcc"]
+    assert result.metrics == result.scene_mean
+    assert interval is not None
+    assert interval[0] < result.metrics["mAcc"] < interval[1]
+
+
+def test_groups_are_averaged_over_the_classes_that_have_ground_truth() -> None:
+    classes = [entry.model_copy(update={"group": "head"}) if entry.name == "chair" else entry for entry in ROOM.classes]
+    rules = load_protocol("rooms-instance").model_copy(update={"classes": tuple(classes)})
+    result = combine(rules, noisy_scores("rooms-instance", 3))
+    assert result.groups == {"head": result.per_class["chair"]}
+
+
+# ---- what a reader is told
+
+
+def warnings_of(name: str, prediction: Prediction, encoder: Encoder | None = None) -> str:
+    rules = load_protocol(name)
+    return "\n".join(combine(rules, {"rooms/a": score_scene(rules, room(), prediction, encoder)}).warnings)
+
+
+def test_a_perfect_prediction_warns_of_nothing() -> None:
+    for name in (*SEMANTIC, "rooms-instance"):
+        assert warnings_of(name, truth_as_prediction(room(), with_labels=True)) == ""
+
+
+def test_constant_confidences_are_told() -> None:
+    prediction = replace(truth_as_prediction(room(), with_labels=True), scores=np.full(8, 0.5))
+    told = warnings_of("rooms-instance", prediction)
+    assert told == "rooms/a: all 8 confidences are 0.5: AP of a class is then recall (1 + precision) / 2"
+
+
+def test_duplicates_are_told() -> None:
+    truth = room()
+    chairs = np.flatnonzero(truth.instance == 2)
+    told = warnings_of("rooms-instance", instances(truth.points, [chairs, chairs[5:]], ["chair", "table"]))
+    assert told == (
+        "rooms/a: 1 pair of predictions overlaps with IoU above 0.9 (first 0 and 1); duplicates can raise or lower AP"
+    )
+
+
+def test_another_encoder_than_the_protocols_is_told() -> None:
+    told = warnings_of("replica-mesh-ex6", truth_as_prediction(room(), with_labels=False), ENCODER)
+    assert told == ("rooms/a: labels come from the encoder 'one-hot', the protocol's is 'ViT-H-14/laion2b_s32b_b79k'")
+    assert warnings_of("rooms-semantic", truth_as_prediction(room(), with_labels=False), ENCODER) == ""
+
+
+def test_what_every_scene_warns_of_is_told_once() -> None:
+    rules = load_protocol("replica-mesh-ex6")
+    score = score_scene(rules, room(), truth_as_prediction(room(), with_labels=False), ENCODER)
+    assert len(combine(rules, {"a": score, "b": score, "c": score}).warnings) == 1
+
+
+def test_a_class_of_the_truth_without_scored_points_is_told_and_counts_zero_in_its_scene_alone() -> None:
+    rules = load_protocol("replica-conceptgraphs-ex6")
+    points = room().points[room().semantic != ID["lamp"]]
+    truth = replace(room(), variant="conceptgraphs", evaluation_points=points)
+    score = score_scene(rules, truth, truth_as_prediction(room(), with_labels=True), None)
+    result = combine(rules, {"a": score})
+    assert result.warnings == (
+        "a: the ground truth has 'lamp', but no scored point does; such a class counts 0 in this scene",
+    )
+    assert result.per_scene["a"]["mAcc"] == 4 / 5
+    assert result.pooled["mAcc"] == 1.0
+
+
+def test_a_class_with_small_instances_only_is_told() -> None:
+    truth = room(n_each=99)
+    rules = load_protocol("rooms-instance")
+    result = combine(rules, {"a": score_scene(rules, truth, truth_as_prediction(truth, with_labels=True), None)})
+    assert np.isnan(result.metrics["AP"])
+    assert result.warnings == (
+        "not scored, because no scene has an instance of 100 points: "
+        "'backpack', 'book', 'chair', 'cushion', 'lamp', 'table'",
+    )
+
+
+@pytest.mark.parametrize("name", [*SEMANTIC, "rooms-instance"])
+def test_coverage_is_the_share_of_scored_points_without_a_predicted_point_that_near(name: str) -> None:
+    truth = room()
+    rules = load_protocol(name)
+    half = [k for k in range(8) if k != 4]  # the lamp is missing; the nearest object is 20 cm or more away
+    whole = truth_as_prediction(truth, with_labels=True)
+    prediction = instances(truth.points, [whole.mask(k) for k in half], [NAMES[k] for k in half])
+    coverage = combine(rules, {"a": score_scene(rules, truth, prediction, None)}).coverage
+    n_scored = 6 if name == "replica-mesh-ex6" else 7
+    assert coverage == {"0.025": 1 / n_scored, "0.05": 1 / n_scored, "0.1": 1 / n_scored}
+
+
+def test_the_number_of_predictions_is_reported() -> None:
+    result = combine(ROOM, noisy_scores("rooms-semantic", 2))
+    assert result.n_predictions == {"rooms/0": 8, "rooms/1": 8}
+
+
+# ---- bytes
+
+
+def test_equal_scores_pack_to_equal_bytes_at_any_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    scores = {name: score_scene(load_protocol(name), *noisy(0), None) for name in (*SEMANTIC, *INSTANCE)}
+    first = pack_scores(scores)
+    monkeypatch.setattr(time, "time", lambda: 2e9)
+    assert pack_scores(dict(reversed(scores.items()))) == first
+
+
+def test_packed_scores_hold_no_pickle_and_come_back_whole() -> None:
+    scores = {name: score_scene(load_protocol(name), *noisy(0), None) for name in (*SEMANTIC, *INSTANCE)}
+    data = pack_scores(scores)
+    with np.load(io.BytesIO(data), allow_pickle=False) as archive:
+        assert all(archive[key].dtype != object for key in archive.files)
+    assert pack_scores(unpack_scores(data)) == data
+
+
+@pytest.mark.parametrize("cut", [0, 10, 500])
+def test_damaged_counts_are_a_data_error(cut: int) -> None:
+    data = pack_scores({"rooms-semantic": score_scene(ROOM, *noisy(0), None)})
+    with pytest.raises(DataError, match="counts: are damaged"):
+        unpack_scores(data[:cut])
+
+
+def test_a_result_has_no_nan_in_its_json() -> None:
+    result = combine(load_protocol("rooms-instance"), noisy_scores("rooms-instance", 2))
+    text = json.dumps(result.to_json(), allow_nan=False)
+    assert '"sofa": {"AP": null' in text
+
+
+# ---- what cannot be scored
+
+
+def test_a_prediction_without_labels_and_features_is_refused() -> None:
+    prediction = replace(truth_as_prediction(room(), with_labels=True), labels=None)
+    with pytest.raises(PredictionError, match="neither labels nor features"):
+        score_scene(ROOM, room(), prediction, ENCODER)
+
+
+def test_features_without_an_encoder_are_refused() -> None:
+    with pytest.raises(PredictionError, match="no encoder"):
+        score_scene(ROOM, room(), truth_as_prediction(room(), with_labels=False), None)
+
+
+def test_features_of_another_encoder_are_refused() -> None:
+    prediction = replace(truth_as_prediction(room(), with_labels=False), features=np.ones((8, 3), np.float32))
+    with pytest.raises(PredictionError, match="features have 3 dimensions, the encoder 'one-hot' has 70"):
+        score_scene(ROOM, room(), prediction, ENCODER)
+
+
+@pytest.mark.parametrize("name", ["rooms-semantic", "rooms-instance", "replica-openmask3d"])
+def test_a_confidence_that_is_no_number_is_refused(name: str) -> None:
+    scores = np.full(8, 0.5)
+    scores[3] = np.nan
+    prediction = replace(truth_as_prediction(room(), with_labels=True), scores=scores)
+    with pytest.raises(PredictionError, match="instance 3 has the confidence nan"):
+        score_scene(load_protocol(name), room(), prediction, None)
+
+
+def test_points_that_are_no_numbers_are_refused() -> None:
+    points = room().points.copy()
+    points[7, 1] = np.nan
+    with pytest.raises(PredictionError, match="not finite"):
+        score_scene(ROOM, room(), replace(truth_as_prediction(room(), with_labels=True), points=points), None)
+
+
+def test_a_truth_of_another_kind_is_refused() -> None:
+    prediction = truth_as_prediction(room(), with_labels=True)
+    with pytest.raises(DataError, match="scores the truth 'mesh-vertices', this one is 'face-corners'"):
+        score_scene(ROOM, replace(room(), variant="face-corners"), prediction, None)
+    scannet = replace(room(), labels=LabelSet("scannet", (5,), ("chair",)))
+    with pytest.raises(DataError, match="scores the label space 'replica', the truth has 'scannet'"):
+        score_scene(ROOM, scannet, prediction, None)
+
+
+def test_scores_of_another_version_are_refused() -> None:
+    score = score_scene(ROOM, *noisy(0), None)
+    newer: ProtocolRules = ROOM.model_copy(update={"version": ROOM.version + 1})
+    with pytest.raises(
+        DataError, match="rooms/a: was scored under rooms-semantic version 1, not rooms-semantic version 2; score"
+    ):
+        combine(newer, {"rooms/a": score})
+    with pytest.raises(DataError, match="no scene was scored"):
+        combine(ROOM, {})
+
+
+def test_an_instance_id_that_spills_into_the_next_class_is_refused() -> None:
+    truth = replace(room(), instance=np.where(room().instance == 2, 1000, room().instance).astype(np.int32))
+    with pytest.raises(DataError, match="instance id 1000 would spill into the next class"):
+        score_scene(load_protocol("rooms-instance"), truth, truth_as_prediction(room(), with_labels=True), None)
