@@ -191,6 +191,8 @@ def test_parameters_and_level_move_the_digest() -> None:
 
 def test_coarser_parameters_give_fewer_regions() -> None:
     frame, _ = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE}, noise=40)
-    fine = RgbdSegmenter(SegmenterConfig(superpixel_scale=2, surface_colour=3), "parts").segment(frame)
-    coarse = RgbdSegmenter(SegmenterConfig(superpixel_scale=60, surface_colour=60, surface_contrast=60), "parts").segment(frame)
-    assert len(fine.boxes) > len(coarse.boxes)
+    fine, coarse = (
+        RgbdSegmenter(SegmenterConfig(min_region_px=20, superpixel_scale=scale, surface_contrast=contrast), "parts")
+        for scale, contrast in ((2, 3), (60, 60))
+    )
+    assert len(fine.segment(frame).boxes) > len(coarse.segment(frame).boxes)

@@ -63,6 +63,7 @@ class SegmenterConfig(BaseModel):
     # structure: floor, walls, ceiling
     structure_min_fraction: float = Field(default=0.03, gt=0, le=1)
     structure_distance_m: float = Field(default=0.03, gt=0)
+    structure_relief_m: float = Field(default=0.1, gt=0)  # doors and windows lie within this of their wall
     structure_behind_fraction: float = Field(default=0.02, ge=0, le=1)
     structure_flush_m: float = Field(default=0.005, gt=0)
     structure_flush_relative: float = Field(default=0.0015, gt=0)

@@ -87,8 +87,8 @@ class Borders:
     """Sums along the E borders between pieces ``a`` < ``b`` (E,): pixel pairs, and what was measured at each pair.
 
     ``length`` pairs; ``contrast`` colour difference; ``n_deep`` pairs with depth on both sides; ``gap`` pairs of those
-    with a jump in depth; ``jump`` relative depth steps of those; ``bend`` signed angle between the pieces over the pairs
-    without a jump, convex positive.
+    with a jump in depth; ``jump`` relative depth steps of those; ``bend`` signed angle between the pieces over the
+    pairs without a jump, convex positive.
     """
 
     a: IndexArray

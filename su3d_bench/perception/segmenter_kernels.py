@@ -121,7 +121,7 @@ def _misfit(
             if abs(there - here) < 0.03 * here:
                 total += abs(a * x[u1] + b * y[v1] + c - there)
                 n += 1
-    return total / (n * here)
+    return float(total / (n * here))
 
 
 @njit(cache=True)
@@ -196,7 +196,7 @@ def _reach(planes: Float32Array, v: int, u: int, x: float, y: float, q: float, w
     a, b, c = planes[v, u, 0], planes[v, u, 1], planes[v, u, 2]
     if a == 0 and b == 0 and c == 0:
         return worst
-    return abs(a * x + b * y + c - q)
+    return float(abs(a * x + b * y + c - q))
 
 
 @njit(cache=True)
@@ -214,7 +214,7 @@ def _jump(
         step = min(step, abs(2 * q0 - disparity[v - dv, u - du] - q1))
     if v1 + dv < height and u1 + du < width and disparity[v1 + dv, u1 + du] > 0:
         step = min(step, abs(2 * q1 - disparity[v1 + dv, u1 + du] - q0))
-    return step / max(q0, q1)
+    return float(step / max(q0, q1))
 
 
 @njit(cache=True)
@@ -227,7 +227,7 @@ def _chord(planes: Float32Array, v: int, u: int, v1: int, u1: int) -> float:
     square0, square1 = a0 * a0 + b0 * b0 + c0 * c0, a1 * a1 + b1 * b1 + c1 * c1
     if square0 == 0 or square1 == 0:
         return 0.0
-    return np.sqrt(max(0.0, 2.0 - 2.0 * (a0 * a1 + b0 * b1 + c0 * c1) / np.sqrt(square0 * square1)))
+    return float(np.sqrt(max(0.0, 2.0 - 2.0 * (a0 * a1 + b0 * b1 + c0 * c1) / np.sqrt(square0 * square1))))
 
 
 @njit(cache=True)

@@ -81,8 +81,8 @@ def disparity_noise(disparity: Float32Array) -> float:
     size = min(left.shape[1], here.shape[1], right.shape[1])
     left, here, right = left[:, :size], here[:, :size], right[:, :size]
     bends = np.abs(left - 2 * here + right)[(left > 0) & (here > 0) & (right > 0)]
-    # 1.2816: the 80th percentile of |x| for unit normal x, below which most edges are left out and above which coarsely
-    # quantised depth, whose differences are mostly 0, still counts; sqrt(6): a second difference adds 1 + 4 + 1 variances.
+    # 1.2816: the 80th percentile of |x| for unit normal x; it leaves out most edges, and still counts the steps of
+    # coarsely quantised depth, whose differences are mostly 0. sqrt(6): a second difference adds 1 + 4 + 1 variances.
     return float(np.quantile(bends, 0.8)) / (1.2816 * float(np.sqrt(6))) if len(bends) else 0.0
 
 

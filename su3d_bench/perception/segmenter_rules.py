@@ -67,10 +67,16 @@ def structural_planes(surfaces: Graph, config: SegmenterConfig) -> list[Structur
         distance = centroid @ axis - offset
         tolerance = np.maximum(config.structure_distance_m, 0.015 * centroid[:, 2])
         has_depth = pieces.n_points > 0
-        on_plane = has_depth & (normal @ axis > np.cos(np.deg2rad(12))) & (np.abs(distance) < tolerance)
-        behind = has_depth & (distance < -2 * tolerance)
+        is_parallel = has_depth & (normal @ axis > np.cos(np.deg2rad(12)))
+        on_plane = is_parallel & (np.abs(distance) < tolerance)
+        # A wall hides what is behind it; a door stands before a wall that is larger than the door.
+        is_relief = is_parallel & (np.abs(distance) < config.structure_relief_m)
+        is_level = np.abs(distance) < np.maximum(0.25 * tolerance, rms)
+        n_level = pieces.n_points[is_relief & is_level].sum()
+        n_just_behind = pieces.n_points[is_relief & (distance < 0) & ~is_level].sum()
+        n_behind = pieces.n_points[has_depth & (distance < -2 * tolerance) & ~is_relief].sum()
         is_large = pieces.n_points[on_plane].sum() >= config.structure_min_fraction * total
-        if is_large and pieces.n_points[behind].sum() <= config.structure_behind_fraction * total:
+        if is_large and n_behind <= config.structure_behind_fraction * total and n_just_behind <= n_level:
             planes.append(StructuralPlane(axis, offset, rms, colour[seed]))
             is_taken |= on_plane
     return planes
