@@ -24,7 +24,7 @@ from su3d_bench.types import BoolArray, Float32Array, Float64Array, Frame, Stage
 
 Arrays = dict[str, NDArray[Any]]
 
-# Moves every key: raise it when what is stored, or the code that makes it, changes without any digest changing.
+# Moves every key: raise it when the format of an entry changes.
 CACHE_VERSION = "1"
 _CHECKSUM = "checksum"
 
@@ -36,6 +36,14 @@ def content_key(*parts: str) -> str:
         encoded = part.encode()
         hasher.update(len(encoded).to_bytes(8, "little"))
         hasher.update(encoded)
+    return hasher.hexdigest()
+
+
+def source_digest(prefix: str) -> str:
+    """A digest of the source files of perception whose names begin with ``prefix``."""
+    hasher = hashlib.sha256()
+    for path in sorted(Path(__file__).parent.glob(f"{prefix}*.py")):
+        hasher.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
     return hasher.hexdigest()
 
 

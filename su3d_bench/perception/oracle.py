@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.perception.cache import array_digest, content_key
+from su3d_bench.perception.cache import array_digest, content_key, source_digest
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.oracle_noise import OracleNoise, disturb
 from su3d_bench.types import Float32Array, Frame, InstanceMesh, Int32Array, Regions
@@ -109,7 +109,9 @@ class OracleSegmenter:
         self._projector = MeshProjector(mesh, config)
         names = [f"{key}={mesh.class_of_instance[key]}" for key in sorted(mesh.class_of_instance)]
         truth = array_digest(mesh.vertices, mesh.triangles, mesh.instance_of_triangle)
-        self.digest = content_key("oracle", config.model_dump_json(), truth, *mesh.labels.names, *names)
+        self.digest = content_key(
+            "oracle", config.model_dump_json(), source_digest("oracle"), truth, *mesh.labels.names, *names
+        )
 
     def segment(self, frame: Frame) -> Regions:
         instance = self._projector.instance_image(frame)

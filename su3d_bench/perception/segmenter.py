@@ -6,13 +6,13 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.perception.cache import content_key
+from su3d_bench.perception.cache import content_key, source_digest
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.segmenter_config import SegmenterConfig
-from su3d_bench.perception.segmenter_graph import Graph, IndexArray
+from su3d_bench.perception.segmenter_graph import Graph
 from su3d_bench.perception.segmenter_pixels import superpixels
-from su3d_bench.perception.segmenter_rules import join_objects, join_surfaces, take_out_structure
-from su3d_bench.types import BoolArray, Float32Array, Frame, Int32Array, Regions
+from su3d_bench.perception.segmenter_rules import join_objects, join_surfaces, region_quality, take_out_structure
+from su3d_bench.types import BoolArray, Float64Array, Frame, Int32Array, Regions
 
 __all__ = ["RgbdSegmenter", "SegmenterConfig"]
 
@@ -25,7 +25,7 @@ class RgbdSegmenter:
     def __init__(self, config: SegmenterConfig, level: Literal["objects", "parts"]) -> None:
         self._config = config
         self._level = level
-        self.digest = content_key("rgbd", level, config.model_dump_json())
+        self.digest = content_key("rgbd", level, config.model_dump_json(), source_digest("segmenter"))
 
     def segment(self, frame: Frame) -> Regions:
         """Masks that do not overlap, largest first."""
@@ -51,8 +51,10 @@ class RgbdSegmenter:
         order = np.argsort(-sizes, kind="stable")
         chosen = [k for k in order if not is_left_out[k] and sizes[k] >= self._config.min_region_px]
         masks = np.array([labels == k for k in chosen], bool).reshape(len(chosen), height, width)
-        return Regions(masks, mask_boxes(masks), self._scores(graph, np.array(chosen, np.intp)))
+        quality = region_quality(graph, is_left_out, _pixels_at_image_border(graph, superpixel), self._config)
+        return Regions(masks, mask_boxes(masks), quality[np.array(chosen, np.intp)].astype(np.float32))
 
-    def _scores(self, graph: Graph, chosen: IndexArray) -> Float32Array:
-        coverage = graph.pieces.n_points / np.maximum(graph.pieces.n_pixels, 1)
-        return (0.5 + 0.5 * coverage[chosen]).astype(np.float32)
+
+def _pixels_at_image_border(graph: Graph, superpixel: Int32Array) -> Float64Array:
+    rim = np.concatenate([superpixel[0], superpixel[-1], superpixel[:, 0], superpixel[:, -1]])
+    return np.bincount(graph.piece_of_superpixel[rim], minlength=len(graph.pieces)).astype(np.float64)

@@ -27,6 +27,18 @@ class JoinWeights(BaseModel):
     larger: float = -0.68
 
 
+class QualityWeights(BaseModel):
+    """What makes a region's score: log-odds that its mask overlaps an object by half, fitted on the same rooms."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    bias: float = -8.75
+    border: float = 6.48  # how sure the region is of its borders, 0..1
+    cut_off: float = -2.26  # share of the outline at the border of the image
+    size: float = 1.47  # tenfold pixels
+    compactness: float = 3.94  # 1 for a square, less for what is drawn out or frayed
+
+
 class SegmenterConfig(BaseModel):
     """What is an edge, what is one surface, what is one object.
 
@@ -75,4 +87,5 @@ class SegmenterConfig(BaseModel):
     join: JoinWeights = JoinWeights()
 
     # answer
+    quality: QualityWeights = QualityWeights()
     min_region_px: int = Field(default=100, ge=1)

@@ -193,3 +193,32 @@ def _distance_of_planes(graph: Graph) -> Float64Array:
     off_a = np.abs((between * normal[borders.a]).sum(axis=1))
     off_b = np.abs((between * normal[borders.b]).sum(axis=1))
     return np.asarray(np.maximum(off_a, off_b))
+
+
+def region_quality(
+    graph: Graph, is_structure: BoolArray, at_image_border: Float64Array, config: SegmenterConfig
+) -> Float64Array:
+    """How likely (N,) each piece is one whole object, 0..1; less where little of its depth is known.
+
+    The log-odds rise with how sure its borders are, with its size and its compactness, and fall with the share of its
+    outline that the image cuts off. ``at_image_border`` (N,) counts its pixels there.
+    """
+    borders, pieces, weights = graph.borders, graph.pieces, config.quality
+    apart = 1 / (1 + np.exp(np.clip(join_evidence(graph, config.join), -30, 30)))
+    apart[is_structure[borders.a] | is_structure[borders.b]] = 1
+
+    def around(values: Float64Array) -> Float64Array:
+        n = len(pieces)
+        return np.asarray(np.bincount(borders.a, values, n) + np.bincount(borders.b, values, n))
+
+    inner = around(borders.length)
+    outline = np.maximum(inner + at_image_border, 1)
+    evidence = (
+        weights.bias
+        + weights.border * around(borders.length * apart) / np.maximum(inner, 1)
+        + weights.cut_off * at_image_border / outline
+        + weights.size * (np.log10(pieces.n_pixels) - 2)
+        + weights.compactness * np.minimum(16 * pieces.n_pixels / outline**2, 1)  # 1 for a square
+    )
+    coverage = 0.5 + 0.5 * pieces.n_points / np.maximum(pieces.n_pixels, 1)
+    return np.asarray(coverage / (1 + np.exp(-evidence)))
