@@ -80,6 +80,6 @@ def test_training_runs_from_rooms_to_model_card(tmp_path: Path) -> None:
 
 def test_training_without_torch_names_the_extra(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
-    order = training.Order(tmp_path, tmp_path, 1, 1, 1, 1.0, 0, 1, None)
+    order = training.Order(tmp_path, tmp_path, 1, 1, 1, 1.0, 0, 1, None, None)
     with pytest.raises(ModelMissing, match=r"pip install 'su3d-bench\[models\]'"):
         training.run(order)

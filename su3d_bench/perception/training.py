@@ -1,6 +1,6 @@
 """Train the embedded encoder on rendered rooms that no benchmark uses, export it and measure it.
 
-    python -m su3d_bench.perception.training --out DIR --rooms 300 --minutes 30 --seed 0
+    python -m su3d_bench.perception.training --out DIR --rooms 360 --minutes 30 --seed 0
 
 Needs the models extra (torch, onnx). Time decides how many steps are made, so two trainings differ in their weights.
 """
@@ -44,6 +44,7 @@ class Order:
     seed: int
     jobs: int
     max_steps: int | None
+    snapshot_minutes: float | None
 
 
 def run(order: Order) -> tuple[Figure, ...]:
@@ -59,8 +60,14 @@ def run(order: Order) -> tuple[Figure, ...]:
     held_names = room_names(order.held_out_rooms, FIRST_HELD_OUT_NUMBER)
     held_out = make_crops(held_names, order.frames_per_room, order.seed, order.cache, order.jobs)
     logger.info("%d crops to train on, %d held out", len(crops), len(held_out))
-    plan = TrainingPlan(order.minutes, order.seed, max_steps=order.max_steps, threads=order.jobs)
-    towers = train(crops, plan)
+    plan = TrainingPlan(
+        order.minutes,
+        order.seed,
+        max_steps=order.max_steps,
+        threads=order.jobs,
+        snapshot_minutes=order.snapshot_minutes,
+    )
+    towers = train(crops, plan, keep=lambda snapshot: export(snapshot, order.out))
     export(towers, order.out)
     encoder = EmbeddedEncoder(order.out)
     class_names = sorted({truth.class_name for truth in crops.truths} - {""})
@@ -171,11 +178,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m su3d_bench.perception.training", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder for the two ONNX files and the model card")
     parser.add_argument("--cache", type=Path, help="folder for rendered crops; default: OUT/crops")
-    parser.add_argument("--rooms", type=int, default=300)
+    parser.add_argument("--rooms", type=int, default=360)
     parser.add_argument("--held-out-rooms", type=int, default=24)
-    parser.add_argument("--frames-per-room", type=int, default=16)
+    parser.add_argument("--frames-per-room", type=int, default=6)
     parser.add_argument("--minutes", type=float, default=30.0)
     parser.add_argument("--max-steps", type=int, help="end earlier, after this many steps")
+    parser.add_argument("--snapshot-minutes", type=float, help="also export what there is, every so many minutes")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--jobs", type=int, default=2, help="processes that render, threads that train")
     given = parser.parse_args(arguments)

@@ -15,13 +15,15 @@ import numpy as np
 from su3d_bench import registry
 from su3d_bench.perception.captions import CropTruth, Neighbour
 from su3d_bench.perception.crops import crop_window
-from su3d_bench.perception.embedded_encoder import log_size, shrink
+from su3d_bench.perception.embedded_encoder import IMAGE_SIZE, log_size, shrink
 from su3d_bench.perception.segmenter import RgbdSegmenter, SegmenterConfig
 from su3d_bench.types import Float32Array, Frame, Int32Array, Int64Array, Regions, UInt8Array
 
 KINDS = ("living", "bedroom", "kitchen", "office", "bathroom", "studio")
 FIRST_TRAINING_NUMBER = 10000
 FIRST_HELD_OUT_NUMBER = 20000
+# Poses of the walk through a room from which the images are drawn.
+WALK_FRAMES = 200
 MIN_VIEW_PIXELS = 80
 # A neighbour counts as shown when it fills this part of the window, or when this part of its visible pixels is inside.
 SHOWN_OF_WINDOW, SHOWN_OF_NEIGHBOUR = 0.02, 0.5
@@ -77,10 +79,14 @@ def make_crops(scenes: Sequence[str], frames_per_room: int, seed: int, folder: P
 def read_crops(scenes: Sequence[str], folder: Path) -> CropSet:
     """The crops of ``scenes`` from the files that ``make_crops`` left in ``folder``."""
     facts = [json.loads(_facts_path(folder, scene).read_text()) for scene in scenes]
-    arrays = [np.load(_pixels_path(folder, scene)) for scene in scenes]
     rows = [row for of_scene in facts for row in of_scene]
+    pixels = np.empty((len(rows), IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
+    start = 0
+    for scene, of_scene in zip(scenes, facts, strict=True):
+        pixels[start : start + len(of_scene)] = np.load(_pixels_path(folder, scene))
+        start += len(of_scene)
     return CropSet(
-        np.concatenate(arrays),
+        pixels,
         np.array([row[6] for row in rows], np.float32).reshape(-1, 2),
         tuple(_crop_truth(row) for row in rows),
         np.array([row[7] for row in rows], np.float32),
@@ -104,7 +110,7 @@ def _pixels_path(folder: Path, scene: str) -> Path:
 def _render_room(task: tuple[str, int, int, Path]) -> None:
     scene, n_frames, seed, folder = task
     rooms_class = registry.load("dataset", "rooms")
-    rooms = rooms_class(folder, rooms_class.Options())
+    rooms = rooms_class(folder, rooms_class.Options(n_frames=WALK_FRAMES))
     rng = np.random.default_rng([seed, *scene.encode()])
     truth = rooms.truth(scene)
     trajectory = rooms.trajectory(scene)
@@ -197,8 +203,9 @@ class _View:
         self.counts = np.bincount(instance.ravel(), minlength=n_ids)
         self._related: dict[int, list[tuple[str, int]]] = {}
         for relation in truth.relations:
-            self._related.setdefault(relation.subject, []).append((relation.relation, relation.object))
+            # Sides are left out: training mirrors its crops.
             if relation.relation in INVERSE:
+                self._related.setdefault(relation.subject, []).append((relation.relation, relation.object))
                 inverse = (INVERSE[relation.relation], relation.subject)
                 self._related.setdefault(relation.object, []).append(inverse)
 

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import copy
 import logging
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -31,22 +33,27 @@ logger = logging.getLogger(__name__)
 # Cosines are compared at this scale in training and, as temperature 1 / 20, where regions are named.
 LOGIT_SCALE = 20.0
 CAPTIONS_PER_CROP = 1
-WRONG_RELATIONS = 64
+FIXED_CAPTIONS = 40
+WRONG_RELATIONS = 32
 UNKNOWN_WORDS = 0.06
 
 
 @dataclass(frozen=True)
 class TrainingPlan:
-    """How long and how fast: the learning rate rises for ``warm_up`` of the time and falls as a cosine to 1 %."""
+    """How long and how fast: the learning rate rises for ``warm_up`` of the time and falls as a cosine to 1 %.
+
+    ``batch_size`` counts the crops of a step over all ``threads``.
+    """
 
     minutes: float
     seed: int
     batch_size: int = 256
-    learning_rate: float = 2e-3
+    learning_rate: float = 3e-3
     weight_decay: float = 0.05
     warm_up: float = 0.04
     max_steps: int | None = None
     threads: int = 2
+    snapshot_minutes: float | None = None
 
 
 @dataclass(frozen=True)
@@ -60,34 +67,62 @@ class Towers:
     minutes: float
 
 
-def train(crops: CropSet, plan: TrainingPlan, clock: Callable[[], float] = time.monotonic) -> Towers:
-    """Towers trained on ``crops`` until the time or the steps of ``plan`` are over."""
+def train(crops: CropSet, plan: TrainingPlan, keep: Callable[[Towers], None]) -> Towers:
+    """Towers trained on ``crops`` until the time or steps of ``plan`` are over; ``keep`` is handed the snapshots.
+
+    Each thread works on a batch of its own and the gradients are averaged: threads then meet once a step, where
+    torch's own would meet in every operation and wait for each other on a busy machine.
+    """
     torch.manual_seed(plan.seed)
-    torch.set_num_threads(plan.threads)
-    batches = Batches(crops, plan.seed, plan.batch_size)
     image, text = ImageTower().to(memory_format=torch.channels_last), TextTower()  # type: ignore[call-overload]
     parameters = [*image.parameters(), *text.parameters()]
     optimizer = torch.optim.AdamW(parameters, plan.learning_rate, weight_decay=plan.weight_decay)
-    started, step, running = clock(), 0, 0.0
-    while True:
-        done = (clock() - started) / (60.0 * plan.minutes)
-        if plan.max_steps is not None:
-            done = max(done, step / plan.max_steps)
-        if done >= 1.0:
-            break
-        for group in optimizer.param_groups:
-            group["lr"] = plan.learning_rate * _rate(done, plan.warm_up)
-        loss = _loss(image, text, batches.draw())
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()  # type: ignore[no-untyped-call]
-        torch.nn.utils.clip_grad_norm_(parameters, 5.0)
-        optimizer.step()
-        step += 1
-        running = float(loss.detach()) if step == 1 else 0.98 * running + 0.02 * float(loss.detach())
-        if step % 100 == 0:
-            logger.info("step %d, %.0f %% of the time: loss %.3f", step, 100 * done, running)
-    minutes = (clock() - started) / 60.0
-    return Towers(image.eval(), text.eval(), step, step * plan.batch_size, minutes)
+    sources = [Batches(crops, (plan.seed, lane), plan.batch_size // plan.threads) for lane in range(plan.threads)]
+
+    def gradients(source: Batches) -> tuple[float, tuple[Tensor, ...]]:
+        loss = _loss(image, text, source.draw())
+        return float(loss.detach()), torch.autograd.grad(loss, parameters)
+
+    started, step, running, n_kept = time.monotonic(), 0, 0.0, 0
+    with ThreadPoolExecutor(plan.threads, initializer=torch.set_num_threads, initargs=(1,)) as pool:
+        while (done := _part_done(plan, started, step)) < 1.0:
+            answers = list(pool.map(gradients, sources))
+            for parameter, *parts in zip(parameters, *(of_lane for _, of_lane in answers), strict=True):
+                parameter.grad = torch.stack(parts).mean(0)
+            torch.nn.utils.clip_grad_norm_(parameters, 5.0)
+            for group in optimizer.param_groups:
+                group["lr"] = plan.learning_rate * _rate(done, plan.warm_up)
+            optimizer.step()
+            step += 1
+            loss = float(np.mean([value for value, _ in answers]))
+            running = loss if step == 1 else 0.98 * running + 0.02 * loss
+            minutes = (time.monotonic() - started) / 60.0
+            if step % 100 == 0:
+                logger.info("step %d, %.1f minutes: loss %.3f", step, minutes, running)
+            if plan.snapshot_minutes is not None and minutes >= (n_kept + 1) * plan.snapshot_minutes:
+                n_kept += 1
+                keep(_towers(image, _without_unseen_rows(text, optimizer), step, plan, minutes))
+    minutes = (time.monotonic() - started) / 60.0
+    return _towers(image, _without_unseen_rows(text, optimizer), step, plan, minutes)
+
+
+def _part_done(plan: TrainingPlan, started: float, step: int) -> float:
+    of_time = (time.monotonic() - started) / (60.0 * plan.minutes)
+    return of_time if plan.max_steps is None else max(of_time, step / plan.max_steps)
+
+
+def _without_unseen_rows(text: TextTower, optimizer: torch.optim.Optimizer) -> TextTower:
+    """A copy whose table rows that no caption ever used are zero, so that an unknown word is silence, not noise."""
+    known = copy.deepcopy(text)
+    has_moved = optimizer.state[text.table]["exp_avg_sq"].sum(1) > 0
+    with torch.no_grad():
+        known.table[~has_moved] = 0.0
+    return known
+
+
+def _towers(image: ImageTower, text: TextTower, n_steps: int, plan: TrainingPlan, minutes: float) -> Towers:
+    copies = copy.deepcopy(image).eval(), copy.deepcopy(text).eval()
+    return Towers(*copies, n_steps, n_steps * plan.batch_size, minutes)
 
 
 def _rate(done: float, warm_up: float) -> float:
@@ -114,7 +149,7 @@ class Batch:
 class Batches:
     """Random batches of augmented crops, the rarer classes drawn more often than they occur."""
 
-    def __init__(self, crops: CropSet, seed: int, batch_size: int) -> None:
+    def __init__(self, crops: CropSet, seed: Sequence[int], batch_size: int) -> None:
         self._crops = crops
         self._table = TruthTable(crops.truths)
         self._rng = np.random.default_rng(seed)
@@ -135,7 +170,7 @@ class Batches:
         chosen = chosen.astype(np.int64)
         names = self._table.class_names
         captions = [class_caption(name, rng) for name in names]
-        captions += self._fixed
+        captions += [self._fixed[index] for index in rng.choice(len(self._fixed), FIXED_CAPTIONS, replace=False)]
         drawn = [draw_caption(self._crops.truths[index], rng) for index in chosen for _ in range(CAPTIONS_PER_CROP)]
         related = [caption for caption in drawn if caption.relation and caption.classes][:WRONG_RELATIONS]
         captions += [*drawn, *(wrong_relation(caption, names, rng) for caption in related)]
@@ -151,6 +186,8 @@ class Batches:
 
     def _ids(self, captions: list[Caption]) -> Int64Array:
         ids = token_ids([caption.text for caption in captions])
+        # Positions that no caption of the batch reaches change nothing in the tower and cost as much as the others.
+        ids = ids[:, : max(1, int((ids[:, :, 0] != PADDING).sum(axis=1).max()))]
         # Now and then a word must be told by its 4-grams alone, so that they carry meaning.
         ids[:, :, :2][self._rng.random(ids.shape[:2]) < UNKNOWN_WORDS] = PADDING
         return ids
@@ -193,10 +230,7 @@ def augment(pixels: UInt8Array, rng: np.random.Generator) -> UInt8Array:
 
 def _loss(image: ImageTower, text: TextTower, batch: Batch) -> Tensor:
     """Class cross-entropy over the class captions, and a contrastive loss in which every true pair is a positive."""
-    with torch.autocast("cpu", torch.bfloat16):
-        image_features = image(batch.pixels, batch.log_sizes)
-    text_features = text(batch.ids)
-    logits = LOGIT_SCALE * text_features.float() @ image_features.float().T
+    logits = LOGIT_SCALE * text(batch.ids) @ image(batch.pixels, batch.log_sizes).T
     has_class = batch.classes >= 0
     by_class = logits[: batch.n_classes, has_class].T
     class_loss = functional.cross_entropy(by_class, batch.classes[has_class], label_smoothing=0.02)

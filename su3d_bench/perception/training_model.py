@@ -1,4 +1,7 @@
-"""The two towers in torch; only training imports this module."""
+"""The two towers in torch; only training imports this module.
+
+While training, convolutions run in bfloat16 (twice as fast on a CPU that has it), the heads in float32.
+"""
 
 from __future__ import annotations
 
@@ -22,14 +25,16 @@ def _convolution(n_in: int, n_out: int, stride: int = 1, size: int = 3) -> nn.Se
 
 
 class Residual(nn.Module):
-    """x + f(x), where f narrows to ``n_inner`` channels for its 3 x 3 convolution when that is fewer."""
+    """x + f(x), where f narrows to ``n_inner`` channels for its 3 x 3 convolution."""
 
     def __init__(self, n: int, n_inner: int) -> None:
         super().__init__()
-        first = _convolution(n, n_inner, size=1 if n_inner < n else 3)
-        middle = [_convolution(n_inner, n_inner)] if n_inner < n else []
-        last = nn.Conv2d(n_inner, n, 1 if n_inner < n else 3, padding=0 if n_inner < n else 1, bias=False)
-        self.branch = nn.Sequential(first, *middle, last, nn.BatchNorm2d(n))
+        self.branch = nn.Sequential(
+            _convolution(n, n_inner, size=1),
+            _convolution(n_inner, n_inner),
+            nn.Conv2d(n_inner, n, 1, bias=False),
+            nn.BatchNorm2d(n),
+        )
 
     def forward(self, x: Tensor) -> Tensor:
         return functional.relu(x + self.branch(x))
@@ -45,22 +50,23 @@ class ImageTower(nn.Module):
     def __init__(self) -> None:
         super().__init__()
         self.body = nn.Sequential(
-            _convolution(5, 32, 2),
-            _convolution(32, 64, 2),
-            Residual(64, 32),
-            _convolution(64, 128, 2),
-            Residual(128, 128),
-            Residual(128, 64),
-            _convolution(128, 192, 2),
-            Residual(192, 96),
-            Residual(192, 96),
+            _convolution(5, 48, 4, size=7),
+            _convolution(48, 96, 2),
+            Residual(96, 48),
+            Residual(96, 48),
+            _convolution(96, 160, 2),
+            Residual(160, 80),
+            Residual(160, 80),
         )
-        self.head = nn.Sequential(nn.Linear(3 * 192 + 2, 192), nn.ReLU(inplace=True), nn.Linear(192, DIM), _centred())
+        self.head = nn.Sequential(nn.Linear(3 * 160 + 2, 192), nn.ReLU(inplace=True), nn.Linear(192, DIM), _centred())
 
     def forward(self, pixels: Tensor, log_size: Tensor) -> Tensor:
         image = pixels.permute(0, 3, 1, 2).float() / 64.0 - 2.0
         planes = log_size[:, :, None, None] + torch.zeros_like(image[:, :2])
-        x = self.body(torch.cat([image, planes], dim=1).contiguous(memory_format=torch.channels_last)).float()
+        stacked = torch.cat([image, planes], dim=1).contiguous(memory_format=torch.channels_last)
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.training):
+            x = self.body(stacked)
+        x = x.float()
         pooled = torch.cat([x.mean((2, 3)), x.amax((2, 3)), x[:, :, 1:3, 1:3].mean((2, 3)), log_size], dim=1)
         return _unit(self.head(pooled))
 
@@ -83,9 +89,11 @@ class TextTower(nn.Module):
         n_grams = (ids[:, :, 2:] != PADDING).float().sum(2).clamp(min=1.0).unsqueeze(-1)
         words = rows[:, :, :2].sum(2) + rows[:, :, 2:].sum(2) / n_grams
         is_word = (ids.amax(2) != PADDING).float().unsqueeze(1)
-        x = functional.relu(self.first(words.transpose(1, 2))) * is_word
-        x = (x + functional.relu(self.second(x))) * is_word
-        x = (x + functional.relu(self.third(x))) * is_word
+        with torch.autocast("cpu", torch.bfloat16, enabled=self.training):
+            x = functional.relu(self.first(words.transpose(1, 2))) * is_word
+            x = (x + functional.relu(self.second(x))) * is_word
+            x = (x + functional.relu(self.third(x))) * is_word
+        x = x.float()
         mean = x.sum(2) / is_word.sum(2).clamp(min=1.0)
         return _unit(self.head(torch.cat([mean, x.amax(2)], dim=1)))
 
