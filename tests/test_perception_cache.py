@@ -97,6 +97,10 @@ def test_a_second_run_encodes_nothing_and_a_new_ratio_only_its_own_crops(tmp_pat
     n = len(perception(tmp_path, first).detect(still_life(), needs, Timer()))
     assert first.n_images == 3 * n + 1
 
+    uncached = CountingEncoder()
+    perception(tmp_path, uncached, cache=False).detect(still_life(), needs, Timer())
+    assert uncached.n_images == 3 * n + 1
+
     second = CountingEncoder()
     perception(tmp_path, second).detect(still_life(), needs, Timer())
     assert second.n_images == 0

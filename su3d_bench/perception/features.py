@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.perception.cache import CachedRows, FrameCache, array_digest, content_key
+from su3d_bench.perception.cache import CachedRows, FrameCache, array_digest, content_key, source_digest
 from su3d_bench.perception.crops import crop_images
 from su3d_bench.types import Encoder, Float32Array, Frame, PerceptionNeeds, StageTimer
 
@@ -28,6 +28,7 @@ class CropEncoder:
 
     def __init__(self, encoder: Encoder, cache: FrameCache) -> None:
         self._encoder = encoder
+        self._source = source_digest("crops")
         self._rows = CachedRows(cache, encoder.dim)
 
     def crops(
@@ -37,18 +38,25 @@ class CropEncoder:
         wanted: NDArray[np.intp],
         ratios: tuple[float, ...],
         timer: StageTimer,
+        known: Mapping[float, Float32Array] | None = None,
     ) -> Float32Array:
-        """Features (W, R, D) of the crops around boxes ``wanted``, one for each of ``ratios``."""
+        """Features (W, R, D) of the crops around boxes ``wanted``, one for each of ``ratios``.
+
+        Ratios whose features (K, D) of all K boxes are ``known`` are taken from there.
+        """
         with timer.stage("cache"):
             image = array_digest(frame.rgb, boxes)
         features = np.zeros((len(wanted), len(ratios), self._encoder.dim), np.float32)
         for column, ratio in enumerate(ratios):
+            if known is not None and ratio in known:
+                features[:, column] = known[ratio][wanted]
+                continue
 
             def compute(missing: NDArray[np.intp], ratio: float = ratio) -> Float32Array:
                 with timer.stage("encode"):
                     return self._encoder.encode_images(crop_images(frame.rgb, boxes[missing], ratio))
 
-            key = content_key("crops", image, self._encoder.digest, repr(float(ratio)))
+            key = content_key("crops", image, self._source, self._encoder.digest, repr(float(ratio)))
             features[:, column] = self._rows.rows(key, len(boxes), wanted, compute, timer)
         return features
 

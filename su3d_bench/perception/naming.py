@@ -72,12 +72,16 @@ def scene_caption(name: str, colour: str | None = None) -> str:
 
 
 def colour_word(rgb: UInt8Array, mask: BoolArray) -> str | None:
-    """The colour word nearest in CIELAB to the median colour under ``mask``; None for an empty mask."""
+    """The colour word nearest in CIELAB to the median colour under ``mask``; None for an empty mask.
+
+    Of a large mask some thousand evenly spread pixels are looked at.
+    """
     import cv2
 
     pixels = rgb[mask]
     if not len(pixels):
         return None
+    pixels = pixels[:: 1 + len(pixels) // 1000]
     table = np.array([value for _, value in COLOURS], np.float32)
     samples = np.concatenate([np.median(pixels, axis=0)[None].astype(np.float32), table]) / np.float32(255)
     lab = cv2.cvtColor(samples[None], cv2.COLOR_RGB2LAB)[0]
@@ -109,7 +113,8 @@ class Namer:
         if self._text_features is None:
             prompts = [self._config.prompt.replace("{}", with_article(word)) for word in self._words]
             self._text_features = self._encoder.encode_texts(prompts)
-        similarity = features.astype(np.float64) @ self._text_features.astype(np.float64).T
+        # einsum sums in one order whatever the number of threads; a matrix product may not.
+        similarity = np.einsum("kd,wd->kw", features.astype(np.float64), self._text_features.astype(np.float64))
         logits = similarity / self._config.temperature
         weights = np.exp(logits - logits.max(axis=1, keepdims=True)) if len(logits) else logits
         best = weights.argmax(axis=1) if len(logits) else np.zeros(0, np.intp)

@@ -126,17 +126,17 @@ class EmbeddedPerception:
         kept = regions_to_keep(named.names, regions.boxes, frame.depth_m.shape, needs)
         masks = regions.masks[kept]
         names = tuple(named.names[k] for k in kept)
+        with timer.stage("encode"):
+            colours = [colour_word(frame.rgb, mask) for mask in masks]
         return Detections(
             frame_index=frame.index,
             masks=masks,
             boxes=regions.boxes[kept],
             scores=(regions.scores[kept] * named.confidences[kept]).astype(np.float32),
             names=names,
-            captions=tuple(
-                scene_caption(name, colour_word(frame.rgb, mask)) for name, mask in zip(names, masks, strict=True)
-            ),
+            captions=tuple(scene_caption(name, colour) for name, colour in zip(names, colours, strict=True)),
             crop_ratios=needs.crop_ratios,
-            crop_features=self._crops.crops(frame, regions.boxes, kept, needs.crop_ratios, timer),
+            crop_features=self._crops.crops(frame, regions.boxes, kept, needs.crop_ratios, timer, {1.0: best_fit}),
             global_feature=self._crops.whole(frame, timer),
         )
 
@@ -226,16 +226,11 @@ class StoredPerception:
         ratios: tuple[float, ...],
         timer: StageTimer,
     ) -> tuple[Float32Array, Float32Array]:
-        given = stored.features
+        given, boxes = stored.features, stored.regions.boxes
         if given is None:
-            return self._crops.crops(frame, stored.regions.boxes, kept, ratios, timer), self._crops.whole(frame, timer)
-        columns = []
-        for ratio in ratios:
-            if ratio in given.crop_ratios:
-                columns.append(given.crop_features[kept, given.crop_ratios.index(ratio)])
-            else:
-                columns.append(self._crops.crops(frame, stored.regions.boxes, kept, (ratio,), timer)[:, 0])
-        return np.stack(columns, axis=1), given.global_feature
+            return self._crops.crops(frame, boxes, kept, ratios, timer), self._crops.whole(frame, timer)
+        known = {ratio: given.crop_features[:, column] for column, ratio in enumerate(given.crop_ratios)}
+        return self._crops.crops(frame, boxes, kept, ratios, timer, known), given.global_feature
 
 
 def _files_digest(folder: Path, scene: SceneInfo) -> str:
