@@ -1,0 +1,66 @@
+"""How much of a run's score the labels earn: the same masks under one label, and under labels drawn at random.
+
+``python benchmarks/label_floor.py RUN`` prints a Markdown table of OpenSU3D's headline metrics on the rooms as run,
+with the single label that scores best, and with random labels (the mean of 20 draws).
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from su3d_bench.datasets.rooms import Rooms
+from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
+from su3d_bench.planning import data_root
+from su3d_bench.protocols import ProtocolRules, load_protocol
+from su3d_bench.scoring import combine, score_scene
+from su3d_bench.store import RunFolder, read_prediction
+from su3d_bench.types import GroundTruth, Instances
+
+PROTOCOLS = ("rooms-semantic", "rooms-instance")
+N_DRAWS = 20
+Labels = Callable[[int], Sequence[str]] | None
+
+
+def scored(
+    rules: ProtocolRules, scenes: dict[str, tuple[GroundTruth, Instances]], labels: Labels, encoder: EmbeddedEncoder
+) -> list[float]:
+    """Headline values with the labels that ``labels`` gives for so many instances, or the map's own."""
+    scores = {}
+    for scene, (truth, instances) in scenes.items():
+        named = instances if labels is None else replace(instances, labels=tuple(labels(len(instances))))
+        scores[scene] = score_scene(rules, truth, named, encoder)
+    metrics = combine(rules, scores).metrics
+    return [metrics[name] for name in rules.headline]
+
+
+def main(run: Path) -> int:
+    rooms, encoder = Rooms(data_root(), Rooms.Options()), EmbeddedEncoder()
+    scenes = {}
+    for folder in sorted((run / "scenes").glob("rooms.*")):
+        scene = folder.name.removeprefix("rooms.")
+        prediction = read_prediction(RunFolder(run).job(f"rooms/{scene}", "opensu3d").prediction)
+        assert isinstance(prediction, Instances)
+        scenes[scene] = (rooms.ground_truth(scene, "mesh-vertices"), prediction)
+    print("| protocol | metrics | as run | best single label | random labels |\n|---|---|---|---|---|")
+    for name in PROTOCOLS:
+        rules = load_protocol(name)
+        names = [entry.name for entry in rules.scored]
+        own = scored(rules, scenes, None, encoder)
+        single = max((scored(rules, scenes, lambda n, one=one: [one] * n, encoder), one) for one in names)
+        draws = np.random.default_rng(0)
+        random = np.mean(
+            [scored(rules, scenes, lambda n: draws.choice(names, n).tolist(), encoder) for _ in range(N_DRAWS)], axis=0
+        )
+        cells = [" / ".join(f"{100 * value:.1f}" for value in values) for values in (own, single[0], random)]
+        cells[1] += f" ({single[1]})"
+        print(f"| {name} | {' / '.join(rules.headline)} | " + " | ".join(cells) + " |")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))
