@@ -38,6 +38,11 @@ def scored(
     return [metrics[name] for name in rules.headline]
 
 
+def _random_labels(names: Sequence[str], seed: int) -> Labels:
+    rng = np.random.default_rng(seed)
+    return lambda n: rng.choice(names, n).tolist()
+
+
 def main(run: Path) -> int:
     rooms, encoder = Rooms(data_root(), Rooms.Options()), EmbeddedEncoder()
     scenes = {}
@@ -52,10 +57,7 @@ def main(run: Path) -> int:
         names = [entry.name for entry in rules.scored]
         own = scored(rules, scenes, None, encoder)
         single = max((scored(rules, scenes, lambda n, one=one: [one] * n, encoder), one) for one in names)
-        draws = np.random.default_rng(0)
-        random = np.mean(
-            [scored(rules, scenes, lambda n: draws.choice(names, n).tolist(), encoder) for _ in range(N_DRAWS)], axis=0
-        )
+        random = np.mean([scored(rules, scenes, _random_labels(names, draw), encoder) for draw in range(N_DRAWS)], 0)
         cells = [" / ".join(f"{100 * value:.1f}" for value in values) for values in (own, single[0], random)]
         cells[1] += f" ({single[1]})"
         print(f"| {name} | {' / '.join(rules.headline)} | " + " | ".join(cells) + " |")
