@@ -254,7 +254,11 @@ Prediction = Instances | Partition | DenseFeatures
 
 
 class Dataset(Protocol):
-    """Where frames and ground truth come from; one file a dataset."""
+    """Where frames and ground truth come from; one file a dataset.
+
+    The class also has ``Options``, a strict model of its settings, ``label_space``, whose class ids its truth uses, and
+    ``variants``, the forms of ground truth it can give, the fullest first; it is made as ``Cls(data_root, options)``.
+    """
 
     name: str
 
