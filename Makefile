@@ -8,7 +8,7 @@ DEMO_SCENES := rooms/living0 rooms/bedroom0 rooms/kitchen0 rooms/office0
 .PHONY: demo test bench lint clean
 
 demo: $(VENV)/core
-	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods opensu3d oracle --out runs/demo
+	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods opensu3d oracle --protocols rooms-semantic rooms-instance --out runs/demo
 
 test: $(VENV)/test
 	$(BIN)/python -m pytest -q -n auto
