@@ -217,9 +217,7 @@ def _instance_warnings(
     assert rules.min_region_size is not None
     warnings = [encoder] if encoder else []
     if rules.confidence == "prediction" and len(scores) > 1 and (scores == scores[0]).all():
-        warnings.append(
-            f"all {len(scores)} confidences are {scores[0]:g}: AP of a class is then recall (1 + precision) / 2"
-        )
+        warnings.append(f"every confidence is {scores[0]:g}: AP of a class is then recall (1 + precision) / 2")
     large = np.flatnonzero(np.diff(moved.indptr) >= rules.min_region_size)
     pairs = transfer.duplicate_pairs(transfer.select(moved, large), len(truth.points), DUPLICATE_IOU)
     if pairs:

@@ -113,7 +113,7 @@ def test_a_perfect_prediction_warns_of_nothing() -> None:
 def test_constant_confidences_are_told() -> None:
     prediction = replace(truth_as_prediction(room(), with_labels=True), scores=np.full(8, 0.5))
     told = warnings_of("rooms-instance", prediction)
-    assert told == "rooms/a: all 8 confidences are 0.5: AP of a class is then recall (1 + precision) / 2"
+    assert told == "rooms/a: every confidence is 0.5: AP of a class is then recall (1 + precision) / 2"
 
 
 def test_duplicates_are_told() -> None:
