@@ -107,10 +107,13 @@ def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["rum"], "su3d-bench: unknown VERB 'rum'; did you mean 'run'?; see su3d-bench --help"),
-        ([], "su3d-bench: the following arguments are required: VERB; see su3d-bench --help"),
-        (["run", "--scene-s", "x"], "su3d-bench: unknown argument '--scene-s'"),
-        (["run", "--jobs", "x"], "su3d-bench run: argument --jobs: invalid int value: 'x'; see su3d-bench run --help"),
+        (["rum"], "unknown VERB 'rum'; did you mean 'run'?; see su3d-bench --help"),
+        ([], "the following arguments are required: VERB; see su3d-bench --help"),
+        (
+            ["run", "--scene-s", "x"],
+            "run: unknown argument '--scene-s'; did you mean '--scenes'?; see su3d-bench run --help",
+        ),
+        (["run", "--jobs", "x"], "run: argument --jobs: invalid int value: 'x'; see su3d-bench run --help"),
         (["run", "--scenes", "replcia/*"], "no scene matches 'replcia/*'; did you mean 'replica/*'?"),
         (["run", "--scenes", f"{PAINTED}/e"], f"no scene matches '{PAINTED}/e'; did you mean '{PAINTED}/d'?"),
         (["run", "--scenes", "nothing"], "no scene matches 'nothing'; known datasets: rooms, replica"),

@@ -56,7 +56,12 @@ def _add_make(actions: Any) -> None:
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="the data root to make (native: default $SU3D_DATA)")
     parser.add_argument(
-        "--set", action="append", default=[], metavar="KEY=VALUE", help="an option of the dataset, such as n_frames=200"
+        "--set",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="KEY=VALUE",
+        help="an option of the dataset, such as n_frames=200",
     )
     parser.add_argument("--workers", type=int, metavar="N", help="processes side by side (default: the CPU cores)")
 

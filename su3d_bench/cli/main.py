@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from typing import Any
 
 from su3d_bench import __version__
 from su3d_bench.cli import datasets, methods, protocols, query, run
@@ -23,7 +24,15 @@ class Parser(argparse.ArgumentParser):
     """An argument parser whose errors are ``ConfigError``, with a suggestion for a misspelt verb or flag."""
 
     def error(self, message: str) -> None:  # type: ignore[override]
-        raise ConfigError(f"{self.prog}: {self._with_suggestion(message)}; see {self.prog} --help")
+        verb = self.prog.partition(" ")[2]
+        raise ConfigError(f"{verb}{': ' if verb else ''}{self._with_suggestion(message)}; see {self.prog} --help")
+
+    def parse_known_args(self, args: Any = None, namespace: Any = None) -> tuple[Any, list[str]]:
+        """As the base class, but a verb itself refuses what it does not know, for it knows what comes near."""
+        parsed, unknown = super().parse_known_args(args, namespace)
+        if unknown:
+            self.error(f"unrecognized arguments: {' '.join(unknown)}")
+        return parsed, unknown
 
     def _with_suggestion(self, message: str) -> str:
         if message.startswith("unrecognized arguments: "):

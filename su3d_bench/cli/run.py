@@ -46,7 +46,9 @@ def add_parser(verbs: Any) -> None:
     parser.add_argument(
         "--pictures", action=argparse.BooleanOptionalAction, help="draw the maps into the run folder (default: yes)"
     )
-    parser.add_argument("--set", action="append", default=[], metavar="KEY=VALUE", help="such as opensu3d.top_m=10")
+    parser.add_argument(
+        "--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help="such as opensu3d.top_m=10"
+    )
     parser.add_argument("--config", type=Path, metavar="FILE", help="a TOML file, such as the run.toml of a run")
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="run folder (default: runs/<name made from the request>)"
