@@ -59,7 +59,7 @@ def objects(frame: Frame, **values: float) -> Regions:
 
 TWO_BOXES: dict[int, Box] = {
     LEFT: ((-0.25, 0.7, 0.0), (0.0, 0.95, 0.2)),
-    RIGHT: ((0.0, 0.7, 0.0), (0.25, 0.95, 0.12)),
+    RIGHT: ((0.0, 0.76, 0.0), (0.25, 0.95, 0.12)),
 }
 GREY, RED, BLUE = (190, 190, 190), (170, 60, 50), (60, 80, 170)
 

@@ -14,17 +14,16 @@ class JoinWeights(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    bias: float = 2.6
-    contrast: float = -1.49  # colour difference right at the border
-    concave: float = -1.14  # the border is an inner edge
-    concave_colour: float = -0.19  # the same, and the colours differ
-    stepped_colour: float = -3.3  # the colours differ, and the surfaces lie off each other's plane
-    gap: float = -1.1  # share of the border with a jump in depth
-    step: float = -1.13  # how far it jumps
-    contact: float = 0.84  # length of border without a jump
-    depth: float = 1.14  # share of the border where depth is known
-    smaller: float = -0.13  # sizes of the two surfaces
-    larger: float = -0.68
+    bias: float = 2.8
+    contrast: float = -0.68  # colour difference right at the border
+    concave: float = -1.25  # the border is an inner edge
+    stepped_colour: float = -3.73  # the colours differ, and the surfaces lie off each other's plane by centimetres
+    raised_colour: float = -0.8  # the same for millimetres, and one is much smaller: a plate on a table
+    gap: float = -1.0  # share of the border with a jump in depth
+    step: float = -1.77  # how far it jumps
+    contact: float = 0.71  # length of border without a jump
+    depth: float = 1.25  # share of the border where depth is known
+    larger: float = -0.63  # size of the larger of the two
 
 
 class QualityWeights(BaseModel):

@@ -167,17 +167,16 @@ def join_cues(graph: Graph) -> dict[str, Float64Array]:
     colour, contrast, bend, gap = _differences(graph)
     sizes = np.stack([pieces.n_pixels[borders.a], pieces.n_pixels[borders.b]])
     off_colour = _saturating(colour, 12.0)
-    concave = _saturating(np.maximum(-bend, 0), 0.5)
+    distance = _distance_of_planes(graph)
     return {
         "contrast": _saturating(contrast, 10.0),
-        "concave": concave,
-        "concave_colour": concave * off_colour,
-        "stepped_colour": _saturating(_distance_of_planes(graph), 0.03) * off_colour,
+        "concave": _saturating(np.maximum(-bend, 0), 0.5),
+        "stepped_colour": _saturating(distance, 0.03) * off_colour,
+        "raised_colour": _saturating(distance, 0.004) * off_colour * (1 - sizes.min(axis=0) / sizes.max(axis=0)),
         "gap": gap,
         "step": _saturating(borders.jump / np.maximum(borders.gap, 1), 0.1),
         "contact": np.log10(1 + borders.n_deep - borders.gap),
         "depth": borders.n_deep / borders.length,
-        "smaller": np.log10(sizes.min(axis=0)) - 2,
         "larger": np.log10(sizes.max(axis=0)) - 3,
     }
 
