@@ -185,7 +185,7 @@ def test_sizes_that_no_fraction_divides_are_covered() -> None:
 
 def test_parameters_and_level_move_the_digest() -> None:
     configs = [SegmenterConfig(), SegmenterConfig(min_region_px=99)]
-    digests = {RgbdSegmenter(c, level).digest for c in configs for level in ("objects", "parts")}  # type: ignore[arg-type]
+    digests = {RgbdSegmenter(c, level).digest for c in configs for level in ("objects", "parts")}
     assert len(digests) == 4
 
 
