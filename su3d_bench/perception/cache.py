@@ -68,6 +68,11 @@ class FrameCache:
     def __init__(self, root: Path | None) -> None:
         self._root = None if root is None else root / "perception"
 
+    @property
+    def is_on(self) -> bool:
+        """Whether entries are kept at all; where not, keys need not be made."""
+        return self._root is not None
+
     def path(self, key: str) -> Path | None:
         """Where the entry of ``key`` lies, whether or not it is there."""
         return None if self._root is None else self._root / key[:2] / f"{key}.npz"

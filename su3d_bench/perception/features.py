@@ -28,6 +28,7 @@ class CropEncoder:
 
     def __init__(self, encoder: Encoder, cache: FrameCache) -> None:
         self._encoder = encoder
+        self._is_cached = cache.is_on
         self._source = source_digest("crops")
         self._rows = CachedRows(cache, encoder.dim)
 
@@ -45,7 +46,7 @@ class CropEncoder:
         Ratios whose features (K, D) of all K boxes are ``known`` are taken from there.
         """
         with timer.stage("cache"):
-            image = array_digest(frame.rgb, boxes)
+            image = array_digest(frame.rgb, boxes) if self._is_cached else ""
         features = np.zeros((len(wanted), len(ratios), self._encoder.dim), np.float32)
         for column, ratio in enumerate(ratios):
             if known is not None and ratio in known:
@@ -68,6 +69,7 @@ class CropEncoder:
                 return self._encoder.encode_images([frame.rgb])
 
         with timer.stage("cache"):
-            key = content_key("image", array_digest(frame.rgb), self._encoder.digest)
+            image = array_digest(frame.rgb) if self._is_cached else ""
+            key = content_key("image", image, self._encoder.digest)
         row: Float32Array = self._rows.rows(key, 1, np.zeros(1, np.intp), compute, timer)[0]
         return row

@@ -246,11 +246,16 @@ def _files_digest(folder: Path, scene: SceneInfo) -> str:
 def cached_regions(
     segmenter: Segmenter, frame: Frame, cache: FrameCache, with_pose: bool, timer: StageTimer
 ) -> Regions:
-    """The regions that ``segmenter`` finds in ``frame``, from the cache where they are known."""
+    """The regions that ``segmenter`` finds in ``frame``, from the cache where they are known.
+
+    ``with_pose``: they depend on the camera's pose, and on the index of the frame, which seeds the oracle's noise.
+    """
+    if not cache.is_on:
+        with timer.stage("segment"):
+            return segmenter.segment(frame)
     with timer.stage("cache"):
-        key = content_key(
-            "regions", segmenter.digest, frame_digest(frame, with_pose), str(frame.index) if with_pose else ""
-        )
+        index = str(frame.index) if with_pose else ""
+        key = content_key("regions", segmenter.digest, frame_digest(frame, with_pose), index)
         entry = cache.load(key)
         if entry is not None:
             names = tuple(str(name) for name in entry["names"]) if "names" in entry else None
