@@ -71,11 +71,11 @@ def test_two_boxes_that_touch_on_a_table_are_two_regions() -> None:
     assert best_iou(regions, ids == RIGHT) > 0.9
 
 
-def test_the_faces_of_one_box_are_one_object_and_several_parts() -> None:
+def test_the_faces_of_one_box_are_one_object_and_with_caution_several_parts() -> None:
     boxes = {LEFT: TWO_BOXES[LEFT]}
     frame, ids = view(boxes, {TABLE: GREY, LEFT: RED})
     assert best_iou(objects(frame), ids == LEFT) > 0.9
-    parts = RgbdSegmenter(SegmenterConfig(), "parts").segment(frame)
+    parts = RgbdSegmenter(SegmenterConfig(parts_caution=20), "parts").segment(frame)
     n_on_box = sum((mask & (ids == LEFT)).sum() > 0.5 * mask.sum() for mask in parts.masks)
     assert n_on_box >= 2
 
@@ -192,7 +192,7 @@ def test_parameters_and_level_move_the_digest() -> None:
 def test_coarser_parameters_give_fewer_regions() -> None:
     frame, _ = view(TWO_BOXES, {TABLE: GREY, LEFT: RED, RIGHT: BLUE}, noise=40)
     fine, coarse = (
-        RgbdSegmenter(SegmenterConfig(min_region_px=20, superpixel_scale=scale, surface_contrast=contrast), "parts")
-        for scale, contrast in ((2, 3), (60, 60))
+        RgbdSegmenter(SegmenterConfig(min_region_px=20, superpixel_scale=scale, parts_caution=caution), "parts")
+        for scale, caution in ((2, 9), (60, 0))
     )
     assert len(fine.segment(frame).boxes) > len(coarse.segment(frame).boxes)

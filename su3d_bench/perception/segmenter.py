@@ -11,19 +11,22 @@ from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.segmenter_config import SegmenterConfig
 from su3d_bench.perception.segmenter_graph import Graph
 from su3d_bench.perception.segmenter_pixels import superpixels
-from su3d_bench.perception.segmenter_rules import join_objects, join_surfaces, region_quality, take_out_structure
+from su3d_bench.perception.segmenter_rules import join_objects, region_quality, take_out_structure
 from su3d_bench.types import BoolArray, Float64Array, Frame, Int32Array, Regions
 
 __all__ = ["RgbdSegmenter", "SegmenterConfig"]
 
 
 class RgbdSegmenter:
-    """Regions of any RGB-D frame: whole ``objects`` without floor, walls and ceiling, or all the ``parts``."""
+    """Regions of any RGB-D frame: whole ``objects`` without floor, walls and ceiling; or ``parts`` of everything."""
 
     name = "rgbd"
 
     def __init__(self, config: SegmenterConfig, level: Literal["objects", "parts"]) -> None:
-        self._config = config
+        weights = config.join
+        if level == "parts":
+            weights = weights.model_copy(update={"bias": weights.bias - config.parts_caution})
+        self._config = config.model_copy(update={"join": weights})
         self._level = level
         self.digest = content_key("rgbd", level, config.model_dump_json(), source_digest("segmenter"))
 
@@ -33,14 +36,14 @@ class RgbdSegmenter:
 
         cv2.setNumThreads(1)
         labels, graph = superpixels(frame, self._config)
-        if self._level == "parts":
-            surfaces = join_surfaces(graph, self._config)
-            return self._regions(frame, labels, surfaces, np.zeros(len(surfaces.pieces), bool))
         surfaces, is_structure = take_out_structure(graph, self._config)
         objects, is_structure = join_objects(surfaces, is_structure, self._config)
-        return self._regions(frame, labels, objects, is_structure)
+        is_left_out = is_structure & (self._level == "objects")
+        return self._regions(frame, labels, objects, is_structure, is_left_out)
 
-    def _regions(self, frame: Frame, superpixel: Int32Array, graph: Graph, is_left_out: BoolArray) -> Regions:
+    def _regions(
+        self, frame: Frame, superpixel: Int32Array, graph: Graph, is_structure: BoolArray, is_left_out: BoolArray
+    ) -> Regions:
         height, width = frame.depth_m.shape
         labels = graph.piece_of_superpixel[superpixel]
         factor = -(-width // self._config.max_width)
@@ -51,7 +54,7 @@ class RgbdSegmenter:
         order = np.argsort(-sizes, kind="stable")
         chosen = [k for k in order if not is_left_out[k] and sizes[k] >= self._config.min_region_px]
         masks = np.array([labels == k for k in chosen], bool).reshape(len(chosen), height, width)
-        quality = region_quality(graph, is_left_out, _pixels_at_image_border(graph, superpixel), self._config)
+        quality = region_quality(graph, is_structure, _pixels_at_image_border(graph, superpixel), self._config)
         return Regions(masks, mask_boxes(masks), quality[np.array(chosen, np.intp)].astype(np.float32))
 
 

@@ -84,6 +84,7 @@ class SegmenterConfig(BaseModel):
 
     # objects
     join: JoinWeights = JoinWeights()
+    parts_caution: float = Field(default=1.5, ge=0)  # taken off the bias where parts are asked for, not objects
 
     # answer
     quality: QualityWeights = QualityWeights()
