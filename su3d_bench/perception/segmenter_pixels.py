@@ -97,7 +97,7 @@ def _planes(
     half = np.ascontiguousarray(disparity[::2, ::2])
     broken = kernels.discontinuities(half, 2 * config.depth_jump, config.noise_margin * noise, 2.0)
     distance = cv2.distanceTransform((~broken).astype(np.uint8), cv2.DIST_C, 3)
-    radius = np.clip(distance.astype(np.int32) - 1, 1, config.normal_radius)
+    radius = np.clip(np.minimum(distance, config.normal_radius + 1).astype(np.int32) - 1, 1, config.normal_radius)
     half_x, half_y = x[::2].copy(), y[::2].copy()
     planes = kernels.fit_planes(half, radius, half_x, half_y)
     reach = config.normal_radius
