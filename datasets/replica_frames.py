@@ -10,7 +10,6 @@ from __future__ import annotations
 import json
 import math
 import re
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -18,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from su3d_bench.datasets.image_files import decode_colour, decode_depth, read_bytes
 from su3d_bench.errors import DataError
 from su3d_bench.types import Float32Array, Float64Array, Frame, UInt8Array
 
@@ -25,8 +25,6 @@ CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
 RIGID_TOLERANCE = 1e-2  # catches scaled, mirrored and transposed-in-place matrices, not the digits a file left out
 FRAMES_PER_SECOND = 30.0  # the release has no timestamps
 N_DEPTH_VALUES = 1 << 16
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-JPEG_END = b"\xff\xd9"
 
 
 @dataclass(frozen=True)
@@ -159,38 +157,23 @@ class ReplicaFrames(Sequence[Frame]):
         return Frame(index, index / FRAMES_PER_SECOND, rgb, depth_m, self._poses[index], self._camera.intrinsics)
 
     def _read_colour(self, index: int) -> UInt8Array:
-        import cv2
-
         where, content = self._read(colour_name(index))
-        image = None
-        if JPEG_END in content[-1024:]:  # some decoders fill what a cut file lacks with grey
-            image = _decode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
-        if image is None:
-            raise DataError(f"{where}: not a readable JPEG image; copy the file again")
-        if image.shape[:2] != (self._camera.height, self._camera.width):
+        rgb = decode_colour(content, where)
+        if rgb.shape[:2] != (self._camera.height, self._camera.width):
             raise DataError(
-                f"{where} is {image.shape[1]}x{image.shape[0]} but cam_params.json says {self._camera.width}x"
+                f"{where} is {rgb.shape[1]}x{rgb.shape[0]} but cam_params.json says {self._camera.width}x"
                 f"{self._camera.height}; it belongs to another render"
             )
-        rgb: UInt8Array = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
         return rgb
 
     def _read_depth(self, index: int, rgb: UInt8Array) -> Float32Array:
-        import cv2
-
         where, content = self._read(depth_name(index))
-        header = _whole_png_header(content)
-        if header is None:
-            raise DataError(f"{where}: not a readable PNG image; copy the file again")
-        height, width = rgb.shape[:2]
-        if header[:2] != (width, height):
+        values = decode_depth(content, where)
+        if values.shape != rgb.shape[:2]:
             raise DataError(
-                f"{where} is {header[0]}x{header[1]} and {colour_name(index)} is {width}x{height}; both must have one "
-                "size"
+                f"{where} is {values.shape[1]}x{values.shape[0]} and {colour_name(index)} is {rgb.shape[1]}x"
+                f"{rgb.shape[0]}; both must have one size"
             )
-        values = _decode(content, cv2.IMREAD_UNCHANGED) if header[2:] == (16, 0) else None
-        if values is None or values.dtype != np.uint16 or values.ndim != 2:
-            raise DataError(f"{where}: not a depth image; expected one channel of 16 bits, metres times the scale")
         if not values.any():
             raise DataError(f"{where}: empty depth, no pixel is above 0; copy the file again or leave the scene out")
         depth_m: Float32Array = self._depth_m_of_value[values]
@@ -198,38 +181,4 @@ class ReplicaFrames(Sequence[Frame]):
 
     def _read(self, name: str) -> tuple[str, bytes]:
         where = f"{self._where}: {name}"
-        try:
-            return where, (self._folder / name).read_bytes()
-        except FileNotFoundError as error:
-            raise DataError(f"{where} is missing; copy results/ again") from error
-        except OSError as error:
-            raise DataError(f"{where} cannot be read: {error.strerror}") from error
-
-
-def _decode(content: bytes, flags: int) -> Any:
-    """The image, or None where it cannot be decoded."""
-    import cv2
-
-    try:
-        return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
-    except cv2.error:
-        return None
-
-
-def _whole_png_header(content: bytes) -> tuple[int, int, int, int] | None:
-    """Width, height, bits and colour type of a PNG; None unless every chunk is there with its checksum right.
-
-    Checked before decoding: the decoder would speak of damage on stderr, and would allocate what the header promises.
-    """
-    if not content.startswith(PNG_SIGNATURE) or len(content) < 33:
-        return None
-    at, kind = len(PNG_SIGNATURE), b""
-    while kind != b"IEND":
-        length, kind = int.from_bytes(content[at : at + 4], "big"), content[at + 4 : at + 8]
-        end = at + 8 + length
-        if end + 4 > len(content) or zlib.crc32(content[at + 4 : end]) != int.from_bytes(content[end : end + 4], "big"):
-            return None
-        at = end + 4
-    if content[12:16] != b"IHDR":
-        return None
-    return int.from_bytes(content[16:20], "big"), int.from_bytes(content[20:24], "big"), content[24], content[25]
+        return where, read_bytes(self._folder / name, where, "copy results/ again")

@@ -16,8 +16,6 @@ from su3d_bench.errors import DataError
 from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
 
 VIEW_WIDTH, VIEW_HEIGHT = 160, 120  # of the depth images that decide what is visible: 1 cm a pixel at 1 m
-# Fusion keeps a surface that several images agree on and drops what flits by: 16 of 1600 frames, half a second.
-SIGHTINGS = 0.01
 TOUR = 40  # frames are visited at this stride first, so that most faces are settled by the first few
 
 
@@ -41,7 +39,7 @@ class RoomScan:
 
 
 def scan_room(patches: Patches, mesh: RoomMesh, poses: Float64Array, spacing_m: float) -> RoomScan:
-    """The faces of about ``spacing_m`` that enough of the poses see."""
+    """The faces of about ``spacing_m`` that at least one of the poses sees."""
     grid = cut(patches, np.full(len(patches.corners), spacing_m))
     points = at_rows(patches.corners, grid.rows)
     owner = patches.object_id[grid.quad_of_face]
@@ -51,7 +49,7 @@ def scan_room(patches: Patches, mesh: RoomMesh, poses: Float64Array, spacing_m: 
 
 
 def _visible(points: Float64Array, grid: Grid, owner: Int32Array, mesh: RoomMesh, poses: Float64Array) -> BoolArray:
-    from su3d_bench.datasets.rooms_scan_kernels import count_sightings
+    from su3d_bench.datasets.rooms_scan_kernels import drop_seen
 
     corners = [points[grid.faces[:, k]] for k in range(4)]
     normals = np.cross(corners[2] - corners[0], corners[3] - corners[1])
@@ -60,17 +58,16 @@ def _visible(points: Float64Array, grid: Grid, owner: Int32Array, mesh: RoomMesh
     centres = (sum(corners[1:], corners[0]) / 4).astype(np.float32)
     renderer = Renderer(mesh, VIEW_WIDTH, VIEW_HEIGHT)
     intrinsics = camera_intrinsics(VIEW_WIDTH, VIEW_HEIGHT)
-    sightings = np.zeros(len(centres), np.int32)
-    enough = max(1, round(SIGHTINGS * len(poses)))
+    seen = np.zeros(len(centres), np.bool_)
     active = np.flatnonzero(size[:, 0] > 1e-10).astype(np.int32)
     n_active = len(active)
     for index in (i for start in range(TOUR) for i in range(start, len(poses), TOUR)):
         pose = poses[index]
         depth, instance = renderer.depth_and_instance(pose)
-        n_active = count_sightings(active, n_active, centres, normals, owner, sightings, enough,
-                                   pose.astype(np.float32), np.float32(intrinsics[0, 0]), np.float32(intrinsics[0, 2]),
-                                   np.float32(intrinsics[1, 2]), depth, instance)  # fmt: skip
-    return sightings >= enough
+        n_active = drop_seen(active, n_active, centres, normals, owner, seen, pose.astype(np.float32),
+                             np.float32(intrinsics[0, 0]), np.float32(intrinsics[0, 2]), np.float32(intrinsics[1, 2]),
+                             depth, instance)  # fmt: skip
+    return seen
 
 
 def _welded(

@@ -14,13 +14,13 @@ LOOSE_M, LOOSE_SHARE = 0.012, 0.012  # depth may differ by this much, and by thi
 
 
 @compiled
-def count_sightings(  # type: ignore[no-untyped-def]
-    active, n_active, centres, normals, owner, sightings, enough, pose, focal, cx, cy, depth, instance
+def drop_seen(  # type: ignore[no-untyped-def]
+    active, n_active, centres, normals, owner, seen, pose, focal, cx, cy, depth, instance
 ):
-    """Adds 1 to ``sightings`` of the active faces that the image shows; answers how many stay active.
+    """Marks in ``seen`` the active faces that the image shows; answers how many stay active.
 
-    ``active`` is compacted in place: a face leaves it with ``enough`` sightings. A face is shown where the pixel
-    nearest to its centre holds its own object at its depth.
+    ``active`` is compacted in place: what is seen once leaves it. A face is shown where the pixel nearest to its
+    centre holds its own object at its depth.
     """
     height, width = depth.shape
     ox, oy, oz = pose[0, 3], pose[1, 3], pose[2, 3]
@@ -40,8 +40,8 @@ def count_sightings(  # type: ignore[no-untyped-def]
                     loose = LOOSE_M + LOOSE_SHARE * z / max(cosine, 0.15)
                     hit = cosine > GRAZING and abs(depth[row, column] - z) < loose
         if hit:
-            sightings[f] += 1
-        if sightings[f] < enough:
+            seen[f] = True
+        else:
             active[left] = f
             left += 1
     return left

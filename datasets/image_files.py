@@ -1,0 +1,135 @@
+"""Colour and depth images out of the bytes of a file: JPEG, PNG, and the portable maps PPM and PGM.
+
+What a header promises is checked before anything is decoded: a decoder would allocate it, and would speak of damage on
+stderr. Every fault is a ``DataError`` that begins with ``where``.
+"""
+
+from __future__ import annotations
+
+import re
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.errors import DataError
+from su3d_bench.types import UInt8Array
+
+UInt16Array = NDArray[np.uint16]
+MAX_PIXELS = 100_000_000  # no RGB-D camera has more; a damaged header may promise 4 billion
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+JPEG_START, JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
+JPEG_END_WITHIN = 1024  # some writers put a little behind the end of the image
+JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # the markers that carry the size
+PORTABLE_MAP = re.compile(rb"(P[56])\s+(?:#[^\n]*\s+)*(\d{1,6})\s+(\d{1,6})\s+(\d{1,5})\s")
+
+
+def read_bytes(path: Path, where: str, advice: str = "copy the file again") -> bytes:
+    """The content of a file; ``advice`` says what to do where it is missing."""
+    try:
+        return path.read_bytes()
+    except FileNotFoundError as error:
+        raise DataError(f"{where} is missing; {advice}") from error
+    except OSError as error:
+        raise DataError(f"{where} cannot be read: {error.strerror}") from error
+
+
+def image_size(content: bytes) -> tuple[int, int] | None:
+    """Width and height as the header of a JPEG, PNG, PPM or PGM says them; None where there is no such header."""
+    if content.startswith(PNG_SIGNATURE) and content[12:16] == b"IHDR" and len(content) >= 33:
+        return int.from_bytes(content[16:20], "big"), int.from_bytes(content[20:24], "big")
+    if match := PORTABLE_MAP.match(content[:4096]):
+        return int(match[2]), int(match[3])
+    return _jpeg_size(content)
+
+
+def decode_colour(content: bytes, where: str) -> UInt8Array:
+    """Pixels (H, W, 3) RGB of a JPEG, an 8-bit PNG or a PPM."""
+    import cv2
+
+    kind = "PNG" if content.startswith(PNG_SIGNATURE) else "PPM" if content.startswith(b"P6") else "JPEG"
+    if kind == "PPM":
+        return _portable_map(content, b"P6", where)
+    header = _whole_png_header(content) if kind == "PNG" else None
+    # Some decoders fill what a cut JPEG lacks with grey.
+    is_whole = header is not None if kind == "PNG" else JPEG_END in content[-JPEG_END_WITHIN:]
+    size = image_size(content)
+    image = None
+    if is_whole and size is not None and 0 < size[0] * size[1] <= MAX_PIXELS:
+        image = _decode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+    if image is None or image.dtype != np.uint8:
+        raise DataError(f"{where}: not a readable {kind} image; copy the file again")
+    rgb: UInt8Array = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return rgb
+
+
+def decode_depth(content: bytes, where: str) -> UInt16Array:
+    """Values (H, W) uint16 of a PNG with one channel of 16 bits, or of a PGM of 16 bits (big-endian, as the format)."""
+    import cv2
+
+    if content.startswith(b"P5"):
+        return _portable_map(content, b"P5", where)
+    header = _whole_png_header(content)
+    if header is None or not 0 < header[0] * header[1] <= MAX_PIXELS:
+        raise DataError(f"{where}: not a readable PNG image; copy the file again")
+    values = _decode(content, cv2.IMREAD_UNCHANGED) if header[2:] == (16, 0) else None
+    if values is None or values.dtype != np.uint16 or values.ndim != 2:
+        raise DataError(f"{where}: not a depth image; expected one channel of 16 bits")
+    return np.asarray(values)
+
+
+def _portable_map(content: bytes, magic: bytes, where: str) -> NDArray[Any]:
+    match = PORTABLE_MAP.match(content[:4096])
+    name, top, n_channels = ("PGM", 65535, 1) if magic == b"P5" else ("PPM", 255, 3)
+    if match is None or match[1] != magic:
+        raise DataError(f"{where}: not a readable {name} image; copy the file again")
+    width, height, maximum = (int(match[k]) for k in (2, 3, 4))
+    dtype = np.dtype(">u2") if magic == b"P5" else np.dtype(np.uint8)
+    if (maximum > 255) != (top > 255) or not 0 < width * height <= MAX_PIXELS:
+        raise DataError(f"{where}: {name} of {width}x{height} with values to {maximum}; expected values to {top}")
+    n = width * height * n_channels
+    if len(content) - match.end() != n * dtype.itemsize:
+        raise DataError(
+            f"{where}: {name} of {width}x{height} needs {n * dtype.itemsize} bytes of pixels, "
+            f"{len(content) - match.end()} are there; copy the file again"
+        )
+    pixels = np.frombuffer(content, dtype, n, match.end()).astype(dtype.newbyteorder("="))
+    return pixels.reshape((height, width, 3) if n_channels == 3 else (height, width))
+
+
+def _decode(content: bytes, flags: int) -> Any:
+    """The image, or None where it cannot be decoded."""
+    import cv2
+
+    try:
+        return cv2.imdecode(np.frombuffer(content, np.uint8), flags)
+    except cv2.error:
+        return None
+
+
+def _whole_png_header(content: bytes) -> tuple[int, int, int, int] | None:
+    """Width, height, bits and colour type of a PNG; None unless every chunk is there with its checksum right."""
+    if not content.startswith(PNG_SIGNATURE) or len(content) < 33 or content[12:16] != b"IHDR":
+        return None
+    at, kind = len(PNG_SIGNATURE), b""
+    while kind != b"IEND":
+        length, kind = int.from_bytes(content[at : at + 4], "big"), content[at + 4 : at + 8]
+        end = at + 8 + length
+        if end + 4 > len(content) or zlib.crc32(content[at + 4 : end]) != int.from_bytes(content[end : end + 4], "big"):
+            return None
+        at = end + 4
+    return int.from_bytes(content[16:20], "big"), int.from_bytes(content[20:24], "big"), content[24], content[25]
+
+
+def _jpeg_size(content: bytes) -> tuple[int, int] | None:
+    if not content.startswith(JPEG_START):
+        return None
+    at = 2
+    while at + 9 <= len(content) and content[at] == 0xFF:
+        marker, length = content[at + 1], int.from_bytes(content[at + 2 : at + 4], "big")
+        if marker in JPEG_FRAMES:
+            return int.from_bytes(content[at + 7 : at + 9], "big"), int.from_bytes(content[at + 5 : at + 7], "big")
+        at += 1 if marker == 0xFF else 2 + length
+    return None
