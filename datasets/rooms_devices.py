@@ -122,17 +122,7 @@ def tv_screen(look: Look) -> Assembly:
     height = width * 0.57
     black = plastic(linear((20, 20, 22)))
     build.add(black, soft_block(width, 0.04, height, 0, 0, 0.07, 0.012))
-    dark = Material(
-        Texture.SCREEN,
-        linear((14, 16, 22)),
-        linear((44, 50, 64)),
-        0.0,
-        0.9,
-        0.0,
-        0,
-        (-width / 2, width / 2, 0.07, 0.07 + height),
-        1,
-    )
+    dark = _dark_screen(width, 0.07, height)
     build.add(dark, block(width - 0.03, 0.006, height - 0.035, 0, -0.0225, 0.09))
     build.add(plastic(tone("grey")), block(0.05, 0.004, 0.008, 0, -0.022, 0.0755))
     build.add(black, block(0.1, 0.04, 0.075, 0, 0.005, 0.012))
@@ -140,22 +130,18 @@ def tv_screen(look: Look) -> Assembly:
     return build
 
 
+def _dark_screen(width: float, bottom: float, height: float) -> Material:
+    """A screen that is switched off, with a faint reflection."""
+    window = (-width / 2, width / 2, bottom, bottom + height)
+    return Material(Texture.SCREEN, linear((14, 16, 22)), linear((44, 50, 64)), 0.0, 0.9, 0.0, 0, window, 1)
+
+
 def wall_tv(look: Look) -> Assembly:
     build = Assembly(look)
     width = look.size(1.0, 1.25)
     height = width * 0.57
     build.add(plastic(linear((20, 20, 22))), soft_block(width, 0.05, height, 0, 0, 0, 0.012))
-    dark = Material(
-        Texture.SCREEN,
-        linear((14, 16, 22)),
-        linear((44, 50, 64)),
-        0.0,
-        0.9,
-        0.0,
-        0,
-        (-width / 2, width / 2, 0, height),
-        1,
-    )
+    dark = _dark_screen(width, 0.0, height)
     build.add(dark, block(width - 0.03, 0.006, height - 0.035, 0, -0.0275, 0.02))
     build.add(plastic(tone("grey")), block(0.05, 0.004, 0.008, 0, -0.027, 0.006))
     return build

@@ -30,6 +30,7 @@ LAYERS = (
     {"registry", "store", "scoring"},
     {"perception"},
     {"opensu3d", "datasets", "baselines", "reports"},
+    {"predictions"},
     {"executors"},
     {"scene_run"},
     {"planning"},
