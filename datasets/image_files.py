@@ -7,6 +7,7 @@ stderr. Every fault is a ``DataError`` that begins with ``where``.
 from __future__ import annotations
 
 import re
+import stat
 import zlib
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,7 @@ from su3d_bench.types import UInt8Array
 UInt16Array = NDArray[np.uint16]
 MAX_PIXELS = 100_000_000  # no RGB-D camera has more; a damaged header may promise 4 billion
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+MAX_BYTES = 1 << 30  # of one image file; 100 million pixels of 16-bit RGB take 600 MB
 JPEG_START, JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 JPEG_END_WITHIN = 1024  # some writers put a little behind the end of the image
 JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # the markers that carry the size
@@ -29,6 +31,11 @@ PORTABLE_MAP = re.compile(rb"(P[56])\s+(?:#[^\n]*\s+)*(\d{1,6})\s+(\d{1,6})\s+(\
 def read_bytes(path: Path, where: str, advice: str = "copy the file again") -> bytes:
     """The content of a file; ``advice`` says what to do where it is missing."""
     try:
+        found = path.stat()
+        if not stat.S_ISREG(found.st_mode):
+            raise DataError(f"{where} is not a file; {advice}")
+        if found.st_size > MAX_BYTES:
+            raise DataError(f"{where} has {found.st_size} bytes; expected an image of at most {MAX_BYTES}")
         return path.read_bytes()
     except FileNotFoundError as error:
         raise DataError(f"{where} is missing; {advice}") from error
@@ -78,6 +85,28 @@ def decode_depth(content: bytes, where: str) -> UInt16Array:
     if values is None or values.dtype != np.uint16 or values.ndim != 2:
         raise DataError(f"{where}: not a depth image; expected one channel of 16 bits")
     return np.asarray(values)
+
+
+def sized_colour(content: bytes, size: tuple[int, int], where: str, reason: str) -> UInt8Array:
+    """``decode_colour`` of an image whose width and height must be ``size``; ``reason`` says why in the message."""
+    _check_size(image_size(content), size, where, reason)
+    rgb = decode_colour(content, where)
+    _check_size((rgb.shape[1], rgb.shape[0]), size, where, reason)
+    return rgb
+
+
+def sized_depth(content: bytes, size: tuple[int, int], where: str, reason: str) -> UInt16Array:
+    """``decode_depth`` of an image whose width and height must be ``size``; ``reason`` says why in the message."""
+    _check_size(image_size(content), size, where, reason)
+    values = decode_depth(content, where)
+    _check_size((values.shape[1], values.shape[0]), size, where, reason)
+    return values
+
+
+def _check_size(found: tuple[int, int] | None, size: tuple[int, int], where: str, reason: str) -> None:
+    """Nothing where no size was found: the decoder says what is wrong with such an image."""
+    if found is not None and found != size:
+        raise DataError(f"{where} is {found[0]}x{found[1]}; expected {size[0]}x{size[1]}, {reason}")
 
 
 def _portable_map(content: bytes, magic: bytes, where: str) -> NDArray[Any]:

@@ -2,19 +2,30 @@
 
 from __future__ import annotations
 
-import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
+from su3d_bench.datasets.replica_boxes import read_boxes
+from su3d_bench.datasets.replica_clouds import cloud_files, conceptgraphs_truth
+from su3d_bench.datasets.replica_digest import digest_of
 from su3d_bench.datasets.replica_folders import (
+    CLOUDS_URL,
+    FUSED_CLOUD,
+    HOW_TO_GET_LABELS,
+    INSTANCE_FOLDERS,
     ORIGINAL_URL,
+    REFERENCE_CLOUD,
     RENDER_FOLDERS,
+    SEMANTIC_FOLDERS,
+    SEMANTIC_LABEL_FOLDERS,
     RenderTree,
+    find_label_file,
     find_original_scene,
     find_render_tree,
+    find_semantic_sequence,
     no_render_tree,
     original_name,
     read_marker,
@@ -27,6 +38,8 @@ from su3d_bench.datasets.replica_frames import (
     read_camera,
     read_trajectory,
 )
+from su3d_bench.datasets.replica_label_files import LabelledMesh, class_file_truth, instance_file_truth
+from su3d_bench.datasets.replica_problems import original_problems, render_problems
 from su3d_bench.datasets.replica_truth import (
     INFO_NAME,
     MESH_NAME,
@@ -36,11 +49,10 @@ from su3d_bench.datasets.replica_truth import (
     triangle_mesh,
     vertex_truth,
 )
-from su3d_bench.digests import digest_file
 from su3d_bench.errors import DataError, GroundTruthMissing, suggest
-from su3d_bench.types import Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo
+from su3d_bench.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, SceneInfo
 
-READER_VERSION = 1  # raise it whenever the same files come out as other frames or another truth
+READER_VERSION = 2  # raise it whenever the same files come out as other frames or another truth
 
 
 class ReplicaOptions(BaseModel):
@@ -54,7 +66,7 @@ class Replica:
 
     name = "replica"
     label_space = "replica"
-    variants: tuple[str, ...] = ("mesh-vertices", "face-corners", "conceptgraphs")
+    variants: tuple[str, ...] = ("mesh-vertices", "face-corners", "conceptgraphs", "openmask3d", "ovo-51")
     Options = ReplicaOptions
 
     def __init__(self, root: Path, options: ReplicaOptions | None = None) -> None:
@@ -86,9 +98,17 @@ class Replica:
         except OSError:
             return "traj.txt is missing"
         try:
-            return f"{n_poses} frames, ground truth in {self._original(scene)}"
+            truth = f"ground truth in {self._original(scene)}"
         except GroundTruthMissing as error:
-            return f"{n_poses} frames, {str(error).partition(': ')[2]}"
+            truth = str(error).partition(": ")[2]
+            original = find_original_scene(self.root, scene)
+            if original is not None and (original / INFO_NAME).exists():
+                truth = f"{len(self.object_boxes(scene))} boxes of objects, no mesh ({original / MESH_NAME} is missing)"
+        released = []
+        for variant, files in self._released_truths(scene).items():
+            missing = [path.name for path in files if not path.exists()]
+            released += [f"{variant} without its {missing[0]}" if missing else variant] if files else []
+        return f"{n_poses} frames, {truth}" + (f"; also {', '.join(released)}" if released else "")
 
     def info(self, scene: str, stride: int) -> SceneInfo:
         """Cheap facts and a check that the scene's frames are complete; the domain tells made scenes from scans."""
@@ -111,35 +131,42 @@ class Replica:
         return (self.tree.folder / "cam_params.json", folder / "traj.txt", *images, *self._truth_files(scene))
 
     def digest(self, scene: str) -> str:
-        """A key of the content of all small files and the mesh, of all frames' names and sizes, and of the content of
-        the first and the last frame: a re-rendered frame in the middle that has the same size goes unseen."""
+        """A key of the content of every file; ``image_key`` says what it cannot see in an image."""
         folder = self._folder(scene)
-        total = hashlib.sha256(f"replica {READER_VERSION} {scene} {self._image_domain(scene)}\n".encode())
-        camera, trajectory = self.tree.folder / "cam_params.json", folder / "traj.txt"
-        images = sorted(folder.glob("results/*"))
-        try:
-            for path in (camera, trajectory, *self._truth_files(scene), *images[:1], *images[-1:]):
-                total.update(f"{path.name} {digest_file(path)}\n".encode())
-            for path in images:
-                total.update(f"{path.name} {path.stat().st_size}\n".encode())
-        except OSError as error:
-            raise DataError(f"{self._where(scene)}: {error.filename} cannot be read: {error.strerror}") from error
-        return total.hexdigest()
+        files = (self.tree.folder / "cam_params.json", folder / "traj.txt", *self._truth_files(scene))
+        parts = (f"replica {READER_VERSION}", scene, self._image_domain(scene))
+        return digest_of(parts, files, sorted(folder.glob("results/*")), self._where(scene))
+
+    def problems(self, scene: str) -> Iterator[str]:
+        """What is wrong with the scene's files, one line each; what has no entry is no fault but void."""
+        self._folder(scene)
+        yield from render_problems(self.tree.folder, scene, self._where(scene))
+        yield from original_problems(find_original_scene(self.root, scene), self._where(scene))
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
-        where = self._where(scene)
-        if variant == "conceptgraphs":
-            sequence = f"{original_name(scene)}/Sequence_1"
+        self._folder(scene)
+        match variant:
+            case "mesh-vertices":
+                return vertex_truth(self._annotated_mesh(scene))
+            case "face-corners":
+                return corner_truth(self._annotated_mesh(scene))
+            case "conceptgraphs":
+                return self._cloud_truth(scene)
+            case "openmask3d" | "ovo-51":
+                return self._label_file_truth(scene, variant)
+        hint = suggest(variant, self.variants) or f"; known: {', '.join(self.variants)}"
+        raise GroundTruthMissing(f"{self._where(scene)}: no ground truth '{variant}'{hint}")
+
+    def object_boxes(self, scene: str) -> Mapping[int, OrientedBox]:
+        """Object id of the original release -> its box in the world, from ``info_semantic.json`` alone."""
+        self._folder(scene)
+        original = find_original_scene(self.root, scene)
+        if original is None or not (original / INFO_NAME).exists():
             raise GroundTruthMissing(
-                f"{where}: ground truth 'conceptgraphs' is not read by this version; it takes the authors' clouds "
-                f"({sequence}/traj_w_c.txt, {sequence}/saved-maps-gt/pointclouds/pc_*.h5) and a run's "
-                f"({scene}/rgb_cloud/pointclouds/pc_points.h5); score under replica-mesh-ex6 instead"
+                f"{self._where(scene)}: no boxes of objects; expected {original_name(scene)}/{INFO_NAME} of the "
+                f"original release ({ORIGINAL_URL}) in {self.root / 'replica_v1'}"
             )
-        makers = {"mesh-vertices": vertex_truth, "face-corners": corner_truth}
-        if variant not in makers:
-            hint = suggest(variant, self.variants) or f"; known: {', '.join(self.variants)}"
-            raise GroundTruthMissing(f"{where}: no ground truth '{variant}'{hint}")
-        return makers[variant](self._annotated_mesh(scene))
+        return read_boxes(original / INFO_NAME, self._where(scene))
 
     def instance_mesh(self, scene: str) -> InstanceMesh:
         return triangle_mesh(self._annotated_mesh(scene))
@@ -157,9 +184,63 @@ class Replica:
         return "rendered-rooms" if scene in read_marker(self.tree.folder) else "camera"
 
     def _truth_files(self, scene: str) -> tuple[Path, ...]:
+        """Every file of ground truth that is here, of whatever variant."""
         original = find_original_scene(self.root, scene)
         names = (MESH_NAME, INFO_NAME)
-        return () if original is None else tuple(original / name for name in names if (original / name).exists())
+        found = [] if original is None else [original / name for name in names]
+        released = self._released_truths(scene)
+        found += [path for files in released.values() for path in files]
+        if released["openmask3d"] or released["ovo-51"]:
+            found += [mesh.path for mesh in self._labelled_meshes(scene)]
+        return tuple(path for path in dict.fromkeys(found) if path.exists())
+
+    def _released_truths(self, scene: str) -> dict[str, tuple[Path, ...]]:
+        """Variant -> its files, of what others than Replica's makers released; none where nothing of it is here."""
+        sequence = find_semantic_sequence(self.root, scene)
+        clouds = () if sequence is None else (*cloud_files(sequence), self._folder(scene) / REFERENCE_CLOUD)
+        labels = {variant: self._label_file(scene, variant) for variant in ("openmask3d", "ovo-51")}
+        return {"conceptgraphs": clouds} | {
+            variant: () if path is None else (path,) for variant, path in labels.items()
+        }
+
+    def _label_file(self, scene: str, variant: str) -> Path | None:
+        if variant == "openmask3d":
+            return find_label_file(self.root, scene, INSTANCE_FOLDERS, "instance_labels_")
+        return find_label_file(self.root, scene, SEMANTIC_LABEL_FOLDERS, "semantic_labels_")
+
+    def _labelled_meshes(self, scene: str) -> list[LabelledMesh]:
+        """The meshes whose vertices a label file may describe, that of the render first, as the authors used it."""
+        original, render = find_original_scene(self.root, scene), self.tree.folder / f"{scene}_mesh.ply"
+        meshes = [LabelledMesh(render, render.name)]
+        if original is not None:
+            meshes.append(LabelledMesh(original / MESH_NAME, MESH_NAME))
+        return [mesh for mesh in meshes if mesh.path.exists()]
+
+    def _label_file_truth(self, scene: str, variant: str) -> GroundTruth:
+        path, where = self._label_file(scene, variant), self._where(scene)
+        if path is None:
+            folder = INSTANCE_FOLDERS[0] if variant == "openmask3d" else SEMANTIC_LABEL_FOLDERS[0]
+            raise GroundTruthMissing(
+                f"{where}: no ground truth '{variant}'; expected {folder}/{scene}.txt, one label a vertex, in "
+                f"{self.tree.folder}; {HOW_TO_GET_LABELS[variant]}"
+            )
+        make = instance_file_truth if variant == "openmask3d" else class_file_truth
+        return make(path, self._labelled_meshes(scene), where)
+
+    def _cloud_truth(self, scene: str) -> GroundTruth:
+        where, sequence = self._where(scene), find_semantic_sequence(self.root, scene)
+        reference = self._folder(scene) / REFERENCE_CLOUD
+        if sequence is None:
+            raise GroundTruthMissing(
+                f"{where}: no ground truth 'conceptgraphs'; expected {original_name(scene)}/Sequence_1/{FUSED_CLOUD} "
+                f"of its authors ({CLOUDS_URL}) in {self.root / SEMANTIC_FOLDERS[0]}; replica-mesh-ex6 needs none of it"
+            )
+        if not reference.exists():
+            raise GroundTruthMissing(
+                f"{where}: no ground truth 'conceptgraphs'; the points to be scored, {REFERENCE_CLOUD}, are missing in "
+                f"{reference.parents[2]}; make them with run_slam_rgb.py of ConceptGraphs (stride 5, 480x640)"
+            )
+        return conceptgraphs_truth(sequence, reference, where)
 
     def _annotated_mesh(self, scene: str) -> AnnotatedMesh:
         """The mesh of ``scene``; the last one is kept, because every protocol asks for it anew."""

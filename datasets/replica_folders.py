@@ -26,8 +26,34 @@ ORIGINAL_FOLDERS = (
     "replica",
     ".",
 )
+# Names that users give the folder of ConceptGraphs' ground truth, whose scenes are room_0/Sequence_1/...
+SEMANTIC_FOLDERS = (
+    "Replica-semantic",
+    "Replica_semantic",
+    "replica-semantic",
+    "replica_semantic",
+    "Replica_Semantic",
+    "Replica_Dataset",
+    "Replica-Dataset",
+    "replica_dataset",
+    "Replica",
+    "replica",
+    ".",
+)
+FUSED_CLOUD = "saved-maps-gt/pointclouds"  # in Sequence_1
+REFERENCE_CLOUD = "rgb_cloud/pointclouds/pc_points.h5"  # in the scene of the render tree
+# Text files of one label a vertex stand in such folders, below the data root or a render tree.
+LABEL_PLACES = (*RENDER_FOLDERS, "opennerf/datasets", "datasets")
+INSTANCE_FOLDERS = ("ground_truth", "instance_gt", "instance_gt/validation", "replica_gt_instances")
+SEMANTIC_LABEL_FOLDERS = ("semantic_gt", "replica_gt_semantics")
 RENDER_URL = "https://cvg-data.inf.ethz.ch/nice-slam/data/Replica.zip"
 ORIGINAL_URL = "https://github.com/facebookresearch/Replica-Dataset"
+CLOUDS_URL = "https://github.com/concept-graphs/concept-graphs"  # its README has the link
+HOW_TO_GET_LABELS = {
+    "openmask3d": "ask its authors (https://github.com/OpenMask3D/openmask3d/issues/1) or take the archive that "
+    "scripts/get_replica_dataset.sh of Open-YOLO 3D downloads; replica-openmask3d scores without them",
+    "ovo-51": "they are in https://github.com/opennerf/opennerf, datasets/replica_gt_semantics",
+}
 MARKER = "rooms.json"  # stands beside cam_params.json where scenes were made by `datasets make`
 
 
@@ -82,6 +108,27 @@ def find_original_scene(root: Path, scene: str) -> Path | None:
         for scene_name in dict.fromkeys((original_name(scene), scene)):
             if (root / name / scene_name / "habitat").is_dir():
                 return root / name / scene_name
+    return None
+
+
+def find_semantic_sequence(root: Path, scene: str) -> Path | None:
+    """The folder ``Sequence_1`` with ConceptGraphs' fused clouds of the scene; None where there is none."""
+    for name in SEMANTIC_FOLDERS:
+        for scene_name in dict.fromkeys((original_name(scene), scene)):
+            sequence = root / name / scene_name / "Sequence_1"
+            if (sequence / FUSED_CLOUD).is_dir():
+                return sequence
+    return None
+
+
+def find_label_file(root: Path, scene: str, folders: tuple[str, ...], prefix: str) -> Path | None:
+    """The text of one label a vertex: ``office0.txt``, ``office_0.txt`` or ``<prefix>office0.txt`` in a usual place."""
+    for place in LABEL_PLACES:
+        for folder in folders:
+            for name in dict.fromkeys((scene, original_name(scene), f"{prefix}{scene}")):
+                path = root / place / folder / f"{name}.txt"
+                if path.is_file():
+                    return path
     return None
 
 

@@ -18,13 +18,15 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.datasets.image_files import decode_colour, decode_depth, read_bytes
+from su3d_bench.datasets.replica_truth import shown
 from su3d_bench.errors import DataError
+from su3d_bench.geometry import are_rigid
 from su3d_bench.types import Float32Array, Float64Array, Frame, UInt8Array
 
 CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
-RIGID_TOLERANCE = 1e-2  # catches scaled, mirrored and transposed-in-place matrices, not the digits a file left out
 FRAMES_PER_SECOND = 30.0  # the release has no timestamps
 N_DEPTH_VALUES = 1 << 16
+MOST_OF_CAMERA = 1e9  # pixels, focal lengths and depth units stay far below
 
 
 @dataclass(frozen=True)
@@ -64,13 +66,19 @@ def _number(table: dict[str, Any], key: str, where: str) -> float:
     if key not in table:
         raise DataError(f"{where}: 'camera' has no '{key}'; expected {', '.join(CAMERA_KEYS)}")
     value = table[key]
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
-        raise DataError(f"{where}: '{key}' is {str(value)[:40]!r}; expected a number")
+    # NaN is not below any bound, and an integer of any length can be compared where it cannot become a float
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MOST_OF_CAMERA:
+        raise DataError(f"{where}: '{key}' is {shown(value)}; expected a number")
     return float(value)
 
 
 def read_trajectory(path: Path, where: str) -> Float64Array:
     """Camera-to-world poses (n, 4, 4), one a line; ``where`` begins each message."""
+    return poses_of_lines(trajectory_lines(path, where), f"{where}: traj.txt")
+
+
+def trajectory_lines(path: Path, where: str) -> list[str]:
+    """The lines of ``traj.txt``, at least one."""
     try:
         lines = path.read_text(encoding="utf-8").rstrip().splitlines()
     except OSError as error:
@@ -79,15 +87,17 @@ def read_trajectory(path: Path, where: str) -> Float64Array:
         raise DataError(f"{where}: traj.txt is not a text file; copy it again") from error
     if not lines:
         raise DataError(f"{where}: traj.txt is empty; expected one pose a line")
-    poses = np.array([_values(line, f"{where}: traj.txt line {n}") for n, line in enumerate(lines, 1)])
+    return lines
+
+
+def poses_of_lines(lines: Sequence[str], where: str, first_line: int = 1) -> Float64Array:
+    """Rigid camera-to-world poses (n, 4, 4), one a line; ``where`` names the file, ``first_line`` counts from 1."""
+    poses = np.array([_values(line, f"{where} line {n}") for n, line in enumerate(lines, first_line)])
     poses = poses.reshape(-1, 4, 4)
-    rotations, last_rows = poses[:, :3, :3], poses[:, 3]
-    products = rotations @ rotations.transpose(0, 2, 1)
-    is_rigid = np.abs(products - np.eye(3)).max(axis=(1, 2)) < RIGID_TOLERANCE
-    is_rigid &= (np.linalg.det(rotations) > 0) & (np.abs(last_rows - (0, 0, 0, 1)).max(axis=1) < RIGID_TOLERANCE)
+    is_rigid = are_rigid(poses)
     if not is_rigid.all():
         raise DataError(
-            f"{where}: traj.txt line {int(np.argmin(is_rigid)) + 1}: not a rigid motion; expected a row-major "
+            f"{where} line {first_line + int(np.argmin(is_rigid))}: not a rigid motion; expected a row-major "
             "camera-to-world matrix with last row 0 0 0 1"
         )
     return poses
@@ -100,7 +110,7 @@ def _values(line: str, where: str) -> list[float]:
     try:
         values = [float(word) for word in words]
     except ValueError as error:
-        raise DataError(f"{where}: {error}; expected 16 numbers") from error
+        raise DataError(f"{where}: {str(error)[:80]}; expected 16 numbers") from error
     for value, word in zip(values, words, strict=True):
         if not math.isfinite(value):
             raise DataError(f"{where}: the pose holds '{word[:20]}'; mend the trajectory or leave the scene out")

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.datasets.ply import ListColumn, PlyElement, read_ply
+from su3d_bench.datasets.ply import ListColumn, PlyElement, PlyFile, read_ply
 from su3d_bench.datasets.replica_labels import replica_label_set
 from su3d_bench.errors import DataError
 from su3d_bench.types import Float32Array, GroundTruth, InstanceMesh, Int32Array, Int64Array
@@ -61,6 +61,20 @@ def read_annotated_mesh(folder: Path, where: str) -> AnnotatedMesh:
 
 def read_object_classes(path: Path, where: str) -> dict[int, int]:
     """Object id -> class id as ``info_semantic.json`` has it, undefined classes included."""
+    objects = read_objects(path, where)
+    where = f"{where}: {INFO_NAME}"
+    found: dict[int, int] = {}
+    for row in objects:
+        one, class_id = whole_number(row, "id", where), whole_number(row, "class_id", where)
+        if not 0 <= one <= MAX_OBJECT_ID:
+            raise DataError(f"{where}: an object has the id {one}; expected 0 to {MAX_OBJECT_ID}")
+        if found.setdefault(one, class_id) != class_id:
+            raise DataError(f"{where}: object {one} stands there twice, as class {found[one]} and as class {class_id}")
+    return found
+
+
+def read_objects(path: Path, where: str) -> list[dict[str, Any]]:
+    """The rows of ``objects`` of an ``info_semantic.json`` whose classes are Replica's."""
     where = f"{where}: {INFO_NAME}"
     try:
         content = json.loads(path.read_text(encoding="utf-8"))
@@ -68,16 +82,9 @@ def read_object_classes(path: Path, where: str) -> dict[int, int]:
         raise DataError(f"{where} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
         raise DataError(f"{where}: not JSON ({error}); copy the file again") from error
-    classes, objects = _list_of_tables(content, "classes", where), _list_of_tables(content, "objects", where)
-    _check_class_names(classes, where)
-    found: dict[int, int] = {}
-    for row in objects:
-        one, class_id = _whole_number(row, "id", where), _whole_number(row, "class_id", where)
-        if not 0 <= one <= MAX_OBJECT_ID:
-            raise DataError(f"{where}: an object has the id {one}; expected 0 to {MAX_OBJECT_ID}")
-        if found.setdefault(one, class_id) != class_id:
-            raise DataError(f"{where}: object {one} stands there twice, as class {found[one]} and as class {class_id}")
-    return found
+    objects = _list_of_tables(content, "objects", where)
+    _check_class_names(_list_of_tables(content, "classes", where), where)
+    return objects
 
 
 def _list_of_tables(content: Any, key: str, where: str) -> list[dict[str, Any]]:
@@ -87,13 +94,17 @@ def _list_of_tables(content: Any, key: str, where: str) -> list[dict[str, Any]]:
     return rows
 
 
-def _whole_number(row: dict[str, Any], key: str, where: str) -> int:
+def whole_number(row: dict[str, Any], key: str, where: str) -> int:
     value = row.get(key)
     if isinstance(value, bool) or not isinstance(value, int):
-        raise DataError(
-            f"{where}: object {str(row.get('id'))[:20]}: '{key}' is {str(value)[:20]!r}, not a whole number"
-        )
+        owner = shown(row.get("id")).strip("'")
+        raise DataError(f"{where}: object {owner}: '{key}' is {shown(value)}, not a whole number")
     return value
+
+
+def shown(value: Any) -> str:
+    """A value of a JSON file as a message may show it: short, on one line, in quotes; a list or table by its type."""
+    return ascii((str(value) if value is None or isinstance(value, str | int | float) else type(value).__name__)[:40])
 
 
 def _check_class_names(classes: list[dict[str, Any]], where: str) -> None:
@@ -103,7 +114,7 @@ def _check_class_names(classes: list[dict[str, Any]], where: str) -> None:
         class_id = row.get("id")
         if class_id in labels.ids and str(row.get("name")).replace("_", "-").lower() != labels.name_of(class_id):
             raise DataError(
-                f"{where}: class {class_id} is '{str(row.get('name'))[:40]}', in Replica it is "
+                f"{where}: class {class_id} is {shown(row.get('name'))}, in Replica it is "
                 f"'{labels.name_of(class_id)}'; this file has other classes"
             )
 
@@ -129,23 +140,20 @@ def _say_what_is_void(ids: Int64Array, n_faces: Int64Array, class_of_object: Map
 def _read_mesh(path: Path, where: str) -> tuple[Float32Array, ListColumn, Int64Array]:
     """Vertices, corners and object ids of a mesh, checked to fit each other."""
     file = read_ply(path, where)
-    vertex, face = file.element("vertex"), file.element("face")
-    if vertex is None or face is None or vertex.n_rows == 0 or face.n_rows == 0:
+    face = file.element("face")
+    if face is None or face.n_rows == 0:
         raise DataError(f"{where}: no annotated mesh; expected elements 'vertex' and 'face' with rows")
-    vertices = np.stack([_scalar(vertex, axis, where) for axis in "xyz"], axis=1).astype(np.float32)
-    if not np.isfinite(vertices).all():
-        row = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
-        raise DataError(f"{where}: vertex {row} is at {vertices[row].tolist()}; copy the file again")
+    vertices = vertex_positions(file, where)
     corners = next((face.columns[name] for name in CORNER_NAMES if name in face.columns), None)
     if not isinstance(corners, ListColumn) or corners.values.dtype.kind == "f":
         raise DataError(f"{where}: faces have no list 'vertex_indices' of whole numbers")
-    is_outside = (corners.values < 0) | (corners.values >= vertex.n_rows)
+    is_outside = (corners.values < 0) | (corners.values >= len(vertices))
     if is_outside.any():
         first = int(np.flatnonzero(is_outside)[0])
         row = int(np.searchsorted(corners.indptr, first, side="right")) - 1
         raise DataError(
-            f"{where}: face {row} names vertex {corners.values[first]}, the mesh has {vertex.n_rows} (0.."
-            f"{vertex.n_rows - 1})"
+            f"{where}: face {row} names vertex {corners.values[first]}, the mesh has {len(vertices)} (0.."
+            f"{len(vertices) - 1})"
         )
     if "object_id" not in face.columns:
         raise DataError(
@@ -155,6 +163,18 @@ def _read_mesh(path: Path, where: str) -> tuple[Float32Array, ListColumn, Int64A
     if objects.dtype.kind == "f":
         raise DataError(f"{where}: 'object_id' is of type {objects.dtype}; expected a type of whole numbers")
     return vertices, corners, objects.astype(np.int64)
+
+
+def vertex_positions(file: PlyFile, where: str) -> Float32Array:
+    """The finite positions (V, 3) of a mesh's vertices, in the order of the file."""
+    vertex = file.element("vertex")
+    if vertex is None or vertex.n_rows == 0:
+        raise DataError(f"{where}: no mesh; expected an element 'vertex' with rows")
+    vertices = np.stack([_scalar(vertex, axis, where) for axis in "xyz"], axis=1).astype(np.float32)
+    if not np.isfinite(vertices).all():
+        row = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
+        raise DataError(f"{where}: vertex {row} is at {vertices[row].tolist()}; copy the file again")
+    return vertices
 
 
 def _scalar(element: PlyElement, name: str, where: str) -> NDArray[Any]:

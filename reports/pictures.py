@@ -63,7 +63,7 @@ def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, 
     if isinstance(prediction, DenseFeatures) or len(prediction.points) == 0:
         return []
     make_folder(folder)
-    cloud = _thinned(_cloud_of(prediction))
+    cloud = thinned(_cloud_of(prediction))
     cameras = _cameras(cloud.points if truth is None else truth.points)
     views = _views(cloud, cameras)
     names = _names_of(prediction)
@@ -73,7 +73,7 @@ def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, 
     if not any(names):
         return [instances]
     classes = folder / "classes.png"
-    truth_cloud = None if truth is None else _thinned(Cloud(truth.points, _truth_owner(truth)))
+    truth_cloud = None if truth is None else thinned(Cloud(truth.points, truth_owner(truth)))
     truth_names = () if truth is None else truth.labels.names
     used = _by_size(cloud, names) if truth_cloud is None else _by_size(truth_cloud, truth_names)
     palette = class_colours([*used, *(name for name in _by_size(cloud, names) if name not in used)])
@@ -88,7 +88,7 @@ def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, 
 def draw_heat_map(instances: Instances, similarity: Float64Array, path: Path, title: str, top: Sequence[str]) -> None:
     """Write the picture of a query: each instance in the colour of its similarity; ``top`` are lines of the legend."""
     make_folder(path.parent)
-    cloud = _thinned(_cloud_of(instances))
+    cloud = thinned(_cloud_of(instances))
     colours = heat_colours(similarity)
     pictures = _paint(_views(cloud, _cameras(cloud.points)), cloud, colours)
     order = np.argsort(-similarity, kind="stable")[: len(top)]
@@ -143,7 +143,7 @@ def _cloud_of(prediction: Prediction) -> Cloud:
     return Cloud(prediction.points, owner)
 
 
-def _truth_owner(truth: GroundTruth) -> Int32Array:
+def truth_owner(truth: GroundTruth) -> Int32Array:
     """Row of ``truth.labels`` a point; -1 where unannotated."""
     row_of_id = {class_id: row for row, class_id in enumerate(truth.labels.ids)}
     ids, inverse = np.unique(truth.semantic, return_inverse=True)
@@ -151,7 +151,8 @@ def _truth_owner(truth: GroundTruth) -> Int32Array:
     return rows[inverse.reshape(-1)] if len(ids) else np.zeros(0, np.int32)
 
 
-def _thinned(cloud: Cloud) -> Cloud:
+def thinned(cloud: Cloud) -> Cloud:
+    """One point of each cell of ``DRAWN_SPACING_M``, which is all that a picture can show."""
     cells = voxel_coordinates(cloud.points, DRAWN_SPACING_M)
     if len(cells) == 0:
         return cloud

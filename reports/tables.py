@@ -27,7 +27,7 @@ def headline(result: Mapping[str, Any]) -> str:
     for name in result["headline"]:
         remarks = [_scenes_text(result) + " scenes"]
         if result["ceiling"] is not None:
-            remarks.append(f"ceiling {_percent(result['ceiling'].get(name))}")
+            remarks.append(f"ceiling {percent(result['ceiling'].get(name))}")
         parts.append(f"{name} {_value_text(result, name)} ({', '.join(remarks)})")
     return ", ".join(parts)
 
@@ -41,14 +41,14 @@ def _protocol_block(rows: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any
     header = ["method", *names, f"ceiling ({' / '.join(names)})", "scenes", "covered at 2.5 / 5 / 10 cm"]
     body = [[one["method"], *(_value_text(one, name) for name in names), *_context(one, names)] for one in rows]
     notes = [line for one in rows for line in _notes(one)]
-    return "\n".join([f"**{title}**", "", *_aligned([header, *body]), *([""] if notes else []), *notes])
+    return "\n".join([f"**{title}**", "", *aligned([header, *body]), *([""] if notes else []), *notes])
 
 
 def _context(row: Mapping[str, Any], names: Sequence[str]) -> list[str]:
     ceiling = row["ceiling"]
-    ceilings = NOT_MEASURED if ceiling is None else " / ".join(_percent(ceiling.get(name)) for name in names)
+    ceilings = NOT_MEASURED if ceiling is None else " / ".join(percent(ceiling.get(name)) for name in names)
     coverage = {} if row["result"] is None else row["result"]["coverage"]
-    covered = [_percent(None if share is None else 1.0 - share) for share in coverage.values()]
+    covered = [percent(None if share is None else 1.0 - share) for share in coverage.values()]
     return [ceilings, _scenes_text(row), " / ".join(covered) or NOT_MEASURED]
 
 
@@ -61,12 +61,13 @@ def _scenes_text(row: Mapping[str, Any]) -> str:
 def _value_text(row: Mapping[str, Any], name: str) -> str:
     if row["result"] is None:
         return NOT_MEASURED
-    text = _percent(row["result"]["metrics"].get(name))
+    text = percent(row["result"]["metrics"].get(name))
     interval = row["result"]["intervals"].get(name)
-    return text if interval is None else f"{text} [{_percent(interval[0])}, {_percent(interval[1])}]"
+    return text if interval is None else f"{text} [{percent(interval[0])}, {percent(interval[1])}]"
 
 
-def _percent(value: float | None) -> str:
+def percent(value: float | None) -> str:
+    """A fraction in per cent with one decimal; ``-`` where there is none."""
     return NOT_MEASURED if value is None else f"{100.0 * value:.1f}"
 
 
@@ -91,7 +92,8 @@ def _some(scenes: Sequence[str]) -> str:
     return ", ".join(scenes[:3]) + (f" and {len(scenes) - 3} more" if len(scenes) > 3 else "")
 
 
-def _aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a Markdown table, the first row its header, with columns of one width."""
     widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
     lines = [
         "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows

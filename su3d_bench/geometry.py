@@ -7,6 +7,8 @@ import numpy as np
 from su3d_bench.errors import DataError
 from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int64Array
 
+RIGID_TOLERANCE = 1e-2  # catches scaled, mirrored and transposed matrices, not the digits that a text file left out
+
 
 def valid_depth(depth_m: Float32Array, depth_min: float, depth_max: float) -> BoolArray:
     """Pixels whose depth is finite and in ``[depth_min, depth_max]`` metres and above 0."""
@@ -39,3 +41,15 @@ def back_project(
 def voxel_coordinates(points: Float64Array | Float32Array, voxel: float) -> Int64Array:
     """Integer cell (N, 3) of each point in a grid of side ``voxel`` metres anchored at the world origin."""
     return np.floor(np.asarray(points, np.float64) / voxel).astype(np.int64)
+
+
+def are_rigid(matrices: Float64Array) -> BoolArray:
+    """Whether each of (n, 4, 4) finite matrices is a rotation and a translation."""
+    rotations, last_rows = matrices[:, :3, :3], matrices[:, 3]
+    with np.errstate(over="ignore", invalid="ignore"):
+        products = rotations @ rotations.transpose(0, 2, 1)
+        is_orthogonal = np.abs(products - np.eye(3)).max(axis=(1, 2)) < RIGID_TOLERANCE
+        is_proper = np.linalg.det(rotations) > 0
+        is_affine = np.abs(last_rows - (0, 0, 0, 1)).max(axis=1) < RIGID_TOLERANCE
+    result: BoolArray = is_orthogonal & is_proper & is_affine
+    return result

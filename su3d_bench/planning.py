@@ -182,7 +182,7 @@ def expand_scenes(
             strangers.append(address)
         elif not scenes:
             assert dataset is not None
-            known = [f"{target}/{scene}" for scene in dataset.scenes()]
+            known = [f"{target}/{scene}" for scene in (*dataset.scenes(), *_groups(dataset))]
             raise ConfigError(f"no scene matches '{address}'{suggest(address, known) or _some(known)}")
         chosen.update(dict.fromkeys((target, scene) for scene in scenes))
     if not chosen:
@@ -197,11 +197,30 @@ def _matching_scenes(dataset: Dataset, pattern: str) -> list[str]:
         return [scene for scene in scenes if fnmatch.fnmatchcase(scene, pattern)]
     if pattern in scenes:
         return [pattern]
+    if pattern in _groups(dataset):
+        return _whole_group(dataset, pattern, set(scenes))
     try:  # a scene that is made on demand stands in no list
         dataset.info(pattern, 1)
     except DataError:
         return []
     return [pattern]
+
+
+def _groups(dataset: Any) -> Mapping[str, Sequence[str]]:
+    """Names that stand for several scenes, such as official splits; a dataset that has some has ``groups``."""
+    return dataset.groups() if hasattr(dataset, "groups") else {}
+
+
+def _whole_group(dataset: Dataset, name: str, here: set[str]) -> list[str]:
+    """The scenes of a group, in its order, all of which must be here: a number over fewer is not the group's."""
+    group = _groups(dataset)[name]
+    missing = [scene for scene in group if scene not in here]
+    if missing:
+        raise ConfigError(
+            f"{dataset.name}/{name}: {len(missing)} of its {len(group)} scenes are not here (the first: {missing[0]}); "
+            "get them or name the scenes that are"
+        )
+    return list(group)
 
 
 def _some(known: Sequence[str]) -> str:
@@ -253,7 +272,7 @@ def _scene_job(config: RunConfig, parts: _Parts, folder: Path, target: str, scen
         scene=f"{parts.datasets[target].name}/{scene}",
         dataset=parts.datasets[target],
         methods=parts.methods,
-        ceiling=parts.ceiling,
+        ceiling=parts.ceiling if parts.protocols[target] else None,
         protocols=parts.protocols[target],
         profile=config.profile,
         perception=parts.perception,

@@ -35,26 +35,58 @@ class TransferRules(BaseModel):
     """How a prediction on other points than the truth's reaches the scored points.
 
     ``candidates``: ``object-points`` (only points that belong to an instance, as ConceptGraphs concatenates its object
-    clouds) or ``map-points`` (all points of the map; the nearest being background means no instance). ``cap_m``:
-    farther neighbours do not count, no cap when absent; a point without a neighbour is predicted as nothing. Each mask
-    is first reduced to one point a voxel of ``evaluation_voxel_m`` where that is above 0. Predictions on the scored
-    points themselves are taken as they are.
+    clouds), ``map-points`` (all points of the map; the nearest being background means no instance) or ``each-mask`` (a
+    point is in every mask that has a point nearer than the cap). ``neighbours``: above 1 a point takes the class that
+    most of so many nearest object points have, the first class of equals; objects that overlap vote each.
+    ``cap_m``: farther neighbours do not count, no cap when absent; a point without a neighbour is predicted as nothing.
+    Where ``evaluation_voxel_m`` is above 0, each mask is first reduced to one point a voxel; under kind ``categories``
+    the whole cloud is, to the mean of the points. With a single neighbour, predictions on the scored points themselves
+    are taken as they are.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    candidates: Literal["object-points", "map-points"]
+    candidates: Literal["object-points", "map-points", "each-mask"]
+    neighbours: Annotated[int, Field(ge=1, le=100)] = 1
     cap_m: Annotated[float, Field(gt=0)] | None = None
     evaluation_voxel_m: Annotated[float, Field(ge=0)] = 0.0
+
+
+CATEGORIES = ("synonyms", "depictions", "vis_sim", "clutter", "missing", "incorrect")
+AP_NAMES = ("AP", "AP50", "AP25")
+VALUES_OF_METRIC: dict[str, tuple[str, ...]] = {
+    "openlex3d-topn": CATEGORIES,
+    "openlex3d-ranking": ("overall", "synonyms", "secondary"),
+    "query-ap": AP_NAMES,
+}
+_METRICS = {
+    "semantic": ("conceptgraphs", "scannet", "hovsg"),
+    "instance": ("scannet",),
+    "queries": ("query-ap",),
+    "categories": ("openlex3d-topn", "openlex3d-ranking"),
+}
+_CONFIDENCES = {"instance": ("ones", "prediction"), "queries": ("similarity", "similarity-min-max")}
+_CANDIDATES = {
+    "semantic": ("object-points", "map-points"),
+    "instance": ("map-points",),
+    "queries": ("each-mask", "map-points"),
+    "categories": ("object-points",),
+}
 
 
 class ProtocolRules(BaseModel):
     """One evaluation, complete: the same rules and the same prediction give the same number.
 
-    ``classes`` is the label set in the order of the original; ``ignore`` names classes that are known but not scored.
-    ``vocabulary``: the classifier chooses among ``all`` classes, the ``scored`` ones, or those scored ones that the
-    ``scene``'s ground truth contains. ``prompt`` has ``{}`` for the class name, which ``prompt_names`` may replace.
-    ``confidence``: ``ones`` for every mask, or the ``prediction``'s own.
+    ``kind``: ``semantic`` (a class a point), ``instance`` (masks with a class), ``queries`` (masks ranked for each
+    text) or ``categories`` (how near a point's label comes to those of its object). ``classes`` is the label set in
+    the order of the original; ``ignore`` names classes that are known but not scored, and for ``categories`` labels
+    whose objects are not. ``vocabulary``: the classifier chooses among ``all`` classes, the ``scored`` ones, or those
+    scored ones that the ``scene``'s ground truth contains. ``prompt`` has ``{}`` for the class name, which
+    ``prompt_names`` may replace; of several ``prompts`` the mean feature counts. ``confidence``: ``ones`` for every
+    mask, the ``prediction``'s own, or for queries the ``similarity`` of mask and text (cosine), or that stretched to
+    0..1 over the scene's masks for each query. ``top_k``: how many labels of a point, or masks of a query, count; all
+    where absent. ``class_agnostic`` drops the labels: the truth's instances are those of the ``scored`` classes (the
+    rest is void), all ``annotated`` ones, or ``everything``, with the points that nobody annotated as one more.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -62,49 +94,89 @@ class ProtocolRules(BaseModel):
     name: str
     version: Annotated[int, Field(ge=1)]
     summary: str
-    kind: Literal["semantic", "instance"]
-    metric: Literal["conceptgraphs", "scannet"]
+    kind: Literal["semantic", "instance", "queries", "categories"]
+    metric: Literal["conceptgraphs", "scannet", "hovsg", "query-ap", "openlex3d-topn", "openlex3d-ranking"]
     datasets: tuple[str, ...]
     label_space: str
     ground_truth: str
-    classes: tuple[ClassEntry, ...]
+    classes: tuple[ClassEntry, ...] = ()
+    class_agnostic: Literal["scored", "annotated", "everything"] | None = None
     ignore: tuple[str, ...] = ()
     ignore_rule: Literal["exact", "substring"] = "exact"
-    vocabulary: Literal["all", "scored", "scene"]
-    prompt: str
+    vocabulary: Literal["all", "scored", "scene"] | None = None
+    prompt: str | None = None
+    prompts: tuple[str, ...] = ()
     prompt_names: dict[str, str] = {}
     encoder: str | None = None
     transfer: TransferRules
     min_region_size: Annotated[int, Field(ge=1)] | None = None
     thresholds: tuple[float, ...] = ()
-    confidence: Literal["ones", "prediction"] | None = None
+    confidence: Literal["ones", "prediction", "similarity", "similarity-min-max"] | None = None
+    top_k: Annotated[int, Field(ge=1)] | None = None
     aggregate: Literal["pooled", "scene-mean"] = "pooled"
     headline: Annotated[tuple[str, ...], Field(min_length=1)]
     not_comparable_with: tuple[str, ...] = ()
 
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
+        self._check_classes()
+        self._check_texts()
+        self._check_metric()
+        return self
+
+    def _check_classes(self) -> None:
         names = [entry.name for entry in self.classes]
         if len(set(names)) != len(names) or len({entry.id for entry in self.classes}) != len(names):
             raise ValueError("classes: each id and each name may stand there once")
-        if "{}" not in self.prompt:
-            raise ValueError(f"prompt: '{self.prompt}' has no {{}} for the class name")
+        has_labels = self.kind in ("semantic", "instance") and self.class_agnostic in (None, "scored")
+        if bool(names) != has_labels:
+            raise ValueError("classes: needed where labels count, that is under kinds 'semantic' and 'instance'")
         unknown = [name for name in (*self.ignore, *self.prompt_names) if not any(name in known for known in names)]
-        if unknown:
+        if unknown and self.kind != "categories":
             raise ValueError(f"ignore or prompt_names: '{unknown[0]}' is no class{suggest(unknown[0], names)}")
-        known = {"semantic": ("mAcc", "mIoU", "F-mIoU"), "instance": ("AP", "AP50", "AP25")}[self.kind]
+        if self.class_agnostic is not None and self.kind != "instance":
+            raise ValueError("class_agnostic: belongs to kind 'instance'")
+
+    def _check_texts(self) -> None:
+        texts = self.prompts if self.prompt is None else (self.prompt, *self.prompts)
+        if self.class_agnostic is not None and (texts or self.vocabulary or self.encoder):
+            raise ValueError("class_agnostic: takes no prompt, vocabulary or encoder")
+        if (self.vocabulary is None) == (self.kind in ("semantic", "instance") and self.class_agnostic is None):
+            raise ValueError("vocabulary: belongs to protocols that choose among classes, and these need it")
+        if self.class_agnostic is None and (self.prompt is None) == (not self.prompts):
+            raise ValueError("prompt: give either prompt or prompts")
+        without = [text for text in texts if "{}" not in text]
+        if without:
+            raise ValueError(f"prompt: '{without[0]}' has no {{}} for the class name")
+
+    def _check_metric(self) -> None:
+        has_curve = self.kind in ("instance", "queries")
+        if self.metric not in _METRICS[self.kind] or (has_curve and None in (self.min_region_size, self.confidence)):
+            names = " or ".join(f"'{name}'" for name in _METRICS[self.kind])
+            rest = ", min_region_size, thresholds and confidence" if has_curve else ""
+            raise ValueError(f"kind '{self.kind}' needs metric {names}{rest}")
+        known = VALUES_OF_METRIC.get(self.metric, AP_NAMES if has_curve else ("mAcc", "mIoU", "F-mIoU"))
         if not set(self.headline) <= set(known):
             raise ValueError(f"headline: a protocol of kind '{self.kind}' has {', '.join(known)}")
-        if self.kind == "semantic" and (self.min_region_size or self.thresholds or self.confidence):
-            raise ValueError("min_region_size, thresholds and confidence belong to kind 'instance'")
-        if self.kind == "instance":
-            if self.metric != "scannet" or self.min_region_size is None or self.confidence is None:
-                raise ValueError("kind 'instance' needs metric 'scannet', min_region_size, thresholds and confidence")
-            if not {0.25, 0.5} <= set(self.thresholds):
-                raise ValueError("thresholds: 0.25 and 0.5 must be among them")
-            if self.transfer.candidates != "map-points":
-                raise ValueError("transfer.candidates: kind 'instance' takes 'map-points'")
-        return self
+        if not has_curve and (self.min_region_size or self.thresholds or self.confidence):
+            raise ValueError("min_region_size, thresholds and confidence belong to kind 'instance' or 'queries'")
+        if has_curve and not {0.25, 0.5} <= set(self.thresholds):
+            raise ValueError("thresholds: 0.25 and 0.5 must be among them")
+        if has_curve and self.confidence not in _CONFIDENCES[self.kind]:
+            raise ValueError(f"confidence: kind '{self.kind}' takes {' or '.join(_CONFIDENCES[self.kind])}")
+        if (self.metric == "openlex3d-topn") != (self.top_k is not None) and self.kind != "queries":
+            raise ValueError("top_k: belongs to kind 'queries' and to metric 'openlex3d-topn', which needs it")
+        self._check_transfer()
+
+    def _check_transfer(self) -> None:
+        transfer = self.transfer
+        if transfer.candidates not in _CANDIDATES[self.kind]:
+            names = " or ".join(f"'{name}'" for name in _CANDIDATES[self.kind])
+            raise ValueError(f"transfer.candidates: kind '{self.kind}' takes {names}")
+        if transfer.candidates == "each-mask" and (transfer.cap_m is None or transfer.evaluation_voxel_m > 0):
+            raise ValueError("transfer.cap_m: 'each-mask' needs one, and no evaluation_voxel_m")
+        if transfer.neighbours > 1 and self.kind != "semantic":
+            raise ValueError("transfer.neighbours: belongs to kind 'semantic'")
 
     def is_ignored(self, name: str) -> bool:
         """Whether the class ``name`` is left out, by exact name or, under the substring rule, by a part of it."""
@@ -115,14 +187,22 @@ class ProtocolRules(BaseModel):
         """The classes that count, in order."""
         return tuple(entry for entry in self.classes if not self.is_ignored(entry.name))
 
-    def prompt_of(self, name: str) -> str:
-        """The text that stands for the class ``name``."""
-        return self.prompt.replace("{}", self.prompt_names.get(name, name))
+    @property
+    def curve_names(self) -> tuple[str, ...]:
+        """What the precision-recall curves are named after: the scored classes, or ``object`` where labels are none."""
+        if self.class_agnostic is not None or self.kind == "queries":
+            return ("object",)
+        return tuple(entry.name for entry in self.scored)
+
+    def texts_of(self, name: str) -> tuple[str, ...]:
+        """The texts that stand for the class, label or query ``name``; their mean feature counts."""
+        templates = self.prompts if self.prompt is None else (self.prompt,)
+        return tuple(template.replace("{}", self.prompt_names.get(name, name)) for template in templates)
 
     @property
     def digest(self) -> str:
-        """A content key of all rules."""
-        return hashlib.sha256(self.model_dump_json().encode()).hexdigest()
+        """A content key of all rules; a field that a later version adds leaves it alone where it has its default."""
+        return hashlib.sha256(self.model_dump_json(exclude_defaults=True).encode()).hexdigest()
 
 
 def protocol_names() -> list[str]:
@@ -135,12 +215,23 @@ def protocols_for(dataset: str) -> list[str]:
     return [name for name in protocol_names() if dataset in load_protocol(name).datasets]
 
 
+def not_comparable_with(rules: ProtocolRules) -> list[str]:
+    """Protocols whose numbers must not stand beside those of ``rules``: it names them, or they name it."""
+    naming = [name for name in protocol_names() if rules.name in load_protocol(name).not_comparable_with]
+    return sorted({*rules.not_comparable_with, *naming})
+
+
+def rules_file(name: str) -> Path:
+    """Where the rules called ``name`` are read from."""
+    return RULES / f"{name}.toml" if name in protocol_names() else Path(name)
+
+
 @lru_cache(maxsize=64)
 def load_protocol(name: str) -> ProtocolRules:
     """The rules called ``name``, or those in the file ``name`` when it ends in ``.toml``."""
     known = protocol_names()
     if name in known:
-        return read_protocol(RULES / f"{name}.toml")
+        return read_protocol(rules_file(name))
     if name.endswith(".toml"):
         rules = read_protocol(Path(name))
         if rules.name in known:
@@ -159,7 +250,8 @@ def read_protocol(path: Path) -> ProtocolRules:
             known = suggest(table, tables) or "; known: " + ", ".join(sorted(tables))
             raise ConfigError(f"{_line_of(path, 'classes')}: unknown class table '{table}'{known}")
         content["classes"] = _read_toml(tables[table])["classes"]
-    content["classes"] = _entries(path, content.get("classes"))
+    if "classes" in content:
+        content["classes"] = _entries(path, content.get("classes"))
     try:
         return ProtocolRules.model_validate(_with_tuples(content))
     except ValidationError as error:

@@ -16,6 +16,9 @@ from su3d_bench.errors import ConfigError, suggest
 DATASETS = {
     "rooms": "su3d_bench.datasets.rooms:Rooms",
     "replica": "su3d_bench.datasets.replica:Replica",
+    "scannet": "su3d_bench.datasets.scannet:ScanNet",
+    "tum": "su3d_bench.datasets.tum:Tum",
+    "rgbd": "su3d_bench.datasets.rgbd:Rgbd",
 }
 METHODS = {
     "opensu3d": "su3d_bench.opensu3d.pipeline:OpenSU3D",

@@ -66,6 +66,9 @@ def _remarks(plan: Plan, outcomes: Sequence[MethodOutcome]) -> tuple[str, ...]:
     lines = [line for one in outcomes for line in one.warnings]
     reasons = [(one, protocol, why) for one in outcomes for protocol, why in one.unscored]
     lines += [f"{one.scene}, {one.method}: not scored under {protocol}: {why}" for one, protocol, why in reasons]
+    # A table says the caveat beneath it; what no protocol scores has no table.
+    without_table = {job.scene for job in plan.jobs if not job.protocols}
+    lines += [f"{one.method}: {one.caveat}" for one in outcomes if one.caveat and one.scene in without_table]
     said = {(one.scene, why) for one, _, why in reasons}
     for one in outcomes:
         if one.error is not None and one.scene not in failed and (one.scene, one.error) not in said:

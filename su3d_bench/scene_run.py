@@ -29,7 +29,7 @@ from su3d_bench.reports.pictures import draw_scene
 from su3d_bench.scoring import SceneScore, pack_scores, score_scene, why_not_scorable
 from su3d_bench.store import JobFolder, RunFolder, read_prediction, write_bytes, write_prediction, write_text
 from su3d_bench.timing import Timer
-from su3d_bench.types import GroundTruth, InstanceMesh, Method, SceneInfo
+from su3d_bench.types import GroundTruth, InstanceMesh, Method, Prediction, SceneInfo
 
 CEILING_METHOD = "oracle"
 FIELDS_KNOWN_LATER = ("data", "profile", "perception")
@@ -243,6 +243,8 @@ class _Scene:
         self, method: Method, info: SceneInfo, perception: Perception, folder: JobFolder, key: Mapping[str, str]
     ) -> None:
         if hasattr(method, "receive_truth"):
+            if not self.dataset.variants:
+                raise GroundTruthMissing(f"{self.job.scene}: {method.name} needs ground truth, the dataset has none")
             method.receive_truth(self.truth(self.dataset.variants[0]))
         method.start(info)
         rows = self._update_all(method, info, perception) if method.needs.frames else []
@@ -285,7 +287,8 @@ class _Scene:
             if (reason := why_not_scorable(rules, prediction)) is not None:
                 unscored[rules.name] = reason
                 continue
-            scores[rules.name] = score_scene(rules, truth, prediction, perception.encoder)
+            told = self._prediction_in_words_of(truth, part, prediction)
+            scores[rules.name] = score_scene(rules, truth, told, perception.encoder)
         write_bytes(folder.counts, pack_scores(scores))
         pictures: list[Path] = []
         if self.job.pictures:
@@ -293,6 +296,16 @@ class _Scene:
             pictures = draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
         remarks = {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings))}
         folder.seal("score", key, [folder.counts, *pictures], remarks)
+
+    def _prediction_in_words_of(self, truth: GroundTruth, part: Part, prediction: Prediction) -> Prediction:
+        """``prediction``; that of a method that was told the truth is told anew where ``truth`` names its classes
+        otherwise than the truth that it was told: ScanNet has two sets of labels."""
+        method = build_method(part)
+        if not hasattr(method, "receive_truth") or truth.labels == self.truth(self.dataset.variants[0]).labels:
+            return prediction
+        method.receive_truth(truth)
+        told: Prediction = method.finish()
+        return told
 
 
 def refuse_other_run(folder: JobFolder, key: Mapping[str, str], known_later: Sequence[str] = ()) -> None:

@@ -130,6 +130,28 @@ class InstanceMesh:
 
 
 @dataclass(frozen=True)
+class OrientedBox:
+    """A box in the world: ``centre`` and ``sizes`` (3,) in m, ``rotation`` (3, 3) from its axes to the world's."""
+
+    centre: Float64Array
+    sizes: Float64Array
+    rotation: Float64Array
+
+    @property
+    def corners(self) -> Float64Array:
+        """The corners (8, 3); corner k is at the far side of axis i where bit i of k is set."""
+        sides = np.array([[k >> axis & 1 for axis in range(3)] for k in range(8)]) - 0.5
+        corners: Float64Array = (sides * self.sizes) @ self.rotation.T + self.centre
+        return corners
+
+    def distance_outside(self, points: Float64Array) -> Float64Array:
+        """How far (N,) each of ``points`` (N, 3) lies beyond the nearest face plane, the worst axis; 0 inside."""
+        along_axes = np.abs((points - self.centre) @ self.rotation)
+        distance: Float64Array = np.maximum(along_axes - self.sizes / 2, 0.0).max(axis=1, initial=0.0)
+        return distance
+
+
+@dataclass(frozen=True)
 class Detections:
     """What perception found in one frame: K regions, strongest evidence first is not implied.
 
@@ -258,6 +280,10 @@ class Dataset(Protocol):
 
     The class also has ``Options``, a strict model of its settings, ``label_space``, whose class ids its truth uses, and
     ``variants``, the forms of ground truth it can give, the fullest first; it is made as ``Cls(data_root, options)``.
+    Frames are read from several threads at once.
+
+    It may have: ``places()``, the folders that it searches; ``status(scene)``, a word on a scene from a quick look;
+    ``groups()``, names for sets of scenes such as ``val``; ``problems(scene)``, every fault of its files, a line each.
     """
 
     name: str

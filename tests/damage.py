@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from su3d_bench.errors import DataError
+from su3d_bench.errors import DataError, Su3dError
 
 N_DAMAGES = 2_000
 MOST_SECONDS = 20.0  # one read of a small file; generous, for a busy machine, yet no endless loop passes
@@ -43,10 +43,16 @@ def damages(content: bytes, n: int = N_DAMAGES, seed: int = 0) -> Iterator[bytes
         yield bytes(damaged)
 
 
-def outcomes(read: Callable[[bytes], object], copies: Iterator[bytes], *, must_name: str) -> tuple[int, int]:
+def outcomes(
+    read: Callable[[bytes], object],
+    copies: Iterator[bytes],
+    *,
+    must_name: str,
+    refusal: type[Su3dError] = DataError,
+) -> tuple[int, int]:
     """How many copies were read and how many refused; fails on any other error, and where time or memory run away.
 
-    Each refusal must be one ``DataError`` of one line that holds ``must_name``, the name of the file.
+    Each refusal must be one ``refusal`` of one line that holds ``must_name``, the name of the file.
     """
     n_read = n_refused = 0
     tracemalloc.start()
@@ -57,7 +63,7 @@ def outcomes(read: Callable[[bytes], object], copies: Iterator[bytes], *, must_n
             try:
                 read(damaged)
                 n_read += 1
-            except DataError as error:
+            except refusal as error:
                 message = str(error)
                 assert must_name in message, message
                 assert "\n" not in message and len(message) < 600, message

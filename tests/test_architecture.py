@@ -24,7 +24,7 @@ LAYERS = (
     {"errors"},
     {"types"},
     {"geometry", "statistics", "timing"},
-    {"digests", "toml_text"},
+    {"digests", "toml_text", "plain_text"},
     {"config", "protocols", "rules"},
     {"metrics"},
     {"registry", "store", "scoring"},
@@ -34,8 +34,14 @@ LAYERS = (
     {"executors"},
     {"scene_run"},
     {"planning"},
+    {"evaluation_truth", "evaluation_scenes", "evaluation_texts", "evaluation_checks", "evaluation_bound"},
+    {"evaluation_scoring"},
+    {"evaluation_result"},
+    {"evaluation"},
     {"estimate"},
     {"runner"},
+    {"inspection_checks"},
+    {"inspection"},
     {"cli"},
 )
 HEAVY = {"open3d", "torch", "onnxruntime", "sklearn", "pandas", "matplotlib", "numba"}

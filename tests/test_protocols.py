@@ -7,16 +7,20 @@ from pathlib import Path
 
 import pytest
 
+from su3d_bench.cli.main import main
+from su3d_bench.cli.protocols import read_remarks
 from su3d_bench.datasets.rooms_classes import CLASSES
 from su3d_bench.errors import ConfigError
 from su3d_bench.metrics.instance_ap import MIN_REGION_SIZE, THRESHOLDS
-from su3d_bench.protocols import RULES, load_protocol, protocol_names, protocols_for
+from su3d_bench.protocols import RULES, load_protocol, not_comparable_with, protocol_names, protocols_for
 
 CASES = Path(__file__).parent / "cases"
 NAMES = {
-    "replica-conceptgraphs-ex1", "replica-conceptgraphs-ex4", "replica-conceptgraphs-ex6", "replica-mesh-ex6",
-    "replica-openmask3d", "rooms-instance", "rooms-semantic", "scannet-instance", "scannet-semantic",
-    "scannet200-instance",
+    "class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d", "openlex3d-queries",
+    "openlex3d-ranking", "openlex3d-topn", "query-ap", "replica-conceptgraphs-ex1", "replica-conceptgraphs-ex4",
+    "replica-conceptgraphs-ex6", "replica-hovsg", "replica-hovsg-exact", "replica-mesh-ex6", "replica-openmask3d",
+    "replica-openmask3d-released", "replica-ovo51", "rooms-instance", "rooms-semantic", "scannet-instance",
+    "scannet-semantic", "scannet200-instance", "scannet200-semantic",
 }  # fmt: skip
 
 
@@ -29,7 +33,7 @@ def test_a_protocol_is_named_as_its_file_and_names_others_that_exist(name: str) 
     rules = load_protocol(name)
     assert rules.name == name
     assert set(rules.not_comparable_with) <= NAMES - {name}
-    assert set(rules.ignore) <= {entry.name for entry in rules.classes}
+    assert set(rules.ignore) <= {entry.name for entry in rules.classes} or rules.kind == "categories"
 
 
 @pytest.mark.parametrize("name", sorted(NAMES))
@@ -40,7 +44,10 @@ def test_every_rule_that_is_taken_from_an_original_says_from_where(name: str) ->
 
 def test_each_dataset_has_its_default_protocols() -> None:
     assert protocols_for("rooms") == ["replica-mesh-ex6", "replica-openmask3d", "rooms-instance", "rooms-semantic"]
-    assert protocols_for("scannet") == ["scannet-instance", "scannet-semantic", "scannet200-instance"]
+    assert protocols_for("scannet") == [
+        "class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d", "scannet-instance",
+        "scannet-semantic", "scannet200-instance", "scannet200-semantic",
+    ]  # fmt: skip
     assert {"replica-conceptgraphs-ex6", "replica-mesh-ex6", "replica-openmask3d"} <= set(protocols_for("replica"))
     assert protocols_for("nowhere") == []
 
@@ -68,10 +75,19 @@ def test_class_ids_are_those_of_the_original(name: str, case: str, oracle: str) 
 @pytest.mark.parametrize("name", sorted(NAMES))
 def test_instance_protocols_use_the_original_thresholds_and_size(name: str) -> None:
     rules = load_protocol(name)
-    if rules.kind == "instance":
-        assert (rules.thresholds, rules.min_region_size) == (THRESHOLDS, MIN_REGION_SIZE)
+    if rules.kind in ("instance", "queries"):
+        n_points = MIN_REGION_SIZE if rules.kind == "instance" else 1
+        assert (rules.thresholds, rules.min_region_size) == (THRESHOLDS, n_points)
     else:
         assert (rules.thresholds, rules.min_region_size, rules.confidence) == ((), None, None)
+
+
+def test_the_51_classes_of_ovo_fall_into_three_thirds() -> None:
+    group = {entry.name: entry.group for entry in load_protocol("replica-ovo51").scored}
+    assert [list(group.values()).count(name) for name in ("head", "common", "tail")] == [17, 17, 17]
+    assert (group["wall"], group["blanket"], group["tv-stand"], group["monitor"], group["switch"]) == (
+        "head", "head", "common", "common", "tail",
+    )  # fmt: skip
 
 
 def test_scannet200_groups_have_64_68_and_66_classes() -> None:
@@ -85,14 +101,28 @@ def test_the_rooms_classes_are_those_that_the_rooms_generate() -> None:
 
 
 def test_prompts_take_the_class_name_as_it_is_unless_the_rules_replace_it() -> None:
-    assert load_protocol("replica-conceptgraphs-ex6").prompt_of("tv-screen") == "an image of tv-screen"
-    assert load_protocol("scannet-instance").prompt_of("otherfurniture") == "a other in a scene"
+    assert load_protocol("replica-conceptgraphs-ex6").texts_of("tv-screen") == ("an image of tv-screen",)
+    assert load_protocol("scannet-instance").texts_of("otherfurniture") == ("a other in a scene",)
 
 
 def test_the_substring_rule_ignores_names_that_contain_the_word() -> None:
     rules = load_protocol("replica-mesh-ex6").model_copy(update={"ignore_rule": "substring"})
     ignored = {entry.name for entry in rules.classes if rules.is_ignored(entry.name)}
     assert ignored == {"other", "floor", "wall", "ceiling", "door", "window", "indoor-plant", "wall-plug"}
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_protocols_that_must_not_be_compared_are_told_from_both_sides(name: str) -> None:
+    rules = load_protocol(name)
+    others = not_comparable_with(rules)
+    assert set(rules.not_comparable_with) <= set(others)
+    assert all(name in not_comparable_with(load_protocol(other)) for other in others)
+
+
+def test_a_field_that_a_later_version_adds_leaves_digests_alone() -> None:
+    rules = load_protocol("rooms-semantic")
+    explicit = rules.model_copy(update={"top_k": None, "prompts": ()})
+    assert explicit.digest == rules.digest
 
 
 def test_the_digest_moves_with_every_rule() -> None:
@@ -141,6 +171,15 @@ FAULTS = (
     ("instance", "0.9000000000000004, 0.25,", "0.9", "thresholds: 0.25 and 0.5 must be among them"),
     ("instance", '"map-points"', '"object-points"', "kind 'instance' takes 'map-points'"),
     ("instance", "version = 1", "version = ", "mine.toml: is no valid TOML"),
+    ("semantic", 'vocabulary = "scored"', "# none", "vocabulary: belongs to protocols that choose among classes"),
+    ("semantic", "version = 1", 'version = 1\nprompts = ["{}"]', "prompt: give either prompt or prompts"),
+    ("semantic", 'metric = "conceptgraphs"', 'metric = "query-ap"', "kind 'semantic' needs metric 'conceptgraphs' or"),
+    ("semantic", 'classes = "rooms"', "# none", "classes: needed where labels count"),
+    ("semantic", "version = 1", "version = 1\ntop_k = 5", "top_k: belongs to kind 'queries'"),
+    ("semantic", "version = 1", 'version = 1\nclass_agnostic = "scored"', "class_agnostic: belongs to kind 'instance'"),
+    ("instance", "version = 1", 'version = 1\nclass_agnostic = "scored"', "class_agnostic: takes no prompt"),
+    ("instance", 'confidence = "prediction"', 'confidence = "similarity"', "takes ones or prediction"),
+    ("instance", "[transfer]", "[transfer]\nneighbours = 5", "transfer.neighbours: belongs to kind 'semantic'"),
     ("instance", 'name = "mine"', 'name = "rooms-instance"', "the protocol name 'rooms-instance' is built in"),
 )
 
@@ -153,6 +192,64 @@ def test_a_file_that_cannot_be_used_is_told_in_one_line(
         load_protocol(edited(tmp_path, f"rooms-{kind}", old, new))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+OPEN_FAULTS = (
+    ("openlex3d-topn", "top_k = 5", "", "top_k: belongs to kind 'queries' and to metric 'openlex3d-topn'"),
+    ("openlex3d-topn", '["synonyms", "missing"', '["mAcc", "missing"', "a protocol of kind 'categories' has synonyms,"),
+    ("openlex3d-topn", "[transfer]", 'classes = "rooms"\n[transfer]', "classes: needed where labels count"),
+    (
+        "openlex3d-ranking",
+        '["overall"',
+        '["clutter"',
+        "a protocol of kind 'categories' has overall, synonyms, secondary",
+    ),
+    ("openlex3d-queries", "cap_m = 0.03162277660168379", "", "transfer.cap_m: 'each-mask' needs one"),
+    ("openlex3d-queries", '"each-mask"', '"object-points"', "kind 'queries' takes 'each-mask' or 'map-points'"),
+    ("openlex3d-queries", '"similarity-min-max"', '"ones"', "kind 'queries' takes similarity or similarity-min-max"),
+    ("query-ap", "min_region_size = 1", "", "kind 'queries' needs metric 'query-ap', min_region_size"),
+)
+
+
+@pytest.mark.parametrize(("base", "old", "new", "message"), OPEN_FAULTS, ids=[fault[3] for fault in OPEN_FAULTS])
+def test_a_file_of_the_open_vocabulary_kinds_that_cannot_be_used_is_told_in_one_line(
+    tmp_path: Path, base: str, old: str, new: str, message: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_protocol(edited(tmp_path, base, old, new))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_remarks_of_a_file_stand_beside_the_rules_that_they_speak_of(tmp_path: Path) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(
+        '# Heading.\nname = "a # b"  # the name\n# above\nversion = 1  # [X]\n# no encoder: any\nthresholds = [\n'
+        "    0.5,\n]\n# of the section\n[transfer]\ncap_m = 1.0\n# no neighbours\n# at the end\n"
+    )
+    assert read_remarks(path) == {
+        "": ["Heading."],
+        "name": ["the name"],
+        "version": ["above", "[X]"],
+        "encoder": ["no encoder: any"],
+        "thresholds": [],
+        "transfer": ["of the section", "at the end"],
+        "transfer.cap_m": [],
+        "transfer.neighbours": ["no neighbours"],
+    }
+
+
+@pytest.mark.parametrize("name", sorted(NAMES))
+def test_show_prints_every_rule_with_what_its_file_says_of_it(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["protocols", "show", name]) == 0
+    text = capsys.readouterr().out
+    rules = load_protocol(name)
+    for key in rules.model_dump(exclude={"transfer", "prompt_names", "classes"}):
+        assert f"\n{key} " in text
+    for line in (RULES / f"{name}.toml").read_text().splitlines():
+        comment = line.partition("  # ")[2] or line.partition("# ")[2] * line.startswith("#")
+        assert comment in text
+    assert all(other in text for other in not_comparable_with(rules))
 
 
 def test_a_missing_file_is_told(tmp_path: Path) -> None:

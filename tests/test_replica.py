@@ -11,79 +11,33 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from damage import damages, outcomes, truncations
+from replica_scene import (
+    CAMERA,
+    CHAIR,
+    HEIGHT,
+    QUADS,
+    SCALE,
+    TABLE,
+    TWO_OBJECTS,
+    WALL,
+    WIDTH,
+    depth_values,
+    info_table,
+    pose,
+    write_original,
+    write_render,
+)
 
 from su3d_bench.datasets.ply import ListColumn, PlyElement, write_ply
 from su3d_bench.datasets.replica import Replica
 from su3d_bench.datasets.replica_folders import original_name
-from su3d_bench.datasets.replica_labels import replica_label_set
+from su3d_bench.datasets.replica_frames import read_camera, read_trajectory
 from su3d_bench.datasets.replica_truth import object_of_vertex
 from su3d_bench.errors import DataError, GroundTruthMissing
 from su3d_bench.types import Frame
 
-WIDTH, HEIGHT, SCALE = 12, 8, 6553.5
-CAMERA = {"w": WIDTH, "h": HEIGHT, "fx": 6.0, "fy": 6.5, "cx": 5.5, "cy": 3.5, "scale": SCALE}
-CHAIR, TABLE, WALL = 20, 80, 93
 Change = Callable[[Path], object]
-
-
-def pose(index: int) -> np.ndarray:
-    angle = 0.1 * index
-    matrix = np.eye(4)
-    matrix[:2, :2] = [[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]
-    matrix[:3, 3] = index, 1 / 3, -index
-    return matrix
-
-
-def depth_values(index: int) -> np.ndarray:
-    return np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 600 + index
-
-
-def write_render(root: Path, scene: str = "room0", n_frames: int = 3, folder: str = "Replica") -> None:
-    results = root / folder / scene / "results"
-    results.mkdir(parents=True)
-    (root / folder / "cam_params.json").write_text(json.dumps({"camera": CAMERA}))
-    lines = [" ".join(repr(float(value)) for value in pose(index).reshape(-1)) for index in range(n_frames)]
-    (results.parent / "traj.txt").write_text("\n".join(lines) + "\n")
-    for index in range(n_frames):
-        colour = np.full((HEIGHT, WIDTH, 3), (30, 120, 200), np.uint8)  # blue, green, red
-        cv2.imwrite(str(results / f"frame{index:06d}.jpg"), colour, [cv2.IMWRITE_JPEG_QUALITY, 95])
-        cv2.imwrite(str(results / f"depth{index:06d}.png"), depth_values(index))
-
-
-def info_table(objects: list[tuple[int, int]]) -> dict[str, Any]:
-    labels = replica_label_set()
-    classes = [{"id": i, "name": name} for i, name in zip(labels.ids, labels.names, strict=True)]
-    return {"classes": classes, "objects": [{"id": one, "class_id": class_id} for one, class_id in objects]}
-
-
-def write_original(
-    root: Path,
-    faces: list[list[int]],
-    object_ids: list[int],
-    objects: list[tuple[int, int]],
-    folder: str = "replica_v1/room_0",
-    n_vertices: int = 9,
-) -> Path:
-    """A mesh on a grid of points, three a row, and its table of objects."""
-    habitat = root / folder / "habitat"
-    habitat.mkdir(parents=True)
-    grid = np.array([(i % 3, i // 3, 0) for i in range(n_vertices)], np.float32)
-    corners = ListColumn(
-        np.concatenate([[0], np.cumsum([len(face) for face in faces])]),
-        np.array([corner for face in faces for corner in face], np.int32),
-    )
-    vertex = PlyElement("vertex", n_vertices, {axis: grid[:, i].copy() for i, axis in enumerate("xyz")})
-    face = PlyElement("face", len(faces), {"vertex_indices": corners, "object_id": np.array(object_ids, np.uint16)})
-    write_ply(habitat / "mesh_semantic.ply", [vertex, face])
-    (habitat / "info_semantic.json").write_text(json.dumps(info_table(objects)))
-    return habitat
-
-
-# Four quads on nine vertices:   6 7 8    two of object 0, a chair, at the left,
-#                                3 4 5    two of object 5, a table, at the right
-#                                0 1 2
-QUADS = [[0, 1, 4, 3], [3, 4, 7, 6], [1, 2, 5, 4], [4, 5, 8, 7]]
-TWO_OBJECTS = [(0, CHAIR), (5, TABLE)]
 
 
 def first_line_of(change: Change, root: Path) -> str:
@@ -227,12 +181,6 @@ def test_an_unknown_class_id_is_void_and_said_but_the_undefined_ones_of_the_rele
     ]
 
 
-def test_conceptgraphs_truth_is_missing_and_says_which_files_it_takes(tmp_path: Path) -> None:
-    write_render(tmp_path)
-    with pytest.raises(GroundTruthMissing, match=r"not read by this version; .*room_0/Sequence_1/saved-maps-gt"):
-        Replica(tmp_path).ground_truth("room0", "conceptgraphs")
-
-
 def test_a_scene_without_original_has_frames_and_no_truth(tmp_path: Path) -> None:
     write_render(tmp_path)
     replica = Replica(tmp_path)
@@ -267,6 +215,15 @@ def camera_without(key: str) -> Change:
 
 def cut(name: str, n_bytes: int) -> Change:
     return lambda folder: (folder / name).write_bytes((folder / name).read_bytes()[:-n_bytes])
+
+
+def flip_byte(name: str) -> Change:
+    def change(folder: Path) -> None:
+        content = bytearray((folder / name).read_bytes())
+        content[len(content) // 2] ^= 1
+        (folder / name).write_bytes(bytes(content))
+
+    return change
 
 
 def image(name: str, array: np.ndarray) -> Change:
@@ -312,6 +269,8 @@ IDENTITY = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
         (camera_with(scale=-1.0), "cam_params.json: 'scale' is -1; it must be above 0"),
         (camera_with(fy="600"), "cam_params.json: 'fy' is '600'; expected a number"),
         (camera_with(cx=float("nan")), "cam_params.json: 'cx' is 'nan'; expected a number"),
+        (camera_with(w=10**400), "cam_params.json: 'w' is '1000000000000000000000000000000000000000'; expected a"),
+        (camera_with(fx=[[]]), "cam_params.json: 'fx' is 'list'; expected a number"),
         (camera_with(cx=100), "cam_params.json: the principal point (100, 3.5) lies outside the image"),
         (camera_with(w=11.5), "cam_params.json: the image size 11.5x8 is not in whole pixels"),
         (camera_without("cy"), "cam_params.json: 'camera' has no 'cy'; expected w, h, fx"),
@@ -393,6 +352,7 @@ def test_each_fault_of_the_truth_is_one_clear_line(tmp_path: Path, change: Chang
         image("Replica/room0/results/depth000001.png", np.ones((HEIGHT, WIDTH), np.uint16)),
         image("Replica/room0/results/frame000002.jpg", np.full((HEIGHT, WIDTH, 3), 9, np.uint8)),
         lambda root: (root / "Replica/room0/results/depth000002.png").unlink(),
+        flip_byte("Replica/room0/results/frame000001.jpg"),
     ],
 )
 def test_the_digest_moves_with_every_file(tmp_path: Path, change: Change) -> None:
@@ -402,6 +362,19 @@ def test_the_digest_moves_with_every_file(tmp_path: Path, change: Change) -> Non
     assert Replica(tmp_path).digest("room0") == before
     change(tmp_path)
     assert Replica(tmp_path).digest("room0") != before
+
+
+def test_the_digest_sees_a_depth_of_equal_size_in_the_middle(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    path = tmp_path / "Replica/room0/results/depth000001.png"
+    digests = set()
+    for change in (0, 1):
+        values = depth_values(1)
+        values[3, 4] += change
+        cv2.imwrite(str(path), values, [cv2.IMWRITE_PNG_COMPRESSION, 0])
+        digests.add((path.stat().st_size, Replica(tmp_path).digest("room0")))
+    (size, _), (other_size, _) = digests
+    assert size == other_size
 
 
 def test_files_are_all_that_is_read(tmp_path: Path) -> None:
@@ -440,3 +413,23 @@ def test_a_flipped_bit_in_a_depth_image_does_not_become_depth(tmp_path: Path, po
     path.write_bytes(bytes(content))
     with pytest.raises(DataError, match=r"depth000001\.png: not a readable PNG image"):
         Replica(tmp_path).frames("room0", 1)[1]
+
+
+@pytest.mark.parametrize(("name", "reader"), [("cam_params.json", read_camera), (TRAJECTORY, read_trajectory)])
+def test_every_truncation_and_damage_is_read_or_refused_in_one_line(
+    tmp_path: Path, name: str, reader: Callable[[Path, str], object]
+) -> None:
+    write_render(tmp_path)
+    path = tmp_path / "Replica" / name
+    content = path.read_bytes()
+
+    def read(damaged: bytes) -> None:
+        path.write_bytes(damaged)
+        reader(path, "replica/room0")
+
+    where = f"replica/room0: {path.name}"
+    # a trajectory of fewer lines or digits is still one; its poses are counted against the frames elsewhere
+    assert sum(outcomes(read, truncations(content), must_name=where)) == len(content)
+    n_read, n_refused = outcomes(read, damages(content), must_name=where)
+    assert n_read + n_refused == 2_000
+    assert min(n_read, n_refused) > 20

@@ -70,16 +70,18 @@ def test_a_made_room_is_a_scene_of_replica_and_the_same_command_again_does_nothi
     words = [*MAKE, "--layout", "replica", "--out", "made"]
     assert main(words) == 0
     said = capsys.readouterr()
-    assert said.out.split() == ["bathroom0", "made"]
+    assert said.out.split() == ["bathroom0", "made", "replica/bathroom0"]
     assert "SU3D_DATA=made su3d-bench run --scenes 'replica/*'" in said.err
     assert len(Replica(tmp_path / "made").frames("bathroom0", 1)) == 3
     assert main([*words, "--json"]) == 0
-    assert json.loads(capsys.readouterr().out)["scenes"] == [{"scene": "bathroom0", "status": "was there already"}]
+    assert json.loads(capsys.readouterr().out)["scenes"] == [
+        {"scene": "bathroom0", "status": "was there already", "address": "replica/bathroom0"}
+    ]
 
 
 def test_native_layout_puts_the_scan_into_the_data_root(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     assert main([*MAKE, "--out", "native"]) == 0
-    assert capsys.readouterr().out.split() == ["bathroom0", "made"]
+    assert capsys.readouterr().out.split() == ["bathroom0", "made", "rooms/bathroom0"]
     assert len(list((tmp_path / "native").rglob("bathroom0.npz"))) == 1
 
 

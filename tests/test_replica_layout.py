@@ -5,102 +5,26 @@ from __future__ import annotations
 import errno
 import json
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 import pytest
+from scanned_stage import CHAIR, N_FRAMES, WALL, Stage, Surface, files_below
 
 from su3d_bench.datasets.ply import ListColumn, read_ply
 from su3d_bench.datasets.replica import Replica
-from su3d_bench.datasets.replica_layout import DEPTH_SCALE, finish_scene, plan_scenes, write_frames, write_scene
+from su3d_bench.datasets.replica_layout import DEPTH_SCALE, ReplicaLayout
 from su3d_bench.datasets.replica_truth import INFO_NAME, MESH_NAME
 from su3d_bench.datasets.rooms import Rooms
+from su3d_bench.datasets.scene_making import ScannedDataset, finish_scene, plan_scenes, write_frames
+from su3d_bench.datasets.scene_making import write_scene as write_scene_in
 from su3d_bench.errors import DataError, StoreError
-from su3d_bench.types import Frame
 
-CHAIR, WALL = 20, 93
-WIDTH, HEIGHT, N_FRAMES = 16, 12, 5
+LAYOUT = ReplicaLayout()
 
 
-@dataclass(frozen=True)
-class Thing:
-    id: int
-    class_id: int
-    class_name: str
-    box_min: tuple[float, float, float]
-    box_max: tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Surface:
-    """A wall of two quads and a chair of one, which touch."""
-
-    vertices: np.ndarray = field(
-        default_factory=lambda: np.array([(x, y, 0.1) for y in (0, 1 / 3) for x in range(4)], np.float32)
-    )
-    normals: np.ndarray = field(default_factory=lambda: np.tile(np.array([0, 0, 1], np.float32), (8, 1)))
-    colours: np.ndarray = field(default_factory=lambda: np.arange(24, dtype=np.uint8).reshape(8, 3))
-    faces: np.ndarray = field(default_factory=lambda: np.array([[0, 1, 5, 4], [1, 2, 6, 5], [2, 3, 7, 6]], np.int32))
-    object_id: np.ndarray = field(default_factory=lambda: np.array([1, 1, 4], np.int32))
-
-
-class Stage:
-    """A dataset of one scene; it counts the frames that it renders and can die at one of them."""
-
-    name = "stage"
-
-    def __init__(self, *, dies_at: int | None = None, kind: str = "plain", width: int = WIDTH) -> None:
-        self.dies_at, self.kind, self.width = dies_at, kind, width
-        self.rendered: list[int] = []
-
-    @property
-    def intrinsics(self) -> np.ndarray:
-        return np.array([[10.5, 0, 7.5], [0, 10.5, 5.5], [0, 0, 1]])
-
-    def digest(self, scene: str) -> str:
-        return f"{self.kind} {scene}"
-
-    def objects(self, scene: str) -> Sequence[Thing]:
-        return (
-            Thing(1, WALL, "wall", (0, 0, 0.1), (2, 1 / 3, 0.1)),
-            Thing(4, CHAIR, "chair", (2, 0, 0.1), (3, 1 / 3, 0.1)),
-        )
-
-    def trajectory(self, scene: str) -> np.ndarray:
-        poses = np.tile(np.eye(4), (N_FRAMES, 1, 1))
-        poses[:, :3, 3] = np.random.default_rng(7).normal(size=(N_FRAMES, 3))
-        return poses
-
-    def frames(self, scene: str, stride: int) -> Sequence[Frame]:
-        return StageFrames(self, scene)
-
-    def scan(self, scene: str) -> Surface:
-        return Surface()
-
-
-class StageFrames(Sequence[Frame]):
-    def __init__(self, stage: Stage, scene: str) -> None:
-        self.stage, self.poses = stage, stage.trajectory(scene)
-
-    def __len__(self) -> int:
-        return N_FRAMES
-
-    def __getitem__(self, index: int) -> Frame:  # type: ignore[override]
-        if index == self.stage.dies_at:
-            raise KeyboardInterrupt
-        self.stage.rendered.append(index)
-        across = np.linspace(0, 1, self.stage.width)
-        depth_m = np.tile(0.5 + 9 * across + index / 7, (HEIGHT, 1)).astype(np.float32)
-        depth_m[0, 0], depth_m[0, 1] = 0.0, 10.5
-        rgb = np.repeat((40 + 150 * np.tile(across, (HEIGHT, 1)))[..., None], 3, 2).astype(np.uint8)
-        rgb[..., 2] = 10 * index
-        return Frame(index, index / 30, rgb, depth_m, self.poses[index], self.stage.intrinsics)
-
-
-def files_below(folder: Path) -> set[str]:
-    return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+def write_scene(dataset: ScannedDataset, scene: str, out: Path) -> None:
+    write_scene_in(LAYOUT, dataset, scene, out)
 
 
 def test_the_tree_is_that_of_replica_and_nothing_else(tmp_path: Path) -> None:
@@ -274,10 +198,10 @@ def test_a_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     def full(handle: int) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    targets = plan_scenes(Stage(), ["room7"], tmp_path)
+    targets = plan_scenes(LAYOUT, Stage(), ["room7"], tmp_path)
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(StoreError, match=r"cannot write .*frame000000\.jpg: the disk is full; free some space"):
-        write_frames(Stage(), targets[0], range(N_FRAMES))
+        write_frames(LAYOUT, Stage(), targets[0], range(N_FRAMES))
     assert not [name for name in files_below(tmp_path) if name.endswith(".tmp")]
 
 
@@ -288,9 +212,9 @@ def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:
 
 
 def test_a_move_that_fails_is_one_line(tmp_path: Path) -> None:
-    target = plan_scenes(Stage(), ["room7"], tmp_path)[0]
+    target = plan_scenes(LAYOUT, Stage(), ["room7"], tmp_path)[0]
     with pytest.raises(StoreError, match=r"cannot write .*room7: No such file"):
-        finish_scene(target)
+        finish_scene(LAYOUT, Stage(), target)
 
 
 def test_object_ids_beyond_sixteen_bits_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

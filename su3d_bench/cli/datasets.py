@@ -1,4 +1,4 @@
-"""``su3d-bench datasets``: what is here, and making what is not."""
+"""``su3d-bench datasets``: what is here, whether it is whole, how it looks, and making what is not."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from typing import Any
 from su3d_bench.cli.flags import add_verb, answer, answer_json
 from su3d_bench.errors import EXIT_DONE, DataError, Su3dError
 
-LAYOUTS = ("native", "replica")
+LAYOUTS = ("native", "replica", "scannet", "scannet-python", "scannet-cpp", "tum")
 MAX_LISTED = 40
 
 
 def add_parser(verbs: Any) -> None:
     parser = verbs.add_parser(
         "datasets",
-        help="list the datasets and their scenes, or make rooms on disk",
-        description="List the datasets and their scenes, or make rooms on disk.",
+        help="list the datasets and their scenes, check or show scenes, or make rooms on disk",
+        description="List the datasets and their scenes, check or show scenes, or make rooms on disk.",
         epilog="examples:\n  su3d-bench datasets list\n"
         "  su3d-bench datasets make rooms --scenes rooms/living0 --layout replica --out data",
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    actions = parser.add_subparsers(dest="action", metavar="list|make", required=True)
+    actions = parser.add_subparsers(dest="action", metavar="list|check|show|make", required=True)
     add_verb(
         actions,
         "list",
@@ -31,7 +31,58 @@ def add_parser(verbs: Any) -> None:
         ("su3d-bench datasets list", "su3d-bench datasets list --json"),
         call_list,
     )
+    _add_check(actions)
+    _add_show(actions)
     _add_make(actions)
+
+
+def _add_check(actions: Any) -> None:
+    parser = add_verb(
+        actions,
+        "check",
+        "Look at every file and frame of scenes, name all that is wrong, and tell the digest that results carry.",
+        (
+            "su3d-bench datasets check 'replica/*'",
+            "su3d-bench datasets check rooms/living0 --set rooms.n_frames=40 --json",
+        ),
+        call_check,
+    )
+    parser.add_argument("scenes", nargs="+", metavar="SCENE", help="addresses or patterns, such as 'replica/*'")
+    parser.add_argument(
+        "--quick",
+        action="store_true",
+        help="read 20 evenly spaced frames of each scene, as is always done where scenes are made on demand",
+    )
+    parser.add_argument("--jobs", type=int, metavar="N", help="frames read side by side (default: the CPU cores)")
+    _add_options(parser)
+
+
+def _add_show(actions: Any) -> None:
+    parser = add_verb(
+        actions,
+        "show",
+        "Draw a scene: the walk seen from above, some frames, and the ground truth by class and by instance.",
+        (
+            "su3d-bench datasets show rooms/living0 --set rooms.n_frames=40",
+            "su3d-bench datasets show replica/room0 --out room0.png --stride 50",
+        ),
+        call_show,
+    )
+    parser.add_argument("scene", metavar="SCENE", help="the scene's address, such as rooms/living0")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="the PNG to write (default: DATASET-SCENE.png here)")
+    parser.add_argument("--stride", type=int, metavar="N", help="draw every Nth camera (default: 48 cameras in all)")
+    _add_options(parser)
+
+
+def _add_options(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--set",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="KEY=VALUE",
+        help="an option of a dataset, such as rooms.n_frames=40",
+    )
 
 
 def _add_make(actions: Any) -> None:
@@ -41,7 +92,7 @@ def _add_make(actions: Any) -> None:
         "Make scenes on disk, whole or not at all; the same command again takes up what a killed one left.",
         (
             "su3d-bench datasets make rooms --layout replica --out data --scenes 'rooms/*'",
-            "su3d-bench datasets make rooms --layout replica --out small --scenes living0 --set n_frames=200",
+            "su3d-bench datasets make rooms --layout scannet --out small --scenes living0 --set n_frames=200",
         ),
         call_make,
     )
@@ -52,7 +103,10 @@ def _add_make(actions: Any) -> None:
         choices=LAYOUTS,
         default="native",
         help="native: the scans that the dataset keeps in its data root, frames are rendered when asked for; "
-        "replica: every file of Replica, the render and the original release, about 300 MB a room (default: native)",
+        "replica: every file of Replica, the render and the original release, about 300 MB a room; scannet: scans with "
+        ".sens, mesh and annotation; scannet-python, scannet-cpp: the same, frames as ScanNet's readers export them "
+        "(C++: about 1 GB a room); "
+        "tum: the RGB-D benchmark, without ground truth (default: native)",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="the data root to make (native: default $SU3D_DATA)")
     parser.add_argument(
@@ -120,6 +174,24 @@ def _lines(row: dict[str, Any]) -> list[str]:
     lines += [f"  {one['scene']:<{width}}  {one['status']}" for one in scenes]
     n_more = len(row["scenes"]) - len(scenes)
     return [*lines, f"  and {n_more} more; --json lists all"] if n_more else lines
+
+
+def call_check(arguments: argparse.Namespace) -> int:
+    from su3d_bench.executors import limit_threads
+
+    limit_threads()  # before numerical libraries are loaded
+    from su3d_bench.cli.datasets_check import check
+
+    return check(arguments)
+
+
+def call_show(arguments: argparse.Namespace) -> int:
+    from su3d_bench.executors import limit_threads
+
+    limit_threads()
+    from su3d_bench.cli.datasets_show import show
+
+    return show(arguments)
 
 
 def call_make(arguments: argparse.Namespace) -> int:

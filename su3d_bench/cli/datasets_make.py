@@ -16,7 +16,8 @@ from typing import Any, NoReturn
 from su3d_bench import registry
 from su3d_bench.cli.flags import answer, answer_json, remark
 from su3d_bench.config import read_assignments, resolve
-from su3d_bench.datasets.replica_layout import SceneTarget, finish_scene, plan_scenes, write_frames, write_truth
+from su3d_bench.datasets.layouts import LAYOUTS
+from su3d_bench.datasets.scene_making import SceneTarget, finish_scene, plan_scenes, write_frames
 from su3d_bench.errors import EXIT_DONE, ConfigError, DataError, suggest
 from su3d_bench.executors import Event, Report, run_inline, run_processes
 from su3d_bench.planning import data_root, expand_scenes
@@ -29,11 +30,15 @@ WHAT_A_LAYOUT_TAKES = ("scan", "objects", "trajectory", "intrinsics")
 
 @dataclass(frozen=True)
 class Unit:
-    """A piece of work: the frames at ``indices``, or (None) the truth; without ``target`` the scan alone."""
+    """A piece of work: the frames at ``indices``, or (None) the truth; without ``target`` the scan alone.
+
+    ``layout`` is the name of one; units go to other processes.
+    """
 
     dataset: Part
     root: Path
     scene: str
+    layout: str
     target: SceneTarget | None
     indices: range | None
 
@@ -54,14 +59,21 @@ def make(arguments: argparse.Namespace) -> int:
     out = arguments.out or data_root()
     make_folder(out)
     with RunFolder(out).locked():
-        made = _make_native(part, scenes, out, arguments) if is_native else _make_replica(part, scenes, out, arguments)
-    rows = [{"scene": scene, "status": "made" if scene in made else "was there already"} for scene in scenes]
+        made = _make_native(part, scenes, out, arguments) if is_native else _make_files(part, scenes, out, arguments)
+    reader = part.name if is_native else LAYOUTS[arguments.layout].reader
+    rows = [
+        {
+            "scene": scene,
+            "status": "made" if scene in made else "was there already",
+            "address": f"{reader}/{scene if is_native else LAYOUTS[arguments.layout].scene_name(scene)}",
+        }
+        for scene in scenes
+    ]
     if arguments.json:
         answer_json({"out": str(out), "layout": arguments.layout, "scenes": rows})
     else:
-        answer("\n".join(f"{row['scene']:<16} {row['status']}" for row in rows))
-    name = part.name if is_native else "replica"
-    remark(f"to use them: SU3D_DATA={out} su3d-bench run --scenes '{name}/*'", quiet=arguments.quiet)
+        answer("\n".join(f"{row['scene']:<16} {row['status']:<17} {row['address']}" for row in rows))
+    remark(f"to use them: SU3D_DATA={out} su3d-bench run --scenes '{reader}/*'", quiet=arguments.quiet)
     return EXIT_DONE
 
 
@@ -88,26 +100,26 @@ def _scenes(part: Part, asked: Sequence[str] | None) -> list[str]:
 
 
 def _make_native(part: Part, scenes: Sequence[str], out: Path, arguments: argparse.Namespace) -> set[str]:
-    units = [Unit(part, out, scene, None, None) for scene in scenes]
+    units = [Unit(part, out, scene, arguments.layout, None, None) for scene in scenes]
     _run(units, arguments, lambda unit: None)
     return set(scenes)
 
 
-def _make_replica(part: Part, scenes: Sequence[str], out: Path, arguments: argparse.Namespace) -> set[str]:
-    dataset = build_dataset(part, data_root())
+def _make_files(part: Part, scenes: Sequence[str], out: Path, arguments: argparse.Namespace) -> set[str]:
+    layout, dataset = LAYOUTS[arguments.layout], build_dataset(part, data_root())
     units = []
-    for target in plan_scenes(dataset, scenes, out):
+    for target in plan_scenes(layout, dataset, scenes, out):
         n_frames = dataset.info(target.scene, 1).n_frames
         starts = range(0, n_frames, FRAMES_A_UNIT)
         pieces = [range(start, min(start + FRAMES_A_UNIT, n_frames)) for start in starts]
-        units += [Unit(part, data_root(), target.scene, target, piece) for piece in (*pieces, None)]
+        units += [Unit(part, data_root(), target.scene, layout.name, target, piece) for piece in (*pieces, None)]
     n_open = Counter(unit.scene for unit in units)
 
     def count_down(unit: Unit) -> None:
         n_open[unit.scene] -= 1
         if n_open[unit.scene] == 0:
             assert unit.target is not None
-            finish_scene(unit.target)
+            finish_scene(layout, dataset, unit.target)
 
     _run(units, arguments, count_down)
     return set(n_open)
@@ -130,10 +142,14 @@ def _work(unit: Unit, report: Report) -> Unit:
     if unit.target is None:
         dataset.scan(unit.scene)
     elif unit.indices is None:
-        write_truth(dataset, unit.target)
+        LAYOUTS[unit.layout].write_truth(dataset, unit.target)
     else:
-        n = unit.n_steps
-        write_frames(dataset, unit.target, unit.indices, lambda n_done: report(Event(unit.scene, label, n_done, n)))
+        layout, n = LAYOUTS[unit.layout], unit.n_steps
+
+        def count(n_done: int) -> None:
+            report(Event(unit.scene, label, n_done, n))
+
+        write_frames(layout, dataset, unit.target, unit.indices, count)
     report(Event(unit.scene, label, unit.n_steps, unit.n_steps))
     return unit
 

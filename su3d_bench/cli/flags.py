@@ -6,13 +6,23 @@ import argparse
 import json
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 
 def add_verb(
-    verbs: Any, name: str, summary: str, examples: tuple[str, str], call: Callable[[argparse.Namespace], int]
+    verbs: Any,
+    name: str,
+    summary: str,
+    examples: tuple[str, str],
+    call: Callable[[argparse.Namespace], int],
+    *,
+    json_to_file: bool = False,
 ) -> argparse.ArgumentParser:
-    """A verb's parser: help that ends with two examples, ``--json``, ``--quiet`` and ``--debug``."""
+    """A verb's parser: help that ends with two examples, ``--json``, ``--quiet`` and ``--debug``.
+
+    ``json_to_file``: ``--json`` takes a file to write the answer to, instead of answering in JSON.
+    """
     parser: argparse.ArgumentParser = verbs.add_parser(
         name,
         help=summary[:1].lower() + summary[1:].rstrip("."),
@@ -21,7 +31,10 @@ def add_verb(
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.set_defaults(call=call)
-    parser.add_argument("--json", action="store_true", help="answer in JSON")
+    if json_to_file:
+        parser.add_argument("--json", type=Path, metavar="FILE", help="write the answer to a JSON file too")
+    else:
+        parser.add_argument("--json", action="store_true", help="answer in JSON")
     parser.add_argument("--quiet", action="store_true", help="no progress and no remarks on stderr")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return parser

@@ -10,8 +10,11 @@ from su3d_bench.executors import SCENE_DONE, Event, Report
 
 
 @contextmanager
-def progress(n_scenes: int, *, is_quiet: bool) -> Iterator[Report]:
-    """A ``Report`` that draws bars while the block runs; it draws nothing where stderr is no terminal."""
+def progress(n_scenes: int, *, is_quiet: bool, last_step: str = "scoring") -> Iterator[Report]:
+    """A ``Report`` that draws bars while the block runs; it draws nothing where stderr is no terminal.
+
+    ``last_step`` is what a scene does after its last frame.
+    """
     if is_quiet or not sys.stderr.isatty():
         yield lambda event: None
         return
@@ -26,18 +29,19 @@ def progress(n_scenes: int, *, is_quiet: bool) -> Iterator[Report]:
         TimeElapsedColumn(),
     )
     with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
-        board = _Board(bars, n_scenes)
+        board = _Board(bars, n_scenes, last_step)
         yield board.report
 
 
 class _Board:
     """Turns events into bars: one for all scenes, one for the current method of each scene under way."""
 
-    def __init__(self, bars: object, n_scenes: int) -> None:
+    def __init__(self, bars: object, n_scenes: int, last_step: str) -> None:
         from rich.progress import Progress, TaskID
 
         assert isinstance(bars, Progress)
         self._bars = bars
+        self._last_step = last_step
         self._scenes = bars.add_task("scenes", total=n_scenes, remark="")
         self._tasks: dict[tuple[str, str], TaskID] = {}
 
@@ -54,7 +58,7 @@ class _Board:
         task = self._tasks[key]
         self._bars.update(task, completed=event.done, remark=self._remark(event))
         if event.done == event.total:
-            self._bars.update(task, description=f"  {event.unit} {event.label}: scoring")
+            self._bars.update(task, description=f"  {event.unit} {event.label}: {self._last_step}")
 
     def _remark(self, event: Event) -> str:
         speed = self._bars.tasks[0].speed

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import re
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.flags import add_verb, answer, answer_json
@@ -12,6 +14,11 @@ if TYPE_CHECKING:
     from su3d_bench.protocols import ProtocolRules
 
 ACTIONS = ("list", "show")
+HEADING = ""  # stands for the comments above the first rule of a file
+_KEY = re.compile(r"(\w+)\s*=")
+_SECTION = re.compile(r"\[(\w+)\]")
+_COMMENT = re.compile(r"""(?:[^"'#]|"[^"]*"|'[^']*')*#\s*(.*)""")
+_ABSENT = re.compile(r"no (\w+)")
 
 
 def add_parser(verbs: Any) -> None:
@@ -27,7 +34,7 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.protocols import load_protocol, protocol_names
+    from su3d_bench.protocols import load_protocol, protocol_names, rules_file
 
     if arguments.action not in ACTIONS:
         hint = suggest(arguments.action, ACTIONS) or "; known: list, show NAME"
@@ -39,7 +46,7 @@ def call(arguments: argparse.Namespace) -> int:
         if arguments.json:
             answer_json(rules.model_dump(mode="json") | {"digest": rules.digest})
         else:
-            answer(_rules_text(rules))
+            answer(_rules_text(rules, rules_file(arguments.name)))
         return 0
     rows = [load_protocol(name) for name in protocol_names()]
     if arguments.json:
@@ -51,17 +58,54 @@ def call(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _rules_text(rules: ProtocolRules) -> str:
-    """Every rule as a line; the sources stand beside the lines of the protocol's own file."""
+def _rules_text(rules: ProtocolRules, file: Path) -> str:
+    """Every rule as a line, beneath it what the protocol's file says of it: its source, or that it is ours."""
     from su3d_bench.config import flatten
+    from su3d_bench.protocols import not_comparable_with
     from su3d_bench.toml_text import toml_value
 
-    lines = []
-    for path, value in flatten(rules.model_dump(mode="json", exclude={"classes"})):
-        lines.append(f"{'.'.join(path):<26} {'none' if value is None else toml_value(value)}")
-    lines.append(f"{'digest':<26} {rules.digest}")
-    lines.append(f"\n{len(rules.scored)} of {len(rules.classes)} classes are scored (id, name, group):")
+    remarks = read_remarks(file)
+    shown = rules.model_dump(mode="json", exclude={"classes"}) | {"not_comparable_with": not_comparable_with(rules)}
+    lines = [*remarks.pop(HEADING, []), ""]
+    for path, value in flatten(shown):
+        key = ".".join(path)
+        lines.append(f"{key:<28} {'none' if value is None else toml_value(value)}")
+        lines += [f"    {remark}" for remark in remarks.pop(key, [])]
+    lines += [f"    {remark}" for key in remarks if key != "classes" for remark in remarks[key]]
+    lines.append(f"{'digest':<28} {rules.digest}")
+    if rules.classes:
+        lines.append(f"\n{len(rules.scored)} of {len(rules.classes)} classes are scored (id, name, group):")
+        lines += [f"    {remark}" for remark in remarks.get("classes", [])]
     for entry in rules.classes:
         remark = "" if entry in rules.scored else "  (ignored)"
         lines.append(f"{entry.id:>6}  {entry.name}{f'  {entry.group}' if entry.group else ''}{remark}")
     return "\n".join(lines)
+
+
+def read_remarks(file: Path) -> dict[str, list[str]]:
+    """The comments of a protocol's file by the rule that they stand at or above, the first ones as its heading.
+
+    A comment ``no cap_m ...`` speaks of the rule that it names; comments with no rule after them belong to their
+    section.
+    """
+    from su3d_bench.protocols import ProtocolRules, TransferRules
+
+    remarks: dict[str, list[str]] = {}
+    section, waiting, has_key = "", list[str](), False
+    for line in file.read_text(encoding="utf-8").splitlines():
+        found = _COMMENT.match(line)
+        comment = [found[1]] if found is not None else []
+        key, header = _KEY.match(line), _SECTION.match(line)
+        if key or header:
+            name = section + key[1] if key else header[1] if header else ""
+            remarks.setdefault(name if has_key else HEADING, []).extend(waiting)
+            remarks.setdefault(name, []).extend(comment)
+            waiting, has_key = [], True
+            section = f"{header[1]}." if header else section
+        elif comment:
+            absent = _ABSENT.match(comment[0])
+            fields = TransferRules.model_fields if section else ProtocolRules.model_fields
+            names_one = absent is not None and absent[1] in fields
+            (remarks.setdefault(section + absent[1], []) if absent and names_one else waiting).extend(comment)
+    remarks.setdefault(section.rstrip(".") or HEADING, []).extend(waiting)
+    return remarks

@@ -55,7 +55,7 @@ def call(arguments: argparse.Namespace) -> int:
     prediction = read_prediction(job.prediction)
     if not isinstance(prediction, Instances):
         raise PredictionError(f"{job.prediction}: holds no instances, so there is nothing to rank")
-    ranking = rank(prediction, arguments.text, _encoder(run))
+    ranking = rank(prediction, arguments.text, encoder_of(run))
     rows = _rows(prediction, ranking, arguments.top)
     picture = arguments.out or job.pictures / f"query-{_file_name(arguments.text)}.png"
     lines = [f"{row['rank']}. {row['name']}  {row['similarity']:.3f}" for row in rows]
@@ -104,7 +104,7 @@ def _advice(arguments: argparse.Namespace) -> str:
     return f"run: su3d-bench run --scenes {arguments.scene} --methods {arguments.method} --out {arguments.run}"
 
 
-def _encoder(run: RunFolder) -> Encoder:
+def encoder_of(run: RunFolder) -> Encoder:
     """The text tower that the run's features go with; another version of it is an error, never a wrong ranking."""
     from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
     from su3d_bench.store import read_json

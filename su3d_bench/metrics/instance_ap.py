@@ -149,7 +149,7 @@ def per_scene(
     size = np.diff(indptr)
     prediction_class = np.array([class_of.get(int(label), -1) for label in labels], np.int64)
     kept = np.flatnonzero((prediction_class >= 0) & (size >= min_region_size))
-    intersection = _intersections(segment_of_point, len(segment_value), indptr, indices, kept)
+    intersection = intersections(segment_of_point, len(segment_value), indptr, indices, kept)
     n_void = intersection[:, segment_class < 0].sum(axis=1)
 
     parts = []
@@ -160,7 +160,7 @@ def per_scene(
         shared = intersection[np.ix_(rows, columns)]
         is_small = segment_size[columns] < min_region_size
         parts.append(
-            _count_class(
+            count_class(
                 c,
                 iou=shared / (segment_size[columns][None, :] + n_points[:, None] - shared),
                 takes_part=~is_small,
@@ -181,7 +181,7 @@ def per_scene(
     )
 
 
-def _count_class(
+def count_class(
     class_index: int,
     iou: Float64Array,
     takes_part: BoolArray,
@@ -350,7 +350,7 @@ def _segments(ground_truth: IntArray) -> tuple[Int64Array, Int64Array, Int64Arra
     return row_of_value[ground_truth], values, n_points_of_value[values]
 
 
-def _intersections(
+def intersections(
     segment_of_point: Int64Array, n_segments: int, indptr: IntArray, indices: IntArray, kept: Int64Array
 ) -> Int64Array:
     """Points that prediction ``kept[r]`` shares with each segment, (R, n_segments), by one bincount."""

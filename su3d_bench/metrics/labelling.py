@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
 from su3d_bench.errors import PredictionError
 from su3d_bench.protocols import ProtocolRules
-from su3d_bench.types import BoolArray, Encoder, Float64Array, Int64Array, Prediction
+from su3d_bench.types import BoolArray, Encoder, Float32Array, Float64Array, Int64Array, Prediction
 
 _BLOCK_ROWS = 8192  # 34 MB of float64 at 512 dimensions, whatever the size of the map
+
+
+def scored_classes(rules: ProtocolRules) -> BoolArray:
+    """Which classes of the label set count (C,)."""
+    return np.array([not rules.is_ignored(entry.name) for entry in rules.classes], bool)
 
 
 def candidate_classes(rules: ProtocolRules, is_present: BoolArray) -> Int64Array:
     """Indices of the classes among which the classifier may choose in a scene that contains ``is_present`` (C,)."""
     if rules.vocabulary == "all":
         return np.arange(len(rules.classes))
-    is_scored = np.array([not rules.is_ignored(entry.name) for entry in rules.classes])
+    is_scored = scored_classes(rules)
     return np.flatnonzero(is_scored & is_present if rules.vocabulary == "scene" else is_scored)
 
 
@@ -44,13 +51,44 @@ def classes_of_prediction(
         raise PredictionError(f"{rules.name}: the prediction has features, but there is no encoder to name them with")
     if not len(candidates) or not len(features):
         return np.full(len(features), -1, np.int64)
-    text = encoder.encode_texts([rules.prompt_of(rules.classes[index].name) for index in candidates])
-    if text.shape[1] != features.shape[1]:
+    text = text_features(rules, [rules.classes[index].name for index in candidates], features, encoder)
+    return candidates[most_similar(features, text)]
+
+
+def text_features(
+    rules: ProtocolRules, names: Sequence[str], features: NDArray[Any], encoder: Encoder
+) -> Float32Array | Float64Array:
+    """The feature (C, D) of each name: of its prompt, or the mean of the normalised features of its prompts.
+
+    Raises ``PredictionError`` where ``features`` (K, D) come from an encoder of other dimensions.
+    """
+    texts = [rules.texts_of(name) for name in names]
+    encoded = encoder.encode_texts([text for of_name in texts for text in of_name])
+    if encoded.shape[1] != features.shape[1]:
         raise PredictionError(
             f"{rules.name}: features have {features.shape[1]} dimensions, the encoder '{encoder.name}' has "
-            f"{text.shape[1]}; name them with the encoder that made them"
+            f"{encoded.shape[1]}; name them with the encoder that made them"
         )
-    return candidates[most_similar(features, text)]
+    n_prompts = len(texts[0])
+    if n_prompts == 1:
+        return encoded
+    directions = _normalised(np.asarray(encoded, np.float64))
+    mean: Float64Array = directions.reshape(len(names), n_prompts, -1).mean(axis=1)
+    return mean
+
+
+def cosines(features: NDArray[Any], text: NDArray[Any]) -> Float64Array:
+    """The cosine (K, C) of each row of ``features`` with each row of ``text``, 0 where either has no direction.
+
+    >>> cosines(np.array([[0.0, 2.0], [0.0, 0.0]]), np.array([[1.0, 0.0], [0.0, 3.0]])).tolist()
+    [[0.0, 1.0], [0.0, 0.0]]
+    """
+    # one thread: the last bit of a cosine may not depend on the machine's number of cores
+    with threadpool_limits(1, user_api="blas"):
+        product: Float64Array = (
+            _normalised(np.asarray(features, np.float64)) @ _normalised(np.asarray(text, np.float64)).T
+        )
+    return product
 
 
 def most_similar(features: np.ndarray, text: np.ndarray) -> Int64Array:

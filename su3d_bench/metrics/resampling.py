@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal
 
 import numpy as np
 
 from su3d_bench.metrics.instance_ap import THRESHOLDS, InstanceCounts, ap_columns
 from su3d_bench.metrics.semantic import SemanticCounts
-from su3d_bench.types import Float64Array, Int64Array
+from su3d_bench.types import BoolArray, Float64Array, Int64Array
 
 _MAX_CELLS = 4_000_000  # of a (resamples, rows) block: 32 MB of float64
 
@@ -71,12 +70,12 @@ def _weighted_areas(
 
 
 def resampled_semantic(
-    counts: Sequence[SemanticCounts], weights: Int64Array, metric: Literal["conceptgraphs", "scannet"]
+    counts: Sequence[SemanticCounts], weights: Int64Array, metric: str, is_scored: BoolArray | None = None
 ) -> dict[str, Float64Array]:
     """mAcc, mIoU and F-mIoU (R,) of the pooled confusion of the scenes drawn ``weights`` (R, S) times.
 
     Classes that are true somewhere in the drawn scenes count; under ``scannet`` those that are only predicted join the
-    mean IoU with 0.
+    mean IoU with 0. Where the confusion matrices hold ignored classes too, ``is_scored`` (C,) marks the others.
 
     >>> a = SemanticCounts(np.array([[4, 0, 0], [0, 0, 0]]), np.array([True, True]))
     >>> b = SemanticCounts(np.array([[0, 0, 0], [1, 1, 0]]), np.array([True, True]))
@@ -88,10 +87,12 @@ def resampled_semantic(
     hit = drawn @ np.stack([np.diag(c.confusion[:, :n_classes]) for c in counts]).astype(np.float64)
     n_true = drawn @ np.stack([c.confusion.sum(axis=1) for c in counts]).astype(np.float64)
     n_predicted = drawn @ np.stack([c.confusion[:, :n_classes].sum(axis=0) for c in counts]).astype(np.float64)
+    if is_scored is not None:
+        hit, n_true, n_predicted = hit[:, is_scored], n_true[:, is_scored], n_predicted[:, is_scored]
     counted = n_true > 0
     recall = np.where(counted, hit / np.maximum(n_true, 1), np.nan)
     union = n_true + n_predicted - hit
-    has_iou = counted if metric == "conceptgraphs" else union > 0
+    has_iou = union > 0 if metric == "scannet" else counted
     iou = np.where(has_iou, hit / np.maximum(union, 1), np.nan)
     n_points = n_true.sum(axis=1)
     weighted = (n_true * np.nan_to_num(iou)).sum(axis=1) / np.maximum(n_points, 1)

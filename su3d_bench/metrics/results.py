@@ -9,12 +9,15 @@ from typing import Any, cast
 
 import numpy as np
 
-from su3d_bench.metrics import instance_ap, resampling, semantic
-from su3d_bench.protocols import ProtocolRules
+from su3d_bench.metrics import instance_ap, object_means, resampling, semantic
+from su3d_bench.metrics.labelling import scored_classes
+from su3d_bench.protocols import AP_NAMES, VALUES_OF_METRIC, ProtocolRules
 from su3d_bench.statistics import percentile_interval, resample_weights
 from su3d_bench.types import Float64Array, Int64Array
 
-Counts = instance_ap.InstanceCounts | semantic.SemanticCounts
+Counts = instance_ap.InstanceCounts | semantic.SemanticCounts | object_means.ObjectCounts
+CURVE_KINDS = ("instance", "queries")  # their counts are those of a precision-recall curve
+GROUP_COLUMNS = {"mAcc": "recall", "mIoU": "IoU"}  # what a group of classes is called by, and what it averages
 
 
 @dataclass(frozen=True)
@@ -77,6 +80,7 @@ def form_result(
         scene: metric_values(rules, [count], pooled=False) for scene, count in zip(scenes, counts, strict=True)
     }
     scene_mean = {key: semantic.nan_mean(np.array([row[key] for row in per_scene.values()])) for key in pooled}
+    per_class = _class_values(rules, counts)
     weights = resample_weights(len(scenes))
     if rules.aggregate == "pooled":
         metrics, resampled = pooled, _resampled(rules, counts, weights)
@@ -93,8 +97,8 @@ def form_result(
         scene_mean=scene_mean,
         intervals={key: percentile_interval(resampled[key]) if len(scenes) > 1 else None for key in rules.headline},
         per_scene=per_scene,
-        per_class=_class_values(rules, counts),
-        groups=_group_values(rules, counts),
+        per_class=per_class,
+        groups=_group_values(rules, counts, per_class),
         coverage=coverage,
         n_predictions=n_predictions,
         warnings=(*warnings, *_warnings(rules, counts)),
@@ -107,14 +111,18 @@ def metric_values(rules: ProtocolRules, counts: Sequence[Counts], *, pooled: boo
     ConceptGraphs' rows differ: the pooled one averages over the classes that have scored points, that of a scene over
     the classes that its ground truth contains.
     """
-    if rules.kind == "instance":
+    if rules.kind in CURVE_KINDS:
         ap = instance_ap.combine(cast("Sequence[instance_ap.InstanceCounts]", counts), rules.thresholds)
         return {"AP": ap.ap, "AP50": ap.ap50, "AP25": ap.ap25}
+    if rules.kind == "categories":
+        means = object_means.combine(cast("Sequence[object_means.ObjectCounts]", counts))
+        return dict(zip(VALUES_OF_METRIC[rules.metric], means.tolist(), strict=True))
     metrics = _semantic_metrics(rules, counts, pooled=pooled)
     return {
         "mAcc": metrics.mean_accuracy,
         "mIoU": metrics.mean_iou,
         "F-mIoU": metrics.frequency_weighted_iou,
+        **({"pAcc": metrics.point_accuracy} if rules.metric == "hovsg" else {}),
         "mPrecision": metrics.mean_precision,
         "mF1": metrics.mean_f1,
         "mF1-conceptgraphs": metrics.mean_f1_conceptgraphs,
@@ -125,31 +133,35 @@ def metric_values(rules: ProtocolRules, counts: Sequence[Counts], *, pooled: boo
 
 def _semantic_metrics(rules: ProtocolRules, counts: Sequence[Counts], *, pooled: bool) -> semantic.SemanticMetrics:
     whole = semantic.concatenate(cast("Sequence[semantic.SemanticCounts]", counts))
+    if rules.metric == "hovsg":
+        return semantic.hovsg_metrics(whole.confusion, scored_classes(rules))
     if rules.metric == "scannet":
-        scored = [index for index, entry in enumerate(rules.classes) if not rules.is_ignored(entry.name)]
-        return semantic.scannet_metrics(_keep_columns(whole.confusion, np.array(scored))[scored])
+        scored = np.flatnonzero(scored_classes(rules))
+        return semantic.scannet_metrics(_keep_columns(whole.confusion, scored)[scored])
     has_points = whole.confusion.sum(axis=1) > 0
     keep = np.flatnonzero(has_points if pooled else whole.is_present)
-    folded = np.zeros_like(whole.confusion)
-    folded[:, [*keep, -1]] = _keep_columns(whole.confusion, keep)
+    confusion = whole.confusion.copy()
+    if pooled:
+        # Of a class that a ground-truth cloud has and no scored point, the original slices away what was called so
+        confusion[:, np.flatnonzero(whole.is_present & ~has_points)] = 0
+    folded = np.zeros_like(confusion)
+    folded[:, [*keep, -1]] = _keep_columns(confusion, keep)
     return semantic.conceptgraphs_metrics(folded, keep)
 
 
 def _keep_columns(confusion: Int64Array, keep: Int64Array) -> Int64Array:
-    """The columns ``keep`` and a last one with all others: a point called anything else is called wrongly.
-
-    The original slices other columns away; there, its classifier cannot choose them.
-    """
+    """The columns ``keep`` and a last one with all others: a point called anything else is called wrongly."""
     n_elsewhere = confusion.sum(axis=1) - confusion[:, keep].sum(axis=1)
     return np.concatenate([confusion[:, keep], n_elsewhere[:, None]], axis=1)
 
 
 def _class_values(rules: ProtocolRules, counts: Sequence[Counts]) -> dict[str, dict[str, float]]:
-    if rules.kind == "instance":
+    if rules.kind == "categories":
+        return {}
+    if rules.kind in CURVE_KINDS:
         ap = instance_ap.combine(cast("Sequence[instance_ap.InstanceCounts]", counts), rules.thresholds)
         return {
-            entry.name: dict(zip(("AP", "AP50", "AP25"), ap.of_class(index), strict=True))
-            for index, entry in enumerate(rules.scored)
+            name: dict(zip(AP_NAMES, ap.of_class(index), strict=True)) for index, name in enumerate(rules.curve_names)
         }
     metrics = _semantic_metrics(rules, counts, pooled=True)
     names = rules.scored if rules.metric == "scannet" else rules.classes
@@ -165,20 +177,37 @@ def _class_values(rules: ProtocolRules, counts: Sequence[Counts]) -> dict[str, d
     }
 
 
-def _group_values(rules: ProtocolRules, counts: Sequence[Counts]) -> dict[str, dict[str, float]]:
+def _group_values(
+    rules: ProtocolRules, counts: Sequence[Counts], per_class: Mapping[str, Mapping[str, float]]
+) -> dict[str, dict[str, float]]:
+    """The mean of each group over those of its classes that have a value, all scenes pooled."""
     names = list(dict.fromkeys(entry.group for entry in rules.scored if entry.group))
-    if rules.kind != "instance" or not names:
+    if rules.class_agnostic is not None or not names:
         return {}
-    ap = instance_ap.combine(cast("Sequence[instance_ap.InstanceCounts]", counts), rules.thresholds)
-    members = {name: [i for i, entry in enumerate(rules.scored) if entry.group == name] for name in names}
-    return {name: dict(zip(("AP", "AP50", "AP25"), ap.of_group(members[name]), strict=True)) for name in names}
+    if rules.kind == "instance":
+        ap = instance_ap.combine(cast("Sequence[instance_ap.InstanceCounts]", counts), rules.thresholds)
+        members = {name: [i for i, entry in enumerate(rules.scored) if entry.group == name] for name in names}
+        return {name: dict(zip(AP_NAMES, ap.of_group(members[name]), strict=True)) for name in names}
+    rows = {name: [per_class.get(entry.name, {}) for entry in rules.scored if entry.group == name] for name in names}
+    return {
+        name: {
+            shown: semantic.nan_mean(np.array([row.get(column, np.nan) for row in rows[name]]))
+            for shown, column in GROUP_COLUMNS.items()
+        }
+        for name in names
+    }
 
 
 def _resampled(rules: ProtocolRules, counts: Sequence[Counts], weights: Int64Array) -> dict[str, Float64Array]:
-    if rules.kind == "instance":
+    if rules.kind in CURVE_KINDS:
         instances = cast("Sequence[instance_ap.InstanceCounts]", counts)
         return resampling.resampled_ap(instances, weights, rules.thresholds)
-    return resampling.resampled_semantic(cast("Sequence[semantic.SemanticCounts]", counts), weights, rules.metric)
+    if rules.kind == "categories":
+        values = object_means.resampled(cast("Sequence[object_means.ObjectCounts]", counts), weights)
+        return dict(zip(VALUES_OF_METRIC[rules.metric], values.T, strict=True))
+    confusions = cast("Sequence[semantic.SemanticCounts]", counts)
+    is_scored = scored_classes(rules) if rules.metric == "hovsg" else None
+    return resampling.resampled_semantic(confusions, weights, rules.metric, is_scored)
 
 
 def _weighted_mean(values: Float64Array, weights: Int64Array) -> Float64Array:
@@ -189,11 +218,11 @@ def _weighted_mean(values: Float64Array, weights: Int64Array) -> Float64Array:
 
 
 def _warnings(rules: ProtocolRules, counts: Sequence[Counts]) -> list[str]:
-    if rules.kind != "instance":
+    if rules.kind not in CURVE_KINDS:
         return []
     whole = instance_ap.concatenate(cast("Sequence[instance_ap.InstanceCounts]", counts))
     small = np.flatnonzero((whole.n_truth == 0) & (whole.n_small_truth > 0))
     if not len(small):
         return []
-    names = ", ".join(f"'{rules.scored[index].name}'" for index in small)
+    names = ", ".join(f"'{rules.curve_names[index]}'" for index in small)
     return [f"not scored, because no scene has an instance of {rules.min_region_size} points: {names}"]

@@ -1,7 +1,7 @@
-"""Semantic segmentation metrics from integer confusion matrices, as ConceptGraphs and as ScanNet compute them.
+"""Semantic segmentation metrics from integer confusion matrices, as ConceptGraphs, ScanNet and HOV-SG compute them.
 
 Rows are the true class, columns the predicted one; a last extra column holds points whose prediction is none of the
-classes. Matrices of scenes add up; only ``conceptgraphs_metrics`` and ``scannet_metrics`` form ratios.
+classes. Matrices of scenes add up; only the functions that give ``SemanticMetrics`` form ratios.
 """
 
 from __future__ import annotations
@@ -44,6 +44,7 @@ class SemanticMetrics:
     frequency_weighted_iou: float
     mean_f1: float
     mean_f1_conceptgraphs: float
+    point_accuracy: float
     n_classes_above: tuple[int, ...]
 
 
@@ -142,6 +143,31 @@ def scannet_metrics(confusion: IntArray) -> SemanticMetrics:
     return _with_means(np.arange(n_classes), recall, precision, iou, f1, quirk, n_true)
 
 
+def hovsg_metrics(confusion: IntArray, is_scored: BoolArray) -> SemanticMetrics:
+    """The scores of application/eval/evaluate_sem_seg.py of HOV-SG (commit 71a8069), over scored classes that are true.
+
+    ``confusion`` (C, C + 1) holds all points, those of ignored classes too: what is predicted there is a false
+    positive. A class that is true and never predicted counts 0. Scores are of one scene; the original averages them
+    over scenes.
+
+    >>> confusion = np.array([[2, 0, 0], [1, 3, 0]])  # class 0 is ignored, and one point of class 1 is called so
+    >>> metrics = hovsg_metrics(confusion, np.array([False, True]))
+    >>> metrics.mean_accuracy, metrics.mean_iou
+    (0.75, 0.75)
+    """
+    n_classes = len(confusion)
+    keep = np.flatnonzero(is_scored & (confusion.sum(axis=1) > 0))
+    hit = np.diag(confusion[:, :n_classes])[keep].astype(np.float64)
+    n_true = confusion.sum(axis=1)[keep].astype(np.float64)
+    n_predicted = confusion[:, :n_classes].sum(axis=0)[keep].astype(np.float64)
+    recall = _ratio(hit, n_true)
+    precision = hit / np.maximum(1.0, n_predicted)
+    iou = _ratio(hit, n_true + n_predicted - hit)
+    f1 = _ratio(2 * hit, n_true + n_predicted)
+    quirk = 2 * precision * recall / np.maximum(1.0, precision + recall)
+    return _with_means(keep, recall, precision, iou, f1, quirk, n_true)
+
+
 def _with_means(
     class_index: Int64Array,
     recall: Float64Array,
@@ -168,6 +194,7 @@ def _with_means(
         frequency_weighted_iou=float(weighted),
         mean_f1=nan_mean(f1),
         mean_f1_conceptgraphs=nan_mean(f1_conceptgraphs),
+        point_accuracy=float((n_true * np.nan_to_num(recall)).sum() / n_points) if n_points > 0 else float("nan"),
         n_classes_above=tuple(int((iou > level).sum()) for level in IOU_LEVELS),
     )
 

@@ -90,7 +90,7 @@ def are_same_points(left: Points, right: Points) -> bool:
 
 def reduce_to_voxels(points: Points, masks: Masks, voxel_m: float) -> Int64Array:
     """Indices, ascending, of the points that stay when each mask, and the background, keeps its first point a voxel."""
-    voxel = _row_ids(voxel_coordinates(points, voxel_m))
+    voxel = row_ids(voxel_coordinates(points, voxel_m))
     n_voxels = int(voxel.max()) + 1 if len(voxel) else 0
     background = np.ones(len(points), bool)
     background[masks.indices] = False
@@ -101,7 +101,7 @@ def reduce_to_voxels(points: Points, masks: Masks, voxel_m: float) -> Int64Array
     return np.unique(members[first])
 
 
-def _row_ids(rows: Int64Array) -> Int64Array:
+def row_ids(rows: Int64Array | Float64Array) -> Int64Array:
     """A number from 0 for each distinct row, without the slow comparison of whole rows in numpy's unique."""
     if not len(rows):
         return np.zeros(0, np.int64)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Protocol
 
@@ -15,6 +16,7 @@ from su3d_bench.perception.naming import Namer, NamingConfig, colour_word, scene
 from su3d_bench.perception.oracle import OracleConfig, OracleSegmenter
 from su3d_bench.perception.segmenter import RgbdSegmenter, SegmenterConfig
 from su3d_bench.perception.stored import StoredConfig, StoredFrame, read_stored, stored_path
+from su3d_bench.perception.stored_images import LabelImages
 from su3d_bench.types import (
     Detections,
     Encoder,
@@ -95,6 +97,8 @@ def build_perception(
     if resolved == "stored":
         if config.stored.folder is None:
             raise ConfigError("profile 'stored': perception.stored.folder is not set; name the folder of detections")
+        if config.stored.images is not None:
+            return LabelImagePerception(config, scene, encoder, cache)
         return StoredPerception(config.stored.folder, scene, encoder, cache)
     return EmbeddedPerception(config, scene, encoder, cache)
 
@@ -233,12 +237,55 @@ class StoredPerception:
         return self._crops.crops(frame, boxes, kept, ratios, timer, known), given.global_feature
 
 
+class LabelImagePerception:
+    """Regions from label images; those that have no name get one as any other region does, and its confidence."""
+
+    profile = "stored"
+    caveat: str | None = STORED_CAVEAT
+
+    def __init__(self, config: PerceptionConfig, scene: SceneInfo, encoder: Encoder, cache: FrameCache) -> None:
+        assert config.stored.folder is not None and config.stored.images is not None
+        self.encoder = encoder
+        self._images = LabelImages(config.stored.folder, config.stored.images, config.stored.names, scene)
+        self._namer = Namer(config.naming, encoder)
+        self._crops = CropEncoder(encoder, cache)
+        self.digest = content_key(self.profile, _content_digest(self._images.files), self._namer.digest, encoder.digest)
+
+    def detect(self, frame: Frame, needs: PerceptionNeeds, timer: StageTimer) -> Detections:
+        with timer.stage("cache"):
+            regions = self._images.regions(frame)
+        everything = np.arange(len(regions.values))
+        best_fit = self._crops.crops(frame, regions.boxes, everything, (1.0,), timer)[:, 0]
+        with timer.stage("encode"):
+            guessed = self._namer.name(best_fit)
+            colours = [colour_word(frame.rgb, mask) for mask in regions.masks]
+        pairs = list(zip(regions.names, guessed.names, strict=True))
+        names = tuple(guess if given is None else given for given, guess in pairs)
+        scores = np.where([given is None for given, _ in pairs], guessed.confidences, 1.0).astype(np.float32)
+        kept = regions_to_keep(names, regions.boxes, frame.depth_m.shape, needs)
+        return Detections(
+            frame_index=frame.index,
+            masks=regions.masks[kept],
+            boxes=regions.boxes[kept],
+            scores=scores[kept],
+            names=tuple(names[k] for k in kept),
+            captions=tuple(scene_caption(names[k], colours[k]) for k in kept),
+            crop_ratios=needs.crop_ratios,
+            crop_features=self._crops.crops(frame, regions.boxes, kept, needs.crop_ratios, timer, {1.0: best_fit}),
+            global_feature=self._crops.whole(frame, timer),
+        )
+
+
 def _files_digest(folder: Path, scene: SceneInfo) -> str:
     """A digest of the names and contents of the scene's files."""
+    return _content_digest(sorted(stored_path(folder, scene.dataset, scene.scene, 0).parent.glob("*.npz")))
+
+
+def _content_digest(files: Iterable[Path]) -> str:
     import hashlib
 
     hasher = hashlib.sha256()
-    for path in sorted(stored_path(folder, scene.dataset, scene.scene, 0).parent.glob("*.npz")):
+    for path in files:
         hasher.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
     return hasher.hexdigest()
 

@@ -1,4 +1,4 @@
-"""Detections made elsewhere, read from one npz file a frame.
+"""Detections made elsewhere, read from one npz file a frame (from label images: ``stored_images.py``).
 
 ``<folder>/<dataset>.<scene>/frame000040.npz`` holds the K regions of the frame with index 40:
 
@@ -22,7 +22,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, model_validator
 
 from su3d_bench.errors import DataError
 from su3d_bench.perception.naming import scene_caption
@@ -34,11 +34,22 @@ _OPTIONAL = ("captions", *_FEATURES)
 
 
 class StoredConfig(BaseModel):
-    """Where the detections of the profile ``stored`` lie."""
+    """Where the detections of the profile ``stored`` lie: npz files, or label images where ``images`` is a pattern.
+
+    ``images`` (``frame-{index}.segm.png``) is relative to ``folder``; ``names`` is a TOML or JSON file of names.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     folder: Path | None = None
+    images: str | None = None
+    names: Path | None = None
+
+    @model_validator(mode="after")
+    def _names_are_of_images(self) -> StoredConfig:
+        if self.names is not None and self.images is None:
+            raise ValueError("names are given to the values of label images; set stored.images too")
+        return self
 
 
 @dataclass(frozen=True)

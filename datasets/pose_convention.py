@@ -1,0 +1,169 @@
+"""Whether poses and depth images are meant as they are read: depth of one frame, seen from another, must agree.
+
+Wrong poses that are rigid motions look right to every other check, and a map made with them is only bad. The points of
+one frame are projected into another under the reading at hand and under the usual mistakes: the inverse motion, the
+other camera axes, both, and another unit of depth. Where a mistake agrees clearly better, the reading is wrong.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+
+from su3d_bench.types import Float64Array, Frame
+
+N_ANCHORS = 4
+GAPS = (1, 3, 9, 27)  # frames between the two of a pair: fast and slow cameras, and strides, both find one that tells
+N_COLUMNS = 80  # of the grid of pixels looked at: 4,800 of a 640x480 image
+TOLERANCE = 0.02  # of the depth; a Kinect's noise is 1.4 % of it at 5 m (Khoshelham and Elberink 2012)
+MIN_LANDED = 0.3  # a reading is trusted where this share of the points comes to lie on a pixel with depth
+MIN_SHARE = 0.6  # ... and agrees with this share of those
+MIN_GAIN = 0.2  # ... which is so much more than the reading at hand has
+MIN_WON = 0.75  # of the pairs that tell two readings apart
+FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's camera axes to OpenGL's, and back
+# Between the units m, mm, 0.1 mm and TUM's 0.2 mm; 8: values whose bits were rotated by three, as SUN RGB-D does it.
+ROTATED = 0.125
+DEPTH_FACTORS = (0.001, 0.1, ROTATED, 0.2, 5.0, 8.0, 10.0, 1000.0)
+Motion = Literal["as read", "inverse", "other axes", "inverse and other axes"]
+
+
+@dataclass(frozen=True)
+class Finding:
+    """Another reading that agrees better: how it differs, and the mean shares of both on the pairs that tell."""
+
+    motion: Motion
+    depth_factor: float
+    share_as_read: float
+    share_otherwise: float
+
+    @property
+    def shares(self) -> str:
+        return (
+            f"poses and depth contradict each other: {self.share_as_read:.0%} of the pixels agree between frames, "
+            f"{self.share_otherwise:.0%}"
+        )
+
+    def changes(self, camera_axes: str = "opencv") -> tuple[str, ...]:
+        """Which of ``pose_direction`` and ``camera_axes`` to change in a description with these ``camera_axes``.
+
+        A reading is told by the motion between two frames. The inverse of a pose that had its axes changed moves as
+        the pose with its direction and axes changed.
+        """
+        direction, axes = "pose_direction", "camera_axes"
+        of_motion: Mapping[Motion, tuple[str, ...]] = MappingProxyType(
+            {
+                "as read": (),
+                "inverse": (direction,) if camera_axes == "opencv" else (direction, axes),
+                "other axes": (axes,),
+                "inverse and other axes": (direction, axes) if camera_axes == "opencv" else (direction,),
+            }
+        )
+        return of_motion[self.motion]
+
+
+def check_convention(frames: Sequence[Frame], where: str) -> str | None:
+    """One line that says which other reading of the poses or the depth agrees clearly better; None where none does."""
+    finding = judge_convention(frames)
+    if finding is None:
+        return None
+    if finding.depth_factor != 1:
+        other = f"with depth times {finding.depth_factor:g}; check the unit of the depth"
+    elif finding.motion == "inverse":
+        other = "with the inverse poses; check whether they are camera-to-world or world-to-camera"
+    elif finding.motion == "other axes":
+        other = "with OpenGL's camera axes for OpenCV's, or the reverse; check the axes of the poses"
+    else:
+        other = "with the inverse poses and OpenGL's camera axes for OpenCV's, or the reverse; check both"
+    return f"{where}: {finding.shares} {other}"
+
+
+def judge_convention(frames: Sequence[Frame]) -> Finding | None:
+    """The best of the other readings, if it wins nearly every pair that tells it from the reading at hand.
+
+    Frames without motion between them tell nothing, nor does one frame.
+    """
+    readings: list[tuple[Motion, float]] = [("as read", 1.0), ("inverse", 1.0), ("other axes", 1.0)]
+    readings += [("inverse and other axes", 1.0), *(("as read", factor) for factor in DEPTH_FACTORS)]
+    cache: dict[int, Frame] = {}
+    table = []
+    for first, second in _pairs(len(frames)):
+        for position in (first, second):
+            if position not in cache:
+                cache[position] = frames[position]
+        points = _Points(cache[first])
+        table.append([points.share_in(cache[second], motion, factor) for motion, factor in readings])
+    shares = np.array(table).reshape(-1, len(readings))
+    best: Finding | None = None
+    for column, (motion, factor) in enumerate(readings[1:], start=1):
+        gains = shares[:, column] - shares[:, 0]
+        tells = np.abs(gains) >= MIN_GAIN
+        wins = (gains >= MIN_GAIN) & (shares[:, column] >= MIN_SHARE)
+        if not wins.any() or wins.sum() < MIN_WON * tells.sum():
+            continue
+        finding = Finding(motion, factor, float(shares[tells, 0].mean()), float(shares[tells, column].mean()))
+        if best is None or finding.share_otherwise > best.share_otherwise:
+            best = finding
+    return best
+
+
+def _pairs(n: int) -> list[tuple[int, int]]:
+    """Pairs of positions in ``n`` frames, spread over the recording, both directions of time."""
+    anchors = sorted({round(part * (n - 1) / (N_ANCHORS - 1)) for part in range(N_ANCHORS)}) if n else []
+    pairs = {
+        (anchor, other)
+        for anchor in anchors
+        for gap in GAPS
+        if 0 <= (other := anchor + (gap if anchor + gap < n else -gap)) < n
+    }
+    return sorted(pairs)
+
+
+class _Points:
+    """Points of one frame on a grid of pixels, in its camera."""
+
+    def __init__(self, frame: Frame) -> None:
+        step = max(1, frame.depth_m.shape[1] // N_COLUMNS)
+        offset = step // 2
+        depth_m = frame.depth_m[offset::step, offset::step].astype(np.float64)
+        rows, columns = np.nonzero(depth_m > 0)
+        fx, fy, cx, cy = frame.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]]
+        z = depth_m[rows, columns]
+        x = (columns * step + offset - cx) / fx * z
+        y = (rows * step + offset - cy) / fy * z
+        self._points: Float64Array = np.stack([x, y, z])
+        self._pose = frame.camera_to_world
+
+    def share_in(self, other: Frame, motion: Motion, depth_factor: float) -> float:
+        """The share of the points that land on a pixel with depth in ``other`` and agree; few landings count as 0."""
+        to_other = _motion(self._pose, other.camera_to_world, motion)
+        x, y, z = to_other[:3, :3] @ (self._points * depth_factor) + to_other[:3, 3:]
+        fx, fy, cx, cy = other.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]]
+        in_front = z > 1e-9
+        x, y, z = x[in_front], y[in_front], z[in_front]
+        u, v = x / z * fx + cx, y / z * fy + cy
+        height, width = other.depth_m.shape
+        in_view = (u > -0.5) & (u < width - 0.5) & (v > -0.5) & (v < height - 0.5)
+        seen_m = other.depth_m[v[in_view].round().astype(int), u[in_view].round().astype(int)] * depth_factor
+        has_depth = seen_m > 0
+        n_landed = int(has_depth.sum())
+        if n_landed < MIN_LANDED * self._points.shape[1] or n_landed == 0:
+            return 0.0
+        agrees = np.abs(z[in_view] - seen_m)[has_depth] <= TOLERANCE * seen_m[has_depth]
+        return float(agrees.mean())
+
+
+def _motion(first: Float64Array, second: Float64Array, motion: Motion) -> Float64Array:
+    """The map (4, 4) from the camera of the first pose into that of the second, under a reading of both."""
+    if motion.startswith("inverse"):
+        first, second = _inverse(first), _inverse(second)
+    if motion.endswith("other axes"):
+        first, second = first @ FLIP, second @ FLIP
+    return np.asarray(_inverse(second) @ first)
+
+
+def _inverse(pose: Float64Array) -> Float64Array:
+    return np.asarray(np.linalg.inv(pose), np.float64)

@@ -1,0 +1,191 @@
+"""What readers of loose recordings share: text files of bounded size, paths that stay in their folder, rigid poses, and
+frames that are read from one colour and one depth file each.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+
+from su3d_bench.datasets.image_files import UInt16Array, decode_colour, decode_depth, read_bytes
+from su3d_bench.digests import digest_file
+from su3d_bench.errors import DataError
+from su3d_bench.types import Float32Array, Float64Array, Frame, UInt8Array
+
+MAX_TEXT_BYTES = 64 << 20  # a trajectory of 100 poses a second for an hour has 30 MB
+MAX_NAME_LENGTH = 255  # of one part of a path, in every file system of today
+N_DEPTH_VALUES = 1 << 16
+
+
+def read_text(path: Path, where: str, advice: str = "copy the file again") -> str:
+    """The text of a file; ``where`` names it and begins each message."""
+    try:
+        size = path.stat().st_size
+        if size > MAX_TEXT_BYTES:
+            raise DataError(f"{where} has {size} bytes; expected a text file of at most {MAX_TEXT_BYTES}")
+        return path.read_bytes().decode("utf-8")
+    except FileNotFoundError as error:
+        raise DataError(f"{where} is missing; {advice}") from error
+    except OSError as error:
+        raise DataError(f"{where} cannot be read: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{where}: not a text file; {advice}") from error
+
+
+def numbers(words: Sequence[str], where: str) -> list[float]:
+    """The words as numbers, finite or not."""
+    try:
+        return [float(word) for word in words]
+    except ValueError:
+        bad = next(word for word in words if not _is_number(word))
+        raise DataError(f"{where}: {bad[:20]!r} is no number") from None
+
+
+def _is_number(word: str) -> bool:
+    try:
+        float(word)
+    except ValueError:
+        return False
+    return True
+
+
+class Folder:
+    """A folder whose files are named by other files: a name that leads out of it is a ``DataError``."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._resolved = path.resolve()
+        self._is_inside: dict[Path, bool] = {}
+
+    def file(self, name: str, where: str) -> Path:
+        """The path of ``name``, which may be missing; parts that are symbolic links must end inside, too."""
+        parts = PurePosixPath(name).parts
+        if not name.isprintable() or not parts or max(map(len, parts)) > MAX_NAME_LENGTH:
+            raise DataError(f"{where}: {name[:40]!r} is no file name")
+        path = self.path / name
+        if ".." in parts or name.startswith("/") or not self._leads_inside(path):
+            raise DataError(f"{where}: {name[:80]!r} leads out of the folder; name files inside it")
+        return path
+
+    def _leads_inside(self, path: Path) -> bool:
+        parent = path.parent
+        try:
+            if parent not in self._is_inside:
+                self._is_inside[parent] = parent.resolve().is_relative_to(self._resolved)
+            return self._is_inside[parent] and (not path.is_symlink() or path.resolve().is_relative_to(self._resolved))
+        except (OSError, RuntimeError):  # a name too long for the file system, or links in a circle
+            return False
+
+
+@dataclass(frozen=True)
+class RecordedFrame:
+    """Where a frame comes from: names of its colour and depth file below the folder, camera-to-world pose (4, 4)."""
+
+    index: int
+    timestamp_s: float
+    colour: str
+    depth: str
+    pose: Float64Array
+
+
+@dataclass(frozen=True)
+class Recording:
+    """The usable frames of a scene; ``depth_m_of_value`` (65536,) float32 turns stored depth into metres, 0: invalid.
+
+    ``files`` are all that it is read from besides the images; ``image_size`` is what its camera file says, if it does;
+    ``missing`` says, a line each, what was left out because something of it is not there.
+    """
+
+    where: str
+    folder: Folder
+    frames: tuple[RecordedFrame, ...]
+    intrinsics: Float64Array
+    depth_m_of_value: Float32Array
+    files: tuple[Path, ...]
+    image_size: tuple[int, int] | None = None
+    missing: tuple[str, ...] = ()
+
+    def images(self) -> list[Path]:
+        return [self.folder.path / name for frame in self.frames for name in (frame.colour, frame.depth)]
+
+    def digest(self, words: Iterable[object]) -> str:
+        """A key of ``words``, the content of ``files``, all images' names and sizes, and the content of the first and
+        the last frame: an image in the middle that was changed and kept its size goes unseen."""
+        total = hashlib.sha256(" ".join(str(word) for word in words).encode())
+        images = self.images()
+        try:
+            for path in (*self.files, *images[:2], *images[-2:]):
+                total.update(f"{path.name} {digest_file(path)}\n".encode())
+            for path in images:
+                total.update(f"{path.name} {path.stat().st_size}\n".encode())
+        except OSError as error:
+            raise DataError(f"{self.where}: {error.filename} cannot be read: {error.strerror}") from error
+        return total.hexdigest()
+
+
+class RecordedFrames(Sequence[Frame]):
+    """Every ``stride``-th usable frame, read when it is asked for; a file that cannot be used is a ``DataError``."""
+
+    def __init__(self, recording: Recording, stride: int = 1) -> None:
+        self._recording = recording
+        self._frames = recording.frames[::stride]
+
+    def __len__(self) -> int:
+        return len(self._frames)
+
+    def __getitem__(self, position: int) -> Frame:  # type: ignore[override]
+        frame, recording = self._frames[position], self._recording
+        rgb = self._read_colour(frame)
+        values = self._read_depth(frame, rgb)
+        depth_m = recording.depth_m_of_value[values]
+        return Frame(frame.index, frame.timestamp_s, rgb, depth_m, frame.pose, recording.intrinsics)
+
+    def _read_colour(self, frame: RecordedFrame) -> UInt8Array:
+        where, content = self._read(frame.colour)
+        rgb = decode_colour(content, where)
+        height, width = rgb.shape[:2]
+        expected, (cx, cy) = self._recording.image_size, self._recording.intrinsics[:2, 2]
+        if expected is not None and expected != (width, height):
+            raise DataError(
+                f"{where} is {width}x{height}, the camera file says {expected[0]}x{expected[1]}; intrinsics belong to "
+                "one image size"
+            )
+        if not (0 <= cx <= width and 0 <= cy <= height):
+            raise DataError(
+                f"{where} is {width}x{height} but the principal point is ({cx:g}, {cy:g}); intrinsics belong to one "
+                "image size"
+            )
+        return rgb
+
+    def _read_depth(self, frame: RecordedFrame, rgb: UInt8Array) -> UInt16Array:
+        where, content = self._read(frame.depth)
+        values = decode_depth(content, where)
+        if values.shape != rgb.shape[:2]:
+            raise DataError(
+                f"{where} is {values.shape[1]}x{values.shape[0]} and {frame.colour} is {rgb.shape[1]}x{rgb.shape[0]}; "
+                "both must have one size, the depth registered to the colour"
+            )
+        return values
+
+    def _read(self, name: str) -> tuple[str, bytes]:
+        where = f"{self._recording.where}: {name}"
+        return where, read_bytes(self._recording.folder.path / name, where, "copy the recording again")
+
+
+def left_out(where: str, names: Sequence[str], what: str, n_used: int) -> str:
+    """The line that says what was left out: how many and the first."""
+    return f"{where}: {len(names)} {what} (the first: {names[0][:80]}); left out, {n_used} frames are used"
+
+
+def pinhole(fx: float, fy: float, cx: float, cy: float, where: str) -> Float64Array:
+    """Intrinsics (3, 3); numbers that no camera has are a ``DataError``."""
+    values = (fx, fy, cx, cy)
+    # 1e6 pixels: beyond any lens on an image of MAX_PIXELS
+    if not all(np.isfinite(value) and abs(value) < 1e6 for value in values) or min(fx, fy) <= 0:
+        shown = " ".join(f"{value:g}" for value in values)
+        raise DataError(f"{where}: fx fy cx cy are {shown}; expected pixels, focal lengths above 0")
+    return np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]])

@@ -1,0 +1,112 @@
+"""What a picture of a scene shows: some frames, where the cameras are, what they see in colour, and the truth."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from su3d_bench.errors import DataError, GroundTruthMissing
+from su3d_bench.geometry import back_project, valid_depth
+from su3d_bench.types import Dataset, Float32Array, Float64Array, Frame, GroundTruth, UInt8Array
+
+CAMERAS = 48  # enough for the shape of a walk
+SHOWN_FRAMES = 6
+SEEN_POINTS = 250_000  # of all frames together: one each 2 cm on the surfaces of a room
+PERCENTILES = (1, 99)  # of a frame's depth: a stray pixel is no range
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class SceneLook:
+    """A scene as a picture needs it.
+
+    ``poses`` (n, 4, 4) camera-to-world of the cameras that were read, of ``n_frames`` in the scene; ``seen`` (m, 3) m
+    in the world and ``seen_rgb`` (m, 3) what they see; ``shown`` are some of the frames; ``depth_m`` the least and
+    the greatest depth; ``truth`` or the reason why there is none.
+    """
+
+    scene: str
+    n_frames: int
+    poses: Float64Array
+    seen: Float32Array
+    seen_rgb: UInt8Array
+    shown: tuple[Frame, ...]
+    depth_m: tuple[float, float]
+    truth: GroundTruth | None
+    no_truth: str
+
+    @property
+    def counts(self) -> dict[str, int]:
+        """Points, objects and classes of the truth; nothing where there is none."""
+        if self.truth is None:
+            return {}
+        n_objects, n_classes = (len(np.unique(ids[ids != 0])) for ids in (self.truth.instance, self.truth.semantic))
+        return {"n_points": len(self.truth.points), "n_objects": n_objects, "n_classes": n_classes}
+
+
+def look_at(
+    dataset: Dataset, scene: str, stride: int | None = None, progress: Progress = lambda n_done, n: None
+) -> SceneLook:
+    """Read every ``stride``-th frame of ``scene`` (None: ``CAMERAS`` evenly spaced ones) and its fullest truth.
+
+    A frame or a truth that is damaged is a ``DataError``; a truth that is not there is no fault.
+    """
+    frames = dataset.frames(scene, stride or 1)
+    n_frames = dataset.info(scene, 1).n_frames
+    if not len(frames):
+        raise DataError(f"{dataset.name}/{scene}: has no frames to show")
+    positions = range(len(frames)) if stride else _evenly(len(frames), CAMERAS)
+    is_shown = set(_evenly(len(positions), SHOWN_FRAMES))
+    poses, shown, points, colours, ranges = [], [], [], [], []
+    for k, position in enumerate(positions):
+        progress(k, len(positions))
+        frame = frames[position]
+        poses.append(frame.camera_to_world)
+        if k in is_shown:
+            shown.append(frame)
+        pixels = _chosen_pixels(frame, max(1, SEEN_POINTS // len(positions)))
+        points.append(back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, pixels).astype(np.float32))
+        colours.append(frame.rgb[pixels])
+        depth = frame.depth_m[pixels]
+        ranges += list(np.percentile(depth, PERCENTILES)) if len(depth) else []
+    progress(len(positions), len(positions))
+    truth, reason = _truth(dataset, scene)
+    return SceneLook(
+        scene=f"{dataset.name}/{scene}",
+        n_frames=n_frames,
+        poses=np.array(poses),
+        seen=np.concatenate(points),
+        seen_rgb=np.concatenate(colours),
+        shown=tuple(shown),
+        depth_m=(float(min(ranges, default=0.0)), float(max(ranges, default=0.0))),
+        truth=truth,
+        no_truth=reason,
+    )
+
+
+def _evenly(n: int, most: int) -> Sequence[int]:
+    return sorted({int(place) for place in np.linspace(0, n - 1, min(n, most))})
+
+
+def _chosen_pixels(frame: Frame, most: int) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """At most about ``most`` pixels with a depth, spread over the image."""
+    is_valid = valid_depth(frame.depth_m, 0.0, np.inf)
+    step = int(np.ceil(np.sqrt(max(1.0, is_valid.sum() / most))))
+    chosen = np.zeros_like(is_valid)
+    chosen[::step, ::step] = is_valid[::step, ::step]
+    return chosen
+
+
+def _truth(dataset: Dataset, scene: str) -> tuple[GroundTruth | None, str]:
+    reason = ""
+    for variant in getattr(dataset, "variants", ()):
+        try:
+            truth = dataset.ground_truth(scene, variant)
+        except GroundTruthMissing as error:
+            reason = reason or str(error)
+            continue
+        if len(truth.points):
+            return truth, ""
+    return None, reason or f"{dataset.name} has no ground truth"

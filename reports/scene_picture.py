@@ -1,0 +1,326 @@
+"""One picture of a scene: the walk seen from above, the ground truth by class and by instance, and some frames."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.plain_text import printable
+from su3d_bench.reports.pictures import (
+    NO_INSTANCE,
+    Cloud,
+    Colour,
+    class_colours,
+    instance_colours,
+    thinned,
+    truth_owner,
+)
+from su3d_bench.reports.render import OVERSAMPLING, Camera, colour, render, room_bounds, view_cameras
+from su3d_bench.reports.scene_look import SceneLook
+from su3d_bench.store import make_folder, write_bytes
+from su3d_bench.types import Float32Array, Float64Array, GroundTruth, Int32Array, UInt8Array
+
+WIDTH, DPI = 1920, 100
+MARGIN, HEADER, CAPTION = 16, 76, 26
+PANEL_WIDTH, PANEL_HEIGHT = 536, 500
+LEGEND_WIDTH = WIDTH - 3 * PANEL_WIDTH - 5 * MARGIN
+LEGEND_ROWS, LEGEND_STEP = 21, 22
+FRAME_COLUMNS, SCALE_WIDTH = 6, 74
+FRAME_WIDTH = (WIDTH - 2 * MARGIN - SCALE_WIDTH) // FRAME_COLUMNS
+SEEN_WITHIN_M = 0.12  # a point of the truth has the colour of what a camera saw this near to it
+LEAST_DRAWN_M = 0.012
+UNSEEN = (214, 214, 210)
+SCALE_LENGTHS_M = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+DARK, PALE = "#222222", "#666666"
+WALK, START, END = "#d6246e", "#1a9850", "#111111"
+# Walks outside the truth are drawn where they are, up to this far; farther ones would leave no room for the scene.
+MOST_BEYOND_M = 10.0
+
+
+@dataclass(frozen=True)
+class Panel:
+    """One view of the scene: its caption and pixels, and the camera of a view from above, for what is drawn on it."""
+
+    caption: str
+    pixels: UInt8Array
+    camera: Camera | None = None
+
+
+def draw_scene_picture(look: SceneLook, path: Path) -> None:
+    """Write the picture of ``look`` as a PNG of ``WIDTH`` pixels."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    frame_height = _frame_height(look)
+    height = HEADER + CAPTION + PANEL_HEIGHT + 2 * (CAPTION + frame_height) + MARGIN
+    figure = Figure(figsize=(WIDTH / DPI, height / DPI), dpi=DPI, facecolor="white")
+    FigureCanvasAgg(figure)
+    page = _Page(figure, height)
+    page.text(MARGIN, 14, _shortened(look.scene, 90), size=17, weight="bold")
+    page.text(MARGIN, 46, facts_line(look), size=11, colour=PALE)
+    for column, panel in enumerate(_panels(look)):
+        left = MARGIN + column * (PANEL_WIDTH + MARGIN)
+        page.text(left, HEADER, panel.caption, size=11)
+        axes = page.axes(left, HEADER + CAPTION, PANEL_WIDTH, PANEL_HEIGHT)
+        axes.imshow(panel.pixels, interpolation="nearest", aspect="auto")
+        if panel.camera is not None:
+            _draw_scale(axes, panel.camera)
+            if column == 0:
+                _draw_walk(axes, panel.camera, look.poses)
+        axes.set_xlim(-0.5, PANEL_WIDTH - 0.5)
+        axes.set_ylim(PANEL_HEIGHT - 0.5, -0.5)
+    if look.truth is not None:
+        _draw_legend(page, look.truth)
+    else:
+        _draw_reason(page, look.no_truth)
+    _draw_frames(page, look, HEADER + CAPTION + PANEL_HEIGHT, frame_height)
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    make_folder(path.parent)
+    write_bytes(path, buffer.getvalue())
+
+
+def facts_line(look: SceneLook) -> str:
+    """The counts of the scene in one line."""
+    height, width = look.shown[0].rgb.shape[:2]
+    words = [
+        f"{look.n_frames:,} frames of {width}x{height}",
+        f"depth {look.depth_m[0]:.2f} to {look.depth_m[1]:.2f} m",
+    ]
+    if look.truth is not None:
+        counts = look.counts
+        words.append(f"{counts['n_objects']} objects of {counts['n_classes']} classes")
+        words.append(f"{counts['n_points']:,} points of ground truth ({printable(look.truth.variant, 40)})")
+    else:
+        words.append("no ground truth")
+    return " \u00b7 ".join(words)
+
+
+class _Page:
+    """A figure addressed in pixels from its top left corner."""
+
+    def __init__(self, figure: Any, height: int) -> None:
+        self.figure, self.height = figure, height
+
+    def text(self, x: float, y: float, text: str, size: float, colour: str = DARK, **more: Any) -> None:
+        place = x / WIDTH, 1 - y / self.height
+        style = {"va": "top", "fontsize": size, "color": colour, "parse_math": False} | more
+        self.figure.text(*place, _drawable(printable(text)), **style)
+
+    def axes(self, x: float, y: float, width: float, height: float) -> Any:
+        """Axes without a frame at this place."""
+        box = (x / WIDTH, 1 - (y + height) / self.height, width / WIDTH, height / self.height)
+        axes = self.figure.add_axes(box)
+        axes.set_axis_off()
+        return axes
+
+
+def _panels(look: SceneLook) -> tuple[Panel, ...]:
+    if look.truth is None:
+        points = look.seen if len(look.seen) else look.poses[:, :3, 3].astype(np.float32)
+        colours = look.seen_rgb if len(look.seen) else np.full((len(points), 3), UNSEEN, np.uint8)
+        corners = view_cameras(room_bounds(points), PANEL_WIDTH, PANEL_HEIGHT)[1:]
+        cameras = (_camera_above(look, points), *corners)
+        size_m = _drawn_size(points)
+        pictures = [colour(render(points, size_m, camera), colours) for camera in cameras]
+        return (
+            Panel(f"walk, over what {len(look.poses)} frames see, from above", pictures[0], cameras[0]),
+            Panel("the same points, from one corner", pictures[1]),
+            Panel("from the other corner", pictures[2]),
+        )
+    rows = thinned(Cloud(look.truth.points, np.arange(len(look.truth.points), dtype=np.int32))).owner
+    points, above = look.truth.points[rows], _camera_above(look, look.truth.points)
+    view = render(points, _drawn_size(points), above)
+    by_class, by_instance = _class_palette(look.truth)[rows], _instance_palette(look.truth)[rows]
+    return (
+        Panel("walk, over the ground truth in the frames' colours", colour(view, _seen_colours(look, points)), above),
+        Panel("ground truth by class", colour(view, by_class), above),
+        Panel("ground truth by instance", colour(view, by_instance), above),
+    )
+
+
+def _camera_above(look: SceneLook, points: Float32Array) -> Camera:
+    """The view from above that holds the points and the walk, as far as it stays near."""
+    bounds, places = room_bounds(points), look.poses[:, :2, 3]
+    bounds[0, :2] = np.maximum(np.minimum(bounds[0, :2], places.min(axis=0)), bounds[0, :2] - MOST_BEYOND_M)
+    bounds[1, :2] = np.minimum(np.maximum(bounds[1, :2], places.max(axis=0)), bounds[1, :2] + MOST_BEYOND_M)
+    return view_cameras(bounds, PANEL_WIDTH, PANEL_HEIGHT)[0]
+
+
+def _drawn_size(points: Float32Array) -> float:
+    """The width at which neighbours touch, for clouds as sparse as they may be."""
+    from scipy.spatial import KDTree
+
+    if len(points) < 2:
+        return LEAST_DRAWN_M
+    distance, _ = KDTree(points).query(points[:: max(1, len(points) // 1000)], k=2)
+    return max(LEAST_DRAWN_M, 2.0 * float(np.median(distance[:, 1])))
+
+
+def _seen_colours(look: SceneLook, points: Float32Array) -> UInt8Array:
+    """Of each point the colour that a camera saw at its place; pale where none did."""
+    from scipy.spatial import KDTree
+
+    palette = np.concatenate([look.seen_rgb, np.array([UNSEEN], np.uint8)])
+    if not len(look.seen):
+        return np.repeat(palette, len(points), axis=0)
+    _, nearest = KDTree(look.seen).query(points, distance_upper_bound=max(SEEN_WITHIN_M, _drawn_size(look.seen)))
+    colours: UInt8Array = palette[nearest]
+    return colours
+
+
+def _class_palette(truth: GroundTruth) -> UInt8Array:
+    """Colour of each point by its class."""
+    palette = class_colours([name for name, _, _ in _classes(truth)])
+    names = truth.labels.names
+    colours = np.array([*(palette.get(name, NO_INSTANCE) for name in names), NO_INSTANCE], np.uint8)
+    return colours[truth_owner(truth)]
+
+
+def _instance_palette(truth: GroundTruth) -> UInt8Array:
+    """Colour of each point by its instance, the largest ones most distinct; surfaces of the room pale."""
+    ids, first, inverse, n_points = np.unique(
+        truth.instance, return_index=True, return_inverse=True, return_counts=True
+    )
+    owner = truth_owner(truth)[first]
+    order = [int(row) for row in np.argsort(-n_points, kind="stable") if ids[row] != 0]
+    names = [truth.labels.names[owner[row]] if owner[row] >= 0 else "" for row in order]
+    colours = np.full((len(ids), 3), NO_INSTANCE, np.uint8)
+    colours[order] = np.array(instance_colours(names), np.uint8).reshape(-1, 3)
+    return colours[inverse.reshape(-1)]
+
+
+def _classes(truth: GroundTruth) -> list[tuple[str, int, int]]:
+    """(name, objects, points) of each class that is there, the largest first."""
+    owner = truth_owner(truth)
+    n_points = np.bincount(owner[owner >= 0], minlength=len(truth.labels.names))
+    pairs: Int32Array = np.unique(np.stack([owner, truth.instance])[:, truth.instance != 0], axis=1)[0]
+    n_objects = np.bincount(pairs[pairs >= 0], minlength=len(n_points))
+    order = [int(row) for row in np.argsort(-n_points, kind="stable") if n_points[row]]
+    return [(truth.labels.names[row], int(n_objects[row]), int(n_points[row])) for row in order]
+
+
+def _draw_legend(page: _Page, truth: GroundTruth) -> None:
+    """The largest classes with their numbers of objects and points; the rest as a count."""
+    left, top = 3 * PANEL_WIDTH + 4 * MARGIN, HEADER + CAPTION
+    objects, points = left + LEGEND_WIDTH - 62, left + LEGEND_WIDTH
+    page.text(left, HEADER, "class", size=10, colour=PALE)
+    page.text(objects, HEADER, "objects", size=10, colour=PALE, ha="right")
+    page.text(points, HEADER, "points", size=10, colour=PALE, ha="right")
+    classes = _classes(truth)
+    palette: dict[str, Colour] = class_colours([name for name, _, _ in classes])
+    for k, (name, n_objects, n_points) in enumerate(classes[:LEGEND_ROWS]):
+        y = top + LEGEND_STEP * k + LEGEND_STEP / 2
+        page.text(left, y, "\u25a0", size=15, colour=_hex(palette[name]), va="center")
+        page.text(left + 23, y, _shortened(name, 15), size=10, va="center")
+        page.text(objects, y, f"{n_objects}", size=10, va="center", ha="right")
+        page.text(points, y, _thousands(n_points), size=10, va="center", ha="right")
+    if len(classes) > LEGEND_ROWS:
+        y = top + LEGEND_STEP * LEGEND_ROWS + LEGEND_STEP / 2
+        page.text(left + 23, y, f"and {len(classes) - LEGEND_ROWS} more classes", size=10, colour=PALE, va="center")
+
+
+def _draw_reason(page: _Page, reason: str) -> None:
+    import textwrap
+
+    left = 3 * PANEL_WIDTH + 4 * MARGIN
+    page.text(left, HEADER, "no ground truth", size=11)
+    for k, line in enumerate(textwrap.wrap(printable(reason), 29)[:LEGEND_ROWS]):
+        page.text(left, HEADER + CAPTION + 18 * k, line, size=9, colour=PALE)
+
+
+def _draw_walk(axes: Any, camera: Camera, poses: Float64Array) -> None:
+    """The way of the cameras, short strokes where they look, start and end."""
+    x, y = _pixels(camera, poses[:, :3, 3])
+    ahead_x, ahead_y = _pixels(camera, poses[:, :3, 3] + 0.25 * poses[:, :3, 2])
+    axes.plot(x, y, color="white", linewidth=4.0, solid_capstyle="round")
+    axes.plot(np.stack([x, ahead_x]), np.stack([y, ahead_y]), color=WALK, linewidth=1.3)
+    axes.plot(x, y, color=WALK, linewidth=2.0, solid_capstyle="round")
+    for k, name, shade, marker in ((0, "start", START, "o"), (-1, "end", END, "s")):
+        axes.plot(x[k], y[k], marker, color=shade, markersize=10, markeredgecolor="white", markeredgewidth=1.5)
+        is_right = x[k] > PANEL_WIDTH - 60
+        axes.annotate(
+            name,
+            (float(np.clip(x[k], 0, PANEL_WIDTH)), float(np.clip(y[k], 12, PANEL_HEIGHT - 12))),
+            xytext=(-9 if is_right else 9, 7 if k == 0 else -7),
+            textcoords="offset points",
+            ha="right" if is_right else "left",
+            va="center",
+            fontsize=10,
+            color=shade,
+            fontweight="bold",
+            bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.85},
+        )
+
+
+def _pixels(camera: Camera, points: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """Columns and rows in the picture of a camera that looks from above."""
+    relative = (points - camera.eye) @ camera.rotation.T * camera.focal
+    x: Float64Array = (relative[:, 0] + camera.width / 2) / OVERSAMPLING
+    y: Float64Array = (relative[:, 1] + camera.height / 2) / OVERSAMPLING
+    return x, y
+
+
+def _draw_scale(axes: Any, camera: Camera) -> None:
+    """A bar of a round length in the lower left corner."""
+    pixels_a_metre = camera.focal / OVERSAMPLING
+    length_m = max((one for one in SCALE_LENGTHS_M if one * pixels_a_metre < 0.3 * PANEL_WIDTH), default=0.1)
+    left, row = 14, PANEL_HEIGHT - 12
+    axes.plot([left, left + length_m * pixels_a_metre], [row, row], color="white", linewidth=6, solid_capstyle="butt")
+    axes.plot([left, left + length_m * pixels_a_metre], [row, row], color=DARK, linewidth=3, solid_capstyle="butt")
+    box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
+    axes.text(left, row - 8, f"{length_m:g} m", fontsize=10, color=DARK, va="bottom", bbox=box)
+
+
+def _frame_height(look: SceneLook) -> int:
+    height, width = look.shown[0].rgb.shape[:2]
+    return int(np.clip(round((FRAME_WIDTH - 4) * height / width), 60, 420))
+
+
+def _draw_frames(page: _Page, look: SceneLook, top: int, height: int) -> None:
+    """Colour above depth, the scale of depth at the right."""
+    from matplotlib import colormaps
+    from matplotlib.cm import ScalarMappable
+    from matplotlib.colors import Normalize
+
+    scale = ScalarMappable(Normalize(0.0, max(look.depth_m[1], 1e-3)), colormaps["turbo"].with_extremes(bad="#b8b8b8"))
+    below = top + CAPTION + height
+    for column, frame in enumerate(look.shown):
+        left = MARGIN + column * FRAME_WIDTH
+        page.text(left, top + 8, f"frame {frame.index}", size=10)
+        page.axes(left, top + CAPTION, FRAME_WIDTH - 4, height).imshow(frame.rgb)
+        depth = np.where(frame.depth_m > 0, frame.depth_m, np.nan)
+        page.axes(left, below + CAPTION, FRAME_WIDTH - 4, height).imshow(
+            scale.to_rgba(np.ma.masked_invalid(depth)), interpolation="nearest"
+        )
+    page.text(MARGIN, below + 8, "depth (grey: none)", size=10)
+    bar = page.axes(WIDTH - MARGIN - SCALE_WIDTH + 10, below + CAPTION, 14, height)
+    bar.set_axis_on()
+    page.figure.colorbar(scale, cax=bar)
+    page.text(WIDTH - MARGIN - SCALE_WIDTH + 10, below + 8, "depth (m)", size=10)
+    bar.tick_params(labelsize=9)
+
+
+def _drawable(text: str) -> str:
+    """``text`` with what the font cannot draw written as its escape."""
+    from matplotlib.font_manager import findfont, get_font
+
+    known = get_font(findfont("DejaVu Sans")).get_charmap()
+    return "".join(c if ord(c) in known else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def _hex(rgb: Colour) -> str:
+    return "#{:02x}{:02x}{:02x}".format(*rgb)
+
+
+def _thousands(n: int) -> str:
+    """A count in at most six characters."""
+    return f"{n:,}" if n < 10_000 else f"{n / 1e3:.0f} k" if n < 1_000_000 else f"{n / 1e6:.1f} M"
+
+
+def _shortened(text: str, most: int) -> str:
+    return text if len(text) <= most else text[: most - 1] + "\u2026"

@@ -1,0 +1,137 @@
+"""``su3d-bench datasets check``: every file and frame of scenes looked at, what is wrong said scene by scene."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence
+from dataclasses import asdict
+from itertools import groupby
+from typing import Any
+
+from su3d_bench import registry
+from su3d_bench.cli.flags import answer, answer_json, remark
+from su3d_bench.cli.progress import progress
+from su3d_bench.config import read_assignments, resolve
+from su3d_bench.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
+from su3d_bench.executors import Event
+from su3d_bench.inspection import Inspection, TruthVariant, inspect
+from su3d_bench.inspection_checks import Finding
+from su3d_bench.plain_text import printable, printable_json
+from su3d_bench.planning import data_root, dataset_targets, expand_scenes
+from su3d_bench.scene_run import Part, build_dataset
+
+MOST_OF_A_KIND = 10  # findings of one kind that are printed; --json has all
+
+
+def check(arguments: argparse.Namespace) -> int:
+    """Look at every scene asked for; exit code 1 where one of them has errors."""
+    if arguments.jobs is not None and arguments.jobs < 1:
+        raise ConfigError(f"--jobs {arguments.jobs}: expected 1 or more")
+    scenes = chosen_scenes(arguments.scenes, arguments.set, is_quiet=arguments.quiet)
+    n_threads = arguments.jobs or os.cpu_count() or 1
+    found = []
+    for dataset, scene in scenes:
+        found.append(_inspect(dataset, scene, n_threads, arguments))
+        if not arguments.json:
+            answer("\n".join([*([""] if len(found) > 1 else []), *lines_of(found[-1])]))
+    n_with_errors = sum(one.count("error") > 0 for one in found)
+    if arguments.json:
+        answer_json(
+            {
+                "data_root": printable(str(data_root())),
+                "n_scenes": len(found),
+                "n_with_errors": n_with_errors,
+                "scenes": [as_json(one) for one in found],
+            }
+        )
+    else:
+        answer(f"\n{_count(len(found), 'scene')}, {n_with_errors} with errors")
+    return EXIT_CHECK_FAILED if n_with_errors else EXIT_DONE
+
+
+def _inspect(dataset: Any, scene: str, n_threads: int, arguments: argparse.Namespace) -> Inspection:
+    # A bar of its own for each scene: while a bar is drawn, what is printed would go where the bar goes.
+    with progress(1, is_quiet=arguments.quiet, last_step="ground truth") as report:
+        return inspect(
+            dataset,
+            scene,
+            is_quick=arguments.quick,
+            n_threads=n_threads,
+            progress=lambda n_done, n: report(Event(f"{dataset.name}/{scene}", "frames", n_done, n)),
+        )
+
+
+def chosen_scenes(addresses: Sequence[str], assignments: Sequence[str], *, is_quiet: bool) -> list[tuple[Any, str]]:
+    """(dataset, scene) of every address or pattern, with the options of ``--set``; a dataset is built once."""
+    targets = {str(registry.load("dataset", target).name): target for target in dataset_targets(addresses)}
+    settings = read_assignments(assignments, (), tuple(targets))
+    parts = {}
+    for name, target in targets.items():
+        options = resolve(settings, ("dataset", name), registry.load("dataset", target).Options)
+        parts[target] = Part(target, name, options.model_dump_json())
+    chosen, notes = expand_scenes(addresses, parts)
+    for note in notes:
+        remark(printable(note), quiet=is_quiet)
+    datasets = {target: build_dataset(part, data_root()) for target, part in parts.items()}
+    return [(datasets[target], scene) for target, scene in chosen]
+
+
+def as_json(one: Inspection) -> dict[str, Any]:
+    """All of an inspection as JSON has it, with its numbers of errors and warnings."""
+    counts = {"n_errors": one.count("error"), "n_warnings": one.count("warning")}
+    table: dict[str, Any] = printable_json(asdict(one))
+    return {"scene": table.pop("scene"), **counts, **table}
+
+
+def lines_of(one: Inspection) -> list[str]:
+    """The block of one scene: what is there, then what is wrong."""
+    rows = [("frames", _frames_text(one))]
+    if one.depth is not None:
+        d = one.depth
+        text = f"{d.near_m:.2f} to {d.far_m:.2f} m, median {d.median_m:.2f} m, {d.valid_share:.1%} of the pixels"
+        rows.append(("depth", text))
+    rows += [("ground truth", _truth_text(variant)) for variant in one.truth]
+    if one.meeting is not None:
+        meeting = one.meeting
+        rows.append(
+            ("seen points", f"{meeting.share:.1%} within {meeting.distance_m * 100:.3g} cm of the ground truth")
+        )
+    rows.append(("digest", one.digest or "none"))
+    lines = [printable(one.scene), *(f"  {name:<13} {text}" for name, text in rows)]
+    for _, group in groupby(one.findings, key=lambda finding: (finding.severity, finding.check)):
+        lines += _finding_lines(list(group))
+    n_errors, n_warnings = one.count("error"), one.count("warning")
+    verdict = f"{_count(n_errors, 'error')}, {_count(n_warnings, 'warning')}" if one.findings else "nothing found wrong"
+    return [*lines, f"  {'checked':<13} {one.elapsed_s:.1f} s: {verdict}"]
+
+
+def _finding_lines(findings: Sequence[Finding]) -> list[str]:
+    shown = [f"  {one.severity:<13} {f'{one.where}: ' if one.where else ''}{one.text}" for one in findings]
+    n_more = len(shown) - MOST_OF_A_KIND
+    if n_more <= 0:
+        return shown
+    return [*shown[:MOST_OF_A_KIND], f"  {'':<13} and {n_more} more of this kind; --json lists all"]
+
+
+def _frames_text(one: Inspection) -> str:
+    if one.n_frames is None:
+        return "cannot be counted"
+    read = "all read" if one.n_read == one.n_frames else f"{one.n_read} read"
+    size = "" if one.size is None else f", {one.size[0]}x{one.size[1]}"
+    files = f", {one.n_files} files" if one.n_files else ", made on demand"
+    return f"{one.n_frames} ({read}){size}{files}"
+
+
+def _truth_text(variant: TruthVariant) -> str:
+    if variant.reason is not None:
+        reason = variant.reason.removeprefix(f"no ground truth '{variant.variant}'; ")
+        return f"{variant.variant}: not here; {reason}"
+    return (
+        f"{variant.variant}: {variant.n_points:,} points, {_count(variant.n_objects, 'object')}, "
+        f"{_count(variant.n_classes, 'class', 'classes')}"
+    )
+
+
+def _count(n: int, noun: str, plural: str | None = None) -> str:
+    return f"{n} {noun if n == 1 else plural or noun + 's'}"

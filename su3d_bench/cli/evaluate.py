@@ -1,0 +1,98 @@
+"""``su3d-bench evaluate``: predictions made elsewhere to the numbers of the published protocols."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.cli.flags import add_verb, answer, remark
+from su3d_bench.errors import EXIT_DONE
+
+
+def add_parser(verbs: Any) -> None:
+    parser = add_verb(
+        verbs,
+        "evaluate",
+        "Score predictions made elsewhere, under every protocol that fits; the format is recognised.",
+        (
+            "su3d-bench evaluate predictions/ --dataset replica --json numbers.json",
+            "su3d-bench evaluate pred/ --ground-truth gt/ --protocol scannet-instance --per-class",
+        ),
+        call,
+        json_to_file=True,
+    )
+    parser.add_argument(
+        "predictions",
+        nargs="+",
+        type=Path,
+        metavar="PREDICTIONS",
+        help="a folder of predictions, a run folder, or files",
+    )
+    parser.add_argument(
+        "--dataset", metavar="NAME", help="whose ground truth, below $SU3D_DATA: replica, scannet, rooms"
+    )
+    parser.add_argument(
+        "--ground-truth",
+        type=Path,
+        metavar="DIR",
+        help="ground truth as text instead: <scene>.txt with label * 1000 + instance a vertex, or label ids",
+    )
+    parser.add_argument(
+        "--protocol",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="PROTOCOL",
+        help="evaluations (default: all that fit)",
+    )
+    parser.add_argument("--scenes", nargs="+", default=[], metavar="SCENE", help="names or patterns (default: all)")
+    parser.add_argument("--format", metavar="FORMAT", help="of the predictions, where it cannot be recognised")
+    parser.add_argument(
+        "--text-features",
+        type=Path,
+        metavar="FILE",
+        help="features of class names for predictions that have features: .npz with names and features",
+    )
+    parser.add_argument(
+        "--confidences",
+        choices=("protocol", "file"),
+        help="where a protocol has 1 for every mask: its rule, or the files' (default: file for ScanNet's text)",
+    )
+    parser.add_argument("--per-class", action="store_true", help="print the table of every class too")
+
+
+def call(arguments: argparse.Namespace) -> int:
+    from su3d_bench.executors import limit_threads
+
+    limit_threads()  # before numerical libraries are loaded
+    from su3d_bench.evaluation import Request, evaluate
+    from su3d_bench.reports.evaluation_tables import evaluation_text
+    from su3d_bench.store import write_text
+
+    result = evaluate(
+        Request(
+            tuple(arguments.predictions),
+            dataset=arguments.dataset,
+            ground_truth=arguments.ground_truth,
+            protocols=tuple(arguments.protocol),
+            scenes=tuple(arguments.scenes),
+            format=arguments.format,
+            text_features=arguments.text_features,
+            confidences=arguments.confidences,
+        )
+    )
+    document = result.to_json()
+    if arguments.json is not None:
+        write_text(arguments.json, json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+    answer(evaluation_text(document, per_class=arguments.per_class))
+    remark(f"format: {', '.join(result.formats)}; ground truth: {result.ground_truth}", quiet=arguments.quiet)
+    for line in result.remarks:
+        remark(line, quiet=arguments.quiet)
+    for name, reason in result.not_scored.items():
+        if not reason.startswith("is not meant for"):
+            remark(f"not scored under {name}: {reason}", quiet=arguments.quiet)
+    if arguments.json is not None:
+        remark(f"written: {arguments.json}", quiet=arguments.quiet)
+    return EXIT_DONE

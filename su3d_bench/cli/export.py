@@ -1,0 +1,255 @@
+"""``su3d-bench export``: predictions as the files that other evaluators take."""
+
+from __future__ import annotations
+
+import argparse
+import fnmatch
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.errors import EXIT_DONE, ConfigError, PredictionError, suggest
+from su3d_bench.plain_text import printable
+
+if TYPE_CHECKING:
+    from su3d_bench.predictions.base import Content, Reader
+    from su3d_bench.predictions.export import LabelledMasks
+    from su3d_bench.protocols import ProtocolRules
+    from su3d_bench.types import Encoder
+
+TARGETS = ("openlex3d", "scannet")
+
+
+def add_parser(verbs: Any) -> None:
+    parser = add_verb(
+        verbs,
+        "export",
+        "Write predictions, our own or another program's, as the files that another evaluator takes.",
+        (
+            "su3d-bench export runs/my-run --to openlex3d --method opensu3d --out exported/opensu3d",
+            "su3d-bench export results/open3dis --to scannet --scenes 'replica/*' --out exported/open3dis",
+        ),
+        call,
+    )
+    parser.add_argument("path", type=Path, metavar="RUN_OR_PREDICTION", help="a run folder, or files of predictions")
+    parser.add_argument(
+        "--to",
+        required=True,
+        choices=TARGETS,
+        help="openlex3d: a cloud, the object of each point and features; scannet: lists of masks with class and score",
+    )
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for the files")
+    parser.add_argument("--method", help="whose maps of a run (default: the only method in it)")
+    parser.add_argument(
+        "--scenes", nargs="+", default=[], metavar="SCENE", help="addresses or patterns, such as 'replica/*'"
+    )
+    parser.add_argument("--format", help="the format of the prediction (default: found from its files)")
+    parser.add_argument(
+        "--protocol", help="for scannet: whose classes and ground truth (default: the dataset's only one of instances)"
+    )
+
+
+@dataclass(frozen=True)
+class Source:
+    """One scene's prediction: who reads it from where under which name; its address, as far as its dataset is known.
+
+    ``run`` is the run folder that it lies in.
+    """
+
+    reader: Reader
+    path: Path
+    scene: str
+    address: str
+    run: Path | None = None
+
+
+def call(arguments: argparse.Namespace) -> int:
+    from su3d_bench.executors import limit_threads
+
+    limit_threads()
+    from su3d_bench.predictions.export import whole_folder, write_openlex, write_scannet
+
+    if arguments.protocol is not None and arguments.to != "scannet":
+        raise ConfigError(f"--protocol {arguments.protocol}: belongs to --to scannet; leave it out")
+    sources = chosen(sources_of(arguments.path, arguments.format, arguments.method), arguments.scenes, arguments.path)
+    names = _names([source.address for source in sources], is_flat=arguments.to == "scannet")
+    rows = []
+    with whole_folder(arguments.out) as folder:
+        for source, name in zip(sources, names, strict=True):
+            prediction = source.reader.read(source.path, source.scene)
+            with _named(source):
+                if arguments.to == "openlex3d":
+                    remarks = write_openlex(prediction.content, folder / name)
+                else:
+                    masks = _labelled(prediction.content, source, arguments)
+                    remarks = write_scannet(masks, name, folder)
+            rows.append({"scene": source.address, "remarks": [*prediction.remarks, *remarks]})
+    if arguments.json:
+        answer_json({"to": arguments.to, "folder": str(arguments.out), "scenes": rows})
+        return EXIT_DONE
+    for row in rows:
+        for one in row["remarks"]:
+            remark(printable(f"{row['scene']}: {one}"), quiet=arguments.quiet)
+    answer(f"{len(rows)} scene{'s' if len(rows) > 1 else ''} for {arguments.to}: {arguments.out}")
+    return EXIT_DONE
+
+
+@contextmanager
+def _named(source: Source) -> Iterator[None]:
+    """Errors of the block begin with the scene."""
+    try:
+        yield
+    except PredictionError as error:
+        raise PredictionError(f"{printable(source.address, 120)}: {error}") from error
+
+
+def sources_of(path: Path, format: str | None, method: str | None) -> list[Source]:
+    """Every scene at ``path``: those of one method of a run folder, or what the reader of its format finds."""
+    from su3d_bench.predictions.formats import READERS, recognise
+
+    found = _maps_of_run(path) if format in {None, "su3d-bench"} else {}
+    if not found and method is not None:
+        raise ConfigError(f"--method {method}: {path} is no run folder; leave it out")
+    if found:
+        if method is None and len(found) > 1:
+            raise ConfigError(f"{path}: holds the maps of {', '.join(found)}; choose one with --method")
+        chosen_method = method or next(iter(found))
+        if chosen_method not in found:
+            raise ConfigError(
+                f"{path}: holds no map of the method '{method}'{suggest(chosen_method, found)}; it has "
+                f"{', '.join(found)}"
+            )
+        reader = READERS["su3d-bench"]
+        run = _run_of(found[chosen_method][0])
+        return [Source(reader, file, name, name, run) for file in found[chosen_method] for name in reader.scenes(file)]
+    reader = recognise(path, format)
+    scenes = reader.scenes(path)
+    if not scenes:
+        raise PredictionError(f"{printable(str(path), 300)}: has no prediction in the format '{reader.name}'")
+    return [Source(reader, path, name, name, _run_of(file)) for name, file in scenes.items()]
+
+
+def _run_of(file: Path) -> Path | None:
+    """The run folder that a map lies in."""
+    above = file.absolute().parents
+    is_in_run = file.name == "prediction.npz" and len(above) > 3 and (above[3] / "run.toml").is_file()
+    return above[3] if is_in_run else None
+
+
+def _maps_of_run(path: Path) -> dict[str, list[Path]]:
+    """The predictions of a run folder by method."""
+    found: dict[str, list[Path]] = {}
+    for file in sorted(path.glob("scenes/*/*/prediction.npz")):
+        found.setdefault(file.parent.name, []).append(file)
+    return found
+
+
+def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> list[Source]:
+    """The sources that a pattern matches, all without patterns; a scene without a dataset takes that of its pattern."""
+    if not patterns:
+        return list(sources)
+    found: dict[str, Source] = {}
+    for pattern in patterns:
+        dataset, slash, tail = pattern.partition("/")
+        matching = []
+        for one in sources:
+            lacks_dataset = bool(slash) and "/" not in one.scene
+            if fnmatch.fnmatchcase(one.scene, tail if lacks_dataset else pattern):
+                matching.append(replace(one, address=f"{dataset}/{one.scene}") if lacks_dataset else one)
+        if not matching:
+            known = [one.scene for one in sources]
+            hint = suggest(pattern, known) or f"; it has {', '.join(known[:5])}{', ...' if len(known) > 5 else ''}"
+            raise ConfigError(printable(f"no scene of {path} matches '{pattern}'{hint}"))
+        found.update({one.address: one for one in matching})
+    return list(found.values())
+
+
+def _names(addresses: Sequence[str], *, is_flat: bool) -> list[str]:
+    """The name of each scene's files: its address, or in a flat folder its last part, which must tell scenes apart."""
+    from su3d_bench.predictions.export import file_name
+
+    names = []
+    for address in addresses:
+        dataset, slash, scene = address.partition("/")
+        parts = [scene] if slash and is_flat else [dataset, scene] if slash else [dataset]
+        names.append("/".join(file_name(part) for part in parts))
+    twice = next((name for name in names if names.count(name) > 1), None)
+    if twice is not None:
+        raise ConfigError(f"two scenes are called '{twice}', and their files would be one; choose with --scenes")
+    return names
+
+
+def _labelled(content: Content, source: Source, arguments: argparse.Namespace) -> LabelledMasks:
+    """The masks on the points of the ground truth, with class ids."""
+    from su3d_bench.predictions.base import VertexMasks
+    from su3d_bench.predictions.export import masks_as_they_are, masks_on_truth, needs_truth
+
+    if not needs_truth(content):
+        assert isinstance(content, VertexMasks)
+        return masks_as_they_are(content)
+    if "/" not in source.address:
+        raise PredictionError(f"which dataset it is of is not known; name it, such as --scenes replica/{source.scene}")
+    dataset, scene = _scene_of(source, is_quiet=arguments.quiet)
+    rules = _rules(arguments.protocol, dataset)
+    return masks_on_truth(content, rules, dataset.ground_truth(scene, rules.ground_truth), _encoder(content, source))
+
+
+def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
+    """The dataset and the scene of a prediction, with the options of the run that it lies in."""
+    from su3d_bench import registry
+    from su3d_bench.cli.datasets_check import chosen_scenes
+    from su3d_bench.config import RunConfig, read_file, resolve
+    from su3d_bench.planning import data_root, dataset_targets
+    from su3d_bench.scene_run import Part, build_dataset
+
+    if source.run is None:
+        return chosen_scenes([source.address], [], is_quiet=is_quiet)[0]
+    name, _, scene = source.address.partition("/")
+    settings = read_file(source.run / "run.toml")
+    for target in dataset_targets(resolve(settings, (), RunConfig).scenes):
+        dataset = registry.load("dataset", target)
+        if dataset.name == name:
+            options = resolve(settings, ("dataset", name), dataset.Options)
+            return build_dataset(Part(target, name, options.model_dump_json()), data_root()), scene
+    raise ConfigError(f"{source.run / 'run.toml'}: names no dataset '{name}'; run it again")
+
+
+def _rules(name: str | None, dataset: Any) -> ProtocolRules:
+    """The protocol of ``name``, or the dataset's only one of instances with classes."""
+    from su3d_bench.planning import why_not_fitting
+    from su3d_bench.protocols import load_protocol, protocols_for
+
+    fitting = {rules.name: rules for rules in map(load_protocol, protocols_for(dataset.name)) if _has_masks(rules)}
+    if name is None:
+        if len(fitting) != 1:
+            known = ", ".join(fitting) or "none fits by itself"
+            raise ConfigError(f"{dataset.name}: whose classes? name a protocol with --protocol ({known})")
+        return next(iter(fitting.values()))
+    rules = load_protocol(name)
+    reason = why_not_fitting(rules, dataset)
+    if reason is not None or not _has_masks(rules):
+        raise ConfigError(f"--protocol {name}: {reason or 'has no classes of instances'}")
+    return rules
+
+
+def _has_masks(rules: ProtocolRules) -> bool:
+    return rules.kind == "instance" and bool(rules.classes) and rules.class_agnostic is None
+
+
+def _encoder(content: Content, source: Source) -> Encoder | None:
+    """What names the features of a run of ours; None where the prediction has classes or no features."""
+    from su3d_bench.cli.query import encoder_of
+    from su3d_bench.store import RunFolder
+
+    has_classes = getattr(content, "labels", None) is not None or getattr(content, "class_numbers", None) is not None
+    if has_classes or getattr(content, "features", None) is None:
+        return None
+    if source.run is None:
+        raise PredictionError(
+            "has features and no classes, and only the texts of the encoder that made them can name them; give a run "
+            "folder, or a prediction with classes"
+        )
+    return encoder_of(RunFolder(source.run))

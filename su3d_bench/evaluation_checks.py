@@ -1,0 +1,189 @@
+"""What is wrong or doubtful in a prediction, found before it is scored; each line says where and how much."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from su3d_bench.errors import PredictionError
+from su3d_bench.metrics.transfer import Masks
+from su3d_bench.plain_text import printable
+from su3d_bench.protocols import ProtocolRules
+from su3d_bench.types import Float32Array, Float64Array, Int64Array
+
+NEAR_IOU = 0.9  # pairs above it are the same object twice
+MOST_SHARED = 300_000_000  # products while pairs are sought; 600 masks of a large scene take some ten million
+UNITS = {1000.0: "millimetres", 100.0: "centimetres", 0.001: "kilometres"}
+LARGEST_RATIO = 20.0  # of what two clouds of one scene span
+NEAR_M = 0.1  # outside of the scene's box that a point still counts as inside
+LEAST_INSIDE = 0.5  # of the points; less means another frame of reference or another scene
+
+
+@dataclass(frozen=True)
+class MaskFacts:
+    """What a reader must know of the masks of a scene.
+
+    ``near`` and ``identical`` are pairs of masks whose IoU is above 0.9 or 1, ``near`` None where there are too many
+    overlaps to look; of ``n_covered`` points in masks, ``n_contested`` are in several.
+    """
+
+    n_masks: int
+    n_empty: int
+    near: tuple[tuple[int, int], ...] | None
+    identical: tuple[tuple[int, int], ...]
+    lowest_score: float | None
+    highest_score: float | None
+    n_covered: int
+    n_contested: int
+
+
+def mask_facts(masks: Masks, scores: Float64Array, n_points: int) -> MaskFacts:
+    """Facts of K masks over ``n_points`` points."""
+    n_owners = np.bincount(masks.indices, minlength=n_points) if n_points else np.zeros(0, np.int64)
+    near, identical = _pairs(masks, n_owners)
+    return MaskFacts(
+        n_masks=len(masks),
+        n_empty=int((np.diff(masks.indptr) == 0).sum()),
+        near=near,
+        identical=identical,
+        lowest_score=float(scores.min()) if len(scores) else None,
+        highest_score=float(scores.max()) if len(scores) else None,
+        n_covered=int((n_owners > 0).sum()),
+        n_contested=int((n_owners > 1).sum()),
+    )
+
+
+def _pairs(
+    masks: Masks, n_owners: Int64Array
+) -> tuple[tuple[tuple[int, int], ...] | None, tuple[tuple[int, int], ...]]:
+    """Pairs of masks, the lower first, with IoU above ``NEAR_IOU``, and the equal ones among them."""
+    if float((n_owners.astype(np.float64) ** 2).sum()) > MOST_SHARED:
+        return None, ()
+    from scipy.sparse import csr_array
+
+    # points in one mask alone tell nothing of pairs
+    is_shared = n_owners[masks.indices] > 1
+    starts = np.concatenate([[0], np.cumsum(is_shared)])[masks.indptr]
+    chosen = masks.indices[is_shared]
+    member = csr_array((np.ones(len(chosen), np.int32), chosen, starts), shape=(len(masks), len(n_owners)))
+    shared = (member @ member.T).tocoo()
+    size = np.diff(masks.indptr)
+    union = size[shared.row] + size[shared.col] - shared.data
+    is_near = (shared.row < shared.col) & (shared.data > NEAR_IOU * union)
+    near = sorted(zip(shared.row[is_near].tolist(), shared.col[is_near].tolist(), strict=True))
+    is_equal = (shared.row < shared.col) & (shared.data == union)
+    identical = sorted(zip(shared.row[is_equal].tolist(), shared.col[is_equal].tolist(), strict=True))
+    return tuple(near), tuple(identical)
+
+
+def empty_warnings(scene: str, facts: MaskFacts, masks: Masks, keys: Sequence[str]) -> list[str]:
+    """A sentence on empty masks, with their number and the first of them."""
+    if not facts.n_empty:
+        return []
+    first = int(np.flatnonzero(np.diff(masks.indptr) == 0)[0])
+    return [f"{scene}: {_number(facts.n_empty, 'empty mask')}, the first is mask {first}{_key(keys, first)}"]
+
+
+def duplicate_warnings(scene: str, facts: MaskFacts, keys: Sequence[str]) -> list[str]:
+    """Sentences on masks that are there twice, with the number of pairs and the first of them."""
+    lines = []
+    for pairs, what in ((facts.identical, "identical masks"), (_only(facts.near, facts.identical), "near-duplicates")):
+        if pairs:
+            one, other = pairs[0]
+            names = f"{one}{_key(keys, one)} and {other}{_key(keys, other)}"
+            lines.append(f"{scene}: {_number(len(pairs), 'pair')} of {what}, the first is {names}; they can move AP")
+    if facts.near is None:
+        lines.append(f"{scene}: the masks overlap so much that duplicates were not looked for")
+    return lines
+
+
+def _only(
+    near: tuple[tuple[int, int], ...] | None, identical: tuple[tuple[int, int], ...]
+) -> tuple[tuple[int, int], ...]:
+    equal = set(identical)
+    return tuple(pair for pair in near or () if pair not in equal)
+
+
+def _number(n: int, what: str) -> str:
+    return f"{n} {what}" + ("" if n == 1 else "s")
+
+
+def _key(keys: Sequence[str], k: int) -> str:
+    plain = k < len(keys) and keys[k] not in {"", f"mask {k}"}
+    return f" ({printable(keys[k], 80)})" if plain else ""
+
+
+def class_warnings(scene: str, rules: ProtocolRules, numbers: Int64Array | None, ids: Int64Array) -> list[str]:
+    """A sentence on masks whose class the protocol does not score; ``ids`` (K,) are class ids, 0 for none.
+
+    ``numbers`` (K,) are the classes as the file has them.
+    """
+    if numbers is None or rules.class_agnostic is not None:
+        return []
+    scored = {entry.id for entry in rules.scored}
+    name_of = {entry.id: entry.name for entry in rules.classes}
+    is_dropped = np.array([int(one) not in scored for one in ids], bool)
+    if not is_dropped.any():
+        return []
+    values, counts = np.unique(np.asarray(numbers)[is_dropped], return_counts=True)
+    most = np.argsort(-counts, kind="stable")[:3]
+    texts = [f"{values[row]}{_known(name_of.get(int(values[row])))} {counts[row]} times" for row in most]
+    more = f" and {len(values) - 3} more" if len(values) > 3 else ""
+    first = int(np.argmax(is_dropped))
+    verb = "has" if is_dropped.sum() == 1 else "have"
+    return [
+        f"{scene}: {int(is_dropped.sum())} of {len(ids)} masks {verb} a class that is not scored and "
+        f"{'counts' if verb == 'has' else 'count'} for nothing: {', '.join(texts)}{more}; the first is mask {first}"
+    ]
+
+
+def _known(name: str | None) -> str:
+    return f" ({name})" if name else ""
+
+
+def label_warnings(scene: str, rules: ProtocolRules, class_ids: Int64Array) -> list[str]:
+    """A sentence on points whose predicted class is none of the protocol's."""
+    is_unknown = ~np.isin(class_ids, [entry.id for entry in rules.classes])
+    if not is_unknown.any():
+        return []
+    values, counts = np.unique(class_ids[is_unknown], return_counts=True)
+    worst = int(values[np.argmax(counts)])
+    return [
+        f"{scene}: {int(is_unknown.sum())} of {len(class_ids)} points are predicted as none of the "
+        f"{len(rules.classes)} classes (most often {worst}, first at point {int(np.argmax(is_unknown))}), which is "
+        "wrong wherever they count"
+    ]
+
+
+def check_cloud(scene: str, points: Float32Array, truth: Float32Array) -> list[str]:
+    """Sentences on how a prediction's cloud lies over the truth's; ``PredictionError`` where that makes no sense."""
+    if not len(points) or not len(truth):
+        return []
+    if not np.isfinite(points).all():
+        bad = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
+        raise PredictionError(f"{scene}: point {bad} is at {points[bad].tolist()}; coordinates are finite metres")
+    low, high = truth.min(axis=0).astype(np.float64), truth.max(axis=0).astype(np.float64)
+    span, true_span = float((points.max(axis=0) - points.min(axis=0)).max()), float((high - low).max())
+    ratio = span / true_span if true_span > 0 else 1.0
+    if ratio > LARGEST_RATIO or 0 < ratio < 1 / LARGEST_RATIO:
+        unit = next((name for factor, name in UNITS.items() if factor / 4 < ratio < factor * 4), None)
+        guess = f": {unit}?" if unit else "; is it of this scene?"
+        raise PredictionError(
+            f"{scene}: the cloud spans {span:.4g}, the scene {true_span:.4g} m{guess} coordinates must be metres in "
+            "the frame of the ground truth"
+        )
+    is_inside = ((points >= low - NEAR_M) & (points <= high + NEAR_M)).all(axis=1)
+    share = float(is_inside.mean())
+    if share == 0:
+        raise PredictionError(
+            f"{scene}: no point of the cloud lies in the box of the scene; is it of another scene or in another frame "
+            "of reference?"
+        )
+    if share < LEAST_INSIDE:
+        return [
+            f"{scene}: only {100 * share:.0f} % of the cloud lies in the box of the scene (the first outside is point "
+            f"{int(np.argmin(is_inside))}); is the frame of reference right?"
+        ]
+    return []

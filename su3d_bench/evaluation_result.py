@@ -1,0 +1,266 @@
+"""The numbers of an evaluation with what must stand beside them, and their JSON form."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any, cast
+
+import numpy as np
+
+from su3d_bench.errors import PredictionError
+from su3d_bench.evaluation_checks import MaskFacts
+from su3d_bench.evaluation_scoring import SceneOutcome
+from su3d_bench.metrics.instance_ap import InstanceCounts
+from su3d_bench.metrics.results import ProtocolResult, metric_values
+from su3d_bench.metrics.scene_score import SceneScore
+from su3d_bench.protocols import ProtocolRules
+from su3d_bench.scoring import combine
+
+SCHEMA = 1
+EVERY_CONFIDENCE = "every confidence is"
+# What the file calls the metrics; the first ones of each kind are its headline.
+KEYS = {
+    "AP": "ap", "AP50": "ap50", "AP25": "ap25", "mAcc": "macc", "mIoU": "miou", "F-mIoU": "fmiou", "pAcc": "pacc",
+    "recall": "acc", "precision": "precision", "IoU": "iou", "F1": "f1", "mPrecision": "mprecision", "mF1": "mf1",
+}  # fmt: skip
+MAIN = ("ap", "ap50", "ap25", "macc", "miou", "fmiou")
+
+
+@dataclass
+class SceneOutcomes:
+    """What the scenes gave under one protocol so far."""
+
+    scores: dict[str, SceneScore] = field(default_factory=dict)
+    ceilings: dict[str, SceneScore | None] = field(default_factory=dict)
+    bounds: list[InstanceCounts] = field(default_factory=list)
+    facts: dict[str, MaskFacts] = field(default_factory=dict)
+    warnings: list[str] = field(default_factory=list)
+    missed: list[str] = field(default_factory=list)
+    skipped: list[str] = field(default_factory=list)
+    unscored: dict[str, str] = field(default_factory=dict)
+    has_coverage: bool = False
+
+    def add(self, scene: str, outcome: SceneOutcome) -> None:
+        self.scores[scene] = outcome.score
+        self.ceilings[scene] = outcome.ceiling
+        self.warnings += outcome.warnings
+        if outcome.bound is not None:
+            self.bounds.append(outcome.bound)
+        if outcome.facts is not None:
+            self.facts[scene] = outcome.facts
+
+
+@dataclass(frozen=True)
+class ProtocolEvaluation:
+    """One protocol: ``result`` with the ``ceiling``, and ``every_class``, what every mask under each class would score.
+
+    ``with_ones``: what 1 for every confidence gives, where the protocol has that and the files' own count.
+
+    ``missed`` scenes have no prediction and count as missed, ``skipped`` ones are left out as the original does.
+    ``coverage``: by radius in metres the share of scored points with a predicted point that near, None without
+    coordinates.
+    """
+
+    kind: str
+    result: ProtocolResult
+    ceiling: Mapping[str, float] | None
+    every_class: Mapping[str, float] | None
+    with_ones: Mapping[str, float] | None
+    coverage: Mapping[str, float] | None
+    facts: Mapping[str, MaskFacts]
+    missed: tuple[str, ...]
+    skipped: tuple[str, ...]
+    warnings: tuple[str, ...]
+
+    @property
+    def n_duplicates(self) -> tuple[int, int]:
+        """Pairs of masks with IoU above 0.9, and the identical ones among them, over all scenes."""
+        facts = self.facts.values()
+        return sum(len(one.near or ()) for one in facts), sum(len(one.identical) for one in facts)
+
+    @property
+    def confidences(self) -> tuple[float, float] | None:
+        """The lowest and the highest confidence in the files; None where there is none."""
+        known = [one for one in self.facts.values() if one.lowest_score is not None and one.highest_score is not None]
+        lows = [one.lowest_score for one in known if one.lowest_score is not None]
+        highs = [one.highest_score for one in known if one.highest_score is not None]
+        return (min(lows), max(highs)) if known else None
+
+    @property
+    def contested(self) -> float | None:
+        """Of the points in masks, the share that is in several; None where no mask has a point."""
+        n_covered = sum(one.n_covered for one in self.facts.values())
+        return sum(one.n_contested for one in self.facts.values()) / n_covered if n_covered else None
+
+    def to_json(self) -> dict[str, Any]:
+        result = self.result
+        near, identical = self.n_duplicates
+        confidences = self.confidences
+        metrics = _renamed(result.metrics)
+        return {
+            "version": result.version,
+            "kind": self.kind,
+            "n_scenes": result.n_scenes,
+            "metrics": {key: value for key, value in metrics.items() if key in MAIN or self.kind == "categories"},
+            "intervals": _renamed(result.intervals),
+            "pooled": _renamed(result.pooled),
+            "scene_mean": _renamed(result.scene_mean),
+            "ceiling": None if self.ceiling is None else _renamed(self.ceiling),
+            "every_mask_every_class": None if self.every_class is None else _renamed(self.every_class),
+            "every_confidence_1": None if self.with_ones is None else _renamed(self.with_ones),
+            "groups": {name: _renamed(values) for name, values in result.groups.items()},
+            "per_class": {name: _renamed(values) for name, values in result.per_class.items()},
+            "per_scene": {name: _renamed(values) for name, values in result.per_scene.items()},
+            "coverage": None if self.coverage is None else _plain(self.coverage),
+            "n_predictions": dict(result.n_predictions),
+            "duplicates": {"near": near, "identical": identical},
+            "confidences": None
+            if confidences is None
+            else {"min": confidences[0], "max": confidences[1], "constant": confidences[0] == confidences[1]},
+            "contested_points": self.contested,
+            "missed_scenes": list(self.missed),
+            "skipped_scenes": list(self.skipped),
+            "warnings": list(self.warnings),
+        }
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """All protocols; ``not_scored`` has a reason for each of the others, ``remarks`` are of the files themselves."""
+
+    protocols: tuple[ProtocolEvaluation, ...]
+    not_scored: Mapping[str, str]
+    formats: tuple[str, ...]
+    ground_truth: str
+    remarks: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """The value of the ``--json`` file: fractions in full precision, null where a value is undefined."""
+        return {
+            "schema": SCHEMA,
+            "formats": list(self.formats),
+            "ground_truth": self.ground_truth,
+            "protocols": {one.result.protocol: one.to_json() for one in self.protocols},
+            "not_scored": dict(self.not_scored),
+            "remarks": list(self.remarks),
+        }
+
+
+def form_evaluation(
+    rules: Mapping[str, ProtocolRules],
+    outcomes: Mapping[str, SceneOutcomes],
+    unfit: Mapping[str, str],
+    formats: tuple[str, ...],
+    ground_truth: str,
+    remarks: Sequence[str],
+    *,
+    file_confidences: bool,
+) -> Evaluation:
+    """The evaluation of all scenes; a protocol for which no scene has a truth joins those that are not scored."""
+    not_scored = dict(unfit)
+    for name, kept in outcomes.items():
+        if not kept.scores:
+            not_scored[name] = next(iter(kept.unscored.values()), "no scene was scored")
+    formed = [_form(rules[name], kept, file_confidences) for name, kept in outcomes.items() if kept.scores]
+    if not formed:
+        raise PredictionError(f"nothing could be scored: {next(iter(not_scored.values()))}")
+    return Evaluation(tuple(formed), dict(sorted(not_scored.items())), formats, ground_truth, tuple(_once(remarks)))
+
+
+def _form(rules: ProtocolRules, kept: SceneOutcomes, file_confidences: bool) -> ProtocolEvaluation:
+    result = combine(rules, kept.scores)
+    ceilings = {scene: one for scene, one in kept.ceilings.items() if one is not None}
+    is_whole = len(ceilings) == len(kept.scores)
+    covered = {radius: 1.0 - share for radius, share in result.coverage.items()}
+    evaluation = ProtocolEvaluation(
+        kind=rules.kind,
+        result=result,
+        ceiling=_metrics_of(rules, ceilings) if is_whole else None,
+        every_class=metric_values(rules, kept.bounds, pooled=True) if len(kept.bounds) == len(kept.scores) else None,
+        with_ones=_with_ones(rules, kept) if file_confidences else None,
+        coverage=covered if kept.has_coverage else None,
+        facts=kept.facts,
+        missed=tuple(kept.missed),
+        skipped=tuple(kept.skipped),
+        warnings=(),
+    )
+    lines = [*_scene_warnings(kept), *_confidence_warnings(rules, evaluation, file_confidences), *kept.warnings]
+    lines += [line for line in result.warnings if EVERY_CONFIDENCE not in line]  # said above, for all scenes at once
+    return replace(evaluation, warnings=tuple(_once(lines)))
+
+
+def _metrics_of(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> Mapping[str, float]:
+    """What the protocol reports of these scenes, without the interval, which takes longest."""
+    if rules.aggregate == "pooled":
+        return metric_values(rules, [scores[scene].counts for scene in sorted(scores)], pooled=True)
+    return combine(rules, scores).metrics
+
+
+def _with_ones(rules: ProtocolRules, kept: SceneOutcomes) -> dict[str, float] | None:
+    """The metrics with 1 for every confidence; None where the protocol, or the files themselves, have that anyway.
+
+    Which predictions hit does not depend on confidences, but a hit that is met twice takes the better one; with 1 for
+    all there is no better one.
+    """
+    if rules.kind != "instance" or rules.confidence != "ones":
+        return None
+    counts = [cast("InstanceCounts", score.counts) for score in kept.scores.values()]
+    if all((one.score == 1).all() for one in counts):
+        return None
+    ones = [replace(one, score=np.ones(len(one.score))) for one in counts]
+    return metric_values(rules, ones, pooled=rules.aggregate == "pooled")
+
+
+def _scene_warnings(kept: SceneOutcomes) -> list[str]:
+    lines = []
+    n = len(kept.scores) + len(kept.skipped) + len(kept.unscored)
+    if kept.skipped:
+        lines.append(
+            f"{len(kept.skipped)} of {n} scenes have no prediction and are left out, as the original evaluator does; "
+            f"their objects do not count as missed: {_some(kept.skipped)}"
+        )
+    if kept.missed:
+        lines.append(f"{len(kept.missed)} of {n} scenes have no prediction and count as missed: {_some(kept.missed)}")
+    return lines + [f"{scene}: not scored: {reason}" for scene, reason in kept.unscored.items()]
+
+
+def _confidence_warnings(rules: ProtocolRules, evaluation: ProtocolEvaluation, file_confidences: bool) -> list[str]:
+    found = evaluation.confidences
+    if rules.kind != "instance" or found is None:
+        return []
+    if evaluation.with_ones is not None:
+        shown = ", ".join(f"{name} {100 * evaluation.with_ones[name]:.1f}" for name in rules.headline)
+        return [
+            "the confidences in the files count, as the official script takes them; numbers published under this "
+            f"protocol have 1 for every mask, which gives {shown}"
+        ]
+    if rules.confidence == "ones" and not file_confidences:
+        differ = f"; those of the files, {found[0]:g} to {found[1]:g}, do not count" if found[0] < found[1] else ""
+        return [f"the protocol has 1 for every confidence{differ}: AP of a class is then recall (1 + precision) / 2"]
+    if found[0] == found[1] and sum(one.n_masks for one in evaluation.facts.values()) > 1:
+        return [f"{EVERY_CONFIDENCE} {found[0]:g}: AP of a class is then recall (1 + precision) / 2"]
+    return []
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(names[:5]) + (f" and {len(names) - 5} more" if len(names) > 5 else "")
+
+
+def _once(lines: Sequence[str]) -> list[str]:
+    return list(dict.fromkeys(lines))
+
+
+def _renamed(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values under the names that the file has for them, without counts of classes."""
+    plain = {KEYS.get(name, name.lower().replace("-", "_")): _plain(one) for name, one in values.items()}
+    return {name: one for name, one in plain.items() if not name.startswith("n_") and "conceptgraphs" not in name}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value

@@ -1,0 +1,338 @@
+"""One scene's prediction from elsewhere under one protocol: whether it fits, its counts, what stands beside them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from su3d_bench import registry
+from su3d_bench.errors import PredictionError
+from su3d_bench.evaluation_bound import every_class_counts
+from su3d_bench.evaluation_checks import (
+    MaskFacts,
+    check_cloud,
+    class_warnings,
+    duplicate_warnings,
+    empty_warnings,
+    label_warnings,
+    mask_facts,
+)
+from su3d_bench.evaluation_truth import TextTruth
+from su3d_bench.metrics import instance_ap, semantic, transfer
+from su3d_bench.metrics.labelling import (
+    candidate_classes,
+    class_index_of_ids,
+    classes_of_prediction,
+    encoder_warning,
+    scored_classes,
+)
+from su3d_bench.metrics.scene_score import SceneScore, present
+from su3d_bench.metrics.score_instances import OBJECT, encode_without_classes
+from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
+from su3d_bench.protocols import ProtocolRules
+from su3d_bench.scoring import score_scene, why_not_scorable
+from su3d_bench.types import (
+    DenseFeatures,
+    Encoder,
+    Float32Array,
+    GroundTruth,
+    Instances,
+    Int64Array,
+    Partition,
+    Prediction,
+)
+
+
+@dataclass(frozen=True)
+class SceneOutcome:
+    """A scene under a protocol: its counts, those of the ceiling, those of every mask under every class, facts."""
+
+    score: SceneScore
+    ceiling: SceneScore | None
+    bound: instance_ap.InstanceCounts | None
+    facts: MaskFacts | None
+    warnings: tuple[str, ...]
+
+
+def why_not_content(rules: ProtocolRules, content: Content, *, has_points: bool) -> str | None:
+    """Why a prediction of this kind cannot be scored under the protocol; None where it can.
+
+    ``has_points``: the points of the truth have coordinates.
+    """
+    if rules.kind in ("queries", "categories"):
+        return f"needs ground truth of the form '{rules.ground_truth}', which neither a dataset nor text files give"
+    if not isinstance(content, VertexMasks | VertexLabels):
+        if not has_points:
+            return "the prediction has points of its own, the ground truth has no coordinates; name a --dataset"
+        reason = why_not_scorable(rules, content)
+        return reason.removeprefix(f"{rules.name}: ") if reason else _why_no_labels(rules, content)
+    if isinstance(content, VertexLabels):
+        if rules.kind == "instance":
+            return "needs instances, the prediction has one class a point"
+        return (
+            None if has_points or rules.metric == "scannet" else "needs the coordinates of the points; name a --dataset"
+        )
+    if rules.kind == "semantic" and not has_points:
+        return "needs a class for every point, the prediction has masks; name a --dataset to make them a map"
+    if rules.class_agnostic is None and len(content):
+        if content.class_numbers is None and content.features is None:
+            return "needs classes, the masks have neither classes nor features"
+        if content.class_numbers is not None and content.numbering == "id" and not content.class_numbers.any():
+            return "needs classes, every mask has class 0"
+    return None
+
+
+def _why_no_labels(rules: ProtocolRules, content: Prediction) -> str | None:
+    lacks = isinstance(content, Instances) and len(content) and content.labels is None and content.features is None
+    return (
+        "needs classes, the instances have neither labels nor features" if lacks and not rules.class_agnostic else None
+    )
+
+
+def n_feature_dimensions(rules: ProtocolRules, content: Content) -> int | None:
+    """The dimensions of the features that must be named; None where labels are there or the protocol needs none."""
+    if rules.class_agnostic is not None or isinstance(content, VertexLabels):
+        return None
+    if isinstance(content, VertexMasks):
+        has_labels = content.class_numbers is not None
+    else:
+        has_labels = getattr(content, "labels", None) is not None
+    features = content.features
+    return None if has_labels or features is None or not len(features) else int(features.shape[1])
+
+
+def check_length(scene: str, content: Content, n_points: int) -> None:
+    """``PredictionError`` where masks or labels are not over the points of the truth."""
+    n = None
+    if isinstance(content, VertexMasks):
+        n = content.n_points
+    elif isinstance(content, VertexLabels):
+        n = len(content.class_ids)
+    if n is not None and n != n_points:
+        what = "masks are" if isinstance(content, VertexMasks) else "labels are"
+        raise PredictionError(
+            f"{scene}: the {what} of {n} points, the ground truth has {n_points}; both must be over the vertices of "
+            "one mesh, in its order"
+        )
+
+
+def nothing_like(content: Content) -> Content:
+    """An empty prediction of the same kind, for a scene that was not predicted."""
+    if isinstance(content, VertexLabels):
+        return VertexLabels(np.zeros(0, np.int32))
+    none = np.zeros(0, np.int32)
+    return VertexMasks(None, np.zeros(1, np.int64), none, np.zeros(0), none, "id", None, ())
+
+
+def score_on_vertices(
+    rules: ProtocolRules, truth: TextTruth, scene: str, content: Content, encoder: Encoder | None
+) -> SceneOutcome:
+    """The outcome of masks or labels over points without coordinates: no neighbours, no coverage."""
+    labels = truth.labels(scene)
+    if isinstance(content, VertexLabels):
+        class_ids = content.class_ids if len(content.class_ids) else np.zeros(len(labels), np.int32)
+        ceiling = _semantic_score(rules, labels, labels)
+        told = label_warnings(scene, rules, content.class_ids.astype(np.int64))
+        return SceneOutcome(_semantic_score(rules, labels, class_ids), ceiling, None, None, tuple(told))
+    assert isinstance(content, VertexMasks)
+    values = truth.values[scene]
+    if rules.class_agnostic is not None:
+        is_scored = np.isin(labels, [entry.id for entry in rules.scored])
+        values = encode_without_classes(rules.class_agnostic, values % instance_ap.INSTANCES_PER_CLASS, is_scored)
+    ids = _ids_of_masks(rules, content, labels, encoder)
+    masks = transfer.Masks(content.indptr, content.indices)
+    facts = mask_facts(masks, content.scores, len(values))
+    told = [
+        *empty_warnings(scene, facts, masks, content.keys),
+        *duplicate_warnings(scene, facts, content.keys),
+        *class_warnings(scene, rules, content.class_numbers, ids),
+    ]
+    if (named := encoder_warning(rules, _instances(rules, content, np.zeros((0, 3), np.float32)), encoder)) is not None:
+        told.append(named)
+    return SceneOutcome(
+        _instance_score(rules, values, content, ids),
+        _instance_ceiling(rules, truth, scene, values),
+        _bound(rules, values, masks, content.scores),
+        facts,
+        tuple(told),
+    )
+
+
+def _semantic_score(rules: ProtocolRules, labels: Int64Array, class_ids: np.ndarray) -> SceneScore:
+    is_scored = scored_classes(rules)
+    true_class = class_index_of_ids(rules, labels)
+    counts = semantic.per_scene(true_class, class_index_of_ids(rules, class_ids), is_scored)
+    return _score(rules, counts, len(np.unique(class_ids)), int((true_class >= 0).sum()))
+
+
+def _instance_score(rules: ProtocolRules, values: Int64Array, masks: VertexMasks, ids: Int64Array) -> SceneScore:
+    assert rules.min_region_size is not None
+    scores = np.ones(len(masks)) if rules.confidence == "ones" else masks.scores
+    class_ids = _class_ids(rules)
+    counts = instance_ap.per_scene(
+        values, masks.indptr, masks.indices, ids, scores, class_ids, rules.min_region_size, rules.thresholds
+    )
+    n_scored = int(np.isin(values // instance_ap.INSTANCES_PER_CLASS, class_ids).sum())
+    return _score(rules, counts, len(masks), n_scored)
+
+
+def _score(
+    rules: ProtocolRules,
+    counts: instance_ap.InstanceCounts | semantic.SemanticCounts,
+    n_predictions: int,
+    n_scored: int,
+) -> SceneScore:
+    nowhere = np.zeros(len(transfer.COVERAGE_RADII_M), np.int64)  # without coordinates nothing is known of distances
+    return SceneScore(rules.name, rules.version, counts, n_predictions, n_scored, nowhere, ())
+
+
+def _class_ids(rules: ProtocolRules) -> list[int]:
+    return [OBJECT] if rules.class_agnostic is not None else [entry.id for entry in rules.scored]
+
+
+def _ids_of_masks(rules: ProtocolRules, masks: VertexMasks, labels: Int64Array, encoder: Encoder | None) -> Int64Array:
+    """The class id of each mask, 0 where it has none of the protocol's."""
+    if rules.class_agnostic is not None:
+        return np.full(len(masks), OBJECT, np.int64)
+    if masks.class_numbers is not None:
+        return _ids_of_numbers(rules, masks)
+    is_present = present(class_index_of_ids(rules, labels), len(rules.classes)) & scored_classes(rules)
+    instances = _instances(rules, masks, np.zeros((0, 3), np.float32))
+    classes = classes_of_prediction(rules, instances, encoder, candidate_classes(rules, is_present))
+    ids = np.array([entry.id for entry in rules.classes], np.int64)
+    return np.where(classes >= 0, ids[classes], 0) if len(classes) else np.zeros(0, np.int64)
+
+
+def _ids_of_numbers(rules: ProtocolRules, masks: VertexMasks) -> Int64Array:
+    """Class ids from what the file has: ids already, or places in the list of the classes that are scored."""
+    assert masks.class_numbers is not None
+    numbers = masks.class_numbers.astype(np.int64)
+    if masks.numbering == "id":
+        return numbers
+    ids = np.array([entry.id for entry in rules.scored], np.int64)
+    is_known = (numbers >= 0) & (numbers < len(ids))
+    return np.where(is_known, ids[np.where(is_known, numbers, 0)], 0)
+
+
+def _instance_ceiling(rules: ProtocolRules, truth: TextTruth, scene: str, values: Int64Array) -> SceneScore:
+    """What the annotated objects themselves score."""
+    own = truth.values[scene]
+    n_of_value = np.bincount(own, minlength=1)
+    distinct = np.flatnonzero(n_of_value[instance_ap.INSTANCES_PER_CLASS :]) + instance_ap.INSTANCES_PER_CLASS
+    row_of_value = np.full(len(n_of_value), -1, np.int64)
+    row_of_value[distinct] = np.arange(len(distinct))
+    masks = transfer.masks_of_partition(row_of_value[own], len(distinct))
+    labels = distinct // instance_ap.INSTANCES_PER_CLASS
+    ids = np.full(len(distinct), OBJECT) if rules.class_agnostic is not None else labels
+    ones, keys = np.ones(len(distinct)), ("",) * len(distinct)
+    perfect = VertexMasks(len(own), masks.indptr, masks.indices, ones, None, "id", None, keys)
+    return _instance_score(rules, values, perfect, ids.astype(np.int64))
+
+
+def _bound(
+    rules: ProtocolRules, values: Int64Array, masks: transfer.Masks, scores: np.ndarray
+) -> instance_ap.InstanceCounts | None:
+    if rules.class_agnostic is not None:
+        return None
+    assert rules.min_region_size is not None
+    used = np.ones(len(masks)) if rules.confidence == "ones" else scores
+    return every_class_counts(values, masks, used, _class_ids(rules), rules.min_region_size, rules.thresholds)
+
+
+def _instances(rules: ProtocolRules, masks: VertexMasks, points: Float32Array) -> Instances:
+    """Masks over the truth's points as a map on these points."""
+    k = len(masks)
+    labels = None
+    if masks.class_numbers is not None:
+        name_of = {entry.id: entry.name for entry in rules.classes}
+        ids = _ids_of_numbers(rules, masks)
+        labels = tuple(name_of.get(int(one), f"class {one}") for one in ids)
+    elif not k:
+        labels = ()
+    has_points = len(points) > 0
+    return Instances(
+        points=points,
+        indptr=masks.indptr if has_points else np.zeros(k + 1, np.int64),
+        indices=masks.indices if has_points else np.zeros(0, np.int32),
+        scores=masks.scores,
+        features=masks.features,
+        labels=labels,
+        names=masks.keys,
+        captions=("",) * k,
+        boxes=np.zeros((k, 2, 3), np.float32),
+        centroids=np.zeros((k, 3), np.float32),
+        view_indptr=np.zeros(k + 1, np.int64),
+        views=np.zeros((0, 2), np.int32),
+    )
+
+
+def _map_of_labels(rules: ProtocolRules, content: VertexLabels, points: Float32Array) -> Instances:
+    """One mask a predicted class over the truth's points."""
+    distinct, row = np.unique(content.class_ids, return_inverse=True)
+    masks = transfer.masks_of_partition(row, len(distinct))
+    keys = tuple(f"class {one}" for one in distinct)
+    n = len(content.class_ids)
+    of_classes = VertexMasks(
+        n, masks.indptr, masks.indices, np.ones(len(distinct)), distinct.astype(np.int32), "id", None, keys
+    )
+    return _instances(rules, of_classes, points)
+
+
+def score_on_truth(
+    rules: ProtocolRules, truth: GroundTruth, scene: str, content: Content, encoder: Encoder | None
+) -> SceneOutcome:
+    """The outcome against the truth of a dataset; what has no points of its own stands on those of the truth."""
+    told: list[str] = []
+    if isinstance(content, VertexMasks):
+        prediction: Prediction = _instances(rules, content, truth.points)
+        if content.class_numbers is not None:
+            told += class_warnings(scene, rules, content.class_numbers, _ids_of_numbers(rules, content))
+    elif isinstance(content, VertexLabels):
+        prediction = _map_of_labels(rules, content, truth.points)
+        told += label_warnings(scene, rules, content.class_ids.astype(np.int64))
+    else:
+        prediction = content
+        told += check_cloud(scene, prediction.points, truth.points)
+    facts = None
+    masks, scores = _masks_and_scores(prediction)
+    if masks is not None and not isinstance(content, VertexLabels):
+        facts = mask_facts(masks, scores, len(prediction.points))
+        told += empty_warnings(scene, facts, masks, getattr(prediction, "names", ()))
+    return SceneOutcome(
+        score_scene(rules, truth, prediction, encoder),
+        _oracle_score(rules, truth),
+        None if masks is None else _bound_on_truth(rules, truth, prediction, masks, scores),
+        facts,
+        tuple(told),
+    )
+
+
+def _masks_and_scores(prediction: Prediction) -> tuple[transfer.Masks | None, np.ndarray]:
+    if isinstance(prediction, Instances):
+        return transfer.masks_of(prediction), np.asarray(prediction.scores, np.float64)
+    if isinstance(prediction, Partition):
+        n = len(prediction.features)
+        return transfer.masks_of_partition(prediction.instance, n), np.ones(n)
+    assert isinstance(prediction, DenseFeatures)
+    return None, np.zeros(0)
+
+
+def _bound_on_truth(
+    rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, masks: transfer.Masks, scores: np.ndarray
+) -> instance_ap.InstanceCounts | None:
+    if rules.kind != "instance" or rules.class_agnostic is not None:
+        return None
+    cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
+    moved = transfer.transfer_masks(prediction.points, masks, truth.points, cap_m, voxel_m)
+    return _bound(rules, instance_ap.encode_ground_truth(truth.semantic, truth.instance), moved, scores)
+
+
+def _oracle_score(rules: ProtocolRules, truth: GroundTruth) -> SceneScore | None:
+    """What the truth itself scores through the same steps; None where it has no instances to hand over."""
+    if not truth.instance.any():
+        return None
+    method_class = registry.load("method", "oracle")
+    oracle = method_class(method_class.Config())
+    oracle.receive_truth(truth)
+    return score_scene(rules, truth, oracle.finish(), None)

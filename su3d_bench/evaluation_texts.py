@@ -1,0 +1,112 @@
+"""Features of class names: out of a file that the user gives, or of the encoder that is here."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from su3d_bench.digests import digest_file
+from su3d_bench.errors import DataError, PredictionError
+from su3d_bench.plain_text import printable
+from su3d_bench.predictions.base import shown
+from su3d_bench.predictions.numpy_files import read_npz
+from su3d_bench.protocols import ProtocolRules
+from su3d_bench.types import Encoder, Float32Array, UInt8Array
+
+
+@dataclass(frozen=True)
+class TextFeatures:
+    """A feature (C, D) for each of ``names``, which are class names or whole prompts, out of ``path``."""
+
+    path: Path
+    names: tuple[str, ...]
+    features: Float32Array
+
+    @property
+    def dim(self) -> int:
+        return int(self.features.shape[1])
+
+    def missing(self, rules: ProtocolRules) -> list[str]:
+        """The classes of the protocol among which a classifier may choose and that have no feature here."""
+        known = set(self.names)
+        candidates = rules.classes if rules.vocabulary == "all" else rules.scored
+        return [one.name for one in candidates if one.name not in known and not known.issuperset(_prompts(rules, one))]
+
+
+def _prompts(rules: ProtocolRules, entry: object) -> tuple[str, ...]:
+    return rules.texts_of(str(getattr(entry, "name", entry)))
+
+
+class GivenTexts:
+    """``TextFeatures`` in the place of the protocol's encoder: a prompt has its own feature, or its class's."""
+
+    def __init__(self, given: TextFeatures, rules: ProtocolRules) -> None:
+        self.name = rules.encoder or f"features in {given.path.name}"
+        self.dim = given.dim
+        self._given = given
+        self._row_of = {name: row for row, name in enumerate(given.names)}
+        self._class_of = {text: one.name for one in rules.classes for text in rules.texts_of(one.name)}
+
+    @property
+    def digest(self) -> str:
+        return digest_file(self._given.path)
+
+    def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
+        raise PredictionError(f"{shown(self._given.path)}: has features of texts, not of images")
+
+    def encode_texts(self, texts: Sequence[str]) -> Float32Array:
+        rows = [self._row_of.get(text, self._row_of.get(self._class_of.get(text, text), -1)) for text in texts]
+        if -1 in rows:
+            raise PredictionError(f"{shown(self._given.path)}: has no feature for '{texts[rows.index(-1)]}'")
+        features: Float32Array = self._given.features[rows]
+        return features
+
+
+def read_text_features(path: Path) -> TextFeatures:
+    """The arrays ``names`` (C,) and ``features`` (C, D) of a .npz file."""
+    where = shown(path)
+    try:
+        arrays = read_npz(path, ("names", "features"))
+    except PredictionError as error:
+        raise DataError(str(error)) from error
+    names, features = arrays.get("names"), arrays.get("features")
+    if names is None or features is None:
+        raise DataError(f"{where}: has no 'names' and 'features'; expected both, one row of features a name")
+    if names.ndim != 1 or names.dtype.kind != "U" or features.ndim != 2 or features.dtype.kind != "f":
+        raise DataError(f"{where}: names {names.shape} {names.dtype.kind}, features {features.shape}; expected texts "
+                        "(C,) and numbers (C, D)")  # fmt: skip
+    if len(names) != len(features) or not len(names) or not np.isfinite(features).all():
+        raise DataError(
+            f"{where}: {len(names)} names and features {features.shape}; expected one finite row of features a name"
+        )
+    texts = tuple(str(name) for name in names)
+    if len(set(texts)) < len(texts):
+        twice = next(text for k, text in enumerate(texts) if text in texts[:k])
+        raise DataError(f"{where}: '{printable(twice, 80)}' stands there twice; give each name once")
+    return TextFeatures(path, texts, features.astype(np.float32))
+
+
+def encoder_for(rules: ProtocolRules, n_dimensions: int, given: TextFeatures | None, *, is_own: bool) -> Encoder | str:
+    """What names features of ``n_dimensions`` under a protocol, or the reason why nothing here can.
+
+    ``is_own``: the features come from a run of ours, whose encoder is the embedded one.
+    """
+    if given is not None:
+        missing = given.missing(rules)
+        if missing:
+            return f"{given.path.name} has no feature for {len(missing)} of its classes, such as '{missing[0]}'"
+        if given.dim != n_dimensions:
+            return f"the features have {n_dimensions} dimensions, those in {given.path.name} {given.dim}"
+        return GivenTexts(given, rules)
+    from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
+
+    embedded = EmbeddedEncoder()
+    if n_dimensions == embedded.dim and (is_own or rules.encoder in {None, embedded.name}):
+        return embedded
+    how = "give features of its class names with --text-features FILE.npz (names, features)"
+    if rules.encoder is None:
+        return f"no encoder of {n_dimensions} dimensions is here to name the features with; {how}"
+    return f"needs the encoder '{rules.encoder}' to name the features with, which is not here; {how}"

@@ -1,0 +1,156 @@
+"""From the points of a prediction to the points of the truth by more than the one nearest point.
+
+Votes of the nearest points, as HOV-SG and OVO take them, and masks that reach every point near one of their own, as
+OpenLex3D's queries have it.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.metrics.transfer import Masks, Points, row_ids
+from su3d_bench.types import BoolArray, Float64Array, Int64Array
+
+_MAX_CELLS = 4_000_000  # neighbours held at once
+
+
+def transfer_votes(
+    points: Points, values: Int64Array, targets: Points, wanted: BoolArray, neighbours: int, cap_m: float = np.inf
+) -> tuple[Int64Array, Float64Array]:
+    """What most of the ``neighbours`` nearest points say, and the distance of the nearest, for each wanted target.
+
+    Each of ``points`` (V, 3) has one vote, ``values`` (V,) from 0; of points at the same distance the lower indices
+    vote, of values with as many votes the smallest wins. -1 and infinity where no point is within ``cap_m`` or the
+    target is not wanted.
+
+    >>> points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [9, 0, 0]])
+    >>> value, distance = transfer_votes(points, np.array([4, 7, 7, 4]), points[:1], np.array([True]), 3)
+    >>> value.tolist(), distance.tolist()
+    ([7], [0.0])
+    """
+    value, distance = np.full(len(targets), -1, np.int64), np.full(len(targets), np.inf)
+    asked = np.flatnonzero(wanted)
+    if not len(points) or not len(asked):
+        return value, distance
+    places, place_of_target = _distinct_places(targets[asked])
+    of_place, nearest_m = np.empty(len(places), np.int64), np.empty(len(places))
+    search = _Search(points, neighbours)
+    step = max(1, _MAX_CELLS // (neighbours + 1))
+    for start in range(0, len(places), step):
+        rows = slice(start, start + step)
+        distances, found = search.nearest(places[rows])
+        votes = np.where(distances <= cap_m, values[found], -1)
+        of_place[rows], nearest_m[rows] = _most_votes(votes), distances.min(axis=1)
+    value[asked], distance[asked] = of_place[place_of_target], nearest_m[place_of_target]
+    distance[distance > cap_m] = np.inf
+    return value, distance
+
+
+def _distinct_places(points: Points) -> tuple[Float64Array, Int64Array]:
+    """Each place once, and the row of every point's place: the corners of faces share theirs with several others."""
+    rows = np.asarray(points, np.float64)
+    ids = row_ids(rows)
+    places = np.empty((int(ids.max()) + 1 if len(ids) else 0, 3))
+    places[ids] = rows
+    return places, ids
+
+
+def _most_votes(votes: Int64Array) -> Int64Array:
+    """The value of most votes in each row (R, K), the smallest of equals; negative votes are none.
+
+    >>> _most_votes(np.array([[3, 1, 3, 1], [2, -1, -1, -1], [-1, -1, -1, -1]])).tolist()
+    [1, 2, -1]
+    """
+    best, n_best = np.full(len(votes), -1, np.int64), np.zeros(len(votes), np.int64)
+    for column in votes.T:
+        n = (votes == column[:, None]).sum(axis=1)
+        wins = (column >= 0) & ((n > n_best) | ((n == n_best) & (column < best)))
+        best, n_best = np.where(wins, column, best), np.where(wins, n, n_best)
+    return best
+
+
+class _Search:
+    """The ``k`` nearest of a list of points, exact in float64; the lower indices of equals."""
+
+    def __init__(self, points: Points, k: int) -> None:
+        from scipy.spatial import cKDTree
+
+        self.points = np.asarray(points, np.float64)
+        self.k = min(k, len(points))
+        self.tree: Any = cKDTree(self.points, balanced_tree=False, compact_nodes=False)
+
+    def nearest(self, queries: Float64Array) -> tuple[Float64Array, Int64Array]:
+        """Distances in metres and indices (Q, k), in no set order."""
+        k, n = self.k, len(self.points)
+        distances, found = self.tree.query(queries, k=min(k + 1, n), workers=1)
+        distances, found = distances.reshape(len(queries), -1), found.reshape(len(queries), -1).astype(np.int64)
+        if k < n:
+            tied = np.flatnonzero(distances[:, k - 1] == distances[:, k])
+            found = found[:, :k]
+            found[tied] = self._lowest_of_equals(queries[tied])
+        return distances[:, :k], found
+
+    def _lowest_of_equals(self, queries: Float64Array) -> Int64Array:
+        """Indices (Q, k) where the k-th neighbour has equals beyond it; their distances are those of the tree."""
+        answer = np.empty((len(queries), self.k), np.int64)
+        open_rows = np.arange(len(queries))
+        n_asked = self.k
+        while len(open_rows):
+            n_asked = min(8 * n_asked, len(self.points))
+            unfinished = [open_rows[:0]]
+            step = max(1, _MAX_CELLS // n_asked)
+            for start in range(0, len(open_rows), step):
+                rows = open_rows[start : start + step]
+                _, found = self.tree.query(queries[rows], k=n_asked, workers=1)
+                offset = self.points[found] - queries[rows][:, None, :]
+                squared = offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2
+                order = np.lexsort((found, squared), axis=-1)
+                answer[rows] = np.take_along_axis(found, order, axis=1)[:, : self.k]
+                if n_asked < len(self.points):
+                    ranked = np.take_along_axis(squared, order, axis=1)
+                    unfinished.append(rows[ranked[:, self.k - 1] == ranked[:, -1]])
+            open_rows = np.concatenate(unfinished)
+        return answer
+
+
+def transfer_each_mask(points: Points, masks: Masks, targets: Points, cap_m: float) -> Masks:
+    """The masks on ``targets``: a target is in every mask that has a point nearer than ``cap_m``.
+
+    >>> masks = Masks(np.array([0, 1, 2]), np.array([0, 1]))
+    >>> moved = transfer_each_mask(np.array([[0.0, 0, 0], [1, 0, 0]]), masks, np.array([[0.4, 0, 0], [0.6, 0, 0]]), 0.5)
+    >>> moved.indptr.tolist(), moved.indices.tolist()
+    ([0, 1, 2], [0, 1])
+    """
+    from scipy.sparse import csr_array
+
+    places, place_of_target = _distinct_places(targets)
+    along_x = np.argsort(places[:, 0], kind="stable")
+    x = places[along_x, 0]
+    held = np.asarray(points, np.float64)
+    reached = []
+    for k in range(len(masks)):
+        own = held[masks.indices[masks.indptr[k] : masks.indptr[k + 1]]]
+        reached.append(_within(own, places, along_x, x, cap_m) if len(own) else along_x[:0])
+    indptr = np.concatenate([[0], np.cumsum([len(rows) for rows in reached])])
+    indices = np.concatenate([along_x[:0], *reached])
+    of_place = csr_array((np.ones(len(indices), np.int8), indices, indptr), shape=(len(masks), len(places)))
+    moved = of_place.tocsc()[:, place_of_target].tocsr()
+    moved.sort_indices()
+    return Masks(moved.indptr.astype(np.int64), moved.indices.astype(np.int32))
+
+
+def _within(own: Float64Array, places: Float64Array, along_x: Int64Array, x: Float64Array, cap_m: float) -> Int64Array:
+    """The places nearer than ``cap_m`` to one of the points ``own``, ascending; only those in its box are looked at."""
+    from scipy.spatial import cKDTree
+
+    low, high = own.min(axis=0) - cap_m, own.max(axis=0) + cap_m
+    near = along_x[np.searchsorted(x, low[0], "left") : np.searchsorted(x, high[0], "right")]
+    near = np.sort(near[((places[near, 1:] >= low[1:]) & (places[near, 1:] <= high[1:])).all(axis=1)])
+    _, found = cKDTree(own).query(places[near], distance_upper_bound=np.nextafter(cap_m, np.inf), workers=1)
+    near, found = near[found < len(own)], found[found < len(own)]
+    offset = own[found] - places[near]
+    squared = offset[:, 0] ** 2 + offset[:, 1] ** 2 + offset[:, 2] ** 2
+    within: Int64Array = near[squared < cap_m * cap_m]
+    return within

@@ -1,0 +1,61 @@
+"""Values that are averaged over objects, each object with the same weight however many points it has."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from su3d_bench.types import Float64Array, Int64Array
+
+
+@dataclass(frozen=True)
+class ObjectCounts:
+    """What one scene, or several, adds: a row for each object that has scored points.
+
+    ``n_points`` (O,) int64; ``totals`` (O, V) float64, V values summed over the points, NaN where the object has none.
+    """
+
+    n_points: Int64Array
+    totals: Float64Array
+
+
+def concatenate(counts: Sequence[ObjectCounts]) -> ObjectCounts:
+    """The counts of several scenes as one: rows one after another."""
+    return ObjectCounts(
+        np.concatenate([one.n_points for one in counts]), np.concatenate([one.totals for one in counts])
+    )
+
+
+def combine(counts: Sequence[ObjectCounts]) -> Float64Array:
+    """The mean (V,) over the objects of the mean over each one's points; NaN rows are left out.
+
+    >>> combine([ObjectCounts(np.array([4, 1]), np.array([[2.0, np.nan], [1.0, 0.25]]))]).tolist()
+    [0.75, 0.25]
+    """
+    whole = concatenate(counts)
+    return _means(*_sums(whole))
+
+
+def _sums(counts: ObjectCounts) -> tuple[Float64Array, Int64Array]:
+    """The sum (V,) of the objects' means and the number (V,) of objects that have one."""
+    of_object = counts.totals / counts.n_points[:, None]
+    has_value = ~np.isnan(of_object)
+    return np.where(has_value, of_object, 0.0).sum(axis=0), has_value.sum(axis=0)
+
+
+def _means(sums: Float64Array, n_objects: Int64Array) -> Float64Array:
+    return np.where(n_objects > 0, sums / np.maximum(n_objects, 1), np.nan)
+
+
+def resampled(counts: Sequence[ObjectCounts], weights: Int64Array) -> Float64Array:
+    """The means (R, V) over the objects of the scenes drawn ``weights`` (R, S) times.
+
+    >>> a, b = ObjectCounts(np.array([2]), np.array([[2.0]])), ObjectCounts(np.array([2]), np.array([[1.0]]))
+    >>> resampled([a, b], np.array([[2, 0], [1, 1]])).tolist()
+    [[1.0], [0.75]]
+    """
+    per_scene = [_sums(one) for one in counts]
+    sums: Float64Array = weights.astype(np.float64) @ np.stack([total for total, _ in per_scene])
+    return _means(sums, weights @ np.stack([n for _, n in per_scene]))

@@ -1,0 +1,132 @@
+"""Average precision of text queries: for each text the masks are ranked, and only instances of that text can be met.
+
+The curve is that of ``instance_ap`` with the single class ``object``; all queries of all scenes share it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from su3d_bench.errors import DataError
+from su3d_bench.metrics import instance_ap
+from su3d_bench.metrics.instance_ap import InstanceCounts
+from su3d_bench.metrics.transfer import Masks
+from su3d_bench.types import Float32Array, Float64Array, Int64Array
+
+SPACE = "queries"
+_SMALLEST_RANGE = 1e-8  # openlex3d's floor of the range over which similarities are stretched
+
+
+@dataclass(frozen=True)
+class TextQuery:
+    """A text and the ids of the objects that it speaks of."""
+
+    text: str
+    object_ids: tuple[int, ...]
+
+    def __post_init__(self) -> None:
+        if len(set(self.object_ids)) != len(self.object_ids):
+            raise DataError(f"query '{self.text[:60]}': an object stands there twice; name each once")
+
+
+@dataclass(frozen=True)
+class QueryTruth:
+    """Objects of a scene and the texts that ask for them.
+
+    ``points`` (N, 3) float32 m, ``object_of_point`` (N,) int64, -1 for none.
+    """
+
+    points: Float32Array
+    object_of_point: Int64Array
+    queries: tuple[TextQuery, ...]
+    variant: str
+    source: str
+    space: str = SPACE
+
+    def __post_init__(self) -> None:
+        n = len(self.points)
+        if self.points.shape != (n, 3) or self.object_of_point.shape != (n,):
+            raise DataError(
+                f"ground truth '{self.variant}': points {self.points.shape} and objects {self.object_of_point.shape} "
+                "do not agree"
+            )
+
+
+def confidences(similarity: Float64Array, rule: Literal["similarity", "similarity-min-max"]) -> Float64Array:
+    """The confidence (K, Q) of each mask for each query: its cosine, or that stretched to 0..1 over the masks.
+
+    Under ``similarity-min-max`` the best mask of every query has confidence 1, however little it resembles the text.
+
+    >>> confidences(np.array([[0.5, 0.1], [0.0, 0.1], [-0.5, 0.1]]), "similarity-min-max").tolist()
+    [[1.0, 0.0], [0.5, 0.0], [0.0, 0.0]]
+    """
+    if rule == "similarity" or not len(similarity):
+        return similarity
+    halved = (similarity + 1.0) / 2.0
+    low, high = halved.min(axis=0), halved.max(axis=0)
+    stretched: Float64Array = (halved - low) / np.maximum(high - low, _SMALLEST_RANGE)
+    return stretched
+
+
+def per_scene(
+    object_of_point: Int64Array,
+    queries: Sequence[TextQuery],
+    masks: Masks,
+    confidence: Float64Array,
+    *,
+    top_k: int | None = None,
+    min_region_size: int = 1,
+    thresholds: Sequence[float] = instance_ap.THRESHOLDS,
+) -> InstanceCounts:
+    """The additive counts of one scene: ``masks`` over its points with ``confidence`` (K, Q) for each query.
+
+    The ``top_k`` masks of each query count, the first of equals, and of these those of the minimum size. Objects below
+    it are no instances; a query that is left without one still has its false positives.
+
+    >>> masks = Masks(np.array([0, 2, 4]), np.array([0, 1, 2, 3]))
+    >>> found = TextQuery("seat", (7,)), TextQuery("lamp", (8,))
+    >>> objects = np.array([7, 7, 8, 8])
+    >>> counts = per_scene(objects, found, masks, np.array([[0.9, 0.2], [0.1, 0.8]]))
+    >>> instance_ap.combine([counts]).ap
+    1.0
+    """
+    ids, segment_of_point, size_of_object = np.unique(object_of_point, return_inverse=True, return_counts=True)
+    n_masks = len(masks)
+    size = np.diff(masks.indptr)
+    shared = instance_ap.intersections(segment_of_point, len(ids), masks.indptr, masks.indices, np.arange(n_masks))
+    iou = shared / (size_of_object[None, :] + size[:, None] - shared)
+    column_of = {int(one): column for column, one in enumerate(ids) if one >= 0}
+    order = np.argsort(-confidence, axis=0, kind="stable")[:top_k]
+    parts = [_no_counts(len(thresholds))]
+    for q, query in enumerate(queries):
+        columns = [column_of[one] for one in query.object_ids if one in column_of]
+        takes_part = size_of_object[columns] >= min_region_size
+        rows = order[size[order[:, q]] >= min_region_size, q]
+        one = instance_ap.count_class(
+            0,
+            iou=iou[np.ix_(rows, np.array(columns, np.int64)[takes_part])],
+            takes_part=np.ones(int(takes_part.sum()), bool),
+            scores=confidence[rows, q],
+            ignored_share=np.zeros(len(rows)),
+            thresholds=thresholds,
+        )
+        parts.append(one)
+    return instance_ap.concatenate(parts)
+
+
+def _no_counts(n_thresholds: int) -> InstanceCounts:
+    none = np.zeros(0)
+    return InstanceCounts(
+        class_index=none.astype(np.int32),
+        threshold_index=none.astype(np.int32),
+        score=none,
+        is_true=none.astype(bool),
+        n_missed=np.zeros((1, n_thresholds), np.int64),
+        n_truth=np.zeros(1, np.int64),
+        n_small_truth=np.zeros(1, np.int64),
+        n_predictions=np.zeros(1, np.int64),
+    )

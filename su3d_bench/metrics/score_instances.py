@@ -1,0 +1,142 @@
+"""One scene under a protocol of kind ``instance``: masks on the truth's points, and their counts."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.errors import DataError
+from su3d_bench.metrics import instance_ap, transfer
+from su3d_bench.metrics.labelling import (
+    candidate_classes,
+    class_index_of_ids,
+    classes_of_prediction,
+    encoder_warning,
+    scored_classes,
+)
+from su3d_bench.metrics.scene_score import SceneScore, n_predictions, present
+from su3d_bench.protocols import ProtocolRules
+from su3d_bench.types import (
+    BoolArray,
+    Encoder,
+    Float64Array,
+    GroundTruth,
+    Instances,
+    Int64Array,
+    Partition,
+)
+
+IntArray = NDArray[np.integer[Any]]
+
+DUPLICATE_IOU = 0.9  # pairs above it are the same object twice; duplicates can raise AP under constant confidences
+OBJECT = 1  # the one label that all have where the protocol has no classes
+
+
+def score_instances(
+    rules: ProtocolRules, truth: GroundTruth, prediction: Instances | Partition, encoder: Encoder | None
+) -> SceneScore:
+    """The additive counts of one scene: masks on the truth's points, each with a label unless class-agnostic."""
+    assert rules.min_region_size is not None
+    if truth.evaluation_points is not None:
+        raise DataError(f"{rules.name}: the truth '{truth.variant}' has no instances on its evaluation points")
+    values, scored_ids, labels = _truth_and_labels(rules, truth, prediction, encoder)
+    if isinstance(prediction, Instances):
+        masks, scores = transfer.masks_of(prediction), np.asarray(prediction.scores, np.float64)
+    else:
+        masks, scores = transfer.masks_of_partition(prediction.instance, len(labels)), np.ones(len(labels))
+    moved = transfer.transfer_masks(
+        prediction.points, masks, truth.points, rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
+    )
+    counts = instance_ap.per_scene(
+        values,
+        moved.indptr,
+        moved.indices,
+        labels,
+        np.ones(len(scores)) if rules.confidence == "ones" else scores,
+        scored_ids,
+        rules.min_region_size,
+        rules.thresholds,
+    )
+    wanted = np.isin(values // instance_ap.INSTANCES_PER_CLASS, scored_ids)
+    distance = distance_to_masks(prediction.points, masks, truth.points, wanted)
+    told = None if rules.class_agnostic else encoder_warning(rules, prediction, encoder)
+    return SceneScore(
+        protocol=rules.name,
+        version=rules.version,
+        counts=counts,
+        n_predictions=n_predictions(prediction),
+        n_scored=int(wanted.sum()),
+        n_farther=transfer.n_farther(distance[wanted]),
+        warnings=_instance_warnings(rules, truth, moved, scores, told),
+    )
+
+
+def _truth_and_labels(
+    rules: ProtocolRules, truth: GroundTruth, prediction: Instances | Partition, encoder: Encoder | None
+) -> tuple[Int64Array, list[int], Int64Array]:
+    """The truth as label * 1000 + instance, the labels that are scored, and the label of each prediction."""
+    scored_ids = [entry.id for entry in rules.scored]
+    if rules.class_agnostic is not None:
+        has_scored_class = np.isin(truth.semantic, scored_ids)
+        values = encode_without_classes(rules.class_agnostic, truth.instance, has_scored_class)
+        return values, [OBJECT], np.full(n_predictions(prediction), OBJECT)
+    is_present = present(class_index_of_ids(rules, truth.semantic), len(rules.classes)) & scored_classes(rules)
+    classes = classes_of_prediction(rules, prediction, encoder, candidate_classes(rules, is_present))
+    ids = np.array([entry.id for entry in rules.classes])
+    values = instance_ap.encode_ground_truth(truth.semantic, truth.instance)
+    return values, scored_ids, np.where(classes >= 0, ids[classes], 0)
+
+
+def encode_without_classes(
+    rule: Literal["scored", "annotated", "everything"], instance: IntArray, has_scored_class: BoolArray
+) -> Int64Array:
+    """One value a point, 1000 + instance, and 0 where it is void.
+
+    ``scored``: what has no scored class is void. ``annotated``: only points without an instance are.
+    ``everything``: nothing is; the points without an instance are one more instance, of the value 1000.
+
+    >>> instance, has_scored_class = np.array([0, 1, 2]), np.array([False, False, True])
+    >>> encode_without_classes("scored", instance, has_scored_class).tolist()
+    [0, 0, 1002]
+    >>> encode_without_classes("annotated", instance, has_scored_class).tolist()
+    [0, 1001, 1002]
+    >>> encode_without_classes("everything", instance, has_scored_class).tolist()
+    [1000, 1001, 1002]
+    """
+    values = instance_ap.encode_ground_truth(np.full(len(instance), OBJECT), instance)
+    if rule == "everything":
+        values[np.asarray(instance) == 0] = OBJECT * instance_ap.INSTANCES_PER_CLASS
+    elif rule == "scored":
+        values[~has_scored_class] = 0
+    return values
+
+
+def distance_to_masks(
+    points: transfer.Points, masks: transfer.Masks, targets: transfer.Points, wanted: BoolArray
+) -> Float64Array:
+    """How far the nearest point of any mask is from each wanted target, in metres; infinity beyond the last radius."""
+    covered = np.full(len(points), -1, np.int64)
+    covered[masks.indices] = 0
+    reach = max(transfer.COVERAGE_RADII_M)
+    _, distance = transfer.transfer_values(points, covered, covered, targets, wanted, reach)
+    return distance
+
+
+def _instance_warnings(
+    rules: ProtocolRules, truth: GroundTruth, moved: transfer.Masks, scores: Float64Array, encoder: str | None
+) -> tuple[str, ...]:
+    assert rules.min_region_size is not None
+    warnings = [encoder] if encoder else []
+    if rules.confidence == "prediction" and len(scores) > 1 and (scores == scores[0]).all():
+        warnings.append(f"every confidence is {scores[0]:g}: AP of a class is then recall (1 + precision) / 2")
+    large = np.flatnonzero(np.diff(moved.indptr) >= rules.min_region_size)
+    pairs = transfer.duplicate_pairs(transfer.select(moved, large), len(truth.points), DUPLICATE_IOU)
+    if pairs:
+        first, second = large[list(pairs[0])]
+        what = "1 pair of predictions overlaps" if len(pairs) == 1 else f"{len(pairs)} pairs of predictions overlap"
+        warnings.append(
+            f"{what} with IoU above {DUPLICATE_IOU} (first {first} and {second}); duplicates can raise or lower AP"
+        )
+    return tuple(warnings)

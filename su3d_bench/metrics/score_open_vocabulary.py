@@ -1,0 +1,248 @@
+"""One scene under a protocol of kind ``categories`` or ``queries``: features against texts, without a label set."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.errors import PredictionError
+from su3d_bench.geometry import voxel_coordinates
+from su3d_bench.metrics import object_means, openlex3d, query_ap, transfer
+from su3d_bench.metrics.labelling import cosines, encoder_warning, text_features
+from su3d_bench.metrics.neighbours import transfer_each_mask
+from su3d_bench.metrics.openlex3d import OpenLexTruth
+from su3d_bench.metrics.query_ap import QueryTruth
+from su3d_bench.metrics.scene_score import SceneScore, n_predictions
+from su3d_bench.metrics.score_instances import distance_to_masks
+from su3d_bench.metrics.score_semantic import has_feature
+from su3d_bench.protocols import ProtocolRules
+from su3d_bench.types import (
+    DenseFeatures,
+    Encoder,
+    Float32Array,
+    Float64Array,
+    Instances,
+    Int64Array,
+    Partition,
+    Prediction,
+)
+
+NEEDS_FEATURES = "needs features to compare with texts, and the prediction has none"
+_BLOCK_UNITS = 2048  # 2048 units x 3407 prompts of float64 are 56 MB
+
+
+def score_categories(
+    rules: ProtocolRules, truth: OpenLexTruth, prediction: Prediction, encoder: Encoder | None
+) -> SceneScore:
+    """The additive counts of one scene for OpenLex3D's category frequencies or its ranking of labels."""
+    cloud = _units(prediction, rules.transfer.evaluation_voxel_m)
+    is_ranking = rules.metric == "openlex3d-ranking"
+    ids = sorted(truth.objects) if is_ranking else openlex3d.scored_objects(truth.objects, rules.ignore)
+    object_row = _rows_of(truth.object_of_point, ids)
+    scored = object_row >= 0
+    reach = None if rules.transfer.cap_m is None else max(rules.transfer.cap_m, *transfer.COVERAGE_RADII_M)
+    unit, distance = np.full(len(scored), -1, np.int64), np.full(len(scored), np.inf)
+    distance[scored], found = transfer.nearest(cloud.points, truth.points[scored], np.inf if reach is None else reach)
+    unit[scored] = np.where(found >= 0, cloud.unit[found], -1) if len(cloud.unit) else -1
+    if rules.transfer.cap_m is not None:
+        unit[distance > rules.transfer.cap_m] = -1
+    count = _count_ranks if is_ranking else _count_categories
+    warnings = (encoder_warning(rules, prediction, encoder), _shared_points_warning(prediction))
+    return SceneScore(
+        protocol=rules.name,
+        version=rules.version,
+        counts=count(rules, truth, prediction, encoder, ids, object_row, unit),
+        n_predictions=n_predictions(prediction),
+        n_scored=int(scored.sum()),
+        n_farther=transfer.n_farther(distance[scored]),
+        warnings=tuple(warning for warning in warnings if warning),
+    )
+
+
+@dataclass(frozen=True)
+class _Units:
+    """The predicted cloud: ``points`` (M, 3) and what each belongs to, an instance or a point of a dense map."""
+
+    points: Float64Array
+    unit: Int64Array
+
+
+def _units(prediction: Prediction, voxel_m: float) -> _Units:
+    """The points that have a unit, reduced to the mean of those in a voxel with the unit of the nearest of all."""
+    if isinstance(prediction, DenseFeatures):
+        unit = np.where(has_feature(prediction), np.arange(len(prediction.points)), -1)
+    elif isinstance(prediction, Partition):
+        unit = prediction.instance.astype(np.int64)
+    else:
+        unit = transfer.first_owner(transfer.masks_of(prediction), len(prediction.points))
+    points, unit = np.asarray(prediction.points[unit >= 0], np.float64), unit[unit >= 0]
+    if not len(points) or voxel_m <= 0:
+        return _Units(points, unit)
+    means = voxel_means(points, voxel_m)
+    _, found = transfer.nearest(points, means)
+    return _Units(means, unit[found])
+
+
+def voxel_means(points: Float64Array, voxel_m: float) -> Float64Array:
+    """The mean of the points in each voxel of a grid at the world's origin, as Open3D's tensor clouds are reduced.
+
+    >>> voxel_means(np.array([[0.01, 0, 0], [0.03, 0, 0], [0.06, 0, 0]]), 0.05)[:, 0].tolist()
+    [0.02, 0.06]
+    """
+    voxel = transfer.row_ids(voxel_coordinates(points, voxel_m))
+    n = np.bincount(voxel)
+    return np.stack([np.bincount(voxel, weights=points[:, axis]) / n for axis in range(3)], axis=1)
+
+
+def _rows_of(object_of_point: Int64Array, ids: list[int]) -> Int64Array:
+    """Where in ``ids`` (ascending) each point's object stands, -1 where it does not."""
+    known = np.array([*ids, np.iinfo(np.int64).max], np.int64)
+    row = np.searchsorted(known, object_of_point)
+    return np.where((known[row] == object_of_point) & (object_of_point >= 0), row, -1)
+
+
+def _count_categories(
+    rules: ProtocolRules,
+    truth: OpenLexTruth,
+    prediction: Prediction,
+    encoder: Encoder | None,
+    ids: list[int],
+    object_row: Int64Array,
+    unit: Int64Array,
+) -> object_means.ObjectCounts:
+    assert rules.top_k is not None
+    labels = getattr(prediction, "labels", None)
+    used, of_point = _used_units(unit)
+    if not len(used):
+        vocabulary, top = list[str](), np.zeros((0, 1), np.int64)
+    elif labels is not None:
+        vocabulary = sorted(set(labels))
+        top = np.array([[vocabulary.index(labels[one])] for one in used], np.int64).reshape(-1, 1)
+    else:
+        vocabulary = list(truth.prompts)
+        n_top = min(rules.top_k, len(vocabulary))
+        blocks = _similarity_blocks(rules, truth, prediction, encoder, used)
+        top = np.concatenate(
+            [np.zeros((0, n_top), np.int64), *(openlex3d.top_labels(block, n_top) for block in blocks)]
+        )
+    table = openlex3d.category_table(truth.objects, ids, vocabulary)
+    category = openlex3d.point_categories(object_row, of_point, top, table)
+    return openlex3d.count_categories(object_row, category, len(ids))
+
+
+def _count_ranks(
+    rules: ProtocolRules,
+    truth: OpenLexTruth,
+    prediction: Prediction,
+    encoder: Encoder | None,
+    ids: list[int],
+    object_row: Int64Array,
+    unit: Int64Array,
+) -> object_means.ObjectCounts:
+    used, of_point = _used_units(unit)
+    labels = [openlex3d.ranked_labels(truth.objects[one], truth.prompts) for one in ids]
+    rows, units, _ = openlex3d.distinct_pairs(object_row, of_point)
+    scores = np.full((len(rows), 3), np.nan)
+    start = 0
+    for similarity in _similarity_blocks(rules, truth, prediction, encoder, used) if len(used) else ():
+        ranks = openlex3d.rank_of_labels(similarity)
+        here = (units >= start) & (units < start + len(ranks))
+        for row in np.unique(rows[here]):
+            mine = np.flatnonzero(here & (rows == row))
+            scores[mine] = labels[row].scores(ranks[units[mine] - start])
+        start += len(ranks)
+    if len(units) == 0 and (object_row >= 0).any():  # nothing is predicted: no label has a rank, each counts 0
+        return _nothing_ranked(labels, object_row)
+    return openlex3d.count_ranks(object_row, of_point, scores, len(ids))
+
+
+def _nothing_ranked(labels: list[openlex3d.RankedLabels], object_row: Int64Array) -> object_means.ObjectCounts:
+    n_points = np.bincount(object_row[object_row >= 0], minlength=len(labels))
+    has = np.array([(len(one.synonyms) > 0, len(one.secondary) > 0) for one in labels])
+    totals = np.where(np.stack([has.any(axis=1), has[:, 0], has[:, 1]], axis=1), 0.0, np.nan)
+    return object_means.ObjectCounts(n_points[n_points > 0].astype(np.int64), totals[n_points > 0])
+
+
+def _used_units(unit: Int64Array) -> tuple[Int64Array, Int64Array]:
+    """The units that some point has, ascending, and each point's place among them, -1 for none."""
+    used, place = np.unique(unit, return_inverse=True)
+    n_without = int(len(used) > 0 and used[0] < 0)
+    return used[n_without:], place.astype(np.int64) - n_without
+
+
+def _similarity_blocks(
+    rules: ProtocolRules, truth: OpenLexTruth, prediction: Prediction, encoder: Encoder | None, used: Int64Array
+) -> Iterator[Float64Array]:
+    """The cosines (B, P) of the units ``used`` with the prompts, a block of units after another."""
+    features, known = _features(rules, prediction, encoder)
+    text = text_features(rules, truth.prompts, features, known)
+    for start in range(0, len(used), _BLOCK_UNITS):
+        yield cosines(features[used[start : start + _BLOCK_UNITS]], text)
+
+
+def _features(
+    rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None
+) -> tuple[Float32Array | NDArray[np.float16], Encoder]:
+    if prediction.features is None:
+        raise PredictionError(f"{rules.name}: {NEEDS_FEATURES}")
+    if encoder is None:
+        raise PredictionError(f"{rules.name}: there is no encoder to turn texts into features with")
+    return prediction.features, encoder
+
+
+def _shared_points_warning(prediction: Prediction) -> str | None:
+    if not isinstance(prediction, Instances):
+        return None
+    n_shared = int((np.bincount(prediction.indices, minlength=1) > 1).sum())
+    return f"points in several instances, counted for the first of them: {n_shared}" if n_shared else None
+
+
+def score_queries(
+    rules: ProtocolRules, truth: QueryTruth, prediction: Instances | Partition, encoder: Encoder | None
+) -> SceneScore:
+    """The additive counts of one scene: its masks ranked by their similarity to each text."""
+    assert rules.min_region_size is not None
+    assert rules.confidence in ("similarity", "similarity-min-max")
+    if isinstance(prediction, Instances):
+        masks = transfer.masks_of(prediction)
+    else:
+        masks = transfer.masks_of_partition(prediction.instance, len(prediction.features))
+    similarity = np.zeros((len(masks), len(truth.queries)))
+    if len(masks) and truth.queries:
+        features, known = _features(rules, prediction, encoder)
+        text = text_features(rules, [query.text for query in truth.queries], features, known)
+        similarity = cosines(features, text)
+    moved = _moved(rules, prediction.points, masks, truth.points)
+    counts = query_ap.per_scene(
+        truth.object_of_point,
+        truth.queries,
+        moved,
+        query_ap.confidences(similarity, rules.confidence),
+        top_k=rules.top_k,
+        min_region_size=rules.min_region_size,
+        thresholds=rules.thresholds,
+    )
+    asked_for = np.unique(np.array([one for query in truth.queries for one in query.object_ids], np.int64))
+    wanted = np.isin(truth.object_of_point, asked_for[asked_for >= 0])
+    distance = distance_to_masks(prediction.points, masks, truth.points, wanted)
+    told = encoder_warning(rules, prediction, encoder)
+    return SceneScore(
+        protocol=rules.name,
+        version=rules.version,
+        counts=counts,
+        n_predictions=n_predictions(prediction),
+        n_scored=int(wanted.sum()),
+        n_farther=transfer.n_farther(distance[wanted]),
+        warnings=(told,) if told else (),
+    )
+
+
+def _moved(rules: ProtocolRules, points: Float32Array, masks: transfer.Masks, targets: Float32Array) -> transfer.Masks:
+    cap_m = rules.transfer.cap_m
+    if rules.transfer.candidates == "each-mask":
+        assert cap_m is not None
+        return transfer_each_mask(points, masks, targets, cap_m)
+    return transfer.transfer_masks(points, masks, targets, cap_m, rules.transfer.evaluation_voxel_m)

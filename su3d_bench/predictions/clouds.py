@@ -1,0 +1,122 @@
+"""Parts that readers of maps with own points share: from the cloud of each object to ``Instances``."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from su3d_bench.errors import DataError, PredictionError
+from su3d_bench.predictions.base import MOST_MASKS, MOST_POINTS, shown
+from su3d_bench.predictions.mask_arrays import kind_of
+from su3d_bench.types import BoolArray, Float32Array, Instances
+
+ONES = "the format has no scores: 1 for every object"
+
+
+@contextmanager
+def as_prediction_error() -> Iterator[None]:
+    """Damage that a reader of data files finds is damage of the prediction."""
+    try:
+        yield
+    except DataError as error:
+        raise PredictionError(str(error)) from error
+
+
+def folders_with(path: Path, patterns: Sequence[str]) -> list[Path]:
+    """What the first of ``patterns`` that matches anything below ``path`` matches, in alphabetical order."""
+    try:
+        return next((found for pattern in patterns if (found := sorted(path.glob(pattern)))), [])
+    except OSError as error:
+        raise PredictionError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+
+
+def named_once(pairs: Sequence[tuple[str, Path]], path: Path) -> Mapping[str, Path]:
+    """``pairs`` as a table; ``PredictionError`` where two paths claim one scene."""
+    table: dict[str, Path] = {}
+    for name, found in pairs:
+        if table.setdefault(name, found) != found:
+            raise PredictionError(
+                f"{shown(path)}: {shown(table[name])} and {shown(found)} are both of scene '{name}'; give one of them"
+            )
+    return table
+
+
+def checked_points(values: object, where: str) -> Float32Array:
+    """Points (N, 3) as float32; ``PredictionError`` for another shape, and for what float32 metres cannot hold."""
+    is_table = isinstance(values, np.ndarray) and values.ndim == 2 and values.shape[1] == 3
+    if not isinstance(values, np.ndarray) or not is_table or values.dtype.kind not in "fiu":
+        raise PredictionError(f"{where}: the points are {kind_of(values)}; expected three coordinates a point")
+    if len(values) > MOST_POINTS:
+        raise PredictionError(f"{where}: has {len(values)} points; is it damaged?")
+    with np.errstate(over="ignore", invalid="ignore"):
+        points = values.astype(np.float32)
+    is_finite = np.isfinite(points).all(axis=1)
+    if not is_finite.all():
+        row = int(np.argmin(is_finite))
+        raise PredictionError(f"{where}: point {row} is at {values[row].tolist()}; expected finite metres")
+    return points
+
+
+def without_nonfinite(features: Float32Array, what: str) -> tuple[Float32Array, tuple[str, ...]]:
+    """``features`` with rows of zeros in place of rows that hold NaN or infinity, and how many rows have no feature."""
+    is_bad = ~np.isfinite(features).all(axis=1)
+    if is_bad.any():
+        features = features.copy()
+        features[is_bad] = 0
+    n = int((~features.any(axis=1)).sum())
+    return features, (f"{n} {what} have no feature (a row of zeros or NaN)",) if n else ()
+
+
+def instances_of(
+    clouds: Sequence[Float32Array],
+    where: str,
+    *,
+    features: Float32Array | None,
+    labels: tuple[str, ...] | None,
+    names: tuple[str, ...],
+    captions: tuple[str, ...],
+    ids: Sequence[int],
+) -> Instances:
+    """One instance a cloud, each with points of its own, score 1 and no views; boxes of empty clouds are zeros."""
+    sizes = np.array([len(cloud) for cloud in clouds], np.int64)
+    n = int(sizes.sum())
+    if n > MOST_POINTS or len(clouds) > MOST_MASKS:
+        raise PredictionError(f"{where}: {len(clouds)} objects of {n} points; is it damaged?")
+    k = len(clouds)
+    boxes, centroids = np.zeros((k, 2, 3), np.float32), np.zeros((k, 3), np.float32)
+    for row, cloud in enumerate(clouds):
+        if len(cloud):
+            boxes[row] = cloud.min(axis=0), cloud.max(axis=0)
+            centroids[row] = cloud.mean(axis=0, dtype=np.float64)
+    return Instances(
+        points=np.concatenate([np.zeros((0, 3), np.float32), *clouds]),
+        indptr=np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
+        indices=np.arange(n, dtype=np.int32),
+        scores=np.ones(k),
+        features=features,
+        labels=labels,
+        names=names,
+        captions=captions,
+        boxes=boxes,
+        centroids=centroids,
+        view_indptr=np.zeros(k + 1, np.int64),
+        views=np.zeros((0, 2), np.int32),
+        ids=np.array(ids, np.int32),
+    )
+
+
+def some(numbers: Sequence[int]) -> str:
+    """The first of ``numbers`` for a message.
+
+    >>> some([1, 2, 3, 4, 5, 6])
+    '1, 2, 3, 4, 5, ...'
+    """
+    return ", ".join(str(number) for number in numbers[:5]) + (", ..." if len(numbers) > 5 else "")
+
+
+def rows_with(mask: BoolArray) -> list[int]:
+    """The indices where ``mask`` is true."""
+    return [int(row) for row in np.flatnonzero(mask)]

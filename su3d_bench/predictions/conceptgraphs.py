@@ -1,0 +1,187 @@
+"""Maps of ConceptGraphs: gzipped pickles of objects, each with its own points and a CLIP feature.
+
+Source: concept-graphs at commit 5c4da70 (``pcd_saves/full_pcd_*.pkl.gz``, with ``_post`` after its last merging) and
+branch ali-dev at dc00a8a (``exps/<suffix>/pcd_<suffix>.pkl.gz``, with ``edges``, without ``bg_objects``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.errors import PredictionError
+from su3d_bench.plain_text import printable
+from su3d_bench.predictions.base import MOST_MASKS, ScenePrediction, shown
+from su3d_bench.predictions.clouds import (
+    ONES,
+    checked_points,
+    folders_with,
+    instances_of,
+    named_once,
+    without_nonfinite,
+)
+from su3d_bench.predictions.mask_arrays import kind_of
+from su3d_bench.predictions.pickles import read_pickle_file
+from su3d_bench.types import Float32Array, Instances
+
+SUFFIX = ".pkl.gz"
+POST = f"_post{SUFFIX}"
+FULL, STREAMLINED = f"full_pcd_*{SUFFIX}", f"pcd_*{SUFFIX}"
+FORGOTTEN = ("mask", "pcd_color_np")  # the masks of every view make most of the file
+NAME_OF_NONE = "item"  # what the class-agnostic variant calls every object
+MOST_TEXT = 1000
+
+
+class ConceptGraphs:
+    name = "conceptgraphs"
+    summary = "ConceptGraphs' pcd_saves/full_pcd_*.pkl.gz (_post before the other) or exps/*/pcd_*.pkl.gz of ali-dev"
+
+    def recognise(self, path: Path) -> str | None:
+        if path.is_file():
+            is_map = path.name.endswith(SUFFIX) and path.name.startswith(("full_pcd_", "pcd_"))
+            return "its name is that of a map of ConceptGraphs" if is_map else None
+        return f"it holds {FULL} or {STREAMLINED}" if _maps(path) else None
+
+    def scenes(self, path: Path) -> Mapping[str, Path]:
+        if path.is_file():
+            return {_scene_of(path): path}
+        return named_once([(_scene_of(one), one.parent) for one in _maps(path)], path)
+
+    def read(self, path: Path, scene: str) -> ScenePrediction:
+        found = self.scenes(path).get(scene)
+        if found is None:
+            raise PredictionError(f"{shown(path)}: has no map of scene '{printable(scene, 80)}'")
+        file, remarks = (found, []) if found.is_file() else _chosen(found)
+        where = shown(file)
+        value = read_pickle_file(file, forget=FORGOTTEN)
+        if not isinstance(value, dict) or not isinstance(value.get("objects"), list):
+            raise PredictionError(f"{where}: holds {kind_of(value)} without a list of 'objects'; expected a map")
+        instances, more = _instances(value["objects"], _class_names(value.get("class_names")), where)
+        remarks += [*more, *_background_remarks(value, where)]
+        return ScenePrediction(scene, self.name, file, instances, (ONES, *remarks))
+
+
+def _maps(path: Path) -> list[Path]:
+    """The map files of one scene or several, at whatever level of the layout ``path`` is."""
+    full = [f"{above}{FULL}" for above in ("", "pcd_saves/", "*/pcd_saves/")]
+    streamlined = [f"{above}{STREAMLINED}" for above in ("", "*/", "exps/*/", "*/exps/*/")]
+    return [one for one in folders_with(path, [*full, *streamlined]) if one.is_file()]
+
+
+def _scene_of(file: Path) -> str:
+    """The folder above ``pcd_saves`` or ``exps``, else the name of the file."""
+    above = file.absolute().parents
+    if above[0].name == "pcd_saves" and above[1].name:
+        return above[1].name
+    if len(above) > 2 and above[1].name == "exps" and above[2].name:
+        return above[2].name
+    return file.name.removesuffix(SUFFIX)
+
+
+def _chosen(folder: Path) -> tuple[Path, list[str]]:
+    """The only map of a folder, or of a pair the one after the last merging, with a remark."""
+    files = _maps(folder)
+    if len(files) == 1:
+        return files[0], []
+    if len(files) == 2 and files[1].name == files[0].name.removesuffix(SUFFIX) + POST:
+        return files[1], [f"'{printable(files[1].name, 120)}' is read, not the map before the last merging beside it"]
+    names = printable(", ".join(file.name for file in files), 200)
+    raise PredictionError(f"{shown(folder)}: holds {len(files)} maps ({names}); give one of these files")
+
+
+def _class_names(value: object) -> tuple[str, ...]:
+    """The list of class names; empty where there is none."""
+    texts = value.tolist() if isinstance(value, np.ndarray) and value.dtype.kind == "U" else value
+    if not isinstance(texts, list | tuple):
+        return ()
+    return tuple(printable(one[:MOST_TEXT], 80) if isinstance(one, str) else "" for one in texts[:MOST_MASKS])
+
+
+def _instances(objects: list[Any], class_names: Sequence[str], where: str) -> tuple[Instances, list[str]]:
+    if len(objects) > MOST_MASKS:
+        raise PredictionError(f"{where}: holds {len(objects)} objects; is it damaged?")
+    clouds, names, captions = [], [], []
+    for k, one in enumerate(objects):
+        at = f"{where}: object {k}"
+        if not isinstance(one, dict) or "pcd_np" not in one:
+            raise PredictionError(f"{at}: is {kind_of(one)} without 'pcd_np'; expected an object of ConceptGraphs")
+        clouds.append(checked_points(one["pcd_np"], at))
+        names.append(_name(one, _majority(one.get("class_id")), class_names))
+        caption = one.get("consolidated_caption")
+        captions.append(printable(caption[:MOST_TEXT], MOST_TEXT) if isinstance(caption, str) else "")
+    features, remarks = _features(objects, where)
+    named = tuple(names)
+    if features is not None and any(name != NAME_OF_NONE for name in names):
+        remarks.append("names are those of most detections; the feature of an object decides its class, as originally")
+    labels = named if features is None and len(objects) else None
+    instances = instances_of(
+        clouds,
+        where,
+        features=features,
+        labels=labels,
+        names=named,
+        captions=tuple(captions),
+        ids=range(len(objects)),
+    )
+    return instances, remarks
+
+
+def _majority(value: object) -> int | None:
+    """The most frequent class number of the detections, the lowest of equals as the original has it."""
+    numbers = value.tolist() if isinstance(value, np.ndarray) and value.ndim == 1 else value
+    if not isinstance(numbers, list | tuple):
+        return None
+    whole = [int(one) for one in numbers if isinstance(one, int | np.integer) and abs(int(one)) < 1 << 31]
+    if not whole:
+        return None
+    values, counts = np.unique(np.array(whole, np.int64), return_counts=True)
+    return int(values[np.argmax(counts)])
+
+
+def _name(one: Mapping[str, Any], number: int | None, class_names: Sequence[str]) -> str:
+    """The name of class ``number``, else what the object says itself."""
+    if number is not None and 0 <= number < len(class_names) and class_names[number]:
+        return class_names[number]
+    said = one.get("class_name")
+    said = said[0] if isinstance(said, list) and said else said
+    return printable(said[:MOST_TEXT], 80) if isinstance(said, str) and said.strip() else NAME_OF_NONE
+
+
+def _features(objects: Sequence[Mapping[str, Any]], where: str) -> tuple[Float32Array | None, list[str]]:
+    """The features (K, D) of the objects; None where no object has one."""
+    found = [one.get("clip_ft") for one in objects]
+    if not any(one is not None for one in found):
+        return None, ["the objects have no 'clip_ft': the names of their detections decide their classes"] * bool(found)
+    rows: list[Float32Array] = []
+    for k, row in enumerate(found):
+        is_row = isinstance(row, np.ndarray) and row.ndim == 1 and row.dtype.kind == "f" and row.size > 0
+        if not isinstance(row, np.ndarray) or not is_row or (rows and row.shape != rows[0].shape):
+            beside = f" of {len(rows[0])} numbers, as object 0 has" if rows else ""
+            raise PredictionError(f"{where}: object {k}: 'clip_ft' is {kind_of(row)}; expected a list{beside}")
+        with np.errstate(over="ignore", invalid="ignore"):
+            rows.append(row.astype(np.float32))
+    features, remarks = without_nonfinite(np.stack(rows), "objects")
+    return features, list(remarks)
+
+
+def _background_remarks(value: Mapping[str, Any], where: str) -> list[str]:
+    """What becomes of walls, floor and ceiling: they are left out.
+
+    The original's evaluation loads them only where it excludes nothing but 'other' (``n_exclude`` 1), and then under
+    their own names without a feature; with 4 or 6 excluded classes, as in the paper, it does not load them.
+    """
+    background = value.get("bg_objects")
+    if background is None:
+        return []
+    if not isinstance(background, list):
+        raise PredictionError(f"{where}: 'bg_objects' is {kind_of(background)}; expected a list")
+    n = sum(one is not None for one in background)
+    if not n:
+        return []
+    return [
+        f"{n} background objects (wall, floor, ceiling) are left out, as the original's evaluation with 4 or 6 "
+        "excluded classes does; with 1 excluded class it adds them under their own names"
+    ]

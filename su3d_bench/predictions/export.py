@@ -1,0 +1,273 @@
+"""Predictions in the forms that other evaluators take: OpenLex3D's three files, ScanNet's lists of masks."""
+
+from __future__ import annotations
+
+import os
+import re
+import shutil
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.datasets.pcd import write_pcd_points
+from su3d_bench.errors import PredictionError, StoreError
+from su3d_bench.metrics import transfer
+from su3d_bench.metrics.labelling import (
+    candidate_classes,
+    class_index_of_ids,
+    classes_of_prediction,
+    encoder_warning,
+    scored_classes,
+)
+from su3d_bench.metrics.scene_score import present
+from su3d_bench.plain_text import printable
+from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
+from su3d_bench.predictions.openlex3d import CLOUD, EMBEDDINGS, INDEX
+from su3d_bench.protocols import ProtocolRules
+from su3d_bench.store import make_folder, write_text
+from su3d_bench.types import (
+    DenseFeatures,
+    Encoder,
+    Float32Array,
+    Float64Array,
+    GroundTruth,
+    Instances,
+    Int64Array,
+)
+
+MASKS_FOLDER = "pred_mask"
+ROWS_AT_ONCE = 1 << 14
+FILE_NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.+-]{0,150}")
+
+
+@contextmanager
+def whole_folder(out: Path) -> Iterator[Path]:
+    """A folder to fill, which becomes ``out`` when the block ends well and vanishes when it does not.
+
+    ``out`` must not exist yet, or be an empty folder.
+    """
+    is_empty = not out.exists() or (out.is_dir() and not any(out.iterdir()))
+    if not is_empty or out.is_symlink():
+        raise StoreError(f"{out}: is there already; choose another folder with --out, or remove it")
+    out = out.absolute()
+    make_folder(out.parent)
+    filled = out.with_name(f".{out.name}.{os.getpid()}.tmp")
+    shutil.rmtree(filled, ignore_errors=True)  # of a process of this number that was killed
+    make_folder(filled)
+    try:
+        yield filled
+        os.replace(filled, out)
+    except OSError as error:
+        raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
+    finally:
+        shutil.rmtree(filled, ignore_errors=True)
+
+
+def file_name(scene: str) -> str:
+    """``scene`` as a name of files; ``PredictionError`` where it would lead elsewhere."""
+    if FILE_NAME.fullmatch(scene) is None:
+        raise PredictionError(f"scene '{printable(scene, 80)}': cannot be the name of a file; rename its files")
+    return scene
+
+
+# ---- OpenLex3D
+
+
+@dataclass(frozen=True)
+class OpenLexParts:
+    """Points (N, 3), the object (N,) of each, features (K, D) of the objects, and what became of the rest."""
+
+    points: Float32Array
+    index: Int64Array
+    features: NDArray[np.floating[Any]]
+    remarks: tuple[str, ...]
+
+
+def openlex_parts(content: Content) -> OpenLexParts:
+    """A map as OpenLex3D can say it: every point in one object, the first that holds it; the others are left out."""
+    if isinstance(content, VertexMasks | VertexLabels):
+        raise PredictionError("is over the points of the ground truth and brings no points, which OpenLex3D needs")
+    features, remarks = content.features, []
+    if features is None:
+        raise PredictionError("has no features, and OpenLex3D needs one for each object")
+    if isinstance(content, DenseFeatures):
+        return _dense_parts(content)
+    if isinstance(content, Instances):
+        owner = transfer.first_owner(transfer.masks_of(content), len(content.points))
+        n_shared = int((np.bincount(content.indices, minlength=1) > 1).sum())
+        if n_shared:
+            remarks.append(f"{n_shared} points are in several objects and went to the first of them")
+    else:
+        owner = content.instance.astype(np.int64)
+        if owner.shape != (len(content.points),) or owner.max(initial=-1) >= len(features):
+            raise PredictionError("names objects that have no row of features; make the map again")
+    kept = owner >= 0
+    if n_without := int((~kept).sum()):
+        remarks.append(f"{n_without} of {len(kept)} points are in no object and were left out")
+    n_empty = len(features) - len(np.unique(owner[kept]))
+    if n_empty:
+        remarks.append(f"{n_empty} of {len(features)} objects have no point left")
+    return OpenLexParts(_finite(content.points[kept]), owner[kept], features, tuple(remarks))
+
+
+def _dense_parts(content: DenseFeatures) -> OpenLexParts:
+    """Each point as its own object; points without a feature are left out."""
+    has_feature = np.zeros(len(content.points), np.bool_)
+    for start in range(0, len(has_feature), ROWS_AT_ONCE):
+        has_feature[start : start + ROWS_AT_ONCE] = content.features[start : start + ROWS_AT_ONCE].any(axis=1)
+    remarks = ["each point is an object of its own"]
+    if n_without := int((~has_feature).sum()):
+        remarks.append(f"{n_without} of {len(has_feature)} points have no feature and were left out")
+    rows = np.cumsum(has_feature)[has_feature] - 1
+    features: Any = content.features if has_feature.all() else content.features[has_feature]
+    return OpenLexParts(_finite(content.points[has_feature]), rows.astype(np.int64), features, tuple(remarks))
+
+
+def _finite(points: Float32Array) -> Float32Array:
+    if not len(points):
+        raise PredictionError("has no point in any object; there is nothing to export")
+    if not np.isfinite(points).all():
+        raise PredictionError("has points that are NaN or infinite; make the map again")
+    return points
+
+
+def write_openlex(content: Content, folder: Path) -> tuple[str, ...]:
+    """``point_cloud.pcd``, ``index.npy`` and ``embeddings.npy`` of one scene; remarks on what did not fit."""
+    parts = openlex_parts(content)
+    make_folder(folder)
+    write_pcd_points(folder / CLOUD, parts.points)
+    np.save(folder / INDEX, parts.index)
+    with (folder / EMBEDDINGS).open("wb") as stream:
+        header = {"descr": "<f4", "fortran_order": False, "shape": parts.features.shape}
+        np.lib.format.write_array_header_1_0(stream, header)
+        for start in range(0, len(parts.features), ROWS_AT_ONCE):  # the table may be larger than memory
+            stream.write(np.ascontiguousarray(parts.features[start : start + ROWS_AT_ONCE], "<f4").tobytes())
+    return parts.remarks
+
+
+# ---- ScanNet
+
+
+@dataclass(frozen=True)
+class LabelledMasks:
+    """K masks over ``n_points`` points of the truth, a class id (K,), 0 for none, and a score (K,) for each."""
+
+    masks: transfer.Masks
+    n_points: int
+    class_ids: Int64Array
+    scores: Float64Array
+    remarks: tuple[str, ...] = ()
+
+
+def needs_truth(content: Content) -> bool:
+    """Whether masks and class ids are not all in the file: other points, class positions, or features alone."""
+    return not isinstance(content, VertexMasks) or content.class_numbers is None or content.numbering == "index"
+
+
+def masks_as_they_are(content: VertexMasks) -> LabelledMasks:
+    """Masks over the truth's points with class ids of their own."""
+    assert content.class_numbers is not None and content.numbering == "id"
+    masks = transfer.Masks(content.indptr, content.indices)
+    return LabelledMasks(masks, content.n_points or 0, content.class_numbers.astype(np.int64), content.scores)
+
+
+def masks_on_truth(
+    content: Content, rules: ProtocolRules, truth: GroundTruth, encoder: Encoder | None
+) -> LabelledMasks:
+    """The masks on the points of the truth, as ``rules`` bring them there, with class ids of its label set.
+
+    Classes are those of the prediction, else what ``encoder`` calls its features among the classes of ``rules``.
+    """
+    if isinstance(content, VertexLabels | DenseFeatures):
+        raise PredictionError("has no masks, and ScanNet's list needs them")
+    named = _instances(content, truth) if isinstance(content, VertexMasks) else content
+    if isinstance(named, Instances):
+        masks, scores = transfer.masks_of(named), np.asarray(named.scores, np.float64)
+    else:
+        n = len(named.features)
+        masks, scores = transfer.masks_of_partition(named.instance, n), np.ones(n)
+    if not np.isfinite(named.points).all() or not np.isfinite(scores).all():
+        raise PredictionError("has points or scores that are NaN or infinite; make it again")
+    moved = transfer.transfer_masks(
+        named.points, masks, truth.points, rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
+    )
+    ids = np.array([entry.id for entry in rules.classes], np.int64)
+    if isinstance(content, VertexMasks) and content.class_numbers is not None:
+        return LabelledMasks(moved, len(truth.points), _own_ids(content, ids), scores)
+    is_present = present(class_index_of_ids(rules, truth.semantic), len(ids)) & scored_classes(rules)
+    classes = classes_of_prediction(rules, named, encoder, candidate_classes(rules, is_present))
+    class_ids = np.where(classes >= 0, ids[classes], 0)
+    told = encoder_warning(rules, named, encoder)
+    return LabelledMasks(moved, len(truth.points), class_ids, scores, (told,) if told else ())
+
+
+def _own_ids(content: VertexMasks, ids: Int64Array) -> Int64Array:
+    """The class ids that the file itself gives, 0 for positions beyond the list of classes."""
+    assert content.class_numbers is not None
+    numbers = content.class_numbers.astype(np.int64)
+    if content.numbering == "id":
+        return numbers
+    is_known = (numbers >= 0) & (numbers < len(ids))
+    return np.where(is_known, ids[np.where(is_known, numbers, 0)], 0)
+
+
+def _instances(content: VertexMasks, truth: GroundTruth) -> Instances:
+    """The masks as instances over the points of the truth."""
+    if content.n_points not in {None, len(truth.points)}:
+        raise PredictionError(
+            f"is of {content.n_points} points, the ground truth of {len(truth.points)}; both must be of one mesh"
+        )
+    k = len(content)
+    return Instances(
+        truth.points,
+        content.indptr,
+        content.indices,
+        content.scores,
+        content.features,
+        None,
+        content.keys,
+        ("",) * k,
+        np.zeros((k, 2, 3), np.float32),
+        np.zeros((k, 3), np.float32),
+        np.zeros(k + 1, np.int64),
+        np.zeros((0, 2), np.int32),
+    )
+
+
+def write_scannet(labelled: LabelledMasks, scene: str, folder: Path) -> tuple[str, ...]:
+    """``<scene>.txt`` and a file of digits for each mask; masks without points or class are left out and told.
+
+    Confidences are written with all their digits: ``%f`` would make equals of what differs in the seventh.
+    """
+    scene = file_name(scene)
+    make_folder(folder / MASKS_FOLDER)
+    sizes = np.diff(labelled.masks.indptr)
+    lines, n_empty, n_unnamed = [], 0, 0
+    for k, (class_id, score) in enumerate(zip(labelled.class_ids.tolist(), labelled.scores.tolist(), strict=True)):
+        if not sizes[k]:
+            n_empty += 1
+        elif class_id == 0:
+            n_unnamed += 1
+        else:
+            name = f"{MASKS_FOLDER}/{scene}_{k:03d}.txt"
+            start, end = labelled.masks.indptr[k : k + 2]
+            digits = np.full((labelled.n_points, 2), (ord("0"), ord("\n")), np.uint8)
+            digits[labelled.masks.indices[start:end], 0] = ord("1")
+            (folder / name).write_bytes(digits.tobytes())
+            lines.append(f"{name} {class_id} {score!r}\n")
+    write_text(folder / f"{scene}.txt", "".join(lines))
+    return (*labelled.remarks, *_left_out(len(sizes), n_empty, n_unnamed))
+
+
+def _left_out(n_masks: int, n_empty: int, n_unnamed: int) -> Sequence[str]:
+    remarks = []
+    if n_empty:
+        remarks.append(f"{n_empty} of {n_masks} masks have no point of the ground truth and were left out")
+    if n_unnamed:
+        remarks.append(f"{n_unnamed} of {n_masks} masks have none of the classes and were left out")
+    return remarks

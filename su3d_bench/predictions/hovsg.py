@@ -1,0 +1,133 @@
+"""Maps of HOV-SG: a cloud a file in ``objects/``, and a row of features for each.
+
+Source: HOV-SG at commit 71a8069. Object i is row i of the features. Its loader counts the files and reads those from 0
+on, which loses the last ones where a number is missing; here the number is read from the name.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from su3d_bench.datasets.pcd import read_pcd_points
+from su3d_bench.datasets.ply import read_ply
+from su3d_bench.errors import PredictionError
+from su3d_bench.plain_text import printable
+from su3d_bench.predictions.base import MOST_MASKS, ScenePrediction, shown
+from su3d_bench.predictions.clouds import (
+    ONES,
+    as_prediction_error,
+    checked_points,
+    folders_with,
+    instances_of,
+    named_once,
+    rows_with,
+    some,
+    without_nonfinite,
+)
+from su3d_bench.predictions.mask_arrays import kind_of
+from su3d_bench.predictions.torch_zip import read_torch
+from su3d_bench.types import Float32Array
+
+FEATURES = "mask_feats.pt"
+OBJECTS = "objects"
+OBJECT_FILE = re.compile(r"pcd_(0|[1-9]\d{0,8})\.(ply|pcd)")
+
+
+class HovSg:
+    name = "hovsg"
+    summary = "HOV-SG's objects/pcd_<i>.ply (or .pcd) with mask_feats.pt, row i of object i"
+
+    def recognise(self, path: Path) -> str | None:
+        return f"it holds {FEATURES} beside {OBJECTS}/" if path.is_dir() and _folders(path) else None
+
+    def scenes(self, path: Path) -> Mapping[str, Path]:
+        return named_once([(folder.absolute().name, folder) for folder in _folders(path)], path)
+
+    def read(self, path: Path, scene: str) -> ScenePrediction:
+        folder = self.scenes(path).get(scene)
+        if folder is None:
+            raise PredictionError(f"{shown(path)}: has no map of scene '{printable(scene, 80)}'")
+        table = _features(folder / FEATURES)
+        files = _object_files(folder / OBJECTS)
+        numbers = sorted(files)
+        if numbers and numbers[-1] >= len(table):
+            raise PredictionError(
+                f"{shown(files[numbers[-1]])}: object {numbers[-1]} has no feature, {FEATURES} has {len(table)} rows; "
+                "both must be of one map"
+            )
+        features, remarks = without_nonfinite(table[numbers], "objects")
+        instances = instances_of(
+            [checked_points(read_cloud(files[number]), shown(files[number])) for number in numbers],
+            shown(folder),
+            features=features,
+            labels=None,
+            names=tuple(f"object {number}" for number in numbers),
+            captions=("",) * len(numbers),
+            ids=numbers,
+        )
+        remarks += _gap_remarks(numbers, len(table))
+        return ScenePrediction(scene, self.name, folder, instances, (ONES, *remarks))
+
+
+def read_cloud(file: Path) -> np.ndarray:
+    """The points (N, 3) of a .ply or .pcd file, as they are; ``PredictionError`` where it is damaged."""
+    where = shown(file)
+    with as_prediction_error():
+        if file.suffix == ".pcd":
+            return read_pcd_points(file, where)
+        vertices = read_ply(file, where).element("vertex")
+    columns = {} if vertices is None else vertices.columns
+    axes = [columns.get(axis) for axis in "xyz"]
+    found = [axis for axis in axes if isinstance(axis, np.ndarray)]
+    if len(found) != len(axes):
+        raise PredictionError(f"{where}: its vertices have no x, y and z; expected a cloud of points")
+    return np.stack([axis.astype(np.float64) for axis in found], axis=1)
+
+
+def _folders(path: Path) -> list[Path]:
+    """The folders of scenes at ``path`` or up to two levels below it."""
+    found = folders_with(path, [f"{above}{FEATURES}" for above in ("", "*/", "*/*/")])
+    return [file.parent for file in found if (file.parent / OBJECTS).is_dir()]
+
+
+def _features(file: Path) -> Float32Array:
+    table = read_torch(file)
+    if not isinstance(table, np.ndarray) or table.ndim != 2 or table.dtype.kind != "f" or not table.shape[1]:
+        raise PredictionError(f"{shown(file)}: holds {kind_of(table)}; expected a row of features an object")
+    with np.errstate(over="ignore", invalid="ignore"):
+        return table.astype(np.float32)
+
+
+def _object_files(folder: Path) -> dict[int, Path]:
+    """The cloud of each object by its number."""
+    try:
+        names = [entry.name for entry in folder.iterdir() if entry.is_file()]
+    except OSError as error:
+        raise PredictionError(f"{shown(folder)}: cannot be read: {error.strerror or error}") from error
+    files: dict[int, Path] = {}
+    for name in sorted(names):
+        match = OBJECT_FILE.fullmatch(name)
+        if match is None:
+            continue
+        if files.setdefault(int(match[1]), folder / name) != folder / name:
+            raise PredictionError(f"{shown(folder)}: object {match[1]} is there as .ply and .pcd; keep one of them")
+    if len(files) > MOST_MASKS:
+        raise PredictionError(f"{shown(folder)}: holds {len(files)} objects; is it damaged?")
+    return files
+
+
+def _gap_remarks(numbers: list[int], n_rows: int) -> tuple[str, ...]:
+    is_there = np.zeros(n_rows, np.bool_)
+    is_there[numbers] = True
+    missing = rows_with(~is_there)
+    if not missing:
+        return ()
+    remarks = [f"{len(missing)} rows of {FEATURES} have no object file and are not used ({some(missing)})"]
+    lost = [number for number in numbers if number >= len(numbers)]
+    if lost:
+        remarks.append(f"the original's loader would not read the last {len(lost)} objects ({some(lost)})")
+    return tuple(remarks)

@@ -1,0 +1,200 @@
+"""Masks over the scene's points in one archive a scene: MaskClustering, Mask3D, Open3DIS, Open-YOLO 3D, OpenIns3D."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.errors import PredictionError
+from su3d_bench.predictions.base import ScenePrediction, VertexMasks, shown
+from su3d_bench.predictions.mask_arrays import (
+    NO_SCORES,
+    check_sizes,
+    classes_of,
+    column_members,
+    kind_of,
+    matrix_of,
+    run_members,
+    scene_file,
+    scene_files,
+    scores_of,
+    vertex_masks,
+)
+from su3d_bench.predictions.numpy_files import npz_names, read_npz
+from su3d_bench.predictions.torch_zip import Kind, SparseTensor, read_torch, torch_kind
+from su3d_bench.types import Int32Array
+
+
+def first_of_kind(path: Path, suffix: str, kinds: tuple[Kind, ...]) -> Path | None:
+    """The first file with ``suffix`` at ``path`` where that holds one of ``kinds``; None where it does not."""
+    if not path.is_dir() and path.suffix != suffix:
+        return None
+    first = next(iter(scene_files(path, (suffix,)).values()), None)
+    return first if first is not None and torch_kind(first) in kinds else None
+
+
+class MaskClustering:
+    name = "maskclustering"
+    summary = "MaskClustering's <scene>.npz with pred_masks (points, masks), pred_score and pred_classes (Mask3D's too)"
+
+    def recognise(self, path: Path) -> str | None:
+        if not path.is_dir() and path.suffix != ".npz":
+            return None
+        first = next(iter(scene_files(path, (".npz",)).values()), None)
+        return "its .npz files hold 'pred_masks'" if first is not None and "pred_masks" in npz_names(first) else None
+
+    def scenes(self, path: Path) -> Mapping[str, Path]:
+        return scene_files(path, (".npz",))
+
+    def read(self, path: Path, scene: str) -> ScenePrediction:
+        file = scene_file(scene_files(path, (".npz",)), path, scene)
+        where = shown(file)
+        arrays = read_npz(file, ("pred_masks", "pred_score", "pred_scores", "pred_classes"))
+        if "pred_masks" not in arrays:
+            raise PredictionError(f"{where}: has no 'pred_masks'; expected an archive of MaskClustering or Mask3D")
+        matrix = matrix_of(arrays["pred_masks"], where)
+        n_points, n_masks = matrix.shape
+        remarks = []
+        scores = arrays.get("pred_score", arrays.get("pred_scores"))
+        if scores is None:
+            remarks.append(NO_SCORES)
+        classes = arrays.get("pred_classes")
+        if classes is not None and n_masks and not classes.any():
+            remarks.append("every mask has class 0, as MaskClustering writes class-agnostic masks")
+        masks = vertex_masks(
+            where,
+            column_members(matrix, where),
+            n_points,
+            scores=None if scores is None else scores_of(scores, n_masks, where),
+            class_numbers=None if classes is None else classes_of(classes, n_masks, where),
+        )
+        return ScenePrediction(scene, self.name, file, masks, tuple(remarks))
+
+
+class Open3dis:
+    name = "open3dis"
+    summary = "Open3DIS's <scene>.pth: a dict of ins (run-length masks or a tensor), conf and final_class"
+
+    def recognise(self, path: Path) -> str | None:
+        first = first_of_kind(path, ".pth", ("dict",))
+        return None if first is None else "its .pth files hold a dict"
+
+    def scenes(self, path: Path) -> Mapping[str, Path]:
+        return scene_files(path, (".pth",))
+
+    def read(self, path: Path, scene: str) -> ScenePrediction:
+        file = scene_file(scene_files(path, (".pth",)), path, scene)
+        where, value = shown(file), read_torch(file)
+        if not isinstance(value, dict) or "ins" not in value:
+            raise PredictionError(f"{where}: holds {kind_of(value)} without 'ins'; expected a dict of Open3DIS")
+        scores, classes = value.get("conf"), value.get("final_class")
+        n_known = next((len(one) for one in (classes, scores) if isinstance(one, np.ndarray) and one.ndim == 1), None)
+        members, n_points = _instances(value["ins"], n_known, where)
+        remarks = [NO_SCORES if scores is None else "Open3DIS's own evaluator puts 1 for every confidence"]
+        if classes is None:
+            remarks.append("the file has no classes: the masks are class-agnostic")
+        masks = vertex_masks(
+            where,
+            members,
+            n_points,
+            scores=None if scores is None else scores_of(scores, len(members), where),
+            class_numbers=None if classes is None else classes_of(classes, len(members), where),
+            numbering="index",
+        )
+        return ScenePrediction(scene, self.name, file, masks, tuple(remarks))
+
+
+def _instances(value: object, n_known: int | None, where: str) -> tuple[list[Int32Array], int | None]:
+    """Members of each mask and the number of points, from run lengths or a matrix; ``n_known`` masks, if known."""
+    if isinstance(value, np.ndarray):
+        matrix = _masks_in_columns(matrix_of(value, where), n_known, where)
+        return column_members(matrix, where), len(matrix)
+    if not isinstance(value, list):
+        raise PredictionError(f"{where}: 'ins' is {kind_of(value)}; expected a list of run lengths or a tensor")
+    members: list[Int32Array] = []
+    length = None
+    for k, one in enumerate(value):
+        if not isinstance(one, dict) or "length" not in one or "counts" not in one:
+            raise PredictionError(f"{where}: mask {k} is {kind_of(one)}; expected a dict of length and counts")
+        members.append(run_members(one["length"], one["counts"], f"{where}: mask {k}"))
+        if length not in {None, int(one["length"])}:
+            raise PredictionError(f"{where}: mask {k} is of {one['length']} points, mask 0 of {length}")
+        length = int(one["length"])
+    return members, length
+
+
+def _masks_in_columns(matrix: NDArray[Any], n_known: int | None, where: str) -> NDArray[Any]:
+    """(points, masks): Open3DIS has masks in rows; the number of scores or classes tells, or else the longer side."""
+    n_rows, n_columns = matrix.shape
+    if n_known is not None and n_known not in {n_rows, n_columns}:
+        raise PredictionError(f"{where}: the masks are {kind_of(matrix)}, but there are {n_known} scores or classes")
+    are_rows = n_rows == n_known if n_known is not None else n_rows <= n_columns
+    return matrix.T if are_rows else matrix
+
+
+class OpenYolo3d:
+    name = "openyolo3d"
+    summary = "Open-YOLO 3D's proposals <scene>.pt: a pair of masks (points, masks) and scores, without classes"
+
+    def recognise(self, path: Path) -> str | None:
+        first = first_of_kind(path, ".pt", ("tuple",))
+        return None if first is None else "its .pt files hold a tuple"
+
+    def scenes(self, path: Path) -> Mapping[str, Path]:
+        return scene_files(path, (".pt",))
+
+    def read(self, path: Path, scene: str) -> ScenePrediction:
+        file = scene_file(scene_files(path, (".pt",)), path, scene)
+        where, value = shown(file), read_torch(file)
+        if not isinstance(value, tuple | list) or len(value) != 2:
+            raise PredictionError(f"{where}: holds {kind_of(value)}; expected a pair of masks and scores")
+        matrix = matrix_of(value[0], where)
+        scores = scores_of(value[1], matrix.shape[1], where)
+        masks = vertex_masks(where, column_members(matrix, where), len(matrix), scores=scores)
+        remarks = ("proposals without classes", "Open-YOLO 3D's own evaluator puts 1 for every score")
+        return ScenePrediction(scene, self.name, file, masks, remarks)
+
+
+class OpenIns3d:
+    name = "openins3d"
+    summary = "OpenIns3D's masks <scene>.pt: a sparse tensor (points, masks), without scores and classes"
+
+    def recognise(self, path: Path) -> str | None:
+        first = first_of_kind(path, ".pt", ("sparse",))
+        return None if first is None else "its .pt files hold a sparse tensor"
+
+    def scenes(self, path: Path) -> Mapping[str, Path]:
+        return scene_files(path, (".pt",))
+
+    def read(self, path: Path, scene: str) -> ScenePrediction:
+        file = scene_file(scene_files(path, (".pt",)), path, scene)
+        where, value = shown(file), read_torch(file)
+        if not isinstance(value, SparseTensor) or len(value.shape) != 2:
+            raise PredictionError(
+                f"{where}: holds {kind_of(value)}; expected a sparse tensor (points, masks), as OpenIns3D saves it"
+            )
+        remarks = (
+            NO_SCORES,
+            "masks without classes; OpenIns3D evaluates with classes and scores that it does not save",
+        )
+        return ScenePrediction(scene, self.name, file, _sparse_masks(value, where), remarks)
+
+
+def _sparse_masks(sparse: SparseTensor, where: str) -> VertexMasks:
+    values = matrix_of(sparse.values[np.newaxis], where)[0].astype(np.float64)
+    n_points, n_masks = sparse.shape
+    check_sizes(n_points, n_masks, where)
+    order = np.lexsort((sparse.indices[0], sparse.indices[1]))
+    rows, columns = sparse.indices[0][order], sparse.indices[1][order]
+    is_first = np.ones(len(order), np.bool_)
+    is_first[1:] = (np.diff(rows) != 0) | (np.diff(columns) != 0)
+    sums = np.add.reduceat(values[order], np.flatnonzero(is_first)) if len(order) else values
+    rows, columns = rows[is_first][sums != 0], columns[is_first][sums != 0]
+    bounds = np.searchsorted(columns, np.arange(n_masks + 1))
+    members = [rows[start:end].astype(np.int32) for start, end in pairwise(bounds)]
+    return vertex_masks(where, members, n_points)

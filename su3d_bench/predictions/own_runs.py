@@ -1,0 +1,123 @@
+"""Predictions of our own runs: ``prediction.npz`` files, alone or in a run folder."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.errors import PredictionError
+from su3d_bench.plain_text import printable
+from su3d_bench.predictions.base import ScenePrediction, shown
+from su3d_bench.predictions.mask_arrays import kind_of, scene_file
+from su3d_bench.predictions.numpy_files import npz_names, read_npz
+from su3d_bench.store import prediction_from_arrays
+from su3d_bench.types import DenseFeatures, Partition, Prediction
+
+FILE = "prediction.npz"
+# Dimensions and kinds of values of each field; see Instances, Partition and DenseFeatures.
+FIELDS = {
+    "kind": (0, "U"),
+    "points": (2, "f"),
+    "indptr": (1, "i"),
+    "indices": (1, "i"),
+    "scores": (1, "f"),
+    "features": (2, "f"),
+    "labels": (1, "U"),
+    "names": (1, "U"),
+    "captions": (1, "U"),
+    "boxes": (3, "f"),
+    "centroids": (2, "f"),
+    "view_indptr": (1, "i"),
+    "views": (2, "i"),
+    "ids": (1, "i"),
+    "instance": (1, "i"),
+}
+
+
+class OwnRuns:
+    name = "su3d-bench"
+    summary = "our own prediction.npz, or a run folder with those of one method"
+
+    def recognise(self, path: Path) -> str | None:
+        try:
+            files = _files(path)
+        except PredictionError:
+            files = {"": path}  # a run folder of several methods: reading it says so
+        if not files:
+            return None
+        is_ours = path.is_dir() or "kind" in npz_names(path)
+        return f"it holds {FILE}" if is_ours else None
+
+    def scenes(self, path: Path) -> Mapping[str, Path]:
+        return _files(path)
+
+    def read(self, path: Path, scene: str) -> ScenePrediction:
+        file = scene_file(_files(path), path, scene)
+        arrays = read_npz(file)
+        for name, array in arrays.items():
+            _check_field(shown(file), name, array)
+        points, indptr = arrays.get("points"), arrays.get("indptr")
+        if points is not None and points.shape[1] != 3:
+            raise PredictionError(f"{shown(file)}: 'points' is {kind_of(points)}; expected three coordinates a point")
+        if indptr is not None and len(indptr) == 0:
+            raise PredictionError(f"{shown(file)}: 'indptr' is empty; run the scene again")
+        try:
+            content = prediction_from_arrays(arrays, shown(file))
+        except PredictionError as error:
+            raise PredictionError(f"{shown(file)}: {str(error).removeprefix(f'{shown(file)}: ')}") from error
+        _check_points(shown(file), content)
+        return ScenePrediction(scene, self.name, file, content)
+
+
+def _check_field(where: str, name: str, array: NDArray[Any]) -> None:
+    n_dimensions, kinds = FIELDS.get(name, (array.ndim, array.dtype.kind))
+    if array.ndim != n_dimensions or array.dtype.kind not in kinds:
+        raise PredictionError(f"{where}: '{printable(name, 60)}' is {kind_of(array)}; run the scene again")
+    if name in {"points", "scores"} and not np.isfinite(array).all():
+        raise PredictionError(f"{where}: '{name}' has values that are NaN or infinite; run the scene again")
+
+
+def _check_points(where: str, content: Prediction) -> None:
+    """Refuses a partition or features that do not go with their points; instances check themselves."""
+    n = len(content.points)
+    if isinstance(content, DenseFeatures) and len(content.features) != n:
+        raise PredictionError(f"{where}: {n} points and {len(content.features)} features; run the scene again")
+    if isinstance(content, Partition):
+        rows, n_rows = content.instance, len(content.features)
+        if len(rows) != n or (len(rows) and not -1 <= int(rows.min()) <= int(rows.max()) < n_rows):
+            raise PredictionError(
+                f"{where}: {n} points, {len(rows)} instance numbers to {int(rows.max(initial=-1))} and {n_rows} "
+                "features; run the scene again"
+            )
+
+
+def _files(path: Path) -> dict[str, Path]:
+    """The predictions below a run folder, its ``scenes`` or a scene's folder, by address; or the one file.
+
+    Raises ``PredictionError`` where a scene has those of several methods.
+    """
+    if path.is_file():
+        return {_scene_of(path): path} if path.suffix == ".npz" else {}
+    above, found = next(
+        ((above, files) for above in ("scenes/*/", "*/", "") if (files := sorted(path.glob(f"{above}*/{FILE}")))),
+        ("", sorted(path.glob(FILE))),
+    )
+    methods = sorted({file.parent.name for file in found})
+    if len(methods) > 1:
+        raise PredictionError(
+            f"{shown(path)}: holds predictions of {len(methods)} methods ({printable(', '.join(methods), 120)}); "
+            f"give the folders of one: {shown(path)}/{above}{printable(methods[0], 60)}"
+        )
+    return {_scene_of(file): file for file in found}
+
+
+def _scene_of(file: Path) -> str:
+    """``dataset/scene`` where the file lies in a run folder, else the name of the file."""
+    folder = file.absolute().parent.parent
+    if folder.parent.name == "scenes":
+        return folder.name.replace(".", "/", 1)
+    return file.stem

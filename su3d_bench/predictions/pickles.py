@@ -1,0 +1,67 @@
+"""Pickles of other programs, read as data by an own interpreter that imports and calls nothing."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import zlib
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import BinaryIO, cast
+
+from su3d_bench.errors import PredictionError
+from su3d_bench.predictions.base import shown
+from su3d_bench.predictions.pickle_constructors import CONSTRUCTORS, Constructors, Forgotten, Inert, RefusedError
+from su3d_bench.predictions.pickle_machine import PickleMachine
+
+__all__ = ["Forgotten", "Inert", "read_pickle", "read_pickle_file"]
+
+GZIP_START = b"\x1f\x8b"
+MOST_INFLATED = 16 << 30  # bytes of a gzip stream; a map of ConceptGraphs with all its masks has some GiB
+INFLATED_A_READ = 1 << 20
+
+
+def read_pickle_file(path: Path, *, forget: Iterable[str] = ()) -> object:
+    """The value of a pickle, plain or gzipped: plain values, lists, dicts, tuples, and read-only arrays.
+
+    Payloads below a dict key in ``forget`` are read past and leave ``Forgotten`` in their place; settings and paths
+    become ``Inert``. Raises ``PredictionError`` for whatever is damaged or not plain data.
+    """
+    where = shown(path)
+    try:
+        with path.open("rb") as stream:
+            is_gzip = stream.read(2) == GZIP_START
+            n_bytes = stream.seek(0, io.SEEK_END)
+            stream.seek(0)
+            if not is_gzip:
+                return read_pickle(stream, n_bytes, where, forget=forget)
+            with gzip.open(stream, "rb") as inflated:
+                buffered = io.BufferedReader(cast(io.RawIOBase, inflated), INFLATED_A_READ)
+                return read_pickle(buffered, MOST_INFLATED, where, forget=forget)
+    except OSError as error:
+        raise PredictionError(f"{where}: cannot be read: {error.strerror or error}") from error
+
+
+def read_pickle(
+    stream: BinaryIO,
+    n_bytes: int,
+    where: str,
+    *,
+    constructors: Constructors = CONSTRUCTORS,
+    persistent: Callable[[object], object] | None = None,
+    forget: Iterable[str] = (),
+) -> object:
+    """The value of the pickle that ``stream`` holds from here to its end, at most ``n_bytes`` away.
+
+    ``constructors`` is the whole of what the pickle may name; ``persistent`` answers references to what is stored
+    outside of it, which are refused without it.
+    """
+    machine = PickleMachine(stream, n_bytes, constructors, persistent, frozenset(forget))
+    try:
+        return machine.run()
+    except RefusedError as error:
+        raise PredictionError(
+            f"{where}: not read as a pickle of plain data, at byte {machine.n_read}: {error}"
+        ) from error
+    except (EOFError, gzip.BadGzipFile, zlib.error) as error:
+        raise PredictionError(f"{where}: the file is cut short or damaged; copy it again") from error

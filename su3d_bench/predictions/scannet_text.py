@@ -1,0 +1,212 @@
+"""Text predictions of ScanNet's benchmark: lists of masks, as Mask3D and Segment3D export them too, and labels."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from su3d_bench.errors import PredictionError
+from su3d_bench.metrics.instance_ap import last_line_of_each_mask_file
+from su3d_bench.plain_text import printable
+from su3d_bench.predictions.base import ScenePrediction, VertexLabels, shown
+from su3d_bench.predictions.mask_arrays import run_members, scene_file, scene_files, vertex_masks
+from su3d_bench.predictions.text_integers import integer_lines
+from su3d_bench.types import Int32Array
+
+OWN_OUTPUT = "semantic_instance_evaluation"  # the original evaluator's own answer, which it leaves out
+MASK3D_FOLDER = "decoder_-1"  # Mask3D and Segment3D write the lists of the last decoder here
+MOST_FIRST_LINE = 4096
+MOST_LOOKED_AT = 50
+
+
+@dataclass(frozen=True)
+class Line:
+    """One line of a list: the mask file as the line says it and as a path without detours, its class and score."""
+
+    number: int
+    file: str
+    label: int
+    score: float
+
+
+class ScannetText:
+    name = "scannet-text"
+    summary = (
+        "ScanNet's submission: <scene>.txt with lines 'mask file, class id, confidence' (Mask3D, Segment3D, ScanNet++)"
+    )
+
+    def recognise(self, path: Path) -> str | None:
+        lines = _first_lines(self.scenes(path)) if _has_texts(path) else []
+        if not lines:
+            return None
+        words = next((line.split(" ") for line in lines if line), None)
+        if words is None:
+            return "its .txt files are empty lists"
+        is_list = len(words) == 3 and _number(words[1]) is not None and _number(words[2]) is not None
+        return "its .txt files list a mask file, a class and a confidence a line" if is_list else None
+
+    def scenes(self, path: Path) -> Mapping[str, Path]:
+        return _text_files(path / MASK3D_FOLDER if (path / MASK3D_FOLDER).is_dir() else path)
+
+    def read(self, path: Path, scene: str) -> ScenePrediction:
+        file = scene_file(dict(self.scenes(path)), path, scene)
+        lines = read_list(file)
+        pairs = last_line_of_each_mask_file([line.file for line in lines])
+        members, n_points = [], None
+        for first, _ in pairs:
+            n, indices = _read_mask(file.parent, lines[first], shown(file))
+            if n_points not in {None, n}:
+                raise PredictionError(
+                    f"{shown(file)}:{lines[first].number}: mask '{printable(lines[first].file, 120)}' is of {n} points "
+                    f"and '{printable(lines[0].file, 120)}' of {n_points}; all must have the points of the scene"
+                )
+            n_points = n
+            members.append(indices)
+        masks = vertex_masks(
+            shown(file),
+            members,
+            n_points,
+            scores=np.array([lines[last].score for _, last in pairs], np.float64),
+            class_numbers=np.array([lines[last].label for _, last in pairs], np.int32),
+            keys=[printable(lines[first].file, 200) for first, _ in pairs],
+        )
+        return ScenePrediction(scene, self.name, file, masks, _remarks(lines, len(pairs)))
+
+
+class ScannetSemanticText:
+    name = "scannet-semantic-text"
+    summary = "ScanNet's semantic submission: <scene>.txt with one class id a line, one line a point"
+
+    def recognise(self, path: Path) -> str | None:
+        lines = _first_lines(_text_files(path)) if _has_texts(path) else []
+        words = next((line.split() for line in lines if line), [])
+        is_label = len(words) == 1 and words[0].removeprefix("-").isdigit()
+        return "its .txt files hold one integer a line" if is_label else None
+
+    def scenes(self, path: Path) -> Mapping[str, Path]:
+        return _text_files(path)
+
+    def read(self, path: Path, scene: str) -> ScenePrediction:
+        file = scene_file(_text_files(path), path, scene)
+        values = integer_lines(_content(file, shown(file)), shown(file))
+        if not len(values):
+            raise PredictionError(f"{shown(file)}: is empty; expected one class id a line, one line a point")
+        limits = np.iinfo(np.int32)
+        is_wrong = (values < limits.min) | (values > limits.max)
+        if is_wrong.any():
+            line = int(np.argmax(is_wrong))
+            raise PredictionError(f"{shown(file)}:{line + 1}: {int(values[line])} is no class id")
+        return ScenePrediction(scene, self.name, file, VertexLabels(values.astype(np.int32)))
+
+
+def read_list(file: Path) -> list[Line]:
+    """The lines of a list of masks, each as the official script takes it: three fields with single spaces between."""
+    where, lines = shown(file), []
+    for number, raw in enumerate(_content(file, where).splitlines(), 1):
+        words = raw.decode("utf-8", "replace").split(" ")
+        if len(words) != 3:
+            raise PredictionError(
+                f"{where}:{number}: {len(words)} fields in '{printable(' '.join(words), 120)}'; expected 'mask file, "
+                "class id, confidence' with single spaces between"
+            )
+        label, score = _number(words[1]), _number(words[2])
+        if label is None or not -(1 << 31) < label < 1 << 31:
+            raise PredictionError(f"{where}:{number}: '{printable(words[1], 60)}' is no class id")
+        if score is None:
+            raise PredictionError(f"{where}:{number}: confidence '{printable(words[2], 60)}' is no finite number")
+        lines.append(Line(number, _plain_path(words[0], f"{where}:{number}"), int(label), score))
+    return lines
+
+
+def _plain_path(text: str, where: str) -> str:
+    """A path inside the folder, without detours, from what a line says."""
+    plain = os.path.normpath(text) if text and "\0" not in text and "\ufffd" not in text else ""
+    if not plain or plain == "." or os.path.isabs(plain) or plain.split(os.sep)[0] == "..":
+        raise PredictionError(
+            f"{where}: '{printable(text, 120)}' is no path inside the folder of the list; mask files must be in it"
+        )
+    return plain
+
+
+def _read_mask(folder: Path, line: Line, where: str) -> tuple[int, Int32Array]:
+    """The number of points of a mask and those in it."""
+    file = folder / line.file
+    place = f"{where}:{line.number}: mask '{printable(line.file, 120)}'"
+    try:
+        target = file.resolve(strict=True)
+        is_inside = target.is_relative_to(folder.resolve()) and target.is_file()
+    except (OSError, RuntimeError) as error:
+        reason = "does not exist" if isinstance(error, FileNotFoundError) else "cannot be read"
+        raise PredictionError(f"{place} {reason}") from error
+    if not is_inside:
+        raise PredictionError(f"{place} is no file inside the folder of the list; copy it there")
+    content = _content(file, place)
+    if file.suffix == ".json":
+        return _run_length_mask(content, place)
+    values = integer_lines(content, place)
+    return len(values), np.flatnonzero(values).astype(np.int32)
+
+
+def _run_length_mask(content: bytes, where: str) -> tuple[int, Int32Array]:
+    """A mask of ScanNet++: JSON with ``length`` and ``counts``, a text of pairs."""
+    try:
+        value = json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise PredictionError(f"{where} is not readable as JSON") from error
+    if not isinstance(value, dict) or "length" not in value or "counts" not in value:
+        raise PredictionError(f"{where} has no 'length' and 'counts'")
+    members = run_members(value["length"], value["counts"], where)
+    return value["length"], members
+
+
+def _remarks(lines: list[Line], n_files: int) -> tuple[str, ...]:
+    n_more = len(lines) - n_files
+    if not n_more:
+        return ()
+    return (
+        f"{n_more} lines name a mask file again: class and confidence of its last line count, at the place of its "
+        "first, as in the official evaluator",
+    )
+
+
+def _number(word: str) -> float | None:
+    try:
+        value = float(word)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) else None
+
+
+def _has_texts(path: Path) -> bool:
+    return path.is_dir() or path.suffix == ".txt"
+
+
+def _text_files(path: Path) -> dict[str, Path]:
+    files = scene_files(path, (".txt",))
+    files.pop(OWN_OUTPUT, None)
+    return files
+
+
+def _first_lines(files: Mapping[str, Path]) -> list[str]:
+    """The first line of some files, empty for empty ones."""
+    lines = []
+    for file in list(files.values())[:MOST_LOOKED_AT]:
+        try:
+            with file.open("rb") as stream:
+                lines.append(stream.readline(MOST_FIRST_LINE).decode("utf-8", "replace").rstrip("\r\n"))
+        except OSError:
+            continue
+    return lines
+
+
+def _content(file: Path, where: str) -> bytes:
+    try:
+        return file.read_bytes()
+    except OSError as error:
+        raise PredictionError(f"{where}: cannot be read: {error.strerror or error}") from error

@@ -1,0 +1,75 @@
+"""One integer a line, as ScanNet's tools write masks and labels: fast where the lines are plain, strict everywhere."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.errors import PredictionError
+from su3d_bench.plain_text import printable
+
+IntegerArray = NDArray[np.integer[Any]]
+DIGIT_AND_NEWLINE = 0x0A30  # "0\n" as a little-endian pair
+MOST_DIGITS = 18  # of a number that int64 surely holds
+LIMIT = 1 << 62
+
+
+def integer_lines(content: bytes, where: str) -> IntegerArray:
+    """The integer of each line; the last line may lack its end. ``PredictionError`` names the first line without one.
+
+    >>> integer_lines(b"0\\n1\\n0\\n", "mask.txt").tolist()
+    [0, 1, 0]
+    >>> integer_lines(b"12\\n-1", "labels.txt").tolist()
+    [12, -1]
+    """
+    if b"\r" in content:
+        content = content.replace(b"\r\n", b"\n")
+    if content and not content.endswith(b"\n"):
+        content += b"\n"
+    values = _single_digits(content)
+    if values is None:
+        values = _plain_numbers(content)
+    return _any_numbers(content, where) if values is None else values
+
+
+def _single_digits(content: bytes) -> IntegerArray | None:
+    """The values where every line is one digit; None where one is not."""
+    if len(content) % 2:
+        return None
+    values = np.frombuffer(content, "<u2") - np.uint16(DIGIT_AND_NEWLINE)  # wraps around for everything else
+    return values if len(values) == 0 or int(values.max()) <= 9 else None
+
+
+def _plain_numbers(content: bytes) -> IntegerArray | None:
+    """The values where every line is some digits; None where one is not."""
+    digits = np.frombuffer(content, np.uint8) - np.uint8(ord("0"))  # wraps around: all else is above 9
+    ends = np.flatnonzero(digits == np.uint8(0x100 + ord("\n") - ord("0")))
+    starts = np.concatenate([[0], ends[:-1] + 1])
+    lengths = ends - starts
+    if np.count_nonzero(digits > 9) != len(ends) or lengths.min() < 1 or lengths.max() > MOST_DIGITS:
+        return None
+    values = np.zeros(len(ends), np.int64)
+    for place in range(int(lengths.max())):
+        has_digit = lengths > place
+        at = np.where(has_digit, starts + place, 0)
+        values = np.where(has_digit, values * 10 + digits[at], values)
+    return values
+
+
+def _any_numbers(content: bytes, where: str) -> IntegerArray:
+    """The values of lines with signs or blanks around them."""
+    lines = content.splitlines()
+    values = np.empty(len(lines), np.int64)
+    for number, line in enumerate(lines, 1):
+        try:
+            value = int(line) if len(line) <= 40 else LIMIT
+        except ValueError as error:
+            text = printable(line[:40].decode("latin1"))
+            raise PredictionError(f"{where}:{number}: '{text}' is not an integer; expected one a line") from error
+        if not -LIMIT < value < LIMIT:
+            text = printable(line[:40].decode("latin1"))
+            raise PredictionError(f"{where}:{number}: '{text}' is out of range; expected one integer a line")
+        values[number - 1] = value
+    return values

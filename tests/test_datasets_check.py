@@ -1,0 +1,395 @@
+"""``datasets check``: a whole scene has no finding, each fault is named, and the digest is that of results."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import box_room
+import cv2
+import numpy as np
+import painted
+import pytest
+from box_room import write_box_room, write_poses, write_truth
+from painted import Painted
+
+from su3d_bench.cli.main import main
+from su3d_bench.datasets.replica import Replica
+from su3d_bench.datasets.rooms import RoomOptions, Rooms
+from su3d_bench.errors import DataError
+from su3d_bench.inspection import SAMPLED_FRAMES, Inspection, inspect
+from su3d_bench.inspection_checks import Finding, check_frames, facts_of
+from su3d_bench.plain_text import printable, printable_json
+from su3d_bench.types import Frame
+
+N_FRAMES = 8
+TREE = Path("replica_v1/room_0/habitat")
+
+
+@pytest.fixture(scope="session")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    root = tmp_path_factory.mktemp("whole")
+    write_box_room(root, N_FRAMES)
+    return root
+
+
+@pytest.fixture
+def root(whole: Path, tmp_path: Path) -> Path:
+    """A copy of the whole scene, to damage."""
+    shutil.copytree(whole, tmp_path / "data")
+    return tmp_path / "data"
+
+
+def look(root: Path, **options: Any) -> Inspection:
+    return inspect(Replica(root), "room0", **options)
+
+
+def texts(found: Inspection, severity: str = "error") -> list[str]:
+    return [f"{one.where}: {one.text}" for one in found.findings if one.severity == severity]
+
+
+def checks(found: Inspection) -> set[str]:
+    return {one.check for one in found.findings}
+
+
+def test_a_whole_scene_has_no_finding_and_its_counts(whole: Path) -> None:
+    found = look(whole, n_threads=2)
+    assert found.findings == ()
+    assert (found.scene, found.n_frames, found.n_read, found.size) == ("replica/room0", N_FRAMES, N_FRAMES, (48, 36))
+    assert found.n_files == 2 + 2 * N_FRAMES + 2
+    assert found.depth is not None and found.meeting is not None
+    assert 0.3 < found.depth.near_m < found.depth.median_m < found.depth.far_m < 5
+    assert found.depth.valid_share == 1
+    assert found.meeting.share > 0.99
+    rows = {row.variant: row for row in found.truth}
+    assert (rows["mesh-vertices"].n_objects, rows["mesh-vertices"].n_classes) == (6, 3)
+    assert rows["conceptgraphs"].reason is not None
+
+
+def test_one_thread_and_four_find_the_same(root: Path) -> None:
+    for index in (1, 4, 6):
+        (root / f"Replica/room0/results/frame{index:06d}.jpg").write_bytes(b"\xff\xd8\xff nothing")
+    one, four = (replace(look(root, n_threads=n), elapsed_s=0.0) for n in (1, 4))
+    assert one == four
+
+
+def test_the_digest_is_the_one_of_the_dataset(whole: Path) -> None:
+    assert look(whole).digest == Replica(whole).digest("room0")
+
+
+def test_every_damaged_file_is_named(root: Path) -> None:
+    results = root / "Replica/room0/results"
+    (results / "frame000001.jpg").write_bytes((results / "frame000001.jpg").read_bytes()[:200])
+    (results / "depth000004.png").write_bytes(b"no image")
+    (results / "depth000006.png").write_bytes(b"")
+    said = " ".join(texts(look(root)))
+    assert all(name in said for name in ("frame000001.jpg", "depth000004.png", "depth000006.png"))
+    assert len(texts(look(root))) == 3
+    assert look(root).n_read == N_FRAMES - 3
+
+
+def test_every_missing_file_is_named_once(root: Path) -> None:
+    for name in ("frame000002.jpg", "depth000005.png", "depth000007.png"):
+        (root / "Replica/room0/results" / name).unlink()
+    said = texts(look(root))
+    for name in ("frame000002.jpg", "depth000005.png", "depth000007.png"):
+        assert sum(name in one for one in said) == 1, said
+
+
+def test_of_many_missing_files_each_one_is_named(tmp_path: Path) -> None:
+    write_box_room(tmp_path, 60, with_truth=False)
+    gone = sorted((tmp_path / "Replica/room0/results").glob("depth*.png"))[::2]
+    for path in gone:
+        path.unlink()
+    said = " ".join(texts(look(tmp_path)))
+    assert all(path.name in said for path in gone)
+
+
+def test_missing_and_damaged_files_are_named_together(root: Path) -> None:
+    results = root / "Replica/room0/results"
+    (results / "frame000002.jpg").unlink()
+    (results / "depth000003.png").write_bytes((results / "depth000003.png").read_bytes()[:-9])
+    (root / TREE / "info_semantic.json").write_text("{")
+    said = " ".join(texts(look(root)))
+    assert all(name in said for name in ("frame000002.jpg", "depth000003.png", "info_semantic.json"))
+
+
+@pytest.mark.parametrize("name", ["cam_params.json", "room0/traj.txt"])
+def test_a_missing_small_file_is_named(root: Path, name: str) -> None:
+    (root / "Replica" / name).unlink()
+    assert any(Path(name).name in one for one in texts(look(root)))
+
+
+def test_counts_that_disagree_are_an_error(root: Path) -> None:
+    write_poses(root / "Replica/room0", [box_room.pose(index) for index in range(N_FRAMES - 2)])
+    assert any("6" in one and "8" in one for one in texts(look(root)))
+
+
+def test_an_image_of_another_size_is_an_error(root: Path) -> None:
+    path = root / "Replica/room0/results/frame000003.jpg"
+    cv2.imwrite(str(path), np.full((20, 30, 3), 90, np.uint8))
+    (said,) = texts(look(root))
+    assert "frame000003.jpg" in said and "30x20" in said
+
+
+def test_a_wrong_depth_scale_is_an_error_and_what_would_be_right_is_said(root: Path) -> None:
+    path = root / "Replica/cam_params.json"
+    table = json.loads(path.read_text())
+    table["camera"]["scale"] = 1000.0
+    path.write_text(json.dumps(table))
+    found = look(root)
+    (said,) = [one.text for one in found.findings if one.check == "frame-of-reference"]
+    assert "with the depth times 0.1526" in said
+    table["camera"]["scale"] = 6.5535
+    path.write_text(json.dumps(table))
+    assert "depth-scale" in checks(look(root))
+
+
+def test_a_nan_pose_is_an_error(root: Path) -> None:
+    poses = [box_room.pose(index) for index in range(N_FRAMES)]
+    poses[5][0, 3] = np.nan
+    write_poses(root / "Replica/room0", poses)
+    assert any("nan" in one and "6" in one for one in texts(look(root)))
+
+
+def test_cameras_outside_the_mesh_are_an_error(root: Path) -> None:
+    moved = [box_room.pose(index) for index in range(N_FRAMES)]
+    for matrix in moved:
+        matrix[:3, 3] += (50.0, 0.0, 0.0)
+    write_poses(root / "Replica/room0", moved)
+    said = [one.text for one in look(root).findings if one.check == "frame-of-reference"]
+    assert said[0].startswith(
+        "8 of 8 cameras lie outside the ground truth's box by more than 1 m, first frame 0 at (51.5"
+    )
+    assert "only 0.0%" in said[1] and "the clouds do not overlap" in said[1]
+
+
+def test_clouds_that_do_not_meet_are_an_error_though_the_cameras_are_inside(root: Path) -> None:
+    write_truth(root / TREE, offset=(0.5, 0.4, 0.6))
+    (said,) = texts(look(root))
+    assert "of what the frames see lies within" in said
+
+
+def test_inverted_poses_are_named_as_such(root: Path) -> None:
+    write_poses(root / "Replica/room0", [np.linalg.inv(box_room.pose(index)) for index in range(N_FRAMES)])
+    said = " ".join(texts(look(root)))
+    assert "with the poses inverted it is 100%" in said
+
+
+def test_a_damaged_mesh_is_an_error_and_frames_are_read_all_the_same(root: Path) -> None:
+    path = root / TREE / "mesh_semantic.ply"
+    path.write_bytes(path.read_bytes()[:-1000])
+    found = look(root)
+    assert any("mesh_semantic.ply" in one for one in texts(found))
+    assert found.n_read == N_FRAMES and found.meeting is None
+
+
+def test_a_scene_without_ground_truth_says_why_and_is_no_error(root: Path) -> None:
+    shutil.rmtree(root / "replica_v1")
+    found = look(root)
+    assert texts(found) == []
+    assert all(row.reason for row in found.truth)
+
+
+def test_rooms_made_on_demand_have_no_finding(tmp_path: Path) -> None:
+    options = RoomOptions(width=64, height=48, n_frames=SAMPLED_FRAMES + 5, mesh_spacing_m=0.1)
+    found = inspect(Rooms(tmp_path, options), "living0")
+    assert found.findings == ()
+    assert (found.n_frames, found.n_read, found.n_files) == (SAMPLED_FRAMES + 5, SAMPLED_FRAMES, 0)
+    assert found.meeting is not None and found.meeting.share > 0.8
+
+
+@pytest.mark.parametrize(
+    ("fault", "severity", "text"),
+    [
+        ("missing-frame", "error", "frame 2 is missing; copy it again"),
+        ("nan-pose", "error", "the pose is not a finite 4x4 matrix"),
+        ("depth-size", "error", "depth is 32x23 and colour is 32x24"),
+        ("empty-depth", "error", "depth is empty, no pixel is above 0 m"),
+        ("unknown-class", "error", "class id 777 is unknown"),
+        ("crash", "error", "ZeroDivisionError: a mistake in a plug-in"),
+    ],
+)
+def test_faults_of_any_dataset_are_found(tmp_path: Path, fault: str, severity: str, text: str) -> None:
+    found = inspect(Painted(tmp_path, Painted.Options(fault=fault)), "b")
+    assert any(text in one for one in texts(found, severity)), found.findings
+    assert found.count("error") == 1
+
+
+class Faulty(Painted):
+    """Names two faults of its own, one with a terminal escape in it."""
+
+    def problems(self, scene: str) -> Sequence[str]:
+        return (f"painted/{scene}: a\x1b[31mb.jpg is missing\n; copy it again", "painted/x: y.png: not readable")
+
+    def frames(self, scene: str, stride: int) -> Sequence[Frame]:
+        raise DataError(f"painted/{scene}: y.png: not an image")
+
+
+def test_what_the_dataset_itself_names_is_an_error_once_and_has_no_escape_in_it(tmp_path: Path) -> None:
+    found = inspect(Faulty(tmp_path, Painted.Options()), "a")
+    assert [one.text for one in found.findings] == [
+        r"a\x1b[31mb.jpg is missing ; copy it again",
+        "painted/x: y.png: not readable",
+    ]
+
+
+class Recording(Painted):
+    """Two frames of one file are broken."""
+
+    def frame(self, scene: str, index: int) -> Frame:
+        if index in (1, 4):
+            raise DataError(f"painted/{scene}: all.sens: frame {index} at byte 7: damaged")
+        return super().frame(scene, index)
+
+
+def test_each_broken_frame_of_one_file_is_named(tmp_path: Path) -> None:
+    found = inspect(Recording(tmp_path, Painted.Options()), "a")
+    assert [one.where for one in found.findings if one.severity == "error"] == ["frame 1", "frame 4"]
+
+
+def frame(**changes: Any) -> Frame:
+    rng = np.random.default_rng(changes.get("index", 0))
+    usual: dict[str, Any] = {
+        "index": 0,
+        "timestamp_s": 0.0,
+        "rgb": rng.integers(50, 200, (24, 32, 3)).astype(np.uint8),
+        "depth_m": rng.uniform(1, 3, (24, 32)).astype(np.float32),
+        "camera_to_world": np.eye(4),
+        "intrinsics": painted.INTRINSICS,
+    }
+    moved = np.eye(4)
+    moved[0, 3] = 0.1 * changes.get("index", 0)
+    return Frame(**(usual | {"camera_to_world": moved} | changes))
+
+
+def found_in(*frames: Frame) -> list[tuple[str, str, str]]:
+    found: list[Finding] = list(check_frames([facts_of(one) for one in frames]))
+    return [(one.severity, one.check, one.where) for one in found]
+
+
+def test_frames_without_a_fault_have_no_finding() -> None:
+    assert found_in(frame(), frame(index=1), frame(index=2)) == []
+    assert found_in() == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "expected"),
+    [
+        ({"camera_to_world": 2 * np.eye(4)}, ("error", "pose", "frame 1")),
+        ({"camera_to_world": np.diag([1.0, 1, -1, 1])}, ("error", "pose", "frame 1")),
+        ({"camera_to_world": np.eye(4) + np.eye(4)[::-1] * 0.1}, ("error", "pose", "frame 1")),
+        ({"depth_m": np.full((24, 32), np.nan, np.float32)}, ("error", "depth", "frame 1")),
+        ({"depth_m": np.full((24, 32), -1, np.float32)}, ("error", "depth", "frame 1")),
+        ({"depth_m": np.eye(24, 32, dtype=np.float32)}, ("warning", "depth", "frame 1")),
+        ({"intrinsics": np.diag([0.0, 30, 1])}, ("error", "intrinsics", "frame 1")),
+        ({"intrinsics": np.array([[30.0, 0, 99], [0, 30, 9], [0, 0, 1]])}, ("error", "intrinsics", "frame 1")),
+        ({"rgb": np.zeros((24, 32, 3), np.uint8)}, ("warning", "colour", "frame 1")),
+        (
+            {"rgb": np.full((12, 16, 3), 90, np.uint8), "depth_m": np.ones((12, 16), np.float32)},
+            ("error", "size", "frame 1"),
+        ),
+        ({"camera_to_world": np.array([[1.0, 0, 0, 500], *np.eye(4)[1:]])}, ("warning", "motion", "")),
+    ],
+)
+def test_a_fault_of_a_frame_is_found_where_it_is(changes: dict[str, Any], expected: tuple[str, str, str]) -> None:
+    assert expected in found_in(frame(), frame(index=1, **changes), frame(index=2))
+
+
+def test_a_camera_that_stands_still_and_images_that_repeat_are_warnings() -> None:
+    still = [frame(index=index, camera_to_world=np.eye(4)) for index in range(3)]
+    assert found_in(*still) == [("warning", "motion", "")]
+    same = frame()
+    repeated = [frame(index=index, rgb=same.rgb, depth_m=same.depth_m) for index in range(3)]
+    assert found_in(*repeated) == [("warning", "motion", "")]
+
+
+@pytest.fixture
+def at_root(root: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    monkeypatch.setenv("SU3D_DATA", str(root))
+    monkeypatch.chdir(tmp_path)
+    return root
+
+
+def test_the_command_says_what_is_there_and_ends_with_0(at_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["datasets", "check", "replica/*"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "replica/room0"
+    assert lines[-1] == "1 scene, 0 with errors"
+    assert f"  digest        {Replica(at_root).digest('room0')}" in lines
+
+
+def test_the_command_caps_what_it_lists_and_ends_with_1(at_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    write_box_room(at_root, 14, "room1", with_truth=False)
+    for path in (at_root / "Replica/room1/results").glob("depth*.png"):
+        path.write_bytes(b"x")
+    assert main(["datasets", "check", "replica/room0", "replica/room1", "--jobs", "2"]) == 1
+    text = capsys.readouterr().out
+    assert text.count("error         ") == 10
+    assert "and 4 more of this kind; --json lists all" in text
+    assert text.endswith("2 scenes, 1 with errors\n")
+    assert main(["datasets", "check", "replica/room1", "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["scenes"][0]["n_errors"] == 14
+
+
+def test_the_json_has_everything(at_root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (at_root / "Replica/room0/results/depth000001.png").write_bytes(b"x")
+    assert main(["datasets", "check", "replica/room0", "--quick", "--json", "--quiet"]) == 1
+    table = json.loads(capsys.readouterr().out)
+    assert (table["n_scenes"], table["n_with_errors"], table["data_root"]) == (1, 1, str(at_root))
+    (one,) = table["scenes"]
+    assert set(one) == {
+        "scene", "n_errors", "n_warnings", "n_frames", "n_read", "n_files", "size", "depth", "truth", "meeting",
+        "digest", "findings", "elapsed_s",
+    }  # fmt: skip
+    assert set(one["findings"][0]) == {"severity", "check", "where", "text"}
+    assert set(one["truth"][0]) == {"variant", "reason", "n_points", "n_objects", "n_classes"}
+    assert set(one["depth"]) == {"near_m", "median_m", "far_m", "valid_share"}
+    assert set(one["meeting"]) == {"share", "distance_m", "hint"}
+
+
+def test_the_digest_is_the_one_that_a_run_records(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from su3d_bench import scene_run
+
+    monkeypatch.setattr(scene_run, "build_perception", painted.colour_perception)
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path))
+    file = Path(painted.__file__)
+    scene, options = f"{file}:Painted/a", ["--set", "painted.n_frames=3"]
+    assert main(["datasets", "check", scene, *options, "--json"]) == 0
+    digest = json.loads(capsys.readouterr().out)["scenes"][0]["digest"]
+    words = ["--methods", f"{file}:Collector", "--no-pictures", "--jobs", "1", "--out", str(tmp_path / "run")]
+    assert main(["run", "--scenes", scene, *options, "--protocols", "rooms-semantic", *words]) == 0
+    assert digest in (tmp_path / "run" / "run.json").read_text()
+    assert json.loads((tmp_path / "run/scenes/painted.a/collector/done.json").read_text())
+    assert digest in (tmp_path / "run/scenes/painted.a/collector/done.json").read_text()
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["replica/room9"], "no scene matches 'replica/room9'; did you mean 'replica/room0'?"),
+        (["replcia/*"], "no scene matches 'replcia/*'; did you mean 'replica/*'?"),
+        (["replica/room0", "--jobs", "0"], "--jobs 0: expected 1 or more"),
+        (["rooms/living0", "--set", "rooms.n_frame=3"], "--set rooms.n_frame: unknown key 'n_frame'; did you mean"),
+        (["replica/room0", "--set", "rooms.n_frames=3"], "--set rooms.n_frames=3: 'rooms' is no method or dataset"),
+    ],
+)
+def test_wrong_names_are_one_line(
+    at_root: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["datasets", "check", *words]) == 2
+    said = capsys.readouterr()
+    assert said.out == "" and said.err.startswith(f"su3d-bench: {message}") and said.err.count("\n") == 1
+
+
+def test_text_of_files_reaches_the_terminal_without_control_characters() -> None:
+    assert printable("a\x1b]0;title\x07\n b\u202e\x00c") == r"a\x1b]0;title\x07 b\u202e\x00c"
+    assert printable("é \U0001f600 日本") == "é \U0001f600 日本"
+    assert len(printable("x" * 9_999)) == 500
+    assert printable_json({"a\x1b": [Path("b\x07"), 3, None, ("c\r",)]}) == {r"a\x1b": [r"b\x07", 3, None, ["c"]]}

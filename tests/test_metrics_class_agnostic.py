@@ -1,0 +1,130 @@
+"""Class-agnostic AP: three rules for what is an instance and what is void, of which no two give the same number."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scored_room import instances
+
+from su3d_bench.errors import DataError
+from su3d_bench.metrics.instance_ap import per_scene
+from su3d_bench.metrics.score_instances import encode_without_classes
+from su3d_bench.protocols import load_protocol
+from su3d_bench.scoring import combine, score_scene
+from su3d_bench.types import DenseFeatures, GroundTruth, Instances, LabelSet, Partition
+
+NAMES = ("class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d")
+CHAIR, WALL, OTHER = 2, 1, 1000  # 1000 is none of the 200
+LABELS = LabelSet("scannet", (CHAIR, WALL, OTHER), ("chair", "wall", "gadget"))
+N = 200
+
+
+def scan(unannotated: int = N) -> GroundTruth:
+    """Two chairs, a wall and a thing of no class, 200 points each, and points that nobody annotated."""
+    semantic = np.repeat([CHAIR, CHAIR, WALL, OTHER, 0], [N, N, N, N, unannotated]).astype(np.int32)
+    instance = np.repeat([1, 2, 3, 4, 0], [N, N, N, N, unannotated]).astype(np.int32)
+    points = np.random.default_rng(0).random((len(semantic), 3)).astype(np.float32)
+    return GroundTruth(points, semantic, instance, LABELS, "scannet200-vertices", "made for a test")
+
+
+def masks(truth: GroundTruth, *ids: int, scores: list[float] | None = None) -> Instances:
+    """Masks without labels and without features."""
+    return instances(truth.points, [np.flatnonzero(truth.instance == one) for one in ids], None, scores=scores)
+
+
+def ap_of(name: str, truth: GroundTruth, prediction: Instances | Partition) -> float:
+    rules = load_protocol(name)
+    return combine(rules, {"a": score_scene(rules, truth, prediction, None)}).metrics["AP"]
+
+
+@pytest.mark.parametrize(("name", "n_instances"), list(zip(NAMES, (5, 2, 4), strict=True)), ids=NAMES)
+def test_each_rule_has_its_own_instances(name: str, n_instances: int) -> None:
+    rules = load_protocol(name)
+    counts = score_scene(rules, scan(), masks(scan(), 1), None).counts
+    assert counts.n_truth.tolist() == [n_instances]  # type: ignore[union-attr]
+
+
+def test_no_two_rules_give_the_same_number() -> None:
+    truth = scan()
+    values = [ap_of(name, truth, masks(truth, 1, 2, 3)) for name in NAMES]
+    assert values == [3 / 5, 1.0, 3 / 4]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_truth_scores_exactly_one_except_where_unannotated_points_are_an_instance(name: str) -> None:
+    truth = scan()
+    value = ap_of(name, truth, masks(truth, 1, 2, 3, 4))
+    assert value == (4 / 5 if name == "class-agnostic-maskclustering" else 1.0)
+    annotated = scan(unannotated=0)
+    assert ap_of(name, annotated, masks(annotated, 1, 2, 3, 4)) == 1.0
+    assert ap_of(name, truth, masks(truth, 1, 2, 3, 4, 0)) == 1.0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_an_empty_prediction_scores_exactly_zero(name: str) -> None:
+    assert ap_of(name, scan(), masks(scan())) == 0.0
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_shuffled_masks_and_confidences_change_nothing(name: str) -> None:
+    truth = scan()
+    rng = np.random.default_rng(1)
+    cut = [np.flatnonzero(truth.instance == one)[rng.random(N) < 0.8] for one in (1, 2, 3, 0, 1)]
+    before = ap_of(name, truth, instances(truth.points, cut, None))
+    shuffled = instances(truth.points, [cut[k] for k in rng.permutation(5)], None, scores=list(rng.random(5)))
+    assert 0 < before < 1
+    assert ap_of(name, truth, shuffled) == before
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_partition_scores_as_the_same_masks_and_dense_features_do_not(name: str) -> None:
+    truth = scan()
+    partition = Partition(truth.points, truth.instance - 1, np.zeros((4, 2), np.float32))
+    assert ap_of(name, truth, partition) == ap_of(name, truth, masks(truth, 1, 2, 3, 4))
+    with pytest.raises(Exception, match="needs instances"):
+        score_scene(load_protocol(name), truth, DenseFeatures(truth.points, np.zeros((N, 2), np.float16)), None)
+
+
+def test_what_lies_on_a_void_object_is_dropped_under_open3dis_and_wrong_under_none_of_the_others() -> None:
+    truth = scan()
+    assert ap_of("class-agnostic-open3dis", truth, masks(truth, 1, 2, 3, 4)) == 1.0
+    assert ap_of("class-agnostic-open3dis", truth, masks(truth, 1, 2, 0)) == 1.0
+    assert ap_of("class-agnostic-segment3d", truth, masks(truth, 1, 2, 3, 4, 0)) == 1.0
+
+
+@pytest.mark.parametrize("is_own_writer", [True, False], ids=["MaskClustering's writer", "Mask3D's writer"])
+def test_both_forms_of_ground_truth_give_maskclustering_the_same_counts(is_own_writer: bool) -> None:
+    """Values as the two programs write them, then mod 1000 + 1000 x the first class, as --no_class does."""
+    truth = scan()
+    known = np.isin(truth.semantic, [entry.id for entry in load_protocol("scannet200-instance").scored])
+    identity = truth.instance.astype(np.int64) - 1  # the position in segGroups, -1 where there is none
+    if is_own_writer:
+        written = np.where(known, truth.semantic, 0) * 1000 + (identity + 1) + 1
+    else:
+        written = truth.semantic * 1000 + identity + 1
+    values = written % 1000 + 2 * 1000
+    prediction = masks(truth, 1, 3, 0)
+    theirs = per_scene(values, prediction.indptr, prediction.indices, np.full(3, 2), np.ones(3), [2, 3])
+    ours = score_scene(load_protocol(NAMES[0]), truth, prediction, None).counts
+    assert theirs.n_truth.tolist()[0] == ours.n_truth.tolist()[0]  # type: ignore[union-attr]
+    assert theirs.n_missed.tolist()[0] == ours.n_missed.tolist()[0]  # type: ignore[union-attr]
+    assert theirs.is_true.tolist() == ours.is_true.tolist()  # type: ignore[union-attr]
+
+
+def test_results_name_the_one_class_object_and_no_group() -> None:
+    rules = load_protocol(NAMES[1])
+    result = combine(rules, {"a": score_scene(rules, scan(), masks(scan(), 1), None)})
+    assert list(result.per_class) == ["object"]
+    assert result.groups == {}
+    whole = scan()
+    few = slice(50)
+    small = replace(whole, points=whole.points[few], semantic=whole.semantic[few], instance=whole.instance[few])
+    told = combine(rules, {"a": score_scene(rules, small, masks(small), None)}).warnings
+    assert told == ("not scored, because no scene has an instance of 100 points: 'object'",)
+
+
+def test_an_instance_id_that_the_encoding_cannot_hold_is_refused() -> None:
+    with pytest.raises(DataError, match="instance id 1000 would spill into the next class"):
+        encode_without_classes("annotated", np.array([1000]), np.array([True]))

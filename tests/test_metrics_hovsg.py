@@ -1,0 +1,259 @@
+"""Semantic protocols by the vote of several neighbours: HOV-SG's and OVO's; and ScanNet's with 20 and 200 classes."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scored_room import ENCODER, ID, LABELS, OneHotEncoder, instances, noisy, nothing, room, truth_as_prediction
+
+from su3d_bench.metrics.labelling import text_features
+from su3d_bench.metrics.semantic import confusion_matrix, hovsg_metrics, per_scene
+from su3d_bench.protocols import ProtocolRules, load_protocol
+from su3d_bench.scoring import combine, pack_scores, score_scene, unpack_scores
+from su3d_bench.types import DenseFeatures, Float32Array, GroundTruth, Instances, LabelSet, Partition, UInt8Array
+
+GOLDEN = json.loads((Path(__file__).parent / "cases/conceptgraphs_golden.json").read_text())["hovsg"]
+HOVSG, EXACT, OVO = (load_protocol(name) for name in ("replica-hovsg", "replica-hovsg-exact", "replica-ovo51"))
+VOTED = {"replica-hovsg": HOVSG, "replica-hovsg-exact": EXACT, "replica-ovo51": OVO}
+
+
+def fitting(rules: ProtocolRules, truth: GroundTruth) -> GroundTruth:
+    return replace(truth, variant=rules.ground_truth)
+
+
+def metrics(rules: ProtocolRules, truth: GroundTruth, prediction: Instances | Partition | DenseFeatures) -> list[float]:
+    result = combine(rules, {"room": score_scene(rules, fitting(rules, truth), prediction, ENCODER)})
+    return [result.metrics[name] for name in rules.headline]
+
+
+# ---- what the original answers
+
+
+def test_the_golden_hovsg_values_come_out() -> None:
+    as_index = {-1: 0} | {one: one for one in range(8)}  # -1 and 0 are ignored alike
+    truth, predicted = (np.array([as_index[one] for one in GOLDEN[key]]) for key in ("gt", "pred"))
+    is_scored = np.array([one not in GOLDEN["ignore"] for one in range(8)])
+    confusion = per_scene(truth, predicted, np.ones(8, bool)).confusion
+    ours = hovsg_metrics(confusion, is_scored)
+    assert ours.class_index.tolist() == [1, 2, 3, 5]
+    assert ours.mean_iou == GOLDEN["miou"]
+    assert ours.frequency_weighted_iou == pytest.approx(GOLDEN["fmiou"], rel=1e-15)
+    assert ours.mean_accuracy == pytest.approx(GOLDEN["macc"], rel=1e-15)
+    assert ours.point_accuracy == pytest.approx(GOLDEN["pacc"], rel=1e-15)
+
+
+@settings(max_examples=40, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_random_points_agree_with_the_formulas_word_by_word(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    truth, predicted = rng.integers(0, 6, 40), rng.integers(-1, 6, 40)
+    ignored = set(rng.permutation(6)[:2].tolist())
+    confusion = confusion_matrix(truth, predicted, 6)
+    ours = hovsg_metrics(confusion, np.array([one not in ignored for one in range(6)]))
+    scored = sorted(set(truth.tolist()) - ignored)
+    hit = {c: int(((truth == c) & (predicted == c)).sum()) for c in scored}
+    n_true = {c: int((truth == c).sum()) for c in scored}
+    n_predicted = {c: int((predicted == c).sum()) for c in scored}
+    iou = {c: hit[c] / (n_true[c] + n_predicted[c] - hit[c]) for c in scored}
+    n_ignored = int(np.isin(truth, list(ignored)).sum())
+    assert ours.mean_iou == pytest.approx(sum(iou[c] for c in scored if n_predicted[c]) / len(scored))
+    assert ours.frequency_weighted_iou == pytest.approx(sum(n_true[c] * iou[c] for c in scored) / (40 - n_ignored))
+    assert ours.mean_accuracy == pytest.approx(sum(hit[c] / n_true[c] for c in scored) / len(scored))
+
+
+# ---- the label set
+
+
+def test_the_substring_rule_leaves_out_the_classes_that_the_original_does() -> None:
+    ignored = {entry.id for entry in HOVSG.classes if HOVSG.is_ignored(entry.name)}
+    assert ignored == {0, 31, 37, 40, 44, 93, 94, 95, 97}
+    assert {entry.id for entry in EXACT.classes if EXACT.is_ignored(entry.name)} == {0, 31, 37, 40, 93, 97}
+    assert (len(HOVSG.classes), len(OVO.classes)) == (102, 51)
+
+
+def test_the_classifier_takes_the_mean_of_both_prompts() -> None:
+    asked: list[str] = []
+
+    class Listening(OneHotEncoder):
+        def encode_texts(self, texts: Sequence[str]) -> Float32Array:
+            asked.extend(texts)
+            return super().encode_texts(texts)
+
+        def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
+            raise AssertionError
+
+    truth = fitting(HOVSG, room())
+    score_scene(HOVSG, truth, truth_as_prediction(room(), with_labels=False), Listening())
+    assert asked[:4] == ["background", "There is the background in the scene.", "backpack",
+                         "There is the backpack in the scene."]  # fmt: skip
+    assert len(asked) == 2 * 102
+
+
+def test_the_mean_of_the_prompts_is_that_of_their_directions() -> None:
+    class Loud(OneHotEncoder):
+        """The second template speaks a hundred times as loud, along an axis of its own."""
+
+        def encode_texts(self, texts: Sequence[str]) -> Float32Array:
+            return np.array([[100.0, 0.0] if text.startswith("There") else [0.0, 1.0] for text in texts], np.float32)
+
+    mean = text_features(HOVSG, ["chair", "table"], np.zeros((1, 2)), Loud())
+    assert mean.tolist() == [[0.5, 0.5]] * 2
+    assert text_features(OVO, ["chair"], np.zeros((1, 2)), Loud()).tolist() == [[0.0, 1.0]]
+
+
+# ---- a whole scene
+
+
+@pytest.mark.parametrize("with_labels", [True, False])
+@pytest.mark.parametrize("rules", VOTED.values(), ids=VOTED)
+def test_objects_apart_from_each_other_score_exactly_one(rules: ProtocolRules, with_labels: bool) -> None:
+    truth = known_to(rules, room())
+    prediction = truth_as_prediction(truth, with_labels=with_labels)
+    assert set(metrics(rules, truth, prediction)) == {1.0}
+
+
+def known_to(rules: ProtocolRules, truth: GroundTruth) -> GroundTruth:
+    """The room without what the protocol has no class for."""
+    ids = [entry.id for entry in rules.classes]
+    known = np.isin(truth.semantic, ids)
+    return replace(
+        truth,
+        semantic=np.where(known, truth.semantic, 0).astype(np.int32),
+        instance=np.where(known, truth.instance, 0).astype(np.int32),
+    )
+
+
+@pytest.mark.parametrize("rules", VOTED.values(), ids=VOTED)
+def test_the_truth_on_its_own_points_does_not_reach_one_where_objects_meet(rules: ProtocolRules) -> None:
+    """The vote of the neighbours smooths the border, on the scored points themselves too."""
+    rng = np.random.default_rng(0)
+    points = rng.random((400, 3)).astype(np.float32)
+    semantic = np.where(points[:, 0] < 0.5, ID["chair"], ID["table"]).astype(np.int32)
+    truth = GroundTruth(points, semantic, (semantic == ID["chair"]) + np.int32(1), LABELS, rules.ground_truth, "test")
+    prediction = truth_as_prediction(truth, with_labels=True)
+    assert all(0.8 < value < 1 for value in metrics(rules, truth, prediction))
+    alone = rules.model_copy(update={"transfer": rules.transfer.model_copy(update={"neighbours": 1})})
+    assert set(metrics(alone, truth, prediction)) == {1.0}
+
+
+@pytest.mark.parametrize("rules", VOTED.values(), ids=VOTED)
+def test_an_empty_prediction_scores_exactly_zero(rules: ProtocolRules) -> None:
+    assert set(metrics(rules, room(), nothing(room()))) == {0.0}
+
+
+@pytest.mark.parametrize("rules", VOTED.values(), ids=VOTED)
+def test_shuffled_instances_change_nothing(rules: ProtocolRules) -> None:
+    truth, prediction = noisy(3)
+    order = np.random.default_rng(0).permutation(len(prediction))
+    labels = prediction.labels or ()
+    shuffled = instances(truth.points, [prediction.mask(k) for k in order], [labels[k] for k in order])
+    before = metrics(rules, truth, prediction)
+    assert 0 < before[0] < 1
+    assert metrics(rules, truth, shuffled) == before
+
+
+def test_what_is_predicted_on_an_ignored_surface_lowers_the_iou_under_hovsg_and_not_under_conceptgraphs() -> None:
+    truth = room()
+    whole = truth_as_prediction(truth, with_labels=True)
+    names = whole.labels or ()
+    clean, spilled = whole, replace(whole, labels=tuple("chair" if name == "wall" else name for name in names))
+    for rules, is_lower in ((HOVSG, True), (load_protocol("replica-mesh-ex6"), False)):
+        values = []
+        for prediction in (clean, spilled):
+            result = combine(rules, {"a": score_scene(rules, fitting(rules, truth), prediction, None)})
+            values.append(result.per_class["chair"]["IoU"])
+        assert (values[1] < values[0]) == is_lower
+
+
+def test_objects_that_overlap_vote_each_and_one_without_a_class_does_not() -> None:
+    truth = room()
+    chairs = np.flatnonzero(truth.instance == 2)
+    for extra, recall in ((["table", "table"], 0.0), (["unheard", "unheard"], 1.0), (["table", "chair"], 1.0)):
+        prediction = instances(truth.points, [chairs] * 3, ["chair", *extra])
+        alone = replace(truth, semantic=np.where(truth.instance == 2, truth.semantic, 0).astype(np.int32))
+        score = score_scene(OVO, fitting(OVO, alone), prediction, None)
+        assert combine(OVO, {"a": score}).per_class["chair"]["recall"] == recall
+
+
+def test_a_partition_and_dense_features_score_as_the_same_instances() -> None:
+    truth = known_to(HOVSG, room())
+    whole = truth_as_prediction(truth, with_labels=False)
+    assert whole.features is not None
+    row = np.searchsorted([int(i) for i in np.unique(truth.instance) if i], truth.instance).astype(np.int32)
+    row[truth.instance == 0] = -1
+    features = np.where(row[:, None] >= 0, whole.features[row], 0).astype(np.float16)
+    for prediction in (Partition(truth.points, row, whole.features), DenseFeatures(truth.points, features)):
+        assert set(metrics(HOVSG, truth, prediction)) == {1.0}
+
+
+def test_hovsg_reports_the_mean_of_the_scenes_and_its_interval() -> None:
+    scores = {f"s{seed}": score_scene(HOVSG, fitting(HOVSG, noisy(seed)[0]), noisy(seed)[1], None) for seed in range(4)}
+    result = combine(HOVSG, scores)
+    interval = result.intervals["mIoU"]
+    assert result.metrics == result.scene_mean
+    assert result.metrics["mIoU"] == pytest.approx(np.mean([row["mIoU"] for row in result.per_scene.values()]))
+    assert 0 < result.metrics["pAcc"] < 1
+    assert interval is not None
+    assert interval[0] < result.metrics["mIoU"] < interval[1]
+
+
+@settings(max_examples=15, deadline=None)
+@given(seeds=st.sets(st.integers(0, 5), min_size=1), name=st.sampled_from(sorted(VOTED)))
+def test_counts_of_scenes_combine_to_the_whole(seeds: set[int], name: str) -> None:
+    rules = VOTED[name]
+    scores = {f"s{seed}": score_scene(rules, fitting(rules, noisy(seed)[0]), noisy(seed)[1], None) for seed in seeds}
+    stored = {scene: unpack_scores(pack_scores({name: score}))[name] for scene, score in scores.items()}
+    assert combine(rules, dict(reversed(stored.items()))).to_json() == combine(rules, scores).to_json()
+
+
+def test_pooled_hovsg_scores_have_an_interval_around_them() -> None:
+    rules = HOVSG.model_copy(update={"aggregate": "pooled"})
+    scores = {f"s{seed}": score_scene(rules, fitting(rules, noisy(seed)[0]), noisy(seed)[1], None) for seed in range(4)}
+    result = combine(rules, scores)
+    for name in rules.headline:
+        interval = result.intervals[name]
+        assert interval is not None
+        assert interval[0] <= result.metrics[name] <= interval[1]
+
+
+# ---- ScanNet
+
+
+def scan(rules: ProtocolRules, truth_names: Sequence[str], predicted: Sequence[str]) -> dict[str, dict[str, float]]:
+    """Values of each class of a scan with ten points a name, and of its groups."""
+    labels = LabelSet("scannet", tuple(c.id for c in rules.classes), tuple(c.name for c in rules.classes))
+    known = dict(zip(labels.names, labels.ids, strict=True))
+    semantic = np.repeat([known.get(name, 0) for name in truth_names], 10).astype(np.int32)
+    points = np.random.default_rng(0).random((len(semantic), 3)).astype(np.float32)
+    truth = GroundTruth(points, semantic, semantic, labels, rules.ground_truth, "made for a test")
+    masks = [np.arange(10 * k, 10 * k + 10) for k in range(len(predicted))]
+    result = combine(rules, {"a": score_scene(rules, truth, instances(points, masks, predicted), None)})
+    return {**result.per_class, **result.groups, "all": dict(result.metrics)}  # type: ignore[dict-item]
+
+
+@pytest.mark.parametrize("name", ["scannet-semantic", "scannet200-semantic"])
+def test_scannet_counts_a_prediction_of_no_known_class_as_wrong_and_an_absent_class_not_at_all(name: str) -> None:
+    values = scan(load_protocol(name), ["chair", "chair", "table", "unlabelled"], ["chair", "ufo", "desk", "sink"])
+    assert values["chair"]["IoU"] == values["chair"]["recall"] == 0.5
+    assert values["table"]["IoU"] == 0.0
+    assert values["desk"]["IoU"] == 0.0 and np.isnan(values["desk"]["recall"])  # never true, yet predicted
+    assert np.isnan(values["sink"]["IoU"])  # predicted on an unlabelled point alone
+    assert np.isnan(values["bathtub"]["IoU"])
+    assert values["all"]["mIoU"] == pytest.approx(0.5 / 3)
+    assert values["all"]["mAcc"] == 0.25
+
+
+def test_scannet200_has_the_means_of_its_three_groups() -> None:
+    rules = load_protocol("scannet200-semantic")
+    assert [sum(c.group == name for c in rules.scored) for name in ("head", "common", "tail")] == [66, 68, 66]
+    values = scan(rules, ["chair", "table", "bag", "cup"], ["chair", "chair", "bag", "clock"])
+    assert values["head"] == {"mAcc": 0.5, "mIoU": 0.25}
+    assert values["common"] == {"mAcc": 1.0, "mIoU": 1.0}
+    assert values["tail"] == {"mAcc": 0.0, "mIoU": 0.0}

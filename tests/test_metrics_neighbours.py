@@ -1,0 +1,105 @@
+"""Votes of several neighbours and masks that reach what is near: exact, whatever the tree, with ties settled."""
+
+from __future__ import annotations
+
+import doctest
+from collections import Counter
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from su3d_bench.metrics import (
+    neighbours,
+    object_means,
+    openlex3d,
+    query_ap,
+    score_instances,
+    score_open_vocabulary,
+)
+from su3d_bench.metrics.neighbours import transfer_each_mask, transfer_votes
+from su3d_bench.metrics.transfer import Masks
+
+MODULES = (neighbours, object_means, openlex3d, query_ap, score_instances, score_open_vocabulary)
+
+
+@pytest.mark.parametrize("module", MODULES, ids=lambda module: module.__name__)
+def test_the_examples_in_the_docstrings_run(module: object) -> None:
+    outcome = doctest.testmod(module)  # type: ignore[arg-type]
+    assert outcome.attempted > 0 and outcome.failed == 0
+
+
+def plain_votes(points: np.ndarray, values: np.ndarray, targets: np.ndarray, k: int, cap_m: float) -> list[int]:
+    answer = []
+    for target in targets.astype(np.float64):
+        squared = ((points.astype(np.float64) - target) ** 2).sum(axis=1)
+        nearest = np.lexsort((np.arange(len(points)), squared))[:k]
+        counted = Counter(int(values[i]) for i in nearest if squared[i] <= cap_m**2)
+        answer.append(min(counted, key=lambda value: (-counted[value], value)) if counted else -1)
+    return answer
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    n=st.integers(1, 120),
+    k=st.integers(2, 7),
+    on_a_grid=st.booleans(),
+    cap_m=st.sampled_from([np.inf, 0.5]),
+)
+def test_votes_equal_a_plain_count_with_the_lowest_indices_of_equals(
+    seed: int, n: int, k: int, on_a_grid: bool, cap_m: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    if on_a_grid:  # few places, many points on each, so that equals lie beyond the last neighbour
+        points, targets = rng.integers(0, 3, (n, 3)).astype(np.float64), rng.integers(0, 5, (30, 3)) / 2
+    else:
+        points, targets = rng.random((n, 3)), rng.random((30, 3))
+    values = rng.integers(0, 4, n)
+    ours, distance = transfer_votes(points, values, targets, np.ones(30, bool), k, cap_m)
+    assert ours.tolist() == plain_votes(points, values, targets, k, cap_m)
+    exact = np.sqrt(((points[None] - targets[:, None]) ** 2).sum(axis=2)).min(axis=1)
+    np.testing.assert_allclose(distance, np.where(exact > cap_m, np.inf, exact), rtol=1e-12)
+
+
+def test_the_lowest_indices_vote_among_more_equals_than_are_asked_for_at_once() -> None:
+    points = np.zeros((5000, 3), np.float32)
+    values = np.array([8, 9, 9] + [1] * 4997)
+    value, _ = transfer_votes(points, values, np.zeros((2, 3), np.float32), np.array([True, True]), 3)
+    assert value.tolist() == [9, 9]
+
+
+def test_the_smallest_value_of_as_many_votes_wins() -> None:
+    points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0]])
+    value, _ = transfer_votes(points, np.array([7, 3, 7, 3, 5]), points[:1], np.ones(1, bool), 5)
+    assert value.tolist() == [3]
+
+
+def test_unwanted_targets_and_a_map_without_points_get_no_vote() -> None:
+    points = np.zeros((1, 3))
+    value, distance = transfer_votes(points, np.array([4]), np.zeros((2, 3)), np.array([True, False]), 5)
+    assert (value.tolist(), distance.tolist()) == ([4, -1], [0.0, np.inf])
+    value, distance = transfer_votes(points[:0], np.zeros(0, int), np.zeros((2, 3)), np.ones(2, bool), 5)
+    assert (value.tolist(), distance.tolist()) == ([-1, -1], [np.inf, np.inf])
+
+
+@settings(max_examples=60, deadline=None)
+@given(seed=st.integers(0, 10_000), n_masks=st.integers(0, 6), on_a_grid=st.booleans())
+def test_masks_reach_what_is_nearer_than_the_cap_to_a_point_of_their_own(
+    seed: int, n_masks: int, on_a_grid: bool
+) -> None:
+    rng = np.random.default_rng(seed)
+    points, targets = rng.random((80, 3)), rng.random((100, 3))
+    if on_a_grid:  # distances that equal the cap, and targets that share their place
+        points, targets = np.round(points * 4) / 4, np.round(targets * 4) / 4
+    sets = [np.sort(rng.permutation(80)[: rng.integers(0, 30)]) for _ in range(n_masks)]
+    masks = Masks(
+        np.cumsum([0, *(len(one) for one in sets)]), np.concatenate([np.zeros(0, int), *sets]).astype(np.int32)
+    )
+    moved = transfer_each_mask(points, masks, targets, 0.25)
+    squared = ((points[None].astype(float) - targets[:, None].astype(float)) ** 2).sum(axis=2)
+    assert len(moved) == n_masks
+    for k, one in enumerate(sets):
+        expected = np.flatnonzero((squared[:, one] < 0.25**2).any(axis=1))
+        assert moved.indices[moved.indptr[k] : moved.indptr[k + 1]].tolist() == expected.tolist()

@@ -1,0 +1,396 @@
+"""OpenLex3D's measures of labels: the original's answers, values worked by hand, and what changes nothing."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from open_scene import (
+    ENCODER,
+    PROMPTS,
+    WordEncoder,
+    instances_with,
+    labels_of,
+    lex_truth,
+    nothing_at,
+    perfect,
+)
+
+from su3d_bench.errors import DataError, PredictionError
+from su3d_bench.metrics import openlex3d, transfer
+from su3d_bench.metrics.object_means import ObjectCounts, combine, concatenate, resampled
+from su3d_bench.metrics.openlex3d import (
+    ObjectLabels,
+    OpenLexTruth,
+    category_table,
+    count_categories,
+    point_categories,
+    rank_scores,
+    ranked_labels,
+    scored_objects,
+)
+from su3d_bench.metrics.score_open_vocabulary import voxel_means
+from su3d_bench.protocols import CATEGORIES, load_protocol
+from su3d_bench.scoring import combine as combine_scenes
+from su3d_bench.scoring import pack_scores, score_scene, unpack_scores, why_not_scorable
+from su3d_bench.types import DenseFeatures, Partition, Prediction
+
+GOLDEN = json.loads((Path(__file__).parent / "cases/conceptgraphs_golden.json").read_text())
+TOPN, RANKING = load_protocol("openlex3d-topn"), load_protocol("openlex3d-ranking")
+
+
+def values_of(rules: Any, truth: OpenLexTruth, prediction: Prediction) -> dict[str, float]:
+    return dict(combine_scenes(rules, {"scene": score_scene(rules, truth, prediction, ENCODER)}).metrics)
+
+
+# ---- what the original answers
+
+
+def golden_labels() -> dict[int, ObjectLabels]:
+    return {
+        int(one): ObjectLabels(
+            tuple(labels["synonyms"]),
+            tuple(labels["depictions"]),
+            tuple(labels["vis_sim"]),
+            tuple(labels.get("clutter", ())),
+        )
+        for one, labels in GOLDEN["ol_topn"]["labels"].items()
+    }
+
+
+def golden_categories() -> tuple[list[int], np.ndarray, np.ndarray]:
+    case = GOLDEN["ol_topn"]
+    objects, words = golden_labels(), sorted({word for row in case["pred_labels"] for word in row})
+    ids = scored_objects(objects, case["excluded"])
+    row = np.array([ids.index(one) if one in ids else -1 for one in case["gt_ids"]])
+    _, unit = transfer.nearest(np.array(case["pred_points"], float), np.array(case["gt_points"], float), 0.05)
+    top = np.array([[words.index(word) for word in labels] for labels in case["pred_labels"]])
+    return ids, row, point_categories(row, unit, top, category_table(objects, ids, words))
+
+
+def test_the_category_of_every_golden_point_is_the_originals() -> None:
+    _, _, category = golden_categories()
+    assert [CATEGORIES[one] if one >= 0 else "none" for one in category] == GOLDEN["ol_topn"]["cats"]
+
+
+def test_the_golden_category_frequencies_come_out() -> None:
+    ids, row, category = golden_categories()
+    means = combine([count_categories(row, category, len(ids))])
+    assert dict(zip(CATEGORIES, means.tolist(), strict=True)) == GOLDEN["ol_topn"]["freq"]
+
+
+@pytest.mark.parametrize("case", ["ol_rank_syn", "ol_rank_sec"])
+def test_the_golden_rank_scores_come_out(case: str) -> None:
+    ranks, first, last, highest = GOLDEN[case]["args"]
+    ours = rank_scores(np.array(ranks), first, last, highest)
+    np.testing.assert_allclose([part.tolist() for part in ours], GOLDEN[case]["scores"], rtol=0, atol=1e-15)
+
+
+# ---- by hand
+
+
+def test_labels_are_compared_without_spaces_and_with_their_case() -> None:
+    table = category_table({1: ObjectLabels(("tv stand",))}, [1], ["tvstand", "t v stand", "TV stand"])
+    assert table.tolist() == [[0, 0, 5]]
+
+
+def test_clutter_counts_any_label_of_the_object_that_stands_near() -> None:
+    objects = {1: ObjectLabels(("a",), clutter=(2, 77)), 2: ObjectLabels(("b",), ("c",), ("d",), clutter=(3,))}
+    words = ["b", "c", "d", "e"]
+    assert [CATEGORIES[one] for one in category_table(objects, [1], words)[0]] == ["clutter"] * 3 + ["incorrect"]
+
+
+def test_an_object_without_synonyms_or_with_an_excluded_one_is_not_scored() -> None:
+    objects = {4: ObjectLabels(("wall", "a")), 2: ObjectLabels((), ("b",)), 9: ObjectLabels(("door frame",)), 1: A}
+    assert scored_objects(objects, ["wall", "doorframe"]) == [1]
+
+
+A = ObjectLabels(("a",))
+
+
+def test_an_object_counts_the_same_however_many_points_it_has() -> None:
+    counts = count_categories(np.array([0] * 99 + [1]), np.array([0] * 99 + [5]), 2)
+    assert combine([counts]).tolist() == [0.5, 0, 0, 0, 0, 0.5]
+
+
+def test_a_box_that_ends_at_the_last_rank_has_nothing_to_its_right() -> None:
+    score, _, _ = rank_scores(np.array([0, 1, 2]), 0, 2, 2)
+    assert score.tolist() == [1.0, 1.0, 1.0]
+
+
+def test_an_object_whose_synonyms_are_no_prompts_has_no_synonym_score_but_a_secondary_one() -> None:
+    labels = ranked_labels(ObjectLabels(("unheard",), ("flower",)), ["x", "flower"])
+    scores = labels.scores(np.array([[1, 0], [0, 1]]))
+    assert np.isnan(scores[:, 1]).all()
+    assert scores[:, 2].tolist() == scores[:, 0].tolist() == [1.0, 0.0]
+
+
+def test_the_overall_score_weighs_every_label_alike() -> None:
+    labels = ranked_labels(ObjectLabels(("a", "b"), ("c",)), ["a", "b", "c", "d"])
+    scores = labels.scores(np.array([[0, 1, 3, 2]]))[0]
+    assert scores.tolist() == pytest.approx([2 / 3, 1.0, 0.0])
+
+
+# ---- a whole scene
+
+
+def test_the_truth_itself_is_all_synonyms_and_ranks_first() -> None:
+    truth = lex_truth()
+    assert values_of(TOPN, truth, perfect(truth)) == {name: float(name == "synonyms") for name in CATEGORIES}
+    assert values_of(RANKING, truth, perfect(truth)) == {"overall": 1.0, "synonyms": 1.0, "secondary": 1.0}
+
+
+def test_an_empty_prediction_is_all_missing_and_ranks_nothing() -> None:
+    truth = lex_truth()
+    assert values_of(TOPN, truth, nothing_at(truth)) == {name: float(name == "missing") for name in CATEGORIES}
+    assert values_of(RANKING, truth, nothing_at(truth)) == {"overall": 0.0, "synonyms": 0.0, "secondary": 0.0}
+
+
+def test_a_point_is_missing_beyond_five_centimetres_and_ranked_however_far_it_is() -> None:
+    truth = lex_truth()
+    whole = perfect(truth)
+    far = instances_with(truth.points + np.array([0, 0, 30], np.float32), masks_of(whole), whole.features)
+    assert values_of(TOPN, truth, far)["missing"] == 1.0
+    assert values_of(RANKING, truth, far)["synonyms"] > 0.5
+
+
+def masks_of(prediction: Any) -> list[np.ndarray]:
+    return [prediction.mask(k) for k in range(len(prediction))]
+
+
+def test_the_ranking_scores_walls_and_the_categories_do_not() -> None:
+    truth = lex_truth()
+    n_walls = int((truth.object_of_point == 40).sum())
+    score, ranked = (score_scene(rules, truth, perfect(truth), ENCODER) for rules in (TOPN, RANKING))
+    assert ranked.n_scored - score.n_scored == n_walls > 0
+
+
+def test_one_of_five_labels_is_enough_for_a_category() -> None:
+    truth = lex_truth()
+    rules = TOPN.model_copy(update={"top_k": 1})
+    mixed = perfect(truth, first="pot", second=0.9)
+    assert values_of(rules, truth, mixed)["synonyms"] < values_of(TOPN, truth, mixed)["synonyms"] == 1.0
+
+
+def test_labels_that_the_method_gives_count_as_its_only_ones() -> None:
+    truth = lex_truth()
+    whole = perfect(truth)
+    named = instances_with(truth.points, masks_of(whole), None, labels=labels_of(truth))
+    assert values_of(TOPN, truth, named)["synonyms"] == 1.0
+    wrong = instances_with(truth.points, masks_of(whole), None, labels=["pot"] * len(whole))
+    assert values_of(TOPN, truth, wrong)["incorrect"] > 0.5
+
+
+@pytest.mark.parametrize("rules", [TOPN, RANKING], ids=lambda rules: rules.name)
+def test_a_partition_and_dense_features_score_as_the_same_instances(rules: Any) -> None:
+    truth = lex_truth()
+    whole = perfect(truth, first="pot", second=0.9)
+    assert whole.features is not None
+    owner = transfer.first_owner(transfer.masks_of(whole), len(truth.points))
+    partition = Partition(truth.points, owner.astype(np.int32), whole.features)
+    features = np.where(owner[:, None] >= 0, whole.features[owner], 0).astype(np.float16)
+    expected = values_of(rules, truth, whole)
+    assert values_of(rules, truth, partition) == expected
+    assert values_of(rules, truth, DenseFeatures(truth.points, features)) == pytest.approx(expected, abs=1e-3)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 1000), rules=st.sampled_from([TOPN, RANKING]))
+def test_shuffled_instances_and_object_ids_change_nothing(seed: int, rules: Any) -> None:
+    rng = np.random.default_rng(seed)
+    truth, whole = lex_truth(seed), noisy(seed)
+    order = rng.permutation(len(whole))
+    assert whole.features is not None
+    shuffled = instances_with(truth.points, [whole.mask(k) for k in order], whole.features[order])
+    new_id = {one: int(n) for one, n in zip(truth.objects, rng.permutation(500)[: len(truth.objects)], strict=True)}
+    renamed = OpenLexTruth(
+        truth.points,
+        np.array([new_id.get(int(one), -1) for one in truth.object_of_point]),
+        {new_id[one]: moved(labels, new_id) for one, labels in truth.objects.items()},
+        truth.prompts,
+        truth.variant,
+        truth.source,
+    )
+    assert values_of(rules, renamed, shuffled) == pytest.approx(values_of(rules, truth, whole), abs=1e-12)
+
+
+def moved(labels: ObjectLabels, new_id: dict[int, int]) -> ObjectLabels:
+    clutter = tuple(new_id[one] for one in labels.clutter)
+    return ObjectLabels(labels.synonyms, labels.depictions, labels.vis_sim, clutter)
+
+
+def noisy(seed: int) -> Any:
+    """Disjoint parts of the objects, each with a feature between its own words and others."""
+    rng = np.random.default_rng(seed)
+    truth = lex_truth(seed)
+    whole = perfect(truth)
+    masks = [whole.mask(k)[rng.random(len(whole.mask(k))) < 0.7] for k in range(len(whole))]
+    assert whole.features is not None
+    return instances_with(truth.points, masks, whole.features + rng.random(whole.features.shape).astype(np.float32))
+
+
+@settings(max_examples=10, deadline=None)
+@given(seed=st.integers(0, 100), rules=st.sampled_from([TOPN, RANKING]))
+def test_a_plain_reading_of_the_rules_gives_the_same(seed: int, rules: Any) -> None:
+    truth, prediction = lex_truth(seed), noisy(seed)
+    plain = plain_topn if rules is TOPN else plain_ranking
+    assert values_of(rules, truth, prediction) == pytest.approx(plain(truth, prediction), abs=1e-9, nan_ok=True)
+
+
+def plain_units(prediction: Any) -> tuple[np.ndarray, np.ndarray]:
+    """A voxel grid by a dictionary, then the nearest point by comparing with all."""
+    owner = transfer.first_owner(transfer.masks_of(prediction), len(prediction.points))
+    points, owner = prediction.points[owner >= 0].astype(float), owner[owner >= 0]
+    cells: dict[tuple[int, ...], list[np.ndarray]] = {}
+    for point in points:
+        cells.setdefault(tuple(np.floor(point / 0.05).astype(int)), []).append(point)
+    means = np.array([np.mean(members, axis=0) for members in cells.values()])
+    return means, owner[[int(((points - mean) ** 2).sum(axis=1).argmin()) for mean in means]]
+
+
+def plain_nearest(truth: OpenLexTruth, prediction: Any) -> list[tuple[int, float, np.ndarray]]:
+    """Object, distance and prompt order (best first) of every point that has an object."""
+    means, owner = plain_units(prediction)
+    text = ENCODER.encode_texts(list(truth.prompts)).astype(float)
+    rows = []
+    for point, one in zip(truth.points, truth.object_of_point.tolist(), strict=True):
+        squared = ((means - point.astype(float)) ** 2).sum(axis=1)
+        feature = prediction.features[owner[squared.argmin()]].astype(float)
+        similarity = text @ feature / np.linalg.norm(feature)
+        rows.append((one, float(np.sqrt(squared.min())), np.argsort(-similarity, kind="stable")))
+    return rows
+
+
+def plain_topn(truth: OpenLexTruth, prediction: Any) -> dict[str, float]:
+    shares: dict[int, dict[str, float]] = {}
+    for one, distance, order in plain_nearest(truth, prediction):
+        labels = truth.objects.get(one)
+        if labels is None or not labels.synonyms or set(labels.synonyms) & set(TOPN.ignore):
+            continue
+        best = {truth.prompts[index] for index in order[:5]}
+        near = [truth.objects[other] for other in labels.clutter]
+        clutter = {word for o in near for word in (*o.synonyms, *o.depictions, *o.vis_sim)}
+        reached = [best & set(words) for words in (labels.synonyms, labels.depictions, labels.vis_sim, clutter)]
+        names = [name for name, hit in zip(CATEGORIES, reached, strict=False) if hit]
+        category = "missing" if distance > 0.05 else (names or ["incorrect"])[0]
+        share = shares.setdefault(one, dict.fromkeys(CATEGORIES, 0.0))
+        share[category] += 1 / int((truth.object_of_point == one).sum())
+    return {name: float(np.mean([share[name] for share in shares.values()])) for name in CATEGORIES}
+
+
+def plain_ranking(truth: OpenLexTruth, prediction: Any) -> dict[str, float]:
+    found: dict[str, dict[int, list[float]]] = {"overall": {}, "synonyms": {}, "secondary": {}}
+    for one, _, order in plain_nearest(truth, prediction):
+        if one not in truth.objects:
+            continue
+        labels = truth.objects[one]
+        rank = {truth.prompts[index]: place for place, index in enumerate(order)}
+        first = [word for word in labels.synonyms if word in rank]
+        second = [word for word in (*labels.depictions, *labels.vis_sim) if word in rank]
+        bounds = ((first, 0, len(first) - 1), (second, len(first), len(first) + len(second) - 1))
+        for name, (words, low, high) in zip(("synonyms", "secondary"), bounds, strict=True):
+            for word in words:
+                left = 1 + min(0, (rank[word] - low) / (low + 1e-8))
+                right = 1 - max(0, (rank[word] - high) / (len(truth.prompts) - 1 - high))
+                found[name].setdefault(one, []).append(min(left, right))
+                found["overall"].setdefault(one, []).append(min(left, right))
+    return {
+        name: float(np.mean([np.mean(scores) for scores in of_object.values()])) for name, of_object in found.items()
+    }
+
+
+def test_a_cloud_is_reduced_as_open3d_reduces_it() -> None:
+    open3d = pytest.importorskip("open3d")
+    points = np.random.default_rng(0).random((2000, 3)) - 0.37
+    theirs = open3d.t.geometry.PointCloud(points).voxel_down_sample(0.05).point.positions.numpy()
+    ours = voxel_means(points, 0.05)
+    assert len(ours) == len(theirs) < 1900
+    distance, index = transfer.nearest(theirs, ours)
+    assert distance.max() < 1e-6  # theirs are added up in single precision
+    assert len(set(index.tolist())) == len(ours)
+
+
+# ---- scenes together
+
+
+def some_counts(seed: int, n_objects: int) -> ObjectCounts:
+    rng = np.random.default_rng(seed)
+    n_points = rng.integers(1, 20, n_objects)
+    totals = rng.random((n_objects, 3)) * n_points[:, None]
+    totals[rng.random((n_objects, 3)) < 0.2] = np.nan
+    return ObjectCounts(n_points, totals)
+
+
+@given(seed=st.integers(0, 1000), n=st.integers(0, 12), cut=st.integers(0, 12))
+def test_counts_of_parts_combine_to_the_whole(seed: int, n: int, cut: int) -> None:
+    whole = some_counts(seed, n)
+    parts = [ObjectCounts(whole.n_points[rows], whole.totals[rows]) for rows in (slice(None, cut), slice(cut, None))]
+    assert np.array_equal(combine(parts), combine([whole]), equal_nan=True)
+    assert np.array_equal(concatenate(parts).totals, whole.totals, equal_nan=True)
+
+
+@given(seed=st.integers(0, 1000))
+def test_resampled_means_are_those_of_the_drawn_scenes(seed: int) -> None:
+    counts = [some_counts(seed + s, 3 + s) for s in range(3)]
+    drawn = resampled(counts, np.array([[2, 0, 1]]))[0]
+    np.testing.assert_allclose(drawn, combine([counts[0], counts[0], counts[2]]), rtol=1e-12)
+
+
+@pytest.mark.parametrize("aggregate", ["scene-mean", "pooled"])
+def test_a_result_over_scenes_has_its_mean_and_an_interval_around_it(aggregate: str) -> None:
+    rules = TOPN.model_copy(update={"aggregate": aggregate})
+    scores = {f"s{seed}": score_scene(rules, lex_truth(seed), noisy(seed), ENCODER) for seed in range(4)}
+    result = combine_scenes(rules, unpack_scores(pack_scores(scores)))
+    interval = result.intervals["synonyms"]
+    assert result.metrics == (result.scene_mean if aggregate == "scene-mean" else result.pooled)
+    assert interval is not None
+    assert interval[0] <= result.metrics["synonyms"] <= interval[1]
+    assert sum(result.metrics[name] for name in CATEGORIES) == pytest.approx(1.0)
+
+
+# ---- what a reader is told, and what is refused
+
+
+def test_points_of_several_instances_are_told() -> None:
+    truth = lex_truth()
+    whole = perfect(truth)
+    assert whole.features is not None
+    features = np.vstack([whole.features, whole.features[:1]])
+    twice = instances_with(truth.points, [*masks_of(whole), whole.mask(0)], features)
+    told = score_scene(TOPN, truth, twice, ENCODER).warnings
+    assert f"points in several instances, counted for the first of them: {len(whole.mask(0))}" in told
+
+
+def test_a_prediction_without_features_cannot_be_ranked() -> None:
+    truth = lex_truth()
+    named = instances_with(truth.points, masks_of(perfect(truth)), None, labels=labels_of(truth))
+    assert why_not_scorable(TOPN, named) is None
+    reason = why_not_scorable(RANKING, named)
+    assert reason == "openlex3d-ranking: needs features to compare with texts, and the prediction has none"
+    with pytest.raises(PredictionError, match="needs features"):
+        score_scene(RANKING, truth, named, ENCODER)
+    with pytest.raises(PredictionError, match="there is no encoder"):
+        score_scene(RANKING, truth, perfect(truth), None)
+
+
+def test_features_of_another_encoder_are_refused() -> None:
+    truth = lex_truth()
+    with pytest.raises(PredictionError, match=f"the encoder 'words' has {WordEncoder().dim}"):
+        score_scene(TOPN, truth, instances_with(truth.points, [np.arange(9)], np.ones((1, 3), np.float32)), ENCODER)
+
+
+def test_a_truth_that_does_not_hold_together_is_refused() -> None:
+    points = np.zeros((3, 3), np.float32)
+    with pytest.raises(DataError, match="do not agree"):
+        OpenLexTruth(points, np.zeros(2, np.int64), {}, PROMPTS, "v", "s")
+    with pytest.raises(DataError, match="has no prompts"):
+        OpenLexTruth(points, np.zeros(3, np.int64), {}, (), "v", "s")
+
+
+def test_a_point_of_no_known_object_is_not_scored() -> None:
+    assert openlex3d.distinct_pairs(np.array([-1, 0]), np.array([0, -1]))[2].tolist() == []

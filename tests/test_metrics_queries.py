@@ -1,0 +1,290 @@
+"""Average precision of text queries: the original's answers, ceilings, and what changes nothing."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from open_scene import ENCODER, OBJECTS, WordEncoder, instances_with, nothing_at, perfect, query_truth
+
+from su3d_bench.errors import DataError, PredictionError
+from su3d_bench.metrics import instance_ap
+from su3d_bench.metrics.query_ap import QueryTruth, TextQuery, confidences, per_scene
+from su3d_bench.metrics.transfer import Masks
+from su3d_bench.protocols import ProtocolRules, load_protocol
+from su3d_bench.scoring import combine, pack_scores, score_scene, unpack_scores, why_not_scorable
+from su3d_bench.types import DenseFeatures, Instances
+
+GOLDEN = json.loads((Path(__file__).parent / "cases/conceptgraphs_golden.json").read_text())
+OPENLEX, PLAIN = load_protocol("openlex3d-queries"), load_protocol("query-ap")
+PROTOCOLS = {"openlex3d-queries": OPENLEX, "query-ap": PLAIN}
+
+
+# ---- what the original answers
+
+
+def golden_counts(case: dict[str, Any], top_k: int) -> instance_ap.InstanceCounts:
+    """A golden case as masks with a confidence for each query; the masks that a query does not list come last."""
+    sets = sorted({tuple(rows) for _, rows, *_ in [*case["gt"], *case["pred"]]})
+    texts = sorted({text for text, *_ in case["gt"]})
+    objects = np.full(30, -1)
+    for one, rows in enumerate(sets):
+        objects[list(rows)] = one
+    queries = [
+        TextQuery(text, tuple(sets.index(tuple(rows)) for other, rows in case["gt"] if other == text)) for text in texts
+    ]
+    masks = Masks(np.concatenate([[0], np.cumsum([len(rows) for rows in sets])]), np.concatenate(sets).astype(np.int32))
+    confidence = np.full((len(sets), len(texts)), -1.0)
+    for text, rows, score in case["pred"]:
+        confidence[sets.index(tuple(rows)), texts.index(text)] = score
+    return per_scene(objects, queries, masks, confidence, top_k=top_k)
+
+
+@pytest.mark.parametrize(
+    ("name", "top_k"), [("ol_ap_perfect", 1), ("ol_ap_perfect_geometry_top3", 3), ("ol_ap_multi_gt_top3", 3)]
+)
+def test_the_golden_average_precisions_come_out(name: str, top_k: int) -> None:
+    case = GOLDEN[name]
+    ours = instance_ap.combine([golden_counts(case, top_k)])
+    np.testing.assert_allclose(ours.table[0], case["ap_per_threshold"], rtol=0, atol=1e-15)
+    averages = (case["avg"]["all_ap"], case["avg"]["all_ap_50%"], case["avg"]["all_ap_25%"])
+    np.testing.assert_allclose((ours.ap, ours.ap50, ours.ap25), np.array(averages) / 100, rtol=0, atol=1e-15)
+
+
+# ---- confidences
+
+
+def test_stretched_confidences_give_the_best_mask_of_every_query_one_and_the_worst_zero() -> None:
+    rng = np.random.default_rng(0)
+    stretched = confidences(rng.uniform(-1, 1, (9, 5)), "similarity-min-max")
+    assert (stretched.max(axis=0) == 1).all() and (stretched.min(axis=0) == 0).all()
+    assert confidences(np.full((4, 1), 0.3), "similarity-min-max").tolist() == [[0.0]] * 4
+
+
+def test_the_top_masks_of_each_query_count_and_of_equals_the_first() -> None:
+    objects = np.repeat([1, 2, 3], 4)
+    masks = Masks(np.array([0, 4, 8, 12]), np.arange(12, dtype=np.int32))
+    counts = per_scene(objects, [TextQuery("x", (2,))], masks, np.array([[0.5], [0.5], [0.5]]), top_k=1)
+    assert instance_ap.combine([counts]).ap == 0.0
+    assert counts.n_predictions.tolist() == [1]
+
+
+# ---- a whole scene
+
+
+def metrics(rules: ProtocolRules, truth: QueryTruth, prediction: Instances) -> list[float]:
+    result = combine(rules, {"scene": score_scene(rules, truth, prediction, ENCODER)})
+    return [result.metrics[name] for name in rules.headline]
+
+
+def with_words(truth: QueryTruth, words: dict[int, dict[str, float]]) -> Instances:
+    masks = [np.flatnonzero(truth.object_of_point == one) for one in OBJECTS]
+    return instances_with(truth.points, masks, np.stack([WordEncoder().feature(words[one]) for one in OBJECTS]))
+
+
+def asking(truth: QueryTruth, *queries: tuple[str, tuple[int, ...]]) -> QueryTruth:
+    return replace(truth, queries=tuple(TextQuery(text, ids) for text, ids in queries))
+
+
+ONE_QUERY_AN_OBJECT = (("seat", (7,)), ("desk", (12,)), ("light", (30,)), ("vase", (31,)), ("wall", (40,)))
+OWN_WORD = {one: {text: 1.0} for text, (one,) in ONE_QUERY_AN_OBJECT}
+
+
+def ruled(rules: ProtocolRules, truth: QueryTruth) -> QueryTruth:
+    return replace(truth, variant=rules.ground_truth)
+
+
+@pytest.mark.parametrize("rules", PROTOCOLS.values(), ids=PROTOCOLS)
+def test_perfect_masks_with_a_query_for_each_score_exactly_one(rules: ProtocolRules) -> None:
+    truth = ruled(rules, asking(query_truth(), *ONE_QUERY_AN_OBJECT))
+    assert metrics(rules, truth, with_words(truth, OWN_WORD)) == [1.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize("rules", PROTOCOLS.values(), ids=PROTOCOLS)
+def test_an_empty_prediction_scores_exactly_zero(rules: ProtocolRules) -> None:
+    truth = ruled(rules, query_truth())
+    assert metrics(rules, truth, nothing_at(truth)) == [0.0, 0.0, 0.0]
+
+
+def test_the_truth_does_not_reach_one_under_openlex3d_where_a_query_has_two_objects_and_does_under_ours() -> None:
+    """Stretching lifts the wrong second mask of a query above the right second mask of another."""
+    words = {
+        7: {"seat": 1.0},
+        12: {"seat": 0.7, "lamp": 0.7},
+        30: {"light": 0.6, "lamp": 0.8},
+        31: {"light": 0.5, "lamp": 0.9},
+        40: {"wall": 1.0},
+    }
+    truth = asking(query_truth(), ("seat", (7, 12)), ("light", (30,)))
+    assert all(0.5 < value < 1 for value in metrics(OPENLEX, truth, with_words(truth, words)))
+    assert metrics(PLAIN, ruled(PLAIN, truth), with_words(truth, words)) == pytest.approx([1.0, 1.0, 1.0])
+
+
+def test_a_mask_meets_only_the_objects_of_its_own_query() -> None:
+    truth = asking(query_truth(), ("seat", (30,)), ("light", (7,)))
+    assert metrics(OPENLEX, truth, with_words(truth, OWN_WORD))[0] < 0.5
+
+
+def test_a_query_without_an_object_in_the_scene_still_has_false_positives() -> None:
+    truth = asking(query_truth(), *ONE_QUERY_AN_OBJECT)
+    whole = with_words(truth, OWN_WORD)
+    more = replace(truth, queries=(*truth.queries, TextQuery("pot", (999,))))
+    assert metrics(OPENLEX, more, whole)[0] <= metrics(OPENLEX, truth, whole)[0]
+    counts = score_scene(OPENLEX, more, whole, ENCODER).counts
+    assert isinstance(counts, instance_ap.InstanceCounts)
+    assert counts.n_truth.tolist() == [5]
+    assert counts.n_predictions.tolist() == [30]
+
+
+def touching() -> tuple[QueryTruth, Instances]:
+    """Two objects side by side, and the same two as masks."""
+    points = np.random.default_rng(0).random((800, 3)).astype(np.float32)
+    objects = np.where(points[:, 0] < 0.5, 7, 30)
+    queries = (TextQuery("seat", (7,)), TextQuery("light", (30,)))
+    truth = QueryTruth(points, objects, queries, OPENLEX.ground_truth, "made for a test")
+    features = np.stack([WordEncoder().feature({word: 1.0}) for word in ("seat", "light")])
+    return truth, instances_with(points, [np.flatnonzero(objects == one) for one in (7, 30)], features)
+
+
+def test_masks_of_objects_that_meet_grow_over_each_other_under_openlex3d_and_keep_their_shape_under_ours() -> None:
+    truth, perfect_masks = touching()
+    wide = OPENLEX.model_copy(update={"transfer": OPENLEX.transfer.model_copy(update={"cap_m": 0.3})})
+    assert 0 < metrics(wide, truth, perfect_masks)[0] < 1
+    assert metrics(PLAIN, ruled(PLAIN, truth), perfect_masks) == [1.0, 1.0, 1.0]
+
+
+@pytest.mark.parametrize(("offset_m", "is_reached"), [(0.0316, True), (0.0317, False)])
+def test_a_mask_reaches_a_point_nearer_than_the_root_of_a_thousandth(offset_m: float, is_reached: bool) -> None:
+    objects = np.array([7])
+    truth = QueryTruth(np.zeros((1, 3), np.float32), objects, (TextQuery("seat", (7,)),), OPENLEX.ground_truth, "test")
+    features = WordEncoder().feature({"seat": 1.0})[None]
+    mask = instances_with(np.array([[0, offset_m, 0]], np.float32), [np.arange(1)], features)
+    assert metrics(OPENLEX, truth, mask) == [float(is_reached)] * 3
+
+
+def test_overlapping_masks_are_all_ranked() -> None:
+    truth = asking(query_truth(), ("seat", (7,)))
+    seats = np.flatnonzero(truth.object_of_point == 7)
+    features = np.stack([WordEncoder().feature({"seat": 1.0, "pot": other}) for other in (0.9, 0.0)])
+    both = instances_with(truth.points, [seats[:50], seats], features)
+    assert metrics(OPENLEX, truth, both)[:2] == [1.0, 1.0]
+
+
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 1000), name=st.sampled_from(sorted(PROTOCOLS)))
+def test_shuffled_instances_objects_and_queries_change_nothing(seed: int, name: str) -> None:
+    rng = np.random.default_rng(seed)
+    rules = PROTOCOLS[name]
+    truth, whole = noisy(rules, seed)
+    order = rng.permutation(len(whole))
+    assert whole.features is not None
+    shuffled = instances_with(truth.points, [whole.mask(k) for k in order], whole.features[order])
+    new_id = {one: int(n) for one, n in zip([*OBJECTS, 999], rng.permutation(500)[:6], strict=True)}
+    queries = [TextQuery(q.text, tuple(new_id[one] for one in q.object_ids)) for q in truth.queries]
+    renamed = replace(
+        truth,
+        object_of_point=np.array([new_id.get(int(one), -1) for one in truth.object_of_point]),
+        queries=tuple(queries[q] for q in rng.permutation(len(queries))),
+    )
+    # AP25 may depend on the order of masks, as ScanNet's does
+    assert metrics(rules, renamed, shuffled)[:2] == pytest.approx(metrics(rules, truth, whole)[:2], abs=1e-12)
+
+
+def noisy(rules: ProtocolRules, seed: int) -> tuple[QueryTruth, Instances]:
+    rng = np.random.default_rng(seed)
+    truth = ruled(rules, query_truth(seed))
+    whole = perfect(truth)
+    masks = [whole.mask(k)[rng.random(len(whole.mask(k))) < rng.uniform(0.4, 1)] for k in range(len(whole))]
+    assert whole.features is not None
+    features = whole.features + rng.random(whole.features.shape).astype(np.float32)
+    return truth, instances_with(truth.points, [*masks, masks[0]], np.vstack([features, features[:1] + 0.1]))
+
+
+@settings(max_examples=20, deadline=None)
+@given(seeds=st.sets(st.integers(0, 5), min_size=1), name=st.sampled_from(sorted(PROTOCOLS)))
+def test_counts_of_scenes_combine_to_the_whole(seeds: set[int], name: str) -> None:
+    rules = PROTOCOLS[name]
+    scores = {f"s{seed}": score_scene(rules, *noisy(rules, seed), ENCODER) for seed in seeds}
+    stored = {scene: unpack_scores(pack_scores({name: score}))[name] for scene, score in scores.items()}
+    result = combine(rules, dict(reversed(stored.items())))
+    assert result.to_json() == combine(rules, scores).to_json()
+    assert result.per_class["object"]["AP"] == pytest.approx(result.metrics["AP"], nan_ok=True)
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 1000))
+def test_a_plain_reading_of_the_rules_gives_the_same(seed: int) -> None:
+    truth, whole = noisy(OPENLEX, seed)
+    assert metrics(OPENLEX, truth, whole) == pytest.approx(plain_ap(truth, whole), abs=1e-12)
+
+
+def plain_ap(truth: QueryTruth, prediction: Instances) -> list[float]:
+    """The original's loops over pairs of sets, one query after another."""
+    members = [set(prediction.mask(k).tolist()) for k in range(len(prediction))]
+    points = truth.points.astype(float)
+    squared = ((points[:, None] - points[None]) ** 2).sum(axis=2)
+    masks = [set(np.flatnonzero(squared[:, sorted(mask)].min(axis=1) < 0.001).tolist()) for mask in members]
+    assert prediction.features is not None
+    directions = prediction.features / np.linalg.norm(prediction.features, axis=1, keepdims=True)
+    values = []
+    for threshold in instance_ap.THRESHOLDS:
+        rows: list[tuple[float, bool]] = []
+        n_missed = 0
+        for query in truth.queries:
+            raw = (directions.astype(float) @ ENCODER.encode_texts([query.text])[0].astype(float) + 1) / 2
+            confidence = (raw - raw.min()) / max(raw.max() - raw.min(), 1e-8)
+            ranked = [int(k) for k in np.argsort(-confidence, kind="stable")[:10] if masks[int(k)]]
+            objects = [set(np.flatnonzero(truth.object_of_point == one).tolist()) for one in query.object_ids]
+            objects = [one for one in objects if one]
+            used: set[int] = set()
+            for one in objects:
+                found = [k for k in ranked if k not in used and iou(masks[k], one) > threshold]
+                if not found:
+                    n_missed += 1
+                    continue
+                used.add(found[0])
+                *lower, best = sorted(float(confidence[k]) for k in found)
+                rows += [(best, True), *((score, False) for score in lower)]
+            unmet = [k for k in ranked if not any(iou(masks[k], one) > threshold for one in objects)]
+            rows += [(float(confidence[k]), False) for k in unmet]
+        scores, is_true = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
+        values.append(instance_ap.average_precision(scores, is_true, n_missed))
+    return [float(np.mean(values[:-1])), values[0], values[-1]]
+
+
+def iou(one: set[int], other: set[int]) -> float:
+    return len(one & other) / len(one | other)
+
+
+# ---- what is refused
+
+
+def test_dense_features_and_masks_without_features_cannot_be_ranked() -> None:
+    truth = query_truth()
+    dense = DenseFeatures(truth.points, np.zeros((len(truth.points), 4), np.float16))
+    assert why_not_scorable(OPENLEX, dense) == (
+        "openlex3d-queries: needs instances, and the method gives one feature a point"
+    )
+    with pytest.raises(PredictionError, match="openlex3d-queries: needs features to compare with texts"):
+        score_scene(OPENLEX, truth, instances_with(truth.points, [np.arange(3)], None, ["chair"]), ENCODER)
+
+
+def test_truths_that_do_not_hold_together_are_refused() -> None:
+    with pytest.raises(DataError, match="query 'seat': an object stands there twice"):
+        TextQuery("seat", (7, 7))
+    with pytest.raises(DataError, match="do not agree"):
+        QueryTruth(np.zeros((3, 3), np.float32), np.zeros(2, np.int64), (), "v", "s")
+
+
+def test_a_truth_of_another_kind_is_refused() -> None:
+    truth = query_truth()
+    with pytest.raises(DataError, match="scores the truth 'query-objects', this one is 'openlex3d-face-corners'"):
+        score_scene(PLAIN, truth, perfect(truth), ENCODER)
+    with pytest.raises(DataError, match="scores the label space 'openlex3d', the truth has 'queries'"):
+        score_scene(load_protocol("openlex3d-topn"), truth, perfect(truth), ENCODER)

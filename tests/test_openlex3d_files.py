@@ -1,0 +1,248 @@
+"""OpenLex3D's text files: read as the original reads them, and one clear line for any that is damaged."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from damage import damages, outcomes, truncations
+from open_scene import ENCODER, OBJECTS, PROMPTS, instances_with
+
+from su3d_bench.datasets.openlex3d import (
+    MOST_BYTES,
+    Corners,
+    OpenLexFiles,
+    categories_truth,
+    queries_truth,
+    read_categories,
+    read_prompts,
+    read_queries,
+    replica_corners,
+)
+from su3d_bench.datasets.ply import ListColumn
+from su3d_bench.datasets.replica_truth import AnnotatedMesh
+from su3d_bench.errors import DataError, GroundTruthMissing
+from su3d_bench.metrics.openlex3d import ObjectLabels
+from su3d_bench.metrics.query_ap import TextQuery
+from su3d_bench.protocols import load_protocol
+from su3d_bench.scoring import combine, score_scene
+
+WHERE = "replica/room0: file"
+CATEGORIES = {
+    "dataset": {
+        "name": "room0",
+        "samples": [
+            {
+                "object_id": one,
+                "name": f"object {one}",
+                "labels": {
+                    "image_attributes": {
+                        "synonyms": list(labels.synonyms),
+                        "depictions": list(labels.depictions),
+                        "vis_sim": list(labels.vis_sim),
+                        "clutter": [str(other) for other in labels.clutter],
+                    }
+                },
+            }
+            for one, labels in OBJECTS.items()
+        ],
+    }
+}
+QUERIES = {"level0": {"chair": [7], "pot": [31, "12"]}, "level1": {"chair": [7]}}
+
+
+def written(tmp_path: Path) -> OpenLexFiles:
+    scene = tmp_path / "replica/room0"
+    scene.mkdir(parents=True)
+    (tmp_path / "replica/prompt_list.txt").write_text("\n".join(f" {prompt} " for prompt in PROMPTS) + "\n")
+    (scene / "gt_categories.json").write_text(json.dumps(CATEGORIES))
+    (scene / "gt_categories_query_to_object_mapping_all.json").write_text(json.dumps(QUERIES))
+    return OpenLexFiles(tmp_path, "replica", "room0")
+
+
+# ---- what is read
+
+
+def test_the_three_files_of_a_scene_are_read(tmp_path: Path) -> None:
+    files = written(tmp_path)
+    assert files.prompts() == PROMPTS
+    assert files.objects() == OBJECTS
+    assert files.queries("all") == (TextQuery("chair", (7,)), TextQuery("pot", (31, 12)), TextQuery("chair", (7,)))
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_prompts_are_lines_however_they_end(tmp_path: Path, end: str) -> None:
+    path = tmp_path / "prompts.txt"
+    path.write_bytes(end.join(["a b", "", "c"]).encode())
+    assert read_prompts(path, WHERE) == ("a b", "", "c")
+
+
+def test_an_object_may_have_no_clutter(tmp_path: Path) -> None:
+    path = tmp_path / "categories.json"
+    sample = {"object_id": 3, "labels": {"image_attributes": {"synonyms": ["a"], "depictions": [], "vis_sim": []}}}
+    path.write_text(json.dumps({"dataset": {"samples": [sample]}}))
+    assert read_categories(path, WHERE) == {3: ObjectLabels(("a",))}
+
+
+# ---- from files to a score
+
+
+def corners() -> Corners:
+    """Each object as points of a box."""
+    rng = np.random.default_rng(0)
+    points = np.concatenate([rng.random((50, 3)) * 0.3 + [i, 0, 0] for i in range(len(OBJECTS))]).astype(np.float32)
+    return Corners(points, np.repeat(list(OBJECTS), 50), "made for a test")
+
+
+def write_visible(root: Path, points: np.ndarray) -> None:
+    fields = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1"
+    size = f"WIDTH {len(points)}\nHEIGHT 1\nVIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}"
+    head = f"# .PCD v0.7 - Point Cloud Data file format\nVERSION 0.7\n{fields}\n{size}\nDATA binary\n"
+    content = head.encode() + points.astype("<f4").tobytes()
+    (root / "replica/room0/gt_visible_cloud.pcd").write_bytes(content)
+
+
+def test_the_files_with_the_points_of_a_mesh_can_be_scored(tmp_path: Path) -> None:
+    files, mesh = written(tmp_path), corners()
+    write_visible(tmp_path, mesh.points[::2] + np.float32(0.001))
+    masks = [np.flatnonzero(mesh.object_of_point == one) for one in OBJECTS]
+    words = [labels.synonyms[0] for labels in OBJECTS.values()]
+    prediction = instances_with(mesh.points, masks, ENCODER.encode_texts(words))
+    rules = load_protocol("openlex3d-topn")
+    score = score_scene(rules, categories_truth(files, mesh), prediction, ENCODER)
+    assert combine(rules, {"a": score}).metrics["synonyms"] == 1.0
+    rules = load_protocol("openlex3d-queries")
+    truth = queries_truth(files, mesh, "all")
+    assert len(truth.queries) == 3
+    assert combine(rules, {"a": score_scene(rules, truth, prediction, ENCODER)}).metrics["AP25"] > 0.5
+
+
+def test_a_visible_point_far_from_every_corner_has_no_object(tmp_path: Path) -> None:
+    mesh = corners()
+    files = written(tmp_path)
+    write_visible(tmp_path, np.array([mesh.points[0] + [0.02, 0, 0], mesh.points[0] + [0, 9, 0]]))
+    truth = categories_truth(files, mesh)
+    assert truth.object_of_point.tolist() == [7, -1]
+
+
+def test_the_corners_of_a_replica_mesh_keep_the_numbers_of_all_objects() -> None:
+    vertices = np.arange(12, dtype=np.float32).reshape(4, 3)
+    faces = ListColumn(np.array([0, 3, 6]), np.array([0, 1, 2, 1, 2, 3]))
+    without_class = np.zeros(2, np.int32)
+    mesh = AnnotatedMesh(vertices, faces, np.array([7, 0]), without_class, without_class, {})
+    found = replica_corners(mesh)
+    assert found.object_of_point.tolist() == [7, 7, 7, 0, 0, 0]
+    assert found.points[3].tolist() == vertices[1].tolist()
+
+
+# ---- what is refused
+
+Reader = Callable[[Path, str], object]
+
+
+def refusal(tmp_path: Path, read: Reader, content: str) -> str:
+    path = tmp_path / "file"
+    path.write_text(content)
+    with pytest.raises(DataError) as caught:
+        read(path, WHERE)
+    return str(caught.value)
+
+
+def edited(**changes: Any) -> str:
+    sample = json.loads(json.dumps(CATEGORIES["dataset"]["samples"][0]))
+    sample["labels"]["image_attributes"] |= {key: value for key, value in changes.items() if key != "object_id"}
+    sample |= {key: value for key, value in changes.items() if key == "object_id"}
+    return json.dumps({"dataset": {"samples": [sample]}})
+
+
+FAULTS = (
+    (read_prompts, " \n \n", "has no prompt; expected one a line"),
+    (read_categories, "[]", "is a list of 0; expected an object"),
+    (read_categories, '{"dataset": {}}', "has no 'samples'; expected the file of the release"),
+    (read_categories, '{"dataset": {"samples": 3}}', "'samples' is 3; expected a list"),
+    (read_categories, edited(object_id=1.5), "sample 0: 'object_id' is 1.5; expected a whole number"),
+    (read_categories, edited(object_id=True), "sample 0: 'object_id' is true; expected a whole number"),
+    (read_categories, edited(object_id=10**30), "sample 0: an object id is outside -2147483647 to 2147483647"),
+    (read_categories, edited(synonyms=["a", 3]), "sample 0: 'synonyms' holds 3; expected texts"),
+    (read_categories, edited(vis_sim="a"), "sample 0: 'vis_sim' is \"a\"; expected a list"),
+    (read_categories, edited(synonyms=["\ud800"]), "'synonyms': '\\ud800' holds half a character"),
+    (read_categories, edited(clutter=["x"]), "sample 0: 'clutter': an object id is \"x\"; expected a whole number"),
+    (read_categories, edited(clutter={"a": 1}), "'clutter': is an object of 1; expected a list of object ids"),
+    (read_categories, "{", "not JSON"),
+    (read_categories, "[" * 100_000, "not JSON"),
+    (read_queries, '{"level0": [1]}', "'level0': is a list of 1; expected an object"),
+    (read_queries, '{"level0": {"a\\u001b[31m": 7}}', "'level0': query 'a\\x1b[31m': is 7; expected a list of object"),
+    (read_queries, '{"level0": {"a": [7, 7]}}', "query 'a': an object stands there twice; name each once"),
+    (read_queries, '{"level0": {"a": [NaN]}}', "query 'a': an object id is NaN; expected a whole number"),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(("read", "content", "message"), FAULTS, ids=[fault[2] for fault in FAULTS])
+def test_a_file_that_cannot_be_used_is_told_in_one_line(
+    tmp_path: Path, read: Reader, content: str, message: str
+) -> None:
+    told = refusal(tmp_path, read, content)
+    assert told.startswith(WHERE)
+    assert message in told
+    assert len(told) < 500 and told.isprintable()
+
+
+def test_an_object_that_stands_twice_with_other_labels_is_told(tmp_path: Path) -> None:
+    first, second = (json.loads(edited(synonyms=[word]))["dataset"]["samples"][0] for word in "ab")
+    told = refusal(tmp_path, read_categories, json.dumps({"dataset": {"samples": [first, second]}}))
+    assert "sample 1: object 7 stands there twice with other labels; keep one of them" in told
+
+
+def test_files_that_are_missing_or_too_large_are_told(tmp_path: Path) -> None:
+    with pytest.raises(GroundTruthMissing, match=r"replica/room0: gt_categories\.json: is not there; expected"):
+        OpenLexFiles(tmp_path, "replica", "room0").objects()
+    files = written(tmp_path)
+    with pytest.raises(GroundTruthMissing, match=r"replica/room0: gt_visible_cloud\.pcd: is not there; expected"):
+        files.visible_points()
+    write_visible(tmp_path, np.array([[0, 0, 0], [np.nan, 0, 0]]))
+    with pytest.raises(DataError, match=r"replica/room0: gt_visible_cloud\.pcd: point 1 is at \[nan, 0.0, 0.0\]"):
+        files.visible_points()
+    large = tmp_path / "large"
+    with large.open("wb") as file:
+        file.truncate(MOST_BYTES + 1)
+    with pytest.raises(DataError, match="has more than 64 MiB"):
+        read_prompts(large, WHERE)
+    (tmp_path / "latin").write_bytes(b"caf\xe9\n")
+    with pytest.raises(DataError, match="byte 3 is not UTF-8"):
+        read_prompts(tmp_path / "latin", WHERE)
+    with pytest.raises(DataError, match="cannot be read"):
+        read_prompts(tmp_path, WHERE)
+
+
+@pytest.mark.parametrize("name", ["..", "", "a/b", "a\\b", "a\0b"])
+def test_a_name_that_leaves_its_folder_is_refused(tmp_path: Path, name: str) -> None:
+    for dataset, scene in ((name, "room0"), ("replica", name)):
+        with pytest.raises(DataError, match="is no name of a dataset or scene"):
+            OpenLexFiles(tmp_path, dataset, scene)
+
+
+@pytest.mark.parametrize(
+    ("read", "content"),
+    [
+        (read_categories, edited()),
+        (read_queries, json.dumps(QUERIES)),
+        (read_prompts, "\n".join(PROMPTS[:8])),
+    ],
+    ids=["categories", "queries", "prompts"],
+)
+def test_every_truncation_and_random_damage_is_read_or_one_error(tmp_path: Path, read: Reader, content: str) -> None:
+    path = tmp_path / "file"
+
+    def read_damaged(damaged: bytes) -> object:
+        path.write_bytes(damaged)
+        return read(path, WHERE)
+
+    plain = content.encode()
+    cut = outcomes(read_damaged, truncations(plain), must_name=WHERE)
+    hurt = outcomes(read_damaged, damages(plain), must_name=WHERE)
+    assert sum(cut) == len(plain) and sum(hurt) == 2_000
+    assert hurt[1] > 100

@@ -1,0 +1,235 @@
+"""PCD files of every form come back to the last bit, and no damage gets past the reader but as one typed error."""
+
+from __future__ import annotations
+
+import struct
+import tracemalloc
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from damage import damages, outcomes, truncations
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from su3d_bench.datasets.pcd import MOST_EXPANSION, read_pcd_points, write_pcd_points
+from su3d_bench.errors import DataError
+
+POINTS = np.array([[1.5, -2.25, 0.0], [1.5, 3.0, 1e-3], [1.5, 3.0, 7.0]], np.float32)
+
+
+def header(
+    form: str, n: int = 3, *, fields: str = "x y z", sizes: str = "4 4 4", types: str = "F F F", **more: str
+) -> str:
+    lines = {
+        "VERSION": "0.7",
+        "FIELDS": fields,
+        "SIZE": sizes,
+        "TYPE": types,
+        "COUNT": " ".join("1" for _ in fields.split()),
+        "WIDTH": str(n),
+        "HEIGHT": "1",
+        "VIEWPOINT": "0 0 0 1 0 0 0",
+        "POINTS": str(n),
+        "DATA": form,
+        **more,
+    }
+    return "# .PCD v0.7 - Point Cloud Data file format\n" + "".join(
+        f"{key} {value}\n" for key, value in lines.items() if value
+    )
+
+
+def packed_as_runs(content: bytes) -> bytes:
+    """LZF that repeats nothing: runs of at most 32 bytes."""
+    parts = [content[at : at + 32] for at in range(0, len(content), 32)]
+    return b"".join(bytes([len(part) - 1]) + part for part in parts)
+
+
+def compressed(points: Any, packed: bytes | None = None, n_plain: int | None = None) -> bytes:
+    plain = np.ascontiguousarray(points.T).tobytes()
+    body = packed_as_runs(plain) if packed is None else packed
+    sizes = struct.pack("<II", len(body), len(plain) if n_plain is None else n_plain)
+    return header("binary_compressed", len(points)).encode() + sizes + body
+
+
+def forms(points: Any = POINTS) -> dict[str, bytes]:
+    text = "".join(" ".join(repr(float(value)) for value in row) + "\n" for row in points)
+    return {
+        "ascii": (header("ascii", len(points)) + text).encode(),
+        "binary": header("binary", len(points)).encode() + points.tobytes(),
+        "binary_compressed": compressed(points),
+    }
+
+
+def read(path: Path, content: bytes) -> Any:
+    path.write_bytes(content)
+    return read_pcd_points(path, "map: a.pcd")
+
+
+def refused(path: Path, content: bytes) -> str:
+    with pytest.raises(DataError) as caught:
+        read(path, content)
+    message = str(caught.value)
+    assert message.startswith("map: a.pcd") and "\n" not in message and len(message) < 500
+    return message
+
+
+@pytest.mark.parametrize("form", forms())
+def test_every_form_gives_the_points_back(tmp_path: Path, form: str) -> None:
+    np.testing.assert_array_equal(read(tmp_path / "a.pcd", forms()[form]), POINTS.astype(np.float64))
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
+def test_what_open3d_writes_is_read(tmp_path: Path, form: str) -> None:
+    open3d = pytest.importorskip("open3d", reason="needs Open3D, whose files these are")
+    rng = np.random.default_rng(0)
+    points = rng.normal(size=(5000, 3)).astype(np.float32).round(1)  # rounded, so that LZF finds repetitions
+    cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points))
+    cloud.colors = open3d.utility.Vector3dVector(rng.random((5000, 3)).round(1))
+    path = tmp_path / "a.pcd"
+    open3d.io.write_point_cloud(str(path), cloud, write_ascii=form == "ascii", compressed=form == "binary_compressed")
+    assert f"DATA {form}\n".encode() in path.read_bytes()[:400]
+    np.testing.assert_allclose(read_pcd_points(path), points, rtol=0, atol=1e-9 if form != "ascii" else 1e-6)
+
+
+def test_what_is_written_is_read_by_us_and_by_open3d(tmp_path: Path) -> None:
+    path = tmp_path / "a.pcd"
+    points = np.random.default_rng(1).normal(size=(100, 3)).astype(np.float32)
+    write_pcd_points(path, points)
+    np.testing.assert_array_equal(read_pcd_points(path), points.astype(np.float64))
+    open3d = pytest.importorskip("open3d", reason="needs Open3D to read the file")
+    np.testing.assert_array_equal(np.asarray(open3d.io.read_point_cloud(str(path)).points), points.astype(np.float64))
+
+
+def test_a_repetition_that_overlaps_itself_is_unpacked(tmp_path: Path) -> None:
+    points = np.zeros((40, 3), np.float32)  # 480 zero bytes: one run, then repetitions at distance 1
+    packed = bytes([0, 0]) + bytes([7 << 5, 255, 0]) + bytes([7 << 5, 215 - 9, 0])  # 1, 264 and 215 bytes
+    np.testing.assert_array_equal(read(tmp_path / "a.pcd", compressed(points, packed)), points)
+
+
+@given(values=st.lists(st.floats(width=32, allow_nan=False), max_size=60))
+@settings(max_examples=60, deadline=None)
+def test_any_points_are_unpacked(tmp_path_factory: pytest.TempPathFactory, values: list[float]) -> None:
+    points = np.array(values[: len(values) // 3 * 3], np.float32).reshape(-1, 3)
+    found = read(tmp_path_factory.mktemp("pcd") / "a.pcd", compressed(points))
+    np.testing.assert_array_equal(found, points)
+
+
+def test_other_fields_and_types_are_passed_over(tmp_path: Path) -> None:
+    kind = np.dtype([("intensity", "u1"), ("x", "<f8"), ("hist", "<f4", 3), ("z", "<i2"), ("y", "<f4")])
+    rows = np.zeros(2, kind)
+    rows["x"], rows["y"], rows["z"] = [0.1, 0.2], [1.5, 2.5], [-3, 4]
+    head = header("binary", 2, fields="intensity x hist z y", sizes="1 8 4 2 4", types="U F F I F", COUNT="1 1 3 1 1")
+    expected = [[0.1, 1.5, -3.0], [0.2, 2.5, 4.0]]
+    assert read(tmp_path / "a.pcd", head.encode() + rows.tobytes()).tolist() == expected
+    text = head.replace("DATA binary", "DATA ascii") + "7 0.1 1 2 3 -3 1.5\n9 0.2 1 2 3 4 2.5\n"
+    assert read(tmp_path / "a.pcd", text.encode()).tolist() == expected
+
+
+def test_points_that_an_organised_cloud_lacks_are_nan(tmp_path: Path) -> None:
+    content = header("ascii", 2, WIDTH="1", HEIGHT="2") + "nan nan nan\n1 2 3\n"
+    found = read(tmp_path / "a.pcd", content.encode())
+    assert np.isnan(found[0]).all() and found[1].tolist() == [1, 2, 3]
+
+
+def test_a_cloud_without_points_is_read(tmp_path: Path) -> None:
+    for content in forms(np.zeros((0, 3), np.float32)).values():
+        assert read(tmp_path / "a.pcd", content).shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"FIELDS": "x y w"}, "has the fields x, y, w; expected x, y and z"),
+        ({"FIELDS": "x x z"}, "field 'x' stands there twice"),
+        ({"FIELDS": "x y"}, "FIELDS, SIZE, TYPE and COUNT have 2, 3, 3 and 3 entries"),
+        ({"SIZE": "4 4 3"}, "field 'z' has TYPE F, SIZE 3, COUNT 1"),
+        ({"TYPE": "F F Q"}, "field 'z' has TYPE Q, SIZE 4, COUNT 1"),
+        ({"COUNT": "1 1 0"}, "COUNT 0"),
+        ({"COUNT": "1 1 999999999999"}, "COUNT 999999999999"),
+        ({"COUNT": "1 1 2"}, "expected x, y and z, one value each"),
+        ({"POINTS": "4"}, "POINTS is 4, WIDTH times HEIGHT is 3"),
+        ({"WIDTH": "-3"}, "WIDTH is '-3'; expected a number"),
+        ({"WIDTH": ""}, "WIDTH is ''; expected a number"),
+        ({"DATA": "base64"}, "DATA is 'base64'; expected ascii, binary, binary_compressed"),
+        ({"COLOUR": "red"}, "'COLOUR red' belongs in no PCD header"),
+        ({"COLUMNS": "a b c"}, "'FIELDS' stands there twice"),
+    ],
+)
+def test_each_fault_of_the_header_is_one_line(tmp_path: Path, changes: dict[str, str], message: str) -> None:
+    head = header("binary", **changes)
+    if "COLOUR" in changes or "COLUMNS" in changes:  # before the line that ends the header
+        ((key, value),) = changes.items()
+        head = header("binary").replace("DATA", f"{key} {value}\nDATA")
+    assert message in refused(tmp_path / "a.pcd", head.encode() + POINTS.tobytes())
+
+
+def test_a_header_without_an_end_is_refused(tmp_path: Path) -> None:
+    assert "no line 'DATA'" in refused(tmp_path / "a.pcd", b"# nothing\n" * 20)
+    assert "no line 'DATA'" in refused(tmp_path / "a.pcd", b"\0" * 1_000_000)
+
+
+@pytest.mark.parametrize("form", ["ascii", "binary", "binary_compressed"])
+def test_promises_of_more_than_is_there_allocate_nothing(tmp_path: Path, form: str) -> None:
+    n = 10**12 - 1
+    content = header(form, n).encode() + struct.pack("<II", 100, 0xFFFFFFFF) + b"1 2 3\n" * 20
+    tracemalloc.start()
+    try:
+        message = refused(tmp_path / "a.pcd", content)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+    assert "cut short or damaged" in message
+
+
+def test_a_body_that_cannot_unpack_to_so_much_allocates_nothing(tmp_path: Path) -> None:
+    n = 100_000_000
+    packed = bytes([0, 0]) + bytes([7 << 5, 255, 0]) * 1000
+    content = header("binary_compressed", n).encode() + struct.pack("<II", len(packed), n * 12) + packed
+    tracemalloc.start()
+    try:
+        refused(tmp_path / "a.pcd", content)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+    assert n * 12 > len(packed) * MOST_EXPANSION
+
+
+@pytest.mark.parametrize(
+    "packed",
+    [
+        bytes([32, 0]) + bytes(34),  # a repetition before anything was written
+        bytes([0, 0, 32, 1]),  # a repetition from before the beginning
+        bytes([31]) + bytes(10),  # a run beyond the end
+        bytes([0, 0, 7 << 5]),  # a repetition without its length
+        bytes([0, 0, 32]),  # a repetition without its distance
+        bytes([0, 0, 7 << 5, 255, 0]),  # more than was promised
+        bytes([0, 0]),  # less
+    ],
+)
+def test_each_fault_of_compressed_points_is_one_line(tmp_path: Path, packed: bytes) -> None:
+    message = refused(tmp_path / "a.pcd", compressed(POINTS, packed))
+    assert "compressed points are damaged" in message or "cut short or damaged" in message
+
+
+def test_text_that_is_no_number_and_text_left_over_are_refused(tmp_path: Path) -> None:
+    whole = forms()["ascii"]
+    assert "no number" in refused(tmp_path / "a.pcd", whole.replace(b"3.0", b"3,0", 1))
+    assert "promises 9 values, the file has 10 values" in refused(tmp_path / "a.pcd", whole + b"8\n")
+    assert "cut short or damaged" in refused(tmp_path / "a.pcd", forms()["binary"] + b"8")
+
+
+def test_a_missing_file_is_one_line(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"a\.pcd: cannot be read: No such file"):
+        read_pcd_points(tmp_path / "a.pcd")
+
+
+@pytest.mark.parametrize("form", forms())
+def test_cut_and_damaged_files_are_read_or_refused_but_nothing_else(tmp_path: Path, form: str) -> None:
+    content = forms()[form]
+    path = tmp_path / "a.pcd"
+    n_read, n_refused = outcomes(lambda one: read(path, one), truncations(content), must_name="a.pcd")
+    assert n_read + n_refused == len(content) and n_read <= (8 if form == "ascii" else 0)  # a shorter number is one
+    n_read, n_refused = outcomes(lambda one: read(path, one), damages(content), must_name="a.pcd")
+    assert n_read + n_refused == 2000 and n_refused > 500

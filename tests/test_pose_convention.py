@@ -1,0 +1,113 @@
+"""The check of poses against depth: every wrong reading of a room's walk is named, a right one never refused."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from su3d_bench.datasets.pose_convention import FLIP, check_convention, judge_convention
+from su3d_bench.datasets.rooms import RoomOptions, Rooms
+from su3d_bench.types import Float64Array, Frame
+
+Reading = Callable[[Float64Array], Float64Array]
+N_FRAMES = 45
+
+
+def inverse(pose: Float64Array) -> Float64Array:
+    return np.asarray(np.linalg.inv(pose), np.float64)
+
+
+@cache
+def walk(scene: str, noise: int) -> tuple[Frame, ...]:
+    options = RoomOptions(width=96, height=72, n_frames=1600, noise=noise)
+    frames = Rooms(Path("unused"), options).frames(scene, 10)
+    return tuple(frames[position] for position in range(N_FRAMES))
+
+
+def read_as(frames: Sequence[Frame], reading: Reading, depth_factor: float = 1.0) -> list[Frame]:
+    """The frames as they come out where poses and depth are misread."""
+    return [
+        replace(f, camera_to_world=reading(f.camera_to_world), depth_m=f.depth_m * np.float32(depth_factor))
+        for f in frames
+    ]
+
+
+@pytest.mark.parametrize(
+    ("scene", "noise"), [("living0", 0), ("living0", 2), ("bathroom0", 1), ("bathroom0", 2), ("kitchen1", 1)]
+)
+def test_a_right_reading_is_never_refused(scene: str, noise: int) -> None:
+    frames = walk(scene, noise)
+    for stride in (1, 4, 15):
+        assert check_convention(frames[::stride], "rooms/x") is None
+
+
+@pytest.mark.parametrize(("scene", "noise"), [("living0", 0), ("living0", 2), ("bathroom0", 2)])
+@pytest.mark.parametrize(
+    ("reading", "motion"),
+    [
+        (inverse, "inverse"),
+        (lambda pose: pose @ FLIP, "other axes"),
+        (lambda pose: inverse(pose @ FLIP), "inverse and other axes"),
+    ],
+    ids=["inverse", "axes", "both"],
+)
+def test_a_wrong_reading_of_the_poses_is_named(scene: str, noise: int, reading: Reading, motion: str) -> None:
+    finding = judge_convention(read_as(walk(scene, noise), reading))
+    assert finding is not None
+    assert (finding.motion, finding.depth_factor) == (motion, 1.0)
+    assert finding.share_otherwise > finding.share_as_read + 0.2
+
+
+@pytest.mark.parametrize("factor", [0.001, 0.1, 0.125, 0.2, 5.0, 8.0, 10.0, 1000.0])
+def test_a_wrong_unit_of_depth_is_named(factor: float) -> None:
+    finding = judge_convention(read_as(walk("living0", 2), lambda pose: pose, factor))
+    assert finding is not None and finding.motion == "as read"
+    if factor < 1:  # too large a depth makes every motion small, and more than one smaller unit agrees
+        assert finding.depth_factor == pytest.approx(1 / factor)
+    else:
+        assert finding.depth_factor < 1
+
+
+def test_the_line_says_which_reading_agrees_and_both_shares() -> None:
+    line = check_convention(read_as(walk("living0", 0), inverse), "rgbd/desk")
+    assert line is not None and line.startswith("rgbd/desk: poses and depth contradict each other: ")
+    assert line.endswith("% with the inverse poses; check whether they are camera-to-world or world-to-camera")
+    assert check_convention(read_as(walk("living0", 0), lambda pose: pose, 0.1), "a/b").endswith(  # type: ignore[union-attr]
+        "with depth times 10; check the unit of the depth"
+    )
+
+
+@pytest.mark.parametrize("reading", [lambda pose: pose, inverse, lambda pose: pose @ FLIP])
+def test_a_camera_that_does_not_move_tells_nothing(reading: Reading) -> None:
+    frame = walk("living0", 2)[0]
+    still = [replace(frame, index=index) for index in range(10)]
+    assert check_convention(read_as(still, reading), "a/b") is None
+
+
+def test_no_frame_one_frame_and_frames_without_depth_tell_nothing() -> None:
+    frames = walk("living0", 0)
+    assert check_convention([], "a/b") is None
+    assert check_convention(frames[:1], "a/b") is None
+    assert check_convention(read_as(frames, inverse, 0.0), "a/b") is None
+
+
+def test_frames_that_share_no_view_tell_nothing() -> None:
+    frames = walk("living0", 0)
+    turned = replace(frames[1], camera_to_world=frames[1].camera_to_world @ np.diag([-1.0, 1.0, -1.0, 1.0]))
+    assert judge_convention([frames[0], turned]) is None
+
+
+def test_what_to_change_in_a_description_depends_on_its_axes() -> None:
+    """A description with OpenGL's axes and the wrong direction gives frames that differ by F T^-1 F from the truth."""
+    frames = walk("living0", 0)
+    as_described = judge_convention(read_as(frames, lambda pose: FLIP @ inverse(pose) @ FLIP))
+    assert as_described is not None and as_described.changes("opengl") == ("pose_direction",)
+    as_described = judge_convention(read_as(frames, inverse))
+    assert as_described is not None and as_described.changes("opencv") == ("pose_direction",)
+    as_described = judge_convention(read_as(frames, lambda pose: inverse(pose) @ FLIP))
+    assert as_described is not None and as_described.changes("opengl") == ("pose_direction", "camera_axes")

@@ -1,0 +1,625 @@
+"""Predictions that bring their own points: what the programs write comes back, and hostile files do nothing."""
+
+from __future__ import annotations
+
+import gzip
+import os
+import pickle
+import struct
+import sys
+import tracemalloc
+from collections.abc import Callable
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from damage import damages, outcomes, truncations
+from prediction_files import TorchFile, refused
+
+from su3d_bench.datasets.pcd import write_pcd_points
+from su3d_bench.datasets.ply import PlyElement, write_ply
+from su3d_bench.errors import PredictionError
+from su3d_bench.predictions import gradslam, pickles
+from su3d_bench.predictions.base import ScenePrediction
+from su3d_bench.predictions.formats import READERS, recognise
+from su3d_bench.predictions.pickle_constructors import CONSTRUCTORS
+from su3d_bench.types import DenseFeatures, Instances, Partition
+
+RNG = np.random.default_rng(0)
+NAMES = ["couch", "lamp", "wall"]
+
+
+# ---- what the programs write
+
+
+def an_object(n_points: int, class_ids: list[int], **more: Any) -> dict[str, Any]:
+    """An object of ConceptGraphs with every key that its map has."""
+    n = len(class_ids)
+    return {
+        "image_idx": list(range(n)),
+        "mask_idx": list(range(n)),
+        "color_path": [f"/home/author/Replica/room0/results/frame{k:06d}.jpg" for k in range(n)],
+        "class_name": [NAMES[one % 3] for one in class_ids],
+        "class_id": list(class_ids),
+        "num_detections": n,
+        "mask": [RNG.random((60, 80)) < 0.5 for _ in range(n)],
+        "xyxy": [RNG.random(4) for _ in range(n)],
+        "conf": [np.float32(0.5)] * n,
+        "n_points": [n_points] * n,
+        "pixel_area": [np.int64(7)] * n,
+        "contain_number": [None] * n,
+        "inst_color": RNG.random(3),
+        "is_background": False,
+        "clip_ft": (lambda f: f / np.linalg.norm(f))(RNG.normal(size=16)).astype(np.float32),
+        "text_ft": np.ones(16, np.float32),
+        "pcd_np": RNG.normal(size=(n_points, 3)),
+        "bbox_np": RNG.normal(size=(8, 3)),
+        "pcd_color_np": RNG.random((n_points, 3)),
+        **more,
+    }
+
+
+def settings(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Settings as ConceptGraphs stores them: an object of omegaconf's class, with a path in it."""
+    module = ModuleType("omegaconf.dictconfig")
+
+    class DictConfig:
+        pass
+
+    DictConfig.__module__, DictConfig.__qualname__ = module.__name__, "DictConfig"
+    module.DictConfig = DictConfig  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "omegaconf", ModuleType("omegaconf"))
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    made = DictConfig()
+    vars(made).update(_content={"dataset_root": Path("/data/Replica"), "stride": 5}, _parent=None, ref_type=dict)
+    return made
+
+
+def a_map(**more: Any) -> dict[str, Any]:
+    objects = [an_object(5, [0, 1, 0]), an_object(0, [1]), an_object(3, [1, 0])]
+    background = [an_object(4, [2], is_background=True)]
+    colours = {str(k): [0.1, 0.2, 0.3] for k in range(3)}
+    return {"objects": objects, "bg_objects": background, "class_names": NAMES, "class_colors": colours, **more}
+
+
+def write_map(path: Path, value: object, protocol: int = 4) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with gzip.open(path, "wb", compresslevel=1) as stream:
+        pickle.dump(value, stream, protocol)
+    return path
+
+
+def write_h5(path: Path, values: Any, **options: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(path, "w") as file:
+        file.create_dataset(path.stem, data=values, **options)
+
+
+def write_gradslam(folder: Path, points: Any, embeddings: Any, **options: Any) -> None:
+    for name, values in {"points": points, "embeddings": embeddings, "colors": points, "confidences": points}.items():
+        write_h5(folder / f"pc_{name}.h5", values, **options)
+
+
+def write_tensor(path: Path, values: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    file = TorchFile()
+    file.write(path, file.tensor(values))
+
+
+def write_object(path: Path, points: Any) -> None:
+    """A cloud as Open3D writes it: doubles, and colours behind them."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    columns = {axis: np.asarray(points)[:, k].astype(np.float64) for k, axis in enumerate("xyz")}
+    colours = {name: np.full(len(points), 7, np.uint8) for name in ("red", "green", "blue")}
+    write_ply(path, [PlyElement("vertex", len(points), {**columns, **colours})], comments=["Created by Open3D"])
+
+
+def write_hovsg(folder: Path, clouds: dict[int, Any], features: Any) -> None:
+    for number, cloud in clouds.items():
+        write_object(folder / f"objects/pcd_{number}.ply", cloud)
+    (folder / "objects").mkdir(parents=True, exist_ok=True)
+    write_tensor(folder / "mask_feats.pt", features)
+
+
+def write_openlex(folder: Path, points: Any, index: Any, features: Any, cloud: str = "point_cloud.pcd") -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    if cloud.endswith(".pcd"):
+        write_pcd_points(folder / cloud, np.asarray(points, np.float32))
+    else:
+        write_object(folder / cloud, points)
+    np.save(folder / "index.npy", index)
+    np.save(folder / "embeddings.npy", features)
+
+
+def write_small(folder: Path, format: str) -> Path:
+    """The scene room0 in ``format``, small; the folder that holds the scene's folder."""
+    scene = folder / "room0"
+    points = RNG.normal(size=(6, 3)).astype(np.float32)
+    if format == "conceptgraphs":
+        write_map(scene / "pcd_saves/full_pcd_none_x.pkl.gz", a_map())
+    elif format == "gradslam":
+        write_gradslam(scene / "saved-map/pointclouds", points, RNG.normal(size=(6, 8)).astype(np.float16))
+    elif format == "hovsg":
+        write_hovsg(scene, {0: points[:4], 1: points[4:]}, RNG.normal(size=(2, 8)).astype(np.float32))
+    else:
+        write_openlex(scene, points, np.array([0, 0, 1, 1, 0, 1]), RNG.normal(size=(2, 8)))
+    return folder
+
+
+FORMATS = ("conceptgraphs", "gradslam", "hovsg", "openlex3d")
+
+
+def read(path: Path, scene: str = "room0", format: str | None = None) -> ScenePrediction:
+    return recognise(path, format).read(path, scene)
+
+
+def instances(prediction: ScenePrediction) -> Instances:
+    assert isinstance(prediction.content, Instances)
+    return prediction.content
+
+
+# ---- every format
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_each_is_known_as_itself_alone_at_every_level(tmp_path: Path, format: str) -> None:
+    folder = write_small(tmp_path, format)
+    for path in (folder, folder / "room0"):
+        assert [name for name in READERS if READERS[name].recognise(path) is not None] == [format]
+        assert list(READERS[format].scenes(path)) == ["room0"]
+        prediction = read(path)
+        assert (prediction.scene, prediction.format) == ("room0", format)
+        assert all(remark == remark.strip() and "\n" not in remark for remark in prediction.remarks)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_a_scene_that_is_not_there_is_one_line(tmp_path: Path, format: str) -> None:
+    folder = write_small(tmp_path, format)
+    assert "of scene 'room9'" in refused(folder, "room9", format)
+    assert READERS[format].recognise(tmp_path / "nothing") is None
+    assert "of scene 'x'" in refused(tmp_path / "nothing", "x", format)
+
+
+# ---- ConceptGraphs
+
+
+@pytest.mark.parametrize("protocol", range(2, 6))  # ConceptGraphs writes 4; before 2 objects were written otherwise
+def test_a_map_comes_back_object_by_object(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, protocol: int) -> None:
+    value = a_map(cfg=settings(monkeypatch))
+    write_map(tmp_path / "room0/pcd_saves/full_pcd_none_x.pkl.gz", value, protocol)
+    prediction = read(tmp_path)
+    found = instances(prediction)
+    assert len(found) == 3 and found.labels is None
+    for k, one in enumerate(value["objects"]):
+        np.testing.assert_array_equal(found.points[found.mask(k)], one["pcd_np"].astype(np.float32))
+    np.testing.assert_array_equal(found.features, np.stack([one["clip_ft"] for one in value["objects"]]))
+    assert found.scores.tolist() == [1, 1, 1]
+    assert found.names == ("couch", "lamp", "couch")  # the lowest of equals
+    np.testing.assert_array_equal(found.boxes[0, 1], value["objects"][0]["pcd_np"].astype(np.float32).max(axis=0))
+    assert not found.boxes[1].any() and not found.centroids[1].any()
+    assert any("1 for every object" in remark for remark in prediction.remarks)
+    assert any("1 background objects (wall, floor, ceiling) are left out" in remark for remark in prediction.remarks)
+
+
+def test_arrays_under_the_names_of_old_numpy_are_read(tmp_path: Path) -> None:
+    value = a_map(bg_objects=None)
+    content = pickle.dumps(value, 2).replace(b"numpy._core.", b"numpy.core.")
+    assert b"numpy.core.multiarray" in content
+    path = tmp_path / "full_pcd_x.pkl.gz"
+    path.write_bytes(gzip.compress(content))
+    found = instances(read(path, "full_pcd_x"))
+    np.testing.assert_array_equal(found.points[:5], value["objects"][0]["pcd_np"].astype(np.float32))
+
+
+def test_the_class_agnostic_variant_calls_everything_item(tmp_path: Path) -> None:
+    one = an_object(3, [0], class_name=["item"])
+    path = write_map(tmp_path / "full_pcd_none_x.pkl.gz", a_map(objects=[one], bg_objects=None, class_names=["item"]))
+    prediction = read(path, "full_pcd_none_x")
+    assert instances(prediction).names == ("item",)
+    assert len(prediction.remarks) == 1
+
+
+def test_the_streamlined_variant_is_read(tmp_path: Path) -> None:
+    one = an_object(3, [1, 1], class_name="lamp", consolidated_caption="a lamp\non a desk", captions=["x"], id="u-1")
+    del one["text_ft"], one["class_id"]
+    value = {"objects": [one], "cfg": {"stride": 10}, "class_names": NAMES, "class_colors": {}, "edges": [(0, 1, "on")]}
+    write_map(tmp_path / "room0/exps/rerun/pcd_rerun.pkl.gz", value)
+    for path in (tmp_path, tmp_path / "room0", tmp_path / "room0/exps", tmp_path / "room0/exps/rerun/pcd_rerun.pkl.gz"):
+        found = instances(read(path))
+        assert (found.names, found.captions) == (("lamp",), ("a lamp on a desk",))
+    write_map(tmp_path / "room0/exps/again/pcd_again.pkl.gz", value)
+    message = refused(tmp_path, "room0", "conceptgraphs")
+    assert "both of scene 'room0'" in message and "exps/again" in message and "exps/rerun" in message
+
+
+def test_without_features_the_names_of_the_detections_are_the_classes(tmp_path: Path) -> None:
+    objects = [an_object(3, [1]), an_object(2, [0])]
+    for one in objects:
+        del one["clip_ft"]
+    prediction = read(write_map(tmp_path / "pcd_x.pkl.gz", {"objects": objects, "class_names": NAMES}), "pcd_x")
+    found = instances(prediction)
+    assert found.features is None and found.labels == ("lamp", "couch")
+    assert any("the names of their detections decide" in remark for remark in prediction.remarks)
+
+
+def test_of_a_pair_of_maps_the_one_after_the_last_merging_is_read(tmp_path: Path) -> None:
+    folder = tmp_path / "room0/pcd_saves"
+    write_map(folder / "full_pcd_a.pkl.gz", a_map())
+    write_map(folder / "full_pcd_a_post.pkl.gz", a_map(objects=[an_object(2, [0])]))
+    prediction = read(tmp_path)
+    assert len(instances(prediction)) == 1 and prediction.path.name == "full_pcd_a_post.pkl.gz"
+    assert any("'full_pcd_a_post.pkl.gz' is read" in remark for remark in prediction.remarks)
+    assert len(instances(read(folder / "full_pcd_a.pkl.gz"))) == 3
+    write_map(folder / "full_pcd_a_post2.pkl.gz", a_map())
+    message = refused(tmp_path, "room0", "conceptgraphs")
+    assert "holds 3 maps (full_pcd_a.pkl.gz, full_pcd_a_post.pkl.gz, full_pcd_a_post2.pkl.gz)" in message
+
+
+def test_masks_of_the_views_are_not_kept(tmp_path: Path) -> None:
+    one = an_object(3, [0] * 8, mask=[np.ones((680, 1200), bool)] * 4 + [RNG.random((680, 1200)) < 0.5] * 4)
+    path = write_map(tmp_path / "pcd_x.pkl.gz", {"objects": [one]})
+    tracemalloc.start()
+    try:
+        read(path, "pcd_x")
+        assert tracemalloc.get_traced_memory()[1] < 4 << 20  # 8 masks have 6.5 MB
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ([1, 2], "holds a list without a list of 'objects'"),
+        ({"objects": None}, "without a list of 'objects'"),
+        ({"objects": [5]}, "object 0: is 5 without 'pcd_np'"),
+        ({"objects": [{"pcd_np": np.zeros((3, 2))}]}, "object 0: the points are an array of shape (3, 2) float64"),
+        ({"objects": [{"pcd_np": np.zeros(3)}]}, "expected three coordinates a point"),
+        ({"objects": [{"pcd_np": np.array([[0, 0, 0], [0, np.nan, 0]])}]}, "object 0: point 1 is at [0.0, nan, 0.0]"),
+        ({"objects": [{"pcd_np": np.full((1, 3), -np.inf)}]}, "point 0 is at [-inf, -inf, -inf]"),
+        ({"objects": [{"pcd_np": np.full((1, 3), 1e300)}]}, "point 0 is at [1e+300, 1e+300, 1e+300]"),
+        ({"objects": [an_object(1, [0], clip_ft=np.ones((2, 2)))]}, "object 0: 'clip_ft' is an array of shape (2, 2)"),
+        ({"objects": [an_object(1, [0]), an_object(1, [0], clip_ft=None)]}, "object 1: 'clip_ft' is a NoneType"),
+        (
+            {"objects": [an_object(1, [0]), an_object(1, [0], clip_ft=np.ones(3))]},
+            "object 1: 'clip_ft' is an array of shape (3,) float64; expected a list of 16 numbers",
+        ),
+        ({"objects": [an_object(1, [0], clip_ft=np.ones(0))]}, "'clip_ft' is an array of shape (0,)"),
+        ({"objects": [], "bg_objects": 5}, "'bg_objects' is 5; expected a list"),
+    ],
+)
+def test_each_fault_of_a_map_is_one_line(tmp_path: Path, value: object, message: str) -> None:
+    path = write_map(tmp_path / "pcd_x.pkl.gz", value)
+    text = refused(path, "pcd_x", "conceptgraphs")
+    assert text.startswith(f"{path}: ") and message in text
+
+
+def test_features_with_nan_are_none_and_odd_names_are_shown_plainly(tmp_path: Path) -> None:
+    objects = [an_object(2, [], clip_ft=np.full(4, np.nan), class_name="\x1b[31mred\n" * 50)]
+    objects += [an_object(2, [7, -1], clip_ft=np.ones(4), class_name=5), an_object(1, [1], clip_ft=np.full(4, 1e300))]
+    prediction = read(write_map(tmp_path / "pcd_x.pkl.gz", {"objects": objects, "class_names": ["a", 5]}), "pcd_x")
+    found = instances(prediction)
+    assert found.features is not None and found.features.any(axis=1).tolist() == [False, True, False]
+    assert any("2 objects have no feature" in remark for remark in prediction.remarks)
+    assert all(name.isprintable() and len(name) <= 80 for name in found.names)
+    assert found.names[1:] == ("item", "lamp")
+
+
+class Bomb:
+    """What a hostile map holds: a call, hidden in an object's state."""
+
+    def __init__(self, function: Any, *args: Any) -> None:
+        self.call = function, args
+
+    def __reduce__(self) -> Any:
+        return self.call
+
+
+def fire(*_: object) -> None:
+    raise AssertionError("the pickle ran code")
+
+
+CALLS: list[tuple[Any, ...]] = [
+    (os.system, "touch {}"),
+    (eval, "open('{}', 'w')"),
+    (exec, "open('{}', 'w')"),
+    (getattr, os, "system"),
+    (__import__, "os"),
+    (open, "{}", "w"),
+    (fire,),
+    (np.load, "{}"),
+    (np.fromfile, "{}"),
+    (pickle.loads, b"."),
+    (map, fire, [1]),
+    (type, "x", (), {}),
+]
+
+
+@pytest.mark.parametrize("protocol", [0, 2, 5])
+@pytest.mark.parametrize("place", ["cfg", "mask", "pcd_np", "class_names", "edges"])
+@pytest.mark.parametrize("call", CALLS, ids=lambda call: getattr(call[0], "__name__", "call"))
+def test_no_call_in_a_map_is_made(tmp_path: Path, call: tuple[Any, ...], place: str, protocol: int) -> None:
+    proof = tmp_path / "proof"
+    args = [one.format(proof) if isinstance(one, str) else one for one in call[1:]]
+    if os in args:
+        args = ["os", "system"]  # modules cannot be pickled
+    value = a_map()
+    holder = value if place in {"cfg", "class_names", "edges"} else value["objects"][0]
+    holder[place] = Bomb(call[0], *args)
+    path = write_map(tmp_path / "pcd_x.pkl.gz", value, protocol)
+    assert "no plain data" in refused(path, "pcd_x", "conceptgraphs")
+    assert not proof.exists()
+
+
+@pytest.mark.parametrize("name", sorted(CONSTRUCTORS), ids=".".join)
+def test_no_name_that_may_stand_in_a_map_makes_or_does_anything(tmp_path: Path, name: tuple[str, str]) -> None:
+    """Each allowed name called with paths, commands and shapes, through every way in which a pickle can call."""
+    proof = tmp_path / "proof"
+    module, attribute = (part.encode() for part in name)
+    reached = b"c" + module + b"\n" + attribute + b"\n"
+    command = pickle.dumps(f"touch {proof}", 2)[2:-1]
+    hostile = [
+        b"(" + command + b"tR",
+        b"(" + command + b"t\x81",
+        b"(" + command + command + b"tR" + b"}" + command + command + b"sb",
+        b")R(" + command * 4 + b"tb",
+        b"(" + reached + command + b"tR",
+        b"(c"
+        + b"numpy\nndarray\n"
+        + b"(K\x00t"
+        + command
+        + b"tR(K\x01(\x8a\x08"
+        + b"\xff" * 7
+        + b"\x3ftcnumpy\ndtype\n"
+        + command
+        + b"\x85R\x89"
+        + command
+        + b"tb",
+    ]
+    for ending in hostile:
+        content = b"\x80\x02}X\x07\x00\x00\x00objects" + reached + ending + b"s."
+        path = tmp_path / "pcd_x.pkl.gz"
+        path.write_bytes(gzip.compress(content))
+        with pytest.raises(PredictionError, match=r"pcd_x\.pkl\.gz"):
+            READERS["conceptgraphs"].read(path, "pcd_x")
+        assert not proof.exists()
+
+
+def test_chains_of_calls_and_built_objects_end_the_reading(tmp_path: Path) -> None:
+    chain: Any = Bomb(os.getcwd)
+    for _ in range(50):
+        chain = Bomb(list, [chain])
+    path = write_map(tmp_path / "pcd_x.pkl.gz", {"objects": chain})
+    refused(path, "pcd_x", "conceptgraphs")
+    nested: Any = []
+    for _ in range(400):
+        nested = [nested]
+    path = write_map(tmp_path / "pcd_x.pkl.gz", {"objects": nested})
+    assert "object 0: is a list without 'pcd_np'" in refused(path, "pcd_x", "conceptgraphs")
+
+
+def test_a_stream_that_inflates_without_end_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pickles, "MOST_INFLATED", 8 << 20)
+    n = 64 << 20
+    content = b"\x80\x04}\x8c\x07objects]\x8c\x04mask]\x8e" + struct.pack("<Q", n) + bytes(n) + b"aes."
+    path = tmp_path / "pcd_x.pkl.gz"
+    path.write_bytes(gzip.compress(content, 9))
+    assert path.stat().st_size < 100_000
+    tracemalloc.start()
+    try:
+        assert "promises" in refused(path, "pcd_x", "conceptgraphs")
+        path.write_bytes(gzip.compress(b"\x80\x04" + b"N0" * (16 << 20) + b".", 9))
+        refused(path, "pcd_x", "conceptgraphs")
+        assert tracemalloc.get_traced_memory()[1] < 200 << 20
+    finally:
+        tracemalloc.stop()
+
+
+# ---- gradslam
+
+
+@pytest.mark.parametrize("options", [{}, {"compression": "gzip", "shuffle": True}])
+@pytest.mark.parametrize("kind", [np.float16, np.float32])
+def test_a_dense_map_comes_back(tmp_path: Path, kind: Any, options: dict[str, Any]) -> None:
+    points, features = RNG.normal(size=(50, 3)).astype(np.float32), RNG.normal(size=(50, 8)).astype(kind)
+    features[[3, 7]] = 0
+    write_gradslam(tmp_path / "room0/saved-map/pointclouds", points, features, **options)
+    prediction = read(tmp_path)
+    assert isinstance(prediction.content, DenseFeatures)
+    np.testing.assert_array_equal(prediction.content.points, points)
+    np.testing.assert_array_equal(prediction.content.features, features.astype(np.float16))
+    assert any("2 of 50 points have no feature" in remark for remark in prediction.remarks)
+    assert any("first camera" in remark and "first_pose.txt" in remark for remark in prediction.remarks)
+
+
+def test_the_first_pose_beside_the_points_brings_them_to_the_world(tmp_path: Path) -> None:
+    write_gradslam(tmp_path / "room0", np.array([[1, 2, 3]], np.float32), np.ones((1, 4), np.float16))
+    pose = np.array([[0, -1, 0, 10], [1, 0, 0, 20], [0, 0, 1, 30], [0, 0, 0, 1]], float)
+    (tmp_path / "room0/traj.txt").write_text(" ".join(map(repr, pose.reshape(-1).tolist())) + "\nnext pose\n")
+    prediction = read(tmp_path)
+    assert prediction.content.points.tolist() == [[8, 21, 33]]  # type: ignore[union-attr]
+    assert prediction.remarks == ("points were brought to the world with the first pose of traj.txt",)
+    (tmp_path / "room0/first_pose.txt").write_text("1 2 3\n")
+    assert "first_pose.txt line 1 has 3 values; expected 16" in refused(tmp_path, "room0", "gradslam")
+
+
+def test_large_tables_are_mapped_and_not_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(gradslam, "HELD_IN_MEMORY", 1 << 20)
+    n, d = 40_000, 256  # 20 MB of float16
+    features = RNG.random((n, d), np.float32)
+    write_gradslam(tmp_path / "room0", np.zeros((n, 3), np.float32), features)
+    content = read(tmp_path).content
+    assert isinstance(content, DenseFeatures) and isinstance(content.features, np.memmap)
+    np.testing.assert_array_equal(content.features, features.astype(np.float16))
+
+
+def test_rows_that_float16_cannot_hold_have_no_feature(tmp_path: Path) -> None:
+    features = np.ones((4, 2), np.float32)
+    features[0, 0], features[1, 1], features[2, 0] = np.nan, np.inf, 1e6
+    write_gradslam(tmp_path / "room0", np.zeros((4, 3), np.float32), features)
+    prediction = read(tmp_path)
+    assert prediction.content.features.tolist() == [[0, 0], [0, 0], [0, 0], [1, 1]]  # type: ignore[union-attr]
+    assert any("3 of 4 points have no feature" in remark for remark in prediction.remarks)
+
+
+@pytest.mark.parametrize(
+    ("points", "features", "message"),
+    [
+        (np.full((4, 3), np.nan), np.ones((4, 2)), "pc_points.h5: point 0 is at [nan, nan, nan]"),
+        (np.zeros((4, 2)), np.ones((4, 2)), "pc_points.h5: has the shape (4, 2); expected (N, 3)"),
+        (np.zeros((4, 3)), np.ones((5, 2)), "pc_embeddings.h5: has other rows than pc_points.h5, which has 4"),
+        (np.zeros((4, 3)), np.ones((3, 2)), "pc_embeddings.h5: has other rows"),
+        (np.zeros((4, 3)), np.ones(4), "pc_embeddings.h5: has the shape (4,); expected (N, D)"),
+        (np.zeros((4, 3)), np.ones((4, 0)), "expected (N, D)"),
+        (np.zeros((4, 3)), np.ones((4, 2), int), "pc_embeddings.h5: holds values of type int64"),
+    ],
+)
+def test_each_fault_of_a_dense_map_is_one_line(tmp_path: Path, points: Any, features: Any, message: str) -> None:
+    write_gradslam(tmp_path / "room0", points, features)
+    assert message in refused(tmp_path, "room0", "gradslam")
+
+
+# ---- HOV-SG
+
+
+def test_objects_come_back_with_the_row_of_their_number(tmp_path: Path) -> None:
+    clouds = {k: RNG.normal(size=(k % 3 + 1, 3)) for k in range(12)}
+    features = RNG.normal(size=(12, 8))  # as HOV-SG saves them: doubles
+    write_hovsg(tmp_path / "room0", clouds, features)
+    found = instances(read(tmp_path))
+    assert found.ids.tolist() == list(range(12))  # 10 and 11 are not sorted as texts
+    np.testing.assert_array_equal(found.features, features.astype(np.float32))
+    for k, cloud in clouds.items():
+        np.testing.assert_array_equal(found.points[found.mask(k)], cloud.astype(np.float32))
+
+
+def test_missing_numbers_leave_their_rows_out_and_lose_no_object(tmp_path: Path) -> None:
+    features = RNG.normal(size=(6, 4)).astype(np.float16)
+    write_hovsg(tmp_path / "room0", {k: np.full((1, 3), k) for k in (0, 2, 5)}, features)
+    write_pcd_points(tmp_path / "room0/objects/pcd_3.pcd", np.full((2, 3), 3, np.float32))
+    (tmp_path / "room0/objects/pcd_04.ply").write_text("not counted")
+    prediction = read(tmp_path)
+    found = instances(prediction)
+    assert found.ids.tolist() == [0, 2, 3, 5] and found.centroids[:, 0].tolist() == [0, 2, 3, 5]
+    np.testing.assert_array_equal(found.features, features[[0, 2, 3, 5]].astype(np.float32))
+    assert "2 rows of mask_feats.pt have no object file and are not used (1, 4)" in prediction.remarks
+    assert "the original's loader would not read the last 1 objects (5)" in prediction.remarks
+
+
+def test_each_fault_of_a_hovsg_map_is_one_line(tmp_path: Path) -> None:
+    scene = tmp_path / "room0"
+    write_hovsg(scene, {0: np.zeros((2, 3)), 4: np.zeros((1, 3))}, np.ones((3, 4), np.float32))
+    assert "pcd_4.ply: object 4 has no feature, mask_feats.pt has 3 rows" in refused(tmp_path, "room0", "hovsg")
+    (scene / "objects/pcd_4.ply").unlink()
+    write_pcd_points(scene / "objects/pcd_0.pcd", np.zeros((1, 3), np.float32))
+    assert "object 0 is there as .ply and .pcd" in refused(tmp_path, "room0", "hovsg")
+    (scene / "objects/pcd_0.pcd").unlink()
+    write_object(scene / "objects/pcd_0.ply", [[0, 0, np.inf]])
+    assert "pcd_0.ply: point 0 is at [0.0, 0.0, inf]" in refused(tmp_path, "room0", "hovsg")
+    write_ply(scene / "objects/pcd_0.ply", [PlyElement("vertex", 1, {"x": np.zeros(1), "y": np.zeros(1)})])
+    assert "pcd_0.ply: its vertices have no x, y and z" in refused(tmp_path, "room0", "hovsg")
+    write_tensor(scene / "mask_feats.pt", np.ones(3, np.float32))
+    assert "mask_feats.pt: holds an array of shape (3,)" in refused(tmp_path, "room0", "hovsg")
+
+
+# ---- OpenLex3D
+
+
+@pytest.mark.parametrize("cloud", ["point_cloud.pcd", "point_cloud.ply", "input.ply"])
+def test_the_three_files_come_back_as_a_partition(tmp_path: Path, cloud: str) -> None:
+    points, index, features = RNG.normal(size=(9, 3)).astype(np.float32), np.arange(9) % 3, RNG.normal(size=(4, 8))
+    write_openlex(tmp_path / "replica/room0", points, index, features, cloud)
+    prediction = read(tmp_path, "replica/room0")
+    assert isinstance(prediction.content, Partition) and prediction.remarks == ()
+    np.testing.assert_array_equal(prediction.content.points, points)
+    np.testing.assert_array_equal(prediction.content.instance, index)
+    np.testing.assert_array_equal(prediction.content.features, features.astype(np.float32))
+
+
+def test_of_several_clouds_the_one_that_the_original_reads_counts(tmp_path: Path) -> None:
+    write_openlex(tmp_path / "room0", np.zeros((2, 3)), np.zeros(2, int), np.zeros((1, 4)), "input.ply")
+    write_openlex(tmp_path / "room0", np.ones((2, 3)), np.zeros(2, int), np.zeros((1, 4)))
+    prediction = read(tmp_path)
+    assert prediction.content.points.all()  # type: ignore[union-attr]
+    assert prediction.remarks[0] == "point_cloud.pcd is read, as the original does, and not input.ply"
+    assert prediction.remarks[1] == "1 objects have no feature (a row of zeros or NaN)"
+
+
+@pytest.mark.parametrize(
+    ("index", "features", "message"),
+    [
+        (np.array([0, -1]), np.ones((2, 4)), "index.npy: point 1 is of object -1, embeddings.npy has 2 rows"),
+        (np.array([0, 2]), np.ones((2, 4)), "point 1 is of object 2"),
+        (np.array([0, 2**63], np.uint64), np.ones((2, 4)), "point 1 is of object 9223372036854775808"),
+        (np.array([0, 1, 1]), np.ones((2, 4)), "expected an integer for each of the 2 points of point_cloud.pcd"),
+        (np.array([[0, 1]]), np.ones((2, 4)), "holds an array of shape (1, 2) int64"),
+        (np.array([0.0, 1.0]), np.ones((2, 4)), "holds an array of shape (2,) float64"),
+        (np.array([0, 1]), np.ones(4), "embeddings.npy: holds an array of shape (4,)"),
+        (np.array([0, 1]), np.ones((2, 0)), "expected a row of features an object"),
+        (np.array([0, 1]), np.array([[{}]]), "embeddings.npy: holds pickled Python objects"),
+    ],
+)
+def test_each_fault_of_the_three_files_is_one_line(tmp_path: Path, index: Any, features: Any, message: str) -> None:
+    write_openlex(tmp_path / "room0", np.zeros((2, 3)), index, features)
+    assert message in refused(tmp_path, "room0", "openlex3d")
+
+
+def test_a_cloud_that_is_missing_or_not_finite_is_one_line(tmp_path: Path) -> None:
+    write_openlex(tmp_path / "room0", np.array([[0, 0, 0], [0, np.nan, 0]]), np.array([0, 0]), np.ones((1, 4)))
+    assert "point_cloud.pcd: point 1 is at [0.0, nan, 0.0]" in refused(tmp_path, "room0", "openlex3d")
+    (tmp_path / "room0/point_cloud.pcd").unlink()
+    assert "has no cloud; expected point_cloud.pcd, point_cloud.ply or input.ply" in refused(
+        tmp_path, "room0", "openlex3d"
+    )
+
+
+# ---- damage
+
+
+def damaged_files(folder: Path) -> list[Path]:
+    unread = {"pc_colors.h5", "pc_confidences.h5"}
+    return [file for file in sorted(folder.rglob("*")) if file.is_file() and file.name not in unread]
+
+
+def reading(folder: Path, format: str, file: Path) -> Callable[[bytes], object]:
+    def read_bytes(content: bytes) -> object:
+        file.write_bytes(content)
+        READERS[format].recognise(folder)
+        return READERS[format].read(folder, "room0")
+
+    return read_bytes
+
+
+# Files of HDF5 have kilobytes of header; every tenth of their ends is enough.
+@pytest.mark.parametrize("format", FORMATS)
+def test_cut_files_are_refused(tmp_path: Path, format: str) -> None:
+    folder = write_small(tmp_path, format)
+    for file in damaged_files(folder):
+        content = file.read_bytes()
+        step = max(1, len(content) // 400)
+        cuts = (one for k, one in enumerate(truncations(content)) if k % step == 0)
+        n_read, n_refused = outcomes(reading(folder, format, file), cuts, must_name="room0", refusal=PredictionError)
+        assert n_read == 0 and n_refused >= 100
+        file.write_bytes(content)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_damaged_files_are_read_or_refused_but_nothing_else(tmp_path: Path, format: str) -> None:
+    folder = write_small(tmp_path, format)
+    for file in damaged_files(folder):
+        content = file.read_bytes()
+        read_bytes = reading(folder, format, file)
+        n_read, n_refused = outcomes(read_bytes, damages(content), must_name="room0", refusal=PredictionError)
+        assert n_read + n_refused == 2000 and n_refused > 100
+        file.write_bytes(content)
+
+
+def test_damage_inside_the_gzip_is_read_or_refused_but_nothing_else(tmp_path: Path) -> None:
+    file = write_map(tmp_path / "room0/pcd_saves/full_pcd_x.pkl.gz", a_map(objects=[an_object(2, [0, 1], mask=[])]))
+    content = gzip.decompress(file.read_bytes())
+    read_bytes = reading(tmp_path, "conceptgraphs", file)
+    copies = (gzip.compress(one, 1) for one in damages(content))
+    n_read, n_refused = outcomes(read_bytes, copies, must_name="full_pcd_x.pkl.gz", refusal=PredictionError)
+    assert n_read + n_refused == 2000 and n_refused > 200

@@ -1,0 +1,345 @@
+"""What is wrong in predictions of other programs is one clear error, however they are damaged."""
+
+from __future__ import annotations
+
+import json
+import os
+import pickle
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from damage import damages, outcomes, truncations
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from prediction_files import (
+    FEATURES,
+    OURS,
+    TOY,
+    TorchFile,
+    own_instances,
+    refused,
+    torch_text,
+    write_openmask3d,
+    write_sam3d,
+    write_scannetpp_json,
+    written_in,
+)
+
+from su3d_bench.errors import PredictionError
+from su3d_bench.predictions.formats import READERS
+from su3d_bench.store import prediction_arrays, write_npz, write_prediction
+from su3d_bench.types import DenseFeatures, Partition
+
+# ---- what is wrong in a text list
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ("pred_mask/a.txt 5", ":1: 2 fields"),
+        ("pred_mask/a.txt  5 0.5", ":1: 4 fields"),
+        ("pred_mask/a.txt\t5\t0.5", ":1: 1 fields"),
+        ("", ":1: 1 fields"),
+        ("pred_mask/a.txt five 0.5", "'five' is no class id"),
+        ("pred_mask/a.txt nan 0.5", "'nan' is no class id"),
+        ("pred_mask/a.txt 1e300 0.5", "'1e300' is no class id"),
+        ("pred_mask/a.txt 5 nan", "confidence 'nan' is no finite number"),
+        ("pred_mask/a.txt 5 inf", "confidence 'inf' is no finite number"),
+        ("../a.txt 5 0.5", "'../a.txt' is no path inside the folder"),
+        ("pred_mask/../../a.txt 5 0.5", "is no path inside the folder"),
+        ("/etc/passwd 5 0.5", "'/etc/passwd' is no path inside the folder"),
+        (". 5 0.5", "is no path inside the folder"),
+        (" 5 0.5", "is no path inside the folder"),
+        ("a\0b 5 0.5", "is no path inside the folder"),
+        ("pred_mask 5 0.5", "is no file inside the folder"),
+        ("pred_mask/none.txt 5 0.5", "mask 'pred_mask/none.txt' does not exist"),
+        ("pred_mask/link.txt 5 0.5", "is no file inside the folder"),
+        ("links/a.txt 5 0.5", "is no file inside the folder"),
+        ("loop 5 0.5", "mask 'loop' cannot be read"),
+        ("\x1b[31m" + "x" * 9000 + " 5 0.5", "cannot be read"),
+        ("pred_mask/short.txt 5 0.5", "is of 2 points and 'pred_mask/a.txt' of 3;"),
+        ("pred_mask/word.txt 5 0.5", ":2: 'one' is not an integer"),
+        ("pred_mask/float.txt 5 0.5", ":1: '1.0' is not an integer"),
+        ("pred_mask/gap.txt 5 0.5", ":2: '' is not an integer"),
+        ("pred_mask/large.txt 5 0.5", ":1: '99999999999999999999999' is out of range"),
+        ("pred_mask/bad.json 5 0.5", "is not readable as JSON"),
+        ("pred_mask/deep.json 5 0.5", "is not readable as JSON"),
+        ("pred_mask/list.json 5 0.5", "has no 'length' and 'counts'"),
+        ("pred_mask/huge.json 5 0.5", "'length' is 1000000000000"),
+        ("pred_mask/beyond.json 5 0.5", "run of 3 points from 2 on, of 3 points"),
+    ],
+)
+def test_each_fault_of_a_list_is_one_line_with_its_place(tmp_path: Path, line: str, message: str) -> None:
+    folder = tmp_path / "predictions"
+    (folder / "pred_mask").mkdir(parents=True)
+    (tmp_path / "a.txt").write_text("1\n0\n1\n")
+    for name, content in {
+        "a.txt": "1\n0\n1\n",
+        "short.txt": "1\n0\n",
+        "word.txt": "1\none\n1\n",
+        "float.txt": "1.0\n0.0\n1.0\n",
+        "gap.txt": "1\n\n1\n",
+        "large.txt": "99999999999999999999999\n1\n1\n",
+        "bad.json": "{",
+        "deep.json": "[" * 200_000,
+        "list.json": "[1]",
+        "huge.json": json.dumps({"length": 10**12, "counts": "1 1000000000000"}),
+        "beyond.json": json.dumps({"length": 3, "counts": "2 3"}),
+    }.items():
+        (folder / "pred_mask" / name).write_text(content)
+    os.symlink(tmp_path / "a.txt", folder / "pred_mask/link.txt")
+    os.symlink(tmp_path, folder / "links")
+    os.symlink("loop", folder / "loop")
+    other = "pred_mask/a.txt 3 0.5\n" if "short" in line else ""
+    (folder / "scene.txt").write_text(f"{other}{line}\n")
+    text = refused(folder, "scene", "scannet-text")
+    assert text.startswith(f"{folder}/scene.txt") and message in text and "\x1b" not in text
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [("", "is empty"), ("3\nx\n", ":2: 'x' is not an integer"), ("1\n4294967296\n", ":2: 42949")],
+)
+def test_each_fault_of_labels_is_one_line(tmp_path: Path, content: str, message: str) -> None:
+    (tmp_path / "s.txt").write_text(content)
+    assert message in refused(tmp_path, "s", "scannet-semantic-text")
+
+
+# ---- wrong shapes and values in archives
+
+
+MASKS = TOY["masks"].T
+
+
+@pytest.mark.parametrize(
+    ("arrays", "message"),
+    [
+        ({"masks": MASKS}, "has no 'pred_masks'"),
+        ({"pred_masks": MASKS[:, 0]}, "expected a matrix of numbers"),
+        ({"pred_masks": MASKS.astype("U1")}, "expected a matrix of numbers"),
+        ({"pred_masks": np.full((4, 2), np.nan)}, "NaN or infinite"),
+        ({"pred_masks": MASKS, "pred_score": np.ones(4)}, "3 masks, but the scores are an array of shape (4,)"),
+        ({"pred_masks": MASKS, "pred_score": np.ones((3, 1))}, "3 masks, but the scores"),
+        ({"pred_masks": MASKS, "pred_score": np.array([1, np.nan, 1])}, "mask 'mask 1': the score is nan"),
+        ({"pred_masks": MASKS, "pred_classes": np.array([1, 2])}, "3 masks, but the classes"),
+        ({"pred_masks": MASKS, "pred_classes": np.array([1, 2.5, 3])}, "mask 1 has class 2.5"),
+        ({"pred_masks": MASKS, "pred_classes": np.array([1, 2, 1 << 40])}, "mask 2 has class 1099511627776"),
+        ({"pred_masks": np.zeros((0, 200_000), bool)}, "200000 masks of 0 points; is it damaged?"),
+    ],
+)
+def test_each_fault_of_an_archive_of_masks_is_one_line(tmp_path: Path, arrays: dict[str, Any], message: str) -> None:
+    np.savez(tmp_path / "s.npz", **arrays)
+    text = refused(tmp_path, "s", "maskclustering")
+    assert text.startswith(f"{tmp_path}/s.npz") and message in text
+
+
+def pickled(kind: str) -> bytes:
+    """The inside of a torch file that is well formed and no prediction."""
+    file = TorchFile()
+    two_runs = b"](}(" + torch_text("length") + b"K\x09" + torch_text("counts")
+    wrong = {
+        "number": b"K\x05",
+        "empty dict": b"}",
+        "ins number": b"}" + torch_text("ins") + b"K\x05s",
+        "ins of numbers": b"}" + torch_text("ins") + b"](K\x01es",
+        "odd runs": b"}" + torch_text("ins") + two_runs + torch_text("1 2 3") + b"ues",
+        "words": b"}" + torch_text("ins") + two_runs + torch_text("one 2") + b"ues",
+        "from zero": b"}" + torch_text("ins") + two_runs + torch_text("0 2") + b"ues",
+        "beyond": b"}" + torch_text("ins") + two_runs + torch_text("8 3") + b"ues",
+        "overlap": b"}" + torch_text("ins") + two_runs + torch_text("1 3 3 1") + b"ues",
+        "huge": b"}" + torch_text("ins") + two_runs + torch_text("1 999999999999999999999999") + b"ues",
+        "pair": b"K\x01K\x02\x86",
+        "many": b"(" + b"N" * 5 + b"t",
+        "text": torch_text("x"),
+    }
+    del file
+    return wrong[kind]
+
+
+@pytest.mark.parametrize(
+    ("format", "kind", "message"),
+    [
+        ("open3dis", "number", "without 'ins'"),
+        ("open3dis", "empty dict", "without 'ins'"),
+        ("open3dis", "ins number", "'ins' is 5"),
+        ("open3dis", "ins of numbers", "mask 0 is 1"),
+        ("open3dis", "odd runs", "expected pairs of start and length"),
+        ("open3dis", "words", "the runs are no numbers"),
+        ("open3dis", "from zero", "run of 2 points from 0 on"),
+        ("open3dis", "beyond", "run of 3 points from 8 on, of 9 points"),
+        ("open3dis", "overlap", "run of 1 points from 3 on"),
+        ("open3dis", "huge", "the runs are no numbers"),
+        ("openyolo3d", "pair", "the masks are 1; expected a matrix"),
+        ("openyolo3d", "many", "holds a tuple; expected a pair"),
+        ("openins3d", "text", "expected a sparse tensor"),
+        ("openmask3d", "text", "the masks are a str; expected a matrix"),
+        ("sam3d", "text", "expected one group number a point"),
+    ],
+)
+def test_each_fault_of_a_torch_file_is_one_line(tmp_path: Path, format: str, kind: str, message: str) -> None:
+    suffix = ".pth" if format in {"open3dis", "sam3d"} else ".pt"
+    TorchFile().write(tmp_path / f"s{suffix}", pickled(kind))
+    text = refused(tmp_path, "s", format)
+    assert text.startswith(f"{tmp_path}/s{suffix}") and message in text
+
+
+def test_wrong_shapes_in_torch_files_are_refused(tmp_path: Path) -> None:
+    file = TorchFile()
+    file.write(tmp_path / "a.pt", file.tensor(MASKS) + file.tensor(np.ones(4, np.float32)) + b"\x86")
+    assert "3 masks, but the scores are an array of shape (4,)" in refused(tmp_path, "a", "openyolo3d")
+    file = TorchFile()
+    inside = b"}(" + torch_text("ins") + file.tensor(MASKS) + torch_text("conf") + file.tensor(np.ones(7)) + b"u"
+    file.write(tmp_path / "b.pth", inside)
+    assert "but there are 7 scores or classes" in refused(tmp_path, "b", "open3dis")
+    write_openmask3d(tmp_path, TOY, FEATURES[:2])
+    assert "3 masks, but the features are an array of shape (2, 768)" in refused(tmp_path, TOY["name"], "openmask3d")
+    write_sam3d(tmp_path, "c", np.zeros((2, 2), np.int64))
+    assert "expected one group number a point" in refused(tmp_path, "c", "sam3d")
+    np.save(tmp_path / "d.npy", np.zeros(4))
+    assert "expected one group number a point" in refused(tmp_path, "d", "sam3d")
+    wide = TorchFile()
+    layout = b"ctorch.serialization\n_get_layout\n" + torch_text("torch.sparse_coo") + b"\x85R"
+    parts = wide.tensor(np.zeros((2, 0), np.int64)) + wide.tensor(np.zeros(0, np.float32))
+    shape = b"(K\x05\x8a\x08" + (10**12).to_bytes(8, "little") + b"t"
+    wide.write(
+        tmp_path / "e.pt", b"ctorch._utils\n_rebuild_sparse_tensor\n" + layout + b"(" + parts + shape + b"\x88t\x86R"
+    )
+    assert "1000000000000 masks of 5 points" in refused(tmp_path, "e", "openins3d")
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"kind": np.array("Picture")}, "holds no 'kind' out of"),
+        ({"kind": np.array(3)}, "'kind' is an array"),
+        ({"points": np.zeros((6, 2), np.float32)}, "expected three coordinates"),
+        ({"points": np.zeros(6, np.float32)}, "'points' is an array of shape (6,)"),
+        ({"points": np.full((6, 3), np.nan, np.float32)}, "'points' has values that are NaN"),
+        ({"scores": np.array([1.0, np.inf])}, "'scores' has values that are NaN"),
+        ({"indptr": np.zeros(0, np.int64)}, "'indptr' is empty"),
+        ({"indptr": np.array([0, 5, 2])}, "indptr does not describe"),
+        ({"indices": np.array([0, 1, 2, 3, 6], np.int32)}, "mask holds index 6, the map has 6 points"),
+        ({"boxes": None}, "lacks 'boxes'"),
+    ],
+)
+def test_each_fault_of_our_own_file_is_one_line(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    arrays = {
+        name: array for name, array in {**prediction_arrays(own_instances()), **changes}.items() if array is not None
+    }
+    write_npz(tmp_path / "prediction.npz", arrays)
+    text = refused(tmp_path / "prediction.npz", "prediction", "su3d-bench")
+    assert text.startswith(f"{tmp_path}/prediction.npz: ") and message in text
+
+
+POINTS = np.zeros((3, 3), np.float32)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (
+            Partition(POINTS, np.array([0, -1, 2]), np.ones((2, 4), np.float32)),
+            "3 points, 3 instance numbers to 2 and 2 features",
+        ),
+        (Partition(POINTS, np.array([0, -2, 1]), np.ones((2, 4), np.float32)), "3 points, 3 instance numbers to 1"),
+        (Partition(POINTS, np.array([0, 1]), np.ones((2, 4), np.float32)), "3 points, 2 instance numbers"),
+        (DenseFeatures(POINTS, np.ones((2, 4), np.float16)), "3 points and 2 features"),
+    ],
+)
+def test_parts_and_features_that_do_not_go_with_their_points_are_refused(
+    tmp_path: Path, content: Any, message: str
+) -> None:
+    write_prediction(tmp_path / "prediction.npz", content)
+    assert message in refused(tmp_path / "prediction.npz", "prediction", "su3d-bench")
+
+
+# ---- damage
+
+
+def scene_name(format: str) -> str:
+    return "replica/scene0011_00" if format == "su3d-bench" else "scene0011_00"
+
+
+def files_to_damage(folder: Path, format: str) -> list[Path]:
+    """The files of a prediction that can be hurt: what the scene is read from, and what that refers to."""
+    files = list(READERS[format].scenes(folder).values())
+    return files + sorted(folder.glob("pred_mask/*_0.txt")) + sorted(folder.glob("*.npy"))
+
+
+@pytest.mark.parametrize("format", OURS)
+def test_cut_predictions_are_read_or_refused_but_nothing_else(tmp_path: Path, format: str) -> None:
+    folder = written_in(tmp_path, format)
+    for file in files_to_damage(folder, format):
+        content = file.read_bytes()
+        n_read, n_refused = outcomes(
+            reading(folder, format, file), truncations(content), must_name=file.name, refusal=PredictionError
+        )
+        assert n_refused > 0
+        assert n_read == 0 or file.suffix == ".txt"  # a shorter list is a list, too
+        file.write_bytes(content)
+
+
+@pytest.mark.parametrize("format", OURS)
+def test_damaged_predictions_are_read_or_refused_but_nothing_else(tmp_path: Path, format: str) -> None:
+    folder = written_in(tmp_path, format)
+    for file in files_to_damage(folder, format):
+        content = file.read_bytes()
+        n_read, n_refused = outcomes(
+            reading(folder, format, file), damages(content), must_name=file.name, refusal=PredictionError
+        )
+        assert n_read + n_refused == 2000 and n_refused > 200
+        file.write_bytes(content)
+
+
+def reading(folder: Path, format: str, file: Path) -> Callable[[bytes], object]:
+    def read_bytes(content: bytes) -> object:
+        file.write_bytes(content)
+        READERS[format].recognise(folder)
+        return READERS[format].read(folder, scene_name(format))
+
+    return read_bytes
+
+
+def test_damaged_run_lengths_are_read_or_refused_but_nothing_else(tmp_path: Path) -> None:
+    write_scannetpp_json(tmp_path, TOY)
+    file = tmp_path / "masks/scene0011_00_0.json"
+    content = file.read_bytes()
+    for copies in (truncations(content), damages(content)):
+        outcomes(reading(tmp_path, "scannet-text", file), copies, must_name=file.name, refusal=PredictionError)
+
+
+ARRAYS = st.builds(
+    lambda shape, kind, fill: np.full(shape, fill).astype(kind),
+    st.sampled_from([(), (0,), (2,), (3,), (2, 3), (3, 2), (3, 3), (0, 3), (2, 0), (2, 2, 2)]),
+    st.sampled_from(["?", "i8", "u1", "f2", "f8", "U3", "S2"]),
+    st.sampled_from([0, 1, 7]),
+)
+LEAVES = st.none() | st.booleans() | st.integers(-3, 9) | st.floats() | st.text(max_size=3) | ARRAYS
+ANYTHING = st.recursive(
+    LEAVES,
+    lambda inner: (
+        st.lists(inner, max_size=3)
+        | st.tuples(inner, inner)
+        | st.fixed_dictionaries({"length": inner, "counts": inner})
+        | st.fixed_dictionaries({"ins": inner}, optional={"conf": inner, "final_class": inner})
+    ),
+    max_leaves=8,
+)
+
+
+@settings(max_examples=500, deadline=None)
+@given(value=ANYTHING, format=st.sampled_from(["open3dis", "openyolo3d", "openins3d", "openmask3d", "sam3d"]))
+def test_torch_files_of_any_values_are_read_or_refused_but_nothing_else(
+    tmp_path_factory: pytest.TempPathFactory, value: object, format: str
+) -> None:
+    folder = tmp_path_factory.getbasetemp()
+    file = folder / ("any.pth" if format in {"open3dis", "sam3d"} else "any.pt")
+    TorchFile().write(file, pickle.dumps(value, 2)[2:-1])
+    READERS[format].recognise(file)
+    try:
+        READERS[format].read(file, "any")
+    except PredictionError as error:
+        assert "\n" not in str(error) and len(str(error)) < 600  # noqa: PT017 - either outcome is right

@@ -1,0 +1,144 @@
+"""Real recordings, where they are: what the adapters make of sensor data that nobody here wrote."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial import cKDTree
+
+from su3d_bench.cli.main import main
+from su3d_bench.datasets.pose_convention import check_convention
+from su3d_bench.datasets.rgbd import Rgbd
+from su3d_bench.datasets.tum import Tum
+from su3d_bench.geometry import back_project
+from su3d_bench.store import read_prediction
+from su3d_bench.toml_text import write_toml
+from su3d_bench.types import Instances
+
+DATA = Path(__file__).resolve().parents[1] / "../shared/realdata"
+pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="needs the real recordings in ../shared/realdata")
+FRAME_FILES = {
+    "colour": "frame-{index}.color.png",
+    "depth": "frame-{index}.depth.png",
+    "pose": "frame-{index}.pose.txt",
+    "intrinsics_file": "camera-intrinsics.color.txt",
+    "depth_unit_m": 1e-4,
+    "depth_rotated_bits": 3,
+}
+SCENES = {
+    "shelf": {"folder": "label_fusion/labels", **FRAME_FILES},
+    "basket": {"folder": "label_fusion/masks", **FRAME_FILES},
+    "chair": {
+        "folder": "open3d_rgbd",
+        "colour": "color/{index}.jpg",
+        "depth": "depth/{index}.png",
+        "trajectory": "trajectory.log",
+        "intrinsics_file": "camera_primesense.json",
+        "depth_unit_m": 1e-3,
+    },
+}
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A data root whose descriptions point at the recordings, which stay where they are."""
+    for scene, keys in SCENES.items():
+        folder = tmp_path / "data" / "rgbd" / scene
+        folder.mkdir(parents=True)
+        place = os.path.relpath(DATA.resolve() / str(keys["folder"]), folder)
+        leaves = [((key,), value, "") for key, value in {**keys, "folder": place}.items()]
+        (folder / "rgbd.toml").write_text(write_toml(leaves))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
+    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "data"
+
+
+def run(scene: str, *words: str) -> Instances:
+    """The map that the command line makes of every frame of ``scene``."""
+    words = ("run", "--scenes", scene, "--stride", "1", "--out", "out", "--quiet", *words)
+    assert main(list(words)) == 0
+    prediction = read_prediction(next(Path("out").glob("scenes/*/opensu3d/prediction.npz")))
+    assert isinstance(prediction, Instances)
+    return prediction
+
+
+def stored_labels(*words: str) -> list[str]:
+    folder = DATA.resolve() / "label_fusion/labels"
+    return ["--profile", "stored", "--set", f"perception.stored.folder={folder}",
+            "perception.stored.images=frame-{index}.segm.png", *words]  # fmt: skip
+
+
+def test_fifteen_labelled_frames_give_exactly_the_two_labelled_objects_never_swapped(root: Path) -> None:
+    (root / "names.toml").write_text('48 = "parcel"\n132 = "carton"\n')
+    found = run("rgbd/shelf", *stored_labels(f"perception.stored.names={root / 'names.toml'}"))
+    assert sorted(found.names) == ["carton", "parcel"]
+    # Values ascend, so detection 0 of every image is the region 48 and detection 1 the region 132.
+    views = [found.views[found.view_indptr[k] : found.view_indptr[k + 1]].tolist() for k in range(2)]
+    parcel = found.names.index("parcel")
+    assert views[parcel] == [[frame, 0] for frame in range(15)]
+    assert views[1 - parcel] == [[frame, 1] for frame in range(15)]
+    trees = [cKDTree(found.points[found.mask(k)]) for k in (parcel, 1 - parcel)]
+    for frame in Rgbd(root).frames("shelf", 1):
+        labels = cv2.imread(str(DATA / f"label_fusion/labels/frame-{frame.index:06d}.segm.png"), cv2.IMREAD_UNCHANGED)
+        for own, value in enumerate((48, 132)):
+            pixels = (labels == value) & (frame.depth_m > 0)
+            points = back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, pixels)
+            nearer = trees[own].query(points)[0] < trees[1 - own].query(points)[0]
+            assert nearer.mean() > 0.75, (frame.index, value)
+
+
+def test_labelled_frames_without_names_give_the_same_two_objects(root: Path) -> None:
+    found = run("rgbd/shelf", *stored_labels())
+    views = [found.views[found.view_indptr[k] : found.view_indptr[k + 1], 1].tolist() for k in range(len(found))]
+    assert sorted(views) == [[0] * 15, [1] * 15]
+
+
+@pytest.mark.parametrize(
+    ("scene", "data", "extent_m"),
+    [("tum/tum_fr1desk_9", DATA, (2.6, 1.6, 1.3)), ("rgbd/chair", None, (1.5, 1.6, 2.6))],
+)
+def test_recordings_run_unscored_with_the_embedded_segmenter(
+    root: Path,
+    scene: str,
+    data: Path | None,
+    extent_m: tuple[float, float, float],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    if data is not None:
+        monkeypatch.setenv("SU3D_DATA", str(data.resolve()))
+    found = run(scene)
+    assert "no protocol scores these scenes" in capsys.readouterr().out
+    assert len(found) > 5 and len(found.points) > 10_000
+    # A few frames of a room's corner: what the colour images show is one to three metres wide.
+    np.testing.assert_allclose(np.ptp(found.points, axis=0), extent_m, atol=0.3)
+
+
+def test_the_poses_of_every_recording_agree_with_its_depth(root: Path) -> None:
+    for scene in SCENES:
+        assert check_convention(Rgbd(root).frames(scene, 1), scene) is None
+    tum = Tum(DATA.resolve())
+    assert check_convention(tum.frames("tum_fr1desk_9", 1), "tum") is None
+
+
+def test_tum_reports_the_images_that_are_not_there(caplog: pytest.LogCaptureFixture) -> None:
+    frames = Tum(DATA.resolve()).frames("tum_fr1desk_9", 1)
+    assert [frame.index for frame in frames] == list(range(9))
+    assert "associate.txt: 1128 images named there are missing (the first: rgb/1305031453.659600.png)" in caplog.text
+    assert frames[0].intrinsics[0, 0] == 517.3
+
+
+def test_images_of_other_cameras_are_read_as_their_formats_say(root: Path) -> None:
+    """One frame each as NYU, SUN and TUM store them; PGM is big-endian."""
+    from su3d_bench.datasets.image_files import decode_colour, decode_depth
+
+    folder = DATA / "open3d_rgbd/other_formats"
+    for colour, depth in (("NYU_color.ppm", "NYU_depth.pgm"), ("SUN_color.jpg", "SUN_depth.png"),
+                          ("TUM_color.png", "TUM_depth.png")):  # fmt: skip
+        assert decode_colour((folder / colour).read_bytes(), colour).shape == (480, 640, 3)
+        assert (decode_depth((folder / depth).read_bytes(), depth) > 0).mean() > 0.3

@@ -1,0 +1,219 @@
+"""Colour and depth of two cameras on one grid: worked by hand, and against the exact picture of a slanted wall."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from su3d_bench.datasets.registration import Grid, Registration, filled, make_registration
+from su3d_bench.datasets.rgbd_source import SensorPair
+from su3d_bench.errors import DataError
+from su3d_bench.geometry import are_rigid
+from su3d_bench.types import Float32Array, Float64Array, UInt8Array
+
+
+def intrinsics(focal: float, size: tuple[int, int]) -> Float64Array:
+    return np.array([[focal, 0, (size[0] - 1) / 2], [0, focal, (size[1] - 1) / 2], [0, 0, 1]])
+
+
+def motion(angle: float = 0.0, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Float64Array:
+    """A turn about the vertical axis and a step, both in camera axes."""
+    matrix = np.eye(4)
+    matrix[[0, 0, 2, 2], [0, 2, 0, 2]] = np.cos(angle), np.sin(angle), -np.sin(angle), np.cos(angle)
+    matrix[:3, 3] = x, y, z
+    return matrix
+
+
+def pair(
+    colour_size: tuple[int, int] = (8, 6),
+    depth_size: tuple[int, int] = (4, 3),
+    extrinsic: Float64Array | None = None,
+    colour_extrinsic: Float64Array | None = None,
+    colour_focal: float = 8.0,
+    depth_focal: float = 4.0,
+) -> SensorPair:
+    return SensorPair(
+        colour_size=colour_size,
+        depth_size=depth_size,
+        colour_intrinsics=intrinsics(colour_focal, colour_size),
+        depth_intrinsics=intrinsics(depth_focal, depth_size),
+        colour_extrinsic=np.eye(4) if colour_extrinsic is None else colour_extrinsic,
+        depth_extrinsic=np.eye(4) if extrinsic is None else extrinsic,
+        depth_shift=1000.0,
+    )
+
+
+def register(camera: SensorPair, grid: Grid = "depth") -> Registration:
+    return make_registration(camera, grid, "scannet/x")
+
+
+def columns(size: tuple[int, int], step: int = 20) -> UInt8Array:
+    """Red counts columns, green rows, blue is even."""
+    u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    return np.stack([u * step, v * step, np.full_like(u, 7)], axis=-1).astype(np.uint8)
+
+
+@pytest.mark.parametrize("grid", ["depth", "colour"])
+def test_images_that_fit_already_are_handed_on(grid: Grid) -> None:
+    camera = pair((4, 3), (4, 3), colour_focal=4.0)
+    colour, depth_m = columns((4, 3)), np.full((3, 4), 2, np.float32)
+    registration = register(camera, grid)
+    found = registration.images(colour, depth_m)
+    assert found[0] is colour and found[1] is depth_m
+    pose = motion(0.3, 1, 2, 3)
+    assert registration.camera_to_world(pose) is pose
+
+
+def test_two_sizes_of_one_view_by_hand() -> None:
+    """Colour has twice the pixels: a depth pixel lies in the middle of four colour pixels."""
+    camera = pair()
+    depth_m = np.full((3, 4), 2, np.float32)
+    colour, depth = register(camera).images(columns((8, 6)), depth_m)
+    assert depth is depth_m
+    assert colour[1].tolist() == [[20 * u, 50, 7] for u in (0.5, 2.5, 4.5, 6.5)]
+    # the other way a depth pixel falls on the corner of four and, by rounding to even, lands on one of them
+    colour_8, spread = register(camera, "colour").images(columns((8, 6)), depth_m)
+    assert colour_8.shape == (6, 8, 3)
+    assert np.count_nonzero(spread) == 12 and spread.max() == 2
+    assert spread[0].tolist() == [2, 0, 2, 0, 2, 0, 2, 0]
+
+
+def test_a_step_between_the_cameras_moves_near_pixels_further_by_hand() -> None:
+    """Colour camera 1 m to the left: its points are 1 m further right; focal length 4 px: 4 px / depth."""
+    camera = pair((8, 3), (8, 3), motion(x=1.0), colour_focal=4.0)
+    depth_m = np.full((3, 8), 4, np.float32)
+    depth_m[:, 2:4] = 2  # two pixels on
+    colour, _ = register(camera).images(columns((8, 3)), depth_m)
+    assert (colour[0, :, 0] / 20).tolist() == [1, 2, 4, 5, 5, 6, 7, 7]  # the last is beside the image: its border
+    seen, depth = register(camera, "colour").images(columns((8, 3)), depth_m)
+    np.testing.assert_array_equal(seen, columns((8, 3)))
+    # 2 and 3 land on 4 and 5, before 4, which lands on 5 too; nothing lands on 0 and 3
+    assert depth[0].tolist() == [0, 4, 4, 0, 2, 2, 4, 4]
+
+
+def test_a_pixel_without_depth_borrows_that_of_the_nearest() -> None:
+    assert filled(np.array([[0, 0, 3, 0, 0, 5]], np.float32)).tolist() == [[3, 3, 3, 3, 5, 5]]
+    assert filled(np.zeros((2, 2), np.float32)).tolist() == [[1, 1], [1, 1]]
+    camera = pair((8, 3), (8, 3), motion(x=1.0), colour_focal=4.0)
+    depth = np.full((3, 8), 2, np.float32)
+    depth[:, 1] = 0
+    colour, kept = register(camera).images(columns((8, 3)), depth)
+    assert (colour[1, :, 0] / 20).tolist() == [2, 3, 4, 5, 6, 7, 7, 7]
+    assert kept[1, 1] == 0
+
+
+def test_points_behind_the_colour_camera_have_no_place_in_it() -> None:
+    camera = pair((4, 3), (4, 3), motion(z=-3.0), colour_focal=4.0)
+    depth_m = np.full((3, 4), 2, np.float32)
+    _, depth = register(camera, "colour").images(columns((4, 3)), depth_m)
+    assert not depth.any()
+    colour, _ = register(camera).images(columns((4, 3)), depth_m)
+    assert (colour == columns((4, 3))[0, 0]).all()
+
+
+@pytest.mark.parametrize("grid", ["depth", "colour"])
+def test_poses_put_a_pixel_of_either_grid_onto_the_same_point(grid: Grid) -> None:
+    extrinsic = motion(0.2, 0.1, -0.05, 0.02)
+    registration = register(pair(extrinsic=extrinsic), grid)
+    pose = motion(1.0, 3, 4, 5)
+    point = np.array([0.3, -0.2, 2.0, 1.0])  # in the depth camera
+    in_grid = point if grid == "depth" else extrinsic @ point
+    np.testing.assert_allclose(registration.camera_to_world(pose) @ in_grid, pose @ point, atol=1e-12)
+
+
+def test_a_colour_extrinsic_leads_into_the_same_frame_as_that_of_depth() -> None:
+    both = motion(0.3, 1, 2, 3)
+    camera = pair((4, 3), (4, 3), both, both, colour_focal=4.0)
+    assert register(camera).is_needless
+
+
+def test_equal_sizes_with_other_focal_lengths_are_not_taken_as_they_are() -> None:
+    assert not register(pair((640, 480), (640, 480), colour_focal=577.9, depth_focal=577.8)).is_needless
+    assert register(pair((640, 480), (640, 480), colour_focal=577.870605, depth_focal=577.8706054688)).is_needless
+    assert not register(pair((4, 3), (4, 3), motion(x=1e-4), colour_focal=4.0)).is_needless
+
+
+# A wall that stands slanted before the depth camera: points X with normal . X = 2, coloured by place.
+NORMAL = np.array([0.3, -0.2, 1.0])
+DISTANCE_M = 2.0
+COLOUR_SIZE, DEPTH_SIZE = (324, 242), (160, 120)
+
+
+def wall_colour(points: Float64Array) -> Float64Array:
+    """A smooth pattern on the wall (..., 3), 0 to 255; it changes by at most 6 grey levels a colour pixel."""
+    x, y = points[..., 0], points[..., 1]
+    return np.stack([127 + 120 * np.sin(2 * x), 127 + 120 * np.cos(2 * y), 127 + 120 * np.sin(x + y)], axis=-1)
+
+
+def wall_points(matrix: Float64Array, size: tuple[int, int], to_depth_camera: np.ndarray) -> Float64Array:
+    """Where the rays (H, W, 3) of a camera meet the wall, in the depth camera's axes."""
+    u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    rays = np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(matrix).T @ to_depth_camera[:3, :3].T
+    origin = to_depth_camera[:3, 3]
+    reach = (DISTANCE_M - origin @ NORMAL) / (rays @ NORMAL)
+    points: Float64Array = origin + reach[..., None] * rays
+    return points
+
+
+@pytest.fixture(scope="module")
+def wall() -> tuple[SensorPair, UInt8Array, Float32Array]:
+    extrinsic = motion(0.03, 0.04, -0.01, 0.02)
+    camera = pair(COLOUR_SIZE, DEPTH_SIZE, extrinsic, colour_focal=290.0, depth_focal=141.0)
+    seen = wall_points(camera.colour_intrinsics, COLOUR_SIZE, np.linalg.inv(extrinsic))
+    depth_m = wall_points(camera.depth_intrinsics, DEPTH_SIZE, np.eye(4))[..., 2].astype(np.float32)
+    return camera, np.rint(wall_colour(seen)).astype(np.uint8), depth_m
+
+
+def test_colour_on_the_depth_grid_is_that_of_the_point(wall: tuple[SensorPair, UInt8Array, Float32Array]) -> None:
+    camera, colour, depth_m = wall
+    found, depth = register(camera).images(colour, depth_m)
+    assert depth is depth_m
+    points = wall_points(camera.depth_intrinsics, DEPTH_SIZE, np.eye(4))
+    in_colour = points @ register(camera).depth_to_colour[:3, :3].T + register(camera).depth_to_colour[:3, 3]
+    place = in_colour @ camera.colour_intrinsics.T
+    place = place[..., :2] / place[..., 2:]
+    is_inside = ((place >= 0) & (place <= np.array(COLOUR_SIZE) - 1)).all(axis=-1)
+    assert 0.9 < is_inside.mean() < 1
+    error = np.abs(found.astype(float) - wall_colour(points))[is_inside]
+    assert error.max() < 1.5  # rounding of both images, and cv2.remap's 1/32 of a pixel
+    # without the step between the cameras the same pixels are off by far more
+    still = register(pair(COLOUR_SIZE, DEPTH_SIZE, None, colour_focal=290.0, depth_focal=141.0))
+    assert np.abs(still.images(colour, depth_m)[0].astype(float) - wall_colour(points))[is_inside].max() > 10
+
+
+def test_depth_on_the_colour_grid_is_that_of_the_wall(wall: tuple[SensorPair, UInt8Array, Float32Array]) -> None:
+    camera, colour, depth_m = wall
+    registration = register(camera, "colour")
+    found, depth = registration.images(colour, depth_m)
+    assert found is colour
+    extrinsic = registration.depth_to_colour
+    points = wall_points(camera.colour_intrinsics, COLOUR_SIZE, np.linalg.inv(extrinsic))
+    true_m = (points @ extrinsic[:3, :3].T + extrinsic[:3, 3])[..., 2]
+    is_hit = depth > 0
+    assert 0.2 < is_hit.mean() < 0.3  # a quarter: colour has four times the pixels
+    # half a pixel of rounding on a wall that recedes by less than 4 mm a pixel
+    assert np.abs(depth - true_m)[is_hit].max() < 0.004
+    # each depth pixel that the colour camera sees is somewhere
+    assert is_hit.sum() > 0.9 * depth_m.size
+
+
+@pytest.mark.parametrize(
+    ("camera", "message"),
+    [
+        (pair(extrinsic=np.zeros((4, 4))), "the depth extrinsic is not a rigid motion; expected a 4x4 pose, metres"),
+        (pair(colour_extrinsic=np.diag([1.0, 1, -1, 1])), "the colour extrinsic is not a rigid motion"),
+        (pair(extrinsic=np.full((4, 4), 1e300)), "the depth extrinsic is not a rigid motion"),
+        (pair(colour_focal=1e30), "the colour intrinsics are no camera matrix; expected fx 0 cx / 0 fy cy / 0 0 1"),
+    ],
+)
+def test_what_is_no_pair_of_cameras_is_one_line(camera: SensorPair, message: str) -> None:
+    with pytest.raises(DataError) as caught:
+        register(camera)
+    assert str(caught.value).startswith(f"scannet/x: {message}")
+
+
+def test_rigid_motions_are_told_from_others() -> None:
+    scaled, transposed = motion(0.4, 1, 2, 3), motion(0.4, 1, 2, 3).T
+    scaled[:3, :3] *= 1.1
+    cases = np.stack([motion(0.4, 1, 2, 3), np.diag([1.0, 1, -1, 1]), scaled, transposed, np.zeros((4, 4))])
+    assert are_rigid(cases).tolist() == [True, False, False, False, False]

@@ -1,0 +1,223 @@
+"""The boxes of Replica's objects, and everything that is wrong with a scene, line by line."""
+
+from __future__ import annotations
+
+import doctest
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from damage import damages, outcomes, truncations
+from replica_scene import QUADS, TWO_OBJECTS, info_table, write_original, write_render
+
+from su3d_bench.datasets import replica_boxes
+from su3d_bench.datasets.replica import Replica
+from su3d_bench.errors import DataError, GroundTruthMissing
+
+Change = Callable[[Path], object]
+
+
+def with_text(name: str, text: str | bytes) -> Change:
+    return lambda root: (root / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+
+
+def box(
+    centre: Any = (1, 1, 0),
+    sizes: Any = (2, 2, 0.1),
+    rotation: Any = (0, 0, 0, 1),
+    translation: Any = (0, 0, 0),
+) -> dict[str, Any]:
+    return {
+        "abb": {"center": list(centre), "sizes": list(sizes)},
+        "orientation": {"rotation": list(rotation), "translation": list(translation)},
+    }
+
+
+def write_boxes(root: Path, boxes: dict[int, Any], *, mesh: bool = True) -> Path:
+    habitat = write_original(root, QUADS, [0, 0, 5, 5], TWO_OBJECTS)
+    table = info_table(TWO_OBJECTS)
+    for row in table["objects"]:
+        if row["id"] in boxes:
+            row["oriented_bbox"] = boxes[row["id"]]
+    (habitat / "info_semantic.json").write_text(json.dumps(table))
+    if not mesh:
+        (habitat / "mesh_semantic.ply").unlink()
+    return habitat
+
+
+def test_a_box_is_turned_and_then_shifted_without_the_mesh(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    half = 0.5**0.5  # a quarter turn about z: x becomes y
+    write_boxes(tmp_path, {5: box((1, 2, 3), (4, 2, 1), (0, 0, half, half), (10, 20, 30))}, mesh=False)
+    replica = Replica(tmp_path)
+    boxes = replica.object_boxes("room0")
+    assert list(boxes) == [5]
+    np.testing.assert_allclose(boxes[5].centre, [8, 21, 33])
+    np.testing.assert_allclose(boxes[5].rotation @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+    corners = boxes[5].corners
+    assert corners.shape == (8, 3)
+    np.testing.assert_allclose(corners.min(axis=0), [7, 19, 32.5])
+    np.testing.assert_allclose(corners.max(axis=0), [9, 23, 33.5])
+    outside = boxes[5].distance_outside(np.array([[8, 21, 33], [9, 23, 33.5], [9.5, 23.25, 33]]))
+    np.testing.assert_allclose(outside, [0, 0, 0.5], atol=1e-12)
+    assert replica.status("room0").startswith("3 frames, 1 boxes of objects, no mesh (")
+
+
+def test_the_example_of_the_rotation_holds() -> None:
+    assert doctest.testmod(replica_boxes) == (0, 1)
+
+
+def test_without_the_table_there_are_no_boxes(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    with pytest.raises(GroundTruthMissing, match=r"no boxes of objects; expected room_0/habitat/info_semantic\.json"):
+        Replica(tmp_path).object_boxes("room0")
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (box(rotation=(0, 0, 0, 0)), "'rotation' has the length 0; expected a unit quaternion x y z w"),
+        (box(rotation=(0, 0, 0, 2)), "'rotation' has the length 2; expected a unit quaternion"),
+        (box(rotation=(0, 0, float("nan"), 1)), "'rotation' holds 'nan'; expected numbers within 1e+06 m"),
+        (box(rotation=(0, 0, 1)), "'rotation' is 'list' of length 3; expected 4 numbers"),
+        (box(centre=(0, 0, "x\n")), "'center' is 'list' of length 3; expected 3 numbers"),
+        (box(centre=(0, 0, 10**400)), "'center' holds '1000000000000000000000000000000000000000'; expected numbers"),
+        (box(translation=(float("inf"), 0, 0)), "'translation' holds 'inf'; expected numbers within"),
+        (box(sizes=(1, -1, 1)), "'sizes' are [1.0, -1.0, 1.0]; expected 0 m or more"),
+        (box(sizes=(True, 1, 1)), "'sizes' is 'list' of length 3; expected 3 numbers"),
+        ({"abb": {"center": [0, 0, 0]}}, "'oriented_bbox' is incomplete; expected abb (center, sizes) and orientation"),
+        ([1, 2], "'oriented_bbox' is incomplete"),
+        ("text", "'oriented_bbox' is incomplete"),
+    ],
+)
+def test_each_damaged_box_is_one_clear_line(tmp_path: Path, content: Any, message: str) -> None:
+    write_render(tmp_path)
+    write_boxes(tmp_path, {0: content})
+    with pytest.raises(DataError) as caught:
+        Replica(tmp_path).object_boxes("room0")
+    assert str(caught.value).startswith("replica/room0: habitat/info_semantic.json: object 0: ")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_damaged_tables_are_read_or_refused_in_one_line(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    path = write_boxes(tmp_path, {0: box(), 5: box()}, mesh=False) / "info_semantic.json"
+    table = json.loads(path.read_text())
+    table["classes"] = table["classes"][18:22]
+    content, replica = json.dumps(table).encode(), Replica(tmp_path)
+
+    def read(damaged: bytes) -> None:
+        path.write_bytes(damaged)
+        replica.object_boxes("room0")
+
+    name = "replica/room0: habitat/info_semantic.json"
+    assert outcomes(read, truncations(content), must_name=name) == (0, len(content))
+    n_read, n_refused = outcomes(read, damages(content), must_name=name)
+    assert min(n_read, n_refused) > 20
+
+
+def test_damaged_meshes_are_read_or_refused_in_one_line(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    path = write_boxes(tmp_path, {}) / "mesh_semantic.ply"
+    content = path.read_bytes()
+
+    def read(damaged: bytes) -> None:
+        path.write_bytes(damaged)
+        Replica(tmp_path).ground_truth("room0", "mesh-vertices")
+
+    name = "replica/room0: habitat/mesh_semantic.ply"
+    assert outcomes(read, truncations(content), must_name=name) == (0, len(content))
+    n_read, n_refused = outcomes(read, damages(content), must_name=name)
+    assert min(n_read, n_refused) > 100
+
+
+# --- what is wrong with a scene
+
+
+FITTING = {0: box((0.5, 1, 0), (1, 2, 0)), 5: box((1.5, 1, 0), (1, 2, 0))}
+
+
+def test_a_whole_scene_has_no_problem(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    write_boxes(tmp_path, FITTING)
+    assert list(Replica(tmp_path).problems("room0")) == []
+
+
+def test_a_scene_without_ground_truth_has_no_problem(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    assert list(Replica(tmp_path).problems("room0")) == []
+
+
+def test_face_centres_within_5_cm_of_a_box_are_inside_and_others_are_named(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    # face centres of object 0 are at y = 0.5 and 1.5; the box ends at 1.46 and at 1.44
+    write_boxes(tmp_path, FITTING | {0: box((0.5, 0.96, 0), (1, 1, 0))})
+    assert list(Replica(tmp_path).problems("room0")) == []
+    info = tmp_path / "replica_v1/room_0/habitat/info_semantic.json"
+    info.write_text(info.read_text().replace("0.96", "0.44"))
+    assert list(Replica(tmp_path).problems("room0")) == [
+        "replica/room0: habitat/info_semantic.json: object 0 has faces 0.51 m beyond its box and the slack of 0.05 m; "
+        "the boxes are of another mesh"
+    ]
+
+
+def resized(name: str) -> Change:
+    return lambda root: cv2.imwrite(str(root / name), np.ones((4, 6, 3), np.uint8))
+
+
+def cut(name: str, n_bytes: int) -> Change:
+    return lambda root: (root / name).write_bytes((root / name).read_bytes()[:-n_bytes])
+
+
+def no_poses(root: Path) -> None:
+    path = root / "Replica/room0/traj.txt"
+    path.write_text("\n".join(["nan " * 16, *path.read_text().splitlines()[1:], "1 2 3"]) + "\n")
+
+
+@pytest.mark.parametrize(
+    ("change", "messages"),
+    [
+        (no_poses, ["traj.txt line 1: the pose holds 'nan'", "traj.txt line 4 has 3 values", "has 4 poses but"]),
+        (resized("Replica/room0/results/frame000001.jpg"), ["frame000001.jpg is 6x4 but cam_params.json says 12x8"]),
+        (cut("Replica/room0/results/frame000002.jpg", 5), ["results/frame000002.jpg: no image, or cut short"]),
+        (cut("Replica/room0/results/depth000002.png", 5), ["results/depth000002.png: no image, or cut short"]),
+        (with_text("Replica/room0/results/depth000000.png", b""), ["results/depth000000.png: no image, or cut short"]),
+        (with_text("Replica/cam_params.json", "{}"), ["cam_params.json: has no table 'camera'"]),
+        (lambda root: (root / "Replica/room0/results/depth000001.png").unlink(), ["depth000001.png is missing"]),
+        (
+            lambda root: (root / "replica_v1/room_0/habitat/mesh_semantic.ply").unlink(),
+            ["habitat/mesh_semantic.ply is missing in"],
+        ),
+        (
+            lambda root: (root / "replica_v1/room_0/habitat/info_semantic.json").unlink(),
+            ["habitat/info_semantic.json is missing in"],
+        ),
+        (with_text("replica_v1/room_0/habitat/mesh_semantic.ply", b"ply\n"), ["mesh_semantic.ply: its header has"]),
+        (with_text("replica_v1/room_0/habitat/info_semantic.json", b"{"), ["habitat/info_semantic.json: not JSON"]),
+    ],
+)  # fmt: skip
+def test_each_problem_of_a_scene_is_a_line_and_none_hides_another(
+    tmp_path: Path, change: Change, messages: list[str]
+) -> None:
+    write_render(tmp_path)
+    write_boxes(tmp_path, FITTING)
+    change(tmp_path)
+    found = list(Replica(tmp_path).problems("room0"))
+    assert len(found) == len(messages)
+    for line, message in zip(found, messages, strict=True):
+        assert line.startswith("replica/room0: ")
+        assert message in line
+
+
+def test_many_faults_of_one_kind_are_counted(tmp_path: Path) -> None:
+    write_render(tmp_path, n_frames=30)
+    for path in (tmp_path / "Replica/room0/results").glob("frame*"):
+        path.write_bytes(b"")
+    found = list(Replica(tmp_path).problems("room0"))
+    assert len(found) == 21
+    assert found[-1] == "replica/room0: results/: 10 more faults of this kind"

@@ -1,0 +1,483 @@
+"""The ScanNet adapter on small scans as they circulate: places, splits, frames, options, and a run that is scored."""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from pydantic import ValidationError
+from scannet_scan import (
+    COLOUR_SIZE,
+    DEPTH_SIZE,
+    HEIGHT_M,
+    LEFT,
+    LOST,
+    RIGHT,
+    SCAN,
+    floor_image,
+    header,
+    pose,
+    positions,
+    table_text,
+    write_floor_truth,
+    write_recording,
+)
+
+from su3d_bench.cli.main import main
+from su3d_bench.datasets.image_files import UInt16Array
+from su3d_bench.datasets.rgbd_source import SensorPair
+from su3d_bench.datasets.scannet import ScanNet, ScannetOptions
+from su3d_bench.datasets.scannet_folders import PAPER_SCENES, find_scans, split_scenes
+from su3d_bench.datasets.scannet_frames import read_walk
+from su3d_bench.datasets.scannet_labels import TABLE_NAME
+from su3d_bench.errors import ConfigError, DataError, GroundTruthMissing
+from su3d_bench.planning import expand_scenes
+from su3d_bench.scene_run import Part
+from su3d_bench.types import Float64Array, UInt8Array
+
+WHERE = f"scannet/{SCAN}"
+
+
+def write_scan(root: Path, scan: str = SCAN, place: str = "scans", n_frames: int = 5, lost: Sequence[int] = ()) -> Path:
+    """A scan with recording and truth; the folder that it lies in."""
+    folder = root / place / scan
+    write_recording(folder / f"{scan}.sens", n_frames, lost)
+    write_floor_truth(folder, scan)
+    (folder / f"{scan}.txt").write_text("axisAlignment = 0 -1 0 5 1 0 0 6 0 0 1 7 0 0 0 1\ncolorHeight = 48\n")
+    (root / TABLE_NAME).write_text(table_text())
+    return folder
+
+
+def dataset(root: Path, **options: Any) -> ScanNet:
+    return ScanNet(root, ScannetOptions(**options))
+
+
+@pytest.mark.parametrize(
+    "place",
+    [".", "scans", "scannet", "scannet/scans", "ScanNet", "ScanNet/scans_test", "scannetv2/scans", "scans/val",
+     "scannet_v2/train", "ScanNet/public/v2/scans", "scannet200"],
+)  # fmt: skip
+def test_scans_are_found_in_every_layout_that_circulates(tmp_path: Path, place: str) -> None:
+    write_scan(tmp_path, place=place)
+    found = ScanNet(tmp_path)
+    assert list(found.scenes()) == [SCAN]
+    assert list(found.places()) == [tmp_path / place]
+    assert len(found.frames(SCAN, 1)) == 5
+    assert "scannet200-vertices" in found.ground_truth(SCAN, "scannet200-vertices").variant
+
+
+def test_the_papers_scenes_come_first_then_every_other_in_order(tmp_path: Path) -> None:
+    for scan, place in (("scene0549_00", "scans"), ("scene0707_00", "scans_test"), ("scene0000_00", "scans"),
+                        ("scene0000_01", "scans"), ("mine", "scans")):  # fmt: skip
+        write_recording(tmp_path / place / scan / f"{scan}.sens", 1)
+    (tmp_path / "scans" / "empty").mkdir()
+    assert list(ScanNet(tmp_path).scenes()) == ["scene0000_00", "scene0549_00", "mine", "scene0000_01", "scene0707_00"]
+
+
+def test_the_table_is_found_beside_the_scans_and_above_them(tmp_path: Path) -> None:
+    folder = write_scan(tmp_path, place="scannet/scans")
+    for place in ("scannet/scans", "scannet", "scannet/tasks", "."):
+        (tmp_path / TABLE_NAME).unlink(missing_ok=True)
+        assert find_scans(tmp_path).find_label_table() is None
+        (tmp_path / place).mkdir(exist_ok=True)
+        (tmp_path / place / TABLE_NAME).write_text(table_text())
+        assert find_scans(tmp_path).find_label_table() == tmp_path / place / TABLE_NAME
+        (tmp_path / place / TABLE_NAME).unlink()
+    with pytest.raises(GroundTruthMissing) as caught:
+        ScanNet(tmp_path).ground_truth(SCAN, "scannet200-vertices")
+    assert str(caught.value) == (
+        f"{WHERE}: no ground truth 'scannet200-vertices'; {TABLE_NAME} of the release is missing, put it into "
+        f"{folder.parent}"
+    )
+    assert ScanNet(tmp_path).ground_truth(SCAN, "nyu40-vertices").semantic.max() == 6
+    assert ScanNet(tmp_path).status(SCAN) == f"5 frames, ground truth, no ScanNet200: {TABLE_NAME} is missing"
+
+
+def test_recording_and_truth_may_lie_in_two_places(tmp_path: Path) -> None:
+    folder = write_scan(tmp_path)
+    (tmp_path / "scannet" / SCAN).mkdir(parents=True)
+    (folder / f"{SCAN}.sens").rename(tmp_path / "scannet" / SCAN / f"{SCAN}.sens")
+    scannet = ScanNet(tmp_path)
+    assert len(scannet.frames(SCAN, 1)) == 5
+    assert scannet.ground_truth(SCAN, "nyu40-vertices").instance.max() == 2
+    assert scannet.status(SCAN) == "5 frames, ground truth"
+
+
+def test_frames_hold_what_the_recording_holds_on_the_depth_grid(tmp_path: Path) -> None:
+    write_scan(tmp_path)
+    frames = ScanNet(tmp_path).frames(SCAN, 2)
+    assert [frames[i].index for i in range(len(frames))] == [0, 2, 4]
+    frame = frames[-1]
+    assert frame.timestamp_s == pytest.approx(1 + 4 * 0.033333)
+    np.testing.assert_array_equal(frame.camera_to_world, pose(positions(5)[4]))
+    assert frame.depth_m.shape == DEPTH_SIZE[::-1]
+    assert (frame.depth_m == HEIGHT_M).all()
+    assert frame.intrinsics.tolist() == [[32, 0, 15.5], [0, 32, 11.5], [0, 0, 1]]
+    # twice as many colour pixels: the edge between the halves lies between two depth pixels
+    np.testing.assert_array_equal(frames[1].rgb, floor_image(DEPTH_SIZE, 2.0))
+    assert frames[1].rgb[0, [15, 16]].tolist() == [list(LEFT), list(RIGHT)]
+    with pytest.raises(IndexError):
+        frames[3]
+
+
+def test_the_colour_grid_keeps_colour_and_thins_depth(tmp_path: Path) -> None:
+    write_scan(tmp_path)
+    frame = dataset(tmp_path, grid="colour").frames(SCAN, 1)[0]
+    np.testing.assert_array_equal(frame.rgb, floor_image(COLOUR_SIZE, 1.0))
+    assert np.count_nonzero(frame.depth_m) == DEPTH_SIZE[0] * DEPTH_SIZE[1]
+    assert frame.intrinsics.tolist() == [[64, 0, 31.5], [0, 64, 23.5], [0, 0, 1]]
+
+
+def test_on_the_colour_grid_the_pose_is_that_of_the_colour_camera(tmp_path: Path) -> None:
+    extrinsic = np.eye(4)
+    extrinsic[0, 3] = 0.25  # points of the depth camera are 0.25 m further right in the colour camera
+    write_recording(tmp_path / SCAN / f"{SCAN}.sens", head=header(extrinsic=extrinsic))
+    places = [dataset(tmp_path, grid=grid).frames(SCAN, 1)[0].camera_to_world[:3, 3] for grid in ("depth", "colour")]
+    np.testing.assert_allclose(places, [(1, 1, HEIGHT_M), (0.75, 1, HEIGHT_M)], atol=1e-12)
+
+
+def test_axis_align_turns_poses_and_mesh_alike(tmp_path: Path) -> None:
+    folder = write_scan(tmp_path)
+    plain, turned = dataset(tmp_path), dataset(tmp_path, axis_align=True)
+    motion = np.array([[0, -1, 0, 5], [1, 0, 0, 6], [0, 0, 1, 7], [0, 0, 0, 1]], float)
+    before, after = plain.frames(SCAN, 1)[3], turned.frames(SCAN, 1)[3]
+    np.testing.assert_allclose(after.camera_to_world, motion @ before.camera_to_world)
+    points = [one.ground_truth(SCAN, "nyu40-vertices").points for one in (plain, turned)]
+    np.testing.assert_allclose(points[1], points[0] @ motion[:3, :3].T + motion[:3, 3], atol=1e-5)
+    np.testing.assert_array_equal(turned.instance_mesh(SCAN).vertices, points[1])
+    assert plain.digest(SCAN) != turned.digest(SCAN)
+    (folder / f"{SCAN}.txt").unlink()
+    assert len(dataset(tmp_path).frames(SCAN, 1)) == 5
+    with pytest.raises(DataError, match=rf"^{WHERE}: {SCAN}\.txt is missing; axis_align needs it"):
+        dataset(tmp_path, axis_align=True).frames(SCAN, 1)
+
+
+def test_options_are_strict() -> None:
+    for options in ({"grid": "color"}, {"axes": True}, {"source": "zip"}):
+        with pytest.raises(ValidationError):
+            ScannetOptions(**options)
+
+
+def export(folder: Path, n_frames: int = 5) -> None:
+    """The same walk as the Python reader exports it, in millimetres of 1.5 m to tell it from the recording."""
+    import cv2
+
+    for name in ("color", "depth", "pose", "intrinsic"):
+        (folder / name).mkdir(parents=True)
+    head = header()
+    for name, matrix in (("intrinsic_color", head.intrinsic_colour), ("intrinsic_depth", head.intrinsic_depth)):
+        np.savetxt(folder / "intrinsic" / f"{name}.txt", matrix, "%f")
+    for i, x_m in enumerate(positions(n_frames)):
+        cv2.imwrite(str(folder / "color" / f"{i}.jpg"), floor_image(COLOUR_SIZE, x_m)[..., ::-1])
+        cv2.imwrite(str(folder / "depth" / f"{i}.png"), np.full(DEPTH_SIZE[::-1], 1500, np.uint16))
+        np.savetxt(folder / "pose" / f"{i}.txt", LOST if i == 1 else pose(x_m), "%f")
+
+
+def test_the_source_option_chooses_among_recording_and_export(tmp_path: Path) -> None:
+    export(write_scan(tmp_path))
+    depths = {
+        kind: dataset(tmp_path, source=kind).frames(SCAN, 4)[1].depth_m[0, 0] for kind in ("auto", "sens", "python")
+    }
+    assert depths == {"auto": 2.0, "sens": 2.0, "python": 1.5}
+    assert dataset(tmp_path, source="python").status(SCAN) == "5 exported frames, ground truth"
+    assert [frame.index for frame in dataset(tmp_path, source="python").frames(SCAN, 1)] == [0, 2, 3, 4]
+    assert dataset(tmp_path, source="cpp").status(SCAN) == "no recording, ground truth"
+    with pytest.raises(DataError, match=rf"^{WHERE}: no recording in .*; looked for _info\.txt"):
+        dataset(tmp_path, source="cpp").frames(SCAN, 1)
+
+
+def test_frames_without_a_pose_are_left_out_and_counted_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_scan(tmp_path, n_frames=7, lost=(2, 3))
+    scannet = ScanNet(tmp_path)
+    with caplog.at_level(logging.INFO):
+        assert [frame.index for frame in scannet.frames(SCAN, 1)] == [0, 1, 4, 5, 6]
+        # at full rate 0, 2, 4, 6: the second has no pose and is not replaced
+        assert [frame.index for frame in scannet.frames(SCAN, 2)] == [0, 4, 6]
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{WHERE}: frames without a pose, left out: 2 of 7 (the first: 2)"
+    ]
+    assert (scannet.info(SCAN, 1).n_frames, scannet.info(SCAN, 2).n_frames) == (5, 3)
+    assert scannet.status(SCAN) == "7 frames, ground truth"
+
+
+class Poses:
+    """A recording of poses alone."""
+
+    where = WHERE
+    camera = SensorPair((1, 1), (1, 1), np.eye(3), np.eye(3), np.eye(4), np.eye(4), 1.0)
+
+    def __init__(self, poses: Sequence[np.ndarray], step: int = 1) -> None:
+        self._poses, self._step = np.array(poses, float), step
+
+    def __len__(self) -> int:
+        return len(self._poses)
+
+    def poses(self) -> Float64Array:
+        return self._poses
+
+    def pose(self, i: int) -> Float64Array:
+        one: Float64Array = self._poses[i]
+        return one
+
+    def timestamp_s(self, i: int) -> float:
+        return float(i)
+
+    def colour(self, i: int) -> UInt8Array:
+        raise AssertionError
+
+    def depth(self, i: int) -> UInt16Array:
+        raise AssertionError
+
+    def frame_number(self, i: int) -> int:
+        return i * self._step
+
+    def files(self) -> Sequence[Path]:
+        return []
+
+
+def turned(angle: float) -> Float64Array:
+    matrix = np.eye(4)
+    matrix[:2, :2] = [[math.cos(angle), -math.sin(angle)], [math.sin(angle), math.cos(angle)]]
+    return matrix
+
+
+def test_which_poses_are_lost() -> None:
+    quarter = np.array([[0.0, -1, 0, 3], [1, 0, 0, 4], [0, 0, 1, 5], [0, 0, 0, 1]])
+    nan, one_inf, zero = turned(0.1), turned(0.2), np.zeros((4, 4))
+    nan[2, 3], one_inf[0, 1] = np.nan, np.inf
+    walk = read_walk(Poses([turned(0.3), LOST, nan, one_inf, zero, quarter]))
+    assert walk.is_usable.tolist() == [True, False, False, False, False, True]
+
+
+@pytest.mark.parametrize(
+    ("poses", "message"),
+    [
+        ([turned(0), turned(0) * 2], "frame 1: the pose is not a rigid motion; copy the recording again"),
+        ([turned(0), np.diag([-1.0, 1, 1, 1])], "frame 1: the pose is not a rigid motion"),
+        ([LOST, np.zeros((4, 4))], "none of the 2 frames has a pose; leave the scene out"),
+        (np.zeros((0, 4, 4)), "none of the 0 frames has a pose"),
+    ],
+)
+def test_poses_that_cannot_be_used_are_one_line(poses: Sequence[np.ndarray], message: str) -> None:
+    with pytest.raises(DataError) as caught:
+        read_walk(Poses(poses))
+    assert str(caught.value).startswith(f"{WHERE}: {message}")
+
+
+def test_the_stride_counts_at_full_rate_whatever_an_export_left_out() -> None:
+    every_second = read_walk(Poses([turned(0.01 * i) for i in range(40)], step=2))
+    assert every_second.numbers[every_second.every(10)].tolist() == [0, 10, 20, 30, 40, 50, 60, 70]
+    every_fourth = read_walk(Poses([turned(0.01 * i) for i in range(10)], step=4))
+    assert every_fourth.numbers[every_fourth.every(10)].tolist() == [0, 12, 20, 32]
+    assert every_fourth.every(1).tolist() == list(range(10))
+
+
+def test_the_official_splits_are_whole_and_apart() -> None:
+    lists = {split: split_scenes(split) for split in ("train", "val", "test")}
+    assert [len(scans) for scans in lists.values()] == [1201, 312, 100]
+    assert len({scan for scans in lists.values() for scan in scans}) == 1613
+    assert set(PAPER_SCENES) <= {*lists["train"], *lists["val"]}
+
+
+def expand(monkeypatch: pytest.MonkeyPatch, root: Path, *addresses: str) -> list[str]:
+    monkeypatch.setenv("SU3D_DATA", str(root))
+    chosen, _ = expand_scenes(addresses, {"scannet": Part("scannet", "scannet", "{}")})
+    return ["/".join(one) for one in chosen]
+
+
+def test_a_split_is_asked_for_by_name_and_must_be_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("su3d_bench.datasets.scannet.split_scenes", lambda split: (f"scene000{len(split)}_00", SCAN))
+    write_scan(tmp_path)
+    write_scan(tmp_path, "scene0003_00", n_frames=1)
+    assert expand(monkeypatch, tmp_path, "scannet/val", f"scannet/{SCAN}") == ["scannet/scene0003_00", WHERE]
+    with pytest.raises(ConfigError) as caught:
+        expand(monkeypatch, tmp_path, "scannet/train")
+    assert str(caught.value) == (
+        "scannet/train: 1 of its 2 scenes are not here (the first: scene0005_00); get them or name the scenes that are"
+    )
+    with pytest.raises(
+        ConfigError, match=r"^scannet/paper: 4 of its 5 scenes are not here \(the first: scene0034_00\)"
+    ):
+        expand(monkeypatch, tmp_path, "scannet/paper")
+    with pytest.raises(ConfigError, match=r"no scene matches 'scannet/trian'; did you mean 'scannet/train'\?"):
+        expand(monkeypatch, tmp_path, "scannet/trian")
+
+
+def test_no_data_is_said_with_the_way_to_get_it(tmp_path: Path) -> None:
+    with pytest.raises(DataError) as caught:
+        ScanNet(tmp_path).scenes()
+    assert str(caught.value).startswith(f"scannet: no scan in {tmp_path} or in its folders scans, scannet")
+    assert "datasets make rooms --layout scannet" in str(caught.value)
+    write_recording(tmp_path / SCAN / f"{SCAN}.sens", 1)
+    with pytest.raises(DataError, match=r"scannet: no scene 'scene0000_01'; did you mean 'scene0000_00'\?"):
+        ScanNet(tmp_path).frames("scene0000_01", 1)
+
+
+def test_a_scan_without_truth_has_frames_and_a_reason(tmp_path: Path) -> None:
+    for scan in (SCAN, "scene0707_00"):
+        write_recording(tmp_path / scan / f"{scan}.sens")
+    scannet = ScanNet(tmp_path)
+    assert (
+        scannet.status(SCAN)
+        == f"5 frames, no ground truth, {SCAN}_vh_clean_2.ply is missing; expected in {tmp_path / SCAN}"
+    )
+    with pytest.raises(
+        GroundTruthMissing, match=r"scene0707_00_vh_clean_2\.ply is missing; the benchmark keeps that of"
+    ):
+        scannet.instance_mesh("scene0707_00")
+    write_floor_truth(tmp_path / SCAN)
+    (tmp_path / SCAN / f"{SCAN}.aggregation.json").unlink()
+    with pytest.raises(
+        GroundTruthMissing, match=r"no ground truth, scene0000_00\.aggregation\.json is missing; expected"
+    ):
+        scannet.ground_truth(SCAN, "nyu40-vertices")
+    with pytest.raises(GroundTruthMissing, match=r"no ground truth 'nyu20-vertices'; did you mean 'nyu40-vertices'\?"):
+        scannet.ground_truth(SCAN, "nyu20-vertices")
+
+
+def test_scans_of_the_marker_are_rendered_rooms_under_any_name(tmp_path: Path) -> None:
+    write_scan(tmp_path, "scene9000_00")
+    write_scan(tmp_path, SCAN)
+    export(tmp_path / "scans" / "kitchen3")
+    (tmp_path / "scans" / "office1" / "rgb").mkdir(parents=True)  # a room in the layout of another dataset
+    scenes = dict.fromkeys(("scene9000_00", "kitchen3", "office1"), "key")
+    marker = {"generator": "rooms", "version": 1, "scenes": scenes}
+    (tmp_path / "scans" / "rooms.json").write_text(json.dumps(marker | {"rooms": {"scene9000_00": "living0"}}))
+    scannet = ScanNet(tmp_path)
+    assert list(scannet.scenes()) == [SCAN, "kitchen3", "scene9000_00"]
+    assert [scannet.info(scan, 1).image_domain for scan in scannet.scenes()] == ["camera", *["rendered-rooms"] * 2]
+
+
+def test_files_are_all_that_is_read(tmp_path: Path) -> None:
+    write_scan(tmp_path)
+    assert set(ScanNet(tmp_path).files(SCAN)) == {path for path in tmp_path.rglob("*") if path.is_file()}
+    shutil.rmtree(tmp_path / "scans")
+    export(tmp_path / "scans" / SCAN)
+    assert set(ScanNet(tmp_path).files(SCAN)) == {path for path in tmp_path.rglob("*") if path.is_file()}
+
+
+def test_every_fault_of_a_scan_is_named_at_once(tmp_path: Path) -> None:
+    folder = write_scan(tmp_path, lost=(1,))
+    assert list(ScanNet(tmp_path).problems(SCAN)) == []
+    content = (folder / f"{SCAN}.sens").read_bytes()
+    for x_m in (positions(5)[2], positions(5)[4]):  # stretched along the view
+        content = content.replace(
+            pose(x_m).astype("<f4").tobytes(), (pose(x_m) @ np.diag([1, 1, 2, 1])).astype("<f4").tobytes()
+        )
+    (folder / f"{SCAN}.sens").write_bytes(content)
+    (folder / f"{SCAN}.txt").write_text("axisAlignment = 1 2 3\n")
+    (folder / f"{SCAN}.aggregation.json").write_text("{")
+    (folder / f"{SCAN}_vh_clean_2.labels.ply").write_text("ply")
+    (tmp_path / TABLE_NAME).write_text("id\n")
+    lines = list(ScanNet(tmp_path).problems(SCAN))
+    assert lines[:2] == [
+        f"{WHERE}: frame {i}: the pose is not a rigid motion; copy the recording again" for i in (2, 4)
+    ]
+    assert [line.split(": ")[1] for line in lines[2:]] == [
+        TABLE_NAME,
+        f"{SCAN}.txt",
+        f"{SCAN}.aggregation.json",
+        f"{SCAN}_vh_clean_2.labels.ply",
+    ]
+    (folder / f"{SCAN}.aggregation.json").unlink()
+    os.truncate(folder / f"{SCAN}.sens", 1000)
+    lines = list(ScanNet(tmp_path).problems(SCAN))
+    assert lines[0].startswith(f"{WHERE}: {SCAN}.sens: frame ") and len(lines) == 4
+
+
+def test_an_export_of_the_other_reader_has_a_status(tmp_path: Path) -> None:
+    matrix = " ".join("1" if i % 5 == 0 else "0" for i in range(16))
+    facts = dict.fromkeys(("m_colorWidth", "m_colorHeight", "m_depthWidth", "m_depthHeight"), "8")
+    facts |= {"m_depthShift": "1000", "m_frames.size": "77"}
+    for camera in ("Color", "Depth"):
+        facts |= dict.fromkeys((f"m_calibration{camera}{kind}" for kind in ("Intrinsic", "Extrinsic")), matrix)
+    (tmp_path / SCAN).mkdir()
+    text = "".join(f"{key} = {value}\n" for key, value in facts.items())
+    (tmp_path / SCAN / "_info.txt").write_text(text)
+    assert ScanNet(tmp_path).status(SCAN).startswith("77 exported frames, no ground truth, ")
+
+
+def flip(path: Path, at: int) -> None:
+    content = bytearray(path.read_bytes())
+    content[at] ^= 1
+    path.write_bytes(bytes(content))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda folder: flip(folder / f"{SCAN}.sens", 30),  # the colour intrinsics
+        lambda folder: flip(folder / f"{SCAN}.sens", -1),  # the last depth image
+        lambda folder: write_recording(folder / f"{SCAN}.sens", lost=(2,)),
+        lambda folder: flip(folder / f"{SCAN}_vh_clean_2.ply", -1),
+        lambda folder: flip(folder / f"{SCAN}_vh_clean_2.labels.ply", -1),
+        lambda folder: flip(folder / f"{SCAN}.aggregation.json", 40),
+        lambda folder: flip(folder / f"{SCAN}_vh_clean_2.0.010000.segs.json", 40),
+        lambda folder: flip(folder / f"{SCAN}.txt", 18),
+        lambda folder: flip(folder.parent.parent / TABLE_NAME, 90),
+    ],
+)
+def test_the_digest_moves_with_every_file(tmp_path: Path, change: Callable[[Path], object]) -> None:
+    folder = write_scan(tmp_path)
+    before = ScanNet(tmp_path).digest(SCAN)
+    assert ScanNet(tmp_path).digest(SCAN) == before
+    change(folder)
+    assert ScanNet(tmp_path).digest(SCAN) != before
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda folder: os.truncate(folder / "color/2.jpg", 100),
+        lambda folder: flip(folder / "depth/4.png", -1),
+        lambda folder: flip(folder / "pose/3.txt", 0),
+        lambda folder: (folder / "intrinsic/intrinsic_depth.txt").write_text("32.001 0 15.5 0 32 11.5 0 0 1"),
+    ],
+)
+def test_the_digest_of_an_export_moves_with_its_files(tmp_path: Path, change: Callable[[Path], object]) -> None:
+    folder = tmp_path / SCAN
+    export(folder)
+    before = ScanNet(tmp_path).digest(SCAN)
+    change(folder)
+    assert ScanNet(tmp_path).digest(SCAN) != before
+
+
+def test_the_digest_moves_with_the_options(tmp_path: Path) -> None:
+    write_scan(tmp_path)
+    options: list[dict[str, Any]] = [{}, {"grid": "colour"}, {"axis_align": True}, {"source": "sens"}]
+    assert len({dataset(tmp_path, **one).digest(SCAN) for one in options}) == 4
+
+
+@pytest.mark.parametrize("profile", ["oracle", "embedded"])
+def test_a_run_on_a_scan_is_scored_under_the_benchmarks_protocols(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, profile: str
+) -> None:
+    """A chair and a couch of 2 x 2 m, seen from above: with true masks the map holds exactly these two."""
+    folder = write_scan(tmp_path / "data")
+    write_recording(folder / f"{SCAN}.sens", 9, (4,), header((256, 192), (128, 96)))
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
+    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+    protocols = ["scannet-instance", "scannet-semantic", "scannet200-instance"]
+    words = ["run", "--scenes", WHERE, "--methods", "opensu3d", "--profile", profile, "--set", "opensu3d.stride=2"]
+    assert main([*words, "--protocols", *protocols, "--out", "out", "--jobs", "1", "--no-pictures", "--quiet"]) == 0
+    rows = {row["protocol"]: row for row in json.loads(Path("out/metrics.json").read_text())["results"]}
+    assert list(rows) == protocols
+    for row in rows.values():
+        assert row["unscored"] == [] and row["result"]["n_predictions"] == {WHERE: 2}
+        assert all(math.isfinite(row["result"]["metrics"][name]) for name in row["headline"])
+    assert rows["scannet-instance"]["ceiling"]["AP"] == rows["scannet200-instance"]["ceiling"]["AP"] == 1
+    assert rows["scannet-semantic"]["ceiling"]["mIoU"] == 1
+    if profile == "oracle":
+        assert rows["scannet-instance"]["result"]["metrics"]["AP25"] == 1
+        assert rows["scannet200-instance"]["result"]["metrics"]["AP25"] == 1
+    log = Path(f"out/scenes/scannet.{SCAN}/opensu3d/log.txt").read_text()
+    assert f"{WHERE}: frames without a pose, left out: 1 of 9 (the first: 4)" in log

@@ -1,0 +1,346 @@
+"""ScanNet's truth on a hand-worked mesh: both label sets, both releases, each fault once, damaged files."""
+
+from __future__ import annotations
+
+import json
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from damage import damages, outcomes, truncations
+from scannet_scan import SCAN, TABLE_ROWS, grid, table_text, write_json, write_mesh, write_truth
+
+from su3d_bench.datasets.scannet_annotations import (
+    aggregation_name,
+    object_of_vertex,
+    read_objects,
+    read_segments,
+    segments_name,
+)
+from su3d_bench.datasets.scannet_labels import (
+    TABLE_NAME,
+    LabelTable,
+    nyu40_label_set,
+    raw_label_set,
+    read_label_table,
+)
+from su3d_bench.datasets.scannet_meta import read_axis_alignment
+from su3d_bench.datasets.scannet_truth import (
+    AnnotatedScan,
+    aligned,
+    instance_mesh,
+    labels_name,
+    mesh_name,
+    nyu40_truth,
+    read_annotated_scan,
+    scannet200_truth,
+    truth_names,
+)
+from su3d_bench.errors import DataError, GroundTruthMissing
+from su3d_bench.metrics.instance_ap import encode_ground_truth
+from su3d_bench.protocols import load_protocol
+
+WHERE = f"scannet/{SCAN}"
+# 24 vertices in four rows of six. Segment 7 holds the first two columns, 12 the next two, 19 the last two;
+# 19 is in two objects, of which the later, the stool, has it; vertex 0 is of segment 3, which is in none.
+SEGMENTS = [7, 7, 12, 12, 19, 19] * 4
+SEGMENTS[0] = 3
+GROUPS = [(0, "chair", [7]), (2, "piano", [12, 19]), (5, "stool", [19])]
+NYU40 = [5, 5, 39, 39, 40, 40] * 4
+NYU40[0] = 0
+INSTANCE = [1, 1, 3, 3, 6, 6] * 4
+INSTANCE[0] = 0
+
+
+def read(folder: Path, scan: str = SCAN) -> AnnotatedScan:
+    return read_annotated_scan({name: folder / name for name in truth_names(scan)}, scan, f"scannet/{scan}")
+
+
+def table(tmp_path: Path, text: str | None = None) -> LabelTable:
+    (tmp_path / TABLE_NAME).write_text(table_text() if text is None else text, newline="")
+    return read_label_table(tmp_path / TABLE_NAME, WHERE)
+
+
+def test_nyu40_truth_is_the_label_of_the_file_and_the_last_object_that_claims_the_segment(tmp_path: Path) -> None:
+    write_truth(tmp_path, SEGMENTS, GROUPS, NYU40)
+    truth = nyu40_truth(read(tmp_path), None)
+    assert truth.semantic.tolist() == NYU40
+    assert truth.instance.tolist() == INSTANCE
+    assert truth.variant == "nyu40-vertices"
+    np.testing.assert_array_equal(truth.points, grid()[0])
+    # label * 1000 + id + 1, as Mask3D writes it
+    assert encode_ground_truth(truth.semantic, truth.instance)[:6].tolist() == [0, 5001, 39003, 39003, 40006, 40006]
+
+
+def test_scannet200_truth_is_the_raw_id_of_the_category(tmp_path: Path) -> None:
+    write_truth(tmp_path, SEGMENTS, GROUPS, NYU40)
+    truth = scannet200_truth(read(tmp_path), table(tmp_path))
+    assert truth.semantic[:6].tolist() == [0, 2, 90, 90, 38, 38]
+    assert truth.instance.tolist() == INSTANCE
+    assert [truth.labels.name_of(one) for one in (2, 38, 90)] == ["chair", "stool", "piano"]
+
+
+def test_the_label_sets_name_every_class_of_the_protocols_as_these_do(tmp_path: Path) -> None:
+    sets = {"scannet-instance": nyu40_label_set(), "scannet200-instance": raw_label_set(table(tmp_path))}
+    for protocol, labels in sets.items():
+        classes = load_protocol(protocol).classes
+        assert [labels.name_of(entry.id) for entry in classes] == [entry.name for entry in classes]
+        assert len(set(labels.names)) == len(labels.names)
+    assert nyu40_label_set().ids == tuple(range(1, 41))
+
+
+def test_a_raw_id_outside_the_200_does_not_bear_the_name_of_one_of_them(tmp_path: Path) -> None:
+    labels = raw_label_set(table(tmp_path, table_text([*TABLE_ROWS, ("book", 1300, 23, "books")])))
+    assert labels.name_of(1300) == "book (1300)"
+    assert labels.name_of(22) == "book"
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_the_table_may_end_its_lines_in_any_way(tmp_path: Path, end: str) -> None:
+    found = table(tmp_path, table_text(end=end))
+    assert found == table(tmp_path)
+    assert found.nyu40_of["stack of chairs"] == 5
+
+
+def test_mixed_line_ends_trailing_blanks_and_repeated_categories_of_the_table(tmp_path: Path) -> None:
+    rows = [*TABLE_ROWS, ("object ", 40, 40, "otherprop"), ("object", 1234, 39, "otherfurniture")]
+    text = "\ufeff" + table_text(rows).replace("\n", "\r\n", 3).replace("\n", "\r", 2) + "\r\n\t\n"
+    (tmp_path / TABLE_NAME).write_bytes(text.encode())
+    found = read_label_table(tmp_path / TABLE_NAME, WHERE)
+    assert (found.nyu40_of["object"], found.raw_id_of["object"]) == (40, 40)
+    assert found.nyu40_of["couch"] == 6
+
+
+def test_a_category_without_row_is_void_and_counted(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_truth(tmp_path, SEGMENTS, [*GROUPS[:2], (5, "Stool", [19])], NYU40)
+    with caplog.at_level(logging.WARNING):
+        truth = scannet200_truth(read(tmp_path), table(tmp_path))
+    assert truth.semantic[:6].tolist() == [0, 2, 90, 90, 0, 0]
+    assert [record.getMessage() for record in caplog.records] == [
+        f"{WHERE}: categories without a row in {TABLE_NAME}: 1 (the first: 'Stool'); vertices made void: 8"
+    ]
+
+
+def test_ids_may_be_text_and_blanks_may_surround_a_category(tmp_path: Path) -> None:
+    groups = [(str(one), f" {category} ", [str(part) for part in parts]) for one, category, parts in GROUPS]
+    write_truth(tmp_path, [str(one) for one in SEGMENTS], groups, NYU40)
+    truth = scannet200_truth(read(tmp_path), table(tmp_path))
+    assert truth.instance.tolist() == INSTANCE
+    assert truth.semantic[:3].tolist() == [0, 2, 90]
+
+
+RAW = [2 if one == 5 else 90 if one == 39 else 38 if one == 40 else 0 for one in NYU40]
+
+
+@pytest.mark.parametrize("groups", [GROUPS, [(0, "chair", [7]), (2, "couch", [12]), (5, "stool", [19])]])
+def test_labels_of_the_first_release_are_raw_ids_and_become_nyu40(tmp_path: Path, groups: list) -> None:  # type: ignore[type-arg]
+    """The second scan has no id above 40: only its objects tell the releases apart."""
+    raw = [6 if one == 90 else one for one in RAW] if groups is not GROUPS else RAW
+    write_truth(tmp_path, SEGMENTS, groups, raw, prefix="")
+    truth = nyu40_truth(read(tmp_path), table(tmp_path))
+    assert truth.semantic.tolist() == ([6 if one == 39 else one for one in NYU40] if groups is not GROUPS else NYU40)
+    assert truth.instance.tolist() == INSTANCE
+    assert "categories" in truth.source
+
+
+def test_labels_of_the_first_release_need_the_table(tmp_path: Path) -> None:
+    write_truth(tmp_path, SEGMENTS, GROUPS, RAW, prefix="")
+    with pytest.raises(GroundTruthMissing, match=r"raw ids of the first release \(the largest: 90\); .*combined\.tsv"):
+        nyu40_truth(read(tmp_path), None)
+
+
+def test_a_triangle_belongs_to_the_instance_of_most_of_its_vertices(tmp_path: Path) -> None:
+    write_truth(tmp_path, SEGMENTS, GROUPS, NYU40)
+    mesh = instance_mesh(read(tmp_path), None)
+    # the first cell: vertices 0 (none), 1 and 6 (chair); the second: 1, 7 (chair) and 2, 8 (piano)
+    assert mesh.triangles[:4].tolist() == [[0, 1, 6], [1, 7, 6], [1, 2, 7], [2, 8, 7]]
+    assert mesh.instance_of_triangle[:4].tolist() == [1, 1, 1, 3]
+    assert mesh.class_of_instance == {1: 5, 3: 39, 6: 40}
+
+
+def test_a_triangle_of_three_instances_belongs_to_none(tmp_path: Path) -> None:
+    points, triangles = np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32)
+    write_truth(tmp_path, [1, 2, 3], [(0, "chair", [1]), (1, "couch", [2]), (2, "x", [3])], [5, 6, 0],
+                mesh=(points, triangles))  # fmt: skip
+    mesh = instance_mesh(read(tmp_path), None)
+    assert mesh.instance_of_triangle.tolist() == [0]
+    assert mesh.class_of_instance == {1: 5, 2: 6}
+
+
+def test_the_class_of_an_instance_is_that_of_most_of_its_vertices(tmp_path: Path) -> None:
+    labels = list(NYU40)
+    labels[1] = 8
+    write_truth(tmp_path, SEGMENTS, GROUPS, labels)
+    assert instance_mesh(read(tmp_path), None).class_of_instance[1] == 5
+
+
+def test_alignment_moves_the_vertices(tmp_path: Path) -> None:
+    write_truth(tmp_path, SEGMENTS, GROUPS, NYU40)
+    (tmp_path / f"{SCAN}.txt").write_text("appVersionId = 7\naxisAlignment = 0 -1 0 5 1 0 0 6 0 0 1 7 0 0 0 1 \n")
+    motion = read_axis_alignment(tmp_path / f"{SCAN}.txt", WHERE)
+    scan = read(tmp_path)
+    moved = aligned(scan, motion)
+    np.testing.assert_allclose(moved.vertices[1], [5, 6.5, 7])
+    assert moved.labels is scan.labels
+
+
+def test_a_scan_without_alignment_has_the_identity(tmp_path: Path) -> None:
+    (tmp_path / "x.txt").write_text("colorHeight = 968\nsceneType = Apartment\n")
+    np.testing.assert_array_equal(read_axis_alignment(tmp_path / "x.txt", WHERE), np.eye(4))
+
+
+def change_json(name: str, **values: object) -> Callable[[Path], object]:
+    def change(folder: Path) -> None:
+        content = json.loads((folder / name).read_text()) | values
+        write_json(folder / name, content)
+
+    return change
+
+
+def rewrite(name: str, content: str | bytes) -> Callable[[Path], object]:
+    return lambda folder: (folder / name).write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def write_mesh_file(
+    name: str, move_m: float = 0.0, n_vertices: int = 24, label: bool = False
+) -> Callable[[Path], None]:
+    def change(folder: Path) -> None:
+        points, triangles = grid()
+        points[3] += move_m
+        kept = triangles[(triangles < n_vertices).all(axis=1)]
+        write_mesh(folder / name, points[:n_vertices], kept, np.zeros(n_vertices, np.uint16) if label else None)
+
+    return change
+
+
+AGGREGATION, SEGMENT_FILE = aggregation_name(SCAN), segments_name(SCAN)
+MESH, LABELS = mesh_name(SCAN), labels_name(SCAN)
+GROUP = {"id": 0, "objectId": 0, "segments": [7], "label": "chair"}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (rewrite(AGGREGATION, "{"), f"{AGGREGATION}: not JSON"),
+        (rewrite(AGGREGATION, "[" * 100_000), f"{AGGREGATION}: not JSON"),
+        (rewrite(AGGREGATION, "[1]"), f"{AGGREGATION}: is no JSON object"),
+        (change_json(AGGREGATION, sceneId="scannet.scene0001_00"), "'sceneId' is 'scannet.scene0001_00', not 'scene00"),
+        (change_json(AGGREGATION, sceneId=None), "'sceneId' is 'None', not"),
+        (
+            change_json(AGGREGATION, segmentsFile=f"scannet.{SCAN}_vh_clean.segs.json"),
+            f"'segmentsFile' is 'scannet.{SCAN}_vh_clean.segs.json', but {SEGMENT_FILE} is read",
+        ),
+        (change_json(AGGREGATION, segGroups={}), f"{AGGREGATION}: has no list 'segGroups'"),
+        (change_json(AGGREGATION, segGroups=[1]), f"{AGGREGATION}: group 0 is no JSON object"),
+        (change_json(AGGREGATION, segGroups=[GROUP | {"id": 999}]), "group 0: 'id' is 999; expected 0 to 998"),
+        (change_json(AGGREGATION, segGroups=[GROUP | {"id": -1}]), "group 0: 'id' is -1; expected 0 to 998"),
+        (change_json(AGGREGATION, segGroups=[GROUP | {"id": 10**400}]), "group 0: 'id' is 1000000000000"),
+        (change_json(AGGREGATION, segGroups=[GROUP | {"id": None}]), "group 0: 'id' is 'None'"),
+        (change_json(AGGREGATION, segGroups=[GROUP | {"id": True}]), "group 0: 'id' is True"),
+        (change_json(AGGREGATION, segGroups=[GROUP | {"label": 3}]), "group 0: 'label' is 3; expected a category"),
+        (change_json(AGGREGATION, segGroups=[GROUP | {"segments": 7}]), "group 0: has no list 'segments'"),
+        (change_json(AGGREGATION, segGroups=[GROUP | {"segments": [7, 1.5]}]), "group 0: 'segments'[1] is '1.5'"),
+        (
+            change_json(AGGREGATION, segGroups=[GROUP, GROUP | {"label": "couch"}]),
+            "object 0 stands there twice, as 'chair' and as 'couch'",
+        ),
+        (change_json(SEGMENT_FILE, sceneId="scene0001_00"), f"{SEGMENT_FILE}: 'sceneId' is 'scene0001_00', not"),
+        (change_json(SEGMENT_FILE, segIndices="x"), f"{SEGMENT_FILE}: has no list 'segIndices'"),
+        (change_json(SEGMENT_FILE, segIndices=SEGMENTS[:-1]), f"has 23 vertices, {MESH} has 24; they belong to two"),
+        (change_json(SEGMENT_FILE, segIndices=[-3] * 24), "'segIndices'[0] is -3; expected a segment id"),
+        (change_json(SEGMENT_FILE, segIndices=[2**32] * 24), "'segIndices'[0] is 4294967296; expected"),
+        (change_json(SEGMENT_FILE, segIndices=["x\n"] * 24), r"'segIndices'[0] is 'x\n'; expected"),
+        (write_mesh_file(LABELS, n_vertices=18, label=True), f"{LABELS}: has 18 vertices, {MESH} has 24"),
+        (write_mesh_file(LABELS, move_m=0.1, label=True), f"{LABELS}: vertex 3 is at [1.6"),
+        (write_mesh_file(LABELS), f"{LABELS}: vertices have no property 'label'"),
+        (write_mesh_file(MESH, move_m=np.nan), f"{MESH}: vertex 3 is at [nan, nan, nan]"),
+        (rewrite(MESH, "ply\n"), f"{MESH}: "),
+    ],
+)
+def test_each_fault_of_the_truth_is_one_clear_line(
+    tmp_path: Path, change: Callable[[Path], object], message: str
+) -> None:
+    write_truth(tmp_path, SEGMENTS, GROUPS, NYU40)
+    change(tmp_path)
+    with pytest.raises(DataError) as caught:
+        read(tmp_path)
+    line = str(caught.value)
+    assert line.startswith(f"{WHERE}: {SCAN}")
+    assert message in line
+    assert line.isprintable() and len(line) < 400
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "has no column 'raw_category'; expected the table of the release, tabs between columns"),
+        ("id\tnyu40id\n1\t1\n", "has no column 'raw_category'"),
+        (table_text([]), "has no row below its header"),
+        (table_text([("chair", 0, 5, "")]), "line 2: 'id' is '0'; expected a whole number from 1 to 65535"),
+        (table_text([("chair", 2, 41, "")]), "line 2: 'nyu40id' is '41'; expected a whole number from 1 to 40"),
+        (table_text([("chair", 10**30, 4, "")]), "line 2: 'id' is '10000000000000000000'; expected"),
+        (table_text() + "3\tlamp\n", "line 8: has no raw_category, id, nyu40id"),
+        (table_text() + "3\tla\x1bmp\t\t\t4\n", "line 8: has no raw_category, id, nyu40id"),
+    ],
+)
+def test_each_fault_of_the_label_table_is_one_clear_line(tmp_path: Path, text: str, message: str) -> None:
+    with pytest.raises(DataError) as caught:
+        table(tmp_path, text)
+    assert str(caught.value).startswith(f"{WHERE}: {TABLE_NAME}")
+    assert message in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", "holds nothing; expected lines 'key = value'"),
+        ("colorHeight\n", "line 1: 'colorHeight' is no 'key = value'"),
+        ("axisAlignment = 1 0 0 0\n", "'axisAlignment' has 4 values; expected 16"),
+        ("axisAlignment = 1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 x\n", "'axisAlignment' holds '1 0 0 0"),
+        ("axisAlignment = 1 0 0 nan 0 1 0 0 0 0 1 0 0 0 0 1\n", "expected 16 finite numbers"),
+        ("axisAlignment = 2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n", "'axisAlignment' is not a rigid motion"),
+        ("axisAlignment = 1e200 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n", "'axisAlignment' is not a rigid motion"),
+    ],
+)
+def test_each_fault_of_the_facts_of_a_scan_is_one_clear_line(tmp_path: Path, text: str, message: str) -> None:
+    (tmp_path / "x.txt").write_text(text)
+    with pytest.raises(DataError, match=r"^scannet/scene0000_00: x\.txt") as caught:
+        read_axis_alignment(tmp_path / "x.txt", WHERE)
+    assert message in str(caught.value)
+
+
+def test_a_segment_of_no_object_and_an_object_without_vertices_are_no_fault() -> None:
+    segments = np.array([4, 4, 9])
+    assert object_of_vertex(segments, []).tolist() == [-1, -1, -1]
+    assert object_of_vertex(np.zeros(0, np.int64), []).tolist() == []
+
+
+def small(name: str) -> Callable[[Path, bytes], object]:
+    """How the file ``name`` is read once its content has been replaced."""
+
+    def attempt(folder: Path, content: bytes) -> object:
+        (folder / name).write_bytes(content)
+        if name == TABLE_NAME:
+            return read_label_table(folder / name, WHERE)
+        if name == SEGMENT_FILE:
+            return read_segments(folder / name, SCAN, WHERE)
+        if name == AGGREGATION:
+            return read_objects(folder / name, SCAN, WHERE)
+        if name == f"{SCAN}.txt":
+            return read_axis_alignment(folder / name, WHERE)
+        return read(folder)
+
+    return attempt
+
+
+@pytest.mark.parametrize("name", [TABLE_NAME, f"{SCAN}.txt", SEGMENT_FILE, AGGREGATION, LABELS])
+def test_damaged_files_are_refused_by_name(tmp_path: Path, name: str) -> None:
+    write_truth(tmp_path, SEGMENTS, GROUPS, NYU40)
+    (tmp_path / TABLE_NAME).write_text(table_text())
+    (tmp_path / f"{SCAN}.txt").write_text("axisAlignment = 1 0 0 5 0 1 0 6 0 0 1 7 0 0 0 1\ncolorHeight = 968\n")
+    content, attempt = (tmp_path / name).read_bytes(), small(name)
+    for copies in (truncations(content), damages(content)):
+        n_read, n_refused = outcomes(lambda damaged: attempt(tmp_path, damaged), copies, must_name=name)
+        assert n_refused > 0.2 * (n_read + n_refused)

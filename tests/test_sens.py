@@ -1,0 +1,428 @@
+"""``.sens`` recordings: what the original readers found in them, any frame at once, and damage of every kind."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import pickle
+import struct
+import tracemalloc
+import zlib
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from damage import damages, outcomes, truncations
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from su3d_bench.datasets.sens import MOTION_RECORD, SensFile, SensSource
+from su3d_bench.datasets.sens_header import SensHeader
+from su3d_bench.datasets.sens_write import SensFrame, colour_content, depth_content, stored_frame, write_sens
+from su3d_bench.errors import DataError, StoreError
+
+CASES = Path(__file__).parent / "cases"
+TOY, RAW_TOY = CASES / "sens01_toy.sens", CASES / "sens02_toy_raw.sens"
+WHERE = "scannet/scene0000_00"
+START_OF_SIZES = 80  # in a frame record
+N_HEADER = 4 + 8 + len("StructureSensor") + 256 + 8 + 16 + 4 + 8
+
+
+@pytest.fixture(scope="module")
+def expected() -> dict[str, np.ndarray]:
+    with np.load(CASES / "sens01_toy.npz") as archive:
+        return {name: archive[name] for name in archive.files}
+
+
+@pytest.fixture(scope="module")
+def recorded() -> dict[str, object]:
+    recorded: dict[str, object] = json.loads((CASES / "sens01_toy.json").read_text())
+    return recorded
+
+
+def opened(path: Path, content: bytes) -> SensFile:
+    path.unlink(missing_ok=True)  # some file systems wait for the disk where a file is overwritten
+    path.write_bytes(content)
+    return SensFile(path, WHERE)
+
+
+def read_whole(file: SensFile) -> None:
+    """Everything that can be asked of a file."""
+    for i in range(len(file)):
+        file.record(i)
+        assert file.colour(i).shape == (file.header.colour_height, file.header.colour_width, 3)
+        assert file.depth(i).shape == (file.header.depth_height, file.header.depth_width)
+    file.motion()
+
+
+def header(**changes: object) -> SensHeader:
+    """A header for colour images of 8x6 and depth images of 4x3."""
+    matrix = np.array([[10.0, 0, 3.5, 0], [0, 10.0, 2.5, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    base = SensHeader("Sensor", matrix, np.eye(4), matrix, np.eye(4), "jpeg", "zlib", 8, 6, 4, 3, 1000.0)
+    return replace(base, **changes)  # type: ignore[arg-type]
+
+
+def frames(header: SensHeader, n: int) -> Iterator[SensFrame]:
+    """Frames of random images, each different."""
+    rng = np.random.default_rng(0)
+    for i in range(n):
+        pose = np.eye(4)
+        pose[:3, 3] = i
+        rgb = rng.integers(0, 256, (header.colour_height, header.colour_width, 3), np.uint8)
+        values = rng.integers(0, 1 << 16, (header.depth_height, header.depth_width), np.uint16)
+        colour = colour_content(rgb, header.colour_compression)
+        yield SensFrame(pose, 33_333 * i, 33_333 * i + 7, colour, depth_content(values, header.depth_compression))
+
+
+# ---------------------------------------------------------------- what the original readers found
+
+
+def test_the_toy_recording_is_read_as_the_original_readers_did(expected: dict[str, np.ndarray]) -> None:
+    file = SensFile(TOY, WHERE)
+    assert len(file) == 4
+    for i in range(4):
+        np.testing.assert_array_equal(file.record(i).camera_to_world, expected["pose"][i])
+        np.testing.assert_array_equal(file.depth(i), expected["depth"][i])
+        np.testing.assert_array_equal(file.colour(i), expected["decoded_color_pil"][i])
+    assert np.isneginf(file.record(2).camera_to_world).all()
+    np.testing.assert_array_equal(file.poses(), expected["pose"])
+    assert file.depth(0).dtype == np.uint16 and file.colour(0).dtype == np.uint8
+    for name, key in (("intrinsic", "K"), ("extrinsic", "E")):
+        for ours, theirs in (("colour", "color"), ("depth", "depth")):
+            np.testing.assert_array_equal(getattr(file.header, f"{name}_{ours}"), expected[f"{key}_{theirs}"])
+
+
+def test_the_toy_recording_has_its_time_stamps_and_motion_data(recorded: dict[str, list[list[int]]]) -> None:
+    file = SensFile(TOY, WHERE)
+    stamps = [[file.record(i).colour_timestamp, file.record(i).depth_timestamp] for i in range(4)]
+    assert stamps == recorded["timestamps"]
+    assert (file.n_imu, file.motion()["timestamp"].tolist()) == (2, [1000, 1001])
+    assert file.motion()["rotation_rate"].shape == (2, 3)
+    source = SensSource(TOY, WHERE)
+    assert source.timestamp_s(1) - source.timestamp_s(0) == pytest.approx(0.033333, abs=1e-9)
+
+
+def test_raw_images_are_read_although_the_original_readers_fail_on_them() -> None:
+    file = SensFile(RAW_TOY, WHERE)
+    assert (file.header.colour_compression, file.header.depth_compression, len(file)) == ("raw", "raw", 2)
+    content = RAW_TOY.read_bytes()
+    at = N_HEADER + 96
+    n_colour, n_depth = 64 * 48 * 3, 32 * 24 * 2
+    np.testing.assert_array_equal(file.colour(0).ravel(), list(content[at : at + n_colour]))
+    values = struct.unpack(f"<{n_depth // 2}H", content[at + n_colour : at + n_colour + n_depth])
+    np.testing.assert_array_equal(file.depth(0).ravel(), values)
+    assert file.depth(1).any() and file.colour(1).any()
+
+
+@pytest.mark.parametrize("path", [TOY, RAW_TOY], ids=["jpeg", "raw"])
+def test_a_recording_written_again_is_the_same_to_the_byte(
+    tmp_path: Path, path: Path, recorded: dict[str, object]
+) -> None:
+    file = SensFile(path, WHERE)
+    motion = file.motion() if file.has_motion else None
+    write_sens(tmp_path / "again.sens", file.header, (stored_frame(file, i) for i in range(len(file))), motion)
+    content = (tmp_path / "again.sens").read_bytes()
+    assert content == path.read_bytes()
+    if path == TOY:
+        assert hashlib.sha256(content).hexdigest() == recorded["sha256_sens"]
+    assert os.listdir(tmp_path) == ["again.sens"]
+
+
+# ---------------------------------------------------------------- reading and writing
+
+
+@pytest.mark.parametrize("colour", ["raw", "png", "jpeg"])
+@pytest.mark.parametrize("depth", ["raw", "zlib"])
+def test_every_compression_gives_the_images_back(tmp_path: Path, colour: str, depth: str) -> None:
+    made = header(colour_compression=colour, depth_compression=depth)
+    rng = np.random.default_rng(1)
+    rgb = rng.integers(0, 256, (6, 8, 3), np.uint8)
+    values = np.array([[0, 1, 255, 256], [65535, 65534, 1000, 2], [7, 8, 9, 10]], np.uint16)
+    frame = SensFrame(
+        np.eye(4), 0, 0, colour_content(rgb, made.colour_compression), depth_content(values, made.depth_compression)
+    )
+    write_sens(tmp_path / "a.sens", made, [frame])
+    file = SensFile(tmp_path / "a.sens", WHERE)
+    np.testing.assert_array_equal(file.depth(0), values)
+    if colour == "jpeg":
+        stored = cv2.imdecode(np.frombuffer(frame.colour, np.uint8), cv2.IMREAD_COLOR)
+        assert stored is not None
+        np.testing.assert_array_equal(file.colour(0), stored[:, :, ::-1])
+    else:
+        np.testing.assert_array_equal(file.colour(0), rgb)
+
+
+@settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(order=st.permutations(range(12)), n_imu=st.one_of(st.none(), st.integers(0, 3)))
+def test_frames_in_any_order_are_those_in_order(tmp_path: Path, order: list[int], n_imu: int | None) -> None:
+    motion = None if n_imu is None else np.zeros(n_imu, MOTION_RECORD)
+    write_sens(tmp_path / "a.sens", header(), frames(header(), 12), motion)
+    file = SensFile(tmp_path / "a.sens", WHERE)
+    assert (file.n_imu, file.has_motion, len(file.motion())) == (n_imu or 0, motion is not None, n_imu or 0)
+    in_order = list(frames(header(), 12))
+    with ThreadPoolExecutor(3) as pool:
+        found = list(pool.map(lambda i: stored_frame(file, i), order))
+    for i, one in zip(order, found, strict=True):
+        assert (one.colour, one.depth, one.colour_timestamp) == (
+            in_order[i].colour, in_order[i].depth, in_order[i].colour_timestamp,
+        )  # fmt: skip
+        np.testing.assert_array_equal(one.camera_to_world, in_order[i].camera_to_world)
+
+
+def test_an_opened_file_goes_to_another_process_and_keeps_no_descriptor(expected: dict[str, np.ndarray]) -> None:
+    before = len(os.listdir("/proc/self/fd")) if Path("/proc/self/fd").exists() else 0
+    file = pickle.loads(pickle.dumps(SensFile(TOY, WHERE)))  # noqa: S301 - bytes of our own
+    np.testing.assert_array_equal(file.depth(3), expected["depth"][3])
+    assert not before or len(os.listdir("/proc/self/fd")) == before
+
+
+def test_frames_count_from_the_end_and_end_as_a_sequence_does() -> None:
+    source = SensSource(TOY, WHERE)
+    np.testing.assert_array_equal(source.depth(-1), source.depth(3))
+    assert (source.frame_number(-1), len(source), source.files()) == (3, 4, [TOY])
+    for ask in (source.pose, source.colour, source.depth, source.timestamp_s, source.frame_number):
+        with pytest.raises(IndexError):
+            ask(4)
+
+
+def test_times_are_30_a_second_where_the_stamps_do_not_increase(tmp_path: Path) -> None:
+    same = [replace(frame, colour_timestamp=2**64 - 1) for frame in frames(header(), 3)]
+    write_sens(tmp_path / "a.sens", header(), same)
+    source = SensSource(tmp_path / "a.sens", WHERE)
+    assert [source.timestamp_s(i) for i in range(3)] == pytest.approx([0, 1 / 30, 2 / 30])
+    assert source.file.record(0).colour_timestamp == 2**64 - 1
+
+
+def test_the_cameras_of_a_source_are_those_of_the_header(expected: dict[str, np.ndarray]) -> None:
+    camera = SensSource(TOY, WHERE).camera
+    assert (camera.colour_size, camera.depth_size, camera.depth_shift) == ((64, 48), (32, 24), 1000.0)
+    np.testing.assert_array_equal(camera.colour_intrinsics, expected["K_color"][:3, :3])
+    np.testing.assert_array_equal(camera.depth_intrinsics, expected["K_depth"][:3, :3])
+    np.testing.assert_array_equal(camera.depth_extrinsic, expected["E_depth"])
+
+
+def test_a_recording_without_frames_is_read_and_written(tmp_path: Path) -> None:
+    write_sens(tmp_path / "a.sens", header(), [])
+    file = SensFile(tmp_path / "a.sens", WHERE)
+    assert (len(file), file.poses().shape, file.n_imu) == (0, (0, 4, 4), 0)
+
+
+def test_a_writer_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
+    (tmp_path / "a.sens").write_bytes(b"old")
+
+    def breaking() -> Iterator[SensFrame]:
+        yield from frames(header(), 2)
+        raise DataError("a source that breaks")
+
+    with pytest.raises(DataError, match="a source that breaks"):
+        write_sens(tmp_path / "a.sens", header(), breaking())
+    assert (os.listdir(tmp_path), (tmp_path / "a.sens").read_bytes()) == (["a.sens"], b"old")
+    with pytest.raises(StoreError, match="cannot write"):
+        write_sens(tmp_path / "none" / "a.sens", header(), [])
+
+
+def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
+    made = header(depth_compression="raw", colour_compression="raw", colour_width=400, colour_height=400)
+    frame = SensFrame(np.eye(4), 0, 0, bytes(3 * 400 * 400), bytes(2 * 4 * 3))
+    tracemalloc.start()
+    try:
+        write_sens(tmp_path / "a.sens", made, (frame for _ in range(60)))
+        file = SensFile(tmp_path / "a.sens", WHERE)
+        for i in range(60):
+            file.colour(i)
+        assert tracemalloc.get_traced_memory()[1] < 2_000_000 < (tmp_path / "a.sens").stat().st_size / 10
+    finally:
+        tracemalloc.stop()
+
+
+# ---------------------------------------------------------------- damage
+
+
+def behind_name(content: bytes, offset: int, new: bytes) -> bytes:
+    """``content`` with ``new`` at ``offset`` behind the name of the sensor."""
+    at = 12 + len("StructureSensor") + offset
+    return content[:at] + new + content[at + len(new) :]
+
+
+def test_each_fault_of_a_header_is_one_line_with_its_value(tmp_path: Path) -> None:
+    toy = TOY.read_bytes()
+    faults = {
+        b"": "has 0 bytes, too few for a .sens file",
+        struct.pack("<I", 3) + toy[4:]: "version 3, a .sens file without motion data; export it",
+        struct.pack("<I", 1) + toy[4:]: "version 1, a .sensor file; export it",
+        b"solid" + toy[5:]: "not a .sens file, its version would be 1768714099; expected 4",
+        toy[:4] + struct.pack("<Q", 10**15) + toy[12:]: "byte 4: the header with a sensor name of 1000000000000000",
+        toy[: N_HEADER - 1]: "byte 4: the header with a sensor name of 15 bytes does not fit into the file",
+        toy[:12] + b"\xff\xfe" + toy[14:]: "byte 12: the sensor's name is not text",
+        behind_name(toy, 256, struct.pack("<i", -1)): "colour compression -1; known: 0 (raw), 1 (png), 2 (jpeg)",
+        behind_name(toy, 260, struct.pack("<i", 2)): "depth is compressed with OCCI (code 2)",
+        behind_name(toy, 260, struct.pack("<i", 9)): "depth compression 9; known: 0 (raw), 1 (zlib)",
+        behind_name(toy, 264, struct.pack("<2I", 2**32 - 1, 2**32 - 1)): "colour images of 4294967295x4294967295",
+        behind_name(toy, 272, struct.pack("<I", 0)): "depth images of 0x24",
+        behind_name(toy, 280, struct.pack("<f", float("nan"))): "the depth shift is nan",
+        behind_name(toy, 284, struct.pack("<Q", 10**12)): "promises 1000000000000 frames of 96 or more bytes, but only",
+        behind_name(toy, 284, struct.pack("<Q", 3)): "the file goes on for 2973 bytes behind the last frame",
+        toy + b"\0": "of which 2 records take 264; it is longer than it should be",
+        toy[:-1]: "the file goes on for 263 bytes behind the last frame",
+    }
+    for content, message in faults.items():
+        with pytest.raises(DataError) as caught:
+            opened(tmp_path / "bad.sens", content)
+        assert str(caught.value).startswith(f"{WHERE}: bad.sens: "), str(caught.value)
+        assert message in str(caught.value), str(caught.value)
+
+
+def test_a_fault_of_the_cameras_is_named(tmp_path: Path) -> None:
+    (tmp_path / "bad.sens").write_bytes(behind_name(TOY.read_bytes(), 0, struct.pack("<f", float("nan"))))
+    with pytest.raises(DataError, match=r"bad\.sens: the colour intrinsics have focal lengths nan"):
+        SensSource(tmp_path / "bad.sens", WHERE)
+
+
+def with_frame(tmp_path: Path, **changes: bytes) -> SensFile:
+    """A recording of three frames of which the second has other images."""
+    all_frames = list(frames(header(), 3))
+    all_frames[1] = replace(all_frames[1], **changes)  # type: ignore[arg-type]
+    write_sens(tmp_path / "bad.sens", header(), all_frames)
+    return SensFile(tmp_path / "bad.sens", WHERE)
+
+
+def jpeg(width: int, height: int) -> bytes:
+    return colour_content(np.zeros((height, width, 3), np.uint8), "jpeg")
+
+
+def png(width: int, height: int) -> bytes:
+    return colour_content(np.zeros((height, width, 3), np.uint8), "png")
+
+
+@pytest.mark.parametrize(
+    ("colour", "message"),
+    [
+        (b"", "not a JPEG image"),
+        (b"\xff\xd8\xff" + bytes(50), "not a JPEG image"),
+        (png(8, 6), "not a JPEG image"),
+        (b"P6 8 6 255\n" + bytes(144), "not a JPEG image"),
+        (jpeg(16, 6), "is 16x6; expected 8x6, as the header says"),
+        (jpeg(8, 6)[:-2], "not a readable JPEG image"),
+    ],
+)
+def test_a_colour_image_that_is_unfit_is_named_with_frame_and_byte(tmp_path: Path, colour: bytes, message: str) -> None:
+    file = with_frame(tmp_path, colour=colour)
+    place = rf"{WHERE}: bad\.sens: frame 1 at byte \d+: colour"
+    with pytest.raises(DataError, match=f"{place}.*{message}"):
+        file.colour(1)
+    assert file.colour(0).shape == file.colour(2).shape and file.depth(1).shape == (3, 4)
+
+
+@pytest.mark.parametrize(
+    ("depth", "message"),
+    [
+        (b"", "unpacks to 0 bytes and breaks off"),
+        (zlib.compress(bytes(24))[:-1], "unpacks to 24 bytes and breaks off"),
+        (zlib.compress(bytes(24))[:-4] + b"\0\0\0\0", "does not unpack"),
+        (zlib.compress(bytes(23)), "has 23 bytes, expected 24"),
+        (zlib.compress(bytes(25)), "unpacks to more than the 24 bytes of an image"),
+        (zlib.compress(bytes(400 << 20), 1), "unpacks to more than the 24 bytes of an image"),
+        (bytes(24), "does not unpack"),
+    ],
+)  # fmt: skip
+def test_a_depth_image_that_is_unfit_is_named_and_never_unpacked_further(
+    tmp_path: Path, depth: bytes, message: str
+) -> None:
+    if len(depth) > 1 << 20:  # more than an image of this size may take, refused before it is read
+        with pytest.raises(DataError, match=r"frame 1 of 3 at byte \d+: images of"):
+            with_frame(tmp_path, depth=depth)
+        depth = zlib.compress(bytes(100 << 20), 9)
+    file = with_frame(tmp_path, depth=depth)
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError, match=rf"{WHERE}: bad\.sens: frame 1 at byte \d+: depth.*{message}"):
+            file.depth(1)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("size", [10**15, 2**64 - 1, 2**63])
+@pytest.mark.parametrize("which", [0, 8], ids=["colour", "depth"])
+def test_a_promise_of_an_enormous_image_allocates_nothing(tmp_path: Path, size: int, which: int) -> None:
+    toy = bytearray(TOY.read_bytes())
+    toy[N_HEADER + START_OF_SIZES + which : N_HEADER + START_OF_SIZES + which + 8] = struct.pack("<Q", size)
+    assert refused_within_a_megabyte(lambda: opened(tmp_path / "bad.sens", bytes(toy)))
+    with pytest.raises(DataError, match=rf"frame 0 of 4 at byte {N_HEADER}: its images of .* do not fit"):
+        opened(tmp_path / "bad.sens", bytes(toy))
+
+
+@pytest.mark.parametrize("n_frames", [10**12, 2**64 - 1, 200])
+def test_a_promise_of_too_many_frames_allocates_nothing(tmp_path: Path, n_frames: int) -> None:
+    content = behind_name(TOY.read_bytes(), 284, struct.pack("<Q", n_frames))
+    assert refused_within_a_megabyte(lambda: opened(tmp_path / "bad.sens", content))
+
+
+def test_an_image_that_fills_an_enormous_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    made = header(colour_compression="raw", depth_compression="raw")
+    write_sens(tmp_path / "bad.sens", made, frames(made, 1))
+    with (tmp_path / "bad.sens").open("r+b") as stream:
+        at = stream.seek(0, os.SEEK_END) - 144 - 24
+        stream.seek(at - 16)
+        stream.write(struct.pack("<2Q", 1 << 40, 24))
+        stream.truncate(at + (1 << 40) + 24)  # sparse: takes no space on the disk
+    assert refused_within_a_megabyte(lambda: SensFile(tmp_path / "bad.sens", WHERE))
+
+
+def refused_within_a_megabyte(read: Callable[[], object]) -> bool:
+    tracemalloc.start()
+    try:
+        with pytest.raises(DataError, match=rf"^{WHERE}: bad\.sens: "):
+            read()
+        return tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_a_missing_file_a_folder_and_a_pipe_are_data_errors(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"none\.sens is missing; copy the recording"):
+        SensFile(tmp_path / "none.sens", WHERE)
+    (tmp_path / "folder.sens").mkdir()
+    os.mkfifo(tmp_path / "pipe.sens")
+    for name in ("folder.sens", "pipe.sens"):
+        with pytest.raises(DataError, match=rf"{name} is not a file"):
+            SensFile(tmp_path / name, WHERE)
+
+
+def test_a_file_that_shrinks_or_goes_while_it_is_read_is_a_data_error(tmp_path: Path) -> None:
+    file = opened(tmp_path / "a.sens", TOY.read_bytes())
+    (tmp_path / "a.sens").write_bytes(TOY.read_bytes()[: N_HEADER + 200])
+    with pytest.raises(DataError, match=r"a\.sens: frame 0 at byte \d+: the file became shorter"):
+        file.colour(0)
+    with pytest.raises(DataError, match=r"a\.sens: motion data: has 0 bytes"):
+        file.motion()
+    (tmp_path / "a.sens").unlink()
+    with pytest.raises(DataError, match=r"a\.sens is missing"):
+        file.depth(0)
+
+
+@pytest.mark.parametrize("path", [TOY, RAW_TOY], ids=["jpeg", "raw"])
+def test_a_recording_cut_short_anywhere_is_refused(tmp_path: Path, path: Path) -> None:
+    content = path.read_bytes()
+    whole = SensFile(path, WHERE)
+    end_of_frames = len(content) - (8 + 128 * whole.n_imu)
+    n_read, n_refused = outcomes(
+        lambda copy: opened(tmp_path / "cut.sens", copy), truncations(content), must_name=f"{WHERE}: cut.sens"
+    )
+    assert (n_read, n_refused) == (1, len(content) - 1)  # without the block of motion data it is a whole recording
+    assert len(opened(tmp_path / "cut.sens", content[:end_of_frames])) == len(whole)
+
+
+@pytest.mark.parametrize("path", [TOY, RAW_TOY], ids=["jpeg", "raw"])
+def test_a_damaged_recording_is_read_or_refused_with_its_name(tmp_path: Path, path: Path) -> None:
+    def read(copy: bytes) -> None:
+        opened(tmp_path / "damaged.sens", copy)
+        read_whole(SensSource(tmp_path / "damaged.sens", WHERE).file)
+
+    n_read, n_refused = outcomes(read, damages(path.read_bytes()), must_name=f"{WHERE}: damaged.sens")
+    assert n_read + n_refused == 2000 and n_refused > 500

@@ -1,0 +1,308 @@
+"""The adapter of the TUM RGB-D layout on small sequences: pairing, poses, cameras, each fault once, damaged lists."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from damage import damages, outcomes, truncations
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from su3d_bench.datasets.timed_poses import pose_at, quaternion_poses, read_trajectory
+from su3d_bench.datasets.tum import Tum, TumOptions, associate
+from su3d_bench.errors import DataError, GroundTruthMissing
+
+WIDTH, HEIGHT = 12, 8
+CAMERA = "6.0 6.5 5.5 3.5\n"
+SCENE = "rgbd_dataset_freiburg2_xyz"
+Change = Callable[[Path], object]
+
+
+def depth_values(index: int) -> np.ndarray:
+    return np.arange(WIDTH * HEIGHT, dtype=np.uint16).reshape(HEIGHT, WIDTH) * 500 + index
+
+
+def write_sequence(root: Path, scene: str = SCENE, n_frames: int = 4) -> Path:
+    """Frames 0.1 s apart, depth 0.004 s after colour, a pose at every colour time that moves by 1 m along x."""
+    folder = root / scene
+    (folder / "rgb").mkdir(parents=True)
+    (folder / "depth").mkdir()
+    lists: dict[str, list[str]] = {"rgb": ["# color images"], "depth": ["# depth maps"], "groundtruth": ["# t x y z"]}
+    for index in range(n_frames):
+        time_s = 100 + index / 10
+        for name, image, late in (
+            ("rgb", np.full((HEIGHT, WIDTH, 3), (30, 120, 200), np.uint8), 0.0),
+            ("depth", depth_values(index), 0.004),
+        ):
+            file = f"{name}/{time_s + late:.6f}.png"
+            cv2.imwrite(str(folder / file), image)
+            lists[name].append(f"{time_s + late:.6f} {file}")
+        lists["groundtruth"].append(f"{time_s:.4f} {index} 0.5 -1 0 0 0 1")
+    for name, lines in lists.items():
+        (folder / f"{name}.txt").write_text("\n".join(lines) + "\n")
+    (folder / "camera.txt").write_text(CAMERA)
+    return folder
+
+
+def test_frames_hold_what_the_files_hold(tmp_path: Path) -> None:
+    write_sequence(tmp_path)
+    frames = Tum(tmp_path).frames(SCENE, 2)
+    last = frames[-1]
+    assert len(frames) == 2 and (last.index, last.timestamp_s) == (2, 100.2)
+    np.testing.assert_allclose(last.camera_to_world[:3, 3], (2, 0.5, -1))
+    np.testing.assert_array_equal(last.depth_m, (depth_values(2) / 5000).astype(np.float32))
+    np.testing.assert_array_equal(last.intrinsics, [[6, 0, 5.5], [0, 6.5, 3.5], [0, 0, 1]])
+    assert (last.rgb == (200, 120, 30)).all()
+    with pytest.raises(IndexError):
+        frames[2]
+
+
+@pytest.mark.parametrize("place", [".", "tum", "TUM"])
+def test_sequences_are_found_in_the_usual_places(tmp_path: Path, place: str) -> None:
+    write_sequence(tmp_path / place)
+    (tmp_path / place / "unpacked.tgz").mkdir()
+    assert Tum(tmp_path).scenes() == (SCENE,)
+    assert Tum(tmp_path).info(SCENE, 3).n_frames == 2
+
+
+def test_a_recording_is_camera_images_and_a_rendered_one_is_marked(tmp_path: Path) -> None:
+    folder = write_sequence(tmp_path)
+    before = Tum(tmp_path).digest(SCENE)
+    assert Tum(tmp_path).info(SCENE, 1).image_domain == "camera"
+    (folder / "rooms.json").write_text("{}")
+    assert Tum(tmp_path).info(SCENE, 1).image_domain == "rendered-rooms"
+    assert Tum(tmp_path).digest(SCENE) != before
+
+
+@pytest.mark.parametrize(
+    ("scene", "focal"),
+    [("rgbd_dataset_freiburg1_desk", 517.3), ("fr2_xyz", 520.9), ("tum_fr3office", 535.4), ("own", 525.0)],
+)
+def test_without_a_camera_file_the_name_tells_the_camera(tmp_path: Path, scene: str, focal: float) -> None:
+    folder = write_sequence(tmp_path, scene)
+    (folder / "camera.txt").unlink()
+    large = np.zeros((480, 640), np.uint16)
+    for path in folder.glob("*/*.png"):
+        cv2.imwrite(str(path), large if path.parent.name == "depth" else np.zeros((480, 640, 3), np.uint8))
+    assert Tum(tmp_path).frames(scene, 1)[0].intrinsics[0, 0] == focal
+    options = TumOptions(intrinsics=(400, 401, 320, 240))
+    assert Tum(tmp_path, options).frames(scene, 1)[0].intrinsics[1, 1] == 401
+
+
+def test_missing_images_are_counted_once_and_the_others_used(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    folder = write_sequence(tmp_path)
+    (folder / "rgb/100.100000.png").unlink()
+    (folder / "depth/100.304000.png").unlink()
+    tum = Tum(tmp_path)
+    with caplog.at_level(logging.WARNING):
+        assert [frame.index for frame in tum.frames(SCENE, 1)] == [0, 2]
+        assert tum.info(SCENE, 1).n_frames == 2
+    assert [record.getMessage() for record in caplog.records] == [
+        f"tum/{SCENE}: rgb.txt and depth.txt: 2 images named there are missing (the first: rgb/100.100000.png); "
+        "left out, 2 frames are used"
+    ]
+
+
+def test_frames_without_a_pose_in_time_are_counted_and_left_out(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = write_sequence(tmp_path)
+    rewrite("groundtruth.txt", lambda text: text.replace("100.1000", "100.1300"))(folder)
+    with caplog.at_level(logging.WARNING):
+        assert [frame.index for frame in Tum(tmp_path).frames(SCENE, 1)] == [0, 2, 3]
+    assert "1 colour images have no pose within 0.02 s in groundtruth.txt (the first: rgb/100.1" in caplog.text
+    assert len(Tum(tmp_path, TumOptions(max_difference_s=0.04)).frames(SCENE, 1)) == 4
+
+
+def test_associate_txt_wins_over_the_lists(tmp_path: Path) -> None:
+    folder = write_sequence(tmp_path)
+    (folder / "associate.txt").write_text("100.2 rgb/100.200000.png 100.1 depth/100.104000.png\n")
+    (frame,) = Tum(tmp_path).frames(SCENE, 1)
+    assert frame.depth_m[0, 0] == np.float32(1 / 5000) and frame.camera_to_world[0, 3] == 2
+
+
+def reference_pairs(first: list[float], second: list[float], limit: float) -> list[tuple[float, float]]:
+    """The benchmark's associate.py, its two loops over everything."""
+    near = sorted((abs(a - b), a, b) for a in first for b in second if abs(a - b) < limit)
+    matches = []
+    left, right = set(first), set(second)
+    for _, a, b in near:
+        if a in left and b in right:
+            left.remove(a)
+            right.remove(b)
+            matches.append((a, b))
+    return sorted(matches)
+
+
+stamps = st.lists(st.integers(0, 400).map(lambda k: k / 1000), min_size=1, max_size=12, unique=True)
+
+
+@settings(max_examples=150, deadline=None)
+@given(stamps, stamps)
+def test_images_pair_up_as_the_benchmarks_tool_pairs_them(
+    tmp_path_factory: pytest.TempPathFactory, colours: list[float], depths: list[float]
+) -> None:
+    folder = tmp_path_factory.mktemp("lists")
+    (folder / "rgb.txt").write_text("".join(f"{time} rgb/{time}.png\n" for time in colours))
+    (folder / "depth.txt").write_text("".join(f"{time},\tdepth/{time}.png\n" for time in depths))
+    pairs = [(colour[0], depth[0]) for colour, depth in associate(folder, "tum/x", 0.02)]
+    assert pairs == reference_pairs(colours, depths, 0.02)
+
+
+def test_poses_between_two_rows_turn_and_move_evenly() -> None:
+    angle = np.radians(80)
+    rows = np.array([[0, 0, 0, 0, 0, 0, 1], [4, 2, 0, 0, 0, np.sin(angle / 2), np.cos(angle / 2)]], np.float64)
+    for sign in (1, -1):  # a quaternion and its negative are one rotation
+        rows[1, 3:] *= sign
+        pose = pose_at(10.25, np.array([10.0, 11.0]), rows, 1.0, interpolate=True)
+        assert pose is not None
+        np.testing.assert_allclose(pose[:3, 3], (1, 0.5, 0))
+        np.testing.assert_allclose(pose[:2, 0], (np.cos(angle / 4), np.sin(angle / 4)))
+    nearest = pose_at(10.25, np.array([10.0, 11.0]), rows, 1.0, interpolate=False)
+    assert nearest is not None
+    np.testing.assert_allclose(nearest, np.eye(4), atol=1e-12)
+
+
+def test_a_row_too_far_in_time_is_not_interpolated_with() -> None:
+    rows = np.array([[0, 0, 0, 0, 0, 0, 1], [4, 0, 0, 0, 0, 0, 1]], np.float64)
+    near = pose_at(0.01, np.array([0.0, 5.0]), rows, 0.02, interpolate=True)
+    assert near is not None and near[0, 3] == 0
+    assert pose_at(0.03, np.array([0.0, 5.0]), rows, 0.02, interpolate=True) is None
+
+
+def test_quaternions_become_rotations_and_any_length_is_made_one(tmp_path: Path) -> None:
+    quarter = quaternion_poses(np.zeros((1, 3)), np.array([[0, 0, 1, 1]]) / np.sqrt(2))[0]
+    np.testing.assert_allclose(quarter[:3, :3], [[0, -1, 0], [1, 0, 0], [0, 0, 1]], atol=1e-15)
+    (tmp_path / "groundtruth.txt").write_text("2 0 0 0 0 0 3 3\n1 0 0 0 0 0 0 -7\n")
+    times_s, rows = read_trajectory(tmp_path / "groundtruth.txt", "x")
+    assert times_s.tolist() == [1, 2]
+    np.testing.assert_allclose(rows[:, 3:], [[0, 0, 0, -1], [0, 0, 0.5**0.5, 0.5**0.5]])
+
+
+def test_there_is_no_ground_truth_and_no_sequence_without_data(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match=r"tum: no sequence in .*folder with rgb\.txt and depth\.txt"):
+        Tum(tmp_path).scenes()
+    write_sequence(tmp_path)
+    with pytest.raises(GroundTruthMissing, match="has none of objects"):
+        Tum(tmp_path).ground_truth(SCENE, "mesh-vertices")
+    with pytest.raises(GroundTruthMissing, match="no annotated mesh"):
+        Tum(tmp_path).instance_mesh(SCENE)
+    with pytest.raises(DataError, match=f"no sequence 'freiburg2_xyz'; did you mean '{SCENE}'"):
+        Tum(tmp_path).info("freiburg2_xyz", 1)
+    with pytest.raises(DataError, match=r"no sequence '\.\./tum'"):
+        Tum(tmp_path).info("../tum", 1)
+
+
+def rewrite(name: str, change: Callable[[str], str]) -> Change:
+    return lambda folder: (folder / name).write_text(change((folder / name).read_text()))
+
+
+def first_line(name: str, line: str) -> Change:
+    return lambda folder: (folder / name).write_text(line + "\n")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda folder: (folder / "groundtruth.txt").unlink(), "groundtruth.txt is missing; copy the file again"),
+        (first_line("rgb.txt", "# nothing"), "rgb.txt: has no lines; expected 'time file'"),
+        (first_line("rgb.txt", "1.0 a b"), "rgb.txt line 1: has 3 values; expected 'time file'"),
+        (first_line("depth.txt", "soon a"), "depth.txt line 1: 'soon' is no number"),
+        (first_line("depth.txt", "nan a"), "depth.txt line 1: the time is nan; expected seconds"),
+        (first_line("depth.txt", "900 a"), "rgb.txt and depth.txt: no two images within 0.02 s"),
+        (first_line("groundtruth.txt", "100 0 0 0 0 0 0 0"), "groundtruth.txt line 1: the quaternion has the length 0"),
+        (first_line("groundtruth.txt", "100 0 0 0 nan 0 0 1"), "line 1: the quaternion has the length nan; expected 1"),
+        (first_line("groundtruth.txt", "100 0 inf 0 0 0 0 1"), "line 1: the camera is at 0 inf 0; expected metres"),
+        (first_line("groundtruth.txt", "100 0 0 0 0 0 1"), "line 1: has 7 values; expected 'time tx ty tz qx qy qz qw"),
+        (first_line("groundtruth.txt", "500 0 0 0 0 0 0 1"), "4 colour images have no pose within 0.02 s"),
+        (
+            lambda folder: [path.unlink() for path in folder.glob("*/*.png")],
+            "rgb.txt and depth.txt: 8 images named there are missing",
+        ),
+        (first_line("associate.txt", "1 rgb/a 1"), "associate.txt line 1: has 3 values"),
+        (first_line("associate.txt", "1 ../a 1 b"), "associate.txt: '../a' leads out of the folder"),
+        (first_line("associate.txt", "1 /etc/passwd 1 b"), "'/etc/passwd' leads out of the folder"),
+        (first_line("camera.txt", "500 500 5"), "camera.txt: has 3 values; expected one line fx fy cx cy"),
+        (first_line("camera.txt", "0 500 5 3"), "camera.txt: fx fy cx cy are 0 500 5 3; expected pixels, focal"),
+        (first_line("camera.txt", "6 6 50 3"), "is 12x8 but the principal point is (50, 3); intrinsics belong to one"),
+        (
+            lambda folder: cv2.imwrite(str(folder / "depth/100.004000.png"), np.ones((4, 6), np.uint16)),
+            "depth/100.004000.png is 6x4 and rgb/100.000000.png is 12x8; both must have one size",
+        ),
+    ],
+)
+def test_each_fault_is_one_clear_line(tmp_path: Path, change: Change, message: str) -> None:
+    change(write_sequence(tmp_path))
+    with pytest.raises(DataError) as caught:
+        list(Tum(tmp_path).frames(SCENE, 1))
+    assert str(caught.value).startswith(f"tum/{SCENE}: ") and "\n" not in str(caught.value)
+    assert message in str(caught.value)
+
+
+def test_a_link_out_of_the_sequence_is_not_followed(tmp_path: Path) -> None:
+    folder = write_sequence(tmp_path / "data")
+    outside = tmp_path / "outside.png"
+    outside.write_bytes((folder / "rgb/100.000000.png").read_bytes())
+    (folder / "rgb/100.000000.png").unlink()
+    (folder / "rgb/100.000000.png").symlink_to(outside)
+    with pytest.raises(DataError, match=r"'rgb/100\.000000\.png' leads out of the folder"):
+        Tum(tmp_path / "data").info(SCENE, 1)
+
+
+def test_times_denser_than_any_camera_are_refused_before_pairs_are_made(tmp_path: Path) -> None:
+    folder = write_sequence(tmp_path)
+    lines = "".join(f"{k / 1e6:.6f} a\n" for k in range(2000))
+    for name in ("rgb.txt", "depth.txt"):
+        (folder / name).write_text(lines)
+    with pytest.raises(DataError, match=r"4000000 pairs within 0\.02 s; lower the limit"):
+        Tum(tmp_path).info(SCENE, 1)
+
+
+def test_the_digest_moves_with_every_file_that_is_read(tmp_path: Path) -> None:
+    folder = write_sequence(tmp_path)
+    seen = {Tum(tmp_path).digest(SCENE)}
+    files = Tum(tmp_path).files(SCENE)
+    assert set(files) == {path for path in folder.rglob("*") if path.is_file()}
+    for name in ("camera.txt", "rgb.txt", "groundtruth.txt"):
+        rewrite(name, lambda text: text + "\n")(folder)
+        seen.add(Tum(tmp_path).digest(SCENE))
+    cv2.imwrite(str(folder / "depth/100.304000.png"), np.full((HEIGHT, WIDTH), 7, np.uint16))
+    seen.add(Tum(tmp_path).digest(SCENE))
+    assert len(seen) == 5
+
+
+def read_open(folder: Path) -> None:
+    Tum(folder.parent).frames(SCENE, 1)
+
+
+READERS: dict[str, Callable[[Path], object]] = {
+    "rgb.txt": lambda folder: associate(folder, f"tum/{SCENE}", 0.02),
+    "depth.txt": lambda folder: associate(folder, f"tum/{SCENE}", 0.02),
+    "associate.txt": read_open,
+    "groundtruth.txt": lambda folder: read_trajectory(folder / "groundtruth.txt", f"tum/{SCENE}: groundtruth.txt"),
+    "camera.txt": read_open,
+}
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_every_damaged_list_is_read_or_refused_with_one_line(tmp_path: Path, name: str) -> None:
+    folder = write_sequence(tmp_path, n_frames=2)
+    if name == "associate.txt":
+        pairs = [f"100.{k} rgb/100.{k}00000.png 100.{k} depth/100.{k}04000.png\n" for k in range(2)]
+        (folder / name).write_text("".join(pairs))
+    path = folder / name
+    content = path.read_bytes()
+
+    def read(damaged: bytes) -> None:
+        path.write_bytes(damaged)
+        READERS[name](folder)
+
+    for copies in (truncations(content), damages(content)):
+        # A time that was changed leaves an image without a pose: groundtruth.txt is then named.
+        n_read, n_refused = outcomes(read, copies, must_name=".txt" if name == "associate.txt" else name)
+        assert n_read > 0 and n_refused > 0
