@@ -14,7 +14,9 @@ test: $(VENV)/test
 	$(BIN)/python -m pytest -q -n auto
 
 bench: $(VENV)/test
-	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-group-by=group --benchmark-columns=min,median,rounds
+	@mkdir -p build
+	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-group-by=group --benchmark-columns=min,median,rounds --benchmark-json=build/bench.json
+	$(BIN)/python benchmarks/write_performance.py build/bench.json docs/performance.md
 
 lint: $(VENV)/dev
 	$(BIN)/ruff check .

@@ -1,7 +1,7 @@
 """How long an evaluation of 8 scenes takes: 200,000 points, 150 masks each, 48 classes.
 
 From masks in memory beside a plain version with one bincount a mask, which must give the same bits; then the whole
-evaluation of the same masks in the text files of ScanNet's benchmark, everything that stands beside the number included.
+evaluation of the same masks in the text files of ScanNet's benchmark, with everything that stands beside the number.
 """
 
 from __future__ import annotations

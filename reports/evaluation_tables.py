@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from su3d_bench.plain_text import printable
 from su3d_bench.reports.tables import NOT_MEASURED, aligned, percent
 
 NAMES = {"ap": "AP", "ap50": "AP50", "ap25": "AP25", "macc": "mAcc", "miou": "mIoU", "fmiou": "F-mIoU"}
@@ -66,7 +67,7 @@ def _context(one: Mapping[str, Any]) -> Iterable[str]:
         shares = " / ".join(percent(share) for share in one["coverage"].values())
         yield f"- scored points with a predicted one within 2.5 / 5 / 10 cm: {shares} %"
     warnings = one["warnings"]
-    yield from (f"- WARNING: {line}" for line in warnings[:MOST_NOTES])
+    yield from (f"- WARNING: {printable(line)}" for line in warnings[:MOST_NOTES])
     if len(warnings) > MOST_NOTES:
         yield f"- and {len(warnings) - MOST_NOTES} more warnings, all in the --json file"
 

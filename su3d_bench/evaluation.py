@@ -13,6 +13,13 @@ from typing import Any, Literal
 
 from su3d_bench import registry
 from su3d_bench.errors import ConfigError, DataError, GroundTruthMissing, PredictionError
+from su3d_bench.evaluation_openlex import (
+    VARIANTS,
+    OpenLexRelease,
+    holds_release,
+    score_on_objects,
+    why_not_lex_content,
+)
 from su3d_bench.evaluation_result import Evaluation, ProtocolEvaluation, SceneOutcomes, form_evaluation
 from su3d_bench.evaluation_scenes import OWN_FORMAT, Match, Source, match_scenes, open_sources, planned_scenes
 from su3d_bench.evaluation_scoring import (
@@ -23,6 +30,7 @@ from su3d_bench.evaluation_scoring import (
     score_on_truth,
     score_on_vertices,
     why_not_content,
+    why_not_numbers,
 )
 from su3d_bench.evaluation_texts import TextFeatures, encoder_for, read_text_features
 from su3d_bench.evaluation_truth import (
@@ -35,15 +43,16 @@ from su3d_bench.evaluation_truth import (
     text_scenes,
     text_variant,
 )
-from su3d_bench.planning import why_not_fitting
-from su3d_bench.predictions.base import Content, ScenePrediction, shown
+from su3d_bench.planning import data_root, why_not_fitting
+from su3d_bench.predictions.base import Content, ScenePrediction, VertexMasks, shown
 from su3d_bench.predictions.scannet_text import ScannetText
 from su3d_bench.protocols import ProtocolRules, load_protocol, protocol_names
-from su3d_bench.types import Encoder, GroundTruth
+from su3d_bench.types import Encoder, GroundTruth, Instances
 
 __all__ = ["Evaluation", "ProtocolEvaluation", "Request", "evaluate"]
 
 
+NOT_MEANT = "is not meant for"
 Confidences = Literal["protocol", "file"]
 
 
@@ -69,13 +78,15 @@ class Request:
 
 @dataclass
 class _Ground:
-    """The truth of every scene: ``text`` where it has no coordinates, else ``dataset``, read when it is asked for."""
+    """The truth of every scene: ``text`` without coordinates, OpenLex3D's ``lex``, or ``dataset``, read when asked."""
 
     where: str
     dataset_name: str | None
     scenes: tuple[str, ...]
     text: TextTruth | None = None
+    files: Mapping[str, Path] = field(default_factory=dict)
     dataset: Any = None
+    lex: OpenLexRelease | None = None
     _kept: dict[tuple[str, str], GroundTruth] = field(default_factory=dict)
 
     def truth(self, scene: str, variant: str) -> GroundTruth:
@@ -95,10 +106,15 @@ def evaluate(request: Request) -> Evaluation:
     candidates, unfit = _candidates(request, ground)
     scoring = _Scoring(ground, texts, {one.name: one for one in candidates}, dict(unfit))
     scoring.uses_file_confidences = _uses_file_confidences(request, sources)
+    of_files: dict[str, list[str]] = {}
     for match in matches:
         prediction = match.source.reader.read(match.source.path, match.name)
         scoring.add(match, prediction, is_named=bool(request.protocols))
-        remarks += [f"{match.scene}: {one}" for one in prediction.remarks]
+        for one in prediction.remarks:
+            of_files.setdefault(one, []).append(match.scene)
+    for line, scenes in of_files.items():
+        is_shared = len(scenes) == len(matches) > 1
+        remarks += [f"every scene: {line}"] if is_shared else [f"{scene}: {line}" for scene in scenes]
     with_prediction = [match.scene for match in matches]
     scoring.add_missed([scene for scene in ground.scenes if scene not in with_prediction])
     formats = tuple(dict.fromkeys(source.reader.name for source in sources))
@@ -124,7 +140,8 @@ def _open_ground(request: Request, sources: Sequence[Source]) -> tuple[_Ground, 
     """The truth, the prediction of each scene that has one, and remarks."""
     names = [name for source in sources for name in source.scenes]
     if request.ground_truth is not None:
-        return _open_text(request, sources)
+        is_lex = holds_release(request.ground_truth)
+        return _open_lex(request, sources) if is_lex else _open_text(request, sources)
     of_names = {name.partition("/")[0] for name in names if "/" in name}
     dataset_name = request.dataset or (of_names.pop() if len(of_names) == 1 else None)
     if dataset_name is None:
@@ -132,8 +149,10 @@ def _open_ground(request: Request, sources: Sequence[Source]) -> tuple[_Ground, 
         what = f"--dataset {hint}" if hint else "--dataset NAME"
         raise ConfigError(f"evaluate: against which ground truth? name one with {what} or --ground-truth DIR")
     dataset = open_dataset(dataset_name)
+    dataset_name = str(dataset.name)
     known = list(dataset.scenes())
-    matches, remarks = match_scenes(sources, known, dataset_name, dataset_name)
+    asked = choose_scenes(request.scenes, known, dataset_name) if _are_all(request.scenes, known) else []
+    matches, remarks = match_scenes(sources, known, dataset_name, dataset_name, asked)
     matched = [match.scene for match in matches]
     if request.scenes:
         scenes = choose_scenes(request.scenes, list(dict.fromkeys([*known, *matched])), dataset_name)
@@ -145,19 +164,34 @@ def _open_ground(request: Request, sources: Sequence[Source]) -> tuple[_Ground, 
     return ground, [match for match in matches if match.scene in scenes], remarks
 
 
+def _are_all(asked: Sequence[str], known: Sequence[str]) -> bool:
+    """Whether every one of ``asked`` names a scene of the list, and not one that is made on demand."""
+    return bool(asked) and all(word.rpartition("/")[2] in known for word in asked)
+
+
+def _open_lex(request: Request, sources: Sequence[Source]) -> tuple[_Ground, list[Match], list[str]]:
+    assert request.ground_truth is not None
+    release = OpenLexRelease(request.ground_truth, data_root())
+    where, known = shown(request.ground_truth), release.scenes()
+    scenes = choose_scenes(request.scenes, known, where) if request.scenes else known
+    matches, remarks = match_scenes(sources, known, None, where, scenes if request.scenes else ())
+    ground = _Ground(where, None, tuple(scenes), lex=release)
+    return ground, [match for match in matches if match.scene in scenes], remarks
+
+
 def _open_text(request: Request, sources: Sequence[Source]) -> tuple[_Ground, list[Match], list[str]]:
     assert request.ground_truth is not None
     files = text_scenes(request.ground_truth)
     where = shown(request.ground_truth)
     if request.scenes:
         files = {scene: files[scene] for scene in choose_scenes(request.scenes, list(files), where)}
-    name = request.dataset or dataset_of_names(files)
+    name = dataset_of_names(files)
     if request.dataset is not None:
-        registry.load("dataset", request.dataset)
+        name = str(registry.load("dataset", request.dataset).name)
     chosen = _only_chosen(sources, request, files)
-    matches, remarks = match_scenes(chosen, list(files), name, where)
-    truth = read_text_truth(request.ground_truth, files)
-    return _Ground(where, name, tuple(files), text=truth), matches, remarks
+    matches, remarks = match_scenes(chosen, list(files), name, where, list(files) if request.scenes else ())
+    truth = read_text_truth({match.scene: files[match.scene] for match in matches})
+    return _Ground(where, name, tuple(files), text=truth, files=files), matches, remarks
 
 
 def _only_chosen(sources: Sequence[Source], request: Request, files: Mapping[str, Path]) -> list[Source]:
@@ -170,7 +204,7 @@ def _only_chosen(sources: Sequence[Source], request: Request, files: Mapping[str
 
 def _candidates(request: Request, ground: _Ground) -> tuple[list[ProtocolRules], dict[str, str]]:
     """The protocols that may score this truth, and why others cannot; named ones that cannot are an error."""
-    if not request.protocols and ground.dataset_name is None:
+    if not request.protocols and ground.dataset_name is None and ground.lex is None:
         raise ConfigError(
             f"{ground.where}: whose labels are these? name the protocol with --protocol or the dataset with --dataset"
         )
@@ -191,9 +225,11 @@ def _candidates(request: Request, ground: _Ground) -> tuple[list[ProtocolRules],
 
 
 def _why_not_truth(rules: ProtocolRules, ground: _Ground, *, is_named: bool) -> str | None:
+    if ground.lex is not None:
+        return None if rules.ground_truth in VARIANTS else f"{NOT_MEANT} the labels of OpenLex3D"
     if ground.dataset is not None:
         if not is_named and ground.dataset_name not in rules.datasets:
-            return f"is not meant for {ground.dataset_name}"
+            return f"{NOT_MEANT} {ground.dataset_name}"
         return why_not_fitting(rules, ground.dataset)
     assert ground.text is not None
     if rules.kind == "instance" and not ground.text.has_instances:
@@ -201,7 +237,7 @@ def _why_not_truth(rules: ProtocolRules, ground: _Ground, *, is_named: bool) -> 
     if is_named:
         return None
     if ground.dataset_name not in rules.datasets:
-        return f"is not meant for {ground.dataset_name}"
+        return f"{NOT_MEANT} {ground.dataset_name}"
     variant = text_variant(ground.text, rules.label_space)
     return None if variant in {None, rules.ground_truth} else f"the labels of the ground truth are '{variant}'"
 
@@ -221,27 +257,35 @@ class _Scoring:
         self._first: Content | None = None
 
     def add(self, match: Match, prediction: ScenePrediction, *, is_named: bool) -> None:
-        """Score one scene; at the first one, protocols that do not fit its kind go out or, when named, raise."""
+        """Score one scene; at the first that is not empty, protocols that do not fit go out or, when named, raise."""
         reasons: dict[str, str] = {}
         for rules in list(self.rules.values()):
-            reason = self._score(rules, match, prediction)
+            reason = self._score(rules, match, prediction, is_named=is_named)
             if reason is not None:
                 reasons[rules.name] = reason
         where = f"{shown(match.source.path)}: {match.scene}"
         for name, reason in reasons.items():
-            if is_named or (self._first is not None and self.outcomes[name].scores):
-                raise PredictionError(f"{where}: {name}: {reason}".replace(f"{match.scene}: {name}: ", f"{name}: ", 1))
+            if is_named or self._first is not None:
+                raise PredictionError(f"{where}: {name}: {reason}")
             self.unfit[name] = reason
             del self.rules[name], self.outcomes[name]
         if not self.rules:
-            raise PredictionError(f"{where}: no protocol can score it: {'; '.join(sorted(set(reasons.values())))}")
-        self._first = prediction.content if self._first is None else self._first
+            first, *others = dict.fromkeys(reasons.values())
+            more = f" (and {len(others)} more reasons)" if others else ""
+            raise PredictionError(f"{where}: none of {len(reasons)} protocols can score it: {first}{more}")
+        if self._first is None and not _is_empty(prediction.content):
+            self._first = prediction.content
 
-    def _score(self, rules: ProtocolRules, match: Match, prediction: ScenePrediction) -> str | None:
+    def _score(self, rules: ProtocolRules, match: Match, prediction: ScenePrediction, *, is_named: bool) -> str | None:
         """The reason why a scene cannot be scored under the protocol; None where it was."""
         content = prediction.content
         has_points = self._ground.text is None
-        reason = why_not_content(rules, content, has_points=has_points)
+        if self._ground.lex is not None:
+            reason = why_not_lex_content(rules, content)
+        else:
+            reason = why_not_content(rules, content, has_points=has_points)
+        if reason is None and has_points and not is_named and self._first is None:
+            reason = why_not_numbers(rules, content)
         if reason is not None:
             return reason
         encoder: Encoder | None = None
@@ -262,20 +306,30 @@ class _Scoring:
             kept.warnings += [line for line in doubts(rules, self._ground.text) if line not in kept.warnings]
         else:
             try:
-                truth = self._ground.truth(scene, rules.ground_truth)
+                found = self._on_points(rules, scene, content, encoder)
             except GroundTruthMissing as error:
                 if kept.scores or len(self._ground.scenes) > 1:
                     kept.unscored[scene] = str(error)
                     return None
                 return str(error)
-            try:
-                check_length(scene, content, len(truth.points))
-            except PredictionError as error:
-                return str(error)
-            outcome = score_on_truth(self._used(rules), truth, scene, content, encoder)
-            kept.has_coverage = True
+            if isinstance(found, str):
+                return found
+            outcome, kept.has_coverage = found, True
         kept.add(scene, outcome)
         return None
+
+    def _on_points(
+        self, rules: ProtocolRules, scene: str, content: Content, encoder: Encoder | None
+    ) -> SceneOutcome | str:
+        """The outcome against a truth with coordinates, or the reason why there is none."""
+        if self._ground.lex is not None:
+            return score_on_objects(rules, self._ground.lex.truth(scene, rules.ground_truth), scene, content, encoder)
+        truth = self._ground.truth(scene, rules.ground_truth)
+        try:
+            check_length(scene, content, len(truth.points))
+        except PredictionError as error:
+            return str(error).removeprefix(f"{scene}: ")
+        return score_on_truth(self._used(rules), truth, scene, content, encoder)
 
     def _used(self, rules: ProtocolRules) -> ProtocolRules:
         changes = self.uses_file_confidences and rules.kind == "instance" and rules.confidence == "ones"
@@ -283,8 +337,10 @@ class _Scoring:
 
     def add_missed(self, scenes: Sequence[str]) -> None:
         """Scenes without a prediction: left out where the original leaves them out, otherwise counted as missed."""
-        assert self._first is not None
         nothing = nothing_like(self._first)
+        text = self._ground.text
+        if text is not None and not all(skips_missing_scenes(rules) for rules in self.rules.values()):
+            self._ground.text = text.with_scenes({scene: self._ground.files[scene] for scene in scenes})
         for rules in self.rules.values():
             kept = self.outcomes[rules.name]
             if skips_missing_scenes(rules):
@@ -298,9 +354,13 @@ class _Scoring:
                     kept.missed.append(scene)
 
 
+def _is_empty(content: Content) -> bool:
+    return isinstance(content, VertexMasks | Instances) and not len(content)
+
+
 def skips_missing_scenes(rules: ProtocolRules) -> bool:
     """Whether the original leaves scenes without a prediction out, so that their objects never count as missed.
 
     evaluate_semantic_instance.py, evaluate_semantic_label.py and those made after them walk the prediction files.
     """
-    return rules.metric == "scannet" and "rooms" not in rules.name
+    return rules.metric == "scannet" and rules.name in protocol_names() and "rooms" not in rules.name

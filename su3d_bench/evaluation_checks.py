@@ -11,7 +11,7 @@ from su3d_bench.errors import PredictionError
 from su3d_bench.metrics.transfer import Masks
 from su3d_bench.plain_text import printable
 from su3d_bench.protocols import ProtocolRules
-from su3d_bench.types import Float32Array, Float64Array, Int64Array
+from su3d_bench.types import Float32Array, Float64Array, Int32Array, Int64Array
 
 NEAR_IOU = 0.9  # pairs above it are the same object twice
 MOST_SHARED = 300_000_000  # products while pairs are sought; 600 masks of a large scene take some ten million
@@ -115,7 +115,7 @@ def _key(keys: Sequence[str], k: int) -> str:
     return f" ({printable(keys[k], 80)})" if plain else ""
 
 
-def class_warnings(scene: str, rules: ProtocolRules, numbers: Int64Array | None, ids: Int64Array) -> list[str]:
+def class_warnings(scene: str, rules: ProtocolRules, numbers: Int32Array | None, ids: Int64Array) -> list[str]:
     """A sentence on masks whose class the protocol does not score; ``ids`` (K,) are class ids, 0 for none.
 
     ``numbers`` (K,) are the classes as the file has them.
@@ -129,8 +129,8 @@ def class_warnings(scene: str, rules: ProtocolRules, numbers: Int64Array | None,
         return []
     values, counts = np.unique(np.asarray(numbers)[is_dropped], return_counts=True)
     most = np.argsort(-counts, kind="stable")[:3]
-    texts = [f"{values[row]}{_known(name_of.get(int(values[row])))} {counts[row]} times" for row in most]
-    more = f" and {len(values) - 3} more" if len(values) > 3 else ""
+    texts = [f"{counts[row]} of class {values[row]}{_known(name_of.get(int(values[row])))}" for row in most]
+    more = f" and {len(values) - 3} classes more" if len(values) > 3 else ""
     first = int(np.argmax(is_dropped))
     verb = "has" if is_dropped.sum() == 1 else "have"
     return [

@@ -52,20 +52,27 @@ def open_sources(paths: Sequence[Path], format: str | None) -> list[Source]:
 
 
 def match_scenes(
-    sources: Sequence[Source], known: Sequence[str], dataset: str | None, where: str
+    sources: Sequence[Source], known: Sequence[str], dataset: str | None, where: str, asked: Sequence[str] = ()
 ) -> tuple[list[Match], list[str]]:
     """The prediction of each scene of ``known`` that has one, in that order, and remarks.
 
     Names agree when they are equal without case, ``_`` and ``-``; otherwise the only name that goes on after the
-    scene's is taken, and said. Raises ``PredictionError`` where several fit or one fits no scene.
+    scene's is taken, and said. A single prediction is that of the single scene that was ``asked`` for, whatever its
+    name. Raises ``PredictionError`` where several fit or one fits no scene.
     """
     names = {name: source for source in sources for name in source.scenes}
     if len(names) < sum(len(source.scenes) for source in sources):
         twice = next(n for k, s in enumerate(sources) for n in s.scenes if any(n in t.scenes for t in sources[:k]))
         raise PredictionError(f"scene '{printable(twice, 80)}' is predicted in several of the paths; give each once")
-    foreign = [name for name, source in names.items() if source.dataset_of(name) not in {None, dataset}]
+    foreign = [
+        name for name, one in names.items() if dataset is not None and one.dataset_of(name) not in {None, dataset}
+    ]
     remarks = [f"left out, of another dataset: {printable(', '.join(foreign), 200)}"] if foreign else []
     own = {name: _plain(name.rpartition("/")[2]) for name in names if name not in foreign}
+    if len(asked) == 1 and len(own) == 1 and not _is_known(next(iter(own)), known):
+        name = next(iter(own))
+        said = f"{asked[0]}: the prediction '{printable(name, 80)}' is taken for it, as the only one"
+        return [Match(asked[0], name, names[name])], [*remarks, said]
     taken: dict[str, list[str]] = {}
     for name, plain in own.items():
         taken.setdefault(_scene_of(name, plain, known, where), []).append(name)
@@ -90,6 +97,10 @@ def _scene_of(name: str, plain: str, known: Sequence[str], where: str) -> str:
         return max(longer, key=len)
     hint = suggest(name, known) or f"; known: {', '.join(known[:4])}{', ...' if len(known) > 4 else ''}"
     raise PredictionError(f"{where}: no ground truth for the predicted scene '{printable(name, 80)}'{hint}")
+
+
+def _is_known(name: str, known: Sequence[str]) -> bool:
+    return "/" in name or any(_plain(scene) == _plain(name) or _goes_on(name, scene) for scene in known)
 
 
 def _goes_on(name: str, scene: str) -> bool:

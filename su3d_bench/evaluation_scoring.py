@@ -18,7 +18,7 @@ from su3d_bench.evaluation_checks import (
     label_warnings,
     mask_facts,
 )
-from su3d_bench.evaluation_truth import TextTruth
+from su3d_bench.evaluation_truth import MAX_NYU40_ID, TextTruth
 from su3d_bench.metrics import instance_ap, semantic, transfer
 from su3d_bench.metrics.labelling import (
     candidate_classes,
@@ -43,6 +43,9 @@ from su3d_bench.types import (
     Prediction,
 )
 
+# Ground truths of ScanNet and whose class ids they hold.
+ID_LISTS = {"nyu40-vertices": "ids of NYU40 do", "scannet200-vertices": "ids of ScanNet200 do"}
+
 
 @dataclass(frozen=True)
 class SceneOutcome:
@@ -61,7 +64,7 @@ def why_not_content(rules: ProtocolRules, content: Content, *, has_points: bool)
     ``has_points``: the points of the truth have coordinates.
     """
     if rules.kind in ("queries", "categories"):
-        return f"needs ground truth of the form '{rules.ground_truth}', which neither a dataset nor text files give"
+        return f"needs ground truth of the form '{rules.ground_truth}', which neither a dataset nor such texts give"
     if not isinstance(content, VertexMasks | VertexLabels):
         if not has_points:
             return "the prediction has points of its own, the ground truth has no coordinates; name a --dataset"
@@ -83,6 +86,25 @@ def why_not_content(rules: ProtocolRules, content: Content, *, has_points: bool)
     return None
 
 
+def why_not_numbers(rules: ProtocolRules, content: Content) -> str | None:
+    """Why the class ids of a prediction cannot be those of the protocol, where its label space has two lists of ids."""
+    if rules.class_agnostic is not None or rules.ground_truth not in ID_LISTS:
+        return None
+    ids: np.ndarray | None = None
+    if isinstance(content, VertexLabels):
+        ids = content.class_ids
+    elif isinstance(content, VertexMasks) and content.numbering == "id":
+        ids = content.class_numbers
+    if ids is None or not len(ids):
+        return None
+    found = "nyu40-vertices" if int(ids.max()) <= MAX_NYU40_ID else "scannet200-vertices"
+    return (
+        None
+        if found == rules.ground_truth
+        else f"the predicted classes go up to {int(ids.max())}, as {ID_LISTS[found]}"
+    )
+
+
 def _why_no_labels(rules: ProtocolRules, content: Prediction) -> str | None:
     lacks = isinstance(content, Instances) and len(content) and content.labels is None and content.features is None
     return (
@@ -97,7 +119,8 @@ def n_feature_dimensions(rules: ProtocolRules, content: Content) -> int | None:
     if isinstance(content, VertexMasks):
         has_labels = content.class_numbers is not None
     else:
-        has_labels = getattr(content, "labels", None) is not None
+        compares = rules.kind == "queries" or rules.metric == "openlex3d-ranking"  # with texts, whatever the labels
+        has_labels = getattr(content, "labels", None) is not None and not compares
     features = content.features
     return None if has_labels or features is None or not len(features) else int(features.shape[1])
 
@@ -117,8 +140,8 @@ def check_length(scene: str, content: Content, n_points: int) -> None:
         )
 
 
-def nothing_like(content: Content) -> Content:
-    """An empty prediction of the same kind, for a scene that was not predicted."""
+def nothing_like(content: Content | None) -> Content:
+    """An empty prediction of the same kind, for a scene that was not predicted; masks where no kind is known."""
     if isinstance(content, VertexLabels):
         return VertexLabels(np.zeros(0, np.int32))
     none = np.zeros(0, np.int32)

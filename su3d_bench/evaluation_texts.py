@@ -19,11 +19,15 @@ from su3d_bench.types import Encoder, Float32Array, UInt8Array
 
 @dataclass(frozen=True)
 class TextFeatures:
-    """A feature (C, D) for each of ``names``, which are class names or whole prompts, out of ``path``."""
+    """A feature (C, D) for each of ``names``, which are class names or whole prompts, out of ``path``.
+
+    ``encoder``: what made them, as far as the file says it.
+    """
 
     path: Path
     names: tuple[str, ...]
     features: Float32Array
+    encoder: str
 
     @property
     def dim(self) -> int:
@@ -44,7 +48,7 @@ class GivenTexts:
     """``TextFeatures`` in the place of the protocol's encoder: a prompt has its own feature, or its class's."""
 
     def __init__(self, given: TextFeatures, rules: ProtocolRules) -> None:
-        self.name = rules.encoder or f"features in {given.path.name}"
+        self.name = given.encoder
         self.dim = given.dim
         self._given = given
         self._row_of = {name: row for row, name in enumerate(given.names)}
@@ -66,10 +70,10 @@ class GivenTexts:
 
 
 def read_text_features(path: Path) -> TextFeatures:
-    """The arrays ``names`` (C,) and ``features`` (C, D) of a .npz file."""
+    """The arrays ``names`` (C,) and ``features`` (C, D) of a .npz file, and ``encoder``, a text, where it is there."""
     where = shown(path)
     try:
-        arrays = read_npz(path, ("names", "features"))
+        arrays = read_npz(path, ("names", "features", "encoder"))
     except PredictionError as error:
         raise DataError(str(error)) from error
     names, features = arrays.get("names"), arrays.get("features")
@@ -86,7 +90,11 @@ def read_text_features(path: Path) -> TextFeatures:
     if len(set(texts)) < len(texts):
         twice = next(text for k, text in enumerate(texts) if text in texts[:k])
         raise DataError(f"{where}: '{printable(twice, 80)}' stands there twice; give each name once")
-    return TextFeatures(path, texts, features.astype(np.float32))
+    said = arrays.get("encoder")
+    if said is not None and (said.ndim != 0 or said.dtype.kind != "U"):
+        raise DataError(f"{where}: 'encoder' is {said.shape} {said.dtype.kind}; expected one text")
+    encoder = f"of {path.name}" if said is None else printable(str(said), 80)
+    return TextFeatures(path, texts, features.astype(np.float32), encoder)
 
 
 def encoder_for(rules: ProtocolRules, n_dimensions: int, given: TextFeatures | None, *, is_own: bool) -> Encoder | str:

@@ -14,6 +14,7 @@ import numpy as np
 from su3d_bench import registry
 from su3d_bench.errors import DataError, PredictionError, suggest
 from su3d_bench.metrics.instance_ap import INSTANCES_PER_CLASS
+from su3d_bench.plain_text import printable
 from su3d_bench.planning import data_root
 from su3d_bench.predictions.base import MOST_POINTS, shown
 from su3d_bench.predictions.mask_arrays import scene_files
@@ -32,7 +33,6 @@ SCENE_NAMES = {"scannet": re.compile(r"scene\d{4}_\d\d"), "replica": re.compile(
 class TextTruth:
     """One value a point of each scene: a class id, or with ``has_instances`` class id * 1000 + instance."""
 
-    folder: Path
     values: Mapping[str, Int64Array]
     has_instances: bool
 
@@ -40,6 +40,10 @@ class TextTruth:
         """Class id of each point, 0 for none."""
         values = self.values[scene]
         return values // INSTANCES_PER_CLASS if self.has_instances else values
+
+    def with_scenes(self, files: Mapping[str, Path]) -> TextTruth:
+        """The truth with further scenes."""
+        return TextTruth({**self.values, **_read_all(files)}, self.has_instances)
 
     @cached_property
     def largest_label(self) -> int:
@@ -54,16 +58,22 @@ def text_scenes(folder: Path) -> dict[str, Path]:
         files = scene_files(folder, (".txt",))
     except PredictionError as error:
         raise DataError(str(error)) from error
+    if odd := next((name for name in files if not name.isprintable()), None):
+        raise DataError(f"{shown(folder)}: holds a file '{printable(odd, 80)}'; name files after scenes")
     if not files:
         raise DataError(f"{shown(folder)}: has no .txt file; expected <scene>.txt, one value a point")
     return files
 
 
-def read_text_truth(folder: Path, files: Mapping[str, Path]) -> TextTruth:
+def read_text_truth(files: Mapping[str, Path]) -> TextTruth:
     """The truth of the scenes in ``files``; whether values hold instances is told from all of them together."""
-    values = {scene: _read_values(path) for scene, path in files.items()}
+    values = _read_all(files)
     largest = max((int(one.max(initial=0)) for one in values.values()), default=0)
-    return TextTruth(folder, values, largest > LARGEST_LABEL)
+    return TextTruth(values, largest > LARGEST_LABEL)
+
+
+def _read_all(files: Mapping[str, Path]) -> dict[str, Int64Array]:
+    return {scene: _read_values(path) for scene, path in files.items()}
 
 
 def _read_values(path: Path) -> Int64Array:

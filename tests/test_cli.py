@@ -57,7 +57,7 @@ def test_the_module_is_the_command() -> None:
     assert (done.returncode, done.stdout) == (0, "su3d-bench 0.1.0\n")
 
 
-@pytest.mark.parametrize("verb", ["run", "query", "datasets", "methods", "protocols", "export"])
+@pytest.mark.parametrize("verb", ["run", "evaluate", "query", "datasets", "methods", "protocols", "export"])
 def test_the_help_of_every_verb_ends_with_two_examples(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     parser = verbs()[verb]
     assert len(examples(parser)) == 2
@@ -65,7 +65,7 @@ def test_the_help_of_every_verb_ends_with_two_examples(verb: str, capsys: pytest
     assert capsys.readouterr().out.rstrip().endswith(examples(parser)[-1])
 
 
-@pytest.mark.parametrize("verb", ["run", "query", "datasets", "methods", "protocols", "export"])
+@pytest.mark.parametrize("verb", ["run", "evaluate", "query", "datasets", "methods", "protocols", "export"])
 def test_the_examples_of_every_verb_parse(verb: str) -> None:
     for example in examples(verbs()[verb]):
         arguments = build_parser().parse_args(shlex.split(example)[1:])

@@ -37,17 +37,24 @@ def brute_force(candidates: np.ndarray, queries: np.ndarray) -> np.ndarray:
     return np.asarray((offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2).argmin(axis=1))
 
 
-@settings(max_examples=40, deadline=None)
-@given(seed=st.integers(0, 10_000), n=st.integers(1, 300), on_a_grid=st.booleans())
-def test_nearest_equals_brute_force_with_the_lowest_index_of_equals(seed: int, n: int, on_a_grid: bool) -> None:
+@settings(max_examples=80, deadline=None)
+@given(seed=st.integers(0, 10_000), n=st.integers(1, 300), on_a_grid=st.booleans(), is_ordered=st.booleans())
+def test_nearest_equals_brute_force_with_the_lowest_index_of_equals(
+    seed: int, n: int, on_a_grid: bool, is_ordered: bool
+) -> None:
     rng = np.random.default_rng(seed)
     if on_a_grid:  # few places, many points on each, queries half-way between
         candidates = rng.integers(0, 3, (n, 3)).astype(np.float64)
         queries = rng.integers(0, 5, (50, 3)) / 2
     else:
         candidates, queries = rng.random((n, 3)), rng.random((50, 3))
-    distance, index = nearest(candidates, queries)
+    with pytest.MonkeyPatch.context() as patch:
+        if is_ordered:  # as large clouds are
+            patch.setattr(transfer, "WORTH_ORDERING", 0)
+        distance, index = nearest(candidates, queries)
+        capped = nearest(candidates, queries, cap_m=0.2)[1]
     assert np.array_equal(index, brute_force(candidates, queries))
+    assert np.array_equal(capped, np.where(distance <= 0.2, index, -1))
     exact = np.sqrt(((candidates[index].astype(np.float64) - queries) ** 2).sum(axis=1))
     np.testing.assert_allclose(distance, exact, rtol=1e-12, atol=0)
 

@@ -20,7 +20,7 @@ POINTS = np.array([[1.5, -2.25, 0.0], [1.5, 3.0, 1e-3], [1.5, 3.0, 7.0]], np.flo
 
 
 def header(
-    form: str, n: int = 3, *, fields: str = "x y z", sizes: str = "4 4 4", types: str = "F F F", **more: str
+    form: str, n: int = 3, *, fields: str = "x y z", sizes: str = "4 4 4", types: str = "F F F", **more: Any
 ) -> str:
     lines = {
         "VERSION": "0.7",
@@ -157,7 +157,7 @@ def test_a_cloud_without_points_is_read(tmp_path: Path) -> None:
         ({"COLUMNS": "a b c"}, "'FIELDS' stands there twice"),
     ],
 )
-def test_each_fault_of_the_header_is_one_line(tmp_path: Path, changes: dict[str, str], message: str) -> None:
+def test_each_fault_of_the_header_is_one_line(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
     head = header("binary", **changes)
     if "COLOUR" in changes or "COLUMNS" in changes:  # before the line that ends the header
         ((key, value),) = changes.items()

@@ -37,7 +37,8 @@ def add_parser(verbs: Any) -> None:
         "--ground-truth",
         type=Path,
         metavar="DIR",
-        help="ground truth as text instead: <scene>.txt with label * 1000 + instance a vertex, or label ids",
+        help="ground truth as text instead, <scene>.txt with label * 1000 + instance a vertex, or label ids; or "
+        "OpenLex3D's release",
     )
     parser.add_argument(
         "--protocol",
@@ -67,9 +68,9 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.executors import limit_threads
 
     limit_threads()  # before numerical libraries are loaded
-    from su3d_bench.evaluation import Request, evaluate
+    from su3d_bench.evaluation import NOT_MEANT, Request, evaluate
     from su3d_bench.reports.evaluation_tables import evaluation_text
-    from su3d_bench.store import write_text
+    from su3d_bench.store import make_folder, write_text
 
     result = evaluate(
         Request(
@@ -85,14 +86,18 @@ def call(arguments: argparse.Namespace) -> int:
     )
     document = result.to_json()
     if arguments.json is not None:
+        make_folder(arguments.json.parent)
         write_text(arguments.json, json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
     answer(evaluation_text(document, per_class=arguments.per_class))
     remark(f"format: {', '.join(result.formats)}; ground truth: {result.ground_truth}", quiet=arguments.quiet)
     for line in result.remarks:
         remark(line, quiet=arguments.quiet)
+    reasons: dict[str, list[str]] = {}
     for name, reason in result.not_scored.items():
-        if not reason.startswith("is not meant for"):
-            remark(f"not scored under {name}: {reason}", quiet=arguments.quiet)
+        reasons.setdefault(reason, []).append(name)
+    for reason, names in reasons.items():
+        if not reason.startswith(NOT_MEANT):
+            remark(f"not scored under {', '.join(names)}: {reason}", quiet=arguments.quiet)
     if arguments.json is not None:
         remark(f"written: {arguments.json}", quiet=arguments.quiet)
     return EXIT_DONE

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import fnmatch
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -42,13 +42,19 @@ def add_parser(verbs: Any) -> None:
         help="openlex3d: a cloud, the object of each point and features; scannet: lists of masks with class and score",
     )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="a new folder for the files")
-    parser.add_argument("--method", help="whose maps of a run (default: the only method in it)")
+    parser.add_argument("--method", help="whose maps of a run (default: the only one that it was asked for)")
     parser.add_argument(
         "--scenes", nargs="+", default=[], metavar="SCENE", help="addresses or patterns, such as 'replica/*'"
     )
     parser.add_argument("--format", help="the format of the prediction (default: found from its files)")
     parser.add_argument(
         "--protocol", help="for scannet: whose classes and ground truth (default: the dataset's only one of instances)"
+    )
+    parser.add_argument(
+        "--text-features",
+        type=Path,
+        metavar="FILE",
+        help="for scannet: features of class names for predictions that have features: .npz with names and features",
     )
 
 
@@ -72,8 +78,9 @@ def call(arguments: argparse.Namespace) -> int:
     limit_threads()
     from su3d_bench.predictions.export import whole_folder, write_openlex, write_scannet
 
-    if arguments.protocol is not None and arguments.to != "scannet":
-        raise ConfigError(f"--protocol {arguments.protocol}: belongs to --to scannet; leave it out")
+    for flag, value in {"--protocol": arguments.protocol, "--text-features": arguments.text_features}.items():
+        if value is not None and arguments.to != "scannet":
+            raise ConfigError(f"{flag} {value}: belongs to --to scannet; leave it out")
     sources = chosen(sources_of(arguments.path, arguments.format, arguments.method), arguments.scenes, arguments.path)
     names = _names([source.address for source in sources], is_flat=arguments.to == "scannet")
     rows = []
@@ -86,7 +93,8 @@ def call(arguments: argparse.Namespace) -> int:
                 else:
                     masks = _labelled(prediction.content, source, arguments)
                     remarks = write_scannet(masks, name, folder)
-            rows.append({"scene": source.address, "remarks": [*prediction.remarks, *remarks]})
+            remarks = (*_partial_remark(source.run), *prediction.remarks, *remarks)
+            rows.append({"scene": source.address, "remarks": list(remarks)})
     if arguments.json:
         answer_json({"to": arguments.to, "folder": str(arguments.out), "scenes": rows})
         return EXIT_DONE
@@ -95,6 +103,14 @@ def call(arguments: argparse.Namespace) -> int:
             remark(printable(f"{row['scene']}: {one}"), quiet=arguments.quiet)
     answer(f"{len(rows)} scene{'s' if len(rows) > 1 else ''} for {arguments.to}: {arguments.out}")
     return EXIT_DONE
+
+
+def _partial_remark(run: Path | None) -> tuple[str, ...]:
+    """That a map is of the first frames only, where its run was limited."""
+    from su3d_bench.config import RunConfig, read_file, resolve
+
+    limit = 0 if run is None else resolve(read_file(run / "run.toml"), (), RunConfig).limit
+    return (f"partial: the map is of the first {limit} updates of the scene",) if limit else ()
 
 
 @contextmanager
@@ -114,22 +130,32 @@ def sources_of(path: Path, format: str | None, method: str | None) -> list[Sourc
     if not found and method is not None:
         raise ConfigError(f"--method {method}: {path} is no run folder; leave it out")
     if found:
-        if method is None and len(found) > 1:
+        method = method or _only_method(found)
+        if method is None:
             raise ConfigError(f"{path}: holds the maps of {', '.join(found)}; choose one with --method")
-        chosen_method = method or next(iter(found))
-        if chosen_method not in found:
+        if method not in found:
             raise ConfigError(
-                f"{path}: holds no map of the method '{method}'{suggest(chosen_method, found)}; it has "
-                f"{', '.join(found)}"
+                f"{path}: holds no map of the method '{method}'{suggest(method, found)}; it has {', '.join(found)}"
             )
         reader = READERS["su3d-bench"]
-        run = _run_of(found[chosen_method][0])
-        return [Source(reader, file, name, name, run) for file in found[chosen_method] for name in reader.scenes(file)]
+        run = _run_of(found[method][0])
+        return [Source(reader, file, name, name, run) for file in found[method] for name in reader.scenes(file)]
     reader = recognise(path, format)
     scenes = reader.scenes(path)
     if not scenes:
         raise PredictionError(f"{printable(str(path), 300)}: has no prediction in the format '{reader.name}'")
     return [Source(reader, path, name, name, _run_of(file)) for name, file in scenes.items()]
+
+
+def _only_method(found: Mapping[str, Sequence[Path]]) -> str | None:
+    """The one method that a run was asked for; the ceiling that comes with it is not meant."""
+    from su3d_bench.config import RunConfig, read_file, resolve
+    from su3d_bench.scene_run import CEILING_METHOD
+
+    run = _run_of(next(iter(found.values()))[0])
+    is_single = run is not None and len(resolve(read_file(run / "run.toml"), (), RunConfig).methods) == 1
+    names = [name for name in found if name != CEILING_METHOD] if is_single and len(found) > 1 else list(found)
+    return names[0] if len(names) == 1 else None
 
 
 def _run_of(file: Path) -> Path | None:
@@ -149,14 +175,16 @@ def _maps_of_run(path: Path) -> dict[str, list[Path]]:
 
 def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> list[Source]:
     """The sources that a pattern matches, all without patterns; a scene without a dataset takes that of its pattern."""
+    from su3d_bench.planning import split_address
+
     if not patterns:
         return list(sources)
     found: dict[str, Source] = {}
     for pattern in patterns:
-        dataset, slash, tail = pattern.partition("/")
+        dataset, tail = split_address(pattern)
         matching = []
         for one in sources:
-            lacks_dataset = bool(slash) and "/" not in one.scene
+            lacks_dataset = bool(tail) and "/" not in one.scene
             if fnmatch.fnmatchcase(one.scene, tail if lacks_dataset else pattern):
                 matching.append(replace(one, address=f"{dataset}/{one.scene}") if lacks_dataset else one)
         if not matching:
@@ -169,13 +197,14 @@ def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> li
 
 def _names(addresses: Sequence[str], *, is_flat: bool) -> list[str]:
     """The name of each scene's files: its address, or in a flat folder its last part, which must tell scenes apart."""
+    from su3d_bench.planning import split_address
     from su3d_bench.predictions.export import file_name
 
     names = []
     for address in addresses:
-        dataset, slash, scene = address.partition("/")
-        parts = [scene] if slash and is_flat else [dataset, scene] if slash else [dataset]
-        names.append("/".join(file_name(part) for part in parts))
+        dataset, scene = split_address(address)
+        parts = [dataset.rpartition(":")[2], scene] if scene else [dataset]
+        names.append("/".join(file_name(part) for part in (parts[-1:] if is_flat else parts)))
     twice = next((name for name in names if names.count(name) > 1), None)
     if twice is not None:
         raise ConfigError(f"two scenes are called '{twice}', and their files would be one; choose with --scenes")
@@ -194,7 +223,8 @@ def _labelled(content: Content, source: Source, arguments: argparse.Namespace) -
         raise PredictionError(f"which dataset it is of is not known; name it, such as --scenes replica/{source.scene}")
     dataset, scene = _scene_of(source, is_quiet=arguments.quiet)
     rules = _rules(arguments.protocol, dataset)
-    return masks_on_truth(content, rules, dataset.ground_truth(scene, rules.ground_truth), _encoder(content, source))
+    encoder = _encoder(content, source, rules, arguments.text_features)
+    return masks_on_truth(content, rules, dataset.ground_truth(scene, rules.ground_truth), encoder)
 
 
 def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
@@ -239,17 +269,20 @@ def _has_masks(rules: ProtocolRules) -> bool:
     return rules.kind == "instance" and bool(rules.classes) and rules.class_agnostic is None
 
 
-def _encoder(content: Content, source: Source) -> Encoder | None:
-    """What names the features of a run of ours; None where the prediction has classes or no features."""
+def _encoder(content: Content, source: Source, rules: ProtocolRules, texts: Path | None) -> Encoder | None:
+    """What names the features; None where the prediction has classes or no features."""
     from su3d_bench.cli.query import encoder_of
+    from su3d_bench.evaluation_scoring import n_feature_dimensions
+    from su3d_bench.evaluation_texts import encoder_for, read_text_features
     from su3d_bench.store import RunFolder
 
-    has_classes = getattr(content, "labels", None) is not None or getattr(content, "class_numbers", None) is not None
-    if has_classes or getattr(content, "features", None) is None:
+    n_dimensions = n_feature_dimensions(rules, content)
+    if n_dimensions is None:
         return None
-    if source.run is None:
-        raise PredictionError(
-            "has features and no classes, and only the texts of the encoder that made them can name them; give a run "
-            "folder, or a prediction with classes"
-        )
-    return encoder_of(RunFolder(source.run))
+    if source.run is not None and texts is None:
+        return encoder_of(RunFolder(source.run))
+    given = None if texts is None else read_text_features(texts)
+    found = encoder_for(rules, n_dimensions, given, is_own=source.reader.name == "su3d-bench")
+    if isinstance(found, str):
+        raise PredictionError(f"{rules.name}: {found}")
+    return found

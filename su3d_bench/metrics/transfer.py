@@ -16,6 +16,7 @@ Points = Float32Array | Float64Array
 
 COVERAGE_RADII_M = (0.025, 0.05, 0.1)
 _MAX_NEIGHBOURS = 4_000_000  # candidates held at once while ties are broken
+WORTH_ORDERING = 100_000  # points, below which sorting takes longer than it saves
 
 
 @dataclass(frozen=True)
@@ -44,24 +45,46 @@ def nearest(candidates: Points, queries: Points, cap_m: float = np.inf) -> tuple
         return np.full(len(queries), np.inf), np.full(len(queries), -1, np.int64)
     from scipy.spatial import cKDTree
 
-    held = np.asarray(candidates, np.float64)
-    asked = np.asarray(queries, np.float64)
+    order, asking_order = _along_curve(candidates, queries)
+    held, asked = np.asarray(candidates, np.float64)[order], np.asarray(queries, np.float64)[asking_order]
     tree = cKDTree(held, balanced_tree=False, compact_nodes=False)
     # the tree takes only neighbours nearer than its bound; the cap itself still counts
     bound = np.nextafter(cap_m, np.inf)
     distances, indices = tree.query(asked, k=min(2, n), distance_upper_bound=bound, workers=1)
     distances, indices = distances.reshape(len(asked), -1), indices.reshape(len(asked), -1)
-    distance, index = distances[:, 0].copy(), indices[:, 0].astype(np.int64)
+    found = np.append(order, -1)[indices[:, 0]]  # the tree says n where it found none
     if n > 1:
         tied = np.flatnonzero((distances[:, 0] == distances[:, 1]) & np.isfinite(distances[:, 0]))
-        index[tied] = _lowest_of_equals(tree, held, asked[tied])
+        found[tied] = _lowest_of_equals(tree, held, asked[tied], order)
+    distance, index = np.empty(len(asked)), np.empty(len(asked), np.int64)
+    distance[asking_order], index[asking_order] = distances[:, 0], found
     too_far = ~np.isfinite(distance) | (distance > cap_m)
     distance[too_far], index[too_far] = np.inf, -1
     return distance, index
 
 
-def _lowest_of_equals(tree: Any, candidates: Float64Array, queries: Float64Array) -> Int64Array:
-    """The lowest index among the nearest candidates of queries that have several."""
+def _along_curve(candidates: Points, queries: Points) -> tuple[Int64Array, Int64Array]:
+    """Orders in which points that are near in space are near in memory, so that a search finds them in the cache.
+
+    Both follow a Z-order curve through 32 x 32 x 32 cells of a cube around the candidates; few points stay as is.
+    """
+    if len(candidates) + len(queries) < WORTH_ORDERING:
+        return np.arange(len(candidates)), np.arange(len(queries))
+    low = candidates.min(axis=0)
+    cells_a_metre = 32.0 / max(float((candidates.max(axis=0) - low).max()), 1e-9)
+    orders = []
+    for points in (candidates, queries):
+        cell = np.clip((points - low) * cells_a_metre, 0, 31).astype(np.uint16)
+        key = np.zeros(len(points), np.uint16)  # numpy sorts 16 bits in linear time
+        for bit in range(5):
+            for axis in range(3):
+                key |= ((cell[:, axis] >> bit) & 1) << (3 * bit + axis)
+        orders.append(np.argsort(key, kind="stable"))
+    return orders[0], orders[1]
+
+
+def _lowest_of_equals(tree: Any, candidates: Float64Array, queries: Float64Array, order: Int64Array) -> Int64Array:
+    """The lowest index among the nearest candidates of queries that have several; ``order`` holds their indices."""
     answer = np.empty(len(queries), np.int64)
     open_rows = np.arange(len(queries))
     k = 8
@@ -75,7 +98,7 @@ def _lowest_of_equals(tree: Any, candidates: Float64Array, queries: Float64Array
             offset = candidates[found] - queries[rows][:, None, :]
             squared = offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2
             is_nearest = squared == squared.min(axis=1, keepdims=True)
-            answer[rows] = np.where(is_nearest, found, len(candidates)).min(axis=1)
+            answer[rows] = np.where(is_nearest, order[found], len(candidates)).min(axis=1)
             # more equals may lie beyond the last neighbour that was asked for
             unfinished.append(rows[is_nearest[:, -1]] if k < len(candidates) else rows[:0])
         open_rows = np.concatenate(unfinished)

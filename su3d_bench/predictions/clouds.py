@@ -9,9 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.errors import DataError, PredictionError
+from su3d_bench.plain_text import printable
 from su3d_bench.predictions.base import MOST_MASKS, MOST_POINTS, shown
 from su3d_bench.predictions.mask_arrays import kind_of
-from su3d_bench.types import BoolArray, Float32Array, Instances
+from su3d_bench.types import Float32Array, Instances
 
 ONES = "the format has no scores: 1 for every object"
 
@@ -39,7 +40,8 @@ def named_once(pairs: Sequence[tuple[str, Path]], path: Path) -> Mapping[str, Pa
     for name, found in pairs:
         if table.setdefault(name, found) != found:
             raise PredictionError(
-                f"{shown(path)}: {shown(table[name])} and {shown(found)} are both of scene '{name}'; give one of them"
+                f"{printable(str(path), 120)}: {printable(str(table[name]), 120)} and {printable(str(found), 120)} are "
+                f"both of scene '{printable(name, 80)}'; give one of them"
             )
     return table
 
@@ -115,8 +117,3 @@ def some(numbers: Sequence[int]) -> str:
     '1, 2, 3, 4, 5, ...'
     """
     return ", ".join(str(number) for number in numbers[:5]) + (", ..." if len(numbers) > 5 else "")
-
-
-def rows_with(mask: BoolArray) -> list[int]:
-    """The indices where ``mask`` is true."""
-    return [int(row) for row in np.flatnonzero(mask)]

@@ -38,6 +38,7 @@ from su3d_bench.types import (
     GroundTruth,
     Instances,
     Int64Array,
+    Partition,
 )
 
 MASKS_FOLDER = "pred_mask"
@@ -103,9 +104,8 @@ def openlex_parts(content: Content) -> OpenLexParts:
         if n_shared:
             remarks.append(f"{n_shared} points are in several objects and went to the first of them")
     else:
+        _check_partition(content)
         owner = content.instance.astype(np.int64)
-        if owner.shape != (len(content.points),) or owner.max(initial=-1) >= len(features):
-            raise PredictionError("names objects that have no row of features; make the map again")
     kept = owner >= 0
     if n_without := int((~kept).sum()):
         remarks.append(f"{n_without} of {len(kept)} points are in no object and were left out")
@@ -113,6 +113,12 @@ def openlex_parts(content: Content) -> OpenLexParts:
     if n_empty:
         remarks.append(f"{n_empty} of {len(features)} objects have no point left")
     return OpenLexParts(_finite(content.points[kept]), owner[kept], features, tuple(remarks))
+
+
+def _check_partition(content: Partition) -> None:
+    n = len(content.features)
+    if content.instance.shape != (len(content.points),) or content.instance.max(initial=-1) >= n:
+        raise PredictionError(f"needs one of its {n} rows of features for each point, -1 for none; make the map again")
 
 
 def _dense_parts(content: DenseFeatures) -> OpenLexParts:
@@ -186,32 +192,43 @@ def masks_on_truth(
     if isinstance(content, VertexLabels | DenseFeatures):
         raise PredictionError("has no masks, and ScanNet's list needs them")
     named = _instances(content, truth) if isinstance(content, VertexMasks) else content
-    if isinstance(named, Instances):
-        masks, scores = transfer.masks_of(named), np.asarray(named.scores, np.float64)
-    else:
-        n = len(named.features)
-        masks, scores = transfer.masks_of_partition(named.instance, n), np.ones(n)
-    if not np.isfinite(named.points).all() or not np.isfinite(scores).all():
-        raise PredictionError("has points or scores that are NaN or infinite; make it again")
+    masks, scores, remarks = _masks_and_scores(named)
     moved = transfer.transfer_masks(
         named.points, masks, truth.points, rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
     )
-    ids = np.array([entry.id for entry in rules.classes], np.int64)
     if isinstance(content, VertexMasks) and content.class_numbers is not None:
-        return LabelledMasks(moved, len(truth.points), _own_ids(content, ids), scores)
+        return LabelledMasks(moved, len(truth.points), _own_ids(content, rules), scores, remarks)
+    ids = np.array([entry.id for entry in rules.classes], np.int64)
     is_present = present(class_index_of_ids(rules, truth.semantic), len(ids)) & scored_classes(rules)
     classes = classes_of_prediction(rules, named, encoder, candidate_classes(rules, is_present))
     class_ids = np.where(classes >= 0, ids[classes], 0)
-    told = encoder_warning(rules, named, encoder)
-    return LabelledMasks(moved, len(truth.points), class_ids, scores, (told,) if told else ())
+    if (told := encoder_warning(rules, named, encoder)) is not None:
+        remarks = (*remarks, told)
+    return LabelledMasks(moved, len(truth.points), class_ids, scores, remarks)
 
 
-def _own_ids(content: VertexMasks, ids: Int64Array) -> Int64Array:
-    """The class ids that the file itself gives, 0 for positions beyond the list of classes."""
+def _masks_and_scores(named: Instances | Partition) -> tuple[transfer.Masks, Float64Array, tuple[str, ...]]:
+    """The masks on the points of the map, a finite score for each, and what a reader of the scores must know."""
+    remarks: tuple[str, ...] = ()
+    if isinstance(named, Instances):
+        masks, scores = transfer.masks_of(named), np.asarray(named.scores, np.float64)
+    else:
+        _check_partition(named)
+        n = len(named.features)
+        masks, scores = transfer.masks_of_partition(named.instance, n), np.ones(n)
+        remarks = ("a partition has no scores: 1 for every mask",)
+    if not np.isfinite(named.points).all() or not np.isfinite(scores).all():
+        raise PredictionError("has points or scores that are NaN or infinite; make it again")
+    return masks, scores, remarks
+
+
+def _own_ids(content: VertexMasks, rules: ProtocolRules) -> Int64Array:
+    """The class ids that the file itself gives; positions count the scored classes, beyond them there is none: 0."""
     assert content.class_numbers is not None
     numbers = content.class_numbers.astype(np.int64)
     if content.numbering == "id":
         return numbers
+    ids = np.array([entry.id for entry in rules.scored], np.int64)
     is_known = (numbers >= 0) & (numbers < len(ids))
     return np.where(is_known, ids[np.where(is_known, numbers, 0)], 0)
 

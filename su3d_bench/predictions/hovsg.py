@@ -24,7 +24,6 @@ from su3d_bench.predictions.clouds import (
     folders_with,
     instances_of,
     named_once,
-    rows_with,
     some,
     without_nonfinite,
 )
@@ -123,7 +122,7 @@ def _object_files(folder: Path) -> dict[int, Path]:
 def _gap_remarks(numbers: list[int], n_rows: int) -> tuple[str, ...]:
     is_there = np.zeros(n_rows, np.bool_)
     is_there[numbers] = True
-    missing = rows_with(~is_there)
+    missing = np.flatnonzero(~is_there).tolist()
     if not missing:
         return ()
     remarks = [f"{len(missing)} rows of {FEATURES} have no object file and are not used ({some(missing)})"]

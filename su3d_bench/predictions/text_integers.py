@@ -25,6 +25,8 @@ def integer_lines(content: bytes, where: str) -> IntegerArray:
     [12, -1]
     """
     if b"\r" in content:
+        if b"\r" in content.replace(b"\r\n", b""):
+            return _any_numbers(content, where)  # a carriage return alone ends a line, too
         content = content.replace(b"\r\n", b"\n")
     if content and not content.endswith(b"\n"):
         content += b"\n"

@@ -1,0 +1,88 @@
+"""The plot of an attribution: from the value as it is, a bar for what the mending of each kind of error adds."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.reports.attribution_table import n_text
+from su3d_bench.reports.comparison_table import signed
+from su3d_bench.store import make_folder, write_bytes
+
+DPI = 100
+PANEL_WIDTH, ROW_HEIGHT, PANEL_EXTRA = 4.6, 0.34, 1.25  # inches
+# Grey and hatches tell bars apart on a printer without colours.
+STYLES: dict[str, dict[str, Any]] = {
+    "gain": {"facecolor": "#4a7ab5", "edgecolor": "#1b2f4a"},
+    "left": {"facecolor": "#ffffff", "edgecolor": "#555555", "hatch": "////"},
+    "stage": {"facecolor": "#d9d9d9", "edgecolor": "#555555", "hatch": "...."},
+}
+
+
+def draw_attribution(attribution: Mapping[str, Any], path: Path) -> None:
+    """Write the plot as a PNG: a row of panels a protocol, a panel a metric."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    protocols = attribution["protocols"]
+    n_columns = max(len(one["values"]) for one in protocols)
+    heights = [ROW_HEIGHT * len(_bars(one, next(iter(one["values"])))) + PANEL_EXTRA for one in protocols]
+    figure = Figure(figsize=(1.6 + PANEL_WIDTH * n_columns, sum(heights) + 0.5), dpi=DPI, facecolor="white")
+    FigureCanvasAgg(figure)
+    figure.suptitle(f"{attribution['run']}: {attribution['method']}", fontsize=13, fontweight="bold")
+    grid = figure.add_gridspec(len(protocols), n_columns, height_ratios=heights)
+    for row, one in enumerate(protocols):
+        for column, name in enumerate(one["values"]):
+            _draw_panel(figure.add_subplot(grid[row, column]), one, name, has_names=column == 0)
+    figure.tight_layout(rect=(0, 0, 1, 0.98))
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    make_folder(path.parent)
+    write_bytes(path, buffer.getvalue())
+
+
+Bar = tuple[str, float, str, str]  # name, length, style, what stands beside it
+
+
+def _bars(one: Mapping[str, Any], metric: str) -> list[Bar]:
+    value = one["values"][metric] or 0.0
+    bars = []
+    for kind, cause in one["causes"].items():
+        gain = cause["gains"][metric]
+        bars.append((kind, gain or 0.0, "gain", f"{signed(gain)}  ({n_text(cause['n'], one['n_scored'])})"))
+    bars += [(name, one[name][metric] or 0.0, "left", signed(one[name][metric])) for name in ("overlap", "rest")]
+    for stage, values in one["stages"].items():
+        change = None if values[metric] is None else values[metric] - value
+        bars.append((f"true {stage}", change or 0.0, "stage", signed(change)))
+    return bars
+
+
+def _draw_panel(axes: Any, one: Mapping[str, Any], metric: str, *, has_names: bool) -> None:
+    value = 100 * (one["values"][metric] or 0.0)
+    bars = _bars(one, metric)
+    places = range(len(bars))
+    for place, (_, length, style, text) in zip(places, bars, strict=True):
+        axes.barh(place, 100 * length, left=value, height=0.62, linewidth=0.8, **STYLES[style])
+        end = max(value, value + 100 * length)
+        free = {"facecolor": "white", "edgecolor": "none", "pad": 0.8}  # the line at 100 does not cross the number
+        axes.text(end + 0.02 * _span(value), place, text, va="center", fontsize=8.5, color="#222222", bbox=free)
+    axes.axvline(value, color="black", linewidth=1.2)
+    axes.axvline(100, color="black", linewidth=0.8, linestyle=":")
+    lowest = min([value, *(value + 100 * length for _, length, _, _ in bars)])
+    axes.set_xlim(lowest - 0.04 * _span(value), 100 + 0.42 * _span(value))
+    axes.set_xticks([tick for tick in axes.get_xticks() if lowest - 0.04 * _span(value) <= tick <= 100])
+    axes.set_ylim(len(bars) - 0.4, -0.6)
+    axes.set_yticks(list(places), [name for name, *_ in bars] if has_names else [""] * len(bars), fontsize=9.5)
+    axes.set_title(f"{one['protocol']}: {metric} {value:.1f}", fontsize=10.5, loc="left")
+    axes.set_xlabel("value with this alone mended", fontsize=8.5, color="#444444")
+    axes.tick_params(axis="y", length=0)
+    axes.tick_params(axis="x", labelsize=8.5)
+    for side in ("top", "right", "left"):
+        axes.spines[side].set_visible(False)
+
+
+def _span(value: float) -> float:
+    """The width that bars may take, at least one point."""
+    return max(1.0, 100 - value)

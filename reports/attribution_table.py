@@ -1,0 +1,69 @@
+"""What each kind of error costs, as tables, from the JSON form of an attribution: Markdown, plain text too."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from su3d_bench.reports.comparison_table import signed
+from su3d_bench.reports.tables import aligned, percent
+
+MEANINGS: dict[str, dict[str, str]] = {
+    "instance": {
+        "merged": "one mask holds several objects",
+        "split": "one object lies in several masks",
+        "duplicate": "a mask repeats another one's object",
+        "mislabelled": "the right mask, another class",
+        "background": "a mask that belongs to no object",
+        "missed": "an object that no mask is of",
+    },
+    "semantic": {
+        "geometry": "no point of the map within 5 cm",
+        "background": "the map is there, but no mask",
+        "association": "a mask that belongs to another object",
+        "label": "the object's own mask, another class",
+    },
+}
+REST: dict[str, str] = {
+    "instance": "masks that fit badly; mask and label wrong at once",
+    "semantic": "classes that no mending of points reaches",
+}
+SUM = "gains are in percentage points, each with one kind alone mended; the value, all gains, overlap and rest give 100"
+OVERLAP = "what all mendings give together beyond their sum"
+STAGES: dict[str, str] = {
+    "labels": "every mask named by the truth",
+    "2D masks": "masks and names of each image from the truth",
+}
+
+
+def attribution_tables(attribution: Mapping[str, Any]) -> str:
+    """One table a protocol; gains are in percentage points, each for one kind of error mended alone."""
+    blocks = [f"{attribution['run']}: {attribution['method']}"]
+    blocks += [_protocol_block(one) for one in attribution["protocols"]]
+    blocks.append("\n".join(f"- {line}" for line in (SUM, *attribution["remarks"])))
+    return "\n\n".join(blocks) + "\n"
+
+
+def _protocol_block(one: Mapping[str, Any]) -> str:
+    names, n_scored = list(one["values"]), one["n_scored"]
+    n = len(one["scenes"])
+    title = f"**{one['protocol']} (version {one['version']}): {n} scene{'s' if n != 1 else ''}**"
+    header = ["", "errors" if n_scored is None else "points", *names, "what it is"]
+    rows = [["as it is", "", *(percent(one["values"][name]) for name in names), ""]]
+    for kind, cause in one["causes"].items():
+        gains = [signed(cause["gains"][name]) for name in names]
+        rows.append([kind, n_text(cause["n"], n_scored), *gains, MEANINGS[one["kind"]][kind]])
+    rows.append(["overlap", "", *(signed(one["overlap"][name]) for name in names), OVERLAP])
+    rows.append(["rest", "", *(signed(one["rest"][name]) for name in names), REST[one["kind"]]])
+    for stage, values in one["stages"].items():
+        rows.append([f"with true {stage}", "", *(percent(values[name]) for name in names), STAGES[stage]])
+    return "\n".join([title, "", *aligned([header, *rows])])
+
+
+def n_text(n: int, n_scored: int | None) -> str:
+    """A number of errors, or a share of the scored points.
+
+    >>> n_text(3, None), n_text(25, 1000)
+    ('3', '2.5 %')
+    """
+    return str(n) if n_scored is None else f"{100 * n / max(n_scored, 1):.1f} %"

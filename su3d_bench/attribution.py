@@ -1,0 +1,330 @@
+"""Why a run's numbers are not perfect: what each kind of error costs, and what each stage of the pipeline does.
+
+Predictions are taken from the run folder and scored again; counts that differ from those of the run are refused. What
+the kinds of errors are is said in ``metrics.attribution`` and ``metrics.attribution_semantic``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench import registry
+from su3d_bench.comparison_sides import Side, refuse_unlike
+from su3d_bench.config import Setting, Settings, resolve
+from su3d_bench.errors import ConfigError, DataError, PredictionError, suggest
+from su3d_bench.finished_run import FinishedRun, read_run
+from su3d_bench.metrics import attribution as instances
+from su3d_bench.metrics import attribution_semantic as semantic
+from su3d_bench.metrics.mask_overlaps import measure_overlaps
+from su3d_bench.metrics.results import Counts, metric_values
+from su3d_bench.metrics.scored_arrays import scored_masks, scored_points
+from su3d_bench.metrics.semantic import nan_mean
+from su3d_bench.plain_text import printable
+from su3d_bench.planning import data_root, dataset_targets
+from su3d_bench.protocols import ProtocolRules, load_protocol
+from su3d_bench.scene_run import Part, build_dataset
+from su3d_bench.scoring import SceneScore
+from su3d_bench.store import RunFolder, read_prediction
+from su3d_bench.types import DenseFeatures, Encoder, GroundTruth, Prediction
+
+SCHEMA = 1
+KINDS = {"instance": instances.KINDS, "semantic": semantic.CAUSES}
+Values = Mapping[str, float]
+EncoderOf = Callable[[RunFolder], Encoder]
+
+
+@dataclass(frozen=True)
+class Cause:
+    """``n`` errors of one kind (masks and instances, or points) and the gain in each metric when they are mended."""
+
+    n: int
+    gains: Values
+
+
+@dataclass(frozen=True)
+class ProtocolAttribution:
+    """Of one protocol: ``values + sum of gains + overlap + rest = 1`` for each metric.
+
+    ``rest`` is 1 less the value with everything mended, ``overlap`` what that gives beyond the sum of the gains.
+    ``stages`` are values with one stage of the pipeline replaced by the truth. ``n_scored`` points where points are
+    counted.
+    """
+
+    protocol: str
+    version: int
+    kind: str
+    scenes: tuple[str, ...]
+    values: Values
+    causes: Mapping[str, Cause]
+    overlap: Values
+    rest: Values
+    stages: Mapping[str, Values]
+    n_scored: int | None
+
+
+@dataclass(frozen=True)
+class RunAttribution:
+    run: str
+    method: str
+    protocols: tuple[ProtocolAttribution, ...]
+    remarks: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values, fractions in full precision, null where undefined."""
+        return {
+            "schema": SCHEMA,
+            "run": self.run,
+            "method": self.method,
+            "remarks": list(self.remarks),
+            "protocols": [_protocol_json(one) for one in self.protocols],
+        }
+
+
+def attribute(
+    path: Path,
+    encoder_of: EncoderOf,
+    *,
+    method: str | None = None,
+    protocols: Sequence[str] = (),
+    oracle: Path | None = None,
+) -> RunAttribution:
+    """Where the run at ``path`` loses its points, under each protocol of kind ``instance`` or ``semantic``.
+
+    ``encoder_of`` gives the encoder that named the run's instances. ``oracle``: a run of the same method on the same
+    scenes with the profile ``oracle``, for the stage of the 2D masks.
+    """
+    run = read_run(path)
+    side = Side(run, _method_of(run, method))
+    names, remarks = _protocols_of(run, protocols)
+    other = None if oracle is None else Side(_oracle_run(oracle), side.method)
+    if other is not None:
+        other.run.check_method(other.method)
+    scores = run.scores(side.method)
+    gathered = {name: _Gathered(load_protocol(name)) for name in names}
+    read = _Reader(run, encoder_of)
+    for scene in run.scenes:
+        mine = [name for name in names if scene in scores[name]]
+        if mine:
+            prediction = read_prediction(run.folder.job(scene, side.method).prediction)
+            for name in mine:
+                truth = read.truth(scene, gathered[name].rules.ground_truth)
+                gathered[name].add(scene, truth, prediction, read.encoder(prediction), scores[name][scene])
+            read.forget(scene)
+    explained = [one for one in gathered.values() if one.scenes]
+    formed = tuple(one.form(_oracle_values(one.rules, side, other, one.scenes)) for one in explained)
+    if not formed:
+        raise ConfigError(f"{side.name}: no scene is scored under {', '.join(names)}; nothing to explain")
+    return RunAttribution(run.name, side.method, formed, (*remarks, *_remarks(run)))
+
+
+def _method_of(run: FinishedRun, method: str | None) -> str:
+    if method is None and len(run.methods) > 1:
+        raise ConfigError(f"{run.name}: holds {', '.join(run.methods)}; choose one with --method")
+    chosen = method or run.methods[0]
+    run.check_method(chosen)
+    return chosen
+
+
+def _protocols_of(run: FinishedRun, wanted: Sequence[str]) -> tuple[list[str], list[str]]:
+    """The protocols that can be explained, and remarks on the others; one that is named and cannot is an error."""
+    for name in wanted:
+        if name not in run.protocols:
+            known = suggest(name, run.protocols) or f"; it has {', '.join(run.protocols)}"
+            raise ConfigError(f"{run.name}: was not scored under '{printable(name, 80)}'{known}")
+    chosen, remarks = [], []
+    for name in wanted or run.protocols:
+        rules = load_protocol(name)
+        if rules.version != run.protocols[name][0]:
+            raise ConfigError(
+                f"{run.name}: was scored under {name} version {run.protocols[name][0]}, here is version "
+                f"{rules.version}; score it again"
+            )
+        if rules.kind in KINDS:
+            chosen.append(name)
+        elif wanted:
+            raise ConfigError(f"protocol '{name}' is of kind '{rules.kind}'; only instance and semantic are explained")
+        else:
+            remarks.append(f"{name} is of kind {rules.kind}, which is not explained")
+    if not chosen:
+        raise ConfigError(f"{run.name}: was scored under no protocol of kind instance or semantic; nothing to explain")
+    return chosen, remarks
+
+
+def _oracle_run(path: Path) -> FinishedRun:
+    run = read_run(path)
+    if run.profile != "oracle":
+        raise ConfigError(
+            f"{run.name}: has the profile '{printable(str(run.profile), 60)}'; --oracle takes a run made with "
+            "--profile oracle"
+        )
+    return run
+
+
+def _oracle_values(rules: ProtocolRules, side: Side, other: Side | None, scenes: Sequence[str]) -> Values | None:
+    """The metrics of the run with perfect 2D masks over the same scenes."""
+    if other is None:
+        return None
+    if rules.name not in other.run.protocols:
+        raise ConfigError(f"{other.run.name}: was not scored under {rules.name}; score it again with --protocols")
+    scores = other.run.scores(other.method)[rules.name]
+    missing = [scene for scene in scenes if scene not in scores]
+    if missing:
+        raise ConfigError(f"{other.name}: lacks {printable(missing[0], 100)}; the run must have the same scenes")
+    refuse_unlike(side, other, rules.name, scenes)
+    return _values(rules, [scores[scene].counts for scene in scenes])
+
+
+class _Reader:
+    """Truths and the encoder of a run, read when they are asked for."""
+
+    def __init__(self, run: FinishedRun, encoder_of: EncoderOf) -> None:
+        self._run = run
+        self._encoder_of = encoder_of
+        self._encoder: Encoder | None = None
+        self._truths: dict[tuple[str, str], GroundTruth] = {}
+        settings = Settings(tuple(Setting(path, value, "run.toml") for path, value in run.settings.items()))
+        self._datasets: dict[str, Any] = {}
+        for target in dataset_targets([str(each) for each in run.settings.get(("scenes",), ())]):
+            cls = registry.load("dataset", target)
+            options = resolve(settings, ("dataset", cls.name), cls.Options)
+            self._datasets[cls.name] = build_dataset(Part(target, cls.name, options.model_dump_json()), data_root())
+
+    def truth(self, scene: str, variant: str) -> GroundTruth:
+        if (scene, variant) not in self._truths:
+            dataset_name, _, name = scene.partition("/")
+            if dataset_name not in self._datasets:
+                raise DataError(f"{printable(scene, 100)}: run.toml names no dataset '{printable(dataset_name, 60)}'")
+            dataset = self._datasets[dataset_name]
+            if dataset.digest(name) != self._run.data_digests.get(scene):
+                raise DataError(f"{printable(scene, 100)}: its data are not those of the run; run it again")
+            self._truths[scene, variant] = dataset.ground_truth(name, variant)
+        return self._truths[scene, variant]
+
+    def forget(self, scene: str) -> None:
+        self._truths = {key: truth for key, truth in self._truths.items() if key[0] != scene}
+
+    def encoder(self, prediction: Prediction) -> Encoder | None:
+        """None for a prediction that has labels of its own."""
+        if getattr(prediction, "labels", None) is not None:
+            return None
+        if self._encoder is None:
+            self._encoder = self._encoder_of(self._run.folder)
+        return self._encoder
+
+
+@dataclass
+class _Gathered:
+    """The counts of scene after scene under one protocol: as they are, mended, with the truth's labels."""
+
+    rules: ProtocolRules
+    scenes: list[str] = field(default_factory=list)
+    as_is: list[Counts] = field(default_factory=list)
+    all: list[Counts] = field(default_factory=list)
+    alone: dict[str, list[Counts]] = field(default_factory=dict)
+    labelled: list[Counts | None] = field(default_factory=list)
+    n: dict[str, int] = field(default_factory=dict)
+    n_scored: int = 0
+
+    def add(
+        self, scene: str, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None, score: SceneScore
+    ) -> None:
+        if self.rules.kind == "instance":
+            if isinstance(prediction, DenseFeatures):
+                raise PredictionError(f"{scene}: {self.rules.name}: needs instances, the map has one feature a point")
+            values, masks, scoring = scored_masks(self.rules, truth, prediction, encoder)
+            mended: instances.Mended | semantic.MendedPoints = instances.mend_scene(values, masks, scoring)
+            relabelled: Counts | None = None
+            if self.rules.class_agnostic is None:
+                overlaps = measure_overlaps(values, masks, scoring)
+                relabelled = instances.count_masks(values, instances.with_true_labels(overlaps), scoring)
+        else:
+            found = scored_points(self.rules, truth, prediction, encoder)
+            mended = semantic.mend_points(found.points, found.is_counted, has_masks=found.has_masks)
+            relabelled = mended.with_true_labels
+            self.n_scored += mended.n_scored
+        _refuse_other_counts(scene, self.rules, score.counts, mended.as_is)
+        self.scenes.append(scene)
+        self.as_is.append(mended.as_is)
+        self.all.append(mended.all)
+        self.labelled.append(relabelled)
+        for kind, counts in mended.alone.items():
+            self.alone.setdefault(kind, []).append(counts)
+            self.n[kind] = self.n.get(kind, 0) + mended.n[kind]
+
+    def form(self, with_true_masks: Values | None) -> ProtocolAttribution:
+        values, mended = _values(self.rules, self.as_is), _values(self.rules, self.all)
+        causes = {}
+        for kind in KINDS[self.rules.kind]:
+            after = _values(self.rules, self.alone[kind])
+            causes[kind] = Cause(self.n[kind], {name: after[name] - values[name] for name in values})
+        labelled = [counts for counts in self.labelled if counts is not None]
+        stages = {} if len(labelled) < len(self.labelled) else {"labels": _values(self.rules, labelled)}
+        if with_true_masks is not None:
+            stages["2D masks"] = dict(with_true_masks)
+        total = {name: sum(cause.gains[name] for cause in causes.values()) for name in values}
+        return ProtocolAttribution(
+            protocol=self.rules.name,
+            version=self.rules.version,
+            kind=self.rules.kind,
+            scenes=tuple(self.scenes),
+            values=values,
+            causes=causes,
+            overlap={name: mended[name] - values[name] - total[name] for name in values},
+            rest={name: 1.0 - mended[name] for name in values},
+            stages=stages,
+            n_scored=self.n_scored if self.rules.kind == "semantic" else None,
+        )
+
+
+def _values(rules: ProtocolRules, counts: Sequence[Counts]) -> dict[str, float]:
+    """The headline metrics of the scenes, as the protocol reports them."""
+    if rules.aggregate == "pooled":
+        found = metric_values(rules, counts, pooled=True)
+        return {name: found[name] for name in rules.headline}
+    rows = [metric_values(rules, [one], pooled=False) for one in counts]
+    return {name: nan_mean(np.array([row[name] for row in rows])) for name in rules.headline}
+
+
+def _refuse_other_counts(scene: str, rules: ProtocolRules, stored: Counts, formed: Counts) -> None:
+    """The errors that are explained must be those of the run's own number."""
+    if type(stored) is type(formed) and all(
+        np.array_equal(getattr(stored, each.name), getattr(formed, each.name)) for each in fields(formed)
+    ):
+        return
+    raise PredictionError(
+        f"{printable(scene, 100)}: {rules.name}: the counts of the run are not those that its prediction gives here; "
+        "score it again"
+    )
+
+
+def _remarks(run: FinishedRun) -> list[str]:
+    lines = []
+    if run.is_partial:
+        lines.append(f"PARTIAL: only the first {run.limit} frames of each scene")
+    if run.is_incomplete:
+        lines.append("INCOMPLETE: scenes that failed are not in these numbers")
+    return lines
+
+
+def _protocol_json(one: ProtocolAttribution) -> dict[str, Any]:
+    return {
+        "protocol": one.protocol,
+        "version": one.version,
+        "kind": one.kind,
+        "scenes": list(one.scenes),
+        "values": _plain(one.values),
+        "causes": {name: {"n": cause.n, "gains": _plain(cause.gains)} for name, cause in one.causes.items()},
+        "overlap": _plain(one.overlap),
+        "rest": _plain(one.rest),
+        "stages": {name: _plain(values) for name, values in one.stages.items()},
+        "n_scored": one.n_scored,
+    }
+
+
+def _plain(values: Values) -> dict[str, float | None]:
+    return {name: None if np.isnan(value) else value for name, value in values.items()}

@@ -1,0 +1,63 @@
+"""``su3d-bench attribute``: where a run loses its points."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.cli.query import encoder_of
+from su3d_bench.errors import EXIT_DONE
+
+
+def add_parser(verbs: Any) -> None:
+    parser = add_verb(
+        verbs,
+        "attribute",
+        "Show where a run loses its points: the gain when each kind of error alone is mended.",
+        (
+            "su3d-bench attribute runs/my-run --out errors.png",
+            "su3d-bench attribute runs/my-run --protocol rooms-instance --oracle runs/my-oracle-run --json",
+        ),
+        call,
+    )
+    parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a run")
+    parser.add_argument("--method", help="whose predictions (default: the run's only method)")
+    parser.add_argument(
+        "--protocol",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="P",
+        help="under these protocols alone (default: all of kind instance or semantic)",
+    )
+    parser.add_argument(
+        "--oracle", type=Path, metavar="RUN", help="the same run with --profile oracle: what perfect 2D masks give"
+    )
+    parser.add_argument("--out", type=Path, metavar="PNG", help="draw the plot to this file")
+
+
+def call(arguments: argparse.Namespace) -> int:
+    from su3d_bench.executors import limit_threads
+
+    limit_threads()
+    from su3d_bench.attribution import attribute
+    from su3d_bench.reports.attribution_picture import draw_attribution
+    from su3d_bench.reports.attribution_table import attribution_tables
+
+    found = attribute(
+        arguments.run,
+        encoder_of,
+        method=arguments.method,
+        protocols=arguments.protocol,
+        oracle=arguments.oracle,
+    ).to_json()
+    if arguments.out is not None:
+        draw_attribution(found, arguments.out)
+        remark(f"plot: {arguments.out}", quiet=arguments.quiet)
+    if arguments.json:
+        answer_json(found)
+    else:
+        answer(attribution_tables(found))
+    return EXIT_DONE

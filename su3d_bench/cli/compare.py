@@ -1,0 +1,55 @@
+"""``su3d-bench compare``: what one run changes over another, and how sure that is."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from su3d_bench.cli.flags import add_verb, answer, answer_json
+from su3d_bench.errors import EXIT_DONE
+
+
+def add_parser(verbs: Any) -> None:
+    parser = add_verb(
+        verbs,
+        "compare",
+        "Compare two runs over their common scenes: differences with interval and exact test.",
+        (
+            "su3d-bench compare runs/before runs/after --per-class",
+            "su3d-bench compare runs/my-run:opensu3d runs/my-run:oracle --protocol rooms-instance --json",
+        ),
+        call,
+    )
+    parser.add_argument("left", metavar="A", help="the folder of a run, or FOLDER:METHOD")
+    parser.add_argument("right", metavar="B", help="the run that is held against it; differences are B - A")
+    parser.add_argument("--method", help="compare this method alone (default: all of the same name)")
+    parser.add_argument(
+        "--protocol",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="P",
+        help="under these protocols alone (default: all that scored both)",
+    )
+    parser.add_argument("--per-class", action="store_true", help="each class too")
+
+
+def call(arguments: argparse.Namespace) -> int:
+    from su3d_bench.executors import limit_threads
+
+    limit_threads()
+    from su3d_bench.comparison import compare
+    from su3d_bench.reports.comparison_table import comparison_tables
+
+    found = compare(
+        arguments.left,
+        arguments.right,
+        method=arguments.method,
+        protocols=arguments.protocol,
+        per_class=arguments.per_class,
+    ).to_json()
+    if arguments.json:
+        answer_json(found)
+    else:
+        answer(comparison_tables(found))
+    return EXIT_DONE

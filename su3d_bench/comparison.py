@@ -1,0 +1,306 @@
+"""Two runs side by side: what the second changes over the first, per metric, scene and class, and how sure that is.
+
+Numbers are formed over the scenes that both have. The interval is a bootstrap in which both sides draw the same scenes;
+the test flips the signs of the differences of single scenes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.comparison_sides import (
+    Side,
+    check_shapes,
+    pair_methods,
+    parse_side,
+    protocols_in_both,
+    refuse_unlike,
+    rules_of,
+)
+from su3d_bench.errors import ConfigError
+from su3d_bench.finished_run import FinishedRun
+from su3d_bench.metrics.resampled_values import resampled_classes, resampled_metrics
+from su3d_bench.metrics.results import Counts, ProtocolResult
+from su3d_bench.plain_text import printable
+from su3d_bench.protocols import ProtocolRules, load_protocol
+from su3d_bench.scoring import SceneScore, combine
+from su3d_bench.statistics import SignFlipTest, percentile_interval, resample_weights, sign_flip_test
+from su3d_bench.types import Float64Array
+
+SCHEMA = 1
+_SETTINGS_ASIDE = ("jobs", "pictures", "scenes", "methods", "protocols")  # they move no number of a common scene
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Difference:
+    """One value on both sides, as fractions, NaN where undefined; ``difference`` is the second less the first.
+
+    ``per_scene`` holds the difference of each scene in which both have a value, ``mean_of_scenes`` their mean, on which
+    ``test`` is.
+    """
+
+    left: float
+    right: float
+    difference: float
+    interval: Interval | None
+    per_scene: Mapping[str, float]
+    mean_of_scenes: float
+    test: SignFlipTest | None
+
+
+@dataclass(frozen=True)
+class ProtocolComparison:
+    """Two methods under one protocol over ``scenes``; ``classes`` is class -> column -> difference."""
+
+    protocol: str
+    version: int
+    aggregate: str
+    left: str
+    right: str
+    scenes: tuple[str, ...]
+    metrics: Mapping[str, Difference]
+    classes: Mapping[str, Mapping[str, Difference]]
+    remarks: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """``remarks`` are of the runs as such: partial or incomplete ones, and in which settings they differ."""
+
+    left: str
+    right: str
+    protocols: tuple[ProtocolComparison, ...]
+    remarks: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values in full precision, null where undefined."""
+        return {
+            "schema": SCHEMA,
+            "left": self.left,
+            "right": self.right,
+            "remarks": list(self.remarks),
+            "protocols": [_protocol_json(one) for one in self.protocols],
+        }
+
+
+def compare(
+    left: str, right: str, *, method: str | None = None, protocols: Sequence[str] = (), per_class: bool = False
+) -> Comparison:
+    """What ``right`` changes over ``left``, each the folder of a run or ``FOLDER:METHOD``.
+
+    Without methods those of one name are compared, or the only ones. Raises ``ConfigError`` where the two cannot be
+    compared, naming the first field that differs.
+    """
+    pairs = pair_methods(parse_side(left, method), parse_side(right, method))
+    first, second = pairs[0]
+    compared: list[ProtocolComparison] = []
+    for one, other in pairs:
+        compared += _compare_methods(one, other, protocols, per_class)
+    remarks = [*_remarks(first.run, second.run), *(line for pair in pairs for side in pair for line in _caveats(side))]
+    return Comparison(first.run.name, second.run.name, tuple(compared), tuple(dict.fromkeys(remarks)))
+
+
+def _compare_methods(left: Side, right: Side, wanted: Sequence[str], per_class: bool) -> list[ProtocolComparison]:
+    counts, others = left.run.scores(left.method), right.run.scores(right.method)
+    names = protocols_in_both(left, right, wanted)
+    compared = []
+    for name in names:
+        common = [scene for scene in counts.get(name, {}) if scene in others.get(name, {})]
+        refuse_unlike(left, right, name, common)
+        if not common:
+            raise ConfigError(
+                f"{left.name} and {right.name}: no scene in common that is scored under {name}; compare runs of the "
+                "same scenes"
+            )
+        rules = rules_of(left, name)
+        sides = [{scene: scores[name][scene] for scene in common} for scores in (counts, others)]
+        check_shapes(rules, left, sides[0])
+        check_shapes(rules, right, sides[1])
+        remarks = [*_scene_remarks(left, right, counts[name], others[name]), *_own_remarks(left, right, name)]
+        compared.append(_compare_protocol(rules, left, right, sides[0], sides[1], remarks, per_class))
+    return compared
+
+
+def _compare_protocol(
+    rules: ProtocolRules,
+    left: Side,
+    right: Side,
+    left_scores: Mapping[str, SceneScore],
+    right_scores: Mapping[str, SceneScore],
+    remarks: Sequence[str],
+    per_class: bool,
+) -> ProtocolComparison:
+    results = [combine(rules, scores) for scores in (left_scores, right_scores)]
+    scenes = results[0].scenes
+    counts = [[scores[scene].counts for scene in scenes] for scores in (left_scores, right_scores)]
+    weights = resample_weights(len(scenes))
+    drawn = [
+        resampled_metrics(rules, own, [one.per_scene[scene] for scene in scenes], weights)
+        for own, one in zip(counts, results, strict=True)
+    ]
+    metrics = {
+        name: form_difference(
+            (results[0].metrics[name], results[1].metrics[name]),
+            scenes,
+            np.array([results[0].per_scene[scene][name] for scene in scenes]),
+            np.array([results[1].per_scene[scene][name] for scene in scenes]),
+            drawn[1][name] - drawn[0][name],
+        )
+        for name in rules.headline
+    }
+    return ProtocolComparison(
+        protocol=rules.name,
+        version=rules.version,
+        aggregate=rules.aggregate,
+        left=left.method,
+        right=right.method,
+        scenes=scenes,
+        metrics=metrics,
+        classes=_compare_classes(rules, results, counts) if per_class else {},
+        remarks=tuple(remarks),
+    )
+
+
+def _compare_classes(
+    rules: ProtocolRules, results: Sequence[ProtocolResult], counts: Sequence[Sequence[Counts]]
+) -> dict[str, dict[str, Difference]]:
+    scenes = results[0].scenes
+    alone = np.eye(len(scenes), dtype=np.int64)
+    weights = resample_weights(len(scenes))
+    drawn = [resampled_classes(rules, own, weights) for own in counts]
+    single = [resampled_classes(rules, own, alone) for own in counts]
+    return {
+        name: {
+            column: form_difference(
+                (results[0].per_class[name][column], results[1].per_class[name][column]),
+                scenes,
+                single[0][name][column],
+                single[1][name][column],
+                drawn[1][name][column] - values,
+            )
+            for column, values in columns.items()
+        }
+        for name, columns in drawn[0].items()
+        if name in drawn[1]
+    }
+
+
+def form_difference(
+    values: tuple[float, float],
+    scenes: Sequence[str],
+    left_of_scene: Float64Array,
+    right_of_scene: Float64Array,
+    resampled: Float64Array,
+) -> Difference:
+    """The difference of one value; ``resampled`` holds it over resampled scenes."""
+    differences: Float64Array = right_of_scene - left_of_scene
+    numbers = differences[~np.isnan(differences)]
+    return Difference(
+        left=values[0],
+        right=values[1],
+        difference=values[1] - values[0],
+        interval=percentile_interval(resampled) if len(scenes) > 1 else None,
+        per_scene={s: float(d) for s, d in zip(scenes, differences, strict=True) if not np.isnan(d)},
+        mean_of_scenes=float(numbers.mean()) if len(numbers) else float("nan"),
+        test=sign_flip_test(differences),
+    )
+
+
+def _scene_remarks(
+    left: Side, right: Side, counts: Mapping[str, SceneScore], others: Mapping[str, SceneScore]
+) -> list[str]:
+    """Which scenes one of the two alone has."""
+    lines = []
+    for side, own, other in ((left, counts, others), (right, others, counts)):
+        alone = [scene for scene in own if scene not in other]
+        if alone:
+            lines.append(f"only the scenes in common are compared; {side.name} alone has {_some(alone)}")
+    return lines
+
+
+def _own_remarks(left: Side, right: Side, protocol: str) -> list[str]:
+    lines = []
+    for side in (left, right):
+        record = side.run.results.get((side.method, protocol))
+        if record is not None and record.failed:
+            lines.append(f"INCOMPLETE: {side.name} failed on {_some(record.failed)}")
+    if load_protocol(protocol).digest != left.run.protocols[protocol][1]:
+        lines.append(f"the rules of {protocol} here are not to the letter those that scored both runs (same version)")
+    return lines
+
+
+def _caveats(side: Side) -> list[str]:
+    """What must be known of a side's perception, and that a ceiling is one."""
+    if side.method not in side.run.methods:
+        return [f"{side.name} is the ceiling: the truth itself"]
+    caveats = [record.caveat for (method, _), record in side.run.results.items() if method == side.method]
+    return [f"{side.name}: {printable(caveat)}" for caveat in caveats if caveat]
+
+
+def _remarks(left: FinishedRun, right: FinishedRun) -> list[str]:
+    lines = []
+    for run in dict.fromkeys((left.name, right.name)):
+        one = left if run == left.name else right
+        if one.is_partial:
+            lines.append(f"PARTIAL: {run} has only the first {one.limit} frames of each scene")
+        if one.is_incomplete:
+            lines.append(f"INCOMPLETE: {run} lacks scenes that failed")
+    changed = []
+    for path in dict.fromkeys([*left.settings, *right.settings]):
+        pair = (left.settings.get(path, "not set"), right.settings.get(path, "not set"))
+        if path[0] not in _SETTINGS_ASIDE and pair[0] != pair[1]:
+            changed.append(printable(f"{'.'.join(path)} {pair[0]} and {pair[1]}", 120))
+    if changed:
+        lines.append("settings that differ: " + "; ".join(changed[:6]) + _more(len(changed) - 6))
+    if left.code != right.code:
+        lines.append("the runs were made by different versions of the code")
+    return lines
+
+
+def _some(names: Sequence[str]) -> str:
+    return ", ".join(printable(name, 80) for name in names[:3]) + _more(len(names) - 3)
+
+
+def _more(n: int) -> str:
+    return f" and {n} more" if n > 0 else ""
+
+
+def _protocol_json(one: ProtocolComparison) -> dict[str, Any]:
+    return {
+        "protocol": one.protocol,
+        "version": one.version,
+        "aggregate": one.aggregate,
+        "left": one.left,
+        "right": one.right,
+        "scenes": list(one.scenes),
+        "metrics": {name: _difference_json(value) for name, value in one.metrics.items()},
+        "classes": {
+            name: {column: _difference_json(value) for column, value in columns.items()}
+            for name, columns in one.classes.items()
+        },
+        "remarks": list(one.remarks),
+    }
+
+
+def _difference_json(one: Difference) -> dict[str, Any]:
+    return {
+        "left": _number(one.left),
+        "right": _number(one.right),
+        "difference": _number(one.difference),
+        "interval": None if one.interval is None else list(one.interval),
+        "per_scene": dict(one.per_scene),
+        "mean_of_scenes": _number(one.mean_of_scenes),
+        "p": None if one.test is None else one.test.p,
+        "smallest_p": None if one.test is None else one.test.smallest_p,
+        "n_pairs": 0 if one.test is None else one.test.n_pairs,
+        "is_exact": None if one.test is None else one.test.is_exact,
+    }
+
+
+def _number(value: float) -> float | None:
+    return None if np.isnan(value) else value

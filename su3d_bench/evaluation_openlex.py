@@ -1,0 +1,110 @@
+"""Predictions against OpenLex3D's released labels and queries, which lie beside the mesh of the dataset."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from su3d_bench.datasets.openlex3d import (
+    CATEGORIES_NAME,
+    PROMPTS_NAME,
+    Corners,
+    Level,
+    OpenLexFiles,
+    categories_truth,
+    queries_truth,
+    replica_corners,
+)
+from su3d_bench.datasets.replica_folders import find_original_scene, original_name
+from su3d_bench.datasets.replica_truth import read_annotated_mesh
+from su3d_bench.errors import GroundTruthMissing
+from su3d_bench.evaluation_checks import check_cloud, empty_warnings, mask_facts
+from su3d_bench.evaluation_scoring import SceneOutcome
+from su3d_bench.metrics.openlex3d import OpenLexTruth
+from su3d_bench.metrics.query_ap import QueryTruth
+from su3d_bench.metrics.transfer import masks_of
+from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
+from su3d_bench.protocols import ProtocolRules
+from su3d_bench.scoring import score_scene, why_not_scorable
+from su3d_bench.types import Encoder, Instances, Prediction
+
+DATASET = "replica"  # of those that OpenLex3D labels, the one whose mesh can be read here
+QUERY_LEVEL: Level = "l0"  # the level that the release evaluates unless another is asked for
+VARIANTS = ("openlex3d-visible", "openlex3d-face-corners")
+NO_CEILING = (
+    "no ceiling is known: masks grow by the threshold, over their neighbours too, and each query's best mask has "
+    "confidence 1, so that perfect masks with perfect features need not reach 1"
+)
+
+
+@dataclass(frozen=True)
+class OpenLexRelease:
+    """OpenLex3D's text files below ``folder`` and the original release of Replica below ``data_root``."""
+
+    folder: Path
+    data_root: Path
+
+    def scenes(self) -> tuple[str, ...]:
+        """The scenes with labels, in alphabetical order."""
+        return tuple(sorted(path.parent.name for path in (self.folder / DATASET).glob(f"*/{CATEGORIES_NAME}")))
+
+    def truth(self, scene: str, variant: str) -> OpenLexTruth | QueryTruth:
+        """The truth of a scene; ``GroundTruthMissing`` where one of its files is not there."""
+        files = OpenLexFiles(self.folder, DATASET, scene)
+        corners = _corners(self.data_root, scene)
+        if variant == VARIANTS[0]:
+            return categories_truth(files, corners)
+        return queries_truth(files, corners, QUERY_LEVEL)
+
+
+def holds_release(folder: Path) -> bool:
+    """Whether a folder of ground truth is OpenLex3D's."""
+    return (folder / DATASET / PROMPTS_NAME).is_file()
+
+
+@lru_cache(maxsize=1)
+def _corners(data_root: Path, scene: str) -> Corners:
+    """The corners of a scene; the last ones are kept, because every protocol asks for them anew."""
+    where = f"{DATASET}/{scene}"
+    original = find_original_scene(data_root, scene)
+    if original is None:
+        raise GroundTruthMissing(
+            f"{where}: no mesh for OpenLex3D's objects; expected {original_name(scene)}/habitat of the original "
+            f"release in {data_root / 'replica_v1'}"
+        )
+    return replica_corners(read_annotated_mesh(original, where))
+
+
+def why_not_lex_content(rules: ProtocolRules, content: Content) -> str | None:
+    """Why a prediction cannot be scored under OpenLex3D's protocols; None where it can."""
+    if isinstance(content, VertexMasks | VertexLabels):
+        return "needs a map with points of its own, the prediction is over the points of another truth"
+    reason = why_not_scorable(rules, content)
+    return reason.removeprefix(f"{rules.name}: ") if reason else None
+
+
+def score_on_objects(
+    rules: ProtocolRules, truth: OpenLexTruth | QueryTruth, scene: str, content: Content, encoder: Encoder | None
+) -> SceneOutcome:
+    """The outcome against objects with labels or queries; an empty prediction where ``content`` has no points."""
+    prediction: Prediction = _nothing() if isinstance(content, VertexMasks | VertexLabels) else content
+    told = check_cloud(scene, prediction.points, truth.points)
+    facts = None
+    if isinstance(prediction, Instances):
+        masks = masks_of(prediction)
+        facts = mask_facts(masks, np.asarray(prediction.scores, np.float64), len(prediction.points))
+        told += empty_warnings(scene, facts, masks, prediction.names)
+    if rules.kind == "queries":
+        told.append(NO_CEILING)
+    return SceneOutcome(score_scene(rules, truth, prediction, encoder), None, None, facts, tuple(told))
+
+
+def _nothing() -> Instances:
+    none = np.zeros(0, np.int32)
+    empty = np.zeros((0, 3), np.float32)
+    starts = np.zeros(1, np.int64)
+    boxes, views = np.zeros((0, 2, 3), np.float32), np.zeros((0, 2), np.int32)
+    return Instances(empty, starts, none, np.zeros(0), None, (), (), (), boxes, empty, starts, views)

@@ -1,0 +1,155 @@
+"""A run folder as whoever compares or explains it needs it: what was scored, on which data, by which rules."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeVar
+
+from pydantic import BaseModel, Field, ValidationError
+
+from su3d_bench.config import KeyPath, read_file
+from su3d_bench.errors import ConfigError, DataError, StoreError, suggest
+from su3d_bench.plain_text import printable
+from su3d_bench.scene_run import CEILING_METHOD
+from su3d_bench.scoring import SceneScore, unpack_scores
+from su3d_bench.store import RunFolder, read_json
+
+Model = TypeVar("Model", bound=BaseModel)
+
+
+class _Protocol(BaseModel):
+    name: str
+    version: int
+    digest: str
+
+
+class _Record(BaseModel):
+    """What is read of ``run.json``."""
+
+    status: str
+    is_partial: bool
+    code: str
+    profile: str | None
+    encoder_digest: str | None
+    data_digests: dict[str, str]
+    protocols: tuple[_Protocol, ...]
+    methods: tuple[str, ...] = Field(min_length=1)
+    scenes: tuple[str, ...]
+
+
+class _Result(BaseModel):
+    """What is read of a result in ``metrics.json``."""
+
+    method: str
+    protocol: str
+    encoder: str | None
+    encoder_digest: str | None
+    failed: tuple[str, ...]
+    caveat: str | None
+
+
+class _Metrics(BaseModel):
+    limit: int
+    results: tuple[_Result, ...]
+
+
+@dataclass(frozen=True)
+class ResultRecord:
+    """How a method fared under a protocol; ``encoder`` is None where it named its instances itself."""
+
+    encoder: str | None
+    encoder_digest: str | None
+    failed: tuple[str, ...]
+    caveat: str | None
+
+
+@dataclass(frozen=True)
+class FinishedRun:
+    """The records of a run; ``protocols`` holds version and digest of the rules that scored it."""
+
+    folder: RunFolder
+    scenes: tuple[str, ...]
+    methods: tuple[str, ...]
+    protocols: Mapping[str, tuple[int, str]]
+    data_digests: Mapping[str, str]
+    results: Mapping[tuple[str, str], ResultRecord]
+    is_partial: bool
+    is_incomplete: bool
+    limit: int
+    code: str
+    profile: str | None
+    encoder_digest: str | None
+    settings: Mapping[KeyPath, Any]
+
+    @property
+    def name(self) -> str:
+        return printable(str(self.folder.path), 200)
+
+    def check_method(self, method: str) -> None:
+        """A ``ConfigError`` where the run holds no scores of ``method``."""
+        if method not in self.methods and not self.has_scores(method):
+            known = [*self.methods, *([CEILING_METHOD] if self.has_scores(CEILING_METHOD) else [])]
+            hint = suggest(method, known) or f"; it has {', '.join(known)}"
+            raise ConfigError(f"{self.name}: holds no scores of the method '{printable(method, 80)}'{hint}")
+
+    def has_scores(self, method: str) -> bool:
+        """Whether any scene was scored for ``method``; those of the ceiling stand in no table."""
+        is_name = "/" not in method
+        return is_name and any(self.folder.job(scene, method).counts.is_file() for scene in self.scenes)
+
+    def scores(self, method: str) -> dict[str, dict[str, SceneScore]]:
+        """Protocol -> scene -> counts, of every scene that was scored."""
+        found: dict[str, dict[str, SceneScore]] = {name: {} for name in self.protocols}
+        for scene in self.scenes:
+            file = self.folder.job(scene, method).counts
+            if not file.is_file():
+                continue
+            try:
+                of_scene = unpack_scores(file.read_bytes())
+            except DataError as error:
+                raise DataError(f"{printable(scene, 120)}: {method}: {error}") from error
+            for protocol, score in of_scene.items():
+                found.setdefault(protocol, {})[scene] = score
+        return found
+
+
+def read_run(path: Path) -> FinishedRun:
+    """The run in the folder ``path``; a ``StoreError`` where it holds none, or one that is not finished."""
+    shown = printable(str(path), 200)
+    if not (path / "run.json").is_file():
+        raise StoreError(f"{shown}: holds no run.json; name the folder of a run, such as runs/my-run")
+    if not (path / "metrics.json").is_file():
+        raise StoreError(f"{shown}: holds no metrics.json, so the run is not finished; run its command again")
+    record = _checked(_Record, path / "run.json", shown)
+    metrics = _checked(_Metrics, path / "metrics.json", shown)
+    return FinishedRun(
+        folder=RunFolder(path),
+        scenes=record.scenes,
+        methods=record.methods,
+        protocols={one.name: (one.version, one.digest) for one in record.protocols},
+        data_digests=record.data_digests,
+        results={
+            (one.method, one.protocol): ResultRecord(one.encoder, one.encoder_digest, one.failed, one.caveat)
+            for one in metrics.results
+        },
+        is_partial=record.is_partial,
+        is_incomplete=record.status != "complete",
+        limit=metrics.limit,
+        code=record.code,
+        profile=record.profile,
+        encoder_digest=record.encoder_digest,
+        settings={entry.path: entry.value for entry in read_file(path / "run.toml").entries},
+    )
+
+
+def _checked(model: type[Model], file: Path, shown: str) -> Model:
+    try:
+        return model.model_validate(read_json(file))
+    except RecursionError as error:
+        raise StoreError(f"{shown}: {file.name}: is nested too deep for a record of a run; run it again") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = printable(".".join(map(str, first["loc"])), 120)
+        raise StoreError(f"{shown}: {file.name}: {key or 'it'} is not as a run writes it; run it again") from error

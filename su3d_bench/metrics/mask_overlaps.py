@@ -1,0 +1,162 @@
+"""Who shares how much with whom: predicted masks and the instances of the truth, and of which masks each is made up."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from su3d_bench.metrics import instance_ap
+from su3d_bench.metrics.instance_ap import INSTANCES_PER_CLASS
+from su3d_bench.metrics.transfer import Masks
+from su3d_bench.types import BoolArray, Float64Array, Int32Array, Int64Array
+
+HALF = 0.5  # of a mask or an instance; also the IoU above which a mask can match one instance only
+
+
+@dataclass(frozen=True)
+class LabelledMasks:
+    """K masks on the truth's points, each ascending, with a class id (0 for none that is scored) and a confidence."""
+
+    masks: tuple[Int32Array, ...]
+    class_ids: Int64Array
+    scores: Float64Array
+
+    @classmethod
+    def of(cls, masks: Masks, class_ids: Int64Array, scores: Float64Array) -> LabelledMasks:
+        """The masks of a CSR list."""
+        return cls(tuple(np.split(masks.indices, masks.indptr[1:-1])) if len(masks) else (), class_ids, scores)
+
+
+@dataclass(frozen=True)
+class ScoringRules:
+    """What the evaluator needs: the scored class ids, the minimum size in points, the IoU thresholds."""
+
+    class_ids: tuple[int, ...]
+    min_region_size: int = instance_ap.MIN_REGION_SIZE
+    thresholds: tuple[float, ...] = instance_ap.THRESHOLDS
+
+
+@dataclass(frozen=True)
+class Parts:
+    """The masks that lie in one instance: those that make it up, the first the best, and those that repeat others."""
+
+    parts: tuple[int, ...]
+    duplicates: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class Overlaps:
+    """The masks of a scene against its counted instances: of scored classes and at least the minimum size.
+
+    ``shared`` (K, G) points of mask k and instance g; ``inside`` is that as a share of the mask, ``cover`` as a share
+    of the instance; ``members`` are the points of each instance. ``is_merged``: holds several instances under the label
+    of one. ``is_large``: has the minimum size; ``is_counted``: a scored class as well; ``is_ignored``: the evaluator
+    leaves the mask alone at every threshold, because it is void there.
+    """
+
+    predicted: LabelledMasks
+    members: tuple[Int32Array, ...]
+    class_of_instance: Int64Array
+    shared: Int64Array
+    inside: Float64Array
+    cover: Float64Array
+    iou: Float64Array
+    is_merged: BoolArray
+    is_large: BoolArray
+    is_counted: BoolArray
+    is_ignored: BoolArray
+
+    @property
+    def n_instances(self) -> int:
+        return len(self.members)
+
+    def finds(self, k: int, g: int) -> bool:
+        """Whether mask k matches instance g with the right class."""
+        return bool(self.iou[k, g] > HALF and self.predicted.class_ids[k] == self.class_of_instance[g])
+
+    def is_found(self, g: int) -> bool:
+        """Whether any mask, a merged one included, matches instance g with the right class."""
+        return bool(((self.iou[:, g] > HALF) & (self.predicted.class_ids == self.class_of_instance[g])).any())
+
+    @cached_property
+    def parts(self) -> tuple[Parts, ...]:
+        """Of each instance, the masks that make it up; merged ones are no part of anything."""
+        return tuple(self._parts_of(g) for g in range(self.n_instances))
+
+    def is_split(self, g: int) -> bool:
+        """Whether instance g has several parts that together match it, under its class, and no merged mask finds it."""
+        parts = self.parts[g].parts
+        if len(parts) < 2 or (self.is_found(g) and not self.finds(parts[0], g)):
+            return False
+        members = np.array(parts)
+        labels = self.predicted.class_ids[members]
+        label = labels[0]
+        if self.iou[parts[0], g] <= HALF:
+            distinct = np.unique(labels)
+            label = distinct[np.argmax([self.shared[members[labels == each], g].sum() for each in distinct])]
+        union = np.unique(np.concatenate([self.predicted.masks[k] for k in parts]))
+        n_common = len(np.intersect1d(union, self.members[g], assume_unique=True))
+        matches = n_common > HALF * (len(union) + len(self.members[g]) - n_common)
+        return bool(matches and label == self.class_of_instance[g])
+
+    def _parts_of(self, g: int) -> Parts:
+        inside = np.flatnonzero((self.inside[:, g] > HALF) & ~self.is_merged).tolist()
+        order = sorted(inside, key=lambda k: self._rank(k, g))
+        parts, duplicates = order[:1], []
+        size = len(self.members[g])
+        union = self.predicted.masks[order[0]] if order else np.zeros(0, np.int32)
+        n_common = int(self.shared[order[0], g]) if order else 0
+        for k in order[1:]:
+            mask = self.predicted.masks[k]
+            joined = np.union1d(union, mask)
+            n_repeated = len(union) + len(mask) - len(joined)
+            if 2 * n_repeated >= len(mask):
+                duplicates.append(k)
+                continue
+            n_joined = len(np.intersect1d(joined, self.members[g], assume_unique=True))
+            is_better = n_joined / (len(joined) + size - n_joined) > n_common / (len(union) + size - n_common)
+            if is_better:
+                parts.append(k)
+                union, n_common = joined, n_joined
+        return Parts(tuple(parts), tuple(duplicates))
+
+    def _rank(self, k: int, g: int) -> tuple[bool, bool, float, int]:
+        """Sort key: the match with the right class, then any match, each by IoU; the others by points in common."""
+        matches = bool(self.iou[k, g] > HALF)
+        return not self.finds(k, g), not matches, -float(self.iou[k, g] if matches else self.shared[k, g]), k
+
+
+def measure_overlaps(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules) -> Overlaps:
+    """The overlaps of one scene; ``truth`` (N,) is label * 1000 + instance, 0 where void."""
+    values, segment_of_point, sizes = np.unique(truth, return_inverse=True, return_counts=True)
+    is_instance = np.isin(values // INSTANCES_PER_CLASS, rules.class_ids) & (sizes >= rules.min_region_size)
+    instances = np.flatnonzero(is_instance)
+    class_of_instance = (values[instances] // INSTANCES_PER_CLASS).astype(np.int64)
+    size = np.array([len(mask) for mask in predicted.masks], np.int64)
+    indptr = np.cumsum([0, *size])
+    indices = np.concatenate([np.zeros(0, np.int32), *predicted.masks])
+    shared = instance_ap.intersections(segment_of_point, len(values), indptr, indices, np.arange(len(size)))
+    n_ignored = shared[:, ~is_instance].sum(axis=1)
+    shared = shared[:, instances]
+    size_of_instance = sizes[instances][None, :]
+    at_least_one = np.maximum(size, 1)[:, None]
+    inside, cover = shared / at_least_one, shared / size_of_instance
+    order = np.argsort(segment_of_point, kind="stable").astype(np.int32)
+    starts = np.concatenate([[0], np.cumsum(sizes)])
+    is_large = size >= rules.min_region_size
+    has_own_class = predicted.class_ids[:, None] == class_of_instance[None, :]
+    return Overlaps(
+        predicted=predicted,
+        members=tuple(order[starts[s] : starts[s + 1]] for s in instances),
+        class_of_instance=class_of_instance,
+        shared=shared,
+        inside=inside,
+        cover=cover,
+        iou=shared / np.maximum(size[:, None] + size_of_instance - shared, 1),
+        is_merged=((cover > HALF).sum(axis=1) > 1) & (has_own_class & (np.maximum(inside, cover) > HALF)).any(axis=1),
+        is_large=is_large,
+        is_counted=is_large & np.isin(predicted.class_ids, rules.class_ids),
+        is_ignored=n_ignored > max(rules.thresholds) * at_least_one[:, 0],
+    )

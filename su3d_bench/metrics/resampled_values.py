@@ -1,0 +1,112 @@
+"""A protocol's metrics, and those of each class, when scenes are drawn with weights, from their additive counts.
+
+With weights of ones this is the value over all scenes, with a single one that of a scene alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import cast
+
+import numpy as np
+
+from su3d_bench.metrics import object_means, resampling
+from su3d_bench.metrics.instance_ap import InstanceCounts
+from su3d_bench.metrics.labelling import scored_classes
+from su3d_bench.metrics.results import CURVE_KINDS, Counts
+from su3d_bench.metrics.semantic import SemanticCounts
+from su3d_bench.protocols import VALUES_OF_METRIC, ProtocolRules
+from su3d_bench.types import Float64Array, Int64Array
+
+
+def resampled_metrics(
+    rules: ProtocolRules,
+    counts: Sequence[Counts],
+    per_scene: Sequence[Mapping[str, float]],
+    weights: Int64Array,
+) -> dict[str, Float64Array]:
+    """Each headline metric (R,) of the scenes drawn ``weights`` (R, S) times, pooled or as the mean over scenes.
+
+    ``per_scene`` holds the metrics of each scene alone, from which the mean over scenes is formed.
+    """
+    if rules.aggregate == "scene-mean":
+        return {name: _weighted_mean([row[name] for row in per_scene], weights) for name in rules.headline}
+    if rules.kind in CURVE_KINDS:
+        pooled = resampling.resampled_ap(cast("Sequence[InstanceCounts]", counts), weights, rules.thresholds)
+    elif rules.kind == "categories":
+        values = object_means.resampled(cast("Sequence[object_means.ObjectCounts]", counts), weights)
+        pooled = dict(zip(VALUES_OF_METRIC[rules.metric], values.T, strict=True))
+    else:
+        is_scored = scored_classes(rules) if rules.metric == "hovsg" else None
+        pooled = resampling.resampled_semantic(
+            cast("Sequence[SemanticCounts]", counts), weights, rules.metric, is_scored
+        )
+    return {name: pooled[name] for name in rules.headline}
+
+
+def _weighted_mean(values: Sequence[float], weights: Int64Array) -> Float64Array:
+    held = np.array(values)
+    is_number = ~np.isnan(held)
+    drawn = weights[:, is_number].astype(np.float64)
+    n = drawn.sum(axis=1)
+    return np.where(n > 0, (drawn * held[is_number]).sum(axis=1) / np.maximum(n, 1), np.nan)
+
+
+def class_columns(rules: ProtocolRules) -> tuple[str, ...]:
+    """What is known of a single class: its AP values, or its recall and IoU; nothing under kind ``categories``."""
+    if rules.kind in CURVE_KINDS:
+        return tuple(name for name in ("AP", "AP50", "AP25") if name in rules.headline)
+    return () if rules.kind == "categories" else ("recall", "IoU")
+
+
+def resampled_classes(
+    rules: ProtocolRules, counts: Sequence[Counts], weights: Int64Array
+) -> dict[str, dict[str, Float64Array]]:
+    """Class -> column -> value (R,) of the scenes drawn ``weights`` (R, S) times; NaN where it has no truth there."""
+    if rules.kind == "categories":
+        return {}
+    if rules.kind in CURVE_KINDS:
+        columns = class_columns(rules)
+        curves = cast("Sequence[InstanceCounts]", counts)
+        answer = {}
+        for index, name in enumerate(rules.curve_names):
+            if any(one.n_truth[index] for one in curves):
+                values = resampling.resampled_ap([_only(one, index) for one in curves], weights, rules.thresholds)
+                answer[name] = {column: values[column] for column in columns}
+        return answer
+    return _semantic_classes(rules, cast("Sequence[SemanticCounts]", counts), weights)
+
+
+def _only(counts: InstanceCounts, index: int) -> InstanceCounts:
+    """The counts of one class alone."""
+    rows = np.flatnonzero(counts.class_index == index)
+    return InstanceCounts(
+        class_index=np.zeros(len(rows), np.int32),
+        threshold_index=counts.threshold_index[rows],
+        score=counts.score[rows],
+        is_true=counts.is_true[rows],
+        n_missed=counts.n_missed[[index]],
+        n_truth=counts.n_truth[[index]],
+        n_small_truth=counts.n_small_truth[[index]],
+        n_predictions=counts.n_predictions[[index]],
+    )
+
+
+def _semantic_classes(
+    rules: ProtocolRules, counts: Sequence[SemanticCounts], weights: Int64Array
+) -> dict[str, dict[str, Float64Array]]:
+    n_classes = len(counts[0].is_present)
+    drawn = weights.astype(np.float64)
+    hit = drawn @ np.stack([np.diag(one.confusion[:, :n_classes]) for one in counts]).astype(np.float64)
+    n_true = drawn @ np.stack([one.confusion.sum(axis=1) for one in counts]).astype(np.float64)
+    n_predicted = drawn @ np.stack([one.confusion[:, :n_classes].sum(axis=0) for one in counts]).astype(np.float64)
+    recall = np.where(n_true > 0, hit / np.maximum(n_true, 1), np.nan)
+    iou = np.where(n_true > 0, hit / np.maximum(n_true + n_predicted - hit, 1), np.nan)
+    names = rules.scored if rules.metric == "scannet" else rules.classes
+    kept = np.arange(n_classes) if rules.metric != "scannet" else np.flatnonzero(scored_classes(rules))
+    is_scored = scored_classes(rules)
+    return {
+        entry.name: {"recall": recall[:, index], "IoU": iou[:, index]}
+        for entry, index in zip(names, kept, strict=True)
+        if is_scored[index] and any(one.confusion[index].any() for one in counts)
+    }

@@ -1,0 +1,138 @@
+"""Predictions with their own points, written as the programs themselves write them, for tests of readers."""
+
+from __future__ import annotations
+
+import gzip
+import pickle
+import sys
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import h5py
+import numpy as np
+import pytest
+from prediction_files import TorchFile
+
+from su3d_bench.datasets.pcd import write_pcd_points
+from su3d_bench.datasets.ply import PlyElement, write_ply
+
+RNG = np.random.default_rng(0)
+NAMES = ["couch", "lamp", "wall"]
+
+
+def an_object(n_points: int, class_ids: list[int], **more: Any) -> dict[str, Any]:
+    """An object of ConceptGraphs with every key that its map has."""
+    n = len(class_ids)
+    return {
+        "image_idx": list(range(n)),
+        "mask_idx": list(range(n)),
+        "color_path": [f"/home/author/Replica/room0/results/frame{k:06d}.jpg" for k in range(n)],
+        "class_name": [NAMES[one % 3] for one in class_ids],
+        "class_id": list(class_ids),
+        "num_detections": n,
+        "mask": [RNG.random((60, 80)) < 0.5 for _ in range(n)],
+        "xyxy": [RNG.random(4) for _ in range(n)],
+        "conf": [np.float32(0.5)] * n,
+        "n_points": [n_points] * n,
+        "pixel_area": [np.int64(7)] * n,
+        "contain_number": [None] * n,
+        "inst_color": RNG.random(3),
+        "is_background": False,
+        "clip_ft": (lambda f: f / np.linalg.norm(f))(RNG.normal(size=16)).astype(np.float32),
+        "text_ft": np.ones(16, np.float32),
+        "pcd_np": RNG.normal(size=(n_points, 3)),
+        "bbox_np": RNG.normal(size=(8, 3)),
+        "pcd_color_np": RNG.random((n_points, 3)),
+        **more,
+    }
+
+
+def settings(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """Settings as ConceptGraphs stores them: an object of omegaconf's class, with a path in it."""
+    module = ModuleType("omegaconf.dictconfig")
+
+    class DictConfig:
+        pass
+
+    DictConfig.__module__, DictConfig.__qualname__ = module.__name__, "DictConfig"
+    module.DictConfig = DictConfig  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "omegaconf", ModuleType("omegaconf"))
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    made = DictConfig()
+    vars(made).update(_content={"dataset_root": Path("/data/Replica"), "stride": 5}, _parent=None, ref_type=dict)
+    return made
+
+
+def a_map(**more: Any) -> dict[str, Any]:
+    objects = [an_object(5, [0, 1, 0]), an_object(0, [1]), an_object(3, [1, 0])]
+    background = [an_object(4, [2], is_background=True)]
+    colours = {str(k): [0.1, 0.2, 0.3] for k in range(3)}
+    return {"objects": objects, "bg_objects": background, "class_names": NAMES, "class_colors": colours, **more}
+
+
+def write_map(path: Path, value: object, protocol: int = 4) -> Path:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with gzip.open(path, "wb", compresslevel=1) as stream:
+        pickle.dump(value, stream, protocol)
+    return path
+
+
+def write_h5(path: Path, values: Any, **options: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with h5py.File(path, "w") as file:
+        file.create_dataset(path.stem, data=values, **options)
+
+
+def write_gradslam(folder: Path, points: Any, embeddings: Any, **options: Any) -> None:
+    for name, values in {"points": points, "embeddings": embeddings, "colors": points, "confidences": points}.items():
+        write_h5(folder / f"pc_{name}.h5", values, **options)
+
+
+def write_tensor(path: Path, values: Any) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    file = TorchFile()
+    file.write(path, file.tensor(values))
+
+
+def write_object(path: Path, points: Any) -> None:
+    """A cloud as Open3D writes it: doubles, and colours behind them."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    columns = {axis: np.asarray(points)[:, k].astype(np.float64) for k, axis in enumerate("xyz")}
+    colours = {name: np.full(len(points), 7, np.uint8) for name in ("red", "green", "blue")}
+    write_ply(path, [PlyElement("vertex", len(points), {**columns, **colours})], comments=["Created by Open3D"])
+
+
+def write_hovsg(folder: Path, clouds: dict[int, Any], features: Any) -> None:
+    for number, cloud in clouds.items():
+        write_object(folder / f"objects/pcd_{number}.ply", cloud)
+    (folder / "objects").mkdir(parents=True, exist_ok=True)
+    write_tensor(folder / "mask_feats.pt", features)
+
+
+def write_openlex(folder: Path, points: Any, index: Any, features: Any, cloud: str = "point_cloud.pcd") -> None:
+    folder.mkdir(parents=True, exist_ok=True)
+    if cloud.endswith(".pcd"):
+        write_pcd_points(folder / cloud, np.asarray(points, np.float32))
+    else:
+        write_object(folder / cloud, points)
+    np.save(folder / "index.npy", index)
+    np.save(folder / "embeddings.npy", features)
+
+
+def write_small(folder: Path, format: str) -> Path:
+    """The scene room0 in ``format``, small; the folder that holds the scene's folder."""
+    scene = folder / "room0"
+    points = RNG.normal(size=(6, 3)).astype(np.float32)
+    if format == "conceptgraphs":
+        write_map(scene / "pcd_saves/full_pcd_none_x.pkl.gz", a_map())
+    elif format == "gradslam":
+        write_gradslam(scene / "saved-map/pointclouds", points, RNG.normal(size=(6, 8)).astype(np.float16))
+    elif format == "hovsg":
+        write_hovsg(scene, {0: points[:4], 1: points[4:]}, RNG.normal(size=(2, 8)).astype(np.float32))
+    else:
+        write_openlex(scene, points, np.array([0, 0, 1, 1, 0, 1]), RNG.normal(size=(2, 8)))
+    return folder
+
+
+FORMATS = ("conceptgraphs", "gradslam", "hovsg", "openlex3d")

@@ -1,0 +1,220 @@
+"""Where the points of a score are lost: errors made on purpose are found, and nothing else is."""
+
+from __future__ import annotations
+
+import doctest
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from su3d_bench.metrics import attribution, instance_ap
+from su3d_bench.metrics.attribution import KINDS, LabelledMasks, ScoringRules, mend_scene
+from su3d_bench.types import Int32Array, Int64Array
+
+SIZE = 200  # points an instance
+CLASSES = (3, 3, 3, 4, 4, 5)
+RULES = ScoringRules((3, 4, 5))
+N_VOID = 300
+
+
+def truth() -> Int64Array:
+    """Six instances of three classes, one after another, and void points at the end."""
+    values = np.array([c * 1000 + k + 1 for k, c in enumerate(CLASSES)])
+    return np.concatenate([np.repeat(values, SIZE), np.zeros(N_VOID, np.int64)])
+
+
+def points(instance: int, share: float = 1.0, start: float = 0.0) -> Int32Array:
+    first = SIZE * instance
+    return np.arange(first + int(start * SIZE), first + int((start + share) * SIZE), dtype=np.int32)
+
+
+def perfect() -> tuple[list[Int32Array], list[int], list[float]]:
+    return [points(k) for k in range(len(CLASSES))], list(CLASSES), [0.9] * len(CLASSES)
+
+
+def labelled(masks: list[Int32Array], classes: list[int], scores: list[float]) -> LabelledMasks:
+    return LabelledMasks(tuple(np.unique(mask) for mask in masks), np.array(classes), np.array(scores))
+
+
+def gains(masks: list[Int32Array], classes: list[int], scores: list[float]) -> tuple[dict[str, float], dict[str, int]]:
+    """The gain in AP50 of each kind, after checks that hold always."""
+    mended = mend_scene(truth(), labelled(masks, classes, scores), RULES)
+    base = instance_ap.combine([mended.as_is])
+    found = {kind: instance_ap.combine([counts]) for kind, counts in mended.alone.items()}
+    assert list(found) == list(KINDS)
+    for kind, ap in found.items():
+        assert (ap.ap != base.ap) <= (mended.n[kind] > 0)
+    return {kind: ap.ap50 - base.ap50 for kind, ap in found.items()}, dict(mended.n)
+
+
+def test_the_example_runs() -> None:
+    assert doctest.testmod(attribution).failed == 0
+
+
+def test_a_perfect_prediction_loses_nothing() -> None:
+    gain, n = gains(*perfect())
+    assert set(gain.values()) == {0.0}
+    assert set(n.values()) == {0}
+
+
+def with_error(kind: str) -> tuple[list[Int32Array], list[int], list[float]]:
+    masks, classes, scores = perfect()
+    if kind == "merged":
+        masks[0:2], classes[0:2], scores[0:2] = [np.concatenate([masks[0], masks[1]])], [3], [0.9]
+    elif kind == "split":
+        masks[0:1], classes[0:1], scores[0:1] = [points(0, 0.5), points(0, 0.5, 0.5)], [3, 3], [0.9, 0.9]
+    elif kind == "duplicate":
+        masks, classes, scores = [*masks, masks[0]], [*classes, 3], [*scores, 0.9]
+    elif kind == "mislabelled":
+        classes[0] = 4
+    elif kind == "background":
+        # three tenths of two instances each and the rest void: on nothing, yet not ignored
+        blob = np.concatenate([points(0, 0.3), points(3, 0.3), np.arange(1200, 1300, dtype=np.int32)])
+        masks, classes, scores = [*masks, blob], [*classes, 3], [*scores, 0.95]
+    else:
+        del masks[0], classes[0], scores[0]
+    return masks, classes, scores
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_an_error_made_on_purpose_is_found_and_nothing_else(kind: str) -> None:
+    gain, n = gains(*with_error(kind))
+    assert n == {name: int(name == kind) for name in KINDS}
+    assert gain.pop(kind) > 0
+    assert set(gain.values()) == {0.0}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_mending_the_one_error_gives_a_perfect_score(kind: str) -> None:
+    mended = mend_scene(truth(), labelled(*with_error(kind)), RULES)
+    assert instance_ap.combine([mended.as_is]).ap < 1
+    assert instance_ap.combine([mended.alone[kind]]).ap == 1
+    assert instance_ap.combine([mended.all]).ap == 1
+
+
+def test_a_merge_across_classes_is_a_merge_and_no_wrong_label() -> None:
+    masks, classes, scores = perfect()
+    masks[2:4], classes[2:4], scores[2:4] = [np.concatenate([masks[2], masks[3]])], [4], [0.9]
+    gain, n = gains(masks, classes, scores)
+    assert n["merged"] == 1
+    assert sum(n.values()) == 1
+    assert gain["merged"] > 0
+
+
+def test_a_small_thing_swallowed_by_a_mask_that_fits_a_large_one_is_merged() -> None:
+    values = np.concatenate([np.full(2000, 3001), np.full(120, 4002)])
+    both = LabelledMasks((np.arange(2120, dtype=np.int32),), np.array([3]), np.ones(1))
+    mended = mend_scene(values, both, ScoringRules((3, 4)))
+    assert mended.n == dict.fromkeys(KINDS, 0) | {"merged": 1}
+    assert instance_ap.combine([mended.as_is]).ap50 == 0.5
+    assert instance_ap.combine([mended.alone["merged"]]).ap == 1
+
+
+def test_a_piece_that_another_mask_finds_is_not_found_twice() -> None:
+    masks, classes, scores = perfect()
+    masks[0] = np.concatenate([masks[0], masks[1]])  # instance 1 is found on its own as well
+    mended = mend_scene(truth(), labelled(masks, classes, scores), RULES)
+    assert mended.n["merged"] == 1
+    assert instance_ap.combine([mended.alone["merged"]]).ap == 1
+
+
+def test_what_is_left_of_a_merged_mask_goes_where_another_mask_finds_its_instance() -> None:
+    masks, classes, scores = perfect()
+    masks[3] = np.concatenate([masks[2], masks[3]])  # instance 2 of class 3, instance 3 of class 4
+    mended = mend_scene(truth(), labelled(masks, classes, scores), RULES)
+    assert mended.n == dict.fromkeys(KINDS, 0) | {"merged": 1}
+    assert instance_ap.combine([mended.alone["merged"]]).ap == 1
+
+
+def test_a_merged_mask_with_the_label_of_none_is_not_mended_by_cutting() -> None:
+    masks, classes, scores = perfect()
+    masks[0:2], classes[0:2], scores[0:2] = [np.concatenate([masks[0], masks[1]])], [5], [0.9]
+    gain, n = gains(masks, classes, scores)
+    assert set(n.values()) == {0}
+    assert set(gain.values()) == {0.0}
+
+
+def test_a_wrong_label_on_what_a_merged_mask_finds_costs_nothing_by_itself() -> None:
+    masks, classes, scores = perfect()
+    masks[0:2] = [np.concatenate([points(0, 0.55, 0.45), points(1)]), points(1, 0.6)]
+    classes[0:2] = [3, 5]
+    _, n = gains(masks, classes, scores)
+    assert n == dict.fromkeys(KINDS, 0) | {"merged": 1}
+
+
+def test_what_is_wrong_in_mask_and_label_is_left_over() -> None:
+    masks, classes, scores = perfect()
+    masks[5], classes[5] = np.concatenate([points(5, 0.45), np.arange(1200, 1220, dtype=np.int32)]), 3
+    gain, n = gains(masks, classes, scores)
+    assert set(n.values()) == {0}
+    assert set(gain.values()) == {0.0}
+    assert instance_ap.combine([mend_scene(truth(), labelled(masks, classes, scores), RULES).all]).ap50 < 1
+
+
+def test_what_the_evaluator_ignores_is_no_background() -> None:
+    masks, classes, scores = perfect()
+    masks, classes, scores = [*masks, np.arange(1200, 1500, dtype=np.int32)], [*classes, 3], [*scores, 0.99]
+    gain, n = gains(masks, classes, scores)
+    assert n["background"] == 0
+    assert set(gain.values()) == {0.0}
+
+
+def test_of_duplicates_the_best_fit_stays_and_takes_the_best_confidence() -> None:
+    masks, classes, scores = perfect()
+    masks, classes, scores = [*masks, points(0, 0.7)], [*classes, 3], [*scores, 0.99]
+    mended = mend_scene(truth(), labelled(masks, classes, scores), RULES)
+    assert mended.n["duplicate"] == 1
+    after = mended.alone["duplicate"]
+    at_half = (after.class_index == 0) & (after.threshold_index == 0)
+    assert sorted(after.score[at_half]) == [0.9, 0.9, 0.99]
+    assert instance_ap.combine([after]).ap == 1
+
+
+def test_an_empty_prediction_misses_everything() -> None:
+    gain, n = gains([], [], [])
+    assert n == dict.fromkeys(KINDS, 0) | {"missed": len(CLASSES)}
+    assert gain == dict.fromkeys(KINDS, 0.0) | {"missed": 1.0}
+
+
+def test_without_classes_no_label_is_wrong() -> None:
+    values = np.where(truth() > 0, 1000 + truth() % 1000, 0)
+    masks, _, scores = with_error("mislabelled")
+    mended = mend_scene(values, labelled(masks, [1] * len(masks), scores), ScoringRules((1,)))
+    assert set(mended.n.values()) == {0}
+    assert instance_ap.combine([mended.as_is]).ap == 1
+
+
+@st.composite
+def predictions(draw: st.DrawFn) -> LabelledMasks:
+    """Runs of points that ignore the borders of instances, with any class and some equal confidences."""
+    n = draw(st.integers(0, 10))
+    starts = [draw(st.integers(0, 1400)) for _ in range(n)]
+    masks = [np.arange(start, min(1500, start + draw(st.integers(20, 700)))) for start in starts]
+    classes = [draw(st.sampled_from([0, 3, 4, 5])) for _ in range(n)]
+    scores = [draw(st.sampled_from([0.2, 0.5, 0.5, 0.9])) for _ in range(n)]
+    return LabelledMasks(tuple(m.astype(np.int32) for m in masks), np.array(classes, np.int64), np.array(scores))
+
+
+@settings(max_examples=150, deadline=None)
+@given(predictions())
+def test_single_mendings_never_lower_ap50_and_change_nothing_where_there_is_no_error(predicted: LabelledMasks) -> None:
+    mended = mend_scene(truth(), predicted, RULES)
+    base = instance_ap.combine([mended.as_is])
+    for kind in KINDS:
+        after = instance_ap.combine([mended.alone[kind]])
+        if mended.n[kind] == 0:
+            assert after.ap == base.ap
+        assert after.ap50 >= base.ap50 - 1e-12, kind
+
+
+@settings(max_examples=50, deadline=None)
+@given(predictions())
+def test_the_order_of_the_masks_changes_no_number_of_errors(predicted: LabelledMasks) -> None:
+    order = np.argsort(np.random.default_rng(1).random(len(predicted.masks)))
+    shuffled = LabelledMasks(
+        tuple(predicted.masks[k] for k in order), predicted.class_ids[order], predicted.scores[order]
+    )
+    first, second = (mend_scene(truth(), one, RULES) for one in (predicted, shuffled))
+    assert first.n == second.n

@@ -1,0 +1,325 @@
+"""Two runs side by side: differences, intervals and tests that can be worked out by hand, and what is refused."""
+
+from __future__ import annotations
+
+import doctest
+import itertools
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from painted import colour_perception
+
+import su3d_bench.reports.comparison_table
+from su3d_bench import scene_run
+from su3d_bench.cli.main import main
+from su3d_bench.comparison import compare
+from su3d_bench.errors import ConfigError, StoreError
+from su3d_bench.metrics import instance_ap, semantic
+from su3d_bench.metrics.resampled_values import resampled_classes, resampled_metrics
+from su3d_bench.metrics.results import metric_values
+from su3d_bench.protocols import load_protocol
+from su3d_bench.reports.comparison_table import comparison_tables
+from su3d_bench.statistics import MAX_EXACT_PAIRS, SignFlipTest, resample_weights, sign_flip_test
+
+HERE = Path(__file__).parent
+PAINTED = f"{HERE}/painted.py:Painted"
+COLLECTOR = f"{HERE}/painted.py:Collector"
+
+
+# the sign-flip test
+
+
+def by_enumeration(differences: list[float]) -> float:
+    """The share of all sign patterns whose sum is at least as far from 0, one by one."""
+    observed = abs(sum(differences))
+    patterns = itertools.product((-1, 1), repeat=len(differences))
+    sums = [abs(sum(s * d for s, d in zip(signs, differences, strict=True))) for signs in patterns]
+    return sum(total >= observed - 1e-12 for total in sums) / len(sums)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.integers(-8, 8), min_size=1, max_size=11))
+def test_the_sign_flip_test_counts_every_pattern(values: list[int]) -> None:
+    differences = [value / 16 for value in values]  # exact in binary, and often equal
+    found = sign_flip_test(np.array(differences))
+    assert found == SignFlipTest(by_enumeration(differences), 2.0 ** (1 - len(values)), len(values), True)
+
+
+def test_three_scenes_of_one_sign_give_the_smallest_p_that_three_allow() -> None:
+    assert sign_flip_test(np.array([0.1, 0.3, 0.2])) == SignFlipTest(0.25, 0.25, 3, True)
+    assert sign_flip_test(np.array([0.1, 0.3, np.nan, -0.2])) == SignFlipTest(0.75, 0.25, 3, True)
+
+
+def test_no_difference_has_p_one_and_no_pair_has_no_test() -> None:
+    assert sign_flip_test(np.zeros(5)) == SignFlipTest(1.0, 0.0625, 5, True)
+    assert sign_flip_test(np.array([np.nan])) is None
+
+
+def test_rounding_does_not_tell_equal_sums_apart() -> None:
+    found = sign_flip_test(np.array([0.1, 0.2, 0.3, -0.3]))  # 0.1 + 0.2 is not 0.3 in binary
+    assert found is not None
+    assert found.p == by_enumeration([0.1, 0.2, 0.3, -0.3]) == 0.75
+
+
+def test_many_scenes_are_counted_by_halves_and_very_many_are_drawn() -> None:
+    same_sign = sign_flip_test(np.ones(MAX_EXACT_PAIRS))
+    assert same_sign == SignFlipTest(2.0 ** (1 - MAX_EXACT_PAIRS), 2.0 ** (1 - MAX_EXACT_PAIRS), MAX_EXACT_PAIRS, True)
+    rng = np.random.default_rng(0)
+    differences = rng.normal(0.1, 1, MAX_EXACT_PAIRS + 20)
+    drawn = sign_flip_test(differences)
+    assert drawn is not None
+    assert not drawn.is_exact
+    assert drawn == sign_flip_test(differences)
+    # the sum is nearly normal: the share beyond it within a few standard errors of 100,000 draws
+    from math import erfc, sqrt
+
+    expected = erfc(abs(differences.sum()) / sqrt(2 * (differences**2).sum()))
+    assert abs(drawn.p - expected) < 0.02
+
+
+# values over drawn scenes
+
+
+def test_values_over_drawn_scenes_are_those_of_the_scenes_together() -> None:
+    rng = np.random.default_rng(4)
+    rules = load_protocol("rooms-instance")
+    ids = [entry.id for entry in rules.scored][:4]
+    counts = []
+    for _ in range(4):
+        truth = np.repeat(rng.choice(ids, 8) * 1000 + np.arange(1, 9), 150)
+        starts = rng.integers(0, len(truth) - 200, 10)
+        masks = [np.arange(start, start + rng.integers(110, 200)) for start in starts]
+        indptr = np.concatenate([[0], np.cumsum([len(mask) for mask in masks])])
+        labels, scores = rng.choice(ids, 10), rng.integers(1, 4, 10) / 4
+        scored = [entry.id for entry in rules.scored]
+        counts.append(instance_ap.per_scene(truth, indptr, np.concatenate(masks), labels, scores, scored))
+    weights = np.concatenate([np.ones((1, 4), np.int64), np.eye(4, dtype=np.int64), resample_weights(4, 6)])
+    drawn = resampled_metrics(rules, counts, [], weights)
+    classes = resampled_classes(rules, counts, weights)
+    for row, weight in enumerate(weights):
+        chosen = [counts[s] for s in range(4) for _ in range(weight[s])]
+        whole = metric_values(rules, chosen, pooled=True)
+        ap = instance_ap.combine(chosen, rules.thresholds)
+        for name in rules.headline:
+            assert drawn[name][row] == pytest.approx(whole[name], abs=1e-12)
+        for index, name in enumerate(rules.curve_names):
+            if name in classes:
+                np.testing.assert_allclose(classes[name]["AP"][row], ap.of_class(index)[0], atol=1e-12)
+            else:
+                assert np.isnan(ap.of_class(index)[0])
+
+
+def test_recall_and_iou_of_a_class_over_drawn_scenes() -> None:
+    rules = load_protocol("rooms-semantic")
+    n = len(rules.classes)
+    first = semantic.per_scene(np.array([0, 0, 1]), np.array([0, 1, 1]), np.ones(n, bool))
+    second = semantic.per_scene(np.array([0, 0]), np.array([0, 0]), np.ones(n, bool))
+    values = resampled_classes(rules, [first, second], np.array([[1, 0], [0, 1], [1, 1]]))
+    zero, one = rules.classes[0].name, rules.classes[1].name
+    assert set(values) == {zero, one}
+    assert values[zero]["recall"].tolist() == [0.5, 1.0, 0.75]
+    np.testing.assert_array_equal(values[one]["IoU"], [0.5, np.nan, 0.5])
+
+
+# runs of painted scenes
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``a``: everything found; ``b``: one object dropped; ``few``: as ``b``, two scenes; both methods in ``both``."""
+    folder = tmp_path_factory.mktemp("runs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        patch.chdir(folder)
+        for out, scenes, more in (
+            ("a", "[abc]", []),
+            ("b", "[abc]", ["--set", "collector.drop=1"]),
+            ("few", "[bd]", ["--set", "collector.drop=1"]),
+            ("partial", "[ab]", ["--limit", "2"]),
+            ("failed", "[abc]", ["--set", "painted.fault=crash"]),
+            ("other-data", "[abc]", ["--set", "painted.n_frames=5"]),
+        ):
+            words = ["run", "--scenes", f"{PAINTED}/{scenes}", "--methods", COLLECTOR, "--no-pictures", "--jobs", "1"]
+            protocols = ["--protocols", "rooms-semantic", "rooms-instance"]
+            assert main([*words, *protocols, "--quiet", "--out", out, *more]) == (3 if out == "failed" else 0)
+        words[words.index(COLLECTOR)] = "oracle"
+        assert main([*words, *protocols, "--quiet", "--out", "truth"]) == 0
+        copy_as("a", "other-encoder", "metrics.json", lambda text: text.replace("words-1", "words-2"))
+        copy_as(
+            "a", "other-rules", "run.json", lambda text: text.replace(load_protocol("rooms-instance").digest, "0" * 64)
+        )
+        copy_as("a", "old-rules", "run.json", lambda text: text.replace('"version": ', '"version": 9'))
+    return folder
+
+
+def copy_as(source: str, target: str, file: str, change: Callable[[str], str]) -> None:
+    shutil.copytree(source, target)
+    text = Path(target, file).read_text()
+    assert change(text) != text
+    Path(target, file).write_text(change(text))
+
+
+@pytest.fixture(autouse=True)
+def _in_folder(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(runs)
+
+
+def metrics(run: str) -> dict[str, Any]:
+    loaded: dict[str, Any] = json.loads(Path(run, "metrics.json").read_text())
+    return {one["protocol"]: one["result"] for one in loaded["results"]}
+
+
+def test_differences_are_those_of_the_two_runs() -> None:
+    found = compare("a", "b")
+    assert [one.protocol for one in found.protocols] == ["rooms-semantic", "rooms-instance"]
+    for one in found.protocols:
+        before, after = metrics("a")[one.protocol], metrics("b")[one.protocol]
+        assert one.scenes == ("painted/a", "painted/b", "painted/c")
+        for name, value in one.metrics.items():
+            assert (value.left, value.right) == (before["metrics"][name], after["metrics"][name])
+            assert value.difference == value.right - value.left
+            singles = {s: after["per_scene"][s][name] - before["per_scene"][s][name] for s in one.scenes}
+            assert value.per_scene == singles
+            assert value.mean_of_scenes == pytest.approx(sum(singles.values()) / 3)
+            assert value.interval is not None
+            assert value.interval[0] - 1e-12 <= value.difference <= value.interval[1] + 1e-12
+            assert value.test == sign_flip_test(np.array(list(singles.values())))
+    assert found.protocols[1].metrics["AP"].difference < 0
+
+
+def test_the_two_sides_exchanged_change_signs_alone() -> None:
+    forth, back = compare("a", "b"), compare("b", "a")
+    for one, other in zip(forth.protocols, back.protocols, strict=True):
+        for name in one.metrics:
+            left, right = one.metrics[name], other.metrics[name]
+            assert left.difference == -right.difference
+            assert left.test == right.test
+            assert left.interval is not None
+            assert right.interval is not None
+            np.testing.assert_allclose(left.interval, (-right.interval[1], -right.interval[0]), atol=1e-12)
+
+
+def test_classes_are_compared_on_request() -> None:
+    assert compare("a", "b").protocols[1].classes == {}
+    found = compare("a", "b", protocols=["rooms-instance"], per_class=True).protocols[0]
+    assert found.classes["chair"]["AP"].difference == -1.0  # the object that is dropped
+    assert found.classes["chair"]["AP"].per_scene == dict.fromkeys(found.scenes, -1.0)
+    assert all(found.classes[name]["AP50"].difference == 0 for name in ("sofa", "table"))
+
+
+def test_only_common_scenes_are_compared_and_said() -> None:
+    found = compare("a", "few", protocols=["rooms-instance"]).protocols[0]
+    assert found.scenes == ("painted/b",)
+    assert found.metrics["AP"].interval is None
+    assert found.metrics["AP"].test == SignFlipTest(1.0, 1.0, 1, True)
+    assert "only the scenes in common are compared; a:collector alone has painted/a, painted/c" in found.remarks
+    text = comparison_tables(compare("a", "few").to_json())
+    assert "few:collector alone has painted/d" in text
+    assert "a single scene says nothing of other scenes" in text
+
+
+def test_partial_and_incomplete_runs_are_marked() -> None:
+    assert "PARTIAL: partial has only the first 2 frames of each scene" in compare("a", "partial").remarks
+    found = compare("a", "failed")
+    assert "INCOMPLETE: failed lacks scenes that failed" in found.remarks
+    assert "INCOMPLETE: failed:collector failed on painted/b" in found.protocols[0].remarks
+    assert found.protocols[0].scenes == ("painted/a", "painted/c")
+
+
+def test_settings_that_differ_are_named() -> None:
+    assert "settings that differ: method.collector.drop 0 and 1" in compare("a", "b").remarks
+    assert compare("b", "few").remarks == ()
+
+
+def test_two_methods_of_one_run_are_compared() -> None:
+    found = compare("b:collector", "b:oracle")
+    assert (found.protocols[0].left, found.protocols[0].right) == ("collector", "oracle")
+    assert found.protocols[1].metrics["AP"].right == 1.0
+    assert "b:oracle is the ceiling: the truth itself" in found.remarks
+
+
+def test_the_only_methods_of_two_runs_are_compared_whatever_their_names() -> None:
+    found = compare("b", "truth")
+    assert [(one.left, one.right) for one in found.protocols] == [("collector", "oracle")] * 2
+    copy_as("a", "two-others", "run.json", lambda text: text.replace('"collector"', '"one",\n    "two"'))
+    with pytest.raises(ConfigError, match=r"no method in common; name one of each, such as a:collector"):
+        compare("a", "two-others")
+
+
+REFUSED = [
+    (
+        ("a", "other-data"),
+        "a:collector and other-data:collector cannot be compared: data digest of painted/a is ",
+    ),
+    (("a", "other-rules"), "cannot be compared: digest of protocol rooms-instance is "),
+    (("a", "old-rules"), "cannot be compared: version of protocol rooms-semantic is "),
+    (("a", "other-encoder"), "cannot be compared: encoder is words (words-1) and words (words-2)"),
+    (("a", "a"), "a: both sides are the same; name two runs, or two methods of one as a:METHOD"),
+    (("a:oracle", "a:oracle"), "a:oracle: both sides are the same"),
+    (("a", "b:colector"), "b: holds no scores of the method 'colector'; did you mean 'collector'?"),
+    (("a", "b:../../b/scenes/painted.a/collector"), "b: holds no scores of the method '../../b/scenes"),
+    (("a", "nowhere"), "nowhere: there is no such folder; name that of a run, such as runs/my-run"),
+]
+
+
+@pytest.mark.parametrize(("sides", "message"), REFUSED)
+def test_what_cannot_be_compared_is_refused_with_the_field(sides: tuple[str, str], message: str) -> None:
+    with pytest.raises(ConfigError) as caught:
+        compare(*sides)
+    assert message in str(caught.value)
+
+
+def test_rules_that_differ_do_not_forbid_the_other_protocol() -> None:
+    assert compare("a", "other-rules", protocols=["rooms-semantic"]).protocols[0].metrics["mAcc"].difference == 0
+
+
+def test_runs_without_a_common_scene_or_protocol_are_refused() -> None:
+    copy_as("a", "only-d", "run.json", lambda text: text.replace("painted/", "painted/x"))
+    with pytest.raises(ConfigError, match="no scene in common that is scored under rooms-semantic"):
+        compare("a:collector", "only-d:collector")
+    with pytest.raises(ConfigError, match="was not scored under 'rooms-instanse'; did you mean 'rooms-instance'"):
+        compare("a", "b", protocols=["rooms-instanse"])
+
+
+def test_what_is_no_finished_run_is_refused(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match=r"holds no run\.json; name the folder of a run"):
+        compare("a", str(tmp_path))
+    shutil.copy("a/run.json", tmp_path)
+    with pytest.raises(StoreError, match=r"holds no metrics\.json, so the run is not finished"):
+        compare("a", str(tmp_path))
+    (tmp_path / "metrics.json").write_text('{"limit": 0, "results": [{"method": 5}]}')
+    with pytest.raises(StoreError, match=r"metrics\.json: results\.0\.\w+ is not as a run writes it"):
+        compare("a", str(tmp_path))
+    (tmp_path / "metrics.json").write_text("[" * 100_000)
+    with pytest.raises(StoreError, match=r"metrics\.json: "):
+        compare("a", str(tmp_path))
+
+
+def test_the_command_prints_tables_or_json(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", "a", "b", "--protocol", "rooms-instance", "--per-class"]) == 0
+    text = capsys.readouterr().out
+    row = next(line for line in text.splitlines() if line.startswith("| AP "))
+    cells = [cell.strip() for cell in row.strip("|").split("|")]
+    assert cells[0] == "AP"
+    assert cells[1] == "100.0"
+    assert cells[5:] == ["0.25", "0.25", "0 / 0 / 3"]
+    assert "| chair | AP " in text
+    assert "values of classes that no scene changes are left out" in text
+    assert main(["compare", "a", "b", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == compare("a", "b").to_json()
+
+
+def test_the_command_refuses_in_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["compare", "a", "other-data"]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1
+
+
+def test_the_examples_in_the_docstrings_run() -> None:
+    assert doctest.testmod(su3d_bench.reports.comparison_table).failed == 0

@@ -1,0 +1,168 @@
+"""The command ``evaluate``: what it prints, writes and refuses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from prediction_files import write_scannet_text
+
+from su3d_bench.cli.main import main
+
+N = 600
+
+
+@pytest.fixture(autouse=True)
+def _files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Two scenes with a chair and a table in ``gt``, predicted in ``pred``: one rightly, one with the table missed."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
+    Path("gt").mkdir()
+    values = "".join(f"{value}\n" for value in np.repeat([5001, 7002, 1003], 200))
+    for name, n in (("scene0001_00", 2), ("scene0001_01", 1)):
+        Path(f"gt/{name}.txt").write_text(values)
+        masks = np.repeat(np.eye(3, dtype=bool)[:n], 200, axis=1)
+        files = [f"masks/{name}_{k}.txt" for k in range(n)]
+        labels, scores = np.array([5, 7])[:n], np.array([0.9, 0.8])[:n]
+        write_scannet_text(
+            Path("pred"), {"name": name, "masks": masks, "labels": labels, "scores": scores, "files": files}
+        )
+
+
+WORDS = ["evaluate", "pred/", "--ground-truth", "gt/", "--protocol", "scannet-instance"]
+
+
+def test_the_table_has_the_numbers_with_what_stands_beside_them(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*WORDS, "--json", "out/numbers.json"]) == 0
+    answer = capsys.readouterr()
+    assert answer.out.startswith("**scannet-instance** (version 1), 2 scenes\n")
+    rows = {line.split("|")[1].strip(): line for line in answer.out.splitlines() if line.startswith("|")}
+    assert [cell.strip() for cell in rows["result"].split("|")[2:-1]] == ["75.0 [50.0, 100.0]"] * 3
+    assert "| 100.0 " in rows["ceiling"]
+    assert "every mask under every class" in rows
+    assert (
+        "- predictions a scene: 1.5 (1 to 2); near-duplicate pairs 0, identical ones 0; confidences 0.8" in answer.out
+    )
+    assert "- coverage: unknown, the ground truth has no coordinates" in answer.out
+    assert "format: scannet-text; ground truth: gt\n" in answer.err
+    assert answer.err.endswith("written: out/numbers.json\n")
+
+
+def test_the_json_file_has_the_promised_form(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*WORDS, "--json", "out.json", "--quiet"]) == 0
+    assert capsys.readouterr().err == ""
+    value = json.loads(Path("out.json").read_text())
+    assert value["schema"] == 1
+    one = value["protocols"]["scannet-instance"]
+    assert {"version", "metrics", "per_class", "per_scene", "warnings"} <= set(one)
+    assert one["metrics"] == {"ap": 0.75, "ap50": 0.75, "ap25": 0.75}
+    assert one["per_class"]["table"] == {"ap": 0.5, "ap50": 0.5, "ap25": 0.5}
+    assert one["per_class"]["sofa"]["ap"] is None
+    assert one["per_scene"]["scene0001_01"]["ap"] == 0.5
+
+
+def test_semantic_numbers_have_their_own_keys() -> None:
+    Path("labels").mkdir()
+    for name in ("scene0001_00", "scene0001_01"):
+        Path(f"labels/{name}.txt").write_text("5\n" * 200 + "7\n" * 200 + "5\n" * 200)
+    words = ["evaluate", "labels", "--ground-truth", "gt", "--protocol", "scannet-semantic", "--json", "out.json"]
+    assert main([*words, "--quiet"]) == 0
+    one = json.loads(Path("out.json").read_text())["protocols"]["scannet-semantic"]
+    assert set(one["metrics"]) == {"macc", "miou", "fmiou"}
+    assert one["metrics"]["macc"] == pytest.approx(2 / 3)
+    assert set(one["per_class"]["chair"]) == {"acc", "precision", "iou", "f1"}
+    assert one["per_class"]["sofa"]["iou"] is None
+
+
+def test_classes_are_printed_on_request(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*WORDS, "--per-class", "--quiet"]) == 0
+    text = capsys.readouterr().out
+    assert "| chair | 100.0 | 100.0 | 100.0 |" in text
+    assert "no value (-): cabinet, bed, sofa" in text
+
+
+def test_scenes_left_out_are_shouted(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("pred/scene0001_01.txt").unlink()
+    assert main([*WORDS, "--quiet"]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith("**scannet-instance** (version 1), 1 scene; 1 LEFT OUT\n")
+    assert "- WARNING: 1 of 2 scenes have no prediction and are left out, as the original evaluator does" in text
+
+
+def test_protocols_that_do_not_fit_are_told_with_the_reason(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["evaluate", "pred", "--ground-truth", "gt"]) == 0
+    answer = capsys.readouterr()
+    assert "**scannet-instance**" in answer.out
+    assert "not scored under scannet-semantic: needs a class for every point" in answer.err
+    assert "replica" not in answer.err
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["evaluate"], "evaluate: the following arguments are required: PREDICTIONS; see su3d-bench evaluate --help"),
+        (
+            ["evaluate", "prde", "--ground-truth", "gt"],
+            "prde: no such file or folder; give the folder of the predictions",
+        ),
+        (
+            ["evaluate", "pred"],
+            "evaluate: against which ground truth? name one with --dataset scannet or --ground-truth DIR",
+        ),
+        (
+            ["evaluate", "pred", "--ground-truth", "g"],
+            "g: no such folder; give the one with <scene>.txt, one value a point",
+        ),
+        (["evaluate", "pred", "--ground-truth", "."], ".: has no .txt file; expected <scene>.txt, one value a point"),
+        ([*WORDS[:-1], "scannet-instances"], "unknown protocol 'scannet-instances'; did you mean 'scannet-instance'?"),
+        ([*WORDS, "--format", "scanet-text"], "unknown format 'scanet-text'; known: "),
+        ([*WORDS, "--dataset", "scanet"], "unknown dataset 'scanet'; did you mean 'scannet'?"),
+        ([*WORDS, "--scenes", "scene0009_00"], "no scene of gt matches 'scene0009_00'; did you mean 'scene0001_00'?"),
+        ([*WORDS, "--text-features", "none.npz"], "none.npz: cannot be read: No such file or directory"),
+        (
+            [*WORDS[:-1], "replica-mesh-ex6"],
+            "pred: scene0001_00: replica-mesh-ex6: needs a class for every point, the prediction has masks; name a "
+            "--dataset to make them a map",
+        ),
+    ],
+)
+def test_wrong_input_is_one_line_and_exit_code_2(
+    words: list[str], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*words, "--json", "out.json"]) == 2
+    answer = capsys.readouterr()
+    assert answer.out == ""
+    assert answer.err.startswith(f"su3d-bench: {line}")
+    assert answer.err.count("\n") == 1
+    assert not Path("out.json").exists()
+
+
+def test_unknown_names_of_scenes_need_a_protocol(capsys: pytest.CaptureFixture[str]) -> None:
+    for folder in ("gt", "pred"):
+        Path(folder, "scene0001_01.txt").unlink()
+        Path(folder, "scene0001_00.txt").rename(Path(folder, "kitchen.txt"))
+    assert main(["evaluate", "pred", "--ground-truth", "gt"]) == 2
+    assert "gt: whose labels are these? name the protocol with --protocol or the dataset" in capsys.readouterr().err
+    assert main(WORDS) == 0
+
+
+def test_a_mask_that_leaves_the_folder_stops_the_evaluation(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("pred/scene0001_00.txt").write_text("../gt/scene0001_00.txt 5 1.0\n")
+    assert main(WORDS) == 2
+    assert "is no path inside the folder of the list" in capsys.readouterr().err
+
+
+def test_the_oracle_of_the_rooms_says_exactly_one(capsys: pytest.CaptureFixture[str]) -> None:
+    run = ["run", "--scenes", "rooms/bathroom0", "--methods", "oracle", "--no-pictures", "--jobs", "1", "--out", "run"]
+    assert main([*run, "--quiet"]) == 0
+    capsys.readouterr()
+    assert main(["evaluate", "run", "--json", "out.json"]) == 0
+    protocols = json.loads(Path("out.json").read_text())["protocols"]
+    assert {"rooms-instance", "rooms-semantic", "replica-openmask3d", "replica-mesh-ex6"} <= set(protocols)
+    for name, one in protocols.items():
+        assert set(one["metrics"].values()) == {1.0}, name
+        assert set(one["ceiling"].values()) == {1.0}, name
+    metrics = json.loads(Path("run/metrics.json").read_text())["results"]
+    assert {one["protocol"] for one in metrics} == set(protocols)

@@ -1,0 +1,286 @@
+"""What is exported and read back is what it was, and what a format cannot say is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scored_room import ENCODER, ID, room
+
+from su3d_bench.errors import PredictionError, StoreError
+from su3d_bench.metrics.transfer import masks_of, transfer_masks
+from su3d_bench.predictions.base import VertexLabels, VertexMasks
+from su3d_bench.predictions.export import (
+    file_name,
+    masks_as_they_are,
+    masks_on_truth,
+    openlex_parts,
+    whole_folder,
+    write_openlex,
+    write_scannet,
+)
+from su3d_bench.predictions.formats import READERS
+from su3d_bench.predictions.mask_arrays import vertex_masks
+from su3d_bench.protocols import load_protocol
+from su3d_bench.scoring import combine, score_scene
+from su3d_bench.types import DenseFeatures, Instances, Partition
+
+RULES = load_protocol("rooms-instance")
+RNG = np.random.default_rng(0)
+
+
+def a_map(members: list[list[int]], n_points: int = 8, dim: int = 4, **more: Any) -> Instances:
+    k = len(members)
+    values: dict[str, Any] = {
+        "points": RNG.normal(size=(n_points, 3)).astype(np.float32),
+        "indptr": np.cumsum([0, *(len(one) for one in members)]),
+        "indices": np.array([point for one in members for point in one], np.int32),
+        "scores": np.linspace(0.1, 0.9, k),
+        "features": RNG.normal(size=(k, dim)).astype(np.float32),
+        "labels": None,
+        "names": ("",) * k,
+        "captions": ("",) * k,
+        "boxes": np.zeros((k, 2, 3), np.float32),
+        "centroids": np.zeros((k, 3), np.float32),
+        "view_indptr": np.zeros(k + 1, np.int64),
+        "views": np.zeros((0, 2), np.int32),
+    }
+    return Instances(**{**values, **more})
+
+
+def read_openlex(folder: Path) -> Partition:
+    content = READERS["openlex3d"].read(folder, folder.name).content
+    assert isinstance(content, Partition)
+    return content
+
+
+def read_text(folder: Path, scene: str) -> VertexMasks:
+    content = READERS["scannet-text"].read(folder, scene).content
+    assert isinstance(content, VertexMasks)
+    return content
+
+
+# ---- OpenLex3D
+
+
+def test_a_map_without_overlaps_comes_back_whole(tmp_path: Path) -> None:
+    made = a_map([[0, 2], [1, 3, 4], [5, 6, 7]])
+    assert write_openlex(made, tmp_path / "s") == ()
+    found = read_openlex(tmp_path / "s")
+    np.testing.assert_array_equal(found.points, made.points)
+    assert found.instance.tolist() == [0, 1, 0, 1, 1, 2, 2, 2]
+    np.testing.assert_array_equal(found.features, made.features)
+    assert write_openlex(found, tmp_path / "t") == ()
+    for file in ("point_cloud.pcd", "index.npy", "embeddings.npy"):
+        assert (tmp_path / "s" / file).read_bytes() == (tmp_path / "t" / file).read_bytes()
+
+
+def test_shared_points_go_to_the_first_object_and_unowned_ones_nowhere(tmp_path: Path) -> None:
+    made = a_map([[0, 1, 2], [1, 2, 4], [2]])
+    remarks = write_openlex(made, tmp_path / "s")
+    assert remarks == (
+        "2 points are in several objects and went to the first of them",
+        "4 of 8 points are in no object and were left out",
+        "1 of 3 objects have no point left",
+    )
+    found = read_openlex(tmp_path / "s")
+    np.testing.assert_array_equal(found.points, made.points[[0, 1, 2, 4]])
+    assert found.instance.tolist() == [0, 0, 0, 1] and len(found.features) == 3
+
+
+@given(
+    members=st.lists(st.sets(st.integers(0, 11)), min_size=1, max_size=5).filter(any),
+)
+@settings(max_examples=60, deadline=None)
+def test_every_point_of_an_object_is_exported_once_to_one_of_its_objects(members: list[set[int]]) -> None:
+    made = a_map([sorted(one) for one in members], n_points=12)
+    parts = openlex_parts(made)
+    kept = sorted(set().union(*members))
+    np.testing.assert_array_equal(parts.points, made.points[kept])
+    assert [min(k for k, one in enumerate(members) if point in one) for point in kept] == parts.index.tolist()
+
+
+def test_partitions_and_dense_maps_leave_out_what_has_no_object(tmp_path: Path) -> None:
+    points, features = RNG.normal(size=(4, 3)).astype(np.float32), RNG.normal(size=(2, 3)).astype(np.float32)
+    remarks = write_openlex(Partition(points, np.array([1, -1, 0, 1], np.int32), features), tmp_path / "p")
+    assert remarks == ("1 of 4 points are in no object and were left out",)
+    assert read_openlex(tmp_path / "p").instance.tolist() == [1, 0, 1]
+    rows = np.array([[1, 2], [0, 0], [3, 4], [0, -1]], np.float16)
+    remarks = write_openlex(DenseFeatures(points, rows), tmp_path / "d")
+    assert remarks[1] == "1 of 4 points have no feature and were left out"
+    found = read_openlex(tmp_path / "d")
+    np.testing.assert_array_equal(found.points, points[[0, 2, 3]])
+    assert found.instance.tolist() == [0, 1, 2]
+    np.testing.assert_array_equal(found.features, rows[[0, 2, 3]].astype(np.float32))
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (a_map([[0]], features=None), "has no features, and OpenLex3D needs one for each object"),
+        (a_map([[], []]), "has no point in any object; there is nothing to export"),
+        (a_map([[0]], points=np.full((8, 3), np.nan, np.float32)), "has points that are NaN or infinite"),
+        (
+            Partition(np.zeros((1, 3), np.float32), np.array([2], np.int32), np.ones((2, 2), np.float32)),
+            "needs one of its 2 rows of features for each point",
+        ),
+        (VertexLabels(np.zeros(3, np.int32)), "is over the points of the ground truth and brings no points"),
+    ],
+)
+def test_what_openlex3d_cannot_hold_is_refused(content: Any, message: str) -> None:
+    with pytest.raises(PredictionError, match=message):
+        openlex_parts(content)
+
+
+# ---- ScanNet
+
+
+def test_masks_labels_and_scores_come_back_to_the_last_bit(tmp_path: Path) -> None:
+    scores = np.array([0.1 + 0.2, 1 / 3, 1e-17, 0.30000000000000004 + 1e-16])
+    members = [[0, 3], [1], [0, 1, 2, 3], [2, 4]]
+    indptr = np.cumsum([0, *map(len, members)])
+    indices = np.concatenate([np.array(one, np.int32) for one in members])
+    made = vertex_masks(
+        "x",
+        [np.array(one, np.int32) for one in members],
+        5,
+        scores=scores,
+        class_numbers=np.arange(1, 5, dtype=np.int32),
+    )
+    assert write_scannet(masks_as_they_are(made), "scene0011_00", tmp_path) == ()
+    found = read_text(tmp_path, "scene0011_00")
+    assert found.n_points == 5
+    np.testing.assert_array_equal(found.indptr, indptr)
+    np.testing.assert_array_equal(found.indices, indices)
+    assert found.scores.tolist() == scores.tolist()
+    assert found.class_numbers is not None and found.class_numbers.tolist() == [1, 2, 3, 4]
+    assert (tmp_path / "pred_mask/scene0011_00_000.txt").read_text() == "1\n0\n0\n1\n0\n"
+    assert (
+        (tmp_path / "scene0011_00.txt").read_text().startswith("pred_mask/scene0011_00_000.txt 1 0.30000000000000004\n")
+    )
+
+
+def labelled_room() -> Instances:
+    """The truth of a room as a map on other points, with own labels and scores."""
+    truth = room()
+    ids = np.unique(truth.instance[truth.instance > 0])
+    name_of = {value: name for name, value in ID.items()}
+    labels = tuple(name_of[int(truth.semantic[truth.instance == one][0])] for one in ids)
+    members = [np.flatnonzero(truth.instance == one).tolist() for one in ids]
+    points = truth.points + np.random.default_rng(3).normal(size=truth.points.shape).astype(np.float32) * 0.02
+    return a_map(members, len(points), points=points.astype(np.float32), labels=labels, features=None)
+
+
+def test_a_map_on_other_points_is_moved_to_the_vertices_and_scores_the_same(tmp_path: Path) -> None:
+    truth, made = room(), labelled_room()
+    write_scannet(masks_on_truth(made, RULES, truth, None), "living0", tmp_path)
+    found = read_text(tmp_path, "living0")
+    moved = transfer_masks(
+        made.points, masks_of(made), truth.points, RULES.transfer.cap_m, RULES.transfer.evaluation_voxel_m
+    )
+    np.testing.assert_array_equal(found.indptr, moved.indptr)
+    np.testing.assert_array_equal(found.indices, moved.indices)
+    assert found.class_numbers is not None and made.labels is not None
+    assert found.class_numbers.tolist() == [ID[label] for label in made.labels]
+    back = replace(made, points=truth.points, indptr=found.indptr, indices=found.indices, scores=found.scores)
+    before, after = (combine(RULES, {"s": score_scene(RULES, truth, one, None)}).metrics for one in (made, back))
+    assert before == after and 0 < before["AP"] < 1
+
+
+def test_features_are_named_by_the_encoder_among_the_classes_of_the_protocol() -> None:
+    made = labelled_room()
+    assert made.labels is not None
+    featured = replace(made, labels=None, features=ENCODER.encode_texts(made.labels))
+    labelled = masks_on_truth(featured, RULES, room(), ENCODER)
+    assert labelled.class_ids.tolist() == [ID[label] for label in made.labels]
+    assert labelled.remarks == ()
+    other = masks_on_truth(featured, load_protocol("replica-openmask3d"), room(), ENCODER)
+    assert other.remarks == ("labels come from the encoder 'one-hot', the protocol's is 'ViT-L-14-336/openai'",)
+
+
+def test_a_partition_is_exported_with_scores_of_one_and_a_remark(tmp_path: Path) -> None:
+    truth, made = room(), labelled_room()
+    assert made.labels is not None
+    owner = np.full(len(truth.points), -1, np.int32)
+    owner[made.indices] = np.repeat(np.arange(len(made), dtype=np.int32), np.diff(made.indptr))
+    partition = Partition(truth.points, owner, ENCODER.encode_texts(made.labels))
+    labelled = masks_on_truth(partition, RULES, truth, ENCODER)
+    assert labelled.remarks[0] == "a partition has no scores: 1 for every mask"
+    write_scannet(labelled, "living0", tmp_path)
+    found = read_text(tmp_path, "living0")
+    assert found.scores.tolist() == [1.0] * len(made)
+    np.testing.assert_array_equal(found.indices, made.indices)
+    with pytest.raises(PredictionError, match="for each point, -1 for none"):
+        masks_on_truth(replace(partition, instance=owner + 100), RULES, truth, ENCODER)
+
+
+def test_positions_in_the_list_of_classes_become_class_ids() -> None:
+    n = len(room().points)
+    members = [np.array([0, 1], np.int32)] * 3
+    made = vertex_masks("x", members, n, class_numbers=np.array([0, 2, 10_000], np.int32), numbering="index")
+    labelled = masks_on_truth(made, RULES, room(), None)
+    assert labelled.class_ids.tolist() == [RULES.scored[0].id, RULES.scored[2].id, 0]
+
+
+def test_masks_without_points_or_class_are_left_out_and_told(tmp_path: Path) -> None:
+    made = vertex_masks(
+        "x", [np.array(one, np.int32) for one in ([], [1], [2])], 4, class_numbers=np.array([3, 0, 5], np.int32)
+    )
+    remarks = write_scannet(masks_as_they_are(made), "a", tmp_path)
+    assert remarks == (
+        "1 of 3 masks have no point of the ground truth and were left out",
+        "1 of 3 masks have none of the classes and were left out",
+    )
+    assert (tmp_path / "a.txt").read_text() == "pred_mask/a_002.txt 5 1.0\n"
+    assert [file.name for file in (tmp_path / "pred_mask").iterdir()] == ["a_002.txt"]
+
+
+def test_what_scannets_list_cannot_hold_is_refused() -> None:
+    dense = DenseFeatures(np.zeros((1, 3), np.float32), np.ones((1, 2), np.float16))
+    for content in (dense, VertexLabels(np.zeros(3, np.int32))):
+        with pytest.raises(PredictionError, match="has no masks"):
+            masks_on_truth(content, RULES, room(), None)
+    with pytest.raises(PredictionError, match=r"is of 9 points, the ground truth of \d+; both must be of one mesh"):
+        masks_on_truth(vertex_masks("x", [np.array([1], np.int32)], 9), RULES, room(), None)
+    with pytest.raises(PredictionError, match="NaN or infinite"):
+        masks_on_truth(replace(labelled_room(), scores=np.full(8, np.nan)), RULES, room(), None)
+
+
+@pytest.mark.parametrize("scene", ["", "..", ".a", "a/b", "a b", "a\nb", "-x", "x" * 200, "/etc"])
+def test_a_scene_whose_name_leads_elsewhere_is_refused(scene: str, tmp_path: Path) -> None:
+    with pytest.raises(PredictionError, match="cannot be the name of a file"):
+        file_name(scene)
+    masks = masks_as_they_are(vertex_masks("x", [np.array([0], np.int32)], 1, class_numbers=np.array([1], np.int32)))
+    with pytest.raises(PredictionError):
+        write_scannet(masks, scene, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_folder_is_filled_whole_or_not_at_all(tmp_path: Path) -> None:
+    with whole_folder(tmp_path / "deep/out") as folder:
+        (folder / "x").write_text("1")
+        assert not (tmp_path / "deep/out").exists()
+    assert (tmp_path / "deep/out/x").read_text() == "1"
+    with pytest.raises(PredictionError), whole_folder(tmp_path / "other") as folder:
+        write_openlex(a_map([[]]), folder / "s")
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["deep"]
+    with pytest.raises(StoreError, match="choose another folder with --out"), whole_folder(tmp_path / "deep"):
+        pass
+    (tmp_path / "empty").mkdir()
+    with whole_folder(tmp_path / "empty") as folder:
+        (folder / "y").write_text("2")
+    assert (tmp_path / "empty/y").read_text() == "2"
+
+
+def test_a_disk_that_refuses_is_one_line(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    with pytest.raises(StoreError, match="cannot write"), whole_folder(tmp_path / "file/out"):
+        pass
+    with pytest.raises(StoreError, match=r"cannot write .*: No space left"), whole_folder(tmp_path / "out"):
+        raise OSError(28, "No space left on device")
+    assert [file.name for file in tmp_path.iterdir()] == ["file"]
