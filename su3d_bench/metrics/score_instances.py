@@ -41,11 +41,8 @@ def score_instances(
     assert rules.min_region_size is not None
     if truth.evaluation_points is not None:
         raise DataError(f"{rules.name}: the truth '{truth.variant}' has no instances on its evaluation points")
-    values, scored_ids, labels = _truth_and_labels(rules, truth, prediction, encoder)
-    if isinstance(prediction, Instances):
-        masks, scores = transfer.masks_of(prediction), np.asarray(prediction.scores, np.float64)
-    else:
-        masks, scores = transfer.masks_of_partition(prediction.instance, len(labels)), np.ones(len(labels))
+    values, scored_ids, labels = truth_and_labels(rules, truth, prediction, encoder)
+    masks, scores = masks_and_scores(prediction, len(labels))
     moved = transfer.transfer_masks(
         prediction.points, masks, truth.points, rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
     )
@@ -73,7 +70,7 @@ def score_instances(
     )
 
 
-def _truth_and_labels(
+def truth_and_labels(
     rules: ProtocolRules, truth: GroundTruth, prediction: Instances | Partition, encoder: Encoder | None
 ) -> tuple[Int64Array, list[int], Int64Array]:
     """The truth as label * 1000 + instance, the labels that are scored, and the label of each prediction."""
@@ -87,6 +84,13 @@ def _truth_and_labels(
     ids = np.array([entry.id for entry in rules.classes])
     values = instance_ap.encode_ground_truth(truth.semantic, truth.instance)
     return values, scored_ids, np.where(classes >= 0, ids[classes], 0)
+
+
+def masks_and_scores(prediction: Instances | Partition, n_masks: int) -> tuple[transfer.Masks, Float64Array]:
+    """The masks on the prediction's own points and their confidences, 1 for those of a partition."""
+    if isinstance(prediction, Instances):
+        return transfer.masks_of(prediction), np.asarray(prediction.scores, np.float64)
+    return transfer.masks_of_partition(prediction.instance, n_masks), np.ones(n_masks)
 
 
 def encode_without_classes(

@@ -38,7 +38,7 @@ def score_semantic(
         targets = truth.evaluation_points
         _, found = transfer.nearest(truth.points, targets)
         true_class = np.where(found >= 0, class_of_label[found], -1)
-    counted = _counted_classes(rules, is_scored, is_present)
+    counted = counted_classes(rules, is_scored, is_present)
     wanted = (true_class >= 0) & counted[true_class]
 
     classes = classes_of_prediction(rules, prediction, encoder, candidate_classes(rules, is_present))
@@ -60,7 +60,7 @@ def score_semantic(
     )
 
 
-def _counted_classes(rules: ProtocolRules, is_scored: BoolArray, is_present: BoolArray) -> BoolArray:
+def counted_classes(rules: ProtocolRules, is_scored: BoolArray, is_present: BoolArray) -> BoolArray:
     """The classes whose points enter the confusion matrix.
 
     Those that the scene contains for ConceptGraphs, all scored ones for ScanNet, and for HOV-SG the ignored ones too,
@@ -81,49 +81,55 @@ def _predicted_classes(
 ) -> tuple[Int64Array, Float64Array]:
     """The class of each wanted target, -1 for none, and how far the nearest point that takes part is from it."""
     if rules.transfer.neighbours > 1:
-        points, votes = _voters(prediction, classes)
+        point, owner = points_and_owners(prediction)
+        votes = classes[owner]  # objects without a class do not vote
+        points, votes = prediction.points[point[votes >= 0]], votes[votes >= 0]
         cap_m = np.inf if rules.transfer.cap_m is None else rules.transfer.cap_m
         return neighbours.transfer_votes(points, votes, targets, wanted, rules.transfer.neighbours, cap_m)
-    takes_part = np.ones(len(is_scored), bool) if rules.metric == "hovsg" else is_scored
-    values, rank = _point_classes(prediction, classes, takes_part)
+    owner, rank = point_owners(prediction, taking_part(rules, classes, is_scored))
+    values = np.where(owner >= 0, classes[owner], -1) if len(classes) else owner
     predicted, distance = transfer.transfer_values(prediction.points, values, rank, targets, wanted)
     if rules.transfer.cap_m is not None:
         predicted = np.where(distance <= rules.transfer.cap_m, predicted, -1)
     return predicted, distance
 
 
-def _voters(prediction: Prediction, classes: Int64Array) -> tuple[transfer.Points, Int64Array]:
-    """The points of all objects, one object after another, and their classes; objects without a class do not vote."""
+def points_and_owners(prediction: Prediction) -> tuple[Int64Array, Int64Array]:
+    """The points of all objects, one object after another, and the object (or row of features) of each."""
     if isinstance(prediction, DenseFeatures):
         point = np.flatnonzero(has_feature(prediction))
-        votes = classes[point]
-    elif isinstance(prediction, Partition):
+        return point, point
+    if isinstance(prediction, Partition):
         point = np.flatnonzero(prediction.instance >= 0)
-        votes = classes[prediction.instance[point]]
-    else:
-        masks = transfer.masks_of(prediction)
-        point = masks.indices.astype(np.int64)
-        votes = classes[transfer.owners(masks)]
-    return prediction.points[point[votes >= 0]], votes[votes >= 0]
+        return point, prediction.instance[point].astype(np.int64)
+    masks = transfer.masks_of(prediction)
+    return masks.indices.astype(np.int64), transfer.owners(masks)
 
 
-def _point_classes(prediction: Prediction, classes: Int64Array, is_scored: BoolArray) -> tuple[Int64Array, Int64Array]:
-    """Class and rank of each point of the prediction; rank -1 where a point takes no part.
+def taking_part(rules: ProtocolRules, classes: Int64Array, is_scored: BoolArray) -> BoolArray:
+    """Which objects take part: what was named as an ignored class is left out, as ConceptGraphs does not load its
+    background objects; HOV-SG has all."""
+    if rules.metric == "hovsg":
+        return np.ones(len(classes), bool)
+    return (classes < 0) | is_scored[classes]
 
-    What was named as an ignored class is left out, as ConceptGraphs does not load its background objects. A point that
-    several instances share belongs to the first.
+
+def point_owners(prediction: Prediction, takes_part: BoolArray) -> tuple[Int64Array, Int64Array]:
+    """The object (or row of features) of each point of the prediction, and its rank among points at one distance.
+
+    Both are -1 where a point takes no part. A point that several instances share belongs to the first.
     """
-    takes_part = (classes < 0) | is_scored[classes]
     if isinstance(prediction, DenseFeatures):
-        return classes, np.where(takes_part & has_feature(prediction), 0, -1)
+        rows = np.arange(len(prediction.points))
+        return rows, np.where(takes_part & has_feature(prediction), 0, -1)
     if isinstance(prediction, Partition):
         owner = prediction.instance.astype(np.int64)
         owner[(owner >= 0) & ~takes_part[owner]] = -1
-    else:
-        kept = np.flatnonzero(takes_part)
-        first = transfer.first_owner(transfer.select(transfer.masks_of(prediction), kept), len(prediction.points))
-        owner = np.where(first >= 0, kept[first], -1) if len(kept) else first
-    return np.where(owner >= 0, classes[owner], -1) if len(classes) else owner, owner
+        return owner, owner
+    kept = np.flatnonzero(takes_part)
+    first = transfer.first_owner(transfer.select(transfer.masks_of(prediction), kept), len(prediction.points))
+    owner = np.where(first >= 0, kept[first], -1) if len(kept) else first
+    return owner, owner
 
 
 def has_feature(prediction: DenseFeatures) -> BoolArray:

@@ -11,7 +11,6 @@ import numpy as np
 
 from su3d_bench.metrics import neighbours, transfer
 from su3d_bench.metrics.attribution_semantic import LabelledPoints
-from su3d_bench.metrics.instance_ap import encode_ground_truth
 from su3d_bench.metrics.labelling import (
     candidate_classes,
     class_index_of_ids,
@@ -19,9 +18,9 @@ from su3d_bench.metrics.labelling import (
     scored_classes,
 )
 from su3d_bench.metrics.mask_overlaps import LabelledMasks, ScoringRules
-from su3d_bench.metrics.scene_score import n_predictions, present
-from su3d_bench.metrics.score_instances import OBJECT, encode_without_classes
-from su3d_bench.metrics.score_semantic import has_feature
+from su3d_bench.metrics.scene_score import present
+from su3d_bench.metrics.score_instances import masks_and_scores, truth_and_labels
+from su3d_bench.metrics.score_semantic import counted_classes, point_owners, points_and_owners, taking_part
 from su3d_bench.protocols import ProtocolRules
 from su3d_bench.types import (
     BoolArray,
@@ -41,20 +40,8 @@ def scored_masks(
 ) -> tuple[Int64Array, LabelledMasks, ScoringRules]:
     """The truth (N,) as label * 1000 + instance, and the masks on its points, under a protocol of kind ``instance``."""
     assert rules.min_region_size is not None
-    scored_ids = [entry.id for entry in rules.scored]
-    if rules.class_agnostic is not None:
-        values = encode_without_classes(rules.class_agnostic, truth.instance, np.isin(truth.semantic, scored_ids))
-        scored_ids, labels = [OBJECT], np.full(n_predictions(prediction), OBJECT)
-    else:
-        is_present = present(class_index_of_ids(rules, truth.semantic), len(rules.classes)) & scored_classes(rules)
-        classes = classes_of_prediction(rules, prediction, encoder, candidate_classes(rules, is_present))
-        ids = np.array([entry.id for entry in rules.classes])
-        values = encode_ground_truth(truth.semantic, truth.instance)
-        labels = np.where(classes >= 0, ids[classes], 0)
-    if isinstance(prediction, Instances):
-        masks, scores = transfer.masks_of(prediction), np.asarray(prediction.scores, np.float64)
-    else:
-        masks, scores = transfer.masks_of_partition(prediction.instance, len(labels)), np.ones(len(labels))
+    values, scored_ids, labels = truth_and_labels(rules, truth, prediction, encoder)
+    masks, scores = masks_and_scores(prediction, len(labels))
     moved = transfer.transfer_masks(
         prediction.points, masks, truth.points, rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
     )
@@ -89,7 +76,7 @@ def scored_points(
         _, found = transfer.nearest(truth.points, targets)
         true_class = np.where(found >= 0, class_of_label[found], -1)
         object_id = object_id[found]
-    counted = _counted_classes(rules, is_scored, is_present)
+    counted = counted_classes(rules, is_scored, is_present)
     wanted = (true_class >= 0) & counted[true_class]
     classes = classes_of_prediction(rules, prediction, encoder, candidate_classes(rules, is_present))
     predicted, mask, mask_distance_m = _called(rules, prediction, classes, is_scored, targets, wanted)
@@ -114,12 +101,6 @@ def _object_ids(truth: GroundTruth, class_of_label: Int64Array) -> Int64Array:
     return np.where(instance > 0, instance, instance.max(initial=0) + 2 + class_of_label)
 
 
-def _counted_classes(rules: ProtocolRules, is_scored: BoolArray, is_present: BoolArray) -> BoolArray:
-    if rules.metric == "hovsg":
-        return np.ones(len(is_scored), bool)
-    return is_present if rules.metric == "conceptgraphs" else is_scored
-
-
 def _called(
     rules: ProtocolRules,
     prediction: Prediction,
@@ -131,41 +112,17 @@ def _called(
     """The class of each wanted target, the mask (or row of features) that gives it, the distance of its point."""
     if rules.transfer.neighbours > 1:
         return _called_by_votes(rules, prediction, classes, targets, wanted)
-    takes_part = (classes < 0) | is_scored[classes] if rules.metric != "hovsg" else np.ones(len(classes), bool)
-    owner, rank = _owners(prediction, takes_part)
+    owner, rank = point_owners(prediction, taking_part(rules, classes, is_scored))
     mask, distance = transfer.transfer_values(prediction.points, owner, rank, targets, wanted)
     if rules.transfer.cap_m is not None:
         mask = np.where(distance <= rules.transfer.cap_m, mask, -1)
     return _class_of(mask, classes), mask, distance
 
 
-def _owners(prediction: Prediction, takes_part: BoolArray) -> tuple[Int64Array, Int64Array]:
-    """The mask (or row) of each point of the map and its rank among points at one distance, -1 for no part."""
-    if isinstance(prediction, DenseFeatures):
-        rows = np.arange(len(prediction.points))
-        return rows, np.where(takes_part & has_feature(prediction), 0, -1)
-    if isinstance(prediction, Partition):
-        owner = prediction.instance.astype(np.int64)
-        owner[(owner >= 0) & ~takes_part[owner]] = -1
-        return owner, owner
-    kept = np.flatnonzero(takes_part)
-    first = transfer.first_owner(transfer.select(transfer.masks_of(prediction), kept), len(prediction.points))
-    owner = np.where(first >= 0, kept[first], -1) if len(kept) else first
-    return owner, owner
-
-
 def _called_by_votes(
     rules: ProtocolRules, prediction: Prediction, classes: Int64Array, targets: transfer.Points, wanted: BoolArray
 ) -> tuple[Int64Array, Int64Array, Float64Array]:
-    if isinstance(prediction, DenseFeatures):
-        point = np.flatnonzero(has_feature(prediction))
-        owner = point
-    elif isinstance(prediction, Partition):
-        point = np.flatnonzero(prediction.instance >= 0)
-        owner = prediction.instance[point].astype(np.int64)
-    else:
-        masks = transfer.masks_of(prediction)
-        point, owner = masks.indices.astype(np.int64), transfer.owners(masks)
+    point, owner = points_and_owners(prediction)
     votes = classes[owner] >= 0
     points, owner = prediction.points[point[votes]], owner[votes]
     cap_m = np.inf if rules.transfer.cap_m is None else rules.transfer.cap_m
