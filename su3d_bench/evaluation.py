@@ -12,6 +12,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from su3d_bench import registry
+from su3d_bench.datasets.query_files import VARIANT as QUERY_OBJECTS
+from su3d_bench.datasets.query_files import query_truth, read_query_file
 from su3d_bench.errors import ConfigError, DataError, GroundTruthMissing, PredictionError
 from su3d_bench.evaluation_openlex import (
     VARIANTS,
@@ -43,6 +45,7 @@ from su3d_bench.evaluation_truth import (
     text_scenes,
     text_variant,
 )
+from su3d_bench.metrics.query_ap import QueryTruth, TextQuery
 from su3d_bench.planning import data_root, why_not_fitting
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexMasks, shown
 from su3d_bench.predictions.scannet_text import ScannetText
@@ -63,7 +66,8 @@ class Request:
     ``ground_truth``: a folder of <scene>.txt in ScanNet's layout, in place of the dataset's own. ``protocols``: all
     that fit where none is named. ``scenes``: names or patterns. ``confidences``: where a protocol has 1 for every mask,
     its own rule, or what the files say; None: what the files say in the official script's format, which that script
-    reads as it stands, and the protocol's rule in all others.
+    reads as it stands, and the protocol's rule in all others. ``queries``: a file of texts and the objects that they
+    speak of, for ``query-ap``.
     """
 
     predictions: tuple[Path, ...]
@@ -74,6 +78,7 @@ class Request:
     format: str | None = None
     text_features: Path | None = None
     confidences: Confidences | None = None
+    queries: Path | None = None
 
 
 @dataclass
@@ -87,6 +92,7 @@ class _Ground:
     files: Mapping[str, Path] = field(default_factory=dict)
     dataset: Any = None
     lex: OpenLexRelease | None = None
+    queries: Mapping[str, tuple[TextQuery, ...]] | None = None
     _kept: dict[tuple[str, str], GroundTruth] = field(default_factory=dict)
 
     def truth(self, scene: str, variant: str) -> GroundTruth:
@@ -95,12 +101,24 @@ class _Ground:
             self._kept[scene, variant] = self.dataset.ground_truth(scene, variant)
         return self._kept[scene, variant]
 
+    def query_truth(self, scene: str) -> QueryTruth:
+        """The queries of a scene over its objects; ``GroundTruthMissing`` where the file has none of this scene."""
+        assert self.queries is not None
+        if scene not in self.queries:
+            raise GroundTruthMissing(f"{self.where}/{scene}: the file of queries has none of this scene")
+        truth = self.truth(scene, self.dataset.variants[0])
+        return query_truth(truth, self.queries[scene], f"{self.where}/{scene}")
+
 
 def evaluate(request: Request) -> Evaluation:
     """The numbers of ``request`` under every protocol that is named, or else that fits."""
     sources = open_sources(request.predictions, request.format)
     texts = None if request.text_features is None else read_text_features(request.text_features)
     ground, matches, remarks = _open_ground(request, sources)
+    if request.queries is not None:
+        if ground.dataset is None or not ground.dataset.variants:
+            raise ConfigError("evaluate: --queries needs the objects of a dataset; name one with --dataset")
+        ground.queries = read_query_file(request.queries)
     if not matches:
         raise PredictionError(f"{shown(request.predictions[0])}: has no prediction of a scene of {ground.where}")
     candidates, unfit = _candidates(request, ground)
@@ -227,6 +245,10 @@ def _candidates(request: Request, ground: _Ground) -> tuple[list[ProtocolRules],
 def _why_not_truth(rules: ProtocolRules, ground: _Ground, *, is_named: bool) -> str | None:
     if ground.lex is not None:
         return None if rules.ground_truth in VARIANTS else f"{NOT_MEANT} the labels of OpenLex3D"
+    if rules.ground_truth == QUERY_OBJECTS:
+        if ground.queries is not None:
+            return None
+        return "needs --queries FILE" if is_named else f"{NOT_MEANT} scenes without queries"
     if ground.dataset is not None:
         if not is_named and ground.dataset_name not in rules.datasets:
             return f"{NOT_MEANT} {ground.dataset_name}"
@@ -280,7 +302,7 @@ class _Scoring:
         """The reason why a scene cannot be scored under the protocol; None where it was."""
         content = prediction.content
         has_points = self._ground.text is None
-        if self._ground.lex is not None:
+        if rules.kind in ("queries", "categories"):
             reason = why_not_lex_content(rules, content)
         else:
             reason = why_not_content(rules, content, has_points=has_points)
@@ -324,6 +346,8 @@ class _Scoring:
         """The outcome against a truth with coordinates, or the reason why there is none."""
         if self._ground.lex is not None:
             return score_on_objects(rules, self._ground.lex.truth(scene, rules.ground_truth), scene, content, encoder)
+        if rules.ground_truth == QUERY_OBJECTS:
+            return score_on_objects(rules, self._ground.query_truth(scene), scene, content, encoder)
         truth = self._ground.truth(scene, rules.ground_truth)
         try:
             check_length(scene, content, len(truth.points))

@@ -61,6 +61,12 @@ def add_parser(verbs: Any) -> None:
         choices=("protocol", "file"),
         help="where a protocol has 1 for every mask: its rule, or the files' (default: file for ScanNet's text)",
     )
+    parser.add_argument(
+        "--queries",
+        type=Path,
+        metavar="FILE",
+        help="texts and the objects that they speak of, for query-ap: TOML or CSV with scene, text and objects",
+    )
     parser.add_argument("--per-class", action="store_true", help="print the table of every class too")
 
 
@@ -82,6 +88,7 @@ def call(arguments: argparse.Namespace) -> int:
             format=arguments.format,
             text_features=arguments.text_features,
             confidences=arguments.confidences,
+            queries=arguments.queries,
         )
     )
     document = result.to_json()
