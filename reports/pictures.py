@@ -126,7 +126,8 @@ def _distinct(k: int) -> Colour:
 
 def _names_of(prediction: Prediction) -> tuple[str, ...]:
     if isinstance(prediction, Instances):
-        return prediction.labels or prediction.names
+        labels = prediction.labels or prediction.names
+        return tuple(label or name for label, name in zip(labels, prediction.names, strict=True))
     assert not isinstance(prediction, DenseFeatures)
     return ("",) * len(prediction.features)
 

@@ -302,7 +302,7 @@ class _Scoring:
         """The reason why a scene cannot be scored under the protocol; None where it was."""
         content = prediction.content
         has_points = self._ground.text is None
-        if rules.kind in ("queries", "categories"):
+        if self._ground.lex is not None or rules.ground_truth == QUERY_OBJECTS:
             reason = why_not_lex_content(rules, content)
         else:
             reason = why_not_content(rules, content, has_points=has_points)

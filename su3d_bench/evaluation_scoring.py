@@ -25,6 +25,7 @@ from su3d_bench.metrics.labelling import (
     class_index_of_ids,
     classes_of_prediction,
     encoder_warning,
+    has_every_label,
     scored_classes,
 )
 from su3d_bench.metrics.scene_score import SceneScore, present
@@ -120,7 +121,7 @@ def n_feature_dimensions(rules: ProtocolRules, content: Content) -> int | None:
         has_labels = content.class_numbers is not None
     else:
         compares = rules.kind == "queries" or rules.metric == "openlex3d-ranking"  # with texts, whatever the labels
-        has_labels = getattr(content, "labels", None) is not None and not compares
+        has_labels = has_every_label(content) and not compares
     features = content.features
     return None if has_labels or features is None or not len(features) else int(features.shape[1])
 

@@ -210,9 +210,9 @@ class Instances:
 
     ``points`` (M, 3) float32 m; instance k owns points ``indices[indptr[k]:indptr[k + 1]]`` (sorted int32);
     ``scores`` (K,) float64; ``features`` (K, D) float32 where the method has features, ``labels`` one class name each
-    where the method itself decides; ``boxes`` (K, 2, 3) float32 axis-aligned minimum and maximum corners; ``centroids``
-    (K, 3) float32; ``views`` (V, 2) int32 rows (frame index, detection index), those of instance k at
-    ``view_indptr[k]:view_indptr[k + 1]``.
+    where the method itself decides, '' for what it leaves to the feature; ``boxes`` (K, 2, 3) float32 axis-aligned
+    minimum and maximum corners; ``centroids`` (K, 3) float32; ``views`` (V, 2) int32 rows (frame index, detection
+    index), those of instance k at ``view_indptr[k]:view_indptr[k + 1]``.
     """
 
     points: Float32Array

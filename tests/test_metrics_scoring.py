@@ -211,3 +211,22 @@ def test_where_two_objects_have_a_point_in_one_place_the_first_names_it() -> Non
     for names, recall in ((("chair", "table"), 1.0), (("table", "chair"), 0.0)):
         score = score_scene(ROOM, truth, instances(place, masks, names), None)
         assert combine(ROOM, {"room": score}).per_class["chair"]["recall"] == recall
+
+
+# ---- labels for some
+
+
+def test_a_background_object_with_a_label_counts_only_where_its_class_is_scored() -> None:
+    """ConceptGraphs' evaluation: with 1 excluded class background has its own name, with 6 it is not loaded."""
+    truth = replace(room(), variant="conceptgraphs")
+    masks = [np.flatnonzero(truth.instance == 2).astype(np.int32), np.flatnonzero(truth.instance == 1).astype(np.int32)]
+    features = np.stack([OneHotEncoder().feature("chair"), OneHotEncoder().feature("lamp")])
+    prediction = instances(truth.points, masks, ["", "wall"], features)
+    encoder = OneHotEncoder()
+    scored = {n: score_scene(load_protocol(f"replica-conceptgraphs-ex{n}"), truth, prediction, encoder) for n in (1, 6)}
+    with_wall, without = (combine(load_protocol(f"replica-conceptgraphs-ex{n}"), {"a": scored[n]}) for n in (1, 6))
+    assert with_wall.per_class["wall"]["recall"] == 1.0 and with_wall.per_class["chair"]["recall"] > 0
+    assert "wall" not in {name for name, row in without.per_class.items() if row["recall"] > 0}
+    only_chair = instances(truth.points, masks[:1], None, features[:1])
+    alone = score_scene(load_protocol("replica-conceptgraphs-ex6"), truth, only_chair, encoder)
+    np.testing.assert_array_equal(scored[6].counts.confusion, alone.counts.confusion)  # type: ignore[union-attr]

@@ -115,16 +115,17 @@ def test_a_map_comes_back_object_by_object(tmp_path: Path, monkeypatch: pytest.M
     write_map(tmp_path / "room0/pcd_saves/full_pcd_none_x.pkl.gz", value, protocol)
     prediction = read(tmp_path)
     found = instances(prediction)
-    assert len(found) == 3 and found.labels is None
-    for k, one in enumerate(value["objects"]):
+    background = value["bg_objects"][0]
+    assert len(found) == 4 and found.labels == ("", "", "", "wall")
+    for k, one in enumerate([*value["objects"], background]):
         np.testing.assert_array_equal(found.points[found.mask(k)], one["pcd_np"].astype(np.float32))
-    np.testing.assert_array_equal(found.features, np.stack([one["clip_ft"] for one in value["objects"]]))
-    assert found.scores.tolist() == [1, 1, 1]
-    assert found.names == ("couch", "lamp", "couch")  # the lowest of equals
+    np.testing.assert_array_equal(found.features, np.stack([one["clip_ft"] for one in [*value["objects"], background]]))
+    assert found.scores.tolist() == [1, 1, 1, 1]
+    assert found.names == ("couch", "lamp", "couch", "wall")  # the lowest of equals
     np.testing.assert_array_equal(found.boxes[0, 1], value["objects"][0]["pcd_np"].astype(np.float32).max(axis=0))
     assert not found.boxes[1].any() and not found.centroids[1].any()
     assert any("1 for every object" in remark for remark in prediction.remarks)
-    assert any("1 background objects (wall, floor, ceiling) are left out" in remark for remark in prediction.remarks)
+    assert any("1 background objects (wall) have their own names as labels" in said for said in prediction.remarks)
 
 
 def test_the_settings_that_omegaconf_itself_pickles_are_read_past() -> None:
@@ -180,9 +181,9 @@ def test_of_a_pair_of_maps_the_one_after_the_last_merging_is_read(tmp_path: Path
     write_map(folder / "full_pcd_a.pkl.gz", a_map())
     write_map(folder / "full_pcd_a_post.pkl.gz", a_map(objects=[an_object(2, [0])]))
     prediction = read(tmp_path)
-    assert len(instances(prediction)) == 1 and prediction.path.name == "full_pcd_a_post.pkl.gz"
+    assert len(instances(prediction)) == 2 and prediction.path.name == "full_pcd_a_post.pkl.gz"
     assert any("'full_pcd_a_post.pkl.gz' is read" in remark for remark in prediction.remarks)
-    assert len(instances(read(folder / "full_pcd_a.pkl.gz"))) == 3
+    assert len(instances(read(folder / "full_pcd_a.pkl.gz"))) == 4
     write_map(folder / "full_pcd_a_post2.pkl.gz", a_map())
     message = refused(tmp_path, "room0", "conceptgraphs")
     assert "holds 3 maps (full_pcd_a.pkl.gz, full_pcd_a_post.pkl.gz, full_pcd_a_post2.pkl.gz)" in message

@@ -37,9 +37,25 @@ def classes_of_prediction(
     Labels that the method itself decided are taken as they are; otherwise features are classified among ``candidates``.
     """
     labels = getattr(prediction, "labels", None)
-    if labels is not None:
-        index_of = {entry.name: index for index, entry in enumerate(rules.classes)}
-        return np.array([index_of.get(label, -1) for label in labels], np.int64)
+    if labels is None:
+        return _classes_of_features(rules, prediction, encoder, candidates)
+    index_of = {entry.name: index for index, entry in enumerate(rules.classes)}
+    classes = np.array([index_of.get(label, -1) for label in labels], np.int64)
+    if prediction.features is not None and not has_every_label(prediction):
+        is_open = np.array([label == "" for label in labels])
+        classes[is_open] = _classes_of_features(rules, prediction, encoder, candidates)[is_open]
+    return classes
+
+
+def has_every_label(prediction: object) -> bool:
+    """Whether the method itself decided all labels."""
+    labels = getattr(prediction, "labels", None)
+    return labels is not None and all(labels)
+
+
+def _classes_of_features(
+    rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None, candidates: Int64Array
+) -> Int64Array:
     features = prediction.features
     if features is None:
         if getattr(prediction, "scores", np.zeros(1)).size == 0:
@@ -117,7 +133,7 @@ def _normalised(rows: Float64Array) -> Float64Array:
 
 def encoder_warning(rules: ProtocolRules, prediction: Prediction, encoder: Encoder | None) -> str | None:
     """A sentence where another encoder than the protocol's named the features."""
-    if getattr(prediction, "labels", None) is not None or encoder is None or rules.encoder in (None, encoder.name):
+    if has_every_label(prediction) or encoder is None or rules.encoder in (None, encoder.name):
         return None
     return f"labels come from the encoder '{encoder.name}', the protocol's is '{rules.encoder}'"
 

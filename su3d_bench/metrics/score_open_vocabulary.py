@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from su3d_bench.errors import PredictionError
 from su3d_bench.geometry import voxel_coordinates
 from su3d_bench.metrics import object_means, openlex3d, query_ap, transfer
-from su3d_bench.metrics.labelling import cosines, encoder_warning, text_features
+from su3d_bench.metrics.labelling import cosines, encoder_warning, has_every_label, text_features
 from su3d_bench.metrics.neighbours import transfer_each_mask
 from su3d_bench.metrics.openlex3d import OpenLexTruth
 from su3d_bench.metrics.query_ap import QueryTruth
@@ -118,7 +118,7 @@ def _count_categories(
     used, of_point = _used_units(unit)
     if not len(used):
         vocabulary, top = list[str](), np.zeros((0, 1), np.int64)
-    elif labels is not None:
+    elif labels is not None and has_every_label(prediction):
         vocabulary = sorted(set(labels))
         top = np.array([[vocabulary.index(labels[one])] for one in used], np.int64).reshape(-1, 1)
     else:

@@ -59,9 +59,9 @@ class ConceptGraphs:
         value = read_pickle_file(file, forget=FORGOTTEN)
         if not isinstance(value, dict) or not isinstance(value.get("objects"), list):
             raise PredictionError(f"{where}: holds {kind_of(value)} without a list of 'objects'; expected a map")
-        instances, more = _instances(value["objects"], _class_names(value.get("class_names")), where)
-        remarks += [*more, *_background_remarks(value, where)]
-        return ScenePrediction(scene, self.name, file, instances, (ONES, *remarks))
+        background = _background(value.get("bg_objects"), where)
+        instances, more = _instances(value["objects"], background, _class_names(value.get("class_names")), where)
+        return ScenePrediction(scene, self.name, file, instances, (ONES, *remarks, *more))
 
 
 def _maps(path: Path) -> list[Path]:
@@ -100,11 +100,19 @@ def _class_names(value: object) -> tuple[str, ...]:
     return tuple(printable(one[:MOST_TEXT], 80) if isinstance(one, str) else "" for one in texts[:MOST_MASKS])
 
 
-def _instances(objects: list[Any], class_names: Sequence[str], where: str) -> tuple[Instances, list[str]]:
-    if len(objects) > MOST_MASKS:
-        raise PredictionError(f"{where}: holds {len(objects)} objects; is it damaged?")
+def _instances(
+    objects: list[Any], background: list[Any], class_names: Sequence[str], where: str
+) -> tuple[Instances, list[str]]:
+    """The objects, then those of the background, which have their own names as labels.
+
+    So the original's evaluation has them where it excludes nothing but 'other' (``n_exclude`` 1). With 4 or 6 excluded
+    classes it does not load them; here they are then left out because their names are among the excluded ones.
+    """
+    everything = [*objects, *background]
+    if len(everything) > MOST_MASKS:
+        raise PredictionError(f"{where}: holds {len(everything)} objects; is it damaged?")
     clouds, names, captions = [], [], []
-    for k, one in enumerate(objects):
+    for k, one in enumerate(everything):
         at = f"{where}: object {k}"
         if not isinstance(one, dict) or "pcd_np" not in one:
             raise PredictionError(f"{at}: is {kind_of(one)} without 'pcd_np'; expected an object of ConceptGraphs")
@@ -113,20 +121,41 @@ def _instances(objects: list[Any], class_names: Sequence[str], where: str) -> tu
         caption = one.get("consolidated_caption")
         captions.append(printable(caption[:MOST_TEXT], MOST_TEXT) if isinstance(caption, str) else "")
     features, remarks = _features(objects, where)
-    named = tuple(names)
-    if features is not None and any(name != NAME_OF_NONE for name in names):
+    if features is not None and any(name != NAME_OF_NONE for name in names[: len(objects)]):
         remarks.append("names are those of most detections; the feature of an object decides its class, as originally")
-    labels = named if features is None and len(objects) else None
+    walls = tuple(name.lower() for name in names[len(objects) :])
+    own = tuple(names[: len(objects)]) if features is None else ("",) * len(objects)
+    if background:
+        which = printable(", ".join(dict.fromkeys(walls)), 80)
+        remarks.append(
+            f"{len(background)} background objects ({which}) have their own names as labels and count only where "
+            "these classes are scored, as in the original's evaluation"
+        )
+        if features is not None:
+            features = np.concatenate([features, _rows_like(background, features.shape[1])])
+    has_labels = bool(background) or (features is None and len(objects) > 0)
     instances = instances_of(
         clouds,
         where,
         features=features,
-        labels=labels,
-        names=named,
+        labels=(*own, *walls) if has_labels else None,
+        names=tuple(names),
         captions=tuple(captions),
-        ids=range(len(objects)),
+        ids=range(len(everything)),
     )
     return instances, remarks
+
+
+def _rows_like(background: Sequence[Mapping[str, Any]], n: int) -> Float32Array:
+    """The features (K, n) of background objects, zeros where one has none of that length; labels come before them."""
+    rows = np.zeros((len(background), n), np.float32)
+    for k, one in enumerate(background):
+        row = one.get("clip_ft")
+        if isinstance(row, np.ndarray) and row.shape == (n,) and row.dtype.kind == "f" and np.isfinite(row).all():
+            with np.errstate(over="ignore"):
+                rows[k] = row
+    rows[~np.isfinite(rows).all(axis=1)] = 0
+    return rows
 
 
 def _majority(value: object) -> int | None:
@@ -167,21 +196,8 @@ def _features(objects: Sequence[Mapping[str, Any]], where: str) -> tuple[Float32
     return features, list(remarks)
 
 
-def _background_remarks(value: Mapping[str, Any], where: str) -> list[str]:
-    """What becomes of walls, floor and ceiling: they are left out.
-
-    The original's evaluation loads them only where it excludes nothing but 'other' (``n_exclude`` 1), and then under
-    their own names without a feature; with 4 or 6 excluded classes, as in the paper, it does not load them.
-    """
-    background = value.get("bg_objects")
-    if background is None:
-        return []
-    if not isinstance(background, list):
-        raise PredictionError(f"{where}: 'bg_objects' is {kind_of(background)}; expected a list")
-    n = sum(one is not None for one in background)
-    if not n:
-        return []
-    return [
-        f"{n} background objects (wall, floor, ceiling) are left out, as the original's evaluation with 4 or 6 "
-        "excluded classes does; with 1 excluded class it adds them under their own names"
-    ]
+def _background(value: object, where: str) -> list[Any]:
+    """Walls, floor and ceiling, which the Detect variant keeps apart; a class that was never seen is None there."""
+    if value is not None and not isinstance(value, list):
+        raise PredictionError(f"{where}: 'bg_objects' is {kind_of(value)}; expected a list")
+    return [one for one in value or () if one is not None]
