@@ -11,6 +11,7 @@ from su3d_bench.metrics.instance_ap import (
     InstanceCounts,
     count_class,
     intersections,
+    stacked,
 )
 from su3d_bench.metrics.transfer import Masks
 from su3d_bench.types import Float64Array, Int64Array
@@ -60,18 +61,4 @@ def every_class_counts(
                 thresholds=thresholds,
             )
         )
-    return _stacked(parts)
-
-
-def _stacked(parts: Sequence[InstanceCounts]) -> InstanceCounts:
-    """The counts of classes one after another."""
-    return InstanceCounts(
-        class_index=np.concatenate([part.class_index for part in parts]),
-        threshold_index=np.concatenate([part.threshold_index for part in parts]),
-        score=np.concatenate([part.score for part in parts]),
-        is_true=np.concatenate([part.is_true for part in parts]),
-        n_missed=np.concatenate([part.n_missed for part in parts]),
-        n_truth=np.concatenate([part.n_truth for part in parts]),
-        n_small_truth=np.concatenate([part.n_small_truth for part in parts]),
-        n_predictions=np.concatenate([part.n_predictions for part in parts]),
-    )
+    return stacked(parts)

@@ -169,6 +169,11 @@ def per_scene(
                 thresholds=thresholds,
             )
         )
+    return stacked(parts)
+
+
+def stacked(parts: Sequence[InstanceCounts]) -> InstanceCounts:
+    """The counts of classes one after another."""
     return InstanceCounts(
         class_index=np.concatenate([part.class_index for part in parts]),
         threshold_index=np.concatenate([part.threshold_index for part in parts]),
