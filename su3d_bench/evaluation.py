@@ -176,10 +176,15 @@ def _open_ground(request: Request, sources: Sequence[Source]) -> tuple[_Ground, 
         scenes = choose_scenes(request.scenes, list(dict.fromkeys([*known, *matched])), dataset_name)
     else:
         planned = planned_scenes(sources, dataset_name)
-        are_files = all(source.path.is_file() for source in sources)
-        scenes = matched if are_files else [*dict.fromkeys([*matched, *(known if planned is None else planned)])]
+        are_single = all(_is_of_one_scene(source.path) for source in sources)
+        scenes = matched if are_single else [*dict.fromkeys([*matched, *(known if planned is None else planned)])]
     ground = _Ground(dataset_name, dataset_name, tuple(scenes), dataset=dataset)
     return ground, [match for match in matches if match.scene in scenes], remarks
+
+
+def _is_of_one_scene(path: Path) -> bool:
+    """Whether a path stands for its scene alone: a file, or the folder of one method and scene in a run."""
+    return path.is_file() or (path / "prediction.npz").is_file()
 
 
 def _are_all(asked: Sequence[str], known: Sequence[str]) -> bool:
