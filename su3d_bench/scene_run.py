@@ -14,7 +14,7 @@ import time
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +26,23 @@ from su3d_bench.executors import Event, Report
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
 from su3d_bench.protocols import load_protocol
 from su3d_bench.reports.pictures import draw_scene
+from su3d_bench.scene_tools import FirstFrames, no_detections, surface_of, true_proposals
 from su3d_bench.scoring import SceneScore, pack_scores, score_scene, why_not_scorable
 from su3d_bench.store import JobFolder, RunFolder, read_prediction, write_bytes, write_prediction, write_text
 from su3d_bench.timing import Timer
-from su3d_bench.types import GroundTruth, InstanceMesh, Method, Prediction, SceneInfo
+from su3d_bench.types import (
+    Frame,
+    GroundTruth,
+    InstanceMesh,
+    Method,
+    Prediction,
+    Proposals,
+    SceneInfo,
+    SceneTools,
+)
 
 CEILING_METHOD = "oracle"
+TRUE_PROPOSALS_CAVEAT = "proposals from the ground truth; a ceiling, not a result"
 FIELDS_KNOWN_LATER = ("data", "profile", "perception")
 Row = dict[str, float | int]
 
@@ -88,6 +99,13 @@ class MethodOutcome:
     was_resumed: bool = False
     unscored: tuple[tuple[str, str], ...] = ()
     warnings: tuple[str, ...] = ()
+
+
+def caveat_of(method: Method, perception: Perception) -> str | None:
+    """What must be said beside every number: where the masks, or the method's own proposals, come from."""
+    own = TRUE_PROPOSALS_CAVEAT if method.needs.true_proposals else getattr(method, "caveat", None)
+    parts = [perception.caveat if method.needs.frames else None, own]
+    return "; ".join(part for part in parts if part) or None
 
 
 def stride_of(job_stride: int, options: str) -> int:
@@ -230,7 +248,7 @@ class _Scene:
             self.job.scene,
             part.name,
             profile=perception.profile if method.needs.frames else None,
-            caveat=perception.caveat if method.needs.frames else None,
+            caveat=caveat_of(method, perception),
             encoder=perception.encoder.name,
             encoder_digest=perception.encoder.digest,
             data_digest=self.data_digest,
@@ -242,19 +260,39 @@ class _Scene:
     def _predict(
         self, method: Method, info: SceneInfo, perception: Perception, folder: JobFolder, key: Mapping[str, str]
     ) -> None:
+        frames: Sequence[Frame] = ()
+        n = 0
+        if method.needs.frames:
+            frames = self.dataset.frames(self.job.scene_name, info.stride)
+            n = min(len(frames), self.job.limit or len(frames))
+        if hasattr(method, "receive_tools"):
+            method.receive_tools(self._tools(method, perception, frames, n))
         if hasattr(method, "receive_truth"):
             if not self.dataset.variants:
                 raise GroundTruthMissing(f"{self.job.scene}: {method.name} needs ground truth, the dataset has none")
             method.receive_truth(self.truth(self.dataset.variants[0]))
         method.start(info)
-        rows = self._update_all(method, info, perception) if method.needs.frames else []
+        rows = self._update_all(method, frames, n, perception) if method.needs.frames else []
         write_prediction(folder.prediction, method.finish())
+        if hasattr(method, "close"):
+            method.close()
         write_text(folder.updates, _csv_text(rows))
         folder.seal("predict", key, [folder.prediction, folder.updates])
 
-    def _update_all(self, method: Method, info: SceneInfo, perception: Perception) -> list[Row]:
-        frames = self.dataset.frames(self.job.scene_name, info.stride)
-        n = min(len(frames), self.job.limit or len(frames))
+    def _tools(self, method: Method, perception: Perception, frames: Sequence[Frame], n: int) -> SceneTools:
+        return SceneTools(
+            frames=FirstFrames(frames, n),
+            regions=perception.regions(),
+            surface=partial(surface_of, self.dataset, self.job.scene_name),
+            true_proposals=self._true_proposals if method.needs.true_proposals else None,
+        )
+
+    def _true_proposals(self) -> Proposals:
+        if not self.dataset.variants:
+            raise GroundTruthMissing(f"{self.job.scene}: proposals 'oracle' need ground truth, the dataset has none")
+        return true_proposals(self.truth(self.dataset.variants[0]))
+
+    def _update_all(self, method: Method, frames: Sequence[Frame], n: int, perception: Perception) -> list[Row]:
         timer, rows = Timer(), []
         self.report(Event(self.job.scene, method.name, 0, n))
         for update in range(n):
@@ -263,7 +301,10 @@ class _Scene:
                 frame = frames[update]
             if not (frame.depth_m > 0).any():
                 raise DataError(f"{self.job.scene} frame {frame.index}: depth is empty, no pixel is above 0 m")
-            detections = perception.detect(frame, method.needs, timer)
+            if method.needs.masks == "none":
+                detections = no_detections(frame, method.needs)
+            else:
+                detections = perception.detect(frame, method.needs, timer)
             method.update(frame, detections, timer)
             total_ms = (time.perf_counter() - start) * 1e3
             size = {name: int(getattr(method, name)) for name in ("n_points", "n_instances") if hasattr(method, name)}

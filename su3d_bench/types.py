@@ -6,7 +6,7 @@ Coordinates are metres in the world frame unless a name says otherwise; camera a
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol, runtime_checkable
@@ -158,7 +158,8 @@ class Detections:
     ``masks`` (K, H, W) bool, may overlap; ``boxes`` (K, 4) float32 x0 y0 x1 y1 in pixels, right and bottom exclusive;
     ``scores`` (K,) float32 in 0..1; ``names`` and ``captions`` one text each;
     ``crop_features`` (K, R, D) float32, L2-normalised, crop r at ``crop_ratios[r]``;
-    ``global_feature`` (D,) float32, of the whole image.
+    ``global_feature`` (D,) float32, of the whole image; ``name_features`` (K, D) float32, of the names as texts, where
+    the method asked for them.
     """
 
     frame_index: int
@@ -170,6 +171,7 @@ class Detections:
     crop_ratios: tuple[float, ...]
     crop_features: Float32Array
     global_feature: Float32Array
+    name_features: Float32Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -183,6 +185,8 @@ class Detections:
                 f"frame {self.frame_index}: crop features {self.crop_features.shape} for {n} regions and "
                 f"{len(self.crop_ratios)} ratios"
             )
+        if self.name_features is not None and len(self.name_features) != n:
+            raise DataError(f"frame {self.frame_index}: {len(self.name_features)} name features for {n} names")
 
     def __len__(self) -> int:
         return len(self.names)
@@ -192,16 +196,82 @@ class Detections:
 class PerceptionNeeds:
     """What a method asks of perception.
 
-    ``masks``: ``grounded`` (named objects) or ``class-agnostic`` (every region); regions whose name is in
+    ``masks``: ``grounded`` (named objects), ``class-agnostic`` (every region) or ``none``; regions whose name is in
     ``background_names`` or whose box covers more than ``max_box_fraction`` of the image are left out before any
-    feature is computed.
+    feature is computed. A crop is the region's box grown by ``crop_padding_px`` on every side, then scaled by a ratio
+    about its centre, then clipped. ``name_features``: the names' text features too. ``true_proposals``: masks in 3D
+    made from the ground truth, which makes every number of the method a ceiling.
     """
 
-    masks: Literal["grounded", "class-agnostic"] = "grounded"
+    masks: Literal["grounded", "class-agnostic", "none"] = "grounded"
     crop_ratios: tuple[float, ...] = (1.0,)
+    crop_padding_px: int = 0
     background_names: tuple[str, ...] = ()
     max_box_fraction: float = 1.0
+    name_features: bool = False
+    true_proposals: bool = False
     frames: bool = True
+
+
+@dataclass(frozen=True)
+class Surface:
+    """The scan's mesh without labels: ``vertices`` (V, 3) float32 m, ``triangles`` (T, 3) int32.
+
+    ``segments`` (V,) int32 numbers the vertices' segments where the dataset publishes an over-segmentation.
+    """
+
+    vertices: Float32Array
+    triangles: Int32Array
+    segments: Int32Array | None = None
+
+
+@dataclass(frozen=True)
+class Proposals:
+    """K class-agnostic masks over N points, which may overlap: mask k is ``indices[indptr[k]:indptr[k + 1]]``.
+
+    ``points`` (N, 3) float32 m; ``scores`` (K,) float64, the best first is not implied; ``source`` says who made them.
+    """
+
+    points: Float32Array
+    indptr: Int64Array
+    indices: Int32Array
+    scores: Float64Array
+    source: str
+
+    def __len__(self) -> int:
+        return len(self.scores)
+
+    def mask(self, k: int) -> Int32Array:
+        """Point indices of mask ``k``."""
+        return self.indices[self.indptr[k] : self.indptr[k + 1]]
+
+
+class RegionPerception(Protocol):
+    """Perception on demand, for methods that choose themselves where in an image to look."""
+
+    dim: int
+
+    def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
+        """The mask (H, W) of what lies under the pixels ``points`` (P, 2), x y, and how sure the segmenter is of it."""
+        ...
+
+    def encode_regions(self, frame: Frame, mask: BoolArray, boxes: Int64Array) -> Float32Array:
+        """Features (B, dim), L2-normalised, of the crops ``boxes`` (B, 4), x0 y0 x1 y1, around the region ``mask``."""
+        ...
+
+
+@dataclass(frozen=True)
+class SceneTools:
+    """What a method that works on the whole scene may use besides its detections; never ground truth.
+
+    ``frames`` are those of the updates, in their order, read anew at every access; ``surface`` raises ``DataError``
+    where the dataset has no mesh; ``true_proposals`` is there where ``PerceptionNeeds.true_proposals`` asks for it.
+    """
+
+    frames: Sequence[Frame]
+    regions: RegionPerception
+    surface: Callable[[], Surface]
+    true_proposals: Callable[[], Proposals] | None = None
 
 
 @dataclass(frozen=True)
@@ -283,7 +353,8 @@ class Dataset(Protocol):
     Frames are read from several threads at once.
 
     It may have: ``places()``, the folders that it searches; ``status(scene)``, a word on a scene from a quick look;
-    ``groups()``, names for sets of scenes such as ``val``; ``problems(scene)``, every fault of its files, a line each.
+    ``groups()``, names for sets of scenes such as ``val``; ``problems(scene)``, every fault of its files, a line each;
+    ``surface(scene)``, the scan's mesh without labels.
     """
 
     name: str
@@ -322,7 +393,12 @@ class StageTimer(Protocol):
 
 
 class Method(Protocol):
-    """A system under test: fed frame by frame, asked for a map at the end or midway."""
+    """A system under test: fed frame by frame, asked for a map at the end or midway.
+
+    It may have ``receive_tools(tools: SceneTools)``, called before ``start``; ``n_points`` and ``n_instances``, the
+    size of its map after an update; ``close()``, called when the prediction is written; ``caveat``, what must be said
+    beside its numbers.
+    """
 
     name: str
     Config: type

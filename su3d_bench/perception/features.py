@@ -23,6 +23,28 @@ def regions_to_keep(
     return np.flatnonzero(is_named & is_small)
 
 
+def grown_boxes(boxes: Float32Array, padding_px: int) -> Float32Array:
+    """``boxes`` (K, 4) with every side moved outwards by ``padding_px``; crops are clipped to the image later."""
+    return boxes + np.array([-padding_px, -padding_px, padding_px, padding_px], np.float32)
+
+
+class NameEncoder:
+    """Text features of region names as they are, each name encoded once."""
+
+    def __init__(self, encoder: Encoder) -> None:
+        self._encoder = encoder
+        self._known: dict[str, Float32Array] = {}
+
+    def features(self, names: Sequence[str], needs: PerceptionNeeds) -> Float32Array | None:
+        """Features (K, D) of ``names``; None where the method does not ask for them."""
+        if not needs.name_features:
+            return None
+        new = [name for name in dict.fromkeys(names) if name not in self._known]
+        if new:
+            self._known |= dict(zip(new, self._encoder.encode_texts(new), strict=True))
+        return np.array([self._known[name] for name in names], np.float32).reshape(len(names), self._encoder.dim)
+
+
 class CropEncoder:
     """Crop and whole-image features of frames, kept in the cache one table a ratio."""
 

@@ -1,0 +1,22 @@
+"""All parameters of all perception profiles."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, ConfigDict
+
+from su3d_bench.perception.naming import NamingConfig
+from su3d_bench.perception.oracle import OracleConfig
+from su3d_bench.perception.segmenter import SegmenterConfig
+from su3d_bench.perception.stored import StoredConfig
+
+
+class PerceptionConfig(BaseModel):
+    """All parameters of all profiles; ``cache`` off: nothing is read from or written to the cache."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    segmenter: SegmenterConfig = SegmenterConfig()
+    naming: NamingConfig = NamingConfig()
+    oracle: OracleConfig = OracleConfig()
+    stored: StoredConfig = StoredConfig()
+    cache: bool = True
