@@ -397,7 +397,7 @@ class Method(Protocol):
 
     It may have ``receive_tools(tools: SceneTools)``, called before ``start``; ``n_points`` and ``n_instances``, the
     size of its map after an update; ``close()``, called when the prediction is written; ``caveat``, what must be said
-    beside its numbers.
+    beside its numbers; ``about``, a ``MethodAbout``.
     """
 
     name: str
@@ -411,6 +411,22 @@ class Method(Protocol):
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None: ...
 
     def finish(self) -> Prediction: ...
+
+
+@dataclass(frozen=True)
+class MethodAbout:
+    """What a list of methods says of one: where it comes from and how far it has been shown to equal its original.
+
+    ``paper``: authors, title, venue; ``source``: the original's repository, with the commit that was read; ``licence``
+    of that repository; ``needs``: proposals, weights, extras, one entry each; ``status``: what has been shown, and no
+    more.
+    """
+
+    paper: str
+    source: str
+    licence: str
+    needs: tuple[str, ...]
+    status: str
 
 
 @runtime_checkable
