@@ -30,11 +30,11 @@ $(VENV)/core: pyproject.toml constraints.txt
 	@touch $@
 
 $(VENV)/test: $(VENV)/core
-	$(PIP) -e '.[models,test]'
+	$(PIP) -e '.[models,sheets,test]'
 	@touch $@
 
 $(VENV)/dev: $(VENV)/test
-	$(PIP) -e '.[models,test,dev]'
+	$(PIP) -e '.[models,sheets,test,dev]'
 	@touch $@
 
 clean:

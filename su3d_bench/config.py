@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -28,7 +28,8 @@ class RunConfig(BaseModel):
     """The part of a run that belongs to no dataset, method or perception profile.
 
     ``protocols`` empty: those of each dataset; ``stride`` 0: the method's own; ``jobs`` 0: one a scene, at most one a
-    CPU core; ``limit`` 0: all frames, otherwise the first ``limit`` frames of each scene, and the run is partial.
+    CPU core; ``limit`` 0: all frames, otherwise the first ``limit`` frames of each scene, and the run is partial;
+    ``anytime``: shares of the updates after which the map so far is scored too, such as 0.1 0.25 0.5.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -42,6 +43,7 @@ class RunConfig(BaseModel):
     limit: int = Field(default=0, ge=0)
     jobs: int = Field(default=0, ge=0)
     pictures: bool = True
+    anytime: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = ()
 
 
 @dataclass(frozen=True)

@@ -280,6 +280,7 @@ def _scene_job(config: RunConfig, parts: _Parts, folder: Path, target: str, scen
         seed=config.seed,
         limit=config.limit,
         pictures=config.pictures,
+        anytime=tuple(sorted(set(config.anytime))),
         folder=folder,
         data_root=data_root(),
         cache_root=cache_root(),

@@ -7,8 +7,10 @@ workers and however often a run was killed and taken up again.
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
 from typing import Any
 
 from su3d_bench.config import KeyPath, flatten
@@ -102,11 +104,10 @@ def resolved_values(plan: Plan) -> list[tuple[KeyPath, Any, str]]:
 
 def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> dict[str, Any]:
     """What ``metrics.json`` holds: one result a method and protocol, with ceiling and the scenes that are missing."""
-    scores: dict[tuple[str, str, str], SceneScore] = {}
-    for one in outcomes:
-        if one.error is None:
-            counts = plan.folder.job(one.scene, one.method).counts.read_bytes()
-            scores |= {(one.method, name, one.scene): score for name, score in unpack_scores(counts).items()}
+    scores = _read_scores(outcomes, lambda one: plan.folder.job(one.scene, one.method).counts)
+    early = {
+        share: _read_scores(outcomes, partial(_early_counts, plan, share)) for share in sorted(set(plan.config.anytime))
+    }
     protocols = dict.fromkeys(name for job in plan.jobs for name in job.protocols)
     rules = [load_protocol(name) for name in protocols]
     return {
@@ -115,8 +116,39 @@ def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> dict[str, Any]:
         "limit": plan.config.limit,
         "seed": plan.config.seed,
         "scenes": [job.scene for job in plan.jobs],
-        "results": [_result(plan, method, one, outcomes, scores) for one in rules for method in plan.methods],
+        "results": [
+            _result(plan, method, one, outcomes, scores) | _anytime(method, one, scores, early)
+            for one in rules
+            for method in plan.methods
+        ],
     }
+
+
+def _early_counts(plan: Plan, share: float, outcome: MethodOutcome) -> Path:
+    return plan.folder.job(outcome.scene, outcome.method).anytime_counts(share)
+
+
+def _read_scores(outcomes: Sequence[MethodOutcome], file_of: Callable[[MethodOutcome], Path]) -> Scores:
+    """(method, protocol, scene) -> counts, from the files of the outcomes that did not fail and have one."""
+    scores: dict[tuple[str, str, str], SceneScore] = {}
+    for one in outcomes:
+        file = file_of(one)
+        if one.error is None and file.is_file():
+            scores |= {(one.method, name, one.scene): score for name, score in unpack_scores(file.read_bytes()).items()}
+    return scores
+
+
+def _anytime(method: str, rules: ProtocolRules, scores: Scores, early: Mapping[float, Scores]) -> dict[str, Any]:
+    """The metrics of the maps midway, over the scenes that the final one is scored on."""
+    if not early:
+        return {}
+    scenes = [scene for one, protocol, scene in scores if (one, protocol) == (method, rules.name)]
+    midway = []
+    for share, counts in early.items():
+        found = {scene: counts[key] for scene in scenes if (key := (method, rules.name, scene)) in counts}
+        if found and len(found) == len(scenes):
+            midway.append({"share": share, "metrics": combine(rules, found).to_json()["metrics"]})
+    return {"anytime": midway}
 
 
 def _result(

@@ -6,11 +6,9 @@ having ``receive_truth`` (the oracle, from which ceilings come).
 
 from __future__ import annotations
 
-import csv
-import io
 import json
 import logging
-import time
+import math
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -21,15 +19,16 @@ from typing import Any
 from su3d_bench import registry
 from su3d_bench.config import flatten
 from su3d_bench.digests import NUMERIC_PACKAGES, code_digest, digest_json, package_versions
-from su3d_bench.errors import DataError, GroundTruthMissing, StoreError, Su3dError
-from su3d_bench.executors import Event, Report
+from su3d_bench.errors import GroundTruthMissing, StoreError, Su3dError
+from su3d_bench.executors import Report
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
 from su3d_bench.protocols import load_protocol
 from su3d_bench.reports.pictures import draw_scene
-from su3d_bench.scene_tools import FirstFrames, no_detections, surface_of, true_proposals
+from su3d_bench.scene_feeding import Feeding
+from su3d_bench.scene_tools import FirstFrames, surface_of, true_proposals
 from su3d_bench.scoring import SceneScore, pack_scores, score_scene, why_not_scorable
-from su3d_bench.store import JobFolder, RunFolder, read_prediction, write_bytes, write_prediction, write_text
-from su3d_bench.timing import Timer
+from su3d_bench.store import JobFolder, RunFolder, read_prediction, write_bytes, write_text
+from su3d_bench.timing import device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.types import (
     Frame,
     GroundTruth,
@@ -44,7 +43,6 @@ from su3d_bench.types import (
 CEILING_METHOD = "oracle"
 TRUE_PROPOSALS_CAVEAT = "proposals from the ground truth; a ceiling, not a result"
 FIELDS_KNOWN_LATER = ("data", "profile", "perception")
-Row = dict[str, float | int]
 
 
 @dataclass(frozen=True)
@@ -71,6 +69,7 @@ class SceneJob:
     seed: int
     limit: int
     pictures: bool
+    anytime: tuple[float, ...]
     folder: Path
     data_root: Path
     cache_root: Path
@@ -119,6 +118,8 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
     sections = [(f"method.{part.name}", part.options), (f"dataset.{job.dataset.name}", job.dataset.options)]
     if method.needs.frames:
         key |= {"stride": str(stride_of(job.stride, part.options)), "limit": str(job.limit or "none")}
+        if job.anytime:
+            key["anytime"] = str(job.anytime)
         sections.append(("perception", job.perception))
     for prefix, options in sections:
         for path, value in flatten(json.loads(options)):
@@ -271,13 +272,21 @@ class _Scene:
             if not self.dataset.variants:
                 raise GroundTruthMissing(f"{self.job.scene}: {method.name} needs ground truth, the dataset has none")
             method.receive_truth(self.truth(self.dataset.variants[0]))
+        start_memory_watch()
         method.start(info)
-        rows = self._update_all(method, frames, n, perception) if method.needs.frames else []
-        write_prediction(folder.prediction, method.finish())
+        feeding = Feeding(self.job.scene, method, perception, self.report)
+        shares = self.job.anytime if method.needs.frames else ()
+        for share in shares:
+            feeding.up_to(math.ceil(share * n), frames, n)
+            feeding.write_map(folder.anytime(share))
+        feeding.up_to(n, frames, n)
+        feeding.write_map(folder.prediction)
         if hasattr(method, "close"):
             method.close()
-        write_text(folder.updates, _csv_text(rows))
-        folder.seal("predict", key, [folder.prediction, folder.updates])
+        write_text(folder.updates, feeding.csv_text())
+        files = [folder.prediction, folder.updates, *map(folder.anytime, shares)]
+        costs = {"maps": feeding.maps, "peak_rss_bytes": peak_memory_bytes(), "device_bytes": device_memory_bytes()}
+        folder.seal("predict", key, files, {"costs": costs})
 
     def _tools(self, method: Method, perception: Perception, frames: Sequence[Frame], n: int) -> SceneTools:
         return SceneTools(
@@ -292,31 +301,26 @@ class _Scene:
             raise GroundTruthMissing(f"{self.job.scene}: proposals 'oracle' need ground truth, the dataset has none")
         return true_proposals(self.truth(self.dataset.variants[0]))
 
-    def _update_all(self, method: Method, frames: Sequence[Frame], n: int, perception: Perception) -> list[Row]:
-        timer, rows = Timer(), []
-        self.report(Event(self.job.scene, method.name, 0, n))
-        for update in range(n):
-            start = time.perf_counter()
-            with timer.stage("decode"):
-                frame = frames[update]
-            if not (frame.depth_m > 0).any():
-                raise DataError(f"{self.job.scene} frame {frame.index}: depth is empty, no pixel is above 0 m")
-            if method.needs.masks == "none":
-                detections = no_detections(frame, method.needs)
-            else:
-                detections = perception.detect(frame, method.needs, timer)
-            method.update(frame, detections, timer)
-            total_ms = (time.perf_counter() - start) * 1e3
-            size = {name: int(getattr(method, name)) for name in ("n_points", "n_instances") if hasattr(method, name)}
-            row: Row = {"update": update, "frame": frame.index, "n_detections": len(detections), **size}
-            row |= {f"{name}_ms": round(ms, 3) for name, ms in timer.take().items()}
-            rows.append(row | {"total_ms": round(total_ms, 3)})
-            self.report(Event(self.job.scene, method.name, update + 1, n, size.get("n_instances")))
-        return rows
-
     def _score(self, part: Part, perception: Perception, folder: JobFolder, key: Mapping[str, str], log: _Log) -> None:
         """Score under every protocol that has a truth here, draw the map, and seal; reasons for the others go along."""
         prediction = read_prediction(folder.prediction)
+        scores, unscored = self._scores(part, perception, prediction)
+        files = [folder.counts]
+        write_bytes(folder.counts, pack_scores(scores))
+        for share in self.job.anytime if build_method(part).needs.frames else ():
+            early, _ = self._scores(part, perception, read_prediction(folder.anytime(share)))
+            write_bytes(folder.anytime_counts(share), pack_scores(early))
+            files.append(folder.anytime_counts(share))
+        if self.job.pictures:
+            truth_to_draw = next(iter(self._truths.values()), None)
+            files += draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
+        remarks = {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings))}
+        folder.seal("score", key, files, remarks)
+
+    def _scores(
+        self, part: Part, perception: Perception, prediction: Prediction
+    ) -> tuple[dict[str, SceneScore], dict[str, str]]:
+        """The scores under every protocol that can score the map, and why the others cannot."""
         scores: dict[str, SceneScore] = {}
         unscored: dict[str, str] = {}
         for rules in map(load_protocol, self.job.protocols):
@@ -330,13 +334,7 @@ class _Scene:
                 continue
             told = self._prediction_in_words_of(truth, part, prediction)
             scores[rules.name] = score_scene(rules, truth, told, perception.encoder)
-        write_bytes(folder.counts, pack_scores(scores))
-        pictures: list[Path] = []
-        if self.job.pictures:
-            truth_to_draw = next(iter(self._truths.values()), None)
-            pictures = draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
-        remarks = {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings))}
-        folder.seal("score", key, [folder.counts, *pictures], remarks)
+        return scores, unscored
 
     def _prediction_in_words_of(self, truth: GroundTruth, part: Part, prediction: Prediction) -> Prediction:
         """``prediction``; that of a method that was told the truth is told anew where ``truth`` names its classes
@@ -367,12 +365,3 @@ def build_method(part: Part) -> Any:
     """A fresh method of ``part``."""
     method_class = registry.load("method", part.target)
     return method_class(method_class.Config.model_validate_json(part.options))
-
-
-def _csv_text(rows: Sequence[Row]) -> str:
-    columns = list(dict.fromkeys(name for row in rows for name in row if name != "total_ms"))
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [*columns, "total_ms"] if rows else ["update"], restval=0, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(rows)
-    return text.getvalue()

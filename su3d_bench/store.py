@@ -205,6 +205,14 @@ class JobFolder:
     def prediction(self) -> Path:
         return self.path / "prediction.npz"
 
+    def anytime(self, share: float) -> Path:
+        """The map after the first ``share`` of the updates."""
+        return self.path / f"anytime-{share:g}.npz"
+
+    def anytime_counts(self, share: float) -> Path:
+        """The counts of that map."""
+        return self.path / f"anytime-{share:g}-counts.npz"
+
     @property
     def counts(self) -> Path:
         return self.path / "counts.npz"

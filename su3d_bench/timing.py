@@ -1,33 +1,82 @@
-"""Stage timers: how long each part of an update took."""
+"""Stage timers and memory: what an update, a scene, a method costs."""
 
 from __future__ import annotations
 
 import os
 import platform
+import sys
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 
 class Timer:
-    """Collects the milliseconds of each stage of the current update; ``take`` hands them over and starts anew."""
+    """Collects the milliseconds of each stage of the current update; ``take`` hands them over and starts anew.
+
+    Where a GPU is in use, each stage waits for it at both ends, so that work is booked where it was asked for.
+    """
 
     def __init__(self) -> None:
         self._elapsed_ms: dict[str, float] = {}
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
+        synchronise_device()
         start = time.perf_counter()
         try:
             yield
         finally:
+            synchronise_device()
             spent = (time.perf_counter() - start) * 1e3
             self._elapsed_ms[name] = self._elapsed_ms.get(name, 0.0) + spent
 
     def take(self) -> dict[str, float]:
         taken, self._elapsed_ms = self._elapsed_ms, {}
         return taken
+
+
+def synchronise_device() -> None:
+    """Wait for the GPU where this process has used one; torch is never imported for it."""
+    torch = sys.modules.get("torch")
+    if torch is not None and hasattr(torch, "cuda") and torch.cuda.is_initialized():
+        torch.cuda.synchronize()
+
+
+def device_memory_bytes() -> int | None:
+    """The most GPU memory that torch held since ``start_memory_watch``; None where no GPU is in use."""
+    torch = sys.modules.get("torch")
+    if torch is None or not hasattr(torch, "cuda") or not torch.cuda.is_initialized():
+        return None
+    return int(torch.cuda.max_memory_allocated())
+
+
+def memory_bytes() -> int:
+    """What this process holds in memory now (resident set)."""
+    import psutil
+
+    return int(psutil.Process().memory_info().rss)
+
+
+def start_memory_watch() -> None:
+    """Let ``peak_memory_bytes`` and ``device_memory_bytes`` start from what is held now."""
+    # 5 resets the peak of the resident set: proc_pid_clear_refs(5). Elsewhere the peak is that of the whole process.
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+    torch = sys.modules.get("torch")
+    if torch is not None and hasattr(torch, "cuda") and torch.cuda.is_initialized():
+        torch.cuda.reset_peak_memory_stats()
+
+
+def peak_memory_bytes() -> int | None:
+    """The most that this process held in memory since ``start_memory_watch``; None where the system does not say."""
+    status = Path("/proc/self/status")
+    if not status.is_file():
+        return None
+    for line in status.read_text().splitlines():
+        if line.startswith("VmHWM:"):
+            return int(line.split()[1]) * 1024
+    return None
 
 
 def hardware_line() -> str:

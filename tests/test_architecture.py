@@ -29,11 +29,12 @@ LAYERS = (
     {"metrics"},
     {"registry", "store", "scoring"},
     {"perception"},
-    {"opensu3d", "datasets"},
+    {"opensu3d", "datasets", "reasoning"},
     {"predictions"},
     {"baselines", "reports"},
     {"executors"},
     {"scene_tools"},
+    {"scene_feeding"},
     {"scene_run"},
     {"planning"},
     {"evaluation_truth", "evaluation_scenes", "evaluation_texts", "evaluation_checks", "evaluation_bound"},
@@ -112,9 +113,10 @@ def test_root_folders_are_reached_through_links_only(name: str) -> None:
 
 def test_every_folder_with_code_is_packaged() -> None:
     configured = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    folders = {path.parent for path in CODE}
-    expected = {"su3d_bench." + part_of(next(p for p in CODE if p.parent == f)) for f in folders if f != PACKAGE}
-    assert expected | {"su3d_bench"} <= set(configured["packages"])
+    folders = {path.parent for path in CODE if PACKAGE in path.parents}
+    expected = {".".join(("su3d_bench", *folder.relative_to(PACKAGE).parts)) for folder in folders}
+    expected |= {f"su3d_bench.{name}" for name in LINKED}
+    assert expected <= set(configured["packages"])
     assert configured["package-dir"] == {f"su3d_bench.{name}": name for name in LINKED}
 
 

@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from su3d_bench.planning import Plan
     from su3d_bench.runner import RunResult
 
-FLAGS_OF_KEYS = ("scenes", "methods", "profile", "protocols", "stride", "seed", "limit", "jobs", "pictures")
+FLAGS_OF_KEYS = ("scenes", "methods", "profile", "protocols", "stride", "seed", "limit", "jobs", "pictures", "anytime")
 
 
 def add_parser(verbs: Any) -> None:
@@ -45,6 +45,9 @@ def add_parser(verbs: Any) -> None:
     parser.add_argument("--jobs", type=int, metavar="N", help="scenes side by side (default: the CPU cores)")
     parser.add_argument(
         "--pictures", action=argparse.BooleanOptionalAction, help="draw the maps into the run folder (default: yes)"
+    )
+    parser.add_argument(
+        "--anytime", nargs="+", type=float, metavar="SHARE", help="score the map after these shares of the updates too"
     )
     parser.add_argument(
         "--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help="such as opensu3d.top_m=10"

@@ -1,0 +1,26 @@
+"""``su3d-bench report``: tables and pages made from finished runs; one module a sub-verb."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from su3d_bench.cli import report_tables, report_verify
+
+# A sub-verb is a module with ``add_parser(actions)``; it is imported for --help too, so nothing heavy at its top.
+SUB_VERBS = (report_tables, report_verify)
+
+
+def add_parser(verbs: Any) -> None:
+    parser = verbs.add_parser(
+        "report",
+        help="make tables and pages from finished runs, and check a paper against them",
+        description="Make tables and pages from finished runs, and check a paper against them.",
+        epilog="examples:\n  su3d-bench report tables runs/my-run --format latex --table II\n"
+        "  su3d-bench report verify paper.tex",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    names = "|".join(module.NAME for module in SUB_VERBS)
+    actions = parser.add_subparsers(dest="action", metavar=names, required=True)
+    for module in SUB_VERBS:
+        module.add_parser(actions)
