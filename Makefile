@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check install -c constraints.txt
 DEMO_SCENES := rooms/living0 rooms/bedroom0 rooms/kitchen0 rooms/office0
 
-.PHONY: demo test bench lint clean
+.PHONY: demo test bench reference lint clean
 
 demo: $(VENV)/core
 	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods opensu3d oracle --protocols rooms-semantic rooms-instance --out runs/demo
@@ -17,6 +17,10 @@ bench: $(VENV)/test
 	@mkdir -p build
 	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-group-by=group --benchmark-columns=min,median,rounds --benchmark-json=build/bench.json
 	$(BIN)/python benchmarks/write_performance.py build/bench.json docs/performance.md
+
+# Learns the reference that .ci/run holds the demo run against; commit it with the change that moves the numbers.
+reference: demo
+	$(BIN)/su3d-bench check --learn runs/demo --out .ci/reference.json
 
 lint: $(VENV)/dev
 	$(BIN)/ruff check .

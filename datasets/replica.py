@@ -46,11 +46,12 @@ from su3d_bench.datasets.replica_truth import (
     AnnotatedMesh,
     corner_truth,
     read_annotated_mesh,
+    read_surface,
     triangle_mesh,
     vertex_truth,
 )
 from su3d_bench.errors import DataError, GroundTruthMissing, suggest
-from su3d_bench.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, SceneInfo
+from su3d_bench.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, SceneInfo, Surface
 
 READER_VERSION = 2  # raise it whenever the same files come out as other frames or another truth
 
@@ -171,8 +172,21 @@ class Replica:
     def instance_mesh(self, scene: str) -> InstanceMesh:
         return triangle_mesh(self._annotated_mesh(scene))
 
+    def surface(self, scene: str) -> Surface:
+        """The mesh beside the render, whose vertices label files for OpenMask3D and OVO describe."""
+        self._folder(scene)
+        mesh = self._render_mesh(scene)
+        if not mesh.exists():
+            raise DataError(
+                f"{self._where(scene)}: no mesh; {mesh.name} of the render is missing in {self.tree.folder}"
+            )
+        return read_surface(mesh, f"{self._where(scene)}: {mesh.name}")
+
     def _where(self, scene: str) -> str:
         return f"{self.name}/{scene}"
+
+    def _render_mesh(self, scene: str) -> Path:
+        return self.tree.folder / f"{scene}_mesh.ply"
 
     def _folder(self, scene: str) -> Path:
         if scene not in self.tree.scenes:
@@ -184,10 +198,10 @@ class Replica:
         return "rendered-rooms" if scene in read_marker(self.tree.folder) else "camera"
 
     def _truth_files(self, scene: str) -> tuple[Path, ...]:
-        """Every file of ground truth that is here, of whatever variant."""
+        """The render's mesh and every file of ground truth that is here, of whatever variant."""
         original = find_original_scene(self.root, scene)
         names = (MESH_NAME, INFO_NAME)
-        found = [] if original is None else [original / name for name in names]
+        found = [self._render_mesh(scene)] + ([] if original is None else [original / name for name in names])
         released = self._released_truths(scene)
         found += [path for files in released.values() for path in files]
         if released["openmask3d"] or released["ovo-51"]:
@@ -210,7 +224,7 @@ class Replica:
 
     def _labelled_meshes(self, scene: str) -> list[LabelledMesh]:
         """The meshes whose vertices a label file may describe, that of the render first, as the authors used it."""
-        original, render = find_original_scene(self.root, scene), self.tree.folder / f"{scene}_mesh.ply"
+        original, render = find_original_scene(self.root, scene), self._render_mesh(scene)
         meshes = [LabelledMesh(render, render.name)]
         if original is not None:
             meshes.append(LabelledMesh(original / MESH_NAME, MESH_NAME))

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from su3d_bench.datasets.ply import ListColumn, PlyElement, PlyFile, read_ply
 from su3d_bench.datasets.replica_labels import replica_label_set
 from su3d_bench.errors import DataError
-from su3d_bench.types import Float32Array, GroundTruth, InstanceMesh, Int32Array, Int64Array
+from su3d_bench.types import Float32Array, GroundTruth, InstanceMesh, Int32Array, Int64Array, Surface
 
 MESH_NAME = "habitat/mesh_semantic.ply"
 INFO_NAME = "habitat/info_semantic.json"
@@ -144,17 +144,7 @@ def _read_mesh(path: Path, where: str) -> tuple[Float32Array, ListColumn, Int64A
     if face is None or face.n_rows == 0:
         raise DataError(f"{where}: no annotated mesh; expected elements 'vertex' and 'face' with rows")
     vertices = vertex_positions(file, where)
-    corners = next((face.columns[name] for name in CORNER_NAMES if name in face.columns), None)
-    if not isinstance(corners, ListColumn) or corners.values.dtype.kind == "f":
-        raise DataError(f"{where}: faces have no list 'vertex_indices' of whole numbers")
-    is_outside = (corners.values < 0) | (corners.values >= len(vertices))
-    if is_outside.any():
-        first = int(np.flatnonzero(is_outside)[0])
-        row = int(np.searchsorted(corners.indptr, first, side="right")) - 1
-        raise DataError(
-            f"{where}: face {row} names vertex {corners.values[first]}, the mesh has {len(vertices)} (0.."
-            f"{len(vertices) - 1})"
-        )
+    corners = face_corners(face, len(vertices), where)
     if "object_id" not in face.columns:
         raise DataError(
             f"{where}: faces have no 'object_id'; a program that drops it has saved this file, take the original"
@@ -163,6 +153,21 @@ def _read_mesh(path: Path, where: str) -> tuple[Float32Array, ListColumn, Int64A
     if objects.dtype.kind == "f":
         raise DataError(f"{where}: 'object_id' is of type {objects.dtype}; expected a type of whole numbers")
     return vertices, corners, objects.astype(np.int64)
+
+
+def face_corners(face: PlyElement, n_vertices: int, where: str) -> ListColumn:
+    """The vertices of each polygon, all of them there."""
+    corners = next((face.columns[name] for name in CORNER_NAMES if name in face.columns), None)
+    if not isinstance(corners, ListColumn) or corners.values.dtype.kind == "f":
+        raise DataError(f"{where}: faces have no list 'vertex_indices' of whole numbers")
+    is_outside = (corners.values < 0) | (corners.values >= n_vertices)
+    if is_outside.any():
+        first = int(np.flatnonzero(is_outside)[0])
+        row = int(np.searchsorted(corners.indptr, first, side="right")) - 1
+        raise DataError(
+            f"{where}: face {row} names vertex {corners.values[first]}, the mesh has {n_vertices} (0..{n_vertices - 1})"
+        )
+    return corners
 
 
 def vertex_positions(file: PlyFile, where: str) -> Float32Array:
@@ -229,15 +234,30 @@ def corner_truth(mesh: AnnotatedMesh) -> GroundTruth:
 
 
 def triangle_mesh(mesh: AnnotatedMesh) -> InstanceMesh:
-    """The polygons as fans of triangles: a quad becomes (0, 1, 2) and (0, 2, 3), as habitat-sim has it."""
-    n_triangles = np.maximum(mesh.corners.lengths - 2, 0)
-    first = np.repeat(mesh.corners.indptr[:-1], n_triangles)
-    step = np.arange(len(first)) - np.repeat(np.cumsum(n_triangles) - n_triangles, n_triangles)
-    rows = np.stack([first, first + step + 1, first + step + 2], axis=1)
+    """The polygons as fans of triangles, each with the instance of its polygon."""
+    triangles, face_of_triangle = fans(mesh.corners)
     return InstanceMesh(
         mesh.vertices,
-        mesh.corners.values[rows].astype(np.int32),
-        np.repeat(mesh.instance_of_face, n_triangles),
+        triangles,
+        mesh.instance_of_face[face_of_triangle],
         mesh.class_of_instance,
         replica_label_set(),
     )
+
+
+def fans(corners: ListColumn) -> tuple[Int32Array, Int64Array]:
+    """Polygons as triangles (T, 3), and the polygon of each: a quad is (0, 1, 2), (0, 2, 3), as habitat-sim has it."""
+    n_triangles = np.maximum(corners.lengths - 2, 0)
+    first = np.repeat(corners.indptr[:-1], n_triangles)
+    step = np.arange(len(first)) - np.repeat(np.cumsum(n_triangles) - n_triangles, n_triangles)
+    rows = np.stack([first, first + step + 1, first + step + 2], axis=1)
+    return corners.values[rows].astype(np.int32), np.repeat(np.arange(len(n_triangles)), n_triangles)
+
+
+def read_surface(path: Path, where: str) -> Surface:
+    """The mesh in a file without regard to labels; ``where`` names the file and begins each message."""
+    file = read_ply(path, where)
+    vertices, face = vertex_positions(file, where), file.element("face")
+    if face is None or face.n_rows == 0:
+        raise DataError(f"{where}: has no faces; expected a mesh")
+    return Surface(vertices, fans(face_corners(face, len(vertices), where))[0])

@@ -26,6 +26,7 @@ from su3d_bench.datasets.recorded_frames import (
     left_out,
     pinhole,
 )
+from su3d_bench.datasets.replica_truth import read_surface
 from su3d_bench.datasets.rgbd_description import FILE_NAME, INDEX, RgbdDescription, read_description
 from su3d_bench.datasets.rgbd_files import (
     Pose,
@@ -36,7 +37,7 @@ from su3d_bench.datasets.rgbd_files import (
     read_trajectory_file,
 )
 from su3d_bench.errors import DataError, GroundTruthMissing, suggest
-from su3d_bench.types import Float32Array, Float64Array, Frame, GroundTruth, InstanceMesh, SceneInfo
+from su3d_bench.types import Float32Array, Float64Array, Frame, GroundTruth, InstanceMesh, SceneInfo, Surface
 
 logger = logging.getLogger(__name__)
 OTHER = {"camera_to_world": "world_to_camera", "world_to_camera": "camera_to_world"}
@@ -114,6 +115,14 @@ class Rgbd:
     def instance_mesh(self, scene: str) -> InstanceMesh:
         raise GroundTruthMissing(f"rgbd/{scene}: no annotated mesh; folders of images have none")
 
+    def surface(self, scene: str) -> Surface:
+        """The mesh that the description names."""
+        description, recording = self._open(scene)
+        place = f"{recording.where}: {self._description(scene).name}"
+        if description.mesh is None:
+            raise DataError(f'{place} names no mesh; add one in the world of the poses: mesh = "mesh.ply"')
+        return read_surface(recording.folder.file(description.mesh, place), f"{recording.where}: {description.mesh}")
+
     def _descriptions(self) -> dict[str, Path]:
         """Scene -> description; a file is called by its own name, or by its folder's where it is an ``rgbd.toml``."""
         place = self.root / "rgbd"
@@ -170,7 +179,8 @@ def open_recording(path: Path, description: RgbdDescription, where: str) -> Reco
     if missing:
         logger.warning("%s", left_out(where, missing, "frames lack an image or a usable pose", len(frames)))
     intrinsics, size, camera_files = _intrinsics(folder, description, where, place)
-    files = (path, *camera_files, *poses.files)
+    mesh = () if description.mesh is None else (folder.file(description.mesh, place),)
+    files = (path, *camera_files, *poses.files, *mesh)
     lines = tuple(f"{where}: {line}" for line in missing)
     return Recording(where, folder, tuple(frames), intrinsics, depth_table(description), files, size, lines)
 

@@ -37,6 +37,7 @@ class RgbdDescription(BaseModel):
       left; with 3, a value p means ((p >> 3) | (p << 13)) & 0xffff units. ``depth_invalid``: how many units, besides 0,
       mean no depth
     - ``intrinsics``: fx, fy, cx, cy in pixels; or ``intrinsics_file``: 3x3 (or 4x4) numbers, or Open3D's camera (JSON)
+    - ``mesh``: a mesh of the scene in the world of the poses (.ply), for methods that work on one
     - ``frames_per_second``: gives frames their times where the trajectory has none
     - ``check_convention``: off to read poses that the depth images contradict
     """
@@ -56,6 +57,7 @@ class RgbdDescription(BaseModel):
     depth_invalid: tuple[DepthValue, ...] = ()
     intrinsics: tuple[Number, Number, Number, Number] | None = None
     intrinsics_file: str | None = None
+    mesh: str | None = None
     frames_per_second: float = Field(default=30.0, gt=0, le=1e4, allow_inf_nan=False)
     check_convention: bool = True
 

@@ -32,6 +32,7 @@ from su3d_bench.types import (
     Int32Array,
     LabelSet,
     SceneInfo,
+    Surface,
 )
 
 GENERATOR_VERSION = 3  # raise it whenever a scene of the same name comes out different
@@ -209,6 +210,14 @@ class Rooms:
         mesh = self._room(scene).mesh
         classes = {one.id: one.class_id for one in self.objects(scene)}
         return InstanceMesh(mesh.vertices, mesh.triangles, mesh.instance_of_triangle, classes, LABELS)
+
+    def surface(self, scene: str) -> Surface:
+        """The scan without labels, each quad (0, 1, 2, 3) as the triangles (0, 1, 2) and (0, 2, 3).
+
+        Its vertices are those of ``mesh-vertices``, in their order. No edge leads from one object to another.
+        """
+        scan = self.scan(scene)
+        return Surface(scan.vertices, scan.faces[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
 
     def _room(self, scene: str) -> BuiltRoom:
         if scene not in self._rooms:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import logging
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.datasets.registration import Grid, make_registration
 from su3d_bench.datasets.rgbd_source import RgbdSource
+from su3d_bench.datasets.scannet_annotations import segments_name
 from su3d_bench.datasets.scannet_exports import SourceKind, find_source
 from su3d_bench.datasets.scannet_folders import (
     PAPER_SCENES,
@@ -30,14 +32,17 @@ from su3d_bench.datasets.scannet_truth import (
     AnnotatedScan,
     aligned,
     instance_mesh,
+    mesh_name,
+    moved,
     nyu40_truth,
     read_annotated_scan,
+    read_surface,
     scannet200_truth,
     truth_names,
 )
 from su3d_bench.digests import digest_file
 from su3d_bench.errors import DataError, GroundTruthMissing, suggest
-from su3d_bench.types import Float64Array, Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo
+from su3d_bench.types import Float64Array, Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo, Surface
 
 READER_VERSION = 1  # raise it whenever the same files come out as other frames or another truth
 logger = logging.getLogger(__name__)
@@ -148,6 +153,19 @@ class ScanNet:
 
     def instance_mesh(self, scene: str) -> InstanceMesh:
         return instance_mesh(self._annotated_scan(scene), self._label_table)
+
+    def surface(self, scene: str) -> Surface:
+        """The decimated mesh, with the published segments where they are here; scans without truth have both."""
+        self._folder(scene)
+        mesh = self.tree.find_file(scene, mesh_name(scene))
+        if mesh is None:
+            raise DataError(
+                f"{self._where(scene)}: no mesh; {mesh_name(scene)} is missing, copy it into "
+                f"{self.tree.folders[scene][0]}"
+            )
+        surface = read_surface(mesh, self.tree.find_file(scene, segments_name(scene)), scene, self._where(scene))
+        motion = self._motion(scene)
+        return surface if motion is None else replace(surface, vertices=moved(surface.vertices, motion))
 
     def problems(self, scene: str) -> Iterator[str]:
         """Every fault of the scene's files, one line each; the readers stop at the first."""

@@ -35,7 +35,7 @@ from su3d_bench.datasets.scannet_labels import (
     raw_label_set,
 )
 from su3d_bench.errors import DataError, GroundTruthMissing
-from su3d_bench.types import Float32Array, Float64Array, GroundTruth, InstanceMesh, Int32Array, Int64Array
+from su3d_bench.types import Float32Array, Float64Array, GroundTruth, InstanceMesh, Int32Array, Int64Array, Surface
 
 CORNER_NAMES = ("vertex_indices", "vertex_index")
 SAME_PLACE_M = 1e-3  # both files hold one mesh; text formats round its coordinates
@@ -84,20 +84,42 @@ def read_annotated_scan(files: Mapping[str, Path], scan: str, where: str) -> Ann
     mesh_where = f"{where}: {mesh_name(scan)}"
     mesh = read_ply(files[mesh_name(scan)], mesh_where)
     vertices = _vertices(mesh, mesh_where)
-    if len(segments) != len(vertices):
-        raise DataError(
-            f"{where}: {segments_name(scan)} has {len(segments)} vertices, {mesh_name(scan)} has {len(vertices)}; they "
-            "belong to two meshes"
-        )
+    _check_one_mesh(segments, vertices, scan, where)
     labels = _labels(files[labels_name(scan)], vertices, f"{where}: {labels_name(scan)}", mesh_name(scan))
     triangles = _triangles(mesh, len(vertices), mesh_where)
     return AnnotatedScan(where, vertices, triangles, labels, objects, object_of_vertex(segments, objects))
 
 
+def read_surface(mesh: Path, segments: Path | None, scan: str, where: str) -> Surface:
+    """The mesh of ``scan`` without labels, with the published segments where their file is there."""
+    mesh_where = f"{where}: {mesh.name}"
+    file = read_ply(mesh, mesh_where)
+    vertices = _vertices(file, mesh_where)
+    triangles = _triangles(file, len(vertices), mesh_where)
+    if segments is None:
+        return Surface(vertices, triangles)
+    ids = read_segments(segments, scan, where)
+    _check_one_mesh(ids, vertices, scan, where)
+    # Ids may exceed 32 bits, and only which of them are equal is of use.
+    return Surface(vertices, triangles, np.unique(ids, return_inverse=True)[1].reshape(-1).astype(np.int32))
+
+
+def _check_one_mesh(segments: Int64Array, vertices: Float32Array, scan: str, where: str) -> None:
+    if len(segments) != len(vertices):
+        raise DataError(
+            f"{where}: {segments_name(scan)} has {len(segments)} vertices, {mesh_name(scan)} has {len(vertices)}; they "
+            "belong to two meshes"
+        )
+
+
+def moved(vertices: Float32Array, motion: Float64Array) -> Float32Array:
+    """``vertices`` (V, 3) moved by a rigid ``motion`` (4, 4)."""
+    return (vertices.astype(np.float64) @ motion[:3, :3].T + motion[:3, 3]).astype(np.float32)
+
+
 def aligned(scan: AnnotatedScan, motion: Float64Array) -> AnnotatedScan:
     """The scan moved by a rigid ``motion`` (4, 4)."""
-    moved = scan.vertices.astype(np.float64) @ motion[:3, :3].T + motion[:3, 3]
-    return replace(scan, vertices=moved.astype(np.float32))
+    return replace(scan, vertices=moved(scan.vertices, motion))
 
 
 def _vertices(file: PlyFile, where: str) -> Float32Array:

@@ -31,12 +31,22 @@ class _Record(BaseModel):
     status: str
     is_partial: bool
     code: str
+    hardware: str
+    processor: str
     profile: str | None
     encoder_digest: str | None
     data_digests: dict[str, str]
     protocols: tuple[_Protocol, ...]
     methods: tuple[str, ...] = Field(min_length=1)
     scenes: tuple[str, ...]
+
+
+class _Values(BaseModel):
+    metrics: dict[str, float | None]
+
+
+class _Midway(_Values):
+    share: float
 
 
 class _Result(BaseModel):
@@ -48,6 +58,9 @@ class _Result(BaseModel):
     encoder_digest: str | None
     failed: tuple[str, ...]
     caveat: str | None
+    headline: tuple[str, ...]
+    result: _Values | None
+    anytime: tuple[_Midway, ...] = ()
 
 
 class _Metrics(BaseModel):
@@ -57,12 +70,19 @@ class _Metrics(BaseModel):
 
 @dataclass(frozen=True)
 class ResultRecord:
-    """How a method fared under a protocol; ``encoder`` is None where it named its instances itself."""
+    """How a method fared under a protocol; ``encoder`` is None where it named its instances itself.
+
+    ``metrics`` are those of the final maps, None where none was scored; ``anytime`` those of maps midway, by the share
+    of the updates.
+    """
 
     encoder: str | None
     encoder_digest: str | None
     failed: tuple[str, ...]
     caveat: str | None
+    headline: tuple[str, ...]
+    metrics: Mapping[str, float | None] | None
+    anytime: Mapping[float, Mapping[str, float | None]]
 
 
 @dataclass(frozen=True)
@@ -79,6 +99,8 @@ class FinishedRun:
     is_incomplete: bool
     limit: int
     code: str
+    hardware: str
+    processor: str
     profile: str | None
     encoder_digest: str | None
     settings: Mapping[KeyPath, Any]
@@ -130,17 +152,28 @@ def read_run(path: Path) -> FinishedRun:
         methods=record.methods,
         protocols={one.name: (one.version, one.digest) for one in record.protocols},
         data_digests=record.data_digests,
-        results={
-            (one.method, one.protocol): ResultRecord(one.encoder, one.encoder_digest, one.failed, one.caveat)
-            for one in metrics.results
-        },
+        results={(one.method, one.protocol): _result_record(one) for one in metrics.results},
         is_partial=record.is_partial,
         is_incomplete=record.status != "complete",
         limit=metrics.limit,
         code=record.code,
+        hardware=record.hardware,
+        processor=record.processor,
         profile=record.profile,
         encoder_digest=record.encoder_digest,
         settings={entry.path: entry.value for entry in read_file(path / "run.toml").entries},
+    )
+
+
+def _result_record(one: _Result) -> ResultRecord:
+    return ResultRecord(
+        encoder=one.encoder,
+        encoder_digest=one.encoder_digest,
+        failed=one.failed,
+        caveat=one.caveat,
+        headline=one.headline,
+        metrics=None if one.result is None else one.result.metrics,
+        anytime={midway.share: midway.metrics for midway in one.anytime},
     )
 
 

@@ -31,6 +31,7 @@ from su3d_bench.types import Dataset
 
 DATA_ROOT = "~/.cache/su3d-bench/data"
 CACHE_ROOT = "~/.cache/su3d-bench/cache"
+NO_SYSTEMS = (CEILING_METHOD, "command")  # what `--methods all` leaves out: the truth itself, and programs of others
 
 
 @dataclass(frozen=True)
@@ -132,7 +133,9 @@ def _check_sections(kind: str, settings: Settings, used: Mapping[str, str]) -> N
 
 
 def _method_targets(methods: Sequence[str]) -> list[str]:
-    targets = registry.names("method") if "all" in methods else list(dict.fromkeys(methods))
+    all_systems = [name for name in registry.METHODS if name not in NO_SYSTEMS]
+    named = [name for one in methods for name in (all_systems if one == "all" else [one])]
+    targets = list(dict.fromkeys(named))
     if not targets:
         raise ConfigError("no method was named; known: " + ", ".join(registry.names("method")))
     return targets

@@ -21,7 +21,7 @@ from su3d_bench.protocols import ProtocolRules, load_protocol
 from su3d_bench.scene_run import CEILING_METHOD, MethodOutcome, SceneJob, failed_outcomes, run_scene
 from su3d_bench.scoring import SceneScore, combine, unpack_scores
 from su3d_bench.store import SCHEMA, remove_file, write_json, write_text
-from su3d_bench.timing import hardware_line
+from su3d_bench.timing import hardware_line, processor_digest
 from su3d_bench.toml_text import write_toml
 
 Scores = Mapping[tuple[str, str, str], SceneScore]
@@ -200,6 +200,7 @@ def _record(plan: Plan, outcomes: Sequence[MethodOutcome], status: str) -> dict[
         "git": git_state(),
         "packages": package_versions(),
         "hardware": hardware_line(),
+        "processor": processor_digest(),
         "n_workers": plan.n_workers,
         "seed": plan.config.seed,
         "profile": _join(one.profile for one in outcomes) or plan.config.profile,

@@ -125,6 +125,8 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
         for path, value in flatten(json.loads(options)):
             key[".".join((prefix, *path))] = json.dumps(value, ensure_ascii=False)
     key.pop("perception.cache", None)  # a cache moves no number
+    if hasattr(method, "inputs"):
+        key |= {f"input.{name}": digest for name, digest in method.inputs.items()}
     return (
         key
         | {f"packages.{name}": text for name, text in package_versions(NUMERIC_PACKAGES).items()}
@@ -285,7 +287,12 @@ class _Scene:
             method.close()
         write_text(folder.updates, feeding.csv_text())
         files = [folder.prediction, folder.updates, *map(folder.anytime, shares)]
-        costs = {"maps": feeding.maps, "peak_rss_bytes": peak_memory_bytes(), "device_bytes": device_memory_bytes()}
+        costs = {
+            "maps": feeding.maps,
+            "calibration_ms": feeding.calibration_ms,
+            "peak_rss_bytes": peak_memory_bytes(),
+            "device_bytes": device_memory_bytes(),
+        }
         folder.seal("predict", key, files, {"costs": costs})
 
     def _tools(self, method: Method, perception: Perception, frames: Sequence[Frame], n: int) -> SceneTools:

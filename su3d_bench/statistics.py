@@ -14,6 +14,8 @@ SEED = 0
 LEVEL = 0.95
 MAX_EXACT_PAIRS = 40  # two halves of 2^20 sums, 8 MB each
 N_FLIPS = 100_000  # patterns drawn where there are more pairs
+FLAT_EXPONENT = 0.1  # at most 7 % more for a size twice as large: what a reader of a plot calls flat
+MIN_FIT = 8
 
 
 def resample_weights(n_scenes: int, n_resamples: int = N_RESAMPLES, seed: int = SEED) -> Int64Array:
@@ -111,3 +113,51 @@ def _n_sums_from(pairs: Float64Array, least: float) -> int:
         halves.append(np.sort(sums))
     below = np.searchsorted(halves[1], least - halves[0], side="left")
     return int((len(halves[1]) - below).sum())
+
+
+@dataclass(frozen=True)
+class Growth:
+    """How a cost grows with a size: ``cost ~ size ** exponent``, with the 95 % interval of the exponent."""
+
+    exponent: float
+    low: float
+    high: float
+
+    @property
+    def words(self) -> str:
+        """``constant per update``, ``grows`` or ``not settled``, by the interval against ``FLAT_EXPONENT``."""
+        if self.high <= FLAT_EXPONENT:
+            return "constant per update"
+        return "grows" if self.low > FLAT_EXPONENT else "not settled"
+
+
+def growth_exponent(sizes: Float64Array, costs: Float64Array, n_resamples: int = N_RESAMPLES) -> Growth | None:
+    """The slope of log cost on log size, with a moving-block bootstrap interval, since neighbours in time are alike.
+
+    Sizes and costs (N,) are in the order of time; those that are not above 0 are left out. None where fewer than
+    ``MIN_FIT`` remain, or where the largest size is not twice the smallest: nothing can be said of growth then.
+
+    >>> sizes = np.linspace(1.0, 100.0, 50)
+    >>> growth_exponent(sizes, 3.0 * sizes).words, growth_exponent(sizes, np.full(50, 7.0)).words
+    ('grows', 'constant per update')
+    """
+    usable = (sizes > 0) & (costs > 0)
+    if np.count_nonzero(usable) < MIN_FIT or sizes[usable].max() < 2.0 * sizes[usable].min():
+        return None
+    x, y = np.log(sizes[usable]), np.log(costs[usable])
+    n = len(x)
+    length = max(1, round(np.sqrt(n)))
+    starts = np.random.default_rng(SEED).integers(0, n - length + 1, (n_resamples, -(-n // length)))
+    rows = (starts[:, :, None] + np.arange(length)).reshape(n_resamples, -1)[:, :n]
+    slopes = _slopes(x[rows], y[rows])
+    low, high = np.nanpercentile(slopes, [2.5, 97.5])
+    return Growth(float(_slopes(x[None], y[None])[0]), float(low), float(high))
+
+
+def _slopes(x: Float64Array, y: Float64Array) -> Float64Array:
+    """The least-squares slope of each row of ``y`` on that of ``x``; NaN where ``x`` does not vary."""
+    dx = x - x.mean(axis=1, keepdims=True)
+    spread = (dx**2).sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        slopes: Float64Array = np.where(spread > 0, (dx * y).sum(axis=1) / spread, np.nan)
+    return slopes

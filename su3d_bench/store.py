@@ -17,16 +17,18 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.digests import digest_file
 from su3d_bench.errors import PredictionError, StoreError
+from su3d_bench.row_blocks import row_blocks
 from su3d_bench.types import DenseFeatures, Instances, Partition, Prediction
 
 SCHEMA = 1
+ROWS_AT_ONCE = 8192  # 16 MB of half precision at 1024 dimensions
 ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
 REASONS = {
     errno.ENOSPC: "the disk is full; free some space and run the same command again",
@@ -52,18 +54,25 @@ def make_folder(path: Path) -> None:
         raise _store_error(path, error) from error
 
 
-def write_bytes(path: Path, content: bytes) -> None:
-    """Put ``content`` at ``path``, whole or not at all, even when the process or the machine dies meanwhile."""
+@contextmanager
+def _replacing(path: Path) -> Iterator[IO[bytes]]:
+    """A stream whose bytes take the place of ``path`` at the end, whole or not at all."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
         with temporary.open("wb") as stream:
-            stream.write(content)
+            yield stream
             stream.flush()
             os.fsync(stream.fileno())
         os.replace(temporary, path)
     except OSError as error:
         temporary.unlink(missing_ok=True)
         raise _store_error(path, error) from error
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Put ``content`` at ``path``, whole or not at all, even when the process or the machine dies meanwhile."""
+    with _replacing(path) as stream:
+        stream.write(content)
 
 
 def remove_file(path: Path) -> None:
@@ -142,7 +151,7 @@ def prediction_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Pr
     for name in kind.__dataclass_fields__:
         value = arrays.get(name)
         values[name] = tuple(str(item) for item in value) if value is not None and value.dtype.kind == "U" else value
-    optional = {"features", "labels"}
+    optional = {"features", "labels", "view_names", "view_scores"}
     missing = [name for name, value in values.items() if value is None and name not in optional]
     if missing:
         raise PredictionError(f"{where}: lacks '{missing[0]}'; write it again with su3d-bench run")
@@ -150,13 +159,49 @@ def prediction_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Pr
     return prediction
 
 
+def features_beside(path: Path) -> Path:
+    """Where the features of a dense prediction at ``path`` are: a file of their own, read without loading it."""
+    return path.with_name(f"{path.name.removesuffix('.npz')}.features.npy")
+
+
 def write_prediction(path: Path, prediction: Prediction) -> None:
-    write_npz(path, prediction_arrays(prediction))
+    """Store ``prediction`` at ``path``, the features of a dense one beside it."""
+    arrays, features_path = prediction_arrays(prediction), features_beside(path)
+    if isinstance(prediction, DenseFeatures):
+        _write_rows(features_path, arrays.pop("features"))
+    else:
+        remove_file(features_path)
+    write_npz(path, arrays)
+
+
+def _write_rows(path: Path, table: NDArray[Any]) -> None:
+    """Put ``table`` at ``path`` as a .npy file, a block at a time."""
+    descr = np.lib.format.dtype_to_descr(table.dtype)
+    with _replacing(path) as stream:
+        header = {"descr": descr, "fortran_order": False, "shape": table.shape}
+        np.lib.format.write_array_header_1_0(stream, header)
+        for _, block in row_blocks(table, ROWS_AT_ONCE):
+            stream.write(np.ascontiguousarray(block).data)
 
 
 def read_prediction(path: Path) -> Prediction:
-    """The prediction that a run stored at ``path``."""
-    return prediction_from_arrays(read_npz(path), str(path))
+    """The prediction that a run stored at ``path``; features of a dense one are memory-mapped."""
+    arrays = read_npz(path)
+    if str(arrays.get("kind")) == DenseFeatures.__name__ and "features" not in arrays:
+        arrays["features"] = _mapped_rows(features_beside(path))
+        if len(arrays["features"]) != len(arrays.get("points", ())):
+            raise StoreError(f"{features_beside(path)}: has other rows than {path.name}; delete both and run again")
+    return prediction_from_arrays(arrays, str(path))
+
+
+def _mapped_rows(path: Path) -> NDArray[Any]:
+    try:
+        table: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
+    except (OSError, ValueError, OverflowError) as error:
+        raise StoreError(f"{path}: not a readable .npy file ({error}); delete it and run again") from error
+    if table.ndim != 2 or table.dtype.kind != "f":
+        raise StoreError(f"{path}: holds {table.dtype} {table.shape}, no rows of features; delete it and run again")
+    return table
 
 
 @dataclass(frozen=True)
@@ -253,10 +298,11 @@ class JobFolder:
     ) -> None:
         """Vouch for ``files`` as the outcome of ``step`` under ``key``; sealing ``predict`` breaks the other seal.
 
-        ``remarks`` are kept beside them for whoever resumes.
+        The features beside a dense prediction go with it. ``remarks`` are kept beside them for whoever resumes.
         """
         steps = {} if step == "predict" else self.seals()
-        digests = {file.relative_to(self.path).as_posix(): digest_file(file) for file in files}
+        beside = [table for file in files if (table := features_beside(file)) != file and table.is_file()]
+        digests = {file.relative_to(self.path).as_posix(): digest_file(file) for file in [*files, *beside]}
         steps[step] = {"key": dict(key), "files": digests, "remarks": dict(remarks or {})}
         write_json(self.done, {"schema": SCHEMA, "steps": steps})
 

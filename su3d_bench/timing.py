@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import sys
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import cache
 from pathlib import Path
+
+import numpy as np
+
+from su3d_bench.types import Float64Array, Int64Array
 
 
 class Timer:
@@ -34,6 +40,24 @@ class Timer:
     def take(self) -> dict[str, float]:
         taken, self._elapsed_ms = self._elapsed_ms, {}
         return taken
+
+
+def calibration_ms() -> float:
+    """Milliseconds of a fixed piece of work like a map's update: sorting, gathering, counting.
+
+    The cost of an update over this one travels from machine to machine better than milliseconds do.
+    """
+    values, keys = _calibration_arrays()
+    start = time.perf_counter()
+    order = np.argsort(values, kind="stable")
+    np.bincount(keys[order], weights=values[order])
+    return (time.perf_counter() - start) * 1e3
+
+
+@cache
+def _calibration_arrays() -> tuple[Float64Array, Int64Array]:
+    generator = np.random.default_rng(0)
+    return generator.random(60_000), generator.integers(0, 50_000, 60_000)
 
 
 def synchronise_device() -> None:
@@ -85,6 +109,17 @@ def hardware_line() -> str:
 
     memory_gib = psutil.virtual_memory().total / 2**30
     return f"{_processor()}, {os.cpu_count()} cores, {memory_gib:.0f} GiB, {platform.system()} {platform.machine()}"
+
+
+def processor_digest() -> str:
+    """A digest of the processor's kind, its instruction sets included: numerical kernels are chosen by them."""
+    cpu_info = Path("/proc/cpuinfo")
+    kind = [platform.machine(), _processor()]
+    if cpu_info.is_file():
+        fields = ("cpu family", "model", "stepping", "flags", "Features")
+        first = cpu_info.read_text(errors="replace").split("\n\n")[0].splitlines()
+        kind += [line for line in first if line.partition(":")[0].strip() in fields]
+    return hashlib.sha256("\n".join(kind).encode()).hexdigest()[:16]
 
 
 def _processor() -> str:

@@ -159,7 +159,8 @@ class Detections:
     ``scores`` (K,) float32 in 0..1; ``names`` and ``captions`` one text each;
     ``crop_features`` (K, R, D) float32, L2-normalised, crop r at ``crop_ratios[r]``;
     ``global_feature`` (D,) float32, of the whole image; ``name_features`` (K, D) float32, of the names as texts, where
-    the method asked for them.
+    the method asked for them. ``score_scale``: ``published`` where scores mean what published thresholds were set for
+    (SAM's predicted IoU, a detector's confidence), ``own`` where they only order regions.
     """
 
     frame_index: int
@@ -172,6 +173,7 @@ class Detections:
     crop_features: Float32Array
     global_feature: Float32Array
     name_features: Float32Array | None = None
+    score_scale: Literal["published", "own"] = "published"
 
     def __post_init__(self) -> None:
         n = len(self.names)
@@ -200,7 +202,9 @@ class PerceptionNeeds:
     ``background_names`` or whose box covers more than ``max_box_fraction`` of the image are left out before any
     feature is computed. A crop is the region's box grown by ``crop_padding_px`` on every side, then scaled by a ratio
     about its centre, then clipped. ``name_features``: the names' text features too. ``true_proposals``: masks in 3D
-    made from the ground truth, which makes every number of the method a ceiling.
+    made from the ground truth, which makes every number of the method a ceiling. ``automatic`` and ``grounding`` name
+    the settings with which the method's own program makes class-agnostic and grounded masks, for profiles that have
+    its models; others pay them no heed.
     """
 
     masks: Literal["grounded", "class-agnostic", "none"] = "grounded"
@@ -211,6 +215,8 @@ class PerceptionNeeds:
     name_features: bool = False
     true_proposals: bool = False
     frames: bool = True
+    automatic: str = "sam"
+    grounding: str = "paper"
 
 
 @dataclass(frozen=True)
@@ -282,7 +288,8 @@ class Instances:
     ``scores`` (K,) float64; ``features`` (K, D) float32 where the method has features, ``labels`` one class name each
     where the method itself decides, '' for what it leaves to the feature; ``boxes`` (K, 2, 3) float32 axis-aligned
     minimum and maximum corners; ``centroids`` (K, 3) float32; ``views`` (V, 2) int32 rows (frame index, detection
-    index), those of instance k at ``view_indptr[k]:view_indptr[k + 1]``.
+    index), those of instance k at ``view_indptr[k]:view_indptr[k + 1]``; where the method keeps them, ``view_names``
+    and ``view_scores`` (V,) float64 are the names and prediction scores that perception gave in those views.
     """
 
     points: Float32Array
@@ -298,6 +305,8 @@ class Instances:
     view_indptr: Int64Array
     views: Int32Array
     ids: Int32Array = field(default_factory=lambda: np.zeros(0, np.int32))
+    view_names: tuple[str, ...] | None = None
+    view_scores: Float64Array | None = None
 
     def __post_init__(self) -> None:
         k = len(self.scores)
@@ -316,6 +325,9 @@ class Instances:
             raise PredictionError(f"instances: {k} masks and {len(self.features)} features")
         if self.labels is not None and len(self.labels) != k:
             raise PredictionError(f"instances: {k} masks and {len(self.labels)} labels")
+        for told in (self.view_names, self.view_scores):
+            if told is not None and len(told) != len(self.views):
+                raise PredictionError(f"instances: {len(self.views)} views and {len(told)} names or scores of views")
 
     def __len__(self) -> int:
         return len(self.scores)
@@ -397,7 +409,8 @@ class Method(Protocol):
 
     It may have ``receive_tools(tools: SceneTools)``, called before ``start``; ``n_points`` and ``n_instances``, the
     size of its map after an update; ``close()``, called when the prediction is written; ``caveat``, what must be said
-    beside its numbers; ``about``, a ``MethodAbout``.
+    beside its numbers; ``about``, a ``MethodAbout``; ``inputs``, digests of files outside the configuration that move
+    its numbers, by name; ``finish_costs``, numbers on the last ``finish`` that stand beside its time.
     """
 
     name: str

@@ -9,7 +9,20 @@ from collections.abc import Sequence
 from typing import Any
 
 from su3d_bench import __version__
-from su3d_bench.cli import attribute, compare, datasets, evaluate, export, methods, protocols, query, report, run
+from su3d_bench.cli import (
+    attribute,
+    check,
+    compare,
+    datasets,
+    evaluate,
+    export,
+    methods,
+    models,
+    protocols,
+    query,
+    report,
+    run,
+)
 from su3d_bench.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_WRONG_INPUT, ConfigError, Su3dError, suggest
 
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
@@ -56,7 +69,20 @@ def build_parser() -> Parser:
     )
     parser.add_argument("--version", action="version", version=f"su3d-bench {__version__}")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
-    for module in (run, evaluate, compare, attribute, report, query, datasets, methods, protocols, export):
+    for module in (
+        run,
+        evaluate,
+        check,
+        compare,
+        attribute,
+        report,
+        query,
+        datasets,
+        methods,
+        models,
+        protocols,
+        export,
+    ):
         module.add_parser(verbs)
     return parser
 

@@ -1,22 +1,25 @@
-"""``su3d-bench methods``: the methods that can be run, and their settings."""
+"""``su3d-bench methods``: the methods that can be run, where they come from, what they need, and their settings."""
 
 from __future__ import annotations
 
 import argparse
+import textwrap
 from typing import Any
 
 from su3d_bench.cli.flags import add_verb, answer, answer_json
+
+WIDTH = 118
 
 
 def add_parser(verbs: Any) -> None:
     parser = add_verb(
         verbs,
         "methods",
-        "List the methods that can be run; with a name, its settings and their defaults.",
+        "List the methods that can be run; with a name, its settings and what papers report of it.",
         ("su3d-bench methods", "su3d-bench methods opensu3d"),
         call,
     )
-    parser.add_argument("name", nargs="?", help="show the settings of this method")
+    parser.add_argument("name", nargs="?", help="show the settings of this method and its published figures")
 
 
 def call(arguments: argparse.Namespace) -> int:
@@ -24,13 +27,31 @@ def call(arguments: argparse.Namespace) -> int:
 
     if arguments.name is not None:
         return _show(arguments)
-    rows = [{"name": name, "summary": _summary(registry.load("method", name))} for name in registry.names("method")]
+    rows = [_about(name, registry.load("method", name)) for name in registry.names("method")]
     if arguments.json:
         answer_json(rows)
     else:
-        width = max(len(row["name"]) for row in rows)
-        answer("\n".join(f"{row['name']:<{width}}  {row['summary']}" for row in rows))
+        answer("\n\n".join("\n".join(_lines(row)) for row in rows))
     return 0
+
+
+def _about(name: str, method: Any) -> dict[str, Any]:
+    """What a list says of a method; a plug-in need not say more than its first sentence."""
+    row: dict[str, Any] = {"name": name, "summary": _summary(method)}
+    about = getattr(method, "about", None)
+    for field in ("paper", "source", "licence", "status"):
+        row[field] = getattr(about, field, None) or None
+    row["needs"] = list(getattr(about, "needs", ()))
+    return row
+
+
+def _lines(row: dict[str, Any]) -> list[str]:
+    lines = [f"{row['name']}  {row['summary']}"]
+    for field in ("paper", "source", "licence", "needs", "status"):
+        value = "; ".join(row[field]) if field == "needs" else row[field]
+        if value:
+            lines += textwrap.wrap(value, WIDTH, initial_indent=f"  {field:<9}", subsequent_indent=" " * 11)
+    return lines
 
 
 def _summary(method: Any) -> str:
@@ -40,17 +61,31 @@ def _summary(method: Any) -> str:
 def _show(arguments: argparse.Namespace) -> int:
     from su3d_bench import registry
     from su3d_bench.config import flatten
+    from su3d_bench.reports.published import figures_of
     from su3d_bench.toml_text import write_toml
 
     method = registry.load("method", arguments.name)
     defaults = method.Config().model_dump(mode="json")
+    row = _about(method.name, method)
+    figures = [figure.model_dump(mode="json", exclude_none=True) for figure in figures_of(method.name)]
     if arguments.json:
-        answer_json({"name": method.name, "summary": _summary(method), "settings": defaults})
+        answer_json({**row, "settings": defaults, "published": figures})
         return 0
     leaves = [(("method", method.name, *path), value, _remark(method, path)) for path, value in flatten(defaults)]
-    answer(f"# {_summary(method)}")
-    answer(write_toml(leaves) if leaves else f"# {method.name} has no settings")
+    answer("\n".join(f"# {line}" for line in _lines(row)))
+    answer("\n" + write_toml(leaves) if leaves else f"# {method.name} has no settings")
+    if figures:
+        answer("\n# as reported, each in its own set-up; no two need be comparable")
+        answer("\n".join(f"# {line}" for figure in figures for line in _figure_lines(figure)))
     return 0
+
+
+def _figure_lines(figure: dict[str, Any]) -> list[str]:
+    values = ", ".join(f"{name} {value}" for name, value in figure["values"].items())
+    row = f" [{figure['row']}]" if "row" in figure else ""
+    note = f"; {figure['note']}" if "note" in figure else ""
+    text = f"{values}{row}: {figure['source']}: {figure['setup']}{note}"
+    return textwrap.wrap(text, WIDTH, subsequent_indent="    ")
 
 
 def _remark(method: Any, path: tuple[str, ...]) -> str:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import argparse
+from types import ModuleType
 from typing import Any
 
-from su3d_bench.cli import report_tables, report_verify
+from su3d_bench.cli import report_timing
 
-# A sub-verb is a module with ``add_parser(actions)``; it is imported for --help too, so nothing heavy at its top.
-SUB_VERBS = (report_tables, report_verify)
+# Modules with ``NAME`` and ``add_parser(actions)``, imported for --help too, so with nothing heavy at their top.
+SUB_VERBS: tuple[ModuleType, ...] = (report_timing,)
 
 
 def add_parser(verbs: Any) -> None:

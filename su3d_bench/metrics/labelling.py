@@ -11,6 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from su3d_bench.errors import PredictionError
 from su3d_bench.protocols import ProtocolRules
+from su3d_bench.row_blocks import row_blocks
 from su3d_bench.types import BoolArray, Encoder, Float32Array, Float64Array, Int64Array, Prediction
 
 _BLOCK_ROWS = 8192  # 34 MB of float64 at 512 dimensions, whatever the size of the map
@@ -119,9 +120,8 @@ def most_similar(features: np.ndarray, text: np.ndarray) -> Int64Array:
     best = np.empty(len(features), np.int64)
     # one thread and blocks of one size: the last bit of a cosine may not depend on the machine's number of cores
     with threadpool_limits(1, user_api="blas"):
-        for start in range(0, len(features), _BLOCK_ROWS):
-            block = np.asarray(features[start : start + _BLOCK_ROWS], np.float64)
-            best[start : start + _BLOCK_ROWS] = (_normalised(block) @ directions.T).argmax(axis=1)
+        for rows, block in row_blocks(features, _BLOCK_ROWS):
+            best[rows] = (_normalised(np.asarray(block, np.float64)) @ directions.T).argmax(axis=1)
     return best
 
 

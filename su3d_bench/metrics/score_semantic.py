@@ -14,6 +14,7 @@ from su3d_bench.metrics.labelling import (
 )
 from su3d_bench.metrics.scene_score import SceneScore, n_predictions, present
 from su3d_bench.protocols import ProtocolRules
+from su3d_bench.row_blocks import row_blocks
 from su3d_bench.types import (
     BoolArray,
     DenseFeatures,
@@ -135,6 +136,6 @@ def point_owners(prediction: Prediction, takes_part: BoolArray) -> tuple[Int64Ar
 def has_feature(prediction: DenseFeatures) -> BoolArray:
     """Which points have a feature: those whose row is not all zero."""
     answer = np.empty(len(prediction.points), bool)
-    for start in range(0, len(answer), 65536):  # the table may be larger than memory
-        answer[start : start + 65536] = np.any(prediction.features[start : start + 65536], axis=1)
+    for rows, block in row_blocks(prediction.features, 65536):  # the table may be larger than memory
+        answer[rows] = np.any(block, axis=1)
     return answer

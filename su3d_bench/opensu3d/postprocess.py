@@ -128,6 +128,7 @@ def to_instances(
     described = [_described(segment, images, config) for segment in segments]
     boxes = [_box(points[segment.points]) for segment in segments]
     n_views = [len(segment.views) for segment in segments]
+    views = [(images[view.position], view.detection) for segment in segments for view in segment.views]
     dimension = len(images[0].global_feature) if images else 0
     return Instances(
         points=points[is_kept].astype(np.float32),
@@ -141,10 +142,10 @@ def to_instances(
         boxes=np.array(boxes, np.float32).reshape(len(segments), 2, 3),
         centroids=np.array([points[s.points].mean(axis=0) for s in segments], np.float32).reshape(len(segments), 3),
         view_indptr=_indptr(n_views),
-        views=np.array(
-            [(images[v.position].frame_index, v.detection) for segment in segments for v in segment.views], np.int32
-        ).reshape(sum(n_views), 2),
+        views=np.array([(image.frame_index, row) for image, row in views], np.int32).reshape(sum(n_views), 2),
         ids=np.array([segment.scene_id for segment in segments], np.int32),
+        view_names=tuple(image.names[row] for image, row in views),
+        view_scores=np.array([image.scores[row] for image, row in views], np.float64),
     )
 
 

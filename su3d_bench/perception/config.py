@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict
 
+from su3d_bench.perception.language.config import LanguageConfig
+from su3d_bench.perception.models.config import ModelsConfig
+from su3d_bench.perception.models.paper_config import PaperConfig
 from su3d_bench.perception.naming import NamingConfig
 from su3d_bench.perception.oracle import OracleConfig
 from su3d_bench.perception.segmenter import SegmenterConfig
@@ -19,4 +22,7 @@ class PerceptionConfig(BaseModel):
     naming: NamingConfig = NamingConfig()
     oracle: OracleConfig = OracleConfig()
     stored: StoredConfig = StoredConfig()
+    models: ModelsConfig = ModelsConfig()
+    paper: PaperConfig = PaperConfig()
+    language: LanguageConfig = LanguageConfig()
     cache: bool = True

@@ -70,6 +70,7 @@ class EmbeddedPerception:
             crop_features=self._features(frame, regions.boxes, kept, needs, best_fit, timer),
             global_feature=self._crops.whole(frame, timer),
             name_features=self._names.features(names, needs),
+            score_scale="own",
         )
 
     def _features(

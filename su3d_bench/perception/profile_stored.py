@@ -136,6 +136,7 @@ class LabelImagePerception:
             ),
             global_feature=self._crops.whole(frame, timer),
             name_features=self._names.features([names[k] for k in kept], needs),
+            score_scale="own",
         )
 
     def regions(self) -> RegionPerception:

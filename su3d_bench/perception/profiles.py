@@ -8,6 +8,7 @@ from typing import Protocol
 from su3d_bench.errors import ConfigError, suggest
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.config import PerceptionConfig
+from su3d_bench.perception.models.config import EMBEDDED
 from su3d_bench.perception.profile_embedded import CAMERA_CAVEAT, EmbeddedPerception
 from su3d_bench.perception.profile_oracle import ORACLE_CAVEAT, OraclePerception
 from su3d_bench.perception.profile_stored import STORED_CAVEAT, LabelImagePerception, StoredPerception
@@ -36,7 +37,9 @@ __all__ = [
     "resolve_profile",
 ]
 
-PROFILES = ("auto", "embedded", "oracle", "stored")
+PROFILES = ("auto", "embedded", "paper", "oracle", "stored")
+# Replies of vision models, below the cache's folder: a rerun asks nothing twice.
+REPLIES = "replies"
 
 
 class Perception(Protocol):
@@ -54,13 +57,22 @@ class Perception(Protocol):
         ...
 
 
-def resolve_profile(profile: str, image_domain: ImageDomain) -> str:
-    """The profile behind ``profile``: ``auto`` is ``embedded``, on images of either domain, until others exist."""
+def resolve_profile(profile: str, image_domain: ImageDomain, config: PerceptionConfig | None = None) -> str:
+    """The profile behind ``profile``: ``auto`` is ``paper`` on camera images where its models are here.
+
+    Elsewhere ``auto`` is ``embedded``: on rendered rooms, which its encoder was made for, and without ``config``.
+    """
     if profile not in PROFILES:
         raise ConfigError(
             f"unknown profile '{profile}'{suggest(profile, PROFILES) or '; known: ' + ', '.join(PROFILES)}"
         )
-    return "embedded" if profile == "auto" else profile
+    if profile != "auto":
+        return profile
+    if config is None or image_domain != "camera":
+        return "embedded"
+    from su3d_bench.perception.models.front_end import is_front_end_here
+
+    return "paper" if is_front_end_here(config.paper, config.models) else "embedded"
 
 
 def build_perception(
@@ -71,14 +83,20 @@ def build_perception(
     cache_root: Path,
     mesh: InstanceMesh | None,
     encoder: Encoder | None = None,
+    job_index: int = 0,
 ) -> Perception:
-    """Perception for one scene; ``mesh`` for the oracle alone; without ``encoder`` the embedded one is made."""
-    resolved = resolve_profile(profile, scene.image_domain)
-    if encoder is None:
-        from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
+    """Perception for one scene; ``mesh`` for the oracle alone.
 
-        encoder = EmbeddedEncoder()
+    Without ``encoder`` the configured one is loaded, or the profile's own; ``job_index`` chooses among several GPUs.
+    """
+    resolved = resolve_profile(profile, scene.image_domain, config)
     cache = FrameCache(cache_root if config.cache else None)
+    if encoder is None:
+        from su3d_bench.perception.models.front_end import PAPER_ENCODER
+        from su3d_bench.perception.models.loading import load_encoder
+
+        own = PAPER_ENCODER if resolved == "paper" else EMBEDDED
+        encoder = load_encoder(config.models, default=own, cache=cache, job_index=job_index)
     if resolved == "oracle":
         if mesh is None:
             raise ConfigError(f"{scene.dataset}/{scene.scene}: profile 'oracle' needs an annotated mesh, there is none")
@@ -90,4 +108,24 @@ def build_perception(
         if config.stored.images is not None:
             return LabelImagePerception(config, scene, encoder, cache)
         return StoredPerception(config.stored.folder, scene, encoder, cache)
+    if resolved == "paper":
+        return _paper(config, encoder, cache, cache_root, job_index)
     return EmbeddedPerception(config, scene, encoder, cache)
+
+
+def _paper(
+    config: PerceptionConfig, encoder: Encoder, cache: FrameCache, cache_root: Path, job_index: int
+) -> Perception:
+    from su3d_bench.perception.models.front_end import load_networks
+    from su3d_bench.perception.profile_paper import PaperPerception
+
+    captioner = None
+    if config.paper.captions == "model":
+        from su3d_bench.perception.language.captioner import Captioner
+        from su3d_bench.perception.language.client import ChatClient
+        from su3d_bench.perception.language.reply_store import ReplyStore
+
+        client = ChatClient(config.language, ReplyStore(cache_root / REPLIES))
+        captioner = Captioner(client, config.language)
+    networks = load_networks(config.paper, config.models, encoder, job_index)
+    return PaperPerception(config, networks, encoder, cache, captioner)

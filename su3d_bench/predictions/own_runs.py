@@ -13,11 +13,12 @@ from su3d_bench.errors import PredictionError
 from su3d_bench.plain_text import printable
 from su3d_bench.predictions.base import ScenePrediction, shown
 from su3d_bench.predictions.mask_arrays import kind_of, scene_file
-from su3d_bench.predictions.numpy_files import npz_names, read_npz
-from su3d_bench.store import prediction_from_arrays
+from su3d_bench.predictions.numpy_files import npy_header_of, npz_names, read_npz
+from su3d_bench.store import features_beside, prediction_from_arrays
 from su3d_bench.types import DenseFeatures, Partition, Prediction
 
 FILE = "prediction.npz"
+FLOATS = ("f2", "f4", "f8")
 # Dimensions and kinds of values of each field; see Instances, Partition and DenseFeatures.
 FIELDS = {
     "kind": (0, "U"),
@@ -58,6 +59,8 @@ class OwnRuns:
     def read(self, path: Path, scene: str) -> ScenePrediction:
         file = scene_file(_files(path), path, scene)
         arrays = read_npz(file)
+        if str(arrays.get("kind")) == DenseFeatures.__name__ and "features" not in arrays:
+            arrays["features"] = _mapped_features(features_beside(file))
         for name, array in arrays.items():
             _check_field(shown(file), name, array)
         points, indptr = arrays.get("points"), arrays.get("indptr")
@@ -71,6 +74,23 @@ class OwnRuns:
             raise PredictionError(f"{shown(file)}: {str(error).removeprefix(f'{shown(file)}: ')}") from error
         _check_points(shown(file), content)
         return ScenePrediction(scene, self.name, file, content)
+
+
+def _mapped_features(file: Path) -> NDArray[Any]:
+    """The features that lie beside a dense prediction, without reading them."""
+    header = npy_header_of(file)
+    if header is None or len(header.shape) != 2 or header.is_fortran or header.code.lstrip("<=") not in FLOATS:
+        raise PredictionError(f"{shown(file)}: no .npy table of features; copy it beside the prediction again")
+    n_rows, n_columns = header.shape
+    n_bytes = header.start + n_rows * n_columns * np.dtype(header.code).itemsize
+    if file.stat().st_size != n_bytes:
+        raise PredictionError(
+            f"{shown(file)}: {n_rows} rows of {n_columns} need {n_bytes} bytes, {file.stat().st_size} are there; copy "
+            "the file again"
+        )
+    if n_rows == 0 or n_columns == 0:
+        return np.zeros((n_rows, n_columns), np.dtype(header.code))
+    return np.memmap(file, np.dtype(header.code), "r", header.start, (n_rows, n_columns))
 
 
 def _check_field(where: str, name: str, array: NDArray[Any]) -> None:

@@ -1,0 +1,302 @@
+"""Any other program as a method: it is run once a scene, gets the frames in a folder, and leaves a prediction."""
+
+from __future__ import annotations
+
+import logging
+import os
+import re
+import shlex
+import shutil
+import tempfile
+import uuid
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Literal, Self
+
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+
+from su3d_bench.baselines.command_frames import ColourFormat, FrameFolder
+from su3d_bench.baselines.command_prediction import as_prediction, class_names, needs_classes, read_output
+from su3d_bench.baselines.command_process import ContainerWatch, Finished, TreeWatch, Watch, run_program
+from su3d_bench.digests import digest_file
+from su3d_bench.errors import ConfigError, DataError, PredictionError, Su3dError
+from su3d_bench.plain_text import printable
+from su3d_bench.predictions.formats import READERS
+from su3d_bench.types import (
+    Detections,
+    Frame,
+    MethodAbout,
+    PerceptionNeeds,
+    Prediction,
+    SceneInfo,
+    SceneTools,
+    StageTimer,
+    Surface,
+)
+
+logger = logging.getLogger(__name__)
+logger.setLevel(logging.INFO)  # what a program prints goes to the log of its scene
+
+Text = Annotated[str, Field(min_length=1)]
+Name = Annotated[str, Field(pattern=r"^([^-\s]\S*)?$")]  # no option in the place of a name
+# What a program finds in its environment unless more is allowed: enough to start it, no credentials.
+ENVIRONMENT = ("PATH", "HOME", "LANG", "LC_ALL", "TZ", "CUDA_VISIBLE_DEVICES", "LD_LIBRARY_PATH")
+INSIDE = {"frames": "/su3d/frames", "output": "/su3d/output", "work": "/su3d/work"}  # of a container
+PLACEHOLDER = re.compile(r"\{(\w*)\}")
+PLACEHOLDERS = ("frames", "output", "scene", "dataset", "seed")
+MOUNT = re.compile(r"(?P<here>/[^:]*):(?P<there>/[^:]*)")
+STOP_S = 60.0  # for `docker kill`
+
+
+class CommandConfig(BaseModel):
+    """What is run and where; docs/command-method.md says it with examples.
+
+    - ``command``: words, or one line that is split as a shell splits it; {frames}, {output}, {scene}, {dataset} and
+      {seed} stand for themselves in either. ``shell``: the line goes to /bin/sh instead
+    - ``runner``: plain, docker (with ``image``, ``gpus`` as docker has them, ``network``) or conda (with
+      ``environment``, a name or a folder). ``mounts``: more folders for the container, HERE:THERE, read-only
+    - ``pass_variables``: the environment variables that the program gets, of those that are set
+    - ``format``: of the prediction, where it cannot be recognised; ``classes_of``: the protocol whose class numbers the
+      program writes, where the dataset has several lists
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    command: tuple[Text, ...] | str = ()
+    shell: bool = False
+    runner: Literal["plain", "docker", "conda"] = "plain"
+    image: Name = ""
+    gpus: str = ""
+    network: bool = False
+    environment: Name = ""
+    mounts: tuple[str, ...] = ()
+    pass_variables: tuple[Annotated[str, Field(pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")], ...] = ENVIRONMENT
+    timeout_s: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 3600.0
+    format: str | None = None
+    classes_of: str | None = None
+    colour: ColourFormat = "png"
+    stride: Annotated[int, Field(ge=1)] = 1
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> Self:
+        if self.shell and not isinstance(self.command, str):
+            raise ValueError("shell = true takes the command as one line; a list of words needs no shell")
+        unknown = [name for word in self.words for name in PLACEHOLDER.findall(word) if name and name not in INSIDE]
+        unknown = [name for name in unknown if name not in PLACEHOLDERS]
+        if unknown and not self.shell:  # a shell has braces of its own
+            raise ValueError(f"'{{{unknown[0]}}}' stands for nothing; known: {{{'}, {'.join(PLACEHOLDERS)}}}")
+        needed = {"docker": ("image", self.image), "conda": ("environment", self.environment)}.get(self.runner)
+        if needed is not None and not needed[1]:
+            raise ValueError(f"runner '{self.runner}' needs {needed[0]}")
+        if (self.image or self.mounts or self.gpus or self.network) and self.runner != "docker":
+            raise ValueError("image, mounts, gpus and network belong to runner 'docker'")
+        if self.environment and self.runner != "conda":
+            raise ValueError("environment belongs to runner 'conda'")
+        for mount in self.mounts:
+            if not MOUNT.fullmatch(mount):
+                raise ValueError(f"mount '{mount}' is not HERE:THERE with two absolute paths")
+        if self.format is not None and self.format not in READERS:
+            raise ValueError(f"unknown format '{self.format}'; known: {', '.join(READERS)}")
+        return self
+
+    @property
+    def words(self) -> tuple[str, ...]:
+        """The command as the program gets it, placeholders unfilled."""
+        if not isinstance(self.command, str):
+            return self.command
+        return ("/bin/sh", "-c", self.command) if self.shell and self.command else tuple(shlex.split(self.command))
+
+
+class Command:
+    """Runs a program of yours once a scene: frames in a folder, a prediction in any format that evaluate reads."""
+
+    name = "command"
+    Config = CommandConfig
+    about = MethodAbout(
+        paper="",
+        source="",
+        licence="that of the program",
+        needs=("a program of yours", "docker or conda where it is run there"),
+        status="hands over frames and reads predictions as tests of both ways show; vouches for no program",
+    )
+
+    def __init__(self, config: CommandConfig | None = None) -> None:
+        self.config = config or CommandConfig()
+        if not self.config.words:
+            raise ConfigError(
+                "method 'command': no program is named; --set 'command.command=[\"run.sh\", \"{frames}\"]'"
+            )
+        self._tools: SceneTools | None = None
+        self._scene: SceneInfo | None = None
+        self._frames: FrameFolder | None = None
+        self._surface: Surface | None = None
+        self._root: Path | None = None
+        self._costs: dict[str, float | int] = {}
+
+    @property
+    def needs(self) -> PerceptionNeeds:
+        """Frames alone: the program has its own perception."""
+        return PerceptionNeeds(masks="none")
+
+    @property
+    def inputs(self) -> Mapping[str, str]:
+        """Digest of each file that the command names, so that another version of a program is another run."""
+        if self.config.runner == "docker":
+            return {}  # its words are files of the image
+        words = shlex.split(self.config.command) if isinstance(self.config.command, str) else self.config.command
+        files = {word: _program_file(word) for word in words}
+        return {f"file {word}": digest_file(path) for word, path in files.items() if path is not None}
+
+    @property
+    def finish_costs(self) -> Mapping[str, float | int]:
+        """What the last run of the program took: ``program_s`` and, where it was measured, ``program_peak_bytes``."""
+        return self._costs
+
+    def receive_tools(self, tools: SceneTools) -> None:
+        self._tools = tools
+
+    def start(self, scene: SceneInfo) -> None:
+        self.close()
+        self._scene, self._surface = scene, None
+        if self._tools is not None:
+            try:
+                self._surface = self._tools.surface()
+            except DataError as error:
+                logger.info("no mesh.ply for the program: %s", error)
+        self._root = Path(tempfile.mkdtemp(prefix="su3d-command-"))
+        self._frames = FrameFolder(self._root / "frames", scene, self.config.colour, self._surface)
+        self._frames.open()
+
+    def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
+        """Adds the frame to the folder; the program runs when the map is asked for."""
+        assert self._frames is not None, "update before start"
+        with timer.stage("export"):
+            self._frames.add(frame)
+
+    def finish(self) -> Prediction:
+        """What the program makes of the frames so far."""
+        assert self._frames is not None and self._root is not None and self._scene is not None, "finish before start"
+        self._frames.close()
+        where = f"{self._scene.dataset}/{self._scene.scene}: command"
+        folders = {name: self._root / name for name in INSIDE}
+        for name in ("output", "work"):
+            shutil.rmtree(folders[name], ignore_errors=True)
+            folders[name].mkdir()
+        try:
+            self._run(folders)
+            prediction = read_output(folders["output"], self._scene.scene, self.config.format)
+            for remark in prediction.remarks:
+                logger.warning("%s", printable(remark))
+            content = prediction.content
+            names = None
+            if needs_classes(content):
+                names = class_names(content, self._scene.dataset, self.config.classes_of)
+            return as_prediction(content, self._surface, names)
+        except Su3dError as error:
+            text = str(error).replace(str(folders["output"]), "{output}")
+            raise PredictionError(f"{where}: {text}") from error
+
+    def close(self) -> None:
+        """Remove the folders that the program worked in."""
+        if self._root is not None:
+            shutil.rmtree(self._root, ignore_errors=True)
+        self._root = self._frames = None
+
+    def __del__(self) -> None:
+        if getattr(self, "_root", None) is not None:
+            self.close()
+
+    def _run(self, folders: Mapping[str, Path]) -> None:
+        container = f"su3d-{uuid.uuid4().hex[:16]}" if self.config.runner == "docker" else None
+        words = self._filled({name: INSIDE[name] if container else str(path) for name, path in folders.items()})
+        id_file = folders["frames"].parent / "container"
+        id_file.unlink(missing_ok=True)
+        if container is not None:
+            words = [*self._docker_words(container, id_file, folders), *words]
+        elif self.config.runner == "conda":
+            kind = "--prefix" if "/" in self.config.environment else "--name"
+            words = ["conda", "run", "--no-capture-output", kind, self.config.environment, *words]
+        environment = {name: os.environ[name] for name in self.config.pass_variables if name in os.environ}
+        logger.info("program: %s", printable(shlex.join(words)))
+
+        def watch_of(pid: int) -> Watch:
+            return TreeWatch(pid) if container is None else ContainerWatch(container, id_file, self._end_container)
+
+        done = run_program(
+            words,
+            folder=folders["work"],
+            environment=environment,
+            timeout_s=self.config.timeout_s,
+            watch_of=watch_of,
+        )
+        self._record(done)
+        last = _last_line(done.stderr)
+        if done.is_timed_out:
+            raise PredictionError(f"was ended after {self.config.timeout_s:g} s (timeout_s){last}")
+        if done.exit_code != 0:
+            how = f"exit code {done.exit_code}" if done.exit_code > 0 else f"was ended by signal {-done.exit_code}"
+            raise PredictionError(f"{how}{last}")
+
+    def _filled(self, folders: Mapping[str, str]) -> list[str]:
+        assert self._scene is not None
+        values = {"scene": self._scene.scene, "dataset": self._scene.dataset, "seed": str(self._scene.seed), **folders}
+        if self.config.shell:  # scenes have names that a shell might take for more
+            values = {name: shlex.quote(value) for name, value in values.items()}
+        words = [PLACEHOLDER.sub(lambda match: values.get(match[1], match[0]), word) for word in self.config.words]
+        if self.config.runner == "docker":
+            return words
+        # The program runs in a folder of its own: files that were named from here must be found from there.
+        return [str(path.absolute()) if "/" in w and (path := Path(w)).is_file() else w for w in words]
+
+    def _docker_words(self, container: str, id_file: Path, folders: Mapping[str, Path]) -> list[str]:
+        mounts = [
+            f"{folders['frames']}:{INSIDE['frames']}:ro",
+            f"{folders['output']}:{INSIDE['output']}",
+            f"{folders['work']}:{INSIDE['work']}",
+            *(f"{mount}:ro" for mount in self.config.mounts),
+        ]
+        words = ["docker", "run", "--rm", "--init", "--name", container, "--cidfile", str(id_file)]
+        words += ["--user", f"{os.getuid()}:{os.getgid()}", "--workdir", INSIDE["work"]]
+        words += [] if self.config.network else ["--network", "none"]
+        words += ["--gpus", self.config.gpus] if self.config.gpus else []
+        for mount in mounts:
+            words += ["--volume", mount]
+        for name in self.config.pass_variables:
+            if name in os.environ and name not in ENVIRONMENT:  # the container has a PATH and a HOME of its own
+                words += ["--env", name]
+        return [*words, self.config.image]
+
+    def _end_container(self, container: str) -> None:
+        environment = {name: os.environ[name] for name in self.config.pass_variables if name in os.environ}
+        # `docker run` may end before its container does: ending the client is not enough.
+        run_program(["docker", "kill", container], folder=Path("/"), environment=environment, timeout_s=STOP_S)
+
+    def _record(self, done: Finished) -> None:
+        self._costs = {"program_s": round(done.wall_s, 3)}
+        memory = f"peak memory {done.memory_source}"
+        if done.peak_memory_bytes is not None:
+            self._costs["program_peak_bytes"] = done.peak_memory_bytes
+            memory = f"peak memory {done.peak_memory_bytes / 2**20:.0f} MiB ({done.memory_source})"
+        logger.info("the program took %.1f s, %s", done.wall_s, memory)
+        for name, text in (("stdout", done.stdout), ("stderr", done.stderr)):
+            for line in text.splitlines():
+                logger.info("%s: %s", name, printable(line, 2000))
+
+
+def _program_file(word: str) -> Path | None:
+    """The file that a word of the command names, if it names one; a bare name is looked for as the system does."""
+    if PLACEHOLDER.search(word):
+        return None
+    path = Path(word).expanduser()
+    if not path.is_file() and "/" not in word:
+        found = shutil.which(word)
+        path = Path(found) if found else path
+    try:
+        return path if path.is_file() else None
+    except OSError:
+        return None
+
+
+def _last_line(stderr: str) -> str:
+    lines = [line for line in map(printable, stderr.splitlines()) if line]
+    return f"; its last line: {lines[-1][:200]}" if lines else "; it wrote nothing to stderr"

@@ -1,0 +1,137 @@
+"""What a program left in its output folder as a map: points of its own, or masks over the scan's vertices."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from su3d_bench.errors import PredictionError
+from su3d_bench.metrics.transfer import masks_of_partition
+from su3d_bench.plain_text import printable
+from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
+from su3d_bench.predictions.formats import recognise
+from su3d_bench.protocols import load_protocol, protocols_for
+from su3d_bench.types import Instances, Prediction, Surface
+
+
+def read_output(folder: Path, scene: str, format: str | None) -> ScenePrediction:
+    """The only prediction in ``folder``, or the one of ``scene`` where there are several."""
+    files = [one for one in folder.iterdir() if not one.name.startswith(".")]
+    if not files:
+        raise PredictionError("it ended without an error and left nothing in {output}")
+    reader = recognise(folder, format)
+    names = list(reader.scenes(folder))
+    if not names:
+        raise PredictionError(f"what it left in {{output}} has no prediction in the format {reader.name}")
+    if len(names) > 1 and scene not in names:
+        shown = printable(", ".join(names[:4]), 200)
+        raise PredictionError(f"it left predictions of {len(names)} scenes ({shown}), none of them '{scene}'")
+    return reader.read(folder, scene if scene in names else names[0])
+
+
+@dataclass(frozen=True)
+class ClassNames:
+    """What class numbers mean: as ids of the label space, and as places in the list of the scored classes."""
+
+    by_id: Mapping[int, str]
+    by_place: Mapping[int, str]
+
+
+def as_prediction(content: Content, surface: Surface | None, names: ClassNames | None) -> Prediction:
+    """``content`` as a map; masks and labels without points stand on the vertices of ``surface``.
+
+    ``names`` are those of the class numbers of such masks, needed where there are any.
+    """
+    if not isinstance(content, VertexMasks | VertexLabels):
+        return content
+    if surface is None:
+        raise PredictionError(
+            "its masks have no points of their own and the dataset has no mesh; write points too, in another format"
+        )
+    n = len(surface.vertices)
+    n_said = len(content.class_ids) if isinstance(content, VertexLabels) else content.n_points
+    if n_said not in {None, n}:
+        raise PredictionError(f"its masks are over {n_said} points, the mesh has {n} vertices; they must be the same")
+    masks = _masks_of_labels(content) if isinstance(content, VertexLabels) else content
+    k = len(masks)
+    return Instances(
+        points=surface.vertices,
+        indptr=masks.indptr,
+        indices=masks.indices,
+        scores=masks.scores,
+        features=masks.features,
+        labels=_labels(masks, names),
+        names=tuple(printable(key, 200) for key in masks.keys),
+        captions=("",) * k,
+        boxes=np.array([_box(surface, masks, i) for i in range(k)], np.float32).reshape(k, 2, 3),
+        centroids=np.array([_centroid(surface, masks, i) for i in range(k)], np.float32).reshape(k, 3),
+        view_indptr=np.zeros(k + 1, np.int64),
+        views=np.zeros((0, 2), np.int32),
+        ids=np.arange(1, k + 1, dtype=np.int32),
+    )
+
+
+def _masks_of_labels(content: VertexLabels) -> VertexMasks:
+    """One mask a class; ids of 0 and below are no class."""
+    distinct, row = np.unique(content.class_ids, return_inverse=True)
+    masks = masks_of_partition(row, len(distinct))
+    is_class = distinct > 0
+    parts = [masks.indices[masks.indptr[i] : masks.indptr[i + 1]] for i in np.flatnonzero(is_class)]
+    kept = distinct[is_class].astype(np.int32)
+    return VertexMasks(
+        n_points=len(content.class_ids),
+        indptr=np.cumsum([0, *(len(part) for part in parts)]).astype(np.int64),
+        indices=np.concatenate([np.zeros(0, np.int32), *parts]).astype(np.int32),
+        scores=np.ones(len(kept)),
+        class_numbers=kept,
+        numbering="id",
+        features=None,
+        keys=tuple(f"class {one}" for one in kept),
+    )
+
+
+def _labels(masks: VertexMasks, names: ClassNames | None) -> tuple[str, ...] | None:
+    if masks.class_numbers is None:
+        return None
+    assert names is not None, "whoever asks for labels has found the classes"
+    told = names.by_place if masks.numbering == "index" else names.by_id
+    return tuple(told.get(number, f"class {number}") for number in masks.class_numbers.tolist())
+
+
+def needs_classes(content: Content) -> bool:
+    """Whether the prediction has class numbers, which need a list of classes to become names."""
+    return isinstance(content, VertexLabels) or (
+        isinstance(content, VertexMasks) and content.class_numbers is not None and len(content) > 0
+    )
+
+
+def class_names(content: Content, dataset: str, protocol: str | None) -> ClassNames:
+    """The names of the class numbers of ``content``: in ``protocol``, else in all that score the dataset by default.
+
+    Raises ``PredictionError`` where these give one number different names.
+    """
+    own = [load_protocol(protocol)] if protocol is not None else list(map(load_protocol, protocols_for(dataset)))
+    own = [rules for rules in own if rules.classes]
+    numbering = content.numbering if isinstance(content, VertexMasks) else "id"
+    lists = [[(entry.id, entry.name) for entry in rules.classes] for rules in own]
+    if numbering == "index":
+        scored = dict.fromkeys(tuple(entry.name for entry in rules.scored) for rules in own if rules.kind == "instance")
+        lists = [list(enumerate(names)) for names in scored]
+    pairs = {pair for one in lists for pair in one}
+    if not pairs or len(pairs) > len({number for number, _ in pairs}):
+        known = ", ".join(rules.name for rules in own) or "any that has classes"
+        raise PredictionError(f"whose are its class numbers? name a protocol in classes_of (known: {known})")
+    return ClassNames(dict(pairs), {}) if numbering == "id" else ClassNames({}, dict(pairs))
+
+
+def _box(surface: Surface, masks: VertexMasks, k: int) -> np.ndarray:
+    points = surface.vertices[masks.mask(k)]
+    return np.zeros((2, 3)) if not len(points) else np.array([points.min(axis=0), points.max(axis=0)])
+
+
+def _centroid(surface: Surface, masks: VertexMasks, k: int) -> np.ndarray:
+    points = surface.vertices[masks.mask(k)]
+    return np.zeros(3) if not len(points) else points.mean(axis=0, dtype=np.float64)

@@ -1,0 +1,190 @@
+"""ConceptFusion: pixel-aligned features of image and regions, fused into points; a feature a point, no instances."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from su3d_bench.baselines.feature_table import FeatureTable, Place, has_any_channel, has_no_zero_channel
+from su3d_bench.baselines.pixel_features import (
+    Overlaps,
+    PixelFeatures,
+    Weights,
+    mixed_features,
+    mixing_weights,
+    paint,
+    picked,
+)
+from su3d_bench.baselines.point_fusion import ABSENT, PointFusion, View, view_of
+from su3d_bench.errors import DataError
+from su3d_bench.types import (
+    DenseFeatures,
+    Detections,
+    Frame,
+    Int64Array,
+    MethodAbout,
+    PerceptionNeeds,
+    SceneInfo,
+    StageTimer,
+)
+
+Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+VALID = {"no-zero-channel": has_no_zero_channel, "any-channel": has_any_channel}
+PAPER = "Jatavallabhula et al.: ConceptFusion: Open-set Multimodal 3D Mapping, RSS 2023"
+SOURCE = (
+    "https://github.com/concept-fusion/concept-fusion, commit 4457c1f (its branch fastsam: 668c26c); "
+    "https://github.com/gradslam/gradslam, branch conceptfusion, commit 59ca872"
+)
+LICENCE = "MIT (concept-fusion and gradslam)"
+STATUS = (
+    "each formula of the released code and of the paper is tested on hand-worked values; never run beside the "
+    "original, and no figure of a paper has been reproduced"
+)
+
+
+class ConceptFusionConfig(BaseModel):
+    """Every hyper-parameter; the defaults are the released scripts' where a comment says nothing else."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+    stride: int = Field(default=20, ge=1)
+    # The size at which pixels are fused, whatever the images' own: image_height and image_width of the fusion script.
+    height: int = Field(default=120, ge=2, le=4096)
+    width: int = Field(default=160, ge=2, le=4096)
+    # The paper's Eq. 4: its README says that masks like Mask2Former's need it and that SAM's do without.
+    weights: Weights = "uniqueness"
+    temperature: Positive = 1.0
+    # "small-over-large" is that of the branch fastsam.
+    overlaps: Overlaps = "sum"
+    # gradslam at 59ca872 averages a feature only where no channel is zero, which its own remark (and forks) take for
+    # "where not all are": "any-channel".
+    valid_features: Literal["no-zero-channel", "any-channel"] = "no-zero-channel"
+    distance_m: Positive = 0.05  # PointFusion's dist_th
+    normal_angle_deg: float = Field(default=20.0, ge=0, le=180)  # angle_th
+    sigma: Positive = 0.6  # m, of alpha
+    # Ours: the same numbers from memory or from a file; a scene of 2 M points x 1024 dimensions is 4.1 GB.
+    features_in: Place = "disk"
+
+
+class ConceptFusion:
+    """Pixel features from masks of named objects, fused into one feature a point; it has no instances."""
+
+    name = "conceptfusion"
+    Config: type[ConceptFusionConfig] = ConceptFusionConfig
+    about = MethodAbout(
+        paper=PAPER,
+        source=f"{SOURCE}; masks of Mask2Former and the uniqueness term are the paper's alone",
+        licence=LICENCE,
+        needs=("masks of named objects",),
+        status=STATUS,
+    )
+
+    def __init__(self, config: ConceptFusionConfig | None = None) -> None:
+        self.config = config or self.Config()
+        self._features: FeatureTable | None = None
+        self._clear()
+
+    def _clear(self) -> None:
+        self.close()
+        self._features = None
+        self._map = PointFusion(self.config.distance_m, self.config.normal_angle_deg)
+
+    @property
+    def needs(self) -> PerceptionNeeds:
+        """Masks of named objects and surfaces, background too, as Mask2Former gives them in the paper.
+
+        ConceptGraphs' table tells the two apart so: its ConceptFusion+SAM has SAM in Mask2Former's place.
+        """
+        return PerceptionNeeds(masks="grounded")
+
+    @property
+    def n_points(self) -> int:
+        """Points of the map so far, those without a feature included."""
+        return len(self._map)
+
+    @property
+    def map_bytes(self) -> int:
+        """What points, normals, counts and features take, wherever they lie."""
+        features = self._features
+        return self._map.n_bytes + (features.n_bytes + len(features) * 8 if features else 0)
+
+    def start(self, scene: SceneInfo) -> None:
+        """Forgets the scene before; of the new one nothing needs to be known."""
+        self._clear()
+        _warm_up()
+
+    def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
+        """Fuses one image into the map; the association goes over the whole map, the rest over the image."""
+        if detections.frame_index != frame.index:
+            raise DataError(f"frame {frame.index}: the detections are those of frame {detections.frame_index}")
+        features = self._table_for(detections)
+        with timer.stage("backproject"):
+            view = self._view(frame)
+        with timer.stage("paint"):
+            field = self._field(frame, detections)
+        with timer.stage("match"):
+            matched = self._map.associate(view)
+        with timer.stage("fuse"):
+            self._map.fuse(view, matched)
+            self._average(features, view, field, matched)
+        with timer.stage("insert"):
+            pixel = self._map.insert(view, matched)
+            # a pixel of no mask makes a point too: its feature is zero, its confidence that of any other
+            features.append(field.features, field.row.ravel()[pixel], view.alpha[pixel])
+
+    def _table_for(self, detections: Detections) -> FeatureTable:
+        n_dimensions = len(detections.global_feature)
+        if self._features is None:
+            self._features = FeatureTable(n_dimensions, self.config.features_in)
+        if self._features.n_dimensions != n_dimensions:
+            raise DataError(
+                f"frame {detections.frame_index}: features have {n_dimensions} dimensions, those of the map have "
+                f"{self._features.n_dimensions}; make all with one encoder"
+            )
+        return self._features
+
+    def _view(self, frame: Frame) -> View:
+        n_rows, n_columns = frame.depth_m.shape
+        return view_of(
+            frame, picked(n_rows, self.config.height), picked(n_columns, self.config.width), self.config.sigma
+        )
+
+    def _field(self, frame: Frame, detections: Detections) -> PixelFeatures:
+        if len(detections) and detections.masks.shape[1:] != frame.depth_m.shape:
+            (rows, columns), (height, width) = detections.masks.shape[1:], frame.depth_m.shape
+            raise DataError(f"frame {frame.index}: masks are {columns}x{rows} and the image is {width}x{height}")
+        config, whole, regions = self.config, detections.global_feature, detections.crop_features[:, 0]
+        mixed = np.zeros((0, len(whole)))
+        if len(regions):
+            weights = mixing_weights(whole, regions, config.weights, config.temperature)
+            mixed = mixed_features(whole, regions, weights)
+        return paint(detections.masks, detections.boxes, mixed, config.overlaps, config.height, config.width)
+
+    def _average(self, features: FeatureTable, view: View, field: PixelFeatures, matched: Int64Array) -> None:
+        is_valid = VALID[self.config.valid_features](field.features)
+        pixel = np.flatnonzero((matched != ABSENT) & is_valid[field.row.ravel()])
+        features.average(matched[pixel], field.features, field.row.ravel()[pixel], view.alpha[pixel])
+
+    def finish(self) -> DenseFeatures:
+        """The points so far, each with its feature, zero for none; features are a view until the next update."""
+        features = np.zeros((0, 0), np.float16) if self._features is None else self._features.features()
+        return DenseFeatures(self._map.points.astype(np.float32), features)
+
+    def close(self) -> None:
+        """Give the features' disk space back; the map cannot be updated after that."""
+        if self._features is not None:
+            self._features.close()
+
+
+@cache
+def _warm_up() -> None:
+    """Fuses a made-up image twice, so that no timed step waits for a compiler."""
+    intrinsics = np.array([[2.0, 0, 0.5], [0, 2.0, 0.5], [0, 0, 1]])
+    frame = Frame(0, 0.0, np.zeros((2, 2, 3), np.uint8), np.ones((2, 2), np.float32), np.eye(4), intrinsics)
+    scratch = PointFusion(0.05, 20.0)
+    for _ in range(2):
+        view = view_of(frame, picked(2, 2), picked(2, 2), 0.6)
+        scratch.insert(view, scratch.associate(view))

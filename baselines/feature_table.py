@@ -1,0 +1,155 @@
+"""A table of one feature a point in half precision that grows and is averaged in place, in memory or on disk."""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from pathlib import Path
+from typing import IO, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.errors import StoreError
+from su3d_bench.row_blocks import release_pages
+from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
+
+Place = Literal["memory", "disk"]
+HalfArray = NDArray[np.float16]
+BLOCK_ROWS = 4096  # 16 MB of float32 at 1024 dimensions
+
+
+class FeatureTable:
+    """Features (N, D) float16 and the confidence of each.
+
+    On disk they lie in a file without a name, which is gone with the process, however that ends. Both places do the
+    same arithmetic: a block in float32, rounded to half precision once an update.
+    """
+
+    def __init__(self, n_dimensions: int, place: Place) -> None:
+        self.n_dimensions = n_dimensions
+        self._file: IO[bytes] | None = _nameless_file() if place == "disk" else None
+        self._held = np.empty((0, n_dimensions), np.float16)
+        self._confidences = np.empty(0)
+        self._n = 0
+
+    def __len__(self) -> int:
+        return self._n
+
+    @property
+    def n_bytes(self) -> int:
+        """What the features take."""
+        return self._n * self.n_dimensions * 2
+
+    @property
+    def confidences(self) -> Float64Array:
+        """Confidence (N,) of each feature; a view."""
+        return self._confidences[: self._n]
+
+    def append(self, features: HalfArray, row: Int32Array, confidences: Float64Array) -> None:
+        """Add ``features[row]`` with their ``confidences``, zero rows included."""
+        end = self._n + len(row)
+        self._confidences = _with_room(self._confidences, self._n, end)
+        self._confidences[self._n : end] = confidences
+        if self._file is None:
+            self._held = _with_room(self._held, self._n, end)
+        for start in range(0, len(row), BLOCK_ROWS):
+            block = features[row[start : start + BLOCK_ROWS]]
+            if self._file is None:
+                self._held[self._n + start : self._n + start + len(block)] = block
+            else:
+                self._write(block, self._n + start)
+        self._n = end
+
+    def _write(self, block: HalfArray, first_row: int) -> None:
+        # A plain write fails where the disk is full; writing through a map of a sparse file would end the process.
+        assert self._file is not None
+        try:
+            self._file.seek(first_row * self.n_dimensions * 2)
+            self._file.write(block.tobytes())
+            self._file.flush()
+        except OSError as error:
+            raise _disk_error(error) from error
+
+    def average(self, point: Int64Array, features: HalfArray, row: Int32Array, weights: Float64Array) -> None:
+        """Running mean of ``features[row]`` with ``weights`` into the features of ``point``, each named once.
+
+        f <- (c f + w e) / (c + w), c <- c + w; the mean is not normalised.
+        """
+        if not len(point):
+            return
+        order = np.argsort(point, kind="stable")  # neighbours in the file are read together
+        table = self._mapped("r+") if self._file is not None else self._held
+        for start in range(0, len(order), BLOCK_ROWS):
+            chosen = order[start : start + BLOCK_ROWS]
+            of_point = point[chosen]
+            held, added = self._confidences[of_point], weights[chosen]
+            share: Float32Array = (added / (held + added)).astype(np.float32)[:, None]
+            before: Float32Array = table[of_point].astype(np.float32)
+            table[of_point] = (np.float32(1) - share) * before + share * features[row[chosen]].astype(np.float32)
+            self._confidences[of_point] = held + added
+            release_pages(table)
+
+    def _mapped(self, mode: Literal["r", "r+"]) -> HalfArray:
+        # mapped anew at each use, for the file grows between them
+        assert self._file is not None
+        return np.memmap(self._file, np.float16, mode, shape=(self._n, self.n_dimensions))
+
+    def features(self) -> HalfArray:
+        """The features (N, D), read-only: a view of the table, whose rows move with the next ``average``."""
+        if self._file is not None and self.n_bytes:
+            return self._mapped("r")
+        view = self._held[: self._n].view()
+        view.flags.writeable = False
+        return view
+
+    def close(self) -> None:
+        """Give the disk space back; a view that is still held keeps it until it goes."""
+        if self._file is not None:
+            self._file.close()
+
+
+def has_no_zero_channel(features: HalfArray) -> BoolArray:
+    """Which rows (C,) have no channel that is exactly zero."""
+    answer: BoolArray = (features != 0).all(axis=1)
+    return answer
+
+
+def has_any_channel(features: HalfArray) -> BoolArray:
+    """Which rows (C,) are not all zero."""
+    answer: BoolArray = (features != 0).any(axis=1)
+    return answer
+
+
+def scratch_folder() -> Path:
+    """Where large temporary files go: TMPDIR, else /var/tmp, else what Python finds.
+
+    /tmp is memory on many systems; /var/tmp is not (Filesystem Hierarchy Standard 5.15).
+    """
+    if not os.environ.get("TMPDIR") and os.access("/var/tmp", os.W_OK):
+        return Path("/var/tmp")
+    return Path(tempfile.gettempdir())
+
+
+def _nameless_file() -> IO[bytes]:
+    try:
+        file: IO[bytes] = tempfile.TemporaryFile(dir=scratch_folder())  # noqa: SIM115  (closed by the table)
+    except OSError as error:
+        raise _disk_error(error) from error
+    return file
+
+
+def _disk_error(error: OSError) -> StoreError:
+    return StoreError(
+        f"cannot write features to {scratch_folder()}: {error.strerror or error}; set TMPDIR to a larger disk, or "
+        "features_in = 'memory'"
+    )
+
+
+def _with_room(array: NDArray[Any], used: int, needed: int) -> NDArray[Any]:
+    """``array`` with room for ``needed`` rows, growing by a half so that appending stays cheap."""
+    if needed <= len(array):
+        return array
+    larger = np.empty((max(needed, len(array) * 3 // 2), *array.shape[1:]), array.dtype)
+    larger[:used] = array[:used]
+    return larger

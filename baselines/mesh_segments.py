@@ -1,0 +1,33 @@
+"""Over-segmentation of a mesh by the bends of its surface, as ScanNet's segments (``.segs.json``) are made.
+
+Felzenszwalb and Huttenlocher's graph segmentation on smoothed normals, in the arithmetic of ScanNet's program
+(Segmentator/segmentator.cpp at commit b38b278): single precision throughout, an unstable sort whose order of equal
+weights decides where segments end, segment ids that are the vertices at the roots of its forest. The sort is that of
+GNU's C++ library; a program built with another library orders equal weights otherwise and may give other segments.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from su3d_bench.types import Float32Array, Int32Array
+
+THRESHOLD = 0.01  # kThresh of the released .segs.json files
+MIN_VERTICES = 20  # segMinVerts of the released files
+
+
+def mesh_segments(
+    vertices: Float32Array, triangles: Int32Array, threshold: float = THRESHOLD, min_vertices: int = MIN_VERTICES
+) -> Int32Array:
+    """The segment (V,) of each of ``vertices`` (V, 3): the number of a vertex in it, as ``segIndices`` has it.
+
+    A segment joins its neighbour over an edge that bends no more than either of them does inside, plus ``threshold``
+    over its number of vertices; then segments below ``min_vertices`` join a neighbour. Vertices without a triangle are
+    segments of their own. A degenerate triangle has no normal: its vertices join others by size alone.
+    """
+    from su3d_bench.baselines.mesh_segments_kernels import edges_of, joined, sort_as_gnu
+
+    edges, weights = edges_of(np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(triangles, np.int32))
+    sort_as_gnu(weights, edges)
+    segments: Int32Array = joined(len(vertices), edges, weights, np.float32(threshold), min_vertices)
+    return segments

@@ -1,0 +1,297 @@
+"""SAM3D: the masks of single images, merged bottom-up into groups of one cloud by overlap alone.
+
+Yang, Wu, He, Zhao, Liu, "SAM3D: Segment Anything in 3D Scenes", 2023, and its code, Pointcept/SegmentAnything3D at
+2aaa8c9. The original has no features, classes or scores; what open-vocabulary protocols need beyond its groups is ours
+and named so: a feature a group, and 1.0 for every score.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cache
+from typing import Annotated, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from su3d_bench.baselines.group_overlap import (
+    NO_GROUP,
+    GroupedCloud,
+    MergeRules,
+    ensemble,
+    groups_on_surface,
+    match_pairs,
+    merge,
+    merge_regions,
+    numbered,
+    renumber,
+    voxelise,
+    without_small_groups,
+)
+from su3d_bench.errors import DataError
+from su3d_bench.geometry import back_project, valid_depth
+from su3d_bench.timing import Timer
+from su3d_bench.types import (
+    BoolArray,
+    Detections,
+    Float32Array,
+    Float64Array,
+    Frame,
+    Instances,
+    Int32Array,
+    Int64Array,
+    MethodAbout,
+    PerceptionNeeds,
+    SceneInfo,
+    SceneTools,
+    StageTimer,
+    Surface,
+)
+
+logger = logging.getLogger(__name__)
+Metres = Annotated[float, Field(gt=0, allow_inf_nan=False)]
+
+
+class SAM3DConfig(BaseModel):
+    """Every hyper-parameter of SAM3D; the defaults are those of its code."""
+
+    model_config = ConfigDict(strict=True, frozen=True, extra="forbid")
+
+    stride: int = Field(default=20, ge=1)  # --frame_skip of the original's export
+    voxel_m: Metres = 0.05  # --voxel_size
+    ratio: float = Field(default=0.5, ge=0, le=1)  # cal_group's default, which no caller changes
+    th: int = Field(default=50, ge=0)  # --th: points below which a group is dropped at the end
+    merge_th: int = Field(default=50, ge=0)  # the same before each merge; 50 whatever --th says
+    # "tree" merges neighbouring frames, then neighbouring pairs, ... once all are there; "incremental" merges every
+    # frame into the map as it comes, which is how one would use SAM3D on a stream.
+    schedule: Literal["tree", "incremental"] = "tree"
+    max_distance_m: Metres = 0.6  # a vertex farther from every merged point has no group
+    ensemble: bool = False  # pcd_ensemble: groups in the borders of the mesh's over-segmentation
+    ensemble_th: int = Field(default=20, ge=0)  # vertices, in pcd_ensemble
+    features: Literal["mean-of-views", "largest-view"] = "mean-of-views"  # ours
+
+    @property
+    def rules(self) -> MergeRules:
+        """What merges two clouds."""
+        return MergeRules(self.voxel_m, self.ratio, self.merge_th)
+
+
+@dataclass(frozen=True)
+class _View:
+    """One mask of one image, with the pixels of it that have a depth and are not painted over."""
+
+    frame_index: int
+    detection: int
+    n_pixels: int
+    feature: Float32Array
+    name: str
+    caption: str
+
+
+class SAM3D:
+    """Groups by bidirectional overlap; ``finish`` gives the groups so far and changes nothing."""
+
+    name = "sam3d"
+    Config = SAM3DConfig
+    about = MethodAbout(
+        paper="Yang, Wu, He, Zhao, Liu: SAM3D: Segment Anything in 3D Scenes, 2023",
+        source="https://github.com/Pointcept/SegmentAnything3D, commit 2aaa8c9",
+        licence="its README names none",
+        needs=("class-agnostic masks", "the scan's mesh where ensemble is on"),
+        status=(
+            "the merging of clouds, the tree and the ensemble match the original's output on reference inputs to the "
+            "last id, with a stable sort in place of its unstable one; features of groups and scores are ours"
+        ),
+    )
+
+    def __init__(self, config: SAM3DConfig | None = None) -> None:
+        self.config = config or SAM3DConfig()
+        self._tools: SceneTools | None = None
+        self._clear()
+
+    def _clear(self) -> None:
+        self._clouds: list[GroupedCloud] = []  # one a frame, or the map alone where it is incremental
+        self._views: list[_View] = []
+        self._feature_dim = 0
+        self._surface: Surface | None = None
+        self._scene = ""
+
+    @property
+    def needs(self) -> PerceptionNeeds:
+        """Every region of an image, and the feature of its crop."""
+        return PerceptionNeeds(masks="class-agnostic")
+
+    @property
+    def caveat(self) -> str:
+        """The original has neither features nor scores."""
+        return f"sam3d has no features of its own: ours are '{self.config.features}', and every score is 1"
+
+    @property
+    def n_points(self) -> int:
+        """Points held: of the map, or of all frames while they wait for the tree."""
+        return sum(len(cloud) for cloud in self._clouds)
+
+    @property
+    def n_instances(self) -> int:
+        """Groups held: of the map, or of all frames while they wait for the tree."""
+        return sum(cloud.n_groups for cloud in self._clouds)
+
+    def receive_tools(self, tools: SceneTools) -> None:
+        """Take the way to the scan's mesh."""
+        self._tools = tools
+
+    def start(self, scene: SceneInfo) -> None:
+        """Forgets the scene before, and reads the mesh of the new one where there is one."""
+        self._clear()
+        self._scene = f"{scene.dataset}/{scene.scene}"
+        self._surface = self._read_surface()
+        _warm_up()
+
+    def _read_surface(self) -> Surface | None:
+        if self._tools is None:
+            return None
+        try:
+            return self._tools.surface()
+        except DataError as error:
+            if self.config.ensemble:
+                raise DataError(
+                    f"{self._scene}: sam3d's ensemble needs the scan's mesh ({error}); set ensemble=false"
+                ) from error
+            logger.warning("%s: sam3d's groups stay on its own points, for there is no mesh (%s)", self._scene, error)
+            return None
+
+    def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
+        """Takes one image in; with ``schedule`` incremental it is merged at once, which costs what the map costs."""
+        if detections.frame_index != frame.index:
+            raise DataError(f"frame {frame.index}: the detections are those of frame {detections.frame_index}")
+        self._feature_dim = len(detections.global_feature)
+        with timer.stage("backproject"):
+            pixels = valid_depth(frame.depth_m, 0.0, np.inf)
+            points = back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, pixels)
+        with timer.stage("paint"):
+            detection = paint(frame, detections.masks)[pixels]
+            cloud = self._grouped(points, detection, detections)
+        with timer.stage("voxelise"):
+            cloud = voxelise(cloud, self.config.voxel_m)
+        if not len(cloud):
+            return
+        if self.config.schedule == "incremental" and self._clouds:
+            merged = merge(self._clouds[0], cloud, self.config.rules, timer)
+            self._clouds = [merged] if merged is not None else []
+        else:
+            self._clouds.append(cloud)
+
+    def _grouped(self, points: Float64Array, detection: Int64Array, detections: Detections) -> GroupedCloud:
+        """The image's cloud, the last detection's group first; enters what is seen of each detection as a view."""
+        n_masks = len(detections)
+        n_pixels = np.bincount(detection + 1, minlength=n_masks + 1)[1:]
+        group = renumber(np.where(detection == NO_GROUP, NO_GROUP, n_masks - 1 - detection))
+        visible = np.flatnonzero(n_pixels)[::-1]
+        first_view = len(self._views)
+        for k in visible.tolist():
+            feature, name = detections.crop_features[k, 0], detections.names[k]
+            view = _View(detections.frame_index, k, int(n_pixels[k]), feature, name, detections.captions[k])
+            self._views.append(view)
+        rows = np.arange(len(visible))
+        return GroupedCloud(points, group, rows, rows + first_view)
+
+    def finish(self) -> Instances:
+        """The groups of at least ``th`` points, on the mesh's vertices where there is a mesh, else on the merged cloud.
+
+        A segment of the ensemble that no group claims has no feature and is no instance.
+        """
+        cloud = merge_regions(self._clouds, self.config.rules, Timer())
+        if cloud is None:
+            logger.warning("%s: no frame of sam3d has a valid point; its map is empty", self._scene)
+            cloud = voxelise(_EMPTY, self.config.voxel_m)
+        cloud = numbered(without_small_groups(cloud, self.config.th))
+        points, group = cloud.points.astype(np.float32), cloud.group
+        if self._surface is not None:
+            points = self._surface.vertices
+            group = groups_on_surface(cloud, points, self.config.max_distance_m)
+            if self.config.ensemble:
+                group, cloud = self._in_segments(group, cloud, self._surface)
+        return self._instances(points, group, cloud)
+
+    def _in_segments(self, group: Int64Array, cloud: GroupedCloud, surface: Surface) -> tuple[Int64Array, GroupedCloud]:
+        """Groups of the vertices after the ensemble, and the cloud with its views under the new numbers."""
+        segments = surface.segments
+        if segments is None:
+            from su3d_bench.baselines.mesh_segments import mesh_segments
+
+            segments = mesh_segments(surface.vertices, surface.triangles)
+        large = without_small_groups(
+            GroupedCloud(surface.vertices.astype(np.float64), group, cloud.view_group, cloud.views),
+            self.config.ensemble_th,
+        )
+        return ensemble(group, segments, self.config.ensemble_th, self.config.ratio), numbered(large)
+
+    def _instances(self, points: Float32Array, group: Int64Array, cloud: GroupedCloud) -> Instances:
+        ids = np.intersect1d(group, cloud.view_group)
+        masks = _members(group, ids)
+        views = [np.sort(cloud.views[cloud.view_group == key]) for key in ids]
+        largest = [max((self._views[v] for v in of), key=lambda view: view.n_pixels) for of in views]
+        k = len(ids)
+        rows = [(self._views[v].frame_index, self._views[v].detection) for of in views for v in of]
+        return Instances(
+            points=points,
+            indptr=_indptr(masks),
+            indices=np.concatenate([np.zeros(0, np.int32), *masks]),
+            scores=np.ones(k),  # the original has none
+            features=self._features(views, largest),
+            labels=None,
+            names=tuple(view.name for view in largest),
+            captions=tuple(view.caption for view in largest),
+            boxes=np.array([[points[m].min(axis=0), points[m].max(axis=0)] for m in masks], np.float32).reshape(
+                k, 2, 3
+            ),
+            centroids=np.array([points[m].mean(axis=0, dtype=np.float64) for m in masks], np.float32).reshape(k, 3),
+            view_indptr=_indptr(views),
+            views=np.array(rows, np.int32).reshape(-1, 2),
+            ids=ids.astype(np.int32),
+        )
+
+    def _features(self, views: Sequence[Int64Array], largest: Sequence[_View]) -> Float32Array:
+        """A feature (K, D) a group, normalised: the mean over its views, each counted once, or that of the largest."""
+        if self.config.features == "largest-view":
+            means = [np.asarray(view.feature, np.float64) for view in largest]
+        else:
+            means = [np.mean([self._views[v].feature for v in of], axis=0, dtype=np.float64) for of in views]
+        features = np.array(means).reshape(len(views), self._feature_dim)
+        norms = np.linalg.norm(features, axis=1, keepdims=True)
+        unit: Float32Array = (features / np.maximum(norms, np.finfo(np.float64).tiny)).astype(np.float32)
+        return unit
+
+
+def paint(frame: Frame, masks: BoolArray) -> Int64Array:
+    """The detection (H, W) of each pixel, NO_GROUP in no mask; of overlapping masks the first shows."""
+    if len(masks) and masks.shape[1:] != frame.depth_m.shape:
+        (rows, columns), (height, width) = masks.shape[1:], frame.depth_m.shape
+        raise DataError(f"frame {frame.index}: masks are {columns}x{rows} and the image is {width}x{height}")
+    detection = np.full(frame.depth_m.shape, NO_GROUP, np.int64)
+    for k in reversed(range(len(masks))):
+        detection[masks[k]] = k
+    return detection
+
+
+def _members(group: Int64Array, ids: Int64Array) -> list[Int32Array]:
+    """The points of each of ``ids``, ascending."""
+    order = np.argsort(group, kind="stable")
+    first, last = (np.searchsorted(group[order], ids, side=side) for side in ("left", "right"))
+    return [order[a:b].astype(np.int32) for a, b in zip(first, last, strict=True)]
+
+
+def _indptr(parts: Sequence[Int32Array] | Sequence[Int64Array]) -> Int64Array:
+    return np.cumsum([0, *(len(part) for part in parts)]).astype(np.int64)
+
+
+_NO_IDS = np.zeros(0, np.int64)
+_EMPTY = GroupedCloud(np.zeros((0, 3)), _NO_IDS, _NO_IDS, _NO_IDS)
+
+
+@cache
+def _warm_up() -> None:
+    """Matches two points, so that no timed step waits for a compiler."""
+    match_pairs(np.zeros((1, 3)), np.zeros((1, 3)), 1.0)

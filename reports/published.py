@@ -1,0 +1,103 @@
+"""Numbers as papers report them, with source and set-up; they are shown beside measured ones, never among them."""
+
+from __future__ import annotations
+
+import tomllib
+from decimal import Decimal
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from su3d_bench.errors import ConfigError
+from su3d_bench.plain_text import printable
+
+FILE = Path(__file__).resolve().parent / "published.toml"
+MOST_BYTES = 1 << 20
+Number = Annotated[str, Field(pattern=r"^\d*\.?\d+$")]  # as printed: the number of decimals says something
+PaperTable = Literal["I", "II", "III", "IV", "V"]
+
+
+class Figure(BaseModel):
+    """One printed row: ``values`` is metric -> number as printed, in ``unit``.
+
+    ``table`` and ``row``: the table of OpenSU3D's paper in which it stands, and its label there. ``protocol``: ours
+    that comes nearest to the set-up. ``read_from``: the paper itself, or somebody who quotes it.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    method: Annotated[str, Field(min_length=1)]
+    dataset: Annotated[str, Field(min_length=1)]
+    setup: Annotated[str, Field(min_length=1)]
+    source: Annotated[str, Field(min_length=1)]
+    read_from: Literal["paper", "quoted"] = "paper"
+    unit: Literal["percent", "fraction"] = "percent"
+    values: Annotated[dict[str, Number], Field(min_length=1)]
+    protocol: str | None = None
+    table: PaperTable | None = None
+    row: str | None = None
+    note: str | None = None
+
+    def percent(self, metric: str) -> str | None:
+        """The number in per cent with the decimals that it was printed with; None where it was not printed.
+
+        >>> Figure(method="a", dataset="b", setup="c", source="d", unit="fraction", values={"AP": ".204"}).percent("AP")
+        '20.4'
+        """
+        text = self.values.get(metric)
+        if text is None or self.unit == "percent":
+            return text
+        return f"{Decimal(text).scaleb(2):f}"
+
+
+class _File(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    figure: tuple[Figure, ...]
+
+
+def read_published(path: Path = FILE) -> tuple[Figure, ...]:
+    """Every figure of a file such as ``published.toml``; ``ConfigError`` with one line where it is not of that form."""
+    shown = printable(path.name, 100)
+    try:
+        content = path.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{shown}: cannot be read: {error.strerror}") from error
+    if len(content) > MOST_BYTES:
+        raise ConfigError(f"{shown}: has {len(content)} bytes; expected at most {MOST_BYTES}")
+    try:
+        table = tomllib.loads(content.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ConfigError(f"{shown}: is no TOML: {printable(str(error), 200)}") from error
+    try:
+        # as a Python value, not through JSON: a number that is no text must stay a number, to be refused
+        return _File.model_validate({**table, "figure": tuple(table.get("figure", ()))}).figure
+    except (ValidationError, TypeError) as error:
+        raise ConfigError(_explain(error, table, shown)) from error
+
+
+def _explain(error: ValidationError | TypeError, table: dict[str, object], shown: str) -> str:
+    if isinstance(error, TypeError):
+        return f"{shown}: 'figure' is no list; write each as [[figure]]"
+    first = error.errors()[0]
+    place = [str(part) for part in first["loc"]]
+    where = shown
+    if len(place) > 1:
+        where = f"{shown}: figure {int(place[1]) + 1}"
+    key = printable(".".join(place[2:]) or ".".join(place), 100)
+    reason = first["msg"][:1].lower() + first["msg"][1:]
+    value = "" if first["type"] in {"missing", "extra_forbidden"} else f" = {printable(repr(first['input']), 80)}"
+    return f"{where}: {key}{value}: {reason}"
+
+
+@cache
+def published() -> tuple[Figure, ...]:
+    """What papers report, as this package has it."""
+    return read_published()
+
+
+def figures_of(method: str) -> tuple[Figure, ...]:
+    """What is reported of one method."""
+    return tuple(one for one in published() if one.method == method)

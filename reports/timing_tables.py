@@ -1,0 +1,126 @@
+"""What updates cost, as tables: one a run for all methods, one a method for its stages, one for maps midway."""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+
+from su3d_bench.reports.tables import NOT_MEASURED, aligned, percent
+from su3d_bench.statistics import Growth
+from su3d_bench.update_times import MethodSummary, StageSummary
+
+MIB = 2**20
+
+
+@dataclass(frozen=True)
+class AnytimePoint:
+    """How good the map was after a share of the updates, and the seconds until it was there, of all scenes together."""
+
+    run: str
+    method: str
+    protocol: str
+    share: float
+    seconds: float
+    metrics: Mapping[str, float | None]
+
+
+def markdown(
+    summaries: Sequence[MethodSummary], anytime: Sequence[AnytimePoint], hardware: Mapping[str, str], camera_rate: float
+) -> str:
+    """All tables; ``hardware`` names the machine of each run, ``camera_rate`` is in frames a second."""
+    runs = list(dict.fromkeys(one.run for one in summaries))
+    blocks = [f"{run}: {hardware[run]}" for run in runs]
+    blocks.append("\n".join(aligned(list(_methods_table(summaries, camera_rate)))))
+    for one in summaries:
+        blocks.append(f"**{one.method}**, ms per update ({_updates_text(one)})")
+        blocks.append("\n".join(aligned(list(_stages_table(one)))))
+    if anytime:
+        blocks.append("**Maps midway**")
+        blocks.append("\n".join(aligned(list(_anytime_table(anytime)))))
+    return "\n\n".join(blocks) + "\n"
+
+
+def csv_text(summaries: Sequence[MethodSummary], hardware: Mapping[str, str]) -> str:
+    """One row a run, method and stage, in full precision."""
+    text = io.StringIO()
+    growth = [f"{name}_{part}" for name in ("points", "frames") for part in ("exponent", "low", "high", "words")]
+    head = ["run", "hardware", "method", "n_scenes", "stage", "n", "first_ms", "p50_ms", "p95_ms", "max_ms", "share"]
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow([*head, *growth])
+    for one in summaries:
+        for stage in one.stages:
+            numbers = [stage.n, stage.first, stage.p50, stage.p95, stage.worst, stage.share]
+            grown = [cell for each in (stage.against_points, stage.against_frames) for cell in _growth_cells(each)]
+            scenes = len(one.scenes)
+            writer.writerow([one.run, hardware[one.run], one.method, scenes, stage.name, *numbers, *grown])
+    return text.getvalue()
+
+
+def _growth_cells(growth: Growth | None) -> list[float | str]:
+    return ["", "", "", ""] if growth is None else [growth.exponent, growth.low, growth.high, growth.words]
+
+
+def _methods_table(summaries: Sequence[MethodSummary], camera_rate: float) -> Iterator[list[str]]:
+    yield [
+        *("run", "method", "updates", "update p50", "p95", "max", "first", "map update p50", "updates/s"),
+        *(f"real time at {camera_rate:g}/s", "finish", "points", "map MiB", "peak MiB", "GPU MiB"),
+    ]
+    for one in summaries:
+        total, of_map = (next(stage for stage in one.stages if stage.name == name) for name in ("total", "map"))
+        yield [
+            *(one.run, one.method, str(one.n_updates)),
+            *(_ms(total.p50), _ms(total.p95), _ms(total.worst), _ms(total.first), _ms(of_map.p50)),
+            f"{one.updates_per_s:.2f}",
+            f"{one.frames_per_s / camera_rate:.2f}x",
+            NOT_MEASURED if one.finish_ms is None else _ms(one.finish_ms),
+            NOT_MEASURED if one.n_points is None else f"{one.n_points:,}",
+            *(_mib(value) for value in (one.map_bytes, one.peak_rss_bytes, one.device_bytes)),
+        ]
+
+
+def _stages_table(summary: MethodSummary) -> Iterator[list[str]]:
+    yield [
+        *("stage", "p50", "p95", "max", "first", "share", "exponent by map points", "exponent by updates"),
+        "with a larger map",
+    ]
+    for stage in summary.stages:
+        yield [
+            *(stage.name, _ms(stage.p50), _ms(stage.p95), _ms(stage.worst), _ms(stage.first), percent(stage.share)),
+            *(_growth(stage.against_points), _growth(stage.against_frames)),
+            _words(stage),
+        ]
+
+
+def _words(stage: StageSummary) -> str:
+    growth = stage.against_points or stage.against_frames
+    return "too few updates to tell" if growth is None else growth.words
+
+
+def _growth(growth: Growth | None) -> str:
+    return NOT_MEASURED if growth is None else f"{growth.exponent:.2f} [{growth.low:.2f}, {growth.high:.2f}]"
+
+
+def _anytime_table(points: Sequence[AnytimePoint]) -> Iterator[list[str]]:
+    names = list(dict.fromkeys(name for one in points for name in one.metrics))
+    yield ["run", "method", "protocol", "frames", "seconds", *names]
+    for one in points:
+        values = [percent(one.metrics[name]) if name in one.metrics else "" for name in names]
+        yield [one.run, one.method, one.protocol, f"{100 * one.share:g} %", f"{one.seconds:.1f}", *values]
+
+
+def _updates_text(summary: MethodSummary) -> str:
+    scenes = len(summary.scenes)
+    return f"{summary.n_updates} updates of {scenes} scene{'s' if scenes > 1 else ''}"
+
+
+def _ms(value: float) -> str:
+    """Three digits: 1234, 12.3, 0.123."""
+    if value != value:
+        return NOT_MEASURED
+    return f"{value:.0f}" if value >= 100 else f"{value:.3g}"
+
+
+def _mib(value: int | None) -> str:
+    return NOT_MEASURED if value is None else f"{value / MIB:.0f}"

@@ -1,0 +1,108 @@
+"""``su3d-bench check``: the gate; a run against a reference, or a reference from runs."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
+
+if TYPE_CHECKING:
+    from su3d_bench.gate_findings import Verdict
+
+
+def add_parser(verbs: Any) -> None:
+    parser = add_verb(
+        verbs,
+        "check",
+        "Hold a run against a reference and fail where a number got worse; or learn a reference from runs.",
+        (
+            "su3d-bench check --learn runs/a runs/b runs/c --out reference.json",
+            "su3d-bench check runs/mine --against reference.json --markdown comment.md --junit check.xml",
+        ),
+        call,
+    )
+    parser.add_argument("runs", nargs="*", type=Path, metavar="RUN", help="the run to check")
+    parser.add_argument("--against", type=Path, metavar="FILE", help="the reference")
+    parser.add_argument("--learn", nargs="+", type=Path, metavar="RUN", help="repeats of one run to learn from")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="where --learn writes the reference")
+    parser.add_argument(
+        "--cost-limit", type=float, metavar="TIMES", help="how many times slower an update may be (with --learn)"
+    )
+    parser.add_argument(
+        "--across-machines",
+        type=float,
+        metavar="POINTS",
+        help="by how many points headline values may differ on another machine (with --learn; default: 2)",
+    )
+    parser.add_argument("--markdown", type=Path, metavar="FILE", help="write the table for a pull request")
+    parser.add_argument("--junit", type=Path, metavar="FILE", help="write JUnit XML")
+    parser.add_argument(
+        "--github", action=argparse.BooleanOptionalAction, help="print GitHub annotations (default: in its workflows)"
+    )
+
+
+def call(arguments: argparse.Namespace) -> int:
+    if arguments.learn:
+        return _learn(arguments)
+    if len(arguments.runs) != 1 or arguments.against is None:
+        raise ConfigError("check: give one RUN and --against FILE, or --learn RUN... and --out FILE")
+    if arguments.out is not None or arguments.cost_limit is not None or arguments.across_machines is not None:
+        raise ConfigError("check: --out, --cost-limit and --across-machines belong to --learn")
+    return _check(arguments)
+
+
+def _learn(arguments: argparse.Namespace) -> int:
+    from su3d_bench.finished_run import read_run
+    from su3d_bench.gate import ACROSS_MACHINES, COST_LIMIT, learn
+    from su3d_bench.store import make_folder, write_json
+
+    if arguments.runs or arguments.against or arguments.out is None:
+        raise ConfigError("check: --learn takes the runs and needs --out FILE; it checks nothing")
+    cost_limit = COST_LIMIT if arguments.cost_limit is None else arguments.cost_limit
+    across = ACROSS_MACHINES if arguments.across_machines is None else arguments.across_machines / 100
+    if not cost_limit > 1 or not 0 <= across <= 1:
+        raise ConfigError("check: --cost-limit is a factor above 1, --across-machines from 0 to 100 points")
+    reference = learn([read_run(path) for path in arguments.learn], across, cost_limit)
+    make_folder(arguments.out.parent)
+    write_json(arguments.out, reference.model_dump(mode="json", exclude_defaults=True))
+    n_exact = sum(one.tolerance == 0 for each in reference.results for one in each.metrics.values())
+    n_values = sum(len(each.metrics) for each in reference.results)
+    answer(f"{arguments.out}: {n_values} headline values from {reference.n_runs} runs, {n_exact} of them exact")
+    if reference.n_runs == 1:
+        remark("one run shows no spread: every value must be met exactly; learn from several where runs vary")
+    return EXIT_DONE
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from dataclasses import asdict
+
+    from su3d_bench.finished_run import read_run
+    from su3d_bench.gate import check, read_reference
+    from su3d_bench.reports.gate_report import github_lines, plain_lines
+
+    verdict = check(read_run(arguments.runs[0]), read_reference(arguments.against))
+    _write(verdict, arguments)
+    if arguments.json:
+        answer_json({"passed": verdict.is_passed, **asdict(verdict)})
+    else:
+        answer("\n".join(plain_lines(verdict)))
+        in_workflow = os.environ.get("GITHUB_ACTIONS") == "true"
+        if in_workflow if arguments.github is None else arguments.github:
+            answer("\n".join(github_lines(verdict)))
+    for line in verdict.remarks:
+        remark(line, quiet=arguments.quiet)
+    return EXIT_DONE if verdict.is_passed else EXIT_CHECK_FAILED
+
+
+def _write(verdict: Verdict, arguments: argparse.Namespace) -> None:
+    from su3d_bench.reports.gate_report import junit_xml, markdown
+    from su3d_bench.store import make_folder, write_text
+
+    for path, text in ((arguments.markdown, markdown), (arguments.junit, junit_xml)):
+        if path is not None:
+            make_folder(path.parent)
+            write_text(path, text(verdict))

@@ -1,0 +1,239 @@
+"""``su3d-bench models``: which foundation models there are, whether they are here and whole, and what they take."""
+
+from __future__ import annotations
+
+import argparse
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
+
+if TYPE_CHECKING:
+    from su3d_bench.perception.config import PerceptionConfig
+    from su3d_bench.perception.models.files import ModelFiles
+    from su3d_bench.perception.models.inspection import ModelState, WarmUp
+
+
+def add_parser(verbs: Any) -> None:
+    parser = verbs.add_parser(
+        "models",
+        help="list the foundation models, check their files, export them to ONNX, or run them once",
+        description="List the foundation models, check their files, export them to ONNX, or run them once.",
+        epilog="examples:\n  su3d-bench models list\n  su3d-bench models check clip-vit-h-14",
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    actions = parser.add_subparsers(dest="action", metavar="list|check|export|warm", required=True)
+    listing = add_verb(
+        actions,
+        "list",
+        "List every model: size, licence, which profile loads it, and where it lies or that it is missing.",
+        ("su3d-bench models list", "su3d-bench models list --json"),
+        call_list,
+    )
+    _add_settings(listing)
+    checking = add_verb(
+        actions,
+        "check",
+        "Tell the SHA-256 of every file of models, as run records carry them, and name all that is wrong.",
+        ("su3d-bench models check", "su3d-bench models check clip-vit-h-14 sam-vit-h --json"),
+        call_check,
+    )
+    checking.add_argument("names", nargs="*", metavar="MODEL", help="short names (default: every model that is here)")
+    _add_settings(checking)
+    _add_export(actions)
+    _add_warm(actions)
+
+
+def _add_export(actions: Any) -> None:
+    parser = add_verb(
+        actions,
+        "export",
+        "Write a model as ONNX files with a manifest, and tell how far ONNX Runtime is from torch.",
+        (
+            "su3d-bench models export clip-vit-h-14 --out models/clip-vit-h-14-onnx",
+            "su3d-bench models export siglip-base-224 --out siglip --json",
+        ),
+        call_export,
+    )
+    parser.add_argument("name", metavar="MODEL", help="short name, such as clip-vit-h-14")
+    parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder that the files go to")
+    _add_settings(parser)
+
+
+def _add_warm(actions: Any) -> None:
+    parser = add_verb(
+        actions,
+        "warm",
+        "Load the models of a profile, or one encoder, run them on a made frame, and tell time and memory.",
+        ("su3d-bench models warm --profile paper --device cuda", "su3d-bench models warm clip-vit-b-32"),
+        call_warm,
+    )
+    parser.add_argument("name", nargs="?", metavar="ENCODER", help="an encoder alone (default: the profile's models)")
+    parser.add_argument("--profile", help="whose models (default: paper)")
+    parser.add_argument("--device", help="cpu, cuda or cuda:1 (default: cpu)")
+    _add_settings(parser)
+
+
+def _add_settings(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--set",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="KEY=VALUE",
+        help="a setting of perception, such as perception.models.folder=/data/models",
+    )
+
+
+def _perception_config(arguments: argparse.Namespace) -> PerceptionConfig:
+    from su3d_bench.config import Setting, Settings, read_assignments, resolve
+    from su3d_bench.perception.config import PerceptionConfig
+
+    settings = read_assignments(arguments.set, (), ())
+    if getattr(arguments, "device", None) is not None:
+        settings += Settings((Setting(("perception", "models", "device"), arguments.device, "--device"),))
+    return resolve(settings, ("perception",), PerceptionConfig)
+
+
+def call_list(arguments: argparse.Namespace) -> int:
+    states = _states(arguments, ())
+    if arguments.json:
+        answer_json([_state_row(state) for state in states])
+        return EXIT_DONE
+    width = max(len(state.entry.name) for state in states)
+    for state in states:
+        entry = state.entry
+        place = f"found: {state.found[0].folder}" if state.found else "missing"
+        size = f"{entry.forms[0].size_mb / 1000:.1f} GB"
+        profiles = f" (profile {', '.join(state.profiles)})" if state.profiles else ""
+        answer(f"{entry.name:<{width}}  {entry.kind:<9}  {size:>6}  {entry.licence:<10}  {place}{profiles}")
+    if missing := [state for state in states if not state.found]:
+        remark(
+            f"{len(missing)} missing; su3d-bench models check {missing[0].entry.name} says what to fetch",
+            quiet=arguments.quiet,
+        )
+    return EXIT_DONE
+
+
+def _states(arguments: argparse.Namespace, names: tuple[str, ...]) -> list[ModelState]:
+    from su3d_bench.perception.models.catalogue import MODELS, model_entry
+    from su3d_bench.perception.models.inspection import model_state
+
+    config = _perception_config(arguments).models
+    entries = [model_entry(name) for name in names] or list(MODELS.values())
+    return [model_state(entry, config.path_of(entry.name), config.folder) for entry in entries]
+
+
+def _state_row(state: ModelState) -> dict[str, Any]:
+    entry = state.entry
+    return {
+        "name": entry.name,
+        "kind": entry.kind,
+        "summary": entry.summary,
+        "licence": entry.licence,
+        "profiles": list(state.profiles),
+        "memory_mb": {"float32": entry.memory_mb(4), "float16": entry.memory_mb(2)},
+        "forms": [
+            {"form": form.form, "files": list(form.files), "size_mb": form.size_mb, "source": form.source}
+            for form in entry.forms
+        ],
+        "found": {files.form.form: str(files.folder) for files in state.found},
+        "missing": state.missing,
+        "remark": entry.remark or None,
+    }
+
+
+def call_check(arguments: argparse.Namespace) -> int:
+    names = tuple(dict.fromkeys(arguments.names))
+    states = _states(arguments, names)
+    rows = [_checked(files) for state in states for files in state.found]
+    rows += [_absent(state) for state in states if names and not state.found]
+    if not rows:
+        raise ConfigError("models check: none of the models is here; su3d-bench models list names them all")
+    if arguments.json:
+        answer_json(rows)
+    else:
+        for row in rows:
+            _answer_check(row)
+    return EXIT_CHECK_FAILED if any(row["problems"] for row in rows) else EXIT_DONE
+
+
+def _checked(files: ModelFiles) -> dict[str, Any]:
+    from su3d_bench.perception.models.inspection import problems_of
+
+    return {
+        "name": files.entry.name,
+        "form": files.form.form,
+        "folder": str(files.folder),
+        "sha256": files.digests(),
+        "problems": problems_of(files),
+    }
+
+
+def _absent(state: ModelState) -> dict[str, Any]:
+    return {"name": state.entry.name, "form": None, "folder": None, "sha256": {}, "problems": [state.missing]}
+
+
+def _answer_check(row: dict[str, Any]) -> None:
+    if row["form"] is not None:
+        answer(f"{row['name']} ({row['form']}): {row['folder']}: {'wrong' if row['problems'] else 'whole'}")
+    for name, digest in row["sha256"].items():
+        answer(f"  {digest}  {name}")
+    for problem in row["problems"]:
+        answer(f"  {problem}" if row["form"] else problem)
+
+
+def call_export(arguments: argparse.Namespace) -> int:
+    from su3d_bench.perception.models.catalogue import model_entry
+    from su3d_bench.perception.models.exporting import export_model
+
+    config = _perception_config(arguments).models
+    entry = model_entry(arguments.name)
+    export = export_model(entry, arguments.out, path=config.path_of(entry.name), folder=config.folder)
+    if arguments.json:
+        answer_json({"folder": str(arguments.out), "files": export.files, "parity": [asdict(p) for p in export.parity]})
+        return EXIT_DONE
+    for name, digest in export.files.items():
+        answer(f"{digest}  {arguments.out / name}")
+    for one in export.parity:
+        answer(
+            f"{one.output}: torch and ONNX Runtime differ by at most {one.max_abs_difference:.1e} over {one.n_values} "
+            f"values, cosine at least {one.min_cosine:.9f}"
+        )
+    return EXIT_DONE
+
+
+def call_warm(arguments: argparse.Namespace) -> int:
+    from su3d_bench.executors import limit_threads
+
+    limit_threads()  # before numerical libraries are loaded
+    result = _warm(arguments)
+    if arguments.json:
+        answer_json(asdict(result))
+        return EXIT_DONE
+    answer(f"{result.what}: loaded and first run {result.load_s:.1f} s, next run {result.run_s:.3f} s")
+    for name, ms in result.stages_ms.items():
+        answer(f"  {name:<10} {ms:>10.1f} ms")
+    answer(f"memory: {result.memory_mb:.0f} MB at most ({result.memory_of}); digest {result.digest[:12]}")
+    return EXIT_DONE
+
+
+def _warm(arguments: argparse.Namespace) -> WarmUp:
+    from su3d_bench.perception.models.devices import device_for
+    from su3d_bench.perception.models.inspection import warm_encoder, warm_perception, warm_scene
+    from su3d_bench.perception.models.loading import load_encoder
+
+    config = _perception_config(arguments)
+    if arguments.name is not None:
+        if arguments.profile is not None:
+            raise ConfigError("models warm: give an encoder or --profile, not both")
+        models = config.models.model_copy(update={"encoder": arguments.name})
+        return warm_encoder(load_encoder(models), device_for(models.device, 0))
+    from su3d_bench.perception.profiles import build_perception
+
+    config = config.model_copy(update={"cache": False})  # what is measured must be computed
+    profile = arguments.profile or "paper"
+    perception = build_perception(profile, config, scene=warm_scene(), cache_root=Path(), mesh=None)
+    return warm_perception(perception, device_for(config.models.device, 0))

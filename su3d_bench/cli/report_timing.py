@@ -1,0 +1,108 @@
+"""``su3d-bench report timing``: what an update costs, stage by stage, and whether it grows with the map."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+
+if TYPE_CHECKING:
+    from su3d_bench.finished_run import FinishedRun
+    from su3d_bench.update_times import UpdateTimes
+
+NAME = "timing"
+
+
+def add_parser(actions: Any) -> None:
+    parser = add_verb(
+        actions,
+        NAME,
+        "Say what an update costs, stage by stage, and whether it grows with the map.",
+        ("su3d-bench report timing runs/demo", "su3d-bench report timing runs/a runs/b --out timing --camera-rate 20"),
+        call,
+    )
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of finished runs")
+    parser.add_argument("--methods", nargs="+", metavar="METHOD", help="only these (default: all that look at frames)")
+    parser.add_argument(
+        "--warm-up", type=int, default=3, metavar="N", help="first updates of a scene that stand apart (default: 3)"
+    )
+    parser.add_argument(
+        "--camera-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the camera (default: 30)"
+    )
+    parser.add_argument("--out", type=Path, metavar="DIR", help="write timing.md, timing.csv and the plots there")
+
+
+def call(arguments: argparse.Namespace) -> int:
+    from dataclasses import asdict
+
+    from su3d_bench.errors import ConfigError
+    from su3d_bench.finished_run import read_run
+    from su3d_bench.reports.timing_tables import csv_text, markdown
+    from su3d_bench.update_times import summarise
+
+    if arguments.warm_up < 0 or not arguments.camera_rate > 0:
+        raise ConfigError("--warm-up is a count from 0, --camera-rate a number above 0")
+    runs = [read_run(path) for path in arguments.runs]
+    times = [found for run in runs for method in _methods(run, arguments.methods) if (found := _times(run, method))]
+    if not times:
+        raise ConfigError("no update was timed in these runs: their methods look at no frame")
+    summaries = [summarise(each, arguments.warm_up) for each in times]
+    anytime = [point for each in times for point in _anytime(next(r for r in runs if r.name == each[0].run), each)]
+    hardware = {run.name: run.hardware for run in runs}
+    text = markdown(summaries, anytime, hardware, arguments.camera_rate)
+    if arguments.json:
+        answer_json({"hardware": hardware, "methods": [asdict(one) for one in summaries]})
+    else:
+        answer(text.rstrip("\n"))
+    if arguments.out is not None:
+        _write(arguments, text, csv_text(summaries, hardware), times, anytime)
+    return 0
+
+
+def _methods(run: FinishedRun, asked: list[str] | None) -> list[str]:
+    return list(run.methods) if asked is None else asked
+
+
+def _times(run: FinishedRun, method: str) -> list[UpdateTimes]:
+    from su3d_bench.finished_updates import read_update_times
+
+    return read_update_times(run, method)
+
+
+def _anytime(run: FinishedRun, times: list[UpdateTimes]) -> list[Any]:
+    """The maps midway and the last one, where the run scored some midway."""
+    from su3d_bench.reports.timing_tables import AnytimePoint
+
+    method = times[0].method
+    points = []
+    for (name, protocol), result in run.results.items():
+        if name != method or not result.anytime or result.metrics is None:
+            continue
+        shares = [*sorted(result.anytime.items()), (1.0, result.metrics)]
+        for index, (share, metrics) in enumerate(shares):
+            seconds = sum(_seconds_until(one, index) for one in times)
+            headline = {metric: metrics.get(metric) for metric in result.headline}
+            points.append(AnytimePoint(run.name, method, protocol, share, seconds, headline))
+    return points
+
+
+def _seconds_until(times: UpdateTimes, index: int) -> float:
+    """Seconds of the updates before map ``index`` and of its own making."""
+    made = times.maps[index]
+    return float(times.ms("total")[: made.n_updates].sum() + made.finish_ms) / 1e3
+
+
+def _write(
+    arguments: argparse.Namespace, text: str, table: str, times: list[list[UpdateTimes]], anytime: list[Any]
+) -> None:
+    from su3d_bench.reports.timing_plots import draw_timing
+    from su3d_bench.store import make_folder, write_text
+
+    make_folder(arguments.out)
+    write_text(arguments.out / "timing.md", text)
+    write_text(arguments.out / "timing.csv", table)
+    pictures = draw_timing(times, anytime, arguments.warm_up, arguments.out)
+    for path in (arguments.out / "timing.md", arguments.out / "timing.csv", *pictures):
+        remark(f"wrote {path}", quiet=arguments.quiet)

@@ -1,0 +1,328 @@
+"""The gate for CI: a run against a reference that earlier runs of the same request taught.
+
+A reference holds every number with the tolerance that the spread of the taught runs gives: none where they agree to
+the last bit. What moves a number without being one (protocol, data, weights, settings) must not change at all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from su3d_bench.errors import ConfigError, StoreError
+from su3d_bench.finished_run import FinishedRun
+from su3d_bench.finished_updates import read_update_times
+from su3d_bench.gate_findings import Finding, Verdict
+from su3d_bench.plain_text import printable
+from su3d_bench.store import read_json
+from su3d_bench.update_times import MAP, WARM_UP, pooled
+
+SPREADS = 2.0  # a value may leave the taught ones by this many times their range: 2 of 50 unchanged repeats would at 1
+ACROSS_MACHINES = 0.02  # 2 points: what ONNX Runtime's and BLAS's kernels of other processors may move a headline value
+COST_LIMIT = 1.4  # an update may cost so many times the reference's; single runs scatter by a tenth to a fifth
+# Settings that name what was asked for or move no number; scenes, methods and protocols are compared one by one.
+NOT_COMPARED = ("scenes", "methods", "protocols", "jobs", "pictures", "perception.cache")
+_SHARES = ("recall", "precision", "IoU", "F1", "F1-conceptgraphs", "mPrecision", "mF1", "mF1-conceptgraphs", "pAcc")
+HIGHER_IS_BETTER = frozenset({"AP", "AP50", "AP25", "mAcc", "mIoU", "F-mIoU", "synonyms", "overall", *_SHARES})
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Value(_Model):
+    """A fraction, None where it is undefined, and by how much another run may differ from it."""
+
+    value: float | None = Field(allow_inf_nan=False)
+    tolerance: float = Field(default=0.0, ge=0, allow_inf_nan=False)
+
+
+Values = Mapping[str, Value]
+
+
+class ProtocolKey(_Model):
+    version: int
+    digest: str
+
+
+class MethodResult(_Model):
+    """One method under one protocol: its headline values, those of each scene, and all values of each class."""
+
+    method: str
+    protocol: str
+    profile: str | None
+    encoder_digest: str | None
+    metrics: dict[str, Value]
+    scenes: dict[str, dict[str, Value]]
+    classes: dict[str, dict[str, Value]]
+
+
+class Reference(_Model):
+    """What a run is held against; ``costs``: a method's update over the calibrating piece of work.
+
+    ``processor``: a digest of the processor's kind; byte-equality is promised on one kind alone.
+    """
+
+    schema_version: Literal[1] = 1
+    hardware: str
+    processor: str
+    n_runs: int = Field(ge=1)
+    across_machines: float = Field(ge=0, le=1)
+    cost_limit: float = Field(gt=1)
+    limit: int
+    settings: dict[str, str]
+    data_digests: dict[str, str]
+    protocols: dict[str, ProtocolKey]
+    results: tuple[MethodResult, ...] = Field(min_length=1)
+    costs: dict[str, float]
+
+
+class _Numbers(BaseModel):
+    """What is read of a result's ``result`` in ``metrics.json``."""
+
+    metrics: dict[str, float | None]
+    per_scene: dict[str, dict[str, float | None]]
+    per_class: dict[str, dict[str, float | None]]
+
+
+class _Result(BaseModel):
+    method: str
+    protocol: str
+    profile: str | None
+    encoder_digest: str | None
+    headline: tuple[str, ...]
+    result: _Numbers | None
+
+
+class _Metrics(BaseModel):
+    results: tuple[_Result, ...]
+
+
+def read_reference(path: Path) -> Reference:
+    """The reference in ``path``; ``ConfigError`` where it is none."""
+    try:
+        return Reference.model_validate(read_json(path))
+    except StoreError as error:
+        raise ConfigError(
+            f"{error.args[0].partition(';')[0]}; make a reference with su3d-bench check --learn RUN"
+        ) from error
+    except (ValidationError, RecursionError) as error:
+        shown = printable(str(path), 200)
+        raise ConfigError(
+            f"{shown}: is no reference of this version; make one with su3d-bench check --learn RUN"
+        ) from error
+
+
+def learn(
+    runs: Sequence[FinishedRun], across_machines: float = ACROSS_MACHINES, cost_limit: float = COST_LIMIT
+) -> Reference:
+    """A reference from complete ``runs`` of one request, which must agree in everything that is not a measurement."""
+    first = runs[0]
+    for run in runs:
+        if run.is_incomplete:
+            raise ConfigError(f"{run.name}: is incomplete; a reference is learnt from complete runs")
+        if differing := next(_differing_keys(_settings(first), _settings(run)), None):
+            raise ConfigError(f"{run.name}: differs from {first.name} in {differing[0]}; learn from repeats of one run")
+        if (run.data_digests, run.protocols) != (first.data_digests, first.protocols):
+            raise ConfigError(f"{run.name}: has other data or protocols than {first.name}; learn from repeats")
+    tables = [_results(run) for run in runs]
+    if any(set(table) != set(tables[0]) for table in tables):
+        raise ConfigError(f"{first.name}: the runs hold different methods or protocols; learn from repeats of one run")
+    costs = [update_costs(run) for run in runs]
+    return Reference(
+        hardware=first.hardware,
+        processor=first.processor,
+        n_runs=len(runs),
+        across_machines=across_machines,
+        cost_limit=cost_limit,
+        limit=first.limit,
+        settings=_settings(first),
+        data_digests=dict(first.data_digests),
+        protocols={name: ProtocolKey(version=one[0], digest=one[1]) for name, one in first.protocols.items()},
+        results=tuple(_learn_result([table[key] for table in tables]) for key in tables[0]),
+        costs={name: float(np.median([cost[name] for cost in costs if name in cost])) for name in costs[0]},
+    )
+
+
+def _learn_result(repeats: Sequence[_Result]) -> MethodResult:
+    first = repeats[0]
+    numbers = [one.result for one in repeats if one.result is not None]
+    if len(numbers) < len(repeats):
+        raise ConfigError(f"{first.method} under {first.protocol}: was not scored; learn from runs with numbers")
+    scenes = [{scene: _only(row, first.headline) for scene, row in one.per_scene.items()} for one in numbers]
+    return MethodResult(
+        method=first.method,
+        protocol=first.protocol,
+        profile=first.profile,
+        encoder_digest=first.encoder_digest,
+        metrics=_learn_values([_only(one.metrics, first.headline) for one in numbers]),
+        scenes={scene: _learn_values([one.get(scene, {}) for one in scenes]) for scene in scenes[0]},
+        classes={
+            name: _learn_values([one.per_class.get(name, {}) for one in numbers]) for name in numbers[0].per_class
+        },
+    )
+
+
+def _only(row: Mapping[str, float | None], names: Sequence[str]) -> dict[str, float | None]:
+    return {name: row.get(name) for name in names}
+
+
+def _learn_values(repeats: Sequence[Mapping[str, float | None]]) -> dict[str, Value]:
+    return {name: _learn_value([one.get(name) for one in repeats]) for name in repeats[0]}
+
+
+def _learn_value(repeats: Sequence[float | None]) -> Value:
+    known = [value for value in repeats if value is not None]
+    if not known:
+        return Value(value=None, tolerance=0.0)
+    spread = max(known) - min(known)
+    return Value(value=known[0] if spread == 0 else math.fsum(known) / len(known), tolerance=SPREADS * spread)
+
+
+def check(run: FinishedRun, reference: Reference) -> Verdict:
+    """Everything in which ``run`` differs from ``reference``, failures and improvements."""
+    is_same_machine = run.processor == reference.processor
+    findings = [*_identity(run, reference)]
+    table = _results(run)
+    n_compared = 0
+    for expected in reference.results:
+        where = f"{expected.method} / {expected.protocol}"
+        found = table.get((expected.method, expected.protocol))
+        if found is None or found.result is None:
+            findings.append(Finding("missing", where, "the run has no score of it"))
+            continue
+        if found.profile != expected.profile:
+            findings.append(_changed(where, "profile", expected.profile, found.profile))
+        if found.encoder_digest != expected.encoder_digest:
+            findings.append(_changed(where, "encoder digest", expected.encoder_digest, found.encoder_digest))
+        findings += _numbers(where, expected, found.result, None if is_same_machine else reference.across_machines)
+        n_compared += len(expected.metrics)
+    findings += _costs(run, reference, is_same_machine)
+    remarks = [] if is_same_machine else [_other_machine(run, reference)]
+    return Verdict(run.name, tuple(findings), n_compared, tuple(remarks))
+
+
+def _other_machine(run: FinishedRun, reference: Reference) -> str:
+    return (
+        f"another processor ({run.hardware}) than the reference's ({reference.hardware}): headline values are compared "
+        f"within {100 * reference.across_machines:g} points, scenes and classes by presence, costs are not judged"
+    )
+
+
+def _identity(run: FinishedRun, reference: Reference) -> Iterator[Finding]:
+    if run.is_incomplete:
+        yield Finding("missing", "run", "is incomplete: some scenes failed")
+    if run.limit != reference.limit:
+        yield _changed("run", "limit", reference.limit, run.limit)
+    for key, before, now in _differing_keys(reference.settings, _settings(run)):
+        yield _changed("settings", key, before, now)
+    for scene, digest in reference.data_digests.items():
+        if scene not in run.scenes:
+            yield Finding("missing", scene, "the run does not have this scene")
+        elif run.data_digests.get(scene) != digest:
+            yield _changed(scene, "data digest", digest, run.data_digests.get(scene))
+    for name, expected in reference.protocols.items():
+        if name not in run.protocols:
+            yield Finding("missing", name, "the run does not have this protocol")
+            continue
+        version, digest = run.protocols[name]
+        if version != expected.version:
+            yield _changed(name, "protocol version", expected.version, version)
+        elif digest != expected.digest:
+            yield _changed(name, "protocol digest", expected.digest, digest)
+
+
+def _changed(where: str, what: str, before: object, now: object) -> Finding:
+    return Finding("changed", where, f"{what} was {_short(before)}, now {_short(now)}")
+
+
+def _short(value: object) -> str:
+    text = printable(str(value), 200)
+    return f"{text[:12]}..." if len(text) > 40 and " " not in text else text
+
+
+def _numbers(where: str, expected: MethodResult, found: _Numbers, across: float | None) -> Iterator[Finding]:
+    """``across``: the tolerance of headline values of another machine; None on the same one."""
+    yield from _compare(where, expected.metrics, found.metrics, across)
+    for kind, tables, rows in (
+        ("scene", expected.scenes, found.per_scene),
+        ("class", expected.classes, found.per_class),
+    ):
+        for name, values in tables.items():
+            row = rows.get(name)
+            if row is None:
+                yield Finding(
+                    "missing", f"{where} / {kind} {printable(name, 80)}", f"the run does not have this {kind}"
+                )
+            elif across is None:
+                yield from _compare(f"{where} / {kind} {printable(name, 80)}", values, row, None)
+
+
+def _compare(
+    where: str, expected: Values, found: Mapping[str, float | None], across: float | None
+) -> Iterator[Finding]:
+    for name, one in expected.items():
+        tolerance = one.tolerance if across is None else max(across, one.tolerance)
+        measured = found.get(name)
+        if measured == one.value:
+            continue
+        if measured is None or one.value is None:
+            yield Finding("regression", f"{where} / {name}", "is undefined in one of the two", one.value, measured)
+        elif abs(measured - one.value) > tolerance:
+            is_better = name in HIGHER_IS_BETTER and measured > one.value
+            text = "is better than the reference" if is_better else "is worse than the reference"
+            if name not in HIGHER_IS_BETTER:
+                text = "differs from the reference"
+            kind: Literal["better", "regression"] = "better" if is_better else "regression"
+            yield Finding(kind, f"{where} / {name}", text, one.value, measured, tolerance)
+
+
+def _costs(run: FinishedRun, reference: Reference, is_same_machine: bool) -> Iterator[Finding]:
+    measured = update_costs(run) if reference.costs else {}
+    for method, before in reference.costs.items():
+        now = measured.get(method)
+        if now is None:
+            yield Finding("missing", f"{method} / cost of an update", "the run did not measure it", before)
+        elif is_same_machine and now > reference.cost_limit * before:
+            text = f"costs {now / before:.2f} times the reference; {reference.cost_limit:g} times are allowed"
+            yield Finding("cost", f"{method} / cost of an update", text, before, now)
+
+
+def update_costs(run: FinishedRun) -> dict[str, float]:
+    """Median milliseconds of the map's part of an update over those of the calibrating work, a method; the median over
+    scenes, each against its own calibration. Methods that update nothing are left out."""
+    costs = {}
+    for method in run.methods:
+        ratios = []
+        for one in read_update_times(run, method):
+            steady = pooled([one], MAP, WARM_UP)
+            if one.calibration_ms and len(steady) and steady.any():
+                ratios.append(float(np.median(steady)) / one.calibration_ms)
+        if ratios:
+            costs[method] = float(np.median(ratios))
+    return costs
+
+
+def _settings(run: FinishedRun) -> dict[str, str]:
+    keys = {".".join(path): str(value) for path, value in run.settings.items()}
+    return {key: value for key, value in sorted(keys.items()) if key not in NOT_COMPARED}
+
+
+def _differing_keys(before: Mapping[str, str], now: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
+    for key in [*before, *(key for key in now if key not in before)]:
+        if before.get(key) != now.get(key):
+            yield key, before.get(key, "not set"), now.get(key, "not set")
+
+
+def _results(run: FinishedRun) -> dict[tuple[str, str], _Result]:
+    path = run.folder.path / "metrics.json"
+    try:
+        metrics = _Metrics.model_validate(read_json(path))
+    except (ValidationError, RecursionError) as error:
+        raise StoreError(f"{run.name}: metrics.json is not as a run writes it; run it again") from error
+    return {(one.method, one.protocol): one for one in metrics.results}

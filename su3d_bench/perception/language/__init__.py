@@ -1,0 +1,1 @@
+"""Language and vision-language models behind one OpenAI-compatible interface: captions, names, answers."""

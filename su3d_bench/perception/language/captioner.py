@@ -1,0 +1,79 @@
+"""Names and captions of image crops by a vision-language model; the tagger's where the model gives none."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from su3d_bench.perception.language.chat import ChatRequest, Reply, fitted
+from su3d_bench.perception.language.client import LanguageModel
+from su3d_bench.perception.language.config import LanguageConfig
+from su3d_bench.perception.language.parsing import described, is_refusal
+from su3d_bench.perception.language.prompts import DESCRIBE
+from su3d_bench.perception.naming import scene_caption
+from su3d_bench.types import UInt8Array
+
+
+@dataclass(frozen=True)
+class CropCaption:
+    """Name and caption of a crop, who gave them, and why where it was not the model; ``key`` leads to the reply."""
+
+    name: str
+    caption: str
+    source: Literal["model", "fallback"]
+    reason: str
+    key: str
+
+
+class Captioner:
+    """Asks the vision model for the name and description of each crop."""
+
+    def __init__(self, model: LanguageModel, config: LanguageConfig) -> None:
+        self._model = model
+        self._config = config
+
+    def requests(self, crops: Sequence[UInt8Array]) -> list[ChatRequest]:
+        """What is asked of the crops (h, w, 3)."""
+        config = self._config
+        return [
+            ChatRequest(
+                "caption",
+                config.vision_model,
+                "",
+                DESCRIBE,
+                (fitted(crop, config.max_image_px),),
+                max_answer_tokens=config.max_answer_tokens,
+                temperature=config.temperature,
+                seed=config.seed,
+                image_detail=config.image_detail,
+            )
+            for crop in crops
+        ]
+
+    def captions(self, crops: Sequence[UInt8Array], tagger_names: Sequence[str]) -> list[CropCaption]:
+        """One caption a crop; ``tagger_names`` are what the fallback calls them."""
+        requests = self.requests(crops)
+        replies = self._model.ask_all(requests)
+        return [
+            caption_from(reply, name, request.key)
+            for request, reply, name in zip(requests, replies, tagger_names, strict=True)
+        ]
+
+
+def caption_from(reply: Reply, tagger_name: str, key: str) -> CropCaption:
+    """What the model said, or the tagger's name and "an {object} in a scene" (the paper's section IV-B)."""
+    found = None if reply.failure else described(reply.text)
+    if found is None:
+        name = tagger_name.strip() or "object"
+        return CropCaption(name, scene_caption(name), "fallback", reason_of(reply), key)
+    return CropCaption(found.name, found.description or scene_caption(found.name), "model", "", key)
+
+
+def reason_of(reply: Reply) -> str:
+    """Why a reply holds nothing of use."""
+    if reply.failure:
+        return reply.failure
+    if not reply.text.strip():
+        return f"an empty answer ({reply.finish_reason or 'no reason given'})"
+    return "the model refused" if is_refusal(reply.text) else "the answer cannot be read"

@@ -1,0 +1,102 @@
+"""The file of labels n' beside a map, which itself stays as the run sealed it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, ValidationError
+
+from su3d_bench.digests import digest_file
+from su3d_bench.errors import StoreError
+from su3d_bench.perception.language.refinement import RefinedName, TopNames
+from su3d_bench.store import JobFolder, read_json, write_json
+
+FILE_NAME = "refined_names.json"
+SCHEMA = 1
+Refiner = Literal["vote", "model"]
+
+
+class NameRecord(BaseModel):
+    """Labels n and n' of one instance, and the names that n' was chosen from."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    id: int
+    label: str
+    refined: str
+    source: Literal["model", "vote", "label"]
+    reason: str
+    candidates: tuple[str, ...]
+    request: str
+
+
+class NameRecords(BaseModel):
+    """Labels n' of a map; ``prediction_sha256`` ties them to it, ``model`` is empty for the vote."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    schema_version: int
+    prediction_sha256: str
+    refiner: Refiner
+    model: str
+    top_m: int
+    names: tuple[NameRecord, ...]
+
+    @property
+    def refined(self) -> tuple[str, ...]:
+        return tuple(one.refined for one in self.names)
+
+
+def records_of(
+    job: JobFolder,
+    ids: Sequence[int],
+    tops: Sequence[TopNames],
+    refined: Sequence[RefinedName],
+    refiner: Refiner,
+    model: str,
+    top_m: int,
+) -> NameRecords:
+    """The records of one map, an instance each."""
+    names = tuple(
+        NameRecord(
+            id=int(one_id),
+            label=top.label,
+            refined=one.name,
+            source=one.source,
+            reason=one.reason,
+            candidates=top.names,
+            request=one.key,
+        )
+        for one_id, top, one in zip(ids, tops, refined, strict=True)
+    )
+    return NameRecords(
+        schema_version=SCHEMA,
+        prediction_sha256=digest_file(job.prediction),
+        refiner=refiner,
+        model=model,
+        top_m=top_m,
+        names=names,
+    )
+
+
+def write_records(job: JobFolder, records: NameRecords) -> Path:
+    """Write the file beside the map; its path."""
+    path = job.path / FILE_NAME
+    write_json(path, records.model_dump(mode="json"))
+    return path
+
+
+def read_records(job: JobFolder) -> NameRecords | None:
+    """Labels n' of the map; None where there are none, a ``StoreError`` where they belong to another map."""
+    path = job.path / FILE_NAME
+    if not path.is_file():
+        return None
+    try:
+        records = NameRecords.model_validate(read_json(path))
+    except (ValidationError, RecursionError) as error:
+        raise StoreError(f"{path}: is not as su3d-bench refine writes it; give that command again") from error
+    if records.schema_version != SCHEMA or records.prediction_sha256 != digest_file(job.prediction):
+        raise StoreError(f"{path}: belongs to another map than {job.prediction.name}; give su3d-bench refine again")
+    return records

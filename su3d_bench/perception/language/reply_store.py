@@ -1,0 +1,107 @@
+"""Requests and replies kept with a run, addressed by content, so that a rerun asks nothing.
+
+``<key>.json`` holds a request and its reply; ``images/<digest>.png`` each picture once. Of two processes that ask the
+same at the same time the first to finish is kept, and both get its reply.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import json
+import os
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from su3d_bench.digests import digest_json
+from su3d_bench.errors import StoreError
+from su3d_bench.perception.language.chat import ChatRequest, Reply
+from su3d_bench.store import json_text, make_folder, write_bytes, write_text
+
+SCHEMA = 1
+MOST_ENTRY_BYTES = 200_000_000  # twice the largest answer that a configuration can allow
+
+
+class _StoredReply(BaseModel):
+    model_config = ConfigDict(extra="forbid")
+
+    text: str
+    finish_reason: str
+    model: str
+    input_tokens: int = Field(ge=0)
+    output_tokens: int = Field(ge=0)
+    dropped: tuple[str, ...]
+    failure: str
+
+
+class ReplyStore:
+    """The folder ``language`` of a run."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def path(self, key: str) -> Path:
+        return self.folder / f"{key}.json"
+
+    def load(self, key: str) -> Reply | None:
+        """The reply under ``key``; None where there is none, or one that is damaged."""
+        path = self.path(key)
+        try:
+            if not path.is_file() or path.stat().st_size > MOST_ENTRY_BYTES:
+                return None
+            entry: Any = json.loads(path.read_text(encoding="utf-8"))
+            if entry["schema"] != SCHEMA or digest_json(entry["request"]) != key:
+                return None
+            if digest_json(entry["reply"]) != entry["reply_sha256"]:
+                return None
+            stored = _StoredReply.model_validate(entry["reply"])
+        except (OSError, ValueError, KeyError, TypeError, RecursionError, ValidationError):
+            return None
+        return Reply(**stored.model_dump(), was_stored=True)
+
+    def save(self, request: ChatRequest, reply: Reply, server: str, *, replace: bool = False) -> Reply:
+        """The reply that is kept: ``reply``, or the one that another process stored meanwhile unless ``replace``."""
+        make_folder(self.folder)
+        with self._locked():
+            earlier = None if replace else self.load(request.key)
+            if earlier is not None:
+                return earlier
+            self._save_images(request)
+            answer = asdict(reply)
+            del answer["was_stored"]
+            answer["dropped"] = list(reply.dropped)
+            entry = {
+                "schema": SCHEMA,
+                "purpose": request.purpose,
+                "server": server,
+                "request": request.record(),
+                "reply": answer,
+                "reply_sha256": digest_json(answer),
+            }
+            write_text(self.path(request.key), json_text(entry))
+        return reply
+
+    def _save_images(self, request: ChatRequest) -> None:
+        if request.images:
+            make_folder(self.folder / "images")
+        for image in request.images:
+            path = self.folder / "images" / f"{image.digest}.png"
+            if not path.is_file():
+                write_bytes(path, image.png)
+
+    @contextmanager
+    def _locked(self) -> Iterator[None]:
+        """Hold the folder against other threads and processes; the lock leaves no file behind."""
+        try:
+            handle = os.open(self.folder, os.O_RDONLY)
+        except OSError as error:
+            raise StoreError(f"cannot write {self.folder}: {error.strerror or error}") from error
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            yield
+        finally:
+            os.close(handle)

@@ -1,0 +1,53 @@
+"""Boxes as detectors and segmenters hand them out: their overlaps, and which of them to keep."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.types import Float32Array, Float64Array, Int64Array
+
+
+def corners_of(boxes: Float32Array, height: int, width: int) -> Float32Array:
+    """Boxes (K, 4) x0 y0 x1 y1 in pixels from boxes centre x, centre y, width, height in shares of the image.
+
+    Each product and sum is float32, as the original's are.
+    """
+    centre, half = boxes[:, :2], np.float32(0.5) * boxes[:, 2:]
+    size = np.array([width, height, width, height], np.float32)
+    return np.concatenate([centre - half, centre + half], axis=1).astype(np.float32) * size
+
+
+def box_overlaps(box: Float32Array, others: Float32Array) -> Float64Array:
+    """Intersection over union (K,) of one box with ``others`` (K, 4); NaN between two boxes without area."""
+    first, rest = box.astype(np.float64), others.astype(np.float64).reshape(-1, 4)
+    low, high = np.maximum(first[:2], rest[:, :2]), np.minimum(first[2:], rest[:, 2:])
+    shared = np.prod(np.clip(high - low, 0.0, None), axis=1)
+    areas = np.prod(rest[:, 2:] - rest[:, :2], axis=1) + np.prod(first[2:] - first[:2])
+    with np.errstate(invalid="ignore", divide="ignore"):
+        overlaps: Float64Array = shared / (areas - shared)
+    return overlaps
+
+
+def suppress(boxes: Float32Array, scores: NDArray[np.floating[Any]], most_overlap: float) -> Int64Array:
+    """Indices of the boxes that no better box overlaps by more than ``most_overlap``, the best first.
+
+    Non-maximum suppression whatever the class; of equal scores the first counts as better.
+
+    >>> square = np.array([[0, 0, 10, 10], [0, 0, 10, 5], [20, 0, 30, 10]], np.float32)
+    >>> suppress(square, np.array([0.5, 0.9, 0.1], np.float32), 0.4).tolist()
+    [1, 2]
+    """
+    order = np.argsort(-scores.astype(np.float64), kind="stable")
+    is_open = np.ones(len(order), bool)
+    kept = []
+    for place, index in enumerate(order):
+        if not is_open[place]:
+            continue
+        kept.append(index)
+        rest = place + 1 + np.flatnonzero(is_open[place + 1 :])
+        # NaN, two boxes without area, is no overlap.
+        is_open[rest[box_overlaps(boxes[index], boxes[order[rest]]) > most_overlap]] = False
+    return np.array(kept, np.int64)

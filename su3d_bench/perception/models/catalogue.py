@@ -1,0 +1,280 @@
+"""Every model by its short name: the files that it comes in, from where, under which licence.
+
+Sizes are those of the published weights, in MB of 10^6 bytes; digests stand here only where the publisher or the file's
+own address states them. A requirement such as ``tokenizer.json | vocab.json + merges.txt`` names alternatives, the
+preferred one first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import Literal
+
+from su3d_bench.errors import ConfigError, suggest
+
+Kind = Literal["encoder", "segmenter", "detector", "tagger"]
+FormName = Literal["transformers", "open_clip", "original", "onnx"]
+
+HUB = "https://huggingface.co"
+ONNX_MANIFEST = "manifest.json"
+_HUB_WEIGHTS = "model.safetensors | pytorch_model.bin"
+_CLIP_FILES = (_HUB_WEIGHTS, "config.json", "preprocessor_config.json", "tokenizer.json | vocab.json + merges.txt")
+_OPEN_CLIP_FILES = ("open_clip_model.safetensors | open_clip_pytorch_model.bin",)  # open_clip brings its own words
+
+
+def _no_digests() -> Mapping[str, str]:
+    return MappingProxyType({})
+
+
+@dataclass(frozen=True)
+class ModelForm:
+    """One set of files in which a model comes; the first of ``files`` is the weights.
+
+    ``repository`` is its name on the Hugging Face hub, ``source`` where a person fetches it; ``architecture`` what
+    open_clip calls the model; ``sha256`` by file name.
+    """
+
+    form: FormName
+    files: tuple[str, ...]
+    source: str
+    size_mb: int
+    repository: str | None = None
+    architecture: str | None = None
+    sha256: Mapping[str, str] = field(default_factory=_no_digests)
+
+
+@dataclass(frozen=True)
+class ModelEntry:
+    """One model: ``n_parameters_million`` rules the memory that it takes; ``forms`` in the order they are tried."""
+
+    name: str
+    kind: Kind
+    summary: str
+    licence: str
+    n_parameters_million: int
+    forms: tuple[ModelForm, ...]
+    remark: str = ""
+
+    def memory_mb(self, bytes_a_weight: int) -> int:
+        """What the weights alone take on the device, in MB; activations come on top."""
+        return self.n_parameters_million * bytes_a_weight
+
+    def form(self, name: FormName) -> ModelForm:
+        """The form called ``name``; raises ``ConfigError`` where the model does not come in it."""
+        for form in self.forms:
+            if form.form == name:
+                return form
+        known = ", ".join(form.form for form in self.forms)
+        raise ConfigError(f"model '{self.name}': does not come in the form '{name}'; known: {known}")
+
+
+def _hub(repository: str, size_mb: int, files: tuple[str, ...] = _CLIP_FILES) -> ModelForm:
+    return ModelForm("transformers", files, f"{HUB}/{repository}", size_mb, repository)
+
+
+def _open_clip(architecture: str, repository: str, size_mb: int, sha256: Mapping[str, str] | None = None) -> ModelForm:
+    source = f"{HUB}/{repository}"
+    return ModelForm("open_clip", _OPEN_CLIP_FILES, source, size_mb, repository, architecture, sha256 or _no_digests())
+
+
+def _original(file: str, source: str, size_mb: int, sha256: str, repository: str | None = None) -> ModelForm:
+    return ModelForm("original", (file,), source, size_mb, repository, sha256=MappingProxyType({file: sha256}))
+
+
+def _exported(name: str, size_mb: int) -> ModelForm:
+    return ModelForm("onnx", (ONNX_MANIFEST,), f"su3d-bench models export {name} --out DIR", size_mb)
+
+
+_TORCHSCRIPT = "OpenAI's own .pt file is a TorchScript archive, which holds code and is not loaded"
+_SAM_SOURCE = "https://dl.fbaipublicfiles.com/segment_anything"
+_SAM_FILES = (_HUB_WEIGHTS, "config.json", "preprocessor_config.json")
+_DINO_FILES = (*_SAM_FILES, "tokenizer.json | vocab.txt")
+
+_ENTRIES = (
+    ModelEntry(
+        "clip-vit-h-14",
+        "encoder",
+        "CLIP ViT-H-14 laion2b_s32b_b79k, 1024-d, 224 px: OpenSU3D's, ConceptGraphs', ConceptFusion's",
+        "MIT",
+        986,
+        (
+            _hub("laion/CLIP-ViT-H-14-laion2B-s32B-b79K", 3944),
+            _open_clip(
+                "ViT-H-14",
+                "laion/CLIP-ViT-H-14-laion2B-s32B-b79K",
+                3944,
+                # the hub's pointer of the file
+                {"open_clip_pytorch_model.bin": "9a78ef8e8c73fd0df621682e7a8e8eb36c6916cb3c16b291a082ecd52ab79cc4"},
+            ),
+            _exported("clip-vit-h-14", 3948),
+        ),
+    ),
+    ModelEntry(
+        "clip-vit-l-14",
+        "encoder",
+        "CLIP ViT-L/14 of OpenAI, 768-d, 224 px",
+        "MIT",
+        428,
+        (
+            _hub("openai/clip-vit-large-patch14", 1711),
+            _open_clip("ViT-L-14-quickgelu", "timm/vit_large_patch14_clip_224.openai", 1711),
+            _exported("clip-vit-l-14", 1712),
+        ),
+        _TORCHSCRIPT,
+    ),
+    ModelEntry(
+        "clip-vit-l-14-336",
+        "encoder",
+        "CLIP ViT-L/14@336px of OpenAI, 768-d, 336 px: OpenMask3D's",
+        "MIT",
+        428,
+        (
+            _hub("openai/clip-vit-large-patch14-336", 1712),
+            _open_clip("ViT-L-14-336-quickgelu", "timm/vit_large_patch14_clip_336.openai", 1712),
+            _exported("clip-vit-l-14-336", 1713),
+        ),
+        _TORCHSCRIPT,
+    ),
+    ModelEntry(
+        "clip-vit-b-32",
+        "encoder",
+        "CLIP ViT-B/32 of OpenAI, 512-d, 224 px",
+        "MIT",
+        151,
+        (
+            _hub("openai/clip-vit-base-patch32", 605),
+            _open_clip("ViT-B-32-quickgelu", "timm/vit_base_patch32_clip_224.openai", 605),
+            _exported("clip-vit-b-32", 606),
+        ),
+        _TORCHSCRIPT,
+    ),
+    ModelEntry(
+        "siglip-base-224",
+        "encoder",
+        "SigLIP ViT-B/16, 768-d, 224 px",
+        "Apache-2.0",
+        203,
+        (
+            _hub("google/siglip-base-patch16-224", 813, (*_CLIP_FILES[:3], "tokenizer.json")),
+            _exported("siglip-base-224", 814),
+        ),
+    ),
+    ModelEntry(
+        "siglip-so400m-384",
+        "encoder",
+        "SigLIP SoViT-400m/14, 1152-d, 384 px",
+        "Apache-2.0",
+        878,
+        (
+            _hub("google/siglip-so400m-patch14-384", 3512, (*_CLIP_FILES[:3], "tokenizer.json")),
+            _exported("siglip-so400m-384", 3513),
+        ),
+    ),
+    ModelEntry(
+        "sam-vit-h",
+        "segmenter",
+        "Segment Anything, ViT-H: masks of the paper and of all baselines",
+        "Apache-2.0",
+        641,
+        (
+            _hub("facebook/sam-vit-huge", 2564, _SAM_FILES),
+            _original(
+                "sam_vit_h_4b8939.pth",
+                f"{_SAM_SOURCE}/sam_vit_h_4b8939.pth",
+                2565,
+                "a7bf3b02f3ebf1267aba913ff637d9a2d5c33d3173bb679e46d9f338c26f262e",
+            ),
+            _exported("sam-vit-h", 2570),
+        ),
+    ),
+    ModelEntry(
+        "sam-vit-l",
+        "segmenter",
+        "Segment Anything, ViT-L",
+        "Apache-2.0",
+        312,
+        (
+            _hub("facebook/sam-vit-large", 1250, _SAM_FILES),
+            _original(
+                "sam_vit_l_0b3195.pth",
+                f"{_SAM_SOURCE}/sam_vit_l_0b3195.pth",
+                1250,
+                "3adcc4315b642a4d2101128f611684e8734c41232a17c648ed1693702a49a622",
+            ),
+            _exported("sam-vit-l", 1256),
+        ),
+    ),
+    ModelEntry(
+        "sam-vit-b",
+        "segmenter",
+        "Segment Anything, ViT-B",
+        "Apache-2.0",
+        94,
+        (
+            _hub("facebook/sam-vit-base", 375, _SAM_FILES),
+            _original(
+                "sam_vit_b_01ec64.pth",
+                f"{_SAM_SOURCE}/sam_vit_b_01ec64.pth",
+                375,
+                "ec2df62732614e57411cdcf32a23ffdf28910380d03139ee0f4fcbe91eb8c912",
+            ),
+            _exported("sam-vit-b", 380),
+        ),
+    ),
+    ModelEntry(
+        "grounding-dino",
+        "detector",
+        "GroundingDINO swint_ogc: boxes from tags",
+        "Apache-2.0",
+        172,
+        (
+            _hub("IDEA-Research/grounding-dino-tiny", 689, _DINO_FILES),
+            _original(
+                "groundingdino_swint_ogc.pth",
+                f"{HUB}/ShilongLiu/GroundingDINO/resolve/main/groundingdino_swint_ogc.pth",
+                694,
+                "3b3ca2563c77c69f651d7bd133e97139c186df06231157a64c507099c52bc799",
+                "ShilongLiu/GroundingDINO",
+            ),
+        ),
+    ),
+    ModelEntry(
+        "ram-plus",
+        "tagger",
+        "RAM++ ram_plus_swin_large_14m: tags of an image",
+        "Apache-2.0",
+        750,
+        (
+            _original(
+                "ram_plus_swin_large_14m.pth",
+                f"{HUB}/xinyu1205/recognize-anything-plus-model/resolve/main/ram_plus_swin_large_14m.pth",
+                3010,
+                "497c178836ba66698ca226c7895317e6e800034be986452dbd2593298d50e87d",
+                "xinyu1205/recognize-anything-plus-model",
+            ),
+            # What the package's own onnx/export.py writes, beside the tag list of its ram/data.
+            ModelForm(
+                "onnx",
+                ("ram_plus.onnx", "ram_tag_list.txt"),
+                "onnx/export.py of https://github.com/xinyu1205/recognize-anything",
+                3010,
+            ),
+        ),
+    ),
+)
+MODELS: Mapping[str, ModelEntry] = MappingProxyType({entry.name: entry for entry in _ENTRIES})
+# What a profile loads; profiles that are not named load no model of this table.
+PROFILE_MODELS: Mapping[str, tuple[str, ...]] = MappingProxyType(
+    {"paper": ("clip-vit-h-14", "sam-vit-h", "grounding-dino", "ram-plus")}
+)
+
+
+def model_entry(name: str, kind: Kind | None = None) -> ModelEntry:
+    """The model called ``name``, of ``kind`` where one is asked for; raises ``ConfigError`` for any other name."""
+    known = [entry.name for entry in _ENTRIES if kind is None or entry.kind == kind]
+    if name not in known:
+        what = kind or "model"
+        raise ConfigError(f"unknown {what} '{name}'{suggest(name, known) or '; known: ' + ', '.join(known)}")
+    return MODELS[name]

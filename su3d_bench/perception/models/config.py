@@ -1,0 +1,69 @@
+"""Which foundation models a run loads, and how they run."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from su3d_bench.perception.models.catalogue import MODELS
+from su3d_bench.perception.models.onnx_session import Provider
+
+EMBEDDED = "embedded"
+Precision = Literal["auto", "float32", "float16", "bfloat16"]
+Runtime = Literal["torch", "open_clip", "onnx"]
+
+
+class ModelsConfig(BaseModel):
+    """How foundation models run.
+
+    ``device``: ``cpu``, ``cuda`` (the GPUs in turn, one a job) or ``cuda:1``. ``precision`` ``auto``: float16 on a GPU
+    that has it, float32 elsewhere. ``batch`` 0: 1 on the CPU, so that no feature depends on the rest of its batch, and
+    what the memory holds on a GPU. ``encoder`` None: the profile's own. ``runtime``: who runs the encoder;
+    ``provider`` None: the one of ``device``, for ``runtime`` ``onnx`` alone. ``folder``: searched instead of
+    ``$SU3D_MODELS``; ``paths``: a model's folder or file by the model's name. ``transform``: ``original`` prepares
+    images as open_clip does, ``transformers`` as that library's image processor does.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    device: str = Field(default="cpu", pattern=r"^(cpu|cuda(:[0-9]{1,2})?)$")
+    precision: Precision = "auto"
+    batch: int = Field(default=0, ge=0, le=4096)
+    encoder: str | None = None
+    runtime: Runtime = "torch"
+    provider: Provider | None = None
+    transform: Literal["original", "transformers"] = "original"
+    folder: Path | None = None
+    paths: dict[str, Path] = {}
+
+    @field_validator("encoder")
+    @classmethod
+    def _is_known(cls, name: str | None) -> str | None:
+        known = [EMBEDDED, *(entry.name for entry in MODELS.values() if entry.kind == "encoder")]
+        if name is not None and name not in known:
+            raise ValueError(f"is no encoder; known: {', '.join(known)}")
+        return name
+
+    @field_validator("paths")
+    @classmethod
+    def _are_of_models(cls, paths: dict[str, Path]) -> dict[str, Path]:
+        unknown = [name for name in paths if name not in MODELS]
+        if unknown:
+            raise ValueError(f"'{unknown[0]}' is no model; known: {', '.join(MODELS)}")
+        return paths
+
+    @model_validator(mode="after")
+    def _belong_together(self) -> ModelsConfig:
+        if self.provider is not None and self.runtime != "onnx":
+            raise ValueError("provider belongs to runtime 'onnx'")
+        if self.provider is not None and (self.provider == "cpu") != (self.device == "cpu"):
+            raise ValueError(f"provider '{self.provider}' does not run on device '{self.device}'")
+        if self.runtime == "onnx" and self.precision not in ("auto", "float32"):
+            raise ValueError(f"precision '{self.precision}': exported encoders are float32")
+        return self
+
+    def path_of(self, name: str) -> Path | None:
+        """The configured folder or file of model ``name``."""
+        return self.paths.get(name)

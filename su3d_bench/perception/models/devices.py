@@ -1,0 +1,143 @@
+"""Devices, precisions and batch sizes: what torch runs on, and how much at once."""
+
+from __future__ import annotations
+
+import logging
+import os
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.errors import ConfigError, ModelMissing
+
+Item = TypeVar("Item")
+CPU = "cpu"
+LARGEST_BATCH = 256
+# float16 has units of its own from compute capability 7.0 (Volta) on; before it, half is no faster or not there.
+HALF_CAPABILITY = (7, 0)
+_log = logging.getLogger(__name__)
+
+
+def require(package: str, needed_by: str) -> Any:
+    """The module ``package``; where it is not installed, one line that names the extra."""
+    import importlib
+
+    try:
+        return importlib.import_module(package)
+    except ImportError as error:
+        missing = error.name or package
+        raise ModelMissing(
+            f"{needed_by} needs the package '{missing}': pip install 'su3d-bench[models]'"
+            if missing in {"torch", "transformers", "safetensors", "onnx", "tokenizers"}
+            else f"{needed_by} needs the package '{missing}': pip install {missing}"
+        ) from error
+
+
+def require_transformers(needed_by: str) -> Any:
+    """The module transformers, without its progress bars and remarks, and never reaching out to the network."""
+    os.environ.setdefault("HF_HUB_OFFLINE", "1")  # what is needed lies in the model's folder
+    transformers = require("transformers", needed_by)
+    transformers.utils.logging.disable_progress_bar()
+    transformers.utils.logging.set_verbosity_error()
+    return transformers
+
+
+def device_for(device: str, job_index: int) -> str:
+    """The device of job ``job_index``: ``cuda`` stands for all GPUs, which jobs take in turn.
+
+    Raises ``ConfigError`` for a GPU that is not here; torch is not asked where ``device`` is ``cpu``.
+    """
+    if device == CPU:
+        return CPU
+    torch = require("torch", f"device '{device}'")
+    n_devices = torch.cuda.device_count() if torch.cuda.is_available() else 0
+    if n_devices == 0:
+        raise ConfigError(f"device '{device}': torch sees no GPU here; use --device cpu, or a torch build with CUDA")
+    if device == "cuda":
+        return f"cuda:{job_index % n_devices}"
+    if int(device.partition(":")[2]) >= n_devices:
+        raise ConfigError(f"device '{device}': there are {n_devices} GPUs here, cuda:0 to cuda:{n_devices - 1}")
+    return device
+
+
+def precision_for(precision: str, device: str) -> str:
+    """What ``precision`` stands for on ``device``; ``auto`` is half where the GPU has it and never on the CPU."""
+    if precision != "auto":
+        return precision
+    if device == CPU:
+        return "float32"
+    torch = require("torch", f"device '{device}'")
+    return "float16" if torch.cuda.get_device_capability(device) >= HALF_CAPABILITY else "float32"
+
+
+def make_deterministic(device: str) -> None:
+    """Hold the GPU's libraries to one algorithm and to true float32 products; nothing on the CPU."""
+    if device == CPU:
+        return
+    torch = require("torch", f"device '{device}'")
+    torch.backends.cudnn.deterministic = True
+    torch.backends.cudnn.benchmark = False
+    torch.backends.cudnn.allow_tf32 = False
+    torch.backends.cuda.matmul.allow_tf32 = False
+
+
+def first_batch(device: str, item_bytes: int, weights_bytes: int) -> int:
+    """The batch to begin with: 1 on the CPU, on a GPU the power of two that half of what the weights leave can hold.
+
+    It follows from the GPU's total memory, not from what is free at the moment, so that the same machine takes the
+    same batches; ``in_batches`` halves it where others use the memory.
+    """
+    if device == CPU:
+        return 1
+    torch = require("torch", f"device '{device}'")
+    total = int(torch.cuda.get_device_properties(device).total_memory)
+    fitting = max((total - weights_bytes) // 2 // max(item_bytes, 1), 1)
+    return min(int(2 ** np.floor(np.log2(fitting))), LARGEST_BATCH)
+
+
+class Batches:
+    """Runs items through a model in batches, and in smaller ones after the device has run out of memory."""
+
+    def __init__(self, size: int) -> None:
+        assert size >= 1
+        self.size = size
+
+    def run(self, items: Sequence[Item], work: Callable[[Sequence[Item]], NDArray[Any]]) -> list[NDArray[Any]]:
+        """What ``work`` makes of each batch of ``items``, in their order; one that does not fit alone is an error."""
+        done: list[NDArray[Any]] = []
+        start = 0
+        while start < len(items):
+            batch = items[start : start + self.size]
+            try:
+                done.append(work(batch))
+            except RuntimeError as error:
+                if not is_out_of_memory(error):
+                    raise
+                self._shrink(len(batch), error)
+                continue
+            start += len(batch)
+        return done
+
+    def _shrink(self, n_failed: int, error: RuntimeError) -> None:
+        if n_failed == 1:
+            raise ConfigError(
+                "the device has no memory for a batch of 1; use a smaller model, float16, or --device cpu"
+            ) from error
+        self.size = n_failed // 2
+        _log.info("the device ran out of memory; going on with batches of %d", self.size)
+        empty_cache()
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Whether torch ran out of the device's memory; its class is told by name, so that torch need not be imported."""
+    return type(error).__name__ == "OutOfMemoryError" and type(error).__module__.startswith("torch")
+
+
+def empty_cache() -> None:
+    """Give memory that torch holds in reserve back to the GPU."""
+    import torch
+
+    if torch.cuda.is_available():
+        torch.cuda.empty_cache()

@@ -1,0 +1,34 @@
+"""Any model of the catalogue that comes as ONNX: what its export wrote, and how far it is from torch."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from su3d_bench.errors import ConfigError
+from su3d_bench.perception.models.catalogue import MODELS, ModelEntry
+from su3d_bench.perception.models.devices import require
+from su3d_bench.perception.models.files import locate
+from su3d_bench.perception.models.onnx_export import Parity
+
+
+@dataclass(frozen=True)
+class Export:
+    """``files`` name -> SHA-256, and the ``parity`` of every part."""
+
+    files: Mapping[str, str]
+    parity: tuple[Parity, ...]
+
+
+def export_model(entry: ModelEntry, out: Path, *, path: Path | None = None, folder: Path | None = None) -> Export:
+    """Write ``entry`` as ONNX files into ``out``; raises ``CheckFailed`` where they do not agree with torch."""
+    if not any(form.form == "onnx" for form in entry.forms):
+        known = ", ".join(one.name for one in MODELS.values() if any(form.form == "onnx" for form in one.forms))
+        raise ConfigError(f"models export: '{entry.name}' has no ONNX form here; known: {known}")
+    for package in ("torch", "transformers", "onnx"):
+        require(package, f"models export {entry.name}")
+    from su3d_bench.perception.models.towers_onnx import export_encoder
+
+    manifest = export_encoder(locate(entry.name, ("transformers",), path=path, folder=folder), out)
+    return Export(manifest.files, manifest.parity)

@@ -1,0 +1,224 @@
+"""Where the files of a model lie on this machine, and their digests; nothing is ever fetched.
+
+A model is looked for, in this order: at the path that the configuration names; below the configured folder or
+``$SU3D_MODELS`` (``~/.cache/su3d-bench/models`` where it is not set); in the Hugging Face cache
+(``$HF_HUB_CACHE``, ``$HF_HOME/hub``, ``~/.cache/huggingface/hub``).
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.digests import digest_bytes, digest_file
+from su3d_bench.errors import ConfigError, ModelMissing, StoreError
+from su3d_bench.perception.models.catalogue import FormName, ModelEntry, ModelForm, model_entry
+from su3d_bench.store import make_folder, read_json, write_json
+
+DEFAULT_FOLDER = "~/.cache/su3d-bench/models"
+DIGEST_FOLDER = "model-digests"
+# Beside the weights, what may move an answer.
+_SETTINGS = (
+    "config.json",
+    "preprocessor_config.json",
+    "processor_config.json",
+    "open_clip_config.json",
+    "tokenizer.json",
+    "tokenizer_config.json",
+    "special_tokens_map.json",
+    "added_tokens.json",
+    "vocab.json",
+    "vocab.txt",
+    "merges.txt",
+    "spiece.model",
+)
+
+
+@dataclass(frozen=True)
+class ModelFiles:
+    """One model as it lies here: ``weights`` is the file of weights, or the manifest of an exported model."""
+
+    entry: ModelEntry
+    form: ModelForm
+    folder: Path
+    weights: Path
+
+    def digests(self) -> dict[str, str]:
+        """SHA-256 by file name of the weights and of every file of settings beside them."""
+        names = dict.fromkeys((self.weights.name, *_SETTINGS))
+        return {name: file_sha256(self.folder / name) for name in names if (self.folder / name).is_file()}
+
+    def wrong_digests(self) -> list[str]:
+        """A line for each file whose digest is not the published one."""
+        found = self.digests()
+        advice = f"fetch it anew from {self.form.source}"
+        return [
+            f"{self.folder / name}: sha256 is {found[name]}, published is {known}; {advice}"
+            for name, known in self.form.sha256.items()
+            if name in found and found[name] != known
+        ]
+
+
+def models_folder(configured: Path | None = None) -> Path:
+    """Where models are put: ``configured``, else ``$SU3D_MODELS``, else the user's cache."""
+    return (configured or Path(os.environ.get("SU3D_MODELS") or DEFAULT_FOLDER)).expanduser()
+
+
+def hub_cache() -> Path:
+    """Where the Hugging Face libraries keep what they fetched."""
+    if folder := os.environ.get("HF_HUB_CACHE"):
+        return Path(folder).expanduser()
+    return Path(os.environ.get("HF_HOME") or "~/.cache/huggingface").expanduser() / "hub"
+
+
+def locate(
+    name: str,
+    forms: Sequence[FormName] | None = None,
+    *,
+    path: Path | None = None,
+    folder: Path | None = None,
+) -> ModelFiles:
+    """The files of model ``name`` in the first of ``forms`` (all that it comes in) that is whole.
+
+    ``path``: the configured file or folder, beside which nothing is searched; ``folder``: searched instead of
+    ``$SU3D_MODELS``. Raises ``ModelMissing`` with what to fetch from where, and ``ConfigError`` for an unknown name.
+    """
+    entry = model_entry(name)
+    wanted = entry.forms if forms is None else tuple(entry.form(form) for form in forms)
+    if path is not None:
+        return _at(entry, wanted, path.expanduser())
+    for form in wanted:
+        for candidate in _folders(entry, form, folder):
+            if (weights := _weights(form, candidate)) is not None and not _lacking(form, candidate):
+                return ModelFiles(entry, form, candidate, weights)
+    raise ModelMissing(_advice(entry, wanted, folder))
+
+
+def is_found(entry: ModelEntry, form: ModelForm, folder: Path | None = None) -> ModelFiles | None:
+    """The files of ``entry`` in one form, or None."""
+    try:
+        return locate(entry.name, (form.form,), folder=folder)
+    except ModelMissing:
+        return None
+
+
+def _at(entry: ModelEntry, forms: Sequence[ModelForm], path: Path) -> ModelFiles:
+    if path.is_file():
+        for form in forms:
+            if path.name in _names(form.files[0]) and not _lacking(form, path.parent):
+                return ModelFiles(entry, form, path.parent, path)
+        if originals := [form for form in forms if form.form == "original"]:  # the one form that is a single file
+            return ModelFiles(entry, originals[0], path.parent, path)
+        known = " or ".join(name for form in forms for name in _names(form.files[0]))
+        raise ConfigError(f"model '{entry.name}': {path} is no file that it is read from; name a folder with {known}")
+    if not path.is_dir():
+        raise ModelMissing(f"model '{entry.name}': there is no {path}; mend the path or {_what_to_fetch(forms[0])}")
+    lacking = []
+    for form in forms:
+        weights = _weights(form, path)
+        if weights is not None and not _lacking(form, path):
+            return ModelFiles(entry, form, path, weights)
+        lacking.append(_lacking(form, path))
+    nearest = min(lacking, key=len)
+    raise ModelMissing(f"model '{entry.name}': {path} lacks {', '.join(nearest)}; {_what_to_fetch(forms[0])}")
+
+
+def _folders(entry: ModelEntry, form: ModelForm, configured: Path | None) -> Iterator[Path]:
+    """Where a form may lie, the most telling place first."""
+    root = models_folder(configured)
+    if form.form == "onnx":
+        yield root / f"{entry.name}-onnx"
+        return
+    yield root / entry.name
+    if form.repository is not None:
+        yield root / form.repository
+        yield root / form.repository.rpartition("/")[2]
+        for cache in (root, hub_cache()):
+            yield from _snapshots(cache / f"models--{form.repository.replace('/', '--')}")
+    if form.form == "original":
+        yield root
+
+
+def _snapshots(folder: Path) -> Iterator[Path]:
+    """The snapshot that ``main`` stands for; where that is not known, the only one."""
+    snapshots = folder / "snapshots"
+    try:
+        revision = (folder / "refs" / "main").read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError):
+        revision = ""
+    if revision.isalnum() and (snapshots / revision).is_dir():
+        yield snapshots / revision
+        return
+    found = sorted(path for path in snapshots.glob("*") if path.is_dir())
+    if len(found) > 1:
+        raise ConfigError(f"{snapshots}: holds {len(found)} snapshots and no refs/main; name one with models.paths")
+    yield from found
+
+
+def _names(requirement: str) -> list[str]:
+    return [name.strip() for alternative in requirement.split("|") for name in alternative.split("+")]
+
+
+def _weights(form: ModelForm, folder: Path) -> Path | None:
+    return next((folder / name for name in _names(form.files[0]) if (folder / name).is_file()), None)
+
+
+def _lacking(form: ModelForm, folder: Path) -> list[str]:
+    """The requirements of which no alternative lies whole in ``folder``."""
+    return [
+        requirement.replace(" | ", " or ").replace(" + ", " and ")
+        for requirement in form.files
+        if not any(all((folder / name).is_file() for name in _names(part)) for part in requirement.split("|"))
+    ]
+
+
+def _what_to_fetch(form: ModelForm) -> str:
+    if form.form == "onnx":
+        return f"make it: {form.source}"
+    names = ", ".join(_names(requirement)[0] for requirement in form.files)
+    return f"fetch {names} ({form.size_mb / 1000:.1f} GB) from {form.source}"
+
+
+def _advice(entry: ModelEntry, forms: Sequence[ModelForm], folder: Path | None) -> str:
+    place = models_folder(folder) / (f"{entry.name}-onnx" if forms[0].form == "onnx" else entry.name)
+    return f"model '{entry.name}': not found; {_what_to_fetch(forms[0])} into {place}, or set SU3D_MODELS"
+
+
+def file_sha256(path: Path) -> str:
+    """SHA-256 of a file, kept in ``$SU3D_CACHE`` under its path, size and time of change: weights are gigabytes."""
+    status = path.stat()
+    if not stat.S_ISREG(status.st_mode):
+        raise ConfigError(f"{path}: is no plain file")
+    if status.st_size < 2**20:
+        return digest_file(path)
+    key = f"{path.resolve()}\n{status.st_size}\n{status.st_mtime_ns}"
+    note = digest_cache() / f"{digest_bytes(key.encode())[:32]}.json"
+    if (known := _noted(note, key)) is not None:
+        return known
+    digest = digest_file(path)
+    make_folder(note.parent)
+    write_json(note, {"of": key, "sha256": digest})
+    return digest
+
+
+def digest_cache() -> Path:
+    """The folder of noted digests, in the cache of perception."""
+    root = Path(os.environ.get("SU3D_CACHE") or "~/.cache/su3d-bench/cache").expanduser()
+    return root / DIGEST_FOLDER
+
+
+def _noted(note: Path, key: str) -> str | None:
+    if not note.is_file() or note.stat().st_size > 2**16:
+        return None
+    try:
+        content: Any = read_json(note)
+    except StoreError:  # a damaged note counts as absent
+        return None
+    if not isinstance(content, dict) or content.get("of") != key:
+        return None
+    digest = content.get("sha256")
+    return digest if isinstance(digest, str) and len(digest) == 64 else None

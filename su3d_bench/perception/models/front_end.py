@@ -1,0 +1,127 @@
+"""From the configuration to the networks of the profile ``paper``, each read when it is first used."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+
+from su3d_bench.errors import ConfigError, ModelMissing
+from su3d_bench.perception.cache import content_key
+from su3d_bench.perception.models.catalogue import FormName
+from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig
+from su3d_bench.perception.models.devices import device_for, precision_for, require
+from su3d_bench.perception.models.files import ModelFiles, locate
+from su3d_bench.perception.models.grounded_sam import Networks
+from su3d_bench.perception.models.grounding_dino import GroundingDino
+from su3d_bench.perception.models.loading import encoder_files
+from su3d_bench.perception.models.onnx_session import open_session
+from su3d_bench.perception.models.paper_config import PaperConfig
+from su3d_bench.perception.models.pretrained import load_grounding_dino, load_sam
+from su3d_bench.perception.models.sam import Sam
+from su3d_bench.perception.models.sam_onnx import load_onnx_sam
+from su3d_bench.perception.models.tagging import (
+    RAM_TAG_LIST,
+    OnnxRamTagger,
+    RamTagger,
+    Tagger,
+    WordTagger,
+    load_ram,
+    read_word_list,
+)
+from su3d_bench.types import Encoder
+
+PAPER_ENCODER, DETECTOR, TAGGER = "clip-vit-h-14", "grounding-dino", "ram-plus"
+PACKAGES = ("torch", "transformers")
+_SAM_FORMS: tuple[FormName, ...] = ("transformers", "original")
+
+
+@dataclass(frozen=True)
+class _Place:
+    """Where a network runs and how precisely."""
+
+    device: str
+    precision: str
+
+    @property
+    def digest(self) -> str:
+        """Moves with what moves a number: the kind of device, not which of several."""
+        return content_key(self.device.partition(":")[0], self.precision)
+
+
+def load_networks(config: PaperConfig, models: ModelsConfig, encoder: Encoder, job_index: int = 0) -> Networks:
+    """Tagger, detector and segmenter as configured.
+
+    Raises ``ModelMissing`` for a package or file that is not here, before anything heavy is read.
+    """
+    for package in PACKAGES:
+        require(package, "profile 'paper'")
+    sam = _locate(models, config.segmenter, ("onnx",) if config.sam_runtime == "onnx" else _SAM_FORMS)
+    detector = _locate(models, DETECTOR, ("transformers",))
+    device = device_for(models.device, job_index)
+    place = _Place(device, precision_for(models.precision, device))
+    tagger = _tagger(config, models, encoder, place)
+    digests = [text for files in (sam, detector) for pair in sorted(files.digests().items()) for text in pair]
+    if config.sam_runtime == "onnx":
+        provider = models.provider or ("cpu" if device == "cpu" else "cuda")
+        index = 0 if provider == "cpu" else int(device.partition(":")[2] or 0)
+        load = partial(_onnx_sam, sam, provider, index)
+        digests.append(provider)
+    else:
+        load = partial(_torch_sam, sam, place)
+    return Networks(tagger, partial(_detector, detector, place), load, content_key(place.digest, *digests))
+
+
+def is_front_end_here(config: PaperConfig, models: ModelsConfig) -> bool:
+    """Whether the profile can run: packages, encoder, detector and segmenter are here; tags can do without RAM++."""
+    if any(find_spec(package) is None for package in PACKAGES):
+        return False
+    try:
+        if models.encoder != EMBEDDED:
+            encoder_files(models, models.encoder or PAPER_ENCODER)
+        _locate(models, config.segmenter, ("onnx",) if config.sam_runtime == "onnx" else _SAM_FORMS)
+        _locate(models, DETECTOR, ("transformers",))
+    except (ModelMissing, ConfigError):
+        return False
+    return True
+
+
+def _locate(models: ModelsConfig, name: str, forms: tuple[FormName, ...]) -> ModelFiles:
+    return locate(name, forms, path=models.path_of(name), folder=models.folder)
+
+
+def _torch_sam(files: ModelFiles, place: _Place) -> Sam:
+    return Sam(load_sam(files, place.device, place.precision))
+
+
+def _onnx_sam(files: ModelFiles, provider: str, device_index: int) -> Sam:
+    return Sam(load_onnx_sam(files, provider, device_index))
+
+
+def _detector(files: ModelFiles, place: _Place) -> GroundingDino:
+    return load_grounding_dino(files, place.device, place.precision)
+
+
+def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, place: _Place) -> Tagger:
+    """The tagger that is asked for, or with ``auto`` the first that is here."""
+    if config.tagger == "ram" or (config.tagger == "auto" and find_spec("ram") is not None):
+        try:
+            require("ram", "tagger 'ram'")
+            files = _locate(models, TAGGER, ("original",))
+        except ModelMissing:
+            if config.tagger == "ram":
+                raise
+        else:
+            digests = [text for pair in sorted(files.digests().items()) for text in pair]
+            # RAM++'s own code mixes float32 in, so it runs in float32 wherever it runs.
+            return RamTagger(partial(load_ram, files, place.device), place.device, content_key(*digests))
+    if config.tagger in ("ram-onnx", "auto"):
+        try:
+            files = _locate(models, TAGGER, ("onnx",))
+        except ModelMissing:
+            if config.tagger == "ram-onnx":
+                raise
+        else:
+            tags = read_word_list(files.folder / RAM_TAG_LIST)
+            return OnnxRamTagger(partial(open_session, files.weights), tags, content_key(*files.digests().values()))
+    return WordTagger(encoder, read_word_list(config.words), config.n_tags)

@@ -1,0 +1,171 @@
+"""What of the catalogue is on this machine, whether it is whole, and what a profile's models take to run once."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.errors import ConfigError, DataError, ModelMissing
+from su3d_bench.perception.models import towers_onnx, towers_transformers
+from su3d_bench.perception.models.catalogue import MODELS, PROFILE_MODELS, ModelEntry, ModelForm
+from su3d_bench.perception.models.files import ModelFiles, locate
+from su3d_bench.perception.models.weights import PICKLED, read_settings, read_weights
+from su3d_bench.timing import Timer
+from su3d_bench.types import Encoder, Frame, PerceptionNeeds, SceneInfo
+
+WARM_TEXT = "a chair in a scene"
+
+
+@dataclass(frozen=True)
+class ModelState:
+    """A model of the catalogue and the forms of it that are here; where none is, ``missing`` says what to fetch."""
+
+    entry: ModelEntry
+    found: tuple[ModelFiles, ...]
+    missing: str | None
+
+    @property
+    def profiles(self) -> tuple[str, ...]:
+        """The profiles that load the model."""
+        return tuple(name for name, models in PROFILE_MODELS.items() if self.entry.name in models)
+
+
+def model_state(entry: ModelEntry, path: Path | None = None, folder: Path | None = None) -> ModelState:
+    """Which forms of ``entry`` are here, at ``path`` or where models are looked for."""
+    found = []
+    for form in entry.forms:
+        try:
+            found.append(locate(entry.name, (form.form,), path=path, folder=folder))
+        except (ModelMissing, ConfigError):
+            continue
+    if found:
+        return ModelState(entry, tuple(found), None)
+    try:
+        locate(entry.name, path=path, folder=folder)
+    except (ModelMissing, ConfigError) as error:
+        return ModelState(entry, (), str(error))
+    raise AssertionError("a model of which no form is found cannot be located")
+
+
+def model_states(folder: Path | None = None) -> list[ModelState]:
+    """The state of every model of the catalogue."""
+    return [model_state(entry, folder=folder) for entry in MODELS.values()]
+
+
+def problems_of(files: ModelFiles) -> list[str]:
+    """Everything that is wrong with the files of a model, a line each; of the weights the names alone are read."""
+    problems = files.wrong_digests()
+    try:
+        if files.form.form == "onnx":
+            return problems + _problems_of_export(files)
+        if files.form.form == "transformers":
+            if files.entry.kind == "encoder":
+                towers_transformers.read_spec(files, "original")
+            else:
+                read_settings(files.folder / "config.json")
+        if files.weights.suffix in PICKLED or files.weights.suffix == ".safetensors":
+            read_weights(files.weights, "meta")
+    except (DataError, ModelMissing) as error:
+        problems.append(str(error))
+    return problems
+
+
+def _problems_of_export(files: ModelFiles) -> list[str]:
+    if files.entry.kind != "encoder":
+        read_settings(files.weights)
+        return []
+    manifest = towers_onnx.read_manifest(files.weights)
+    wrong = towers_onnx.wrong_files(files)
+    if manifest.name != files.entry.name:
+        wrong.append(f"{files.folder}: holds '{manifest.name}', not '{files.entry.name}'; mend models.paths")
+    return wrong
+
+
+def form_size_mb(form: ModelForm, files: ModelFiles | None) -> float:
+    """What the weights of a form take on the disk: as they lie here, else as published."""
+    return form.size_mb if files is None or form.form == "onnx" else files.weights.stat().st_size / 1e6
+
+
+@dataclass(frozen=True)
+class WarmUp:
+    """What it took to load and run something once: ``stages_ms`` of the run, ``memory_mb`` at most meanwhile.
+
+    ``memory_of``: ``cuda:0`` for what torch took there, ``process`` for the whole process in main memory.
+    """
+
+    what: str
+    load_s: float
+    run_s: float
+    stages_ms: dict[str, float]
+    memory_mb: float
+    memory_of: str
+    digest: str
+
+
+def warm_encoder(encoder: Encoder, device: str) -> WarmUp:
+    """Load the towers of ``encoder`` and run them on one image and one text."""
+    _reset_memory(device)
+    image = warm_frame().rgb
+    start = time.perf_counter()
+    encoder.encode_images([image])
+    encoder.encode_texts([WARM_TEXT])
+    loaded = time.perf_counter()
+    encoder.encode_images([image])
+    run_s = time.perf_counter() - loaded
+    memory_mb, memory_of = _peak_memory(device)
+    return WarmUp(encoder.name, loaded - start, run_s, {}, memory_mb, memory_of, encoder.digest)
+
+
+def warm_perception(perception: Any, device: str) -> WarmUp:
+    """Let ``perception``, a profile that was built, detect in one made frame twice: loading, then running."""
+    _reset_memory(device)
+    needs = PerceptionNeeds(crop_ratios=(0.8, 1.0, 1.2))  # S_r of the paper
+    frame = warm_frame()
+    start = time.perf_counter()
+    perception.detect(frame, needs, Timer())
+    loaded = time.perf_counter()
+    timer = Timer()
+    perception.detect(frame, needs, timer)
+    run_s = time.perf_counter() - loaded
+    memory_mb, memory_of = _peak_memory(device)
+    stages = {name: round(ms, 3) for name, ms in timer.take().items()}
+    return WarmUp(perception.profile, loaded - start, run_s, stages, memory_mb, memory_of, perception.digest)
+
+
+def warm_scene() -> SceneInfo:
+    """The scene of ``warm_frame``."""
+    return SceneInfo("warm", "frame", 1, 1, "camera")
+
+
+def warm_frame() -> Frame:
+    """A made frame (480, 640): three coloured boxes before a wall."""
+    rgb = np.full((480, 640, 3), 205, np.uint8)
+    depth_m = np.full((480, 640), 3.0, np.float32)
+    for left, colour, distance_m in ((60, (190, 40, 40), 2.0), (260, (50, 140, 60), 2.3), (460, (40, 60, 180), 2.6)):
+        rgb[180:380, left : left + 120] = colour
+        depth_m[180:380, left : left + 120] = distance_m
+    intrinsics = np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]])
+    return Frame(0, 0.0, rgb, depth_m, np.eye(4), intrinsics)
+
+
+def _reset_memory(device: str) -> None:
+    if device != "cpu":
+        import torch
+
+        torch.cuda.reset_peak_memory_stats(device)
+
+
+def _peak_memory(device: str) -> tuple[float, str]:
+    if device != "cpu":
+        import torch
+
+        return torch.cuda.max_memory_allocated(device) / 1e6, device
+    import resource
+    import sys
+
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss  # kB on Linux, bytes on macOS
+    return peak / (1e6 if sys.platform == "darwin" else 1e3), "process"

@@ -1,0 +1,113 @@
+"""From the configuration to an encoder that is ready; its towers are read when the first feature is asked for."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any
+
+from su3d_bench.errors import ConfigError
+from su3d_bench.perception.cache import FrameCache
+from su3d_bench.perception.models import towers_onnx, towers_open_clip, towers_transformers
+from su3d_bench.perception.models.catalogue import FormName, model_entry
+from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, Runtime
+from su3d_bench.perception.models.devices import device_for, precision_for, require
+from su3d_bench.perception.models.encoder import EncoderSpec, FoundationEncoder, Towers
+from su3d_bench.perception.models.files import ModelFiles, locate
+from su3d_bench.perception.models.onnx_session import Provider
+from su3d_bench.perception.models.text_tokens import Tokeniser, read_tokeniser
+from su3d_bench.types import Encoder
+
+FORM_OF_RUNTIME: Mapping[Runtime, FormName] = {"torch": "transformers", "open_clip": "open_clip", "onnx": "onnx"}
+PACKAGES_OF_RUNTIME: Mapping[Runtime, tuple[str, ...]] = {
+    "torch": ("torch", "transformers"),
+    "open_clip": ("torch", "open_clip"),
+    "onnx": ("onnxruntime", "transformers"),
+}
+
+
+def load_encoder(
+    config: ModelsConfig, *, default: str = EMBEDDED, cache: FrameCache | None = None, job_index: int = 0
+) -> Encoder:
+    """The encoder that ``config`` names, or ``default``, the profile's own, where it names none.
+
+    ``cache`` keeps the features of texts; ``job_index`` chooses among several GPUs. Raises ``ModelMissing`` for a
+    package or file that is not here, before anything heavy is loaded.
+    """
+    name = config.encoder or default
+    if name == EMBEDDED:
+        from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
+
+        _refuse_idle_settings(config, is_alone=default == EMBEDDED)
+        return EmbeddedEncoder()
+    files = encoder_files(config, name)
+    for package in PACKAGES_OF_RUNTIME[config.runtime]:
+        require(package, f"encoder '{name}'")
+    if config.runtime == "onnx":
+        return _onnx_encoder(config, files, cache, job_index)
+    return _torch_encoder(config, files, cache, job_index)
+
+
+def encoder_files(config: ModelsConfig, name: str) -> ModelFiles:
+    """Where the files of encoder ``name`` lie in the form that the configured runtime reads."""
+    model_entry(name, "encoder")
+    return locate(name, (FORM_OF_RUNTIME[config.runtime],), path=config.path_of(name), folder=config.folder)
+
+
+def _refuse_idle_settings(config: ModelsConfig, *, is_alone: bool) -> None:
+    """The embedded encoder has a runtime of its own; ``is_alone``: no other model of the profile uses the device."""
+    advice = "choose perception.models.encoder or --profile paper"
+    if config.runtime != "torch":
+        raise ConfigError(f"perception.models.runtime '{config.runtime}': the embedded encoder has its own; {advice}")
+    if is_alone and config.device != "cpu":
+        raise ConfigError(f"device '{config.device}': the embedded encoder runs on the CPU alone; {advice}")
+
+
+def _torch_encoder(
+    config: ModelsConfig, files: ModelFiles, cache: FrameCache | None, job_index: int
+) -> FoundationEncoder:
+    device = device_for(config.device, job_index)
+    precision = precision_for(config.precision, device)
+    name = files.entry.name
+
+    def load_towers() -> Towers:
+        if config.runtime == "open_clip":
+            model = towers_open_clip.load_model(files)
+            return towers_open_clip.OpenClipTowers(model, device, precision, config.batch)
+        model = towers_transformers.load_model(files)
+        return towers_transformers.TransformersTowers(model, device, precision, config.batch)
+
+    def identity() -> Mapping[str, Any]:
+        kind = device.partition(":")[0]
+        return {"runtime": config.runtime, "files": files.digests(), "precision": precision, "device": kind}
+
+    if config.runtime == "open_clip":
+        spec = towers_open_clip.read_spec(files, config.transform)
+        tokeniser: Callable[[], Tokeniser] = partial(towers_open_clip.read_tokeniser, files)
+    else:
+        spec = towers_transformers.read_spec(files, config.transform)
+        tokeniser = _tokeniser_of(files, spec)
+    return FoundationEncoder(name, spec, load_towers, tokeniser, identity, cache)
+
+
+def _onnx_encoder(
+    config: ModelsConfig, files: ModelFiles, cache: FrameCache | None, job_index: int
+) -> FoundationEncoder:
+    provider: Provider = config.provider or ("cpu" if config.device == "cpu" else "cuda")
+    device_index = 0 if provider == "cpu" else int(device_for(config.device, job_index).partition(":")[2])
+    manifest = towers_onnx.read_manifest(files.weights)
+    if manifest.name != files.entry.name:
+        raise ConfigError(f"{files.folder}: holds '{manifest.name}', not '{files.entry.name}'; mend models.paths")
+    spec = towers_onnx.read_spec(files, config.transform)
+
+    def identity() -> Mapping[str, Any]:
+        return {"runtime": "onnx", "files": dict(manifest.files), "provider": provider}
+
+    def load_towers() -> Towers:
+        return towers_onnx.OnnxTowers(files, provider, device_index, config.batch)
+
+    return FoundationEncoder(files.entry.name, spec, load_towers, _tokeniser_of(files, spec), identity, cache)
+
+
+def _tokeniser_of(files: ModelFiles, spec: EncoderSpec) -> Callable[[], Tokeniser]:
+    return partial(read_tokeniser, files.folder, spec.tokens, spec.n_tokens, spec.pad_id, spec.n_words)

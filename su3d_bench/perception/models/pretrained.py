@@ -1,0 +1,147 @@
+"""SAM and GroundingDINO from the files of a model folder, or from SAM's original checkpoint."""
+
+from __future__ import annotations
+
+import os
+import re
+from functools import lru_cache
+from typing import Any
+
+from su3d_bench.errors import DataError
+from su3d_bench.perception.models.devices import make_deterministic, require
+from su3d_bench.perception.models.files import ModelFiles
+from su3d_bench.perception.models.grounding_dino import GroundingDino
+from su3d_bench.perception.models.sam_networks import TorchSam
+from su3d_bench.perception.models.weights import PICKLED, bounded, read_settings, read_weights
+
+# Width, layers, heads and layers with global attention of the image towers, from segment_anything/build_sam.py.
+_SAM_TOWERS = {
+    "sam-vit-h": (1280, 32, 16, (7, 15, 23, 31)),
+    "sam-vit-l": (1024, 24, 16, (5, 11, 17, 23)),
+    "sam-vit-b": (768, 12, 12, (2, 5, 8, 11)),
+}
+# The original's names and transformers' for the same tensors, as whole parts of a dotted name.
+_SAM_NAMES = (
+    (r"^image_encoder\.", "vision_encoder."),
+    (r"\.patch_embed\.proj\.", ".patch_embed.projection."),
+    (r"\.blocks\.", ".layers."),
+    (r"\.neck\.0\.", ".neck.conv1."),
+    (r"\.neck\.1\.", ".neck.layer_norm1."),
+    (r"\.neck\.2\.", ".neck.conv2."),
+    (r"\.neck\.3\.", ".neck.layer_norm2."),
+    (r"\.norm(\d|_final_attn)\.", r".layer_norm\1."),
+    (r"\.pe_layer\.positional_encoding_gaussian_matrix$", ".shared_embedding.positional_embedding"),
+    (r"\.point_embeddings\.", ".point_embed."),
+    (r"\.mask_downscaling\.0\.", ".mask_embed.conv1."),
+    (r"\.mask_downscaling\.1\.", ".mask_embed.layer_norm1."),
+    (r"\.mask_downscaling\.3\.", ".mask_embed.conv2."),
+    (r"\.mask_downscaling\.4\.", ".mask_embed.layer_norm2."),
+    (r"\.mask_downscaling\.6\.", ".mask_embed.conv3."),
+    (r"\.output_upscaling\.0\.", ".upscale_conv1."),
+    (r"\.output_upscaling\.1\.", ".upscale_layer_norm."),
+    (r"\.output_upscaling\.3\.", ".upscale_conv2."),
+    (r"(\.output_hypernetworks_mlps\.\d+|\.iou_prediction_head)\.layers\.0\.", r"\1.proj_in."),
+    (r"(\.output_hypernetworks_mlps\.\d+|\.iou_prediction_head)\.layers\.2\.", r"\1.proj_out."),
+    (r"(\.output_hypernetworks_mlps\.\d+|\.iou_prediction_head)\.layers\.1\.", r"\1.layers.0."),
+)
+_SAM_POSITIONS = "shared_image_embedding.positional_embedding"
+
+
+@lru_cache(maxsize=2)
+def load_sam(files: ModelFiles, device: str, precision: str) -> TorchSam:
+    """SAM ready to run; the last two are kept, because a worker segments one scene after another."""
+    model = _original_sam(files) if files.form.form == "original" else _pretrained(files, "SamModel")
+    return TorchSam(_on_device(model, device, precision))
+
+
+@lru_cache(maxsize=2)
+def load_grounding_dino(files: ModelFiles, device: str, precision: str) -> GroundingDino:
+    """GroundingDINO with its tokenizer ready to run; the last two are kept."""
+    model = _pretrained(files, "GroundingDinoForObjectDetection")
+    transformers = require("transformers", f"detector '{files.entry.name}'")
+    try:
+        tokenizer = transformers.BertTokenizer.from_pretrained(str(files.folder), local_files_only=True)
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise DataError(f"{files.folder}: its tokenizer cannot be read: {bounded(error)}; fetch it anew") from error
+    return GroundingDino(_on_device(model, device, precision), tokenizer)
+
+
+def sam_names(tensors: dict[str, Any]) -> dict[str, Any]:
+    """The tensors of an original SAM checkpoint under the names of ``transformers``' SamModel."""
+    renamed = {}
+    for name, tensor in tensors.items():
+        for old, new in _SAM_NAMES:
+            name = re.sub(old, new, name)
+        renamed[name] = tensor
+    positions = renamed.get("prompt_encoder.shared_embedding.positional_embedding")
+    if positions is not None:
+        renamed[_SAM_POSITIONS] = positions  # one tensor in the original, two names in transformers
+    return renamed
+
+
+def sam_config(name: str) -> Any:
+    """``transformers``' configuration of the published SAM called ``name``."""
+    transformers = require("transformers", f"segmenter '{name}'")
+    width, n_layers, n_heads, global_layers = _SAM_TOWERS[name]
+    tower = {
+        "hidden_size": width,
+        "num_hidden_layers": n_layers,
+        "num_attention_heads": n_heads,
+        "global_attn_indexes": list(global_layers),
+    }
+    return transformers.SamConfig(vision_config=tower)
+
+
+def fill_sam(model: Any, tensors: dict[str, Any], where: str) -> Any:
+    """``model`` with the weights of an original checkpoint, every one of them; raises ``DataError``."""
+    try:
+        model.load_state_dict(sam_names(tensors), strict=True)
+    except RuntimeError as error:
+        raise DataError(f"{where}: is no checkpoint of this SAM: {bounded(error)}; fetch it anew") from error
+    return model
+
+
+def _original_sam(files: ModelFiles) -> Any:
+    transformers = require("transformers", f"segmenter '{files.entry.name}'")
+    tensors = read_weights(files.weights)
+    return fill_sam(transformers.SamModel(sam_config(files.entry.name)), tensors, str(files.weights))
+
+
+def _pretrained(files: ModelFiles, class_name: str) -> Any:
+    """A transformers model in float32 on the CPU; weights that are missing are an error, never random."""
+    os.environ.setdefault("HF_HUB_OFFLINE", "1")  # everything lies in the folder; nothing is to be asked for
+    transformers = require("transformers", f"model '{files.entry.name}'")
+    model_class = getattr(transformers, class_name)
+    told = read_settings(files.folder / "config.json").get("model_type")
+    if told != model_class.config_class.model_type:
+        wanted = model_class.config_class.model_type
+        raise DataError(f"{files.folder}: model_type is {str(told)[:40]!r}; '{files.entry.name}' is {wanted!r}")
+    if files.weights.suffix in PICKLED:
+        read_weights(files.weights, "meta")  # says in our words what is wrong with the file
+    try:
+        model, info = model_class.from_pretrained(
+            str(files.folder),
+            local_files_only=True,
+            use_safetensors=files.weights.suffix == ".safetensors",
+            weights_only=True,
+            dtype=require("torch", class_name).float32,
+            output_loading_info=True,
+        )
+    except Exception as error:
+        if type(error).__module__.startswith("safetensors") or isinstance(
+            error, OSError | ValueError | RuntimeError | KeyError
+        ):
+            raise DataError(f"{files.weights}: cannot be loaded: {bounded(error)}; fetch the folder anew") from error
+        raise
+    if missing := sorted(info["missing_keys"]):
+        raise DataError(
+            f"{files.weights}: lacks {len(missing)} tensors, such as {missing[0][:80]}; it is no "
+            f"{files.entry.name}, fetch the folder anew from {files.form.source}"
+        )
+    return model
+
+
+def _on_device(model: Any, device: str, precision: str) -> Any:
+    torch = require("torch", f"device '{device}'")
+    make_deterministic(device)
+    return model.eval().to(device=device, dtype=getattr(torch, precision))

@@ -1,0 +1,1 @@
+"""Questions about a map: by geometry alone, or by a language model that is given the map."""

@@ -1,0 +1,47 @@
+"""Questions answered by a language model that is given the map without points and features."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from su3d_bench.perception.language.captioner import reason_of
+from su3d_bench.perception.language.chat import ChatRequest
+from su3d_bench.perception.language.client import LanguageModel
+from su3d_bench.perception.language.config import LanguageConfig
+from su3d_bench.perception.language.parsing import answered, is_refusal
+from su3d_bench.reasoning.answers import Answer, unsettled
+from su3d_bench.reasoning.prompting import ask_request, context_for
+from su3d_bench.reasoning.scene_map import SceneMap
+
+
+class LanguageSolver:
+    """Asks the text model with the paper's prompting strategy."""
+
+    def __init__(self, scene: SceneMap, model: LanguageModel, config: LanguageConfig) -> None:
+        self._scene = scene
+        self._model = model
+        self._config = config
+
+    def request(self, question: str) -> ChatRequest:
+        """What is asked of the model."""
+        return ask_request(context_for(self._scene, question, self._config), question, self._config)
+
+    def answer(self, question: str) -> Answer:
+        """The model's answer and the objects that it names; its failure or refusal as an unsettled one."""
+        context = context_for(self._scene, question, self._config)
+        reply = self._model.ask_all([ask_request(context, question, self._config)])[0]
+        notes = tuple(note for note in (context.note, _dropped(reply.dropped)) if note)
+        said = None if reply.failure else answered(reply.text, [one.id for one in context.objects])
+        if said is None or (not said.object_ids and is_refusal(said.text)):
+            return replace(unsettled(f"{self._config.text_model}: {reason_of(reply)}", notes), solver="llm")
+        if reply.finish_reason == "length":
+            notes += ("the answer was cut at max_answer_tokens",)
+        if not said.object_ids:
+            notes += ("the answer names no object of the map",)
+        if said.reasons:
+            notes += (f"reasoning: {said.reasons}",)
+        return Answer(said.text, said.object_ids, kind="llm", notes=notes, solver="llm")
+
+
+def _dropped(names: tuple[str, ...]) -> str:
+    return f"the server does not take {', '.join(names)}; the model ran without" if names else ""

@@ -1,0 +1,160 @@
+"""What the updates of one scene under one method cost."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from su3d_bench.statistics import Growth, growth_exponent
+from su3d_bench.types import Float64Array
+
+# Stages that are no part of keeping the map: reading the frame, and perception.
+NOT_MAP = ("decode", "cache", "segment", "encode", "caption")
+MAP = "map"
+TOTAL = "total"
+WARM_UP = 3  # first updates: caches and memory are cold, and the map is small
+
+
+@dataclass(frozen=True)
+class MapCost:
+    """What one map took: the updates before it and the milliseconds of ``finish``."""
+
+    n_updates: int
+    finish_ms: float
+
+
+@dataclass(frozen=True)
+class UpdateTimes:
+    """The updates of one scene under one method, in their order.
+
+    ``columns`` holds (N,) float64 of every column of ``updates.csv``: ``total_ms``, a ``<stage>_ms`` a stage, sizes.
+    ``maps`` are those midway and the last one; bytes are None where they were not measured. ``calibration_ms``:
+    the time of a fixed piece of work, measured between the updates.
+    """
+
+    run: str
+    scene: str
+    method: str
+    columns: Mapping[str, Float64Array]
+    maps: tuple[MapCost, ...]
+    peak_rss_bytes: int | None
+    device_bytes: int | None
+    calibration_ms: float | None = None
+
+    def __len__(self) -> int:
+        return len(next(iter(self.columns.values()), ()))
+
+    @property
+    def stages(self) -> tuple[str, ...]:
+        """Names of the stages, in the order in which they first took time."""
+        return tuple(name.removesuffix("_ms") for name in self.columns if name.endswith("_ms") and name != "total_ms")
+
+    def ms(self, stage: str) -> Float64Array:
+        """Milliseconds (N,) of a stage, of ``total`` or of ``map``; zeros for a stage that it does not have."""
+        if stage == MAP:
+            mine = [self.ms(name) for name in self.stages if name not in NOT_MAP]
+            return np.sum(mine, axis=0) if mine else np.zeros(len(self))
+        return self.columns.get(f"{stage}_ms", np.zeros(len(self)))
+
+
+def pooled(times: Sequence[UpdateTimes], stage: str, warm_up: int) -> Float64Array:
+    """Milliseconds of ``stage`` over all scenes, without the first ``warm_up`` updates of each."""
+    return np.concatenate([one.ms(stage)[warm_up:] for one in times]) if times else np.zeros(0)
+
+
+@dataclass(frozen=True)
+class StageSummary:
+    """One stage of a method over its updates, in ms; ``first`` is the mean of the updates before the steady ones.
+
+    ``share`` of the total time; ``against_points`` and ``against_frames``: growth with the size of the map and with the
+    number of updates so far, None where the run cannot tell.
+    """
+
+    name: str
+    n: int
+    first: float
+    p50: float
+    p95: float
+    worst: float
+    share: float
+    against_points: Growth | None
+    against_frames: Growth | None
+
+
+@dataclass(frozen=True)
+class MethodSummary:
+    """What a method cost over the scenes of a run; rows of ``stages`` end with ``map`` and ``total``.
+
+    ``map`` is everything but reading the frame and perception. ``frames_per_s`` counts frames at full rate, of which
+    every stride-th is an update. Bytes are the largest over the scenes, None where none was measured.
+    """
+
+    run: str
+    method: str
+    scenes: tuple[str, ...]
+    n_updates: int
+    stages: tuple[StageSummary, ...]
+    updates_per_s: float
+    frames_per_s: float
+    finish_ms: float | None
+    n_points: int | None
+    map_bytes: int | None
+    peak_rss_bytes: int | None
+    device_bytes: int | None
+
+
+def summarise(times: Sequence[UpdateTimes], warm_up: int = WARM_UP) -> MethodSummary:
+    """The costs of one method over ``times``, at least one scene; ``warm_up`` updates of each scene stand apart."""
+    stages = tuple(dict.fromkeys(stage for one in times for stage in one.stages))
+    seconds = sum(float(one.ms("total").sum()) for one in times) / 1e3
+    n_updates = sum(map(len, times))
+    n_frames = sum(_frames_covered(one) for one in times)
+    last = [one.maps[-1].finish_ms for one in times if one.maps]
+    return MethodSummary(
+        run=times[0].run,
+        method=times[0].method,
+        scenes=tuple(one.scene for one in times),
+        n_updates=n_updates,
+        stages=tuple(_summarise_stage(times, name, warm_up) for name in (*stages, MAP, TOTAL)),
+        updates_per_s=n_updates / seconds if seconds else float("nan"),
+        frames_per_s=n_frames / seconds if seconds else float("nan"),
+        finish_ms=max(last) if last else None,
+        n_points=_largest([one.columns["n_points"].max() for one in times if "n_points" in one.columns]),
+        map_bytes=_largest([one.columns["map_bytes"].max() for one in times if "map_bytes" in one.columns]),
+        peak_rss_bytes=_largest([one.peak_rss_bytes for one in times if one.peak_rss_bytes is not None]),
+        device_bytes=_largest([one.device_bytes for one in times if one.device_bytes is not None]),
+    )
+
+
+def _largest(values: Sequence[float]) -> int | None:
+    return int(max(values)) if values else None
+
+
+def _frames_covered(times: UpdateTimes) -> float:
+    """Frames at full rate that the updates stand for: the spacing of their indices, the last one's included."""
+    frames = times.columns.get("frame", np.arange(len(times), dtype=np.float64))
+    spacing = float(np.median(np.diff(frames))) if len(frames) > 1 else 1.0
+    return float(frames[-1] - frames[0]) + spacing
+
+
+def _summarise_stage(times: Sequence[UpdateTimes], stage: str, warm_up: int) -> StageSummary:
+    steady = pooled(times, stage, warm_up)
+    first = np.concatenate([one.ms(stage)[:warm_up] for one in times])
+    everything = float(sum(one.ms(stage).sum() for one in times))
+    total = float(sum(one.ms(TOTAL).sum() for one in times))
+    points = [one.columns.get("n_points", np.zeros(len(one)))[warm_up:] for one in times]
+    counts = [np.arange(warm_up + 1, len(one) + 1, dtype=np.float64) for one in times]
+    middle, high, worst = np.percentile(steady, [50, 95, 100]) if len(steady) else (float("nan"),) * 3
+    return StageSummary(
+        name=stage,
+        n=len(steady),
+        first=float(first.mean()) if len(first) else float("nan"),
+        p50=float(middle),
+        p95=float(high),
+        worst=float(worst),
+        share=everything / total if total else float("nan"),
+        against_points=growth_exponent(np.concatenate(points), steady),
+        against_frames=growth_exponent(np.concatenate(counts), steady),
+    )

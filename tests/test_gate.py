@@ -1,0 +1,266 @@
+"""The gate: twenty planted regressions are caught, fifty unchanged repeats pass."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from painted import colour_perception
+
+from su3d_bench import scene_run
+from su3d_bench.cli.main import main
+from su3d_bench.finished_run import read_run
+from su3d_bench.gate import Reference, check, learn, read_reference
+from su3d_bench.gate_findings import Finding, Verdict
+from su3d_bench.reports.gate_report import github_lines, junit_xml, markdown, plain_lines
+
+PAINTED = f"{Path(__file__).parent}/painted.py"
+WORDS = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--methods", f"{PAINTED}:Collector"]
+WORDS += ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures", "--jobs", "1"]
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("gate") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        assert main([*WORDS, "--out", str(folder)]) == 0
+    for updates in folder.rglob("updates.csv"):
+        _steady(updates)
+    return folder
+
+
+def _steady(updates: Path) -> None:
+    """Put times of 4 ms in place of the measured ones, so that the tests do not depend on the machine's mood."""
+    rows = list(csv.reader(updates.open()))
+    if len(rows) < 2:
+        return
+    header = rows[0]
+    with updates.open("w", newline="") as stream:
+        writer = csv.writer(stream, lineterminator="\n")
+        writer.writerow([*header[:-1], "match_ms", "total_ms"])
+        writer.writerows([*row[:-1], "4.0", "9.0"] for row in rows[1:])
+
+
+@pytest.fixture(scope="module")
+def reference(made: Path) -> Reference:
+    return learn([read_run(made)])
+
+
+@pytest.fixture
+def run(made: Path, tmp_path: Path) -> Path:
+    shutil.copytree(made, tmp_path / "run")
+    return tmp_path / "run"
+
+
+def edit(path: Path, change: Callable[[Any], None]) -> None:
+    value = json.loads(path.read_text())
+    change(value)
+    path.write_text(json.dumps(value))
+
+
+def in_metrics(change: Callable[[Any], None]) -> Callable[[Path], None]:
+    return lambda run: edit(run / "metrics.json", change)
+
+
+def in_record(change: Callable[[Any], None]) -> Callable[[Path], None]:
+    return lambda run: edit(run / "run.json", change)
+
+
+def lowered(table: str, *keys: str, by: float = 0.001) -> Callable[[Path], None]:
+    def change(metrics: Any) -> None:
+        row = metrics["results"][0]["result"][table]
+        for key in keys[:-1]:
+            row = row[key]
+        row[keys[-1]] -= by
+
+    return in_metrics(change)
+
+
+def slower(factor: float) -> Callable[[Path], None]:
+    def change(run: Path) -> None:
+        for updates in run.rglob("updates.csv"):
+            updates.write_text(updates.read_text().replace("4.0,9.0", f"{4 * factor},{5 + 4 * factor}"))
+
+    return change
+
+
+def setting(old: str, new: str) -> Callable[[Path], None]:
+    def change(run: Path) -> None:
+        text = (run / "run.toml").read_text()
+        assert old in text
+        (run / "run.toml").write_text(text.replace(old, new, 1))
+
+    return change
+
+
+def without_calibration(run: Path) -> None:
+    for done in run.rglob("collector/done.json"):
+        edit(done, lambda value: value["steps"]["predict"]["remarks"]["costs"].update(calibration_ms=None))
+
+
+def results_of(metrics: Any) -> Any:
+    return metrics["results"][0]["result"]
+
+
+PLANTED: dict[str, tuple[Callable[[Path], None], str]] = {
+    "a metric off by 0.1 point": (lowered("metrics", "mAcc"), "collector / rooms-semantic / mAcc: is worse"),
+    "a metric off by the last bit": (lowered("metrics", "F-mIoU", by=1e-15), "F-mIoU: is worse"),
+    "an undefined metric": (in_metrics(lambda m: results_of(m)["metrics"].update(mAcc=None)), "is undefined in one"),
+    "a scene worse": (lowered("per_scene", "painted/a", "mAcc"), "scene painted/a / mAcc: is worse"),
+    "a class worse": (lowered("per_class", "chair", "IoU"), "class chair / IoU: is worse"),
+    "a class missing": (in_metrics(lambda m: results_of(m)["per_class"].pop("sofa")), "class sofa: the run does not"),
+    "a scene missing in a result": (
+        in_metrics(lambda m: results_of(m)["per_scene"].pop("painted/b")),
+        "scene painted/b: the run does not have this scene",
+    ),
+    "a scene missing in the run": (in_record(lambda r: r["scenes"].remove("painted/b")), "painted/b: the run does not"),
+    "a result missing": (in_metrics(lambda m: m["results"].pop()), "rooms-instance: the run has no score of it"),
+    "a result without numbers": (in_metrics(lambda m: m["results"][1].update(result=None)), "has no score of it"),
+    "a protocol missing": (in_record(lambda r: r["protocols"].pop()), "rooms-instance: the run does not have this"),
+    "another protocol version": (
+        in_record(lambda r: r["protocols"][0].update(version=9)),
+        "rooms-semantic: protocol version was",
+    ),
+    "another protocol digest": (in_record(lambda r: r["protocols"][0].update(digest="f" * 64)), "protocol digest was"),
+    "other data": (in_record(lambda r: r["data_digests"].update({"painted/a": "x"})), "painted/a: data digest was"),
+    "another encoder": (in_metrics(lambda m: m["results"][0].update(encoder_digest="x")), "encoder digest was"),
+    "another profile": (in_metrics(lambda m: m["results"][0].update(profile="oracle")), "profile was"),
+    "another seed": (setting("seed = 0", "seed = 1"), "settings: seed was 0, now 1"),
+    "another option of the dataset": (setting("n_frames = 6", "n_frames = 5"), "dataset.painted.n_frames was 6, now 5"),
+    "an incomplete run": (in_record(lambda r: r.update(status="incomplete")), "run: is incomplete"),
+    "a partial run": (in_metrics(lambda m: m.update(limit=3)), "run: limit was 0, now 3"),
+    "an update slower by half": (slower(1.5), "cost of an update: costs 1.4"),
+    "an update that nobody timed": (without_calibration, "cost of an update: the run did not measure it"),
+}
+
+
+@pytest.mark.parametrize("name", PLANTED)
+def test_a_planted_regression_is_caught(name: str, run: Path, reference: Reference) -> None:
+    plant, said = PLANTED[name]
+    plant(run)
+    verdict = check(read_run(run), reference)
+    assert not verdict.is_passed
+    assert any(said in line for line in plain_lines(verdict)), plain_lines(verdict)
+
+
+def test_fifty_unchanged_repeats_pass(run: Path, reference: Reference) -> None:
+    generator = np.random.default_rng(0)
+    originals = {path: path.read_text() for path in run.rglob("updates.csv")}
+    for _ in range(50):
+        # Time is the one thing that unchanged repeats differ in: by a twentieth, now and then by a tenth.
+        factor = float(np.exp(generator.normal(0, 0.05)))
+        for path, text in originals.items():
+            path.write_text(text.replace("4.0,9.0", f"{4 * factor},{5 + 4 * factor}"))
+        assert check(read_run(run), reference).is_passed
+
+
+def test_real_repeats_with_real_times_pass(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    for name in "ab":
+        assert main([*WORDS, "--out", str(tmp_path / name)]) == 0
+    taught = learn([read_run(tmp_path / "a")], cost_limit=50.0)  # this method's updates take microseconds
+    assert check(read_run(tmp_path / "b"), taught).is_passed
+
+
+def test_what_is_better_is_said_and_passes(run: Path, reference: Reference) -> None:
+    edit(run / "metrics.json", lambda m: results_of(m)["metrics"].update(mAcc=results_of(m)["metrics"]["mAcc"] + 0.01))
+    verdict = check(read_run(run), reference)
+    assert verdict.is_passed
+    assert [one.kind for one in verdict.findings] == ["better"]
+    assert "1 better" in plain_lines(verdict)[0]
+
+
+def test_the_tolerance_is_twice_the_spread_of_the_taught_runs(run: Path, made: Path, tmp_path: Path) -> None:
+    value = json.loads((made / "metrics.json").read_text())["results"][0]["result"]["metrics"]["mAcc"]
+    lowered("metrics", "mAcc", by=0.004)(run)
+    taught = learn([read_run(made), read_run(run)])
+    learnt = taught.results[0].metrics["mAcc"]
+    assert (learnt.value, learnt.tolerance) == (pytest.approx(value - 0.002), pytest.approx(0.008))
+    assert taught.results[0].metrics["F-mIoU"].tolerance == 0
+    shutil.copytree(made, tmp_path / "third")
+    lowered("metrics", "mAcc", by=0.0099)(tmp_path / "third")
+    assert check(read_run(tmp_path / "third"), taught).is_passed
+    lowered("metrics", "mAcc", by=0.0002)(tmp_path / "third")
+    assert not check(read_run(tmp_path / "third"), taught).is_passed
+
+
+def test_on_another_processor_headline_values_have_a_stated_tolerance(run: Path, reference: Reference) -> None:
+    edit(run / "run.json", lambda r: r.update(processor="other"))
+    lowered("metrics", "mAcc", by=0.019)(run)
+    lowered("per_class", "chair", "IoU", by=0.2)(run)
+    slower(3.0)(run)
+    verdict = check(read_run(run), reference)
+    assert verdict.is_passed
+    assert "another processor" in verdict.remarks[0] and "within 2 points" in verdict.remarks[0]
+    lowered("metrics", "mAcc", by=0.002)(run)
+    assert not check(read_run(run), reference).is_passed
+
+
+def test_runs_of_different_requests_teach_nothing(run: Path, made: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    setting("seed = 0", "seed = 1")(run)
+    assert main(["check", "--learn", str(made), str(run), "--out", str(run / "r.json")]) == 2
+    assert "differs from" in capsys.readouterr().err
+    assert not (run / "r.json").exists()
+
+
+def test_the_command_fails_with_one_and_writes_what_a_pull_request_needs(
+    run: Path, made: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    learnt = tmp_path / "reference.json"
+    assert main(["check", "--learn", str(made), "--out", str(learnt)]) == 0
+    assert main(["check", str(run), "--against", str(learnt)]) == 0
+    lowered("metrics", "mAcc")(run)
+    capsys.readouterr()
+    words = ["check", str(run), "--against", str(learnt), "--github"]
+    assert main([*words, "--markdown", str(tmp_path / "c.md"), "--junit", str(tmp_path / "j.xml")]) == 1
+    shown = capsys.readouterr().out
+    assert shown.startswith("failed: 1 differences") and "::error title=su3d-bench::" in shown
+    assert "| FAIL | collector / rooms-semantic / mAcc |" in (tmp_path / "c.md").read_text()
+    suite = ElementTree.parse(tmp_path / "j.xml").getroot()
+    assert suite.get("failures") == "1" and len(suite.findall("testcase/failure")) == 1
+    assert main([*words, "--json"]) == 1
+    assert json.loads(capsys.readouterr().out)["passed"] is False
+
+
+HOSTILE = "<script>|`$(x)`\n::error::\x00" + "é" * 400
+
+
+def test_a_hostile_name_does_no_harm() -> None:
+    verdict = Verdict("run", (Finding("changed", HOSTILE, HOSTILE),), 1, (HOSTILE,))
+    assert "<script>" not in markdown(verdict).replace("\\<script\\>", "")
+    ElementTree.fromstring(junit_xml(verdict))
+    lines = "\n".join(github_lines(verdict)).split("\n")
+    assert len(lines) == 2 and all(line.startswith("::") and " title=su3d-bench::" in line for line in lines)
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{}", '{"results": []}', "[" * 100_000, '{"hardware": NaN}'])
+def test_a_damaged_reference_is_one_line(
+    text: str, run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "bad.json").write_text(text)
+    assert main(["check", str(run), "--against", str(tmp_path / "bad.json")]) == 2
+    error = capsys.readouterr().err
+    assert "check --learn" in error and error.count("\n") == 1
+
+
+def test_a_reference_survives_its_file(reference: Reference, tmp_path: Path) -> None:
+    (tmp_path / "r.json").write_text(json.dumps(reference.model_dump(mode="json", exclude_defaults=True)))
+    assert read_reference(tmp_path / "r.json") == reference
+
+
+@pytest.mark.parametrize(
+    "words", [[], ["a"], ["a", "b", "--against", "r"], ["--learn", "a"], ["a", "--against", "r", "--cost-limit", "2"]]
+)
+def test_a_request_that_is_neither_check_nor_learn_is_one_line(
+    words: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["check", *words]) == 2
+    assert capsys.readouterr().err.startswith("su3d-bench: check: ")

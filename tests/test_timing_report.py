@@ -1,0 +1,174 @@
+"""What updates cost: reading the tables of a run, summing them up, the report as people see it."""
+
+from __future__ import annotations
+
+import csv
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from painted import colour_perception
+
+from su3d_bench import scene_run
+from su3d_bench.cli.main import main
+from su3d_bench.errors import DataError
+from su3d_bench.finished_run import read_run
+from su3d_bench.finished_updates import read_update_times
+from su3d_bench.statistics import growth_exponent
+from su3d_bench.timing import peak_memory_bytes, start_memory_watch
+from su3d_bench.types import Float64Array
+from su3d_bench.update_times import MapCost, UpdateTimes, summarise
+
+PAINTED = f"{Path(__file__).parent}/painted.py"
+WORDS = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--methods", f"{PAINTED}:Collector"]
+WORDS += ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures", "--jobs", "1", "--anytime", "0.5", "0.1"]
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("timing") / "run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        assert main([*WORDS, "--out", str(folder)]) == 0
+    return folder
+
+
+def times(total_ms: Float64Array, **columns: Float64Array) -> UpdateTimes:
+    return UpdateTimes("r", "d/s", "m", {**columns, "total_ms": total_ms}, (), None, None)
+
+
+def stages_of(summary: Any) -> dict[str, Any]:
+    return {one.name: one for one in summary.stages}
+
+
+def test_a_cost_that_is_a_power_of_the_size_has_its_exponent() -> None:
+    sizes = np.linspace(1e4, 1e6, 60)
+    growth = growth_exponent(sizes, 0.01 * sizes**0.7)
+    assert growth is not None
+    np.testing.assert_allclose([growth.exponent, growth.low, growth.high], 0.7, atol=1e-12)
+    assert growth.words == "grows"
+
+
+def test_a_noisy_constant_is_called_constant_and_a_noisy_root_grows() -> None:
+    sizes = np.linspace(1e4, 1e6, 200)
+    noise = np.exp(np.random.default_rng(0).normal(0, 0.1, 200))
+    flat, root = growth_exponent(sizes, 20.0 * noise), growth_exponent(sizes, np.sqrt(sizes) * noise)
+    assert flat is not None and flat.low < 0 < flat.high and flat.words == "constant per update"
+    assert root is not None and root.low < 0.5 < root.high and root.words == "grows"
+
+
+def test_nothing_is_said_of_growth_where_the_map_hardly_grew() -> None:
+    assert growth_exponent(np.linspace(100, 150, 50), np.ones(50)) is None
+    assert growth_exponent(np.array([1.0, 10.0, 100.0]), np.ones(3)) is None
+
+
+def test_percentiles_leave_the_first_updates_out_and_the_share_counts_them() -> None:
+    total = np.array([100.0, 50.0, 10.0, 10.0, 20.0, 30.0])
+    summary = summarise([times(total, match_ms=total / 2, frame=np.arange(0, 60, 10.0))], warm_up=2)
+    stage = stages_of(summary)["total"]
+    assert (stage.n, stage.p50, stage.worst, stage.first) == (4, 15.0, 30.0, 75.0)
+    assert stages_of(summary)["match"].share == 0.5
+    assert summary.updates_per_s == pytest.approx(6 / 0.22)
+    assert summary.frames_per_s == pytest.approx(60 / 0.22)
+
+
+def test_the_share_of_the_map_is_what_is_neither_reading_nor_perception() -> None:
+    one = times(np.full(4, 10.0), decode_ms=np.full(4, 3.0), encode_ms=np.full(4, 4.0), match_ms=np.full(4, 2.0))
+    np.testing.assert_array_equal(one.ms("map"), 2.0)
+
+
+def test_a_stage_that_only_some_scenes_have_counts_as_zero_in_the_others() -> None:
+    summary = summarise([times(np.ones(5), match_ms=np.ones(5)), times(np.ones(5))], warm_up=0)
+    assert stages_of(summary)["match"].share == 0.5
+    assert stages_of(summary)["match"].n == 10
+
+
+def test_a_run_records_sizes_memory_and_the_cost_of_every_map(run: Path) -> None:
+    (first, second) = read_update_times(read_run(run), "collector")
+    assert [first.scene, second.scene] == ["painted/a", "painted/b"]
+    assert len(first) == 6
+    assert (first.columns["rss_bytes"] > 1e6).all()
+    assert [one.n_updates for one in first.maps] == [1, 3, 6]
+    assert first.peak_rss_bytes is not None and first.peak_rss_bytes >= first.columns["rss_bytes"].max() / 2
+    assert all(isinstance(one, MapCost) and one.finish_ms >= 0 for one in first.maps)
+
+
+def test_the_maps_midway_are_scored_and_their_numbers_stand_in_the_metrics(run: Path) -> None:
+    results = json.loads((run / "metrics.json").read_text())["results"]
+    for one in results:
+        assert [midway["share"] for midway in one["anytime"]] == [0.1, 0.5]
+        assert set(one["anytime"][0]["metrics"]) == set(one["result"]["metrics"])
+    coverage = [midway["metrics"]["mAcc"] for midway in results[0]["anytime"]]
+    assert coverage[0] <= coverage[1] <= results[0]["result"]["metrics"]["mAcc"]
+
+
+def test_a_run_with_other_shares_is_another_run(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = [*WORDS[:-2], "0.25", "--out", str(run)]
+    assert main(words) == 2
+    assert "anytime was (0.1, 0.5), now (0.25,)" in capsys.readouterr().err
+
+
+def test_the_report_prints_tables_and_writes_them_with_plots(
+    run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["report", "timing", str(run), "--out", str(tmp_path), "--warm-up", "1"]) == 0
+    shown = capsys.readouterr().out
+    assert shown.count("| collector |") == 1 + 2 * 3
+    assert "12 updates of 2 scenes" in shown
+    rows = list(csv.DictReader((tmp_path / "timing.csv").open()))
+    assert {"map", "total"} <= {row["stage"] for row in rows}
+    assert all(int(row["n"]) == 10 and float(row["p50_ms"]) >= 0 for row in rows)
+    assert (tmp_path / "timing.md").read_text().startswith(str(run))
+    for name in ("update-cost", "stages", "anytime"):
+        assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
+        assert (tmp_path / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+
+
+def test_the_report_answers_in_json(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["report", "timing", str(run), "--json"]) == 0
+    (method,) = json.loads(capsys.readouterr().out)["methods"]
+    assert (method["method"], method["n_updates"]) == ("collector", 12)
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--methods", "colector"], "did you mean 'collector'"),
+        (["--warm-up", "-1"], "--warm-up is a count from 0"),
+        (["--camera-rate", "0"], "--camera-rate a number above 0"),
+        (["--methods", "oracle"], "no update was timed"),
+    ],
+)
+def test_a_wrong_request_is_one_line(
+    run: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["report", "timing", str(run), *words]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+@pytest.mark.parametrize("text", ["update,total_ms\n1,x\n", "update,total_ms\n1\n", "update,total_ms\n0,nan\n", "\x00"])
+def test_a_damaged_table_of_updates_is_one_line(run: Path, tmp_path: Path, text: str) -> None:
+    import shutil
+
+    shutil.copytree(run, tmp_path / "run")
+    job = read_run(tmp_path / "run").folder.job("painted/a", "collector")
+    job.updates.write_text(text)
+    if "total_ms" not in text:
+        assert [one.scene for one in read_update_times(read_run(tmp_path / "run"), "collector")] == ["painted/b"]
+        return
+    with pytest.raises(DataError, match=r"painted/a: updates\.csv: .*; run the same command again to mend it"):
+        read_update_times(read_run(tmp_path / "run"), "collector")
+
+
+def test_the_memory_watch_forgets_what_was_held_before() -> None:
+    block = np.ones(30_000_000)
+    with_block = peak_memory_bytes()
+    del block
+    start_memory_watch()
+    after = peak_memory_bytes()
+    if with_block is None or after is None:
+        pytest.skip("this system does not tell a process its peak memory")
+    assert after < with_block - 100_000_000
