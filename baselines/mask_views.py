@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.types import Float64Array, Frame, Int32Array, Int64Array, Proposals
+from su3d_bench.types import Float32Array, Float64Array, Frame, Int32Array, Int64Array, Proposals
 
 NO_VIEW = -1
 
@@ -47,7 +47,7 @@ def as_openmask3d(frame: Frame, resolution: tuple[int, int]) -> Float64Array:
 
 
 def visible_pixels(
-    points: Float64Array, frame: Frame, intrinsics: Float64Array, depth_tolerance_m: float
+    points: Float32Array, frame: Frame, intrinsics: Float64Array, depth_tolerance_m: float
 ) -> Int32Array:
     """The pixel (V,), row * width + column, at which each point is seen; -1 where it is not.
 

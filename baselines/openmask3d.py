@@ -28,7 +28,7 @@ class OpenMask3D:
     """OpenMask3D: 3D proposals of Mask3D's kind, described by CLIP features of their five best views."""
 
     name = "openmask3d"
-    Config = OpenMask3DConfig
+    Config: type[MaskPipelineConfig] = OpenMask3DConfig
     about = MethodAbout(
         paper="Takmaz et al.: OpenMask3D: Open-Vocabulary 3D Instance Segmentation, NeurIPS 2023",
         source="https://github.com/OpenMask3D/openmask3d, commit 3bc3fc5",
@@ -38,7 +38,7 @@ class OpenMask3D:
         "files; never run beside the original, and no figure of the paper has been reproduced",
     )
 
-    def __init__(self, config: OpenMask3DConfig | None = None) -> None:
+    def __init__(self, config: MaskPipelineConfig | None = None) -> None:
         self.config = config or OpenMask3DConfig()
         self._tools: SceneTools | None = None
         self._pipeline: MaskPipeline | None = None

@@ -83,22 +83,23 @@ def make_proposals(config: ProposalConfig, tools: SceneTools, dataset: str, scen
     if kind == "files":
         assert config.proposals_folder is not None
         proposals = read_proposals(config.proposals_folder, scene, surface)
-        return _in_parts(proposals, surface, config) if config.split_parts == "always" else proposals
+        return _in_parts(proposals, _segments(surface, config), config) if config.split_parts == "always" else proposals
     choice = NodeChoice(
         config.surface_most, config.surface_min_points, config.surface_max_share, config.surface_same_iou
     )
-    proposals = surface_proposals(surface, _segments(surface, config), choice)
-    return proposals if config.split_parts == "never" else _in_parts(proposals, surface, config)
+    segments = _segments(surface, config)
+    proposals = surface_proposals(surface, segments, choice)
+    return proposals if config.split_parts == "never" else _in_parts(proposals, segments, config)
 
 
 def _segments(surface: Surface, config: ProposalConfig) -> Int64Array:
     return segments_of(surface, config.segment_threshold, config.segment_min_vertices)
 
 
-def _in_parts(proposals: Proposals, surface: Surface, config: ProposalConfig) -> Proposals:
+def _in_parts(proposals: Proposals, segments: Int64Array, config: ProposalConfig) -> Proposals:
     rules = PartRules(config.part_eps_m, config.part_min_points, config.part_most_dropped, config.part_kept_share)
     parts = split_into_parts(proposals, rules)
-    return voted_by_segments(parts, _segments(surface, config)) if config.segment_vote else parts
+    return voted_by_segments(parts, segments) if config.segment_vote else parts
 
 
 def _surface(config: ProposalConfig, tools: SceneTools, where: str) -> Surface:

@@ -88,6 +88,7 @@ class _View:
     feature: Float32Array
     name: str
     caption: str
+    score: float
 
 
 class SAM3D:
@@ -191,9 +192,10 @@ class SAM3D:
         visible = np.flatnonzero(n_pixels)[::-1]
         first_view = len(self._views)
         for k in visible.tolist():
-            feature, name = detections.crop_features[k, 0], detections.names[k]
-            view = _View(detections.frame_index, k, int(n_pixels[k]), feature, name, detections.captions[k])
-            self._views.append(view)
+            told = detections.names[k], detections.captions[k], float(detections.scores[k])
+            self._views.append(
+                _View(detections.frame_index, k, int(n_pixels[k]), detections.crop_features[k, 0], *told)
+            )
         rows = np.arange(len(visible))
         return GroupedCloud(points, group, rows, rows + first_view)
 
@@ -234,7 +236,7 @@ class SAM3D:
         views = [np.sort(cloud.views[cloud.view_group == key]) for key in ids]
         largest = [max((self._views[v] for v in of), key=lambda view: view.n_pixels) for of in views]
         k = len(ids)
-        rows = [(self._views[v].frame_index, self._views[v].detection) for of in views for v in of]
+        seen = [self._views[v] for of in views for v in of]
         return Instances(
             points=points,
             indptr=_indptr(masks),
@@ -249,8 +251,10 @@ class SAM3D:
             ),
             centroids=np.array([points[m].mean(axis=0, dtype=np.float64) for m in masks], np.float32).reshape(k, 3),
             view_indptr=_indptr(views),
-            views=np.array(rows, np.int32).reshape(-1, 2),
+            views=np.array([(view.frame_index, view.detection) for view in seen], np.int32).reshape(-1, 2),
             ids=ids.astype(np.int32),
+            view_names=tuple(view.name for view in seen),
+            view_scores=np.array([view.score for view in seen], np.float64),
         )
 
     def _features(self, views: Sequence[Int64Array], largest: Sequence[_View]) -> Float32Array:

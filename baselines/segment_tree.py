@@ -78,7 +78,7 @@ def contacts_of(vertices: Float32Array, triangles: Int32Array, segments: Int64Ar
         first=pairs // max(n_segments, 1),
         second=pairs % max(n_segments, 1),
         n=np.bincount(of_pair, minlength=len(pairs)),
-        bend=np.bincount(of_pair, bend, len(pairs)),
+        bend=np.bincount(of_pair, bend, len(pairs)).astype(np.float64),
         n_patches=np.bincount(owner, minlength=n_segments),
     )
 
@@ -101,7 +101,7 @@ def _distinct(keys: Int64Array, base: int) -> tuple[Int64Array, Int64Array, Int6
     return found // base, found % base, inverse.reshape(-1)
 
 
-def _sums(group: Int64Array, values: Float32Array | Float64Array, n: int) -> Float64Array:
+def _sums(group: Int32Array | Int64Array, values: Float32Array | Float64Array, n: int) -> Float64Array:
     return np.stack([np.bincount(group, values[:, axis].astype(np.float64), n) for axis in range(3)], axis=1)
 
 

@@ -139,7 +139,7 @@ def read_assignments(texts: Sequence[str], methods: Sequence[str], datasets: Seq
         path = tuple(key.strip().split("."))
         if not equals or not all(path):
             raise ConfigError(f"--set {text}: expected KEY=VALUE, such as opensu3d.top_m=10")
-        entries.append(Setting(_full_path(text, path, methods, datasets), _parse_value(value), f"--set {key.strip()}"))
+        entries.append(Setting(_full_path(text, path, methods, datasets), parse_value(value), f"--set {key.strip()}"))
     return Settings(tuple(entries))
 
 
@@ -156,7 +156,8 @@ def _full_path(text: str, path: KeyPath, methods: Sequence[str], datasets: Seque
     raise ConfigError(f"--set {text}: '{path[0]}' is no method or dataset of this run{hint}")
 
 
-def _parse_value(text: str) -> Any:
+def parse_value(text: str) -> Any:
+    """A value in TOML, and plain text where it is not."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
     except tomllib.TOMLDecodeError:

@@ -6,7 +6,7 @@ import difflib
 import fnmatch
 import os
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +14,7 @@ from su3d_bench import registry
 from su3d_bench.config import RunConfig, Settings, check_keys, check_names, read_assignments, resolve
 from su3d_bench.digests import code_digest, digest_json
 from su3d_bench.errors import ConfigError, DataError, suggest
+from su3d_bench.method_names import NamedMethod, named_method
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig
 from su3d_bench.protocols import ProtocolRules, load_protocol, protocols_for
 from su3d_bench.scene_run import (
@@ -76,13 +77,13 @@ def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | N
     if config.profile not in PROFILES:
         hint = suggest(config.profile, PROFILES) or "; known: " + ", ".join(PROFILES)
         raise ConfigError(f"unknown profile '{config.profile}'{hint}")
-    methods = _own_names("method", _method_targets(config.methods))
-    datasets = _own_names("dataset", dataset_targets(config.scenes))
-    settings += read_assignments(assignments, list(methods), list(datasets))
-    _check_sections("method", settings, methods)
+    methods = {one.name: one for one in map(named_method, _method_targets(config.methods))}
+    datasets = {str(registry.load("dataset", target).name): target for target in dataset_targets(config.scenes)}
+    settings += read_assignments(assignments, [*{one.base for one in methods.values()}, *methods], list(datasets))
+    _check_sections("method", settings, {one.base: one.target for one in methods.values()}, list(methods))
     _check_sections("dataset", settings, datasets)
     parts = _Parts(
-        tuple(_part("method", target, settings) for target in methods.values()),
+        tuple(_method_part(one, settings) for one in methods.values()),
         {target: _part("dataset", target, settings) for target in datasets.values()},
         None if CEILING_METHOD in methods else _part("method", CEILING_METHOD, settings),
         resolve(settings, ("perception",), PerceptionConfig).model_dump_json(),
@@ -108,11 +109,6 @@ class _Parts:
     protocols: dict[str, tuple[str, ...]]
 
 
-def _own_names(kind: str, targets: Sequence[str]) -> dict[str, str]:
-    """Name that each class itself bears -> target."""
-    return {str(registry.load(kind, target).name): target for target in targets}
-
-
 def _options_model(kind: str, target: str) -> Any:
     return getattr(registry.load(kind, target), "Config" if kind == "method" else "Options")
 
@@ -123,13 +119,29 @@ def _part(kind: str, target: str, settings: Settings) -> Part:
     return Part(target, name, options.model_dump_json())
 
 
-def _check_sections(kind: str, settings: Settings, used: Mapping[str, str]) -> None:
-    """Sections of unknown names are refused; a shared file may configure parts unused here, but its keys must exist."""
+def _method_part(method: NamedMethod, settings: Settings) -> Part:
+    """A method with the settings of its base, then those of its variant, then those under its own full name."""
+    base = [
+        replace(entry, path=("method", method.name, *entry.path)) for entry in settings.under(("method", method.base))
+    ]
+    own = [
+        replace(entry, path=("method", method.name, *entry.path)) for entry in settings.under(("method", method.name))
+    ]
+    layered = Settings((*base, *method.settings, *(own if method.name != method.base else ())))
+    options = resolve(layered, ("method", method.name), _options_model("method", method.target))
+    return Part(method.target, method.name, options.model_dump_json())
+
+
+def _check_sections(kind: str, settings: Settings, used: Mapping[str, str], variants: Sequence[str] = ()) -> None:
+    """Sections of unknown names are refused; a shared file may configure parts unused here, but its keys must exist.
+
+    ``used``: name -> target; ``variants`` are full names that have sections of their own, checked with their part.
+    """
     known = dict.fromkeys([*used, *registry.names(kind)])
-    check_names(kind, settings, list(known))
+    check_names(kind, settings, [*known, *variants])
     for name in known:
-        if name not in used and settings.under((kind, name)):
-            resolve(settings, (kind, name), _options_model(kind, name))
+        if settings.under((kind, name)):
+            resolve(settings, (kind, name), _options_model(kind, used.get(name, name)))
 
 
 def _method_targets(methods: Sequence[str]) -> list[str]:

@@ -224,7 +224,7 @@ class _Scene:
 
     def perception(self, info: SceneInfo) -> Perception:
         config: PerceptionConfig = PerceptionConfig.model_validate_json(self.job.perception)
-        profile = resolve_profile(self.job.profile, info.image_domain)
+        profile = resolve_profile(self.job.profile, info.image_domain, config)
         mesh = self.mesh if profile == "oracle" else None
         return build_perception(profile, config, scene=info, cache_root=self.job.cache_root, mesh=mesh)
 

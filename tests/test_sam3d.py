@@ -57,6 +57,7 @@ def test_one_plate_in_many_frames_is_one_group_with_all_its_views(config: SAM3DC
     assert len(found) == 1
     assert views_of(found, 0) == [(index, 0) for index in range(5)]
     assert found.scores.tolist() == [1.0]
+    assert found.view_names == ("plate 0",) * 5 and np.asarray(found.view_scores).tolist() == [0.5] * 5
     assert found.boxes[0] == pytest.approx(np.array([[-0.6, -0.5, 2], [0, 0.5, 2]]), abs=0.05)
 
 

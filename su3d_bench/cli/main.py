@@ -10,6 +10,7 @@ from typing import Any
 
 from su3d_bench import __version__
 from su3d_bench.cli import (
+    ask,
     attribute,
     check,
     compare,
@@ -20,6 +21,7 @@ from su3d_bench.cli import (
     models,
     protocols,
     query,
+    refine,
     report,
     run,
 )
@@ -77,6 +79,8 @@ def build_parser() -> Parser:
         attribute,
         report,
         query,
+        ask,
+        refine,
         datasets,
         methods,
         models,

@@ -48,7 +48,7 @@ def call(arguments: argparse.Namespace) -> int:
 
     if arguments.top < 1:
         raise ConfigError(f"--top {arguments.top}: at least 1 instance must be listed")
-    run = RunFolder(arguments.run) if arguments.run is not None else _latest_run(arguments.scene, arguments.method)
+    run = RunFolder(arguments.run) if arguments.run is not None else latest_run(arguments.scene, arguments.method)
     job = run.job(arguments.scene, arguments.method)
     if not job.prediction.is_file():
         raise StoreError(f"{run.path}: holds no map of {arguments.scene} by {arguments.method}; {_advice(arguments)}")
@@ -87,7 +87,7 @@ def _rows(instances: Instances, ranking: Ranking, top: int) -> list[dict[str, An
     return rows
 
 
-def _latest_run(scene: str, method: str) -> RunFolder:
+def latest_run(scene: str, method: str) -> RunFolder:
     """The run folder below ``runs/`` whose map of the scene is the youngest."""
     from su3d_bench.store import RunFolder
 

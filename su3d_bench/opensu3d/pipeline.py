@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from functools import cache
+from typing import ClassVar
 
 import numpy as np
 
 from su3d_bench.errors import DataError
 from su3d_bench.opensu3d.association import assign_ids, count_overlaps, overlap_ratios
-from su3d_bench.opensu3d.config import OpenSU3DConfig
+from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig
 from su3d_bench.opensu3d.frame_cloud import FrameCloud, frame_cloud
 from su3d_bench.opensu3d.id_image import NO_DETECTION
 from su3d_bench.opensu3d.postprocess import segments_of, to_instances
@@ -33,6 +35,7 @@ class OpenSU3D:
 
     name = "opensu3d"
     Config = OpenSU3DConfig
+    presets: ClassVar[Mapping[str, Mapping[str, str]]] = {scheme: {"scheme": scheme} for scheme in SCHEMES}
 
     def __init__(self, config: OpenSU3DConfig | None = None) -> None:
         self.config = config or OpenSU3DConfig()

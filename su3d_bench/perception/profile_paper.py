@@ -1,4 +1,4 @@
-"""The paper's own front end: RAM++, GroundingDINO, SAM and CLIP; names and captions by a vision model where asked for."""
+"""The paper's own front end: RAM++, GroundingDINO, SAM and CLIP; captions by a vision model where asked for."""
 
 from __future__ import annotations
 

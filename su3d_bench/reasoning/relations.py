@@ -72,7 +72,8 @@ def ground_gap_m(a: Float64Array, b: Float64Array) -> float:
 
 
 def _apart(a: Float64Array, b: Float64Array) -> Float64Array:
-    return np.clip(np.maximum(a[0] - b[1], b[0] - a[1]), 0.0, None)
+    apart: Float64Array = np.clip(np.maximum(a[0] - b[1], b[0] - a[1]), 0.0, None)
+    return apart
 
 
 def _area(a: Float64Array) -> float:

@@ -106,7 +106,7 @@ class Solver:
         return tuple(other for other in others[0] if other.id != one.id and self._stands(one, relation, other))
 
     def _stands(self, one: MapObject, relation: Relation, other: MapObject) -> bool:
-        if relation in ("left of", "right of"):
+        if relation == "left of" or relation == "right of":  # two comparisons narrow the type
             self._note_eye()
             a, b = (one, other) if relation == "left of" else (other, one)
             return is_left_of(a.centroid, b.centroid, self._eye)

@@ -99,7 +99,7 @@ class ChatRequest:
             {"type": "image_url", "image_url": {"url": image.data_url, "detail": self.image_detail}}
             for image in self.images
         ]
-        messages = [{"role": "system", "content": self.system}] if self.system else []
+        messages: list[dict[str, Any]] = [{"role": "system", "content": self.system}] if self.system else []
         messages.append({"role": "user", "content": content if self.images else self.text})
         body: dict[str, Any] = {
             "model": self.model,

@@ -66,9 +66,7 @@ _NO_OBJECT = frozenset({"object", "objects", "thing", "item", "image", "n/a"})
 _KEYS_OF_NAME = ("name", "object", "label", "title", "object_name")
 _KEYS_OF_CAPTION = ("description", "caption", "desc", "details")
 _KEYS_OF_ERRORS = frozenset({"error", "message", "refusal", "reason", "status"})
-_OBJECT_ID = re.compile(
-    r"(?:#|\b(?:ids?|objects?)[\s_:#=\[(]*)(\d{1,9}(?:\s*(?:,|and|&)\s*#?\d{1,9})*)", re.IGNORECASE
-)
+_OBJECT_ID = re.compile(r"(?:#|\b(?:ids?|objects?)[\s_:#=\[(]*)(\d{1,9}(?:\s*(?:,|and|&)\s*#?\d{1,9})*)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)

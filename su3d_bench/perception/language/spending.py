@@ -5,7 +5,8 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
+from typing import Any
 
 from su3d_bench.errors import ConfigError, RunIncomplete
 from su3d_bench.perception.language.chat import ChatRequest, Reply
@@ -22,6 +23,9 @@ class Estimate:
     output_tokens: int
     usd: float | None
     models: tuple[str, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self) | {"models": list(self.models)}
 
     def line(self) -> str:
         """The estimate for people."""

@@ -15,6 +15,7 @@ import re
 import threading
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -99,7 +100,7 @@ class Transport:
             dropped = self._dropped
             body = _without(request.body(), dropped)
             try:
-                text = self._within(lambda body=body: self._post(client, body))
+                text = self._within(partial(self._post, client, body))
             except _Unsupported as refused:
                 if refused.parameter in dropped:
                     raise GiveUp(f"the server refuses '{refused.parameter}'") from None

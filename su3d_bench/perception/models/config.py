@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 from typing import Literal
 
@@ -28,7 +29,7 @@ class ModelsConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    device: str = Field(default="cpu", pattern=r"^(cpu|cuda(:[0-9]{1,2})?)$")
+    device: str = "cpu"
     precision: Precision = "auto"
     batch: int = Field(default=0, ge=0, le=4096)
     encoder: str | None = None
@@ -37,6 +38,13 @@ class ModelsConfig(BaseModel):
     transform: Literal["original", "transformers"] = "original"
     folder: Path | None = None
     paths: dict[str, Path] = {}
+
+    @field_validator("device")
+    @classmethod
+    def _is_a_device(cls, name: str) -> str:
+        if re.fullmatch(r"cpu|cuda(:[0-9]{1,2})?", name) is None:
+            raise ValueError("expected cpu, cuda or cuda:N")
+        return name
 
     @field_validator("encoder")
     @classmethod

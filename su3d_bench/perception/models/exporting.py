@@ -11,6 +11,11 @@ from su3d_bench.perception.models.catalogue import MODELS, ModelEntry
 from su3d_bench.perception.models.devices import require
 from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.onnx_export import Parity
+from su3d_bench.perception.models.sam_onnx import SamManifest, export_sam
+from su3d_bench.perception.models.towers_onnx import Manifest as EncoderManifest
+from su3d_bench.perception.models.towers_onnx import export_encoder
+
+EXPORTED_KINDS = ("encoder", "segmenter")
 
 
 @dataclass(frozen=True)
@@ -23,12 +28,14 @@ class Export:
 
 def export_model(entry: ModelEntry, out: Path, *, path: Path | None = None, folder: Path | None = None) -> Export:
     """Write ``entry`` as ONNX files into ``out``; raises ``CheckFailed`` where they do not agree with torch."""
-    if not any(form.form == "onnx" for form in entry.forms):
-        known = ", ".join(one.name for one in MODELS.values() if any(form.form == "onnx" for form in one.forms))
-        raise ConfigError(f"models export: '{entry.name}' has no ONNX form here; known: {known}")
+    if entry.kind not in EXPORTED_KINDS:
+        known = ", ".join(one.name for one in MODELS.values() if one.kind in EXPORTED_KINDS)
+        raise ConfigError(f"models export: '{entry.name}' is not exported by this program; known: {known}")
     for package in ("torch", "transformers", "onnx"):
         require(package, f"models export {entry.name}")
-    from su3d_bench.perception.models.towers_onnx import export_encoder
-
-    manifest = export_encoder(locate(entry.name, ("transformers",), path=path, folder=folder), out)
+    manifest: EncoderManifest | SamManifest
+    if entry.kind == "encoder":
+        manifest = export_encoder(locate(entry.name, ("transformers",), path=path, folder=folder), out)
+    else:
+        manifest = export_sam(locate(entry.name, ("transformers", "original"), path=path, folder=folder), out)
     return Export(manifest.files, manifest.parity)

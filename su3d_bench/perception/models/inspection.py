@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.errors import ConfigError, DataError, ModelMissing
-from su3d_bench.perception.models import towers_onnx, towers_transformers
-from su3d_bench.perception.models.catalogue import MODELS, PROFILE_MODELS, ModelEntry, ModelForm
+from su3d_bench.perception.models import sam_onnx, towers_onnx, towers_transformers
+from su3d_bench.perception.models.catalogue import MODELS, PROFILE_MODELS, ModelEntry
 from su3d_bench.perception.models.files import ModelFiles, locate
 from su3d_bench.perception.models.weights import PICKLED, read_settings, read_weights
 from su3d_bench.timing import Timer
@@ -75,19 +75,16 @@ def problems_of(files: ModelFiles) -> list[str]:
 
 
 def _problems_of_export(files: ModelFiles) -> list[str]:
-    if files.entry.kind != "encoder":
-        read_settings(files.weights)
-        return []
-    manifest = towers_onnx.read_manifest(files.weights)
-    wrong = towers_onnx.wrong_files(files)
+    if files.entry.kind == "tagger":
+        return []  # the package's own export has no manifest
+    manifest: towers_onnx.Manifest | sam_onnx.SamManifest
+    if files.entry.kind == "encoder":
+        manifest, wrong = towers_onnx.read_manifest(files.weights), towers_onnx.wrong_files(files)
+    else:
+        manifest, wrong = sam_onnx.read_sam_manifest(files.weights), sam_onnx.wrong_sam_files(files)
     if manifest.name != files.entry.name:
         wrong.append(f"{files.folder}: holds '{manifest.name}', not '{files.entry.name}'; mend models.paths")
     return wrong
-
-
-def form_size_mb(form: ModelForm, files: ModelFiles | None) -> float:
-    """What the weights of a form take on the disk: as they lie here, else as published."""
-    return form.size_mb if files is None or form.form == "onnx" else files.weights.stat().st_size / 1e6
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -44,12 +46,23 @@ def read_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
 def load_model(files: ModelFiles) -> Any:
     """The model in evaluation mode and float32 on the CPU, with every weight out of the file."""
     open_clip = require_open_clip(files.entry.name)
-    model = open_clip.create_model(files.form.architecture, pretrained=None, precision="fp32", device="cpu")
+    with _without_warnings():  # of random weights, which are replaced below
+        model = open_clip.create_model(files.form.architecture, pretrained=None, precision="fp32", device="cpu")
     try:
         model.load_state_dict(read_weights(files.weights), strict=True)
     except RuntimeError as error:
         raise DataError(f"{files.weights}: is no {files.form.architecture}: {bounded(error)}") from error
     return model.eval()
+
+
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(before)
 
 
 def read_tokeniser(files: ModelFiles) -> Callable[[Sequence[str]], Int64Array]:

@@ -1,0 +1,253 @@
+"""The tables of OpenSU3D's paper and any other selection, from measured results and what papers report."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from su3d_bench.errors import ConfigError, suggest
+from su3d_bench.plain_text import printable
+from su3d_bench.reports.measured import Measured
+from su3d_bench.reports.published import Figure, PaperTable, published
+from su3d_bench.reports.table_model import NOT_MEASURED, Cell, Origin, Table, TableRow
+from su3d_bench.statistics import SignFlipTest, sign_flip_test
+
+LEVEL = 0.05
+
+
+@dataclass(frozen=True)
+class Layout:
+    """A table of the paper: its metrics, the protocol that comes nearest to its set-up, and its caption."""
+
+    metrics: tuple[str, ...]
+    protocol: str
+    caption: str
+
+
+LAYOUTS: Mapping[PaperTable, Layout] = {
+    "II": Layout(
+        ("mAcc", "F-mIoU"), "replica-conceptgraphs-ex6", "Open-vocabulary segmentation, ConceptGraphs' evaluation"
+    ),
+    "III": Layout(
+        ("AP", "AP50", "AP25"), "replica-openmask3d", "Open-vocabulary instance segmentation, OpenMask3D's evaluation"
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Shown:
+    """What stands in the cells, and which best values are marked."""
+
+    metrics: tuple[str, ...] = ()
+    intervals: bool = False
+    ceilings: bool = False
+    scenes_count: bool = False
+    only_significant: bool = False
+
+
+def paper_table(number: PaperTable, found: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
+    """Table II or III of the paper: under the protocol of its set-up, or one each for the others that have its metrics.
+
+    ``found`` under several protocols of which one is the paper's gives that one alone.
+    """
+    layout = LAYOUTS[number]
+    metrics = shown.metrics or layout.metrics
+    fitting = [one for one in found if all(name in one.metrics for name in metrics)]
+    if not fitting:
+        have = ", ".join(dict.fromkeys(one.protocol for one in found))
+        raise ConfigError(
+            f"Table {number}: needs {', '.join(metrics)}, which none of the runs' protocols has ({have}); score them "
+            f"with --protocols {layout.protocol} too"
+        )
+    names = list(dict.fromkeys(one.protocol for one in fitting))
+    names = [layout.protocol] if layout.protocol in names else names
+    figures = [figure for figure in published() if figure.table == number] if with_published else []
+    tables = []
+    for name in names:
+        rows = [one for one in fitting if one.protocol == name]
+        one = protocol_table(rows, replace(shown, metrics=metrics), figures)
+        tables.append(replace(one, name=f"{number}-{name}", caption=f"{layout.caption}. {one.caption}"))
+    return tables
+
+
+def selection_tables(found: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
+    """One table a protocol, in the order of the runs."""
+    tables = []
+    for name in dict.fromkeys(one.protocol for one in found):
+        rows = [one for one in found if one.protocol == name]
+        figures = [figure for figure in published() if figure.protocol == name] if with_published else []
+        tables.append(protocol_table(rows, shown, figures))
+    return tables
+
+
+def protocol_table(rows: Sequence[Measured], shown: Shown, figures: Sequence[Figure]) -> Table:
+    """The table of measured ``rows`` of one protocol, reported ``figures`` beneath them."""
+    metrics = shown.metrics or rows[0].headline
+    for name in metrics:
+        if name not in rows[0].metrics:
+            known = suggest(name, rows[0].metrics) or f"; it has {', '.join(rows[0].metrics)}"
+            raise ConfigError(f"{rows[0].protocol}: has no metric '{printable(name, 60)}'{known}")
+    shown = replace(shown, metrics=metrics, scenes_count=shown.scenes_count or not _are_alike(rows))
+    best, why = _best(rows, shown)
+    labels = _labels(rows)
+    body = [
+        TableRow(label, tuple(_cells(row, shown, {name for name in metrics if k in best.get(name, ())})))
+        for k, (row, label) in enumerate(zip(rows, labels, strict=True))
+    ]
+    reported, sources = reported_rows(figures, metrics, len(_columns(shown)))
+    return Table(
+        name=rows[0].protocol,
+        caption=_caption(rows[0], shown),
+        head="method",
+        columns=tuple(_columns(shown)),
+        rows=(*body, *reported),
+        notes=(*_notes(rows, labels), *([why] if why else []), *sources),
+    )
+
+
+def _caption(row: Measured, shown: Shown) -> str:
+    unit = "per cent, [95 % interval over scenes]" if shown.intervals else "per cent"
+    return f"Protocol {row.protocol} (version {row.version}), {unit}."
+
+
+def _are_alike(rows: Sequence[Measured]) -> bool:
+    """Whether all rows are of the same whole scenes, so that their number need not be shown."""
+    return all(row.is_whole and row.scenes == rows[0].scenes for row in rows)
+
+
+def _labels(rows: Sequence[Measured]) -> list[str]:
+    """The method, with the run's name where two rows are of one method."""
+    names = [row.method for row in rows]
+    short = [row.run.rstrip("/").rpartition("/")[2] for row in rows]
+    pairs = list(zip(names, short, strict=True))
+    runs = [row.run if pairs.count(pair) > 1 else pair[1] for row, pair in zip(rows, pairs, strict=True)]
+    return [f"{name} ({run})" if names.count(name) > 1 else name for name, run in zip(names, runs, strict=True)]
+
+
+def _columns(shown: Shown) -> list[str]:
+    ceilings = [f"{name} ceiling" for name in shown.metrics] if shown.ceilings else []
+    return [*shown.metrics, *ceilings, *(["scenes"] if shown.scenes_count else [])]
+
+
+def _cells(row: Measured, shown: Shown, best: set[str]) -> list[Cell]:
+    cells = []
+    for name in shown.metrics:
+        interval = row.intervals.get(name) if shown.intervals else None
+        value = row.metrics[name]
+        text = percent(value)
+        if value is not None and interval is not None:
+            text += f" [{percent(interval[0])}, {percent(interval[1])}]"
+        origin = None if value is None else _origin(row, name, value, interval=interval)
+        cells.append(Cell(text, name in best, origin))
+    for name in shown.metrics if shown.ceilings else ():
+        value = row.ceilings.get(name)
+        origin = None if value is None else replace(_origin(row, name, value), what="ceiling")
+        cells.append(Cell(percent(value), origin=origin))
+    if shown.scenes_count:
+        n = float(len(row.per_scene))
+        cells.append(Cell(row.scenes_text, origin=replace(_origin(row, "scenes", n), what="scenes")))
+    return cells
+
+
+def _origin(row: Measured, metric: str, value: float, interval: tuple[float, float] | None = None) -> Origin:
+    return Origin(row.run, row.method, row.protocol, row.version, metric, "value", value, interval)
+
+
+def percent(value: float | None) -> str:
+    """A fraction in per cent with one decimal, as papers of this field print it."""
+    return NOT_MEASURED if value is None else f"{100.0 * value:.1f}"
+
+
+def _best(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int]], str | None]:
+    """Metric -> the rows to mark, and what must be said of the marks; rows of other scenes are not compared.
+
+    Rows that print the same best value are all marked; where only a significant best is marked, none of them.
+    """
+    if len(rows) < 2:
+        return {}, None
+    if any(row.scenes != rows[0].scenes or row.limit != rows[0].limit for row in rows):
+        return {}, "The rows are of different scenes or frames, so that none is marked as the best."
+    found: dict[str, set[int]] = {}
+    tests: list[SignFlipTest | None] = []
+    for name in shown.metrics:
+        values = np.array([np.nan if row.metrics[name] is None else row.metrics[name] for row in rows], np.float64)
+        order = np.argsort(-np.nan_to_num(values, nan=-1.0), kind="stable")
+        if np.isnan(values[order[0]]):
+            continue
+        best = {k for k, row in enumerate(rows) if percent(row.metrics[name]) == percent(float(values[order[0]]))}
+        if shown.only_significant:
+            test = sign_flip_test(_of_scenes(rows[int(order[0])], name) - _of_scenes(rows[int(order[1])], name))
+            tests.append(test)
+            best = best if len(best) == 1 and test is not None and test.p < LEVEL else set()
+        if len(best) < len(rows):
+            found[name] = best
+    if not shown.only_significant:
+        return found, "Bold: the highest measured value." if any(found.values()) else None
+    smallest = min((test.smallest_p for test in tests if test is not None), default=1.0)
+    return found, (
+        f"Bold: the highest measured value where it differs from the second (two-sided sign-flip test over scenes, "
+        f"p < {LEVEL}; with these scenes p cannot be below {smallest:.2g})."
+    )
+
+
+def _of_scenes(row: Measured, metric: str) -> np.ndarray:
+    values = [row.per_scene[scene].get(metric) for scene in sorted(row.per_scene)]
+    return np.array([np.nan if value is None else value for value in values], np.float64)
+
+
+def _notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
+    """What must be known of measured rows: missing scenes, partial runs, where masks come from, who names."""
+    notes: dict[str, list[str]] = {}
+    for row, label in zip(rows, labels, strict=True):
+        if row.limit:
+            notes.setdefault(f"PARTIAL: only the first {row.limit} frames of each scene", []).append(label)
+        if row.failed:
+            notes.setdefault(f"INCOMPLETE: failed on {_some(row.failed)}", []).append(label)
+        if row.unscored:
+            notes.setdefault(f"unscored on {_some(row.unscored)}", []).append(label)
+        if row.caveat:
+            notes.setdefault(row.caveat, []).append(label)
+        if row.profile:
+            encoder = f", encoder {row.encoder}" if row.encoder else ""
+            notes.setdefault(f"perception {row.profile}{encoder}", []).append(label)
+    everyone = len(rows)
+    return [
+        f"{'all measured rows' if len(who) == everyone > 1 else ', '.join(who)}: {what}" for what, who in notes.items()
+    ]
+
+
+def _some(scenes: Sequence[str]) -> str:
+    return ", ".join(scenes[:4]) + (f" and {len(scenes) - 4} more" if len(scenes) > 4 else "")
+
+
+def reported_rows(
+    figures: Sequence[Figure], metrics: Sequence[str], n_columns: int, *, as_fractions: bool = False
+) -> tuple[list[TableRow], list[str]]:
+    """A row for each figure that has one of ``metrics``, marked, and the notes that say where the marks lead."""
+    rows: list[TableRow] = []
+    marks: dict[str, str] = {}
+    for figure in figures:
+        values = [figure.values.get(name) if as_fractions else figure.percent(name) for name in metrics]
+        if not any(values):
+            continue
+        how = " (quoted there)" if figure.read_from == "quoted" else ""
+        source = f"as reported in {figure.source}{how}: {figure.setup}"
+        source += f"; {figure.note}" if figure.note else ""
+        mark = marks.setdefault(source, _mark(len(marks)))
+        cells = [Cell(value or NOT_MEASURED) for value in values]
+        cells += [Cell("")] * (n_columns - len(cells))
+        rows.append(TableRow(figure.row or figure.method, tuple(cells), is_reported=True, mark=mark))
+    notes = [f"[{mark}] {source}. Not measured here: other perception, other data." for source, mark in marks.items()]
+    return rows, notes
+
+
+def _mark(k: int) -> str:
+    """a, b, ... z, aa, ab, ...
+
+    >>> _mark(0), _mark(27)
+    ('a', 'ab')
+    """
+    letter = chr(ord("a") + k % 26)
+    return letter if k < 26 else _mark(k // 26 - 1) + letter

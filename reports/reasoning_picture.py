@@ -1,0 +1,146 @@
+"""The picture of an answer: its objects in the map from above and from the corner that shows most of them."""
+
+from __future__ import annotations
+
+import io
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.plain_text import printable
+from su3d_bench.reports.pictures import DRAWN_SPACING_M, NO_INSTANCE, Cloud, Colour, instance_colours, thinned
+from su3d_bench.reports.render import OVERSAMPLING, Camera, View, colour, render, room_bounds, view_cameras
+from su3d_bench.store import make_folder, write_bytes
+from su3d_bench.types import BoolArray, Float64Array, Instances, Int64Array, UInt8Array
+
+DPI, PANEL_WIDTH, PANEL_HEIGHT, MARGIN = 100, 760, 640, 14
+LINE_HEIGHT, CHARACTERS_A_LINE, MOST_LINES = 22, 165, 5
+ANSWER, REFERENCE = (222, 74, 22), (32, 98, 196)
+MOST_LABELS = 14
+PALE = 0.22  # how much of its colour an object keeps that is not spoken of
+DARK, GREY = "#222222", "#666666"
+# The corners of a box, bit i for axis i, that its twelve edges join.
+EDGES = tuple((a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1)
+
+
+@dataclass(frozen=True)
+class SpokenOf:
+    """Rows of the map that are the answer, and rows that it was held against."""
+
+    answer: tuple[int, ...]
+    reference: tuple[int, ...] = ()
+
+    @property
+    def rows(self) -> tuple[int, ...]:
+        return tuple(dict.fromkeys((*self.answer, *self.reference)))
+
+    def colour(self, row: int) -> Colour:
+        return ANSWER if row in self.answer else REFERENCE
+
+
+def draw_reasoning(
+    instances: Instances, spoken_of: SpokenOf, names: Sequence[str], path: Path, question: str, lines: Sequence[str]
+) -> None:
+    """Write the picture of an answer: ``names`` label the instances, ``lines`` stand under the ``question``."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    written = [part for line in lines for part in textwrap.wrap(printable(line), CHARACTERS_A_LINE)][:MOST_LINES]
+    header = 52 + LINE_HEIGHT * len(written)
+    width, height = 2 * PANEL_WIDTH + 3 * MARGIN, header + PANEL_HEIGHT + MARGIN
+    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
+    FigureCanvasAgg(figure)
+    _write(figure, MARGIN / width, 1 - 14 / height, printable(question, 110), 15, DARK, weight="bold")
+    for k, line in enumerate(written):
+        _write(figure, MARGIN / width, 1 - (46 + LINE_HEIGHT * k) / height, line, 11, DARK if k == 0 else GREY)
+    cloud = thinned(_cloud(instances))
+    palette = _palette(names, spoken_of)
+    for column, (camera, view, title) in enumerate(_two_views(cloud, spoken_of)):
+        left = MARGIN + column * (PANEL_WIDTH + MARGIN)
+        box = (left / width, MARGIN / height, PANEL_WIDTH / width, PANEL_HEIGHT / height)
+        axes = figure.add_axes(box)
+        axes.set_axis_off()
+        axes.imshow(colour(view, palette[cloud.owner]), interpolation="nearest", aspect="auto")
+        axes.set_xlim(-0.5, PANEL_WIDTH - 0.5)
+        axes.set_ylim(PANEL_HEIGHT - 0.5, -0.5)
+        _draw_spoken_of(axes, camera, instances, spoken_of, names)
+        axes.text(10, PANEL_HEIGHT - 10, title, fontsize=10, color=GREY, va="bottom")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    make_folder(path.parent)
+    write_bytes(path, buffer.getvalue())
+
+
+def _write(figure: Any, x: float, y: float, text: str, size: float, shade: str, **more: Any) -> None:
+    figure.text(x, y, text, fontsize=size, color=shade, va="top", parse_math=False, **more)
+
+
+def _cloud(instances: Instances) -> Cloud:
+    """Of masks that overlap, the smaller one is seen."""
+    owner = np.full(len(instances.points), -1, np.int32)
+    sizes: Int64Array = np.diff(instances.indptr)
+    for k in np.argsort(-sizes, kind="stable"):
+        owner[instances.mask(int(k))] = k
+    return Cloud(instances.points, owner)
+
+
+def _palette(names: Sequence[str], spoken_of: SpokenOf) -> UInt8Array:
+    """A colour a row: strong for what is spoken of, pale for the rest; the last one is that of no instance."""
+    own = np.array([*instance_colours(names), NO_INSTANCE], np.float64)
+    pale = PALE * own + (1 - PALE) * 235.0
+    for row in spoken_of.rows:
+        pale[row] = spoken_of.colour(row)
+    return np.rint(pale).astype(np.uint8)
+
+
+def _two_views(cloud: Cloud, spoken_of: SpokenOf) -> list[tuple[Camera, View, str]]:
+    """The view from above, and that from the corner where most of what is spoken of is seen."""
+    spacing = 2.6 * DRAWN_SPACING_M  # as pictures.py draws surfaces without gaps
+    cameras = view_cameras(room_bounds(cloud.points), PANEL_WIDTH, PANEL_HEIGHT)
+    above, *corners = [(camera, render(cloud.points, spacing, camera)) for camera in cameras]
+    wanted = np.isin(cloud.owner, spoken_of.rows)
+    camera, view = max(corners, key=lambda pair: _n_seen(pair[1], wanted))
+    return [(*above, "from above"), (camera, view, "from the corner that shows most of it")]
+
+
+def _n_seen(view: View, wanted: BoolArray) -> int:
+    return int(wanted[view.point[view.point >= 0]].sum())
+
+
+def project(camera: Camera, points: Float64Array) -> Float64Array:
+    """Columns and rows (N, 2) in the picture of ``camera``; NaN for what lies behind it."""
+    relative = (points - camera.eye) @ camera.rotation.T
+    depth = np.where(relative[:, 2] > 0, relative[:, 2], np.nan)
+    scale = camera.focal / depth if camera.is_perspective else np.full(len(points), camera.focal)
+    middle = np.array([camera.width, camera.height]) / 2
+    pixels: Float64Array = (relative[:, :2] * scale[:, None] + middle) / OVERSAMPLING
+    return pixels
+
+
+def _draw_spoken_of(axes: Any, camera: Camera, instances: Instances, spoken_of: SpokenOf, names: Sequence[str]) -> None:
+    """Boxes and names of what is spoken of, and a line from each answer to the nearest reference."""
+    from matplotlib.patheffects import withStroke
+
+    halo = [withStroke(linewidth=3, foreground="white")]
+    centres = instances.centroids.astype(np.float64)
+    for row in spoken_of.answer[:MOST_LABELS]:
+        if spoken_of.reference and row not in spoken_of.reference:
+            others = np.array(spoken_of.reference)
+            nearest = int(others[np.argmin(np.linalg.norm(centres[others] - centres[row], axis=1))])
+            ends = project(camera, centres[[row, nearest]])
+            axes.plot(ends[:, 0], ends[:, 1], color=DARK, linewidth=1.2, linestyle=(0, (4, 3)), path_effects=halo)
+    for row in spoken_of.rows[:MOST_LABELS]:
+        shade = "#{:02x}{:02x}{:02x}".format(*spoken_of.colour(row))
+        low, high = instances.boxes[row].astype(np.float64)
+        corners = np.array([[high[i] if k >> i & 1 else low[i] for i in range(3)] for k in range(8)])
+        pixels = project(camera, corners)
+        for a, b in EDGES:
+            axes.plot(pixels[[a, b], 0], pixels[[a, b], 1], color=shade, linewidth=1.4, path_effects=halo)
+        top = pixels[np.nanargmin(pixels[:, 1])] if np.isfinite(pixels).any() else np.zeros(2)
+        x, y = np.clip(top, [40, 16], [PANEL_WIDTH - 40, PANEL_HEIGHT - 16])
+        box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": shade, "alpha": 0.92}
+        axes.text(x, y - 6, names[row], fontsize=9.5, color=shade, ha="center", va="bottom", bbox=box, parse_math=False)

@@ -1,0 +1,191 @@
+"""``su3d-bench ask``: a question about a scene, answered from its map, with the objects that the answer rests on."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.cli.language_flags import add_language_flags, chat_client, language_config
+from su3d_bench.cli.query import latest_run
+from su3d_bench.errors import EXIT_DONE, ConfigError, PredictionError, StoreError
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from su3d_bench.reasoning.answers import Answer
+    from su3d_bench.reasoning.scene_map import SceneMap
+    from su3d_bench.store import JobFolder, RunFolder
+    from su3d_bench.types import Instances
+
+SOLVERS = ("built-in", "llm")
+NAMES = ("auto", "label", "refined")
+
+
+def add_parser(verbs: Any) -> None:
+    parser = add_verb(
+        verbs,
+        "ask",
+        "Answer a question about a scene from its map: by geometry, or by a language model.",
+        (
+            'su3d-bench ask rooms/living0 "Which lamp is closer to the sofa?"',
+            'su3d-bench ask rooms/living0 "I am feeling cold, what should I do?" --solver llm --dry-run',
+        ),
+        call,
+    )
+    parser.add_argument("scene", help="the scene's address, such as rooms/living0")
+    parser.add_argument("question", help="the question, in English")
+    parser.add_argument(
+        "--run", type=Path, metavar="DIR", help="run folder (default: the latest in runs/ with the scene)"
+    )
+    parser.add_argument("--method", default="opensu3d", help="whose map (default: opensu3d)")
+    parser.add_argument(
+        "--solver", choices=SOLVERS, default="built-in", help="who answers: geometry alone, or a language model"
+    )
+    parser.add_argument(
+        "--names",
+        choices=NAMES,
+        default="auto",
+        help="the map's labels n, or n' of su3d-bench refine (default: n' where it is there)",
+    )
+    parser.add_argument(
+        "--eye",
+        nargs=3,
+        type=float,
+        metavar=("X", "Y", "Z"),
+        help="where one stands for left and right, in metres (default: the middle of the map)",
+    )
+    parser.add_argument("--out", type=Path, metavar="FILE", help="where the picture goes (default: beside the map)")
+    add_language_flags(parser)
+
+
+def call(arguments: argparse.Namespace) -> int:
+    from su3d_bench.executors import limit_threads
+
+    limit_threads()
+    from su3d_bench.reasoning.scene_map import map_of
+
+    if not arguments.question.strip():
+        raise ConfigError(
+            'the question is empty; ask such as: su3d-bench ask rooms/living0 "How many lamps are there?"'
+        )
+    run = _run_of(arguments)
+    job = run.job(arguments.scene, arguments.method)
+    instances = _map(job, arguments)
+    refined, note = _refined(job, arguments.names)
+    scene = map_of(instances, refined)
+    if arguments.dry_run:
+        return _estimate(scene, run, arguments)
+    found = _solve(scene, run, arguments)
+    picture = _draw(instances, scene, found, job, arguments)
+    if arguments.json:
+        answer_json(
+            {"scene": arguments.scene, "question": arguments.question}
+            | found.to_json()
+            | {"names": note, "picture": None if picture is None else str(picture)}
+        )
+        return EXIT_DONE
+    answer(found.text)
+    for line in (*found.notes, f"names: {note}"):
+        remark(line, quiet=arguments.quiet)
+    if picture is not None:
+        remark(f"picture: {picture}", quiet=arguments.quiet)
+    return EXIT_DONE
+
+
+def _run_of(arguments: argparse.Namespace) -> RunFolder:
+    from su3d_bench.store import RunFolder
+
+    return latest_run(arguments.scene, arguments.method) if arguments.run is None else RunFolder(arguments.run)
+
+
+def _map(job: JobFolder, arguments: argparse.Namespace) -> Instances:
+    from su3d_bench.store import read_prediction
+    from su3d_bench.types import Instances
+
+    if not job.prediction.is_file():
+        raise StoreError(
+            f"{arguments.run}: holds no map of {arguments.scene} by {arguments.method}; run: su3d-bench run --scenes "
+            f"{arguments.scene} --methods {arguments.method} --out {arguments.run}"
+        )
+    prediction = read_prediction(job.prediction)
+    if not isinstance(prediction, Instances):
+        raise PredictionError(f"{job.prediction}: holds no instances, so there is nothing to ask about")
+    return prediction
+
+
+def _refined(job: JobFolder, wanted: str) -> tuple[Sequence[str] | None, str]:
+    """Labels n' where they are wanted and there, and which names these are."""
+    from su3d_bench.perception.language.refined_names import read_records
+
+    records = None if wanted == "label" else read_records(job)
+    if records is None:
+        if wanted == "refined":
+            raise StoreError(f"{job.path}: has no labels n'; make them with su3d-bench refine")
+        return None, "labels n"
+    return records.refined, f"labels n' by {records.model or 'vote'}"
+
+
+def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> int:
+    from su3d_bench.reasoning.language_solver import LanguageSolver
+
+    if arguments.solver != "llm":
+        answer("the built-in solver asks no model: nothing to pay")
+        return EXIT_DONE
+    config = language_config(arguments)
+    client = chat_client(arguments, run, config)
+    estimate = client.estimate([LanguageSolver(scene, client, config).request(arguments.question)])
+    if arguments.json:
+        answer_json(estimate.to_json())
+    else:
+        answer(estimate.line())
+    return EXIT_DONE
+
+
+def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> Answer:
+    import numpy as np
+
+    from su3d_bench.reasoning.language_solver import LanguageSolver
+    from su3d_bench.reasoning.solver import Solver
+
+    if arguments.solver == "llm":
+        config = language_config(arguments)
+        return LanguageSolver(scene, chat_client(arguments, run, config), config).answer(arguments.question)
+    eye = None if arguments.eye is None else np.array(arguments.eye, np.float64)
+    if eye is not None and not np.isfinite(eye).all():
+        raise ConfigError(f"--eye {arguments.eye}: expected three finite numbers of metres")
+    return Solver(scene, eye, _nearest_name).answer(arguments.question)
+
+
+def _nearest_name(noun: str, names: Sequence[str]) -> tuple[str, float]:
+    """The embedded encoder's opinion, which is loaded for it only now."""
+    from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
+    from su3d_bench.reasoning.named_objects import nearest_by
+
+    return nearest_by(EmbeddedEncoder())(noun, names)
+
+
+def _draw(
+    instances: Instances, scene: SceneMap, found: Answer, job: JobFolder, arguments: argparse.Namespace
+) -> Path | None:
+    """Draw the answer; None where it names no object."""
+    from su3d_bench.reports.reasoning_picture import SpokenOf, draw_reasoning
+
+    if not found.object_ids:
+        if arguments.out is not None:
+            remark(f"{arguments.out}: not drawn, for the answer names no object", quiet=arguments.quiet)
+        return None
+    picture: Path = arguments.out or job.pictures / f"ask-{_file_name(arguments.question)}.png"
+    rows = [tuple(scene.by_id(one).row for one in ids) for ids in (found.object_ids, found.reference_ids)]
+    names = [""] * len(instances)
+    for one in scene.objects:
+        names[one.row] = one.shown
+    title = f"{arguments.scene}: {arguments.question}"
+    draw_reasoning(instances, SpokenOf(*rows), names, picture, title, (found.text, *found.notes))
+    return picture
+
+
+def _file_name(text: str) -> str:
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60] or "question"

@@ -1,0 +1,61 @@
+"""Flags of the verbs that may ask a language model, and the client that they make."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from su3d_bench.perception.language.client import ChatClient
+    from su3d_bench.perception.language.config import LanguageConfig
+    from su3d_bench.store import RunFolder
+
+PREFIX = ("perception", "language")
+
+
+def add_language_flags(parser: argparse.ArgumentParser) -> None:
+    """``--model``, ``--base-url``, ``--config``, ``--set``, ``--offline``, ``--ask-failed-again``, ``--dry-run``."""
+    parser.add_argument("--model", metavar="NAME", help="language model (default: the paper's gpt-4-1106-preview)")
+    parser.add_argument(
+        "--base-url", metavar="URL", help="OpenAI-compatible server (default: $OPENAI_BASE_URL, else OpenAI's)"
+    )
+    parser.add_argument("--config", type=Path, metavar="FILE", help="a TOML file with [perception.language]")
+    parser.add_argument(
+        "--set",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="KEY=VALUE",
+        help="such as perception.language.budget_usd=0.5",
+    )
+    parser.add_argument("--offline", action="store_true", help="stored replies only; nobody is asked")
+    parser.add_argument(
+        "--ask-failed-again", action="store_true", help="ask again what an earlier command asked in vain"
+    )
+    parser.add_argument("--dry-run", action="store_true", help="say what asking would cost, and ask nothing")
+
+
+def language_config(arguments: argparse.Namespace) -> LanguageConfig:
+    """The settings of the file, then ``--set``, then the flags; keys of other sections are left to other verbs."""
+    from su3d_bench.config import Setting, Settings, read_assignments, read_file, resolve
+    from su3d_bench.errors import ConfigError
+    from su3d_bench.perception.language.config import LanguageConfig
+
+    settings = Settings() if arguments.config is None else read_file(arguments.config)
+    assigned = read_assignments(arguments.set, (), ())
+    for entry in assigned.entries:
+        if entry.path[:2] != PREFIX:
+            raise ConfigError(f"{entry.source}: only perception.language.KEY=VALUE is of use here")
+    flags = [("text_model", "--model", arguments.model), ("base_url", "--base-url", arguments.base_url)]
+    given = tuple(Setting((*PREFIX, key), value, flag) for key, flag, value in flags if value is not None)
+    return resolve(settings + assigned + Settings(given), PREFIX, LanguageConfig)
+
+
+def chat_client(arguments: argparse.Namespace, run: RunFolder, config: LanguageConfig) -> ChatClient:
+    """The client whose replies are kept in the folder ``language`` of the run."""
+    from su3d_bench.perception.language.client import ChatClient
+    from su3d_bench.perception.language.reply_store import ReplyStore
+
+    store = ReplyStore(run.path / "language")
+    return ChatClient(config, store, offline=arguments.offline, ask_failed_again=arguments.ask_failed_again)

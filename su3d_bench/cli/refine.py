@@ -1,0 +1,146 @@
+"""``su3d-bench refine``: one name for each instance out of the names of its best views, label n' of the paper."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.cli.language_flags import add_language_flags, chat_client, language_config
+from su3d_bench.errors import EXIT_DONE, ConfigError, PredictionError, StoreError, suggest
+
+if TYPE_CHECKING:
+    from su3d_bench.perception.language.refined_names import NameRecords
+    from su3d_bench.perception.language.refinement import RefinedName, TopNames
+    from su3d_bench.store import JobFolder
+    from su3d_bench.types import Instances
+
+REFINERS = ("vote", "model")
+
+
+def add_parser(verbs: Any) -> None:
+    parser = add_verb(
+        verbs,
+        "refine",
+        "Give each instance of a run's maps one name out of the names of its best views (label n').",
+        (
+            "su3d-bench refine runs/my-run",
+            "su3d-bench refine runs/my-run --refiner model --model llama3.1 --base-url http://localhost:11434/v1",
+        ),
+        call,
+    )
+    parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a run")
+    parser.add_argument("--method", default="opensu3d", help="whose maps (default: opensu3d)")
+    parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="these scenes alone (default: all of the run)")
+    parser.add_argument(
+        "--refiner",
+        choices=REFINERS,
+        default="vote",
+        help="vote: by the sum of the scores, without a model; model: a language model, as in the paper",
+    )
+    parser.add_argument("--top-m", type=int, default=5, metavar="N", help="views that have a say (default: 5)")
+    add_language_flags(parser)
+
+
+def call(arguments: argparse.Namespace) -> int:
+    from su3d_bench.executors import limit_threads
+
+    limit_threads()
+    from su3d_bench.perception.language.refined_names import records_of, write_records
+    from su3d_bench.perception.language.refinement import top_names
+
+    if arguments.top_m < 1:
+        raise ConfigError(f"--top-m {arguments.top_m}: at least 1 view must have a say")
+    jobs = _jobs(arguments)
+    maps = {scene: _map(job) for scene, job in jobs.items()}
+    tops = {scene: top_names(instances, arguments.top_m) for scene, instances in maps.items()}
+    if arguments.dry_run:
+        return _estimate(tops, arguments)
+    refined, model = _refine(tops, arguments)
+    made: dict[str, NameRecords] = {}
+    for scene, job in jobs.items():
+        ids = maps[scene].ids.tolist() if len(maps[scene].ids) else range(len(maps[scene]))
+        records = records_of(job, list(ids), tops[scene], refined[scene], arguments.refiner, model, arguments.top_m)
+        path = write_records(job, records)
+        made[scene] = records
+        remark(f"{scene}: {path}", quiet=arguments.quiet)
+    _answer(made, arguments)
+    return EXIT_DONE
+
+
+def _jobs(arguments: argparse.Namespace) -> dict[str, JobFolder]:
+    """Scene -> folder of its map, of the scenes asked for."""
+    from su3d_bench.finished_run import read_run
+
+    run = read_run(arguments.run)
+    run_scenes = run.scenes
+    for scene in arguments.scenes or ():
+        if scene not in run_scenes:
+            hint = suggest(scene, run_scenes) or f"; it has {', '.join(run_scenes[:8])}"
+            raise ConfigError(f"{run.name}: holds no scene '{scene}'{hint}")
+    jobs = {scene: run.folder.job(scene, arguments.method) for scene in arguments.scenes or run_scenes}
+    found = {scene: job for scene, job in jobs.items() if job.prediction.is_file()}
+    if not found:
+        raise StoreError(f"{run.name}: holds no map by '{arguments.method}'; it has {', '.join(run.methods)}")
+    return found
+
+
+def _map(job: JobFolder) -> Instances:
+    from su3d_bench.store import read_prediction
+    from su3d_bench.types import Instances
+
+    prediction = read_prediction(job.prediction)
+    if not isinstance(prediction, Instances) or prediction.view_names is None:
+        raise PredictionError(
+            f"{job.prediction}: keeps no names of views to choose from; make the map anew with opensu3d"
+        )
+    return prediction
+
+
+def _estimate(tops: dict[str, list[TopNames]], arguments: argparse.Namespace) -> int:
+    from su3d_bench.perception.language.refinement import ModelRefiner
+    from su3d_bench.store import RunFolder
+
+    if arguments.refiner != "model":
+        answer("the vote asks no model: nothing to pay")
+        return EXIT_DONE
+    config = language_config(arguments)
+    client = chat_client(arguments, RunFolder(arguments.run), config)
+    refiner = ModelRefiner(client, config)
+    estimate = client.estimate([request for of_scene in tops.values() for request in refiner.requests(of_scene)])
+    if arguments.json:
+        answer_json(estimate.to_json())
+    else:
+        answer(estimate.line())
+    return EXIT_DONE
+
+
+def _refine(
+    tops: dict[str, list[TopNames]], arguments: argparse.Namespace
+) -> tuple[dict[str, Sequence[RefinedName]], str]:
+    """Labels n' of each scene, and the model that chose them."""
+    from su3d_bench.perception.language.refinement import ModelRefiner, vote
+    from su3d_bench.store import RunFolder
+
+    if arguments.refiner == "vote":
+        return {scene: [vote(top) for top in of_scene] for scene, of_scene in tops.items()}, ""
+    config = language_config(arguments)
+    refiner = ModelRefiner(chat_client(arguments, RunFolder(arguments.run), config), config)
+    return {scene: refiner.refine(of_scene) for scene, of_scene in tops.items()}, config.text_model
+
+
+def _answer(made: dict[str, NameRecords], arguments: argparse.Namespace) -> None:
+    if arguments.json:
+        answer_json({scene: records.model_dump(mode="json") for scene, records in made.items()})
+        return
+    for scene, records in made.items():
+        changed = [one for one in records.names if one.refined != one.label]
+        kept = [one for one in records.names if one.source == "label"]
+        answer(f"{scene}: {len(records.names)} instances, {len(changed)} names changed")
+        for one in changed:
+            answer(f"  {one.id:>4}  {one.label} -> {one.refined}")
+        if kept:
+            reasons = ", ".join(dict.fromkeys(one.reason for one in kept))
+            remark(f"{scene}: label n stays for {len(kept)} instances: {reasons}", quiet=arguments.quiet)

@@ -1,0 +1,102 @@
+"""``su3d-bench report tables``: the paper's tables and any other selection, from finished runs."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from su3d_bench.cli.flags import add_verb, answer, remark
+from su3d_bench.errors import EXIT_DONE, ConfigError
+
+if TYPE_CHECKING:
+    from su3d_bench.reports.table_model import Table
+
+NAME = "tables"
+FORMATS = ("markdown", "latex", "csv", "html")
+PAPER_TABLES = ("I", "II", "III", "IV", "V")
+JUDGED = {
+    "IV": "answers to text queries by fusion scheme, judged right or wrong",
+    "V": "labels and merges of instances, judged right or wrong",
+}
+
+
+def add_parser(actions: Any) -> None:
+    parser = add_verb(
+        actions,
+        NAME,
+        "Make tables for a paper from runs: those of OpenSU3D's paper by number, or one for each protocol.",
+        (
+            "su3d-bench report tables runs/my-run --table II III --format latex --out tables.tex",
+            "su3d-bench report tables runs/my-run --metrics mAcc mIoU --intervals --ceilings",
+        ),
+        call,
+    )
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of runs; for Table I of an ablation")
+    parser.add_argument("--format", choices=FORMATS, default="markdown", help="(default: markdown)")
+    parser.add_argument("--table", nargs="+", choices=PAPER_TABLES, default=[], help="of the paper (default: none)")
+    for name, what in (("methods", "these rows, in this order"), ("protocols", "under these"), ("metrics", "columns")):
+        parser.add_argument(
+            f"--{name}", nargs="+", default=[], metavar=name[:-1].upper(), help=f"{what} alone (default: all)"
+        )
+    parser.add_argument("--intervals", action="store_true", help="show the 95 %% interval over scenes")
+    parser.add_argument("--ceilings", action="store_true", help="show what the truth itself scores")
+    parser.add_argument(
+        "--scenes-count", action="store_true", help="show the number of scenes even where none is missing"
+    )
+    parser.add_argument(
+        "--significant", action="store_true", help="mark the best only where it differs from the second (p < 0.05)"
+    )
+    parser.add_argument(
+        "--published",
+        action=argparse.BooleanOptionalAction,
+        help="show what papers report beneath (default: with --table)",
+    )
+    parser.add_argument("--out", type=Path, metavar="FILE", help="write there instead of printing")
+
+
+def call(arguments: argparse.Namespace) -> int:
+    from su3d_bench.store import json_text, make_folder, write_text
+
+    for number, what in JUDGED.items():
+        if number in arguments.table:
+            raise ConfigError(f"Table {number}: is made of {what}; a run holds no such scores")
+    tables = _tables(arguments)
+    text = json_text([asdict(one) for one in tables]) if arguments.json else _formatter(arguments.format)(tables)
+    if arguments.out is None:
+        answer(text)
+        return EXIT_DONE
+    make_folder(arguments.out.parent)
+    write_text(arguments.out, text)
+    remark(f"written: {arguments.out}", quiet=arguments.quiet)
+    return EXIT_DONE
+
+
+def _tables(arguments: argparse.Namespace) -> list[Table]:
+    from su3d_bench.reports.paper_tables import Shown, paper_table, selection_tables
+    from su3d_bench.table_sources import choose, measured_results
+
+    shown = Shown(
+        metrics=tuple(arguments.metrics),
+        intervals=arguments.intervals,
+        ceilings=arguments.ceilings,
+        scenes_count=arguments.scenes_count,
+        only_significant=arguments.significant,
+    )
+    with_published = bool(arguments.table) if arguments.published is None else arguments.published
+    found = choose(measured_results(arguments.runs), arguments.methods, arguments.protocols)
+    if not arguments.table:
+        return selection_tables(found, shown, with_published=with_published)
+    tables = []
+    for number in dict.fromkeys(arguments.table):
+        tables += paper_table(number, found, shown, with_published=with_published)
+    return tables
+
+
+def _formatter(name: str) -> Callable[[Sequence[Table]], str]:
+    from su3d_bench.reports.latex import latex
+    from su3d_bench.reports.table_formats import csv_text, html_page, markdown
+
+    return {"markdown": markdown, "latex": latex, "csv": csv_text, "html": html_page}[name]

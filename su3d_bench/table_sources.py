@@ -1,0 +1,219 @@
+"""The numbers of finished runs that a table may show side by side, and what a paper's cells must say of them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+from pydantic import BaseModel, Field, ValidationError
+
+from su3d_bench.comparison_sides import Side, refuse_unlike, rules_of
+from su3d_bench.errors import ConfigError, StoreError, Su3dError, suggest
+from su3d_bench.finished_run import FinishedRun, read_run
+from su3d_bench.metrics.results import ProtocolResult
+from su3d_bench.plain_text import printable
+from su3d_bench.reports.latex import PrintedCell, printed_cells
+from su3d_bench.reports.measured import Measured
+from su3d_bench.reports.table_model import Origin
+from su3d_bench.scene_run import CEILING_METHOD
+from su3d_bench.scoring import combine
+from su3d_bench.store import read_json
+
+Number = Annotated[float, Field(allow_inf_nan=False)]
+MOST_SOURCE_BYTES = 1 << 24  # of a paper's LaTeX
+
+
+class _Values(BaseModel):
+    metrics: dict[str, Number | None]
+    intervals: dict[str, tuple[Number, Number] | None]
+    per_scene: dict[str, dict[str, Number | None]]
+
+
+class _Result(BaseModel):
+    method: str
+    protocol: str
+    version: int
+    kind: str
+    headline: tuple[str, ...]
+    n_planned: int
+    failed: tuple[str, ...]
+    unscored: tuple[str, ...]
+    profile: str | None
+    encoder: str | None
+    caveat: str | None
+    ceiling: dict[str, Number | None] | None
+    result: _Values | None
+
+
+class _Metrics(BaseModel):
+    limit: int
+    results: tuple[_Result, ...]
+
+
+def measured_results(folders: Sequence[Path]) -> list[Measured]:
+    """Every scored method and protocol of the runs, after it is known that those of one protocol may stand together.
+
+    Raises ``ConfigError`` where data, rules or encoder of two runs differ.
+    """
+    runs = {str(folder): read_run(folder) for folder in dict.fromkeys(folders)}
+    found: list[Measured] = []
+    first: dict[str, tuple[FinishedRun, Measured]] = {}
+    for name, run in runs.items():
+        for one in _results_of(name, run):
+            if one.protocol in first and first[one.protocol][0] is not run:
+                other, known = first[one.protocol]
+                common = sorted(known.scenes & one.scenes)
+                refuse_unlike(Side(other, known.method), Side(run, one.method), one.protocol, common)
+            first.setdefault(one.protocol, (run, one))
+            found.append(one)
+    if not found:
+        raise ConfigError(f"{', '.join(runs)}: no scene was scored, so there is nothing for a table")
+    return found
+
+
+def _results_of(name: str, run: FinishedRun) -> list[Measured]:
+    try:
+        metrics = _Metrics.model_validate(read_json(run.folder.path / "metrics.json"))
+    except (ValidationError, RecursionError) as error:
+        key = ".".join(map(str, error.errors()[0]["loc"])) if isinstance(error, ValidationError) else "it"
+        raise StoreError(f"{run.name}: metrics.json: {printable(key, 120)} is not as a run writes it") from error
+    return [
+        Measured(
+            run=name,
+            method=one.method,
+            protocol=one.protocol,
+            version=one.version,
+            kind=one.kind,
+            headline=one.headline,
+            metrics=one.result.metrics,
+            intervals=one.result.intervals,
+            per_scene=one.result.per_scene,
+            ceilings=one.ceiling or {},
+            n_planned=one.n_planned,
+            failed=one.failed,
+            unscored=one.unscored,
+            limit=metrics.limit,
+            profile=one.profile,
+            encoder=one.encoder,
+            caveat=one.caveat,
+        )
+        for one in metrics.results
+        if one.result is not None
+    ]
+
+
+def choose(found: Sequence[Measured], methods: Sequence[str], protocols: Sequence[str]) -> list[Measured]:
+    """Those of ``methods`` and ``protocols``, all where none is named, methods in the order asked for."""
+    for wanted, known, what in (
+        (methods, {one.method for one in found}, "method"),
+        (protocols, {one.protocol for one in found}, "protocol"),
+    ):
+        for name in wanted:
+            if name not in known:
+                hint = suggest(name, known) or f"; they have {', '.join(sorted(known))}"
+                raise ConfigError(f"these runs hold no scores of the {what} '{printable(name, 80)}'{hint}")
+    kept = [one for one in found if not protocols or one.protocol in protocols]
+    kept = [one for name in methods for one in kept if one.method == name] if methods else kept
+    return [one for name in protocols for one in kept if one.protocol == name] if protocols else kept
+
+
+@dataclass(frozen=True)
+class CellCheck:
+    """A cell of a paper: what it shows, what the run gives (None: nothing), and why it fails, None where it holds."""
+
+    file: str
+    line: int
+    shown: str
+    found: str | None
+    fault: str | None
+
+
+class _Recomputed:
+    """Numbers from the counts of runs, each run and protocol scored once."""
+
+    def __init__(self, roots: Sequence[Path]) -> None:
+        self._roots = roots
+        self._runs: dict[str, FinishedRun] = {}
+        self._results: dict[tuple[str, str, str, str], ProtocolResult] = {}
+
+    def _run(self, name: str) -> FinishedRun:
+        if name not in self._runs:
+            places = [root / name for root in self._roots]
+            path = next((place for place in places if (place / "run.json").is_file()), places[0])
+            self._runs[name] = read_run(path)
+        return self._runs[name]
+
+    def result(self, origin: Origin) -> ProtocolResult:
+        key = (origin.run, origin.method, origin.protocol, "ceiling" if origin.what == "ceiling" else "value")
+        if key not in self._results:
+            run = self._run(origin.run)
+            run.check_method(origin.method)
+            if origin.protocol not in run.protocols:
+                raise ConfigError(f"{run.name}: was not scored under '{printable(origin.protocol, 80)}'")
+            rules = rules_of(Side(run, origin.method), origin.protocol)
+            scores = run.scores(origin.method)[rules.name]
+            if origin.what == "ceiling":
+                perfect = run.scores(CEILING_METHOD)[rules.name]
+                scores = {scene: perfect[scene] for scene in scores if scene in perfect}
+            self._results[key] = combine(rules, scores)
+        result = self._results[key]
+        if result.version != origin.version:
+            raise ConfigError(f"the cell is of version {origin.version} of {origin.protocol}, the run {result.version}")
+        return result
+
+
+def check_paper(file: Path, root: Path | None = None) -> list[CellCheck]:
+    """Every cell of a LaTeX source that names its run, held against what the run's counts give now.
+
+    Runs are looked for from ``root``, else from here and then from the folder of ``file``. Raises ``ConfigError`` where
+    no cell names a run.
+    """
+    shown = printable(str(file), 200)
+    try:
+        content = file.read_bytes()
+    except OSError as error:
+        raise ConfigError(f"{shown}: cannot be read: {error.strerror}") from error
+    if len(content) > MOST_SOURCE_BYTES:
+        raise ConfigError(f"{shown}: has {len(content)} bytes; a paper's source has at most {MOST_SOURCE_BYTES}")
+    cells = printed_cells(content.decode("utf-8", "replace"))
+    if not cells:
+        raise ConfigError(f"{shown}: no cell names its run; make the tables with: su3d-bench report tables")
+    recomputed = _Recomputed([root] if root is not None else [Path(), file.parent])
+    return [_check(cell, shown, recomputed) for cell in cells]
+
+
+def _check(cell: PrintedCell, file: str, recomputed: _Recomputed) -> CellCheck:
+    text = printable(cell.shown, 60)
+    if cell.origin is None:
+        return CellCheck(file, cell.line, text, None, "the comment that names its run is damaged")
+    try:
+        result = recomputed.result(cell.origin)
+    except Su3dError as error:
+        return CellCheck(file, cell.line, text, None, f"cannot be recomputed: {error}")
+    numbers = _numbers(cell.origin, result)
+    if numbers is None:
+        return CellCheck(file, cell.line, text, None, f"the run has no '{printable(cell.origin.metric, 60)}'")
+    found = " ".join(f"{number:.4f}".rstrip("0").rstrip(".") for number in numbers)
+    printed = cell.numbers[: len(numbers)]
+    if len(printed) < len(numbers):
+        return CellCheck(file, cell.line, text, found, "shows fewer numbers than its comment")
+    for one, number in zip(printed, numbers, strict=True):
+        n_decimals = len(one.partition(".")[2])
+        if one != f"{number:.{n_decimals}f}":
+            return CellCheck(file, cell.line, text, found, f"shows {one}, the run gives {number:.{n_decimals}f}")
+    return CellCheck(file, cell.line, text, found, None)
+
+
+def _numbers(origin: Origin, result: ProtocolResult) -> list[float] | None:
+    """What the cell should show: per cent, and the interval where it has one; None where the run lacks it."""
+    if origin.what == "scenes":
+        return [float(result.n_scenes)]
+    value = result.metrics.get(origin.metric)
+    if value is None or value != value:
+        return None
+    interval = result.intervals.get(origin.metric) if origin.interval is not None else None
+    if origin.interval is not None and interval is None:
+        return None
+    return [100.0 * value, *(100.0 * end for end in interval or ())]

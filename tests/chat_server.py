@@ -1,0 +1,139 @@
+"""An OpenAI-compatible server on loopback that behaves as a test tells it to, and counts what it is asked."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from typing import Any
+
+from su3d_bench.perception.language.config import LanguageConfig
+
+KEY = "sk-test-0123456789abcdef"
+Body = dict[str, Any]
+
+
+@dataclass
+class Answered:
+    """What the server does with a request: a chat completion of ``text``, or something else."""
+
+    text: str = "ok"
+    status: int = 200
+    headers: dict[str, str] = field(default_factory=dict)
+    raw: bytes | None = None
+    kind: str = "application/json"
+    wait_s: float = 0.0
+    drip_s: float = 0.0
+    usage: tuple[int, int] | None = (10, 5)
+
+
+def error(status: int, message: str = "no", code: str | None = None, **headers: str) -> Answered:
+    raw = json.dumps({"error": {"message": message, "code": code, "type": "x"}}).encode()
+    return Answered(status=status, raw=raw, headers={name.replace("_", "-"): value for name, value in headers.items()})
+
+
+def completion(body: Body, answered: Answered) -> bytes:
+    value: Body = {
+        "id": "1",
+        "object": "chat.completion",
+        "created": 0,
+        "model": body.get("model", ""),
+        "choices": [{"index": 0, "finish_reason": "stop", "message": {"role": "assistant", "content": answered.text}}],
+    }
+    if answered.usage is not None:
+        value["usage"] = {"prompt_tokens": answered.usage[0], "completion_tokens": answered.usage[1]}
+    return json.dumps(value).encode()
+
+
+class ChatServer:
+    """``script`` is worked off first, one answer a request; after it ``answer`` says what to do with a body."""
+
+    def __init__(self) -> None:
+        self.script: list[Answered] = []
+        self.answer: Callable[[Body], Answered] = lambda body: Answered()
+        self.bodies: list[Body] = []
+        self.headers: list[dict[str, str]] = []
+        self.stop = threading.Event()
+        self._lock = threading.Lock()
+        server = self
+
+        class Handler(BaseHTTPRequestHandler):
+            protocol_version = "HTTP/1.1"
+
+            def do_POST(self) -> None:
+                body = json.loads(self.rfile.read(int(self.headers["Content-Length"])))
+                server.respond(self, body)
+
+            def log_message(self, *words: Any) -> None:
+                pass
+
+        self._http = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._http.daemon_threads = True
+        self.url = f"http://127.0.0.1:{self._http.server_address[1]}/v1"
+        threading.Thread(target=self._http.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+
+    @property
+    def n_asked(self) -> int:
+        return len(self.bodies)
+
+    def respond(self, handler: BaseHTTPRequestHandler, body: Body) -> None:
+        with self._lock:
+            self.bodies.append(body)
+            self.headers.append(dict(handler.headers))
+            answered = self.script.pop(0) if self.script else self.answer(body)
+        self.stop.wait(answered.wait_s)
+        content = answered.raw if answered.raw is not None else completion(body, answered)
+        try:
+            handler.send_response(answered.status)
+            handler.send_header("Content-Type", answered.kind)
+            handler.send_header("Content-Length", str(len(content)))
+            for name, value in answered.headers.items():
+                handler.send_header(name, value)
+            handler.end_headers()
+            step = 1 if answered.drip_s else len(content) or 1
+            for start in range(0, len(content), step):
+                handler.wfile.write(content[start : start + step])
+                handler.wfile.flush()
+                if answered.drip_s and self.stop.wait(answered.drip_s):
+                    return
+        except OSError:
+            pass
+
+    def close(self) -> None:
+        self.stop.set()
+        self._http.shutdown()
+        self._http.server_close()
+
+
+@contextmanager
+def chat_server() -> Iterator[ChatServer]:
+    server = ChatServer()
+    try:
+        yield server
+    finally:
+        server.close()
+
+
+def quick_config(server: ChatServer | None = None, **changes: Any) -> LanguageConfig:
+    """A configuration whose pauses take no time."""
+    values: dict[str, Any] = {
+        "base_url": "http://127.0.0.1:9/v1" if server is None else server.url,
+        "key_variable": "SU3D_TEST_KEY",
+        "connect_timeout_s": 0.5,
+        "total_timeout_s": 5.0,
+        "max_retries": 2,
+        "backoff_s": 0.001,
+        "max_wait_s": 0.5,
+        "max_failures_in_a_row": 50,
+    }
+    return LanguageConfig(**(values | changes))
+
+
+def seconds_of(call: Callable[[], Any]) -> float:
+    start = time.monotonic()
+    call()
+    return time.monotonic() - start

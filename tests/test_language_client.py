@@ -1,0 +1,362 @@
+"""The client of language models against a server that answers, refuses, fails, hangs and floods."""
+
+from __future__ import annotations
+
+import builtins
+import json
+import sys
+import threading
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from chat_server import KEY, Answered, ChatServer, chat_server, error, quick_config
+
+from su3d_bench.errors import ConfigError, ModelMissing, RunIncomplete, StoreError
+from su3d_bench.perception.language.chat import ChatRequest, Image, fitted
+from su3d_bench.perception.language.client import ChatClient
+from su3d_bench.perception.language.config import LanguageConfig, Price
+from su3d_bench.perception.language.reply_store import ReplyStore
+from su3d_bench.perception.language.transport import HOSTED
+
+pytest.importorskip("openai", reason="the models extra is not installed")
+
+
+@pytest.fixture(scope="module")
+def shared() -> Iterator[ChatServer]:
+    with chat_server() as server:
+        yield server
+
+
+@pytest.fixture
+def server(shared: ChatServer, monkeypatch: pytest.MonkeyPatch) -> ChatServer:
+    monkeypatch.setenv("SU3D_TEST_KEY", KEY)
+    monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
+    shared.script.clear()
+    shared.bodies.clear()
+    shared.headers.clear()
+    shared.answer = lambda body: Answered()
+    return shared
+
+
+def ask(text: str, **changes: Any) -> ChatRequest:
+    return ChatRequest("ask", "tiny-model", "be brief", text, max_answer_tokens=20, **changes)
+
+
+def client(server: ChatServer, folder: Path, **changes: Any) -> ChatClient:
+    return ChatClient(quick_config(server, **changes), ReplyStore(folder))
+
+
+def everything_in(folder: Path) -> str:
+    return "".join(path.read_text(errors="replace") for path in sorted(folder.rglob("*")) if path.is_file())
+
+
+def test_an_answer_is_stored_and_a_rerun_asks_nothing(server: ChatServer, tmp_path: Path) -> None:
+    server.answer = lambda body: Answered("a lamp")
+    first = client(server, tmp_path).ask_all([ask("one"), ask("two"), ask("one")])
+    assert [reply.text for reply in first] == ["a lamp"] * 3
+    assert server.n_asked == 2
+    files = everything_in(tmp_path)
+    again = client(server, tmp_path).ask_all([ask("one"), ask("two")])
+    assert server.n_asked == 2
+    assert again == first[:2]
+    assert all(reply.was_stored for reply in again)
+    assert everything_in(tmp_path) == files
+
+
+def test_the_request_is_that_of_a_chat_completion(server: ChatServer, tmp_path: Path) -> None:
+    picture = Image(np.zeros((4, 6, 3), np.uint8))
+    client(server, tmp_path).ask(ask("what is it?", images=(picture,)))
+    body = server.bodies[0]
+    assert body["model"] == "tiny-model"
+    assert (body["temperature"], body["seed"], body["max_tokens"]) == (0.0, 0, 20)
+    assert body["messages"][0] == {"role": "system", "content": "be brief"}
+    words, image = body["messages"][1]["content"]
+    assert words == {"type": "text", "text": "what is it?"}
+    assert image["image_url"]["url"].startswith("data:image/png;base64,")
+    assert server.headers[0]["Authorization"] == f"Bearer {KEY}"
+    assert (tmp_path / "images" / f"{picture.digest}.png").is_file()
+
+
+def test_offline_replays_and_names_what_is_missing(server: ChatServer, tmp_path: Path) -> None:
+    client(server, tmp_path).ask(ask("known"))
+    offline = ChatClient(quick_config(server), ReplyStore(tmp_path), offline=True)
+    assert offline.ask(ask("known")).text == "ok"
+    with pytest.raises(StoreError, match=r"holds no reply to this ask request of model 'tiny-model'.*--offline"):
+        offline.ask(ask("unknown"))
+    assert server.n_asked == 1
+
+
+def test_offline_needs_neither_key_nor_package(
+    server: ChatServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    client(server, tmp_path).ask(ask("known"))
+    monkeypatch.delenv("SU3D_TEST_KEY")
+    monkeypatch.setitem(sys.modules, "openai", None)
+    assert ChatClient(LanguageConfig(), ReplyStore(tmp_path), offline=True).ask(ask("known")).text == "ok"
+
+
+@pytest.mark.parametrize(
+    "trouble",
+    [
+        error(429, "slow down", retry_after="0.01"),
+        error(429, "slow down", retry_after="Wed, 21 Oct 2015 07:28:00 GMT"),
+        error(500, "oops"),
+        error(503, "busy"),
+        Answered(raw=b"{not json"),
+        Answered(raw=b"[" * 100_000),
+        Answered(raw=b'{"choices": []}'),
+        Answered(raw=b"<html>gateway</html>", kind="text/html"),
+        Answered(raw=b'{"choices": [{"message": {"content": 5}}]}'),
+    ],
+    ids=["429", "429-date", "500", "503", "malformed", "nested", "no-choice", "html", "wrong-type"],
+)
+def test_trouble_that_passes_is_retried(server: ChatServer, tmp_path: Path, trouble: Answered) -> None:
+    server.script = [trouble]
+    assert client(server, tmp_path).ask(ask("x")).text == "ok"
+    assert server.n_asked == 2
+
+
+def test_the_pause_that_a_server_asks_for_is_kept(server: ChatServer, tmp_path: Path) -> None:
+    pauses: list[float] = []
+    server.script = [error(429, "slow down", retry_after="0.25"), error(500)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("su3d_bench.perception.language.client.time.sleep", pauses.append)
+        client(server, tmp_path, backoff_s=0.1).ask(ask("x"))
+    assert pauses == [0.25, 0.1]
+
+
+def test_a_pause_longer_than_the_limit_is_a_failure(server: ChatServer, tmp_path: Path) -> None:
+    server.script = [error(429, "come back tomorrow", retry_after="86400")]
+    reply = client(server, tmp_path).ask(ask("x"))
+    assert reply.failure == "status 429: come back tomorrow; it asks to wait 86400 s"
+    assert server.n_asked == 1
+
+
+def test_a_failure_for_good_is_stored_and_asked_again_on_demand_only(server: ChatServer, tmp_path: Path) -> None:
+    server.answer = lambda body: error(500, "down")
+    failed = client(server, tmp_path).ask(ask("x"))
+    assert failed.failure == "status 500: down; tried 3 times"
+    server.answer = lambda body: Answered("up again")
+    assert client(server, tmp_path).ask(ask("x")) == failed
+    assert server.n_asked == 3
+    again = ChatClient(quick_config(server), ReplyStore(tmp_path), ask_failed_again=True)
+    assert [reply.text for reply in again.ask_all([ask("x"), ask("x")])] == ["up again"] * 2
+    assert server.n_asked == 4
+
+
+def test_a_request_that_the_server_refuses_is_not_repeated(server: ChatServer, tmp_path: Path) -> None:
+    server.script = [error(400, "content policy")]
+    assert client(server, tmp_path).ask(ask("x")).failure == "status 400: content policy"
+    assert server.n_asked == 1
+
+
+def test_a_hung_connection_ends_with_the_time_out(server: ChatServer, tmp_path: Path) -> None:
+    server.script = [Answered(wait_s=30)]
+    assert client(server, tmp_path, total_timeout_s=0.3).ask(ask("x")).text == "ok"
+    server.script = [Answered(wait_s=30)] * 2
+    reply = client(server, tmp_path, total_timeout_s=0.2, max_retries=1).ask(ask("y"))
+    assert reply.failure.endswith("answer within 0.2 s; tried 2 times")
+
+
+def test_an_answer_that_drips_ends_with_the_total_time_out(server: ChatServer, tmp_path: Path) -> None:
+    server.script = [Answered("x" * 10_000, drip_s=0.05)]
+    reply = client(server, tmp_path, total_timeout_s=0.3, max_retries=0).ask(ask("x"))
+    assert reply.failure == "no whole answer within 0.3 s; tried 1 times"
+
+
+@pytest.mark.parametrize("status", [200, 500])
+def test_a_huge_answer_is_not_read_to_its_end(server: ChatServer, tmp_path: Path, status: int) -> None:
+    server.script = [Answered(raw=b" " * 3_000_000, status=status)]
+    reply = client(server, tmp_path, max_answer_bytes=100_000).ask(ask("x"))
+    assert reply.failure == "the answer is larger than 100,000 bytes"
+    assert server.n_asked == 1
+
+
+def test_a_packed_body_is_refused(server: ChatServer, tmp_path: Path) -> None:
+    server.script = [Answered(raw=b"\x1f\x8b" + bytes(100), headers={"Content-Encoding": "gzip"})]
+    assert "larger than" in client(server, tmp_path).ask(ask("x")).failure
+
+
+def test_a_server_that_is_not_there_ends_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SU3D_TEST_KEY", KEY)
+    with chat_server() as gone:
+        url = gone.url
+    missing = ChatClient(quick_config(base_url=url), ReplyStore(tmp_path))
+    with pytest.raises(ModelMissing, match="cannot be reached"):
+        missing.ask(ask("x"))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_server_that_fails_again_and_again_ends_the_command(server: ChatServer, tmp_path: Path) -> None:
+    server.answer = lambda body: error(500)
+    with pytest.raises(ModelMissing, match="3 requests failed one after the other"):
+        client(server, tmp_path, max_retries=0, max_failures_in_a_row=3, max_concurrent=1).ask_all(
+            [ask(str(k)) for k in range(9)]
+        )
+    assert server.n_asked == 3
+
+
+@pytest.mark.parametrize(
+    ("trouble", "line"),
+    [
+        (error(401, f"Incorrect API key provided: {KEY}"), r"refuses the key in \$SU3D_TEST_KEY"),
+        (error(404, "model 'tiny-model' not found"), "knows no such model or address"),
+        (error(429, "pay", "insufficient_quota"), "no quota left"),
+    ],
+)
+def test_what_no_retry_mends_is_one_line(server: ChatServer, tmp_path: Path, trouble: Answered, line: str) -> None:
+    server.script = [trouble]
+    with pytest.raises(ModelMissing, match=line) as caught:
+        client(server, tmp_path).ask(ask("x"))
+    assert KEY not in str(caught.value)
+    assert "\n" not in str(caught.value)
+    assert server.n_asked == 1
+
+
+def test_the_key_stands_in_no_file_and_no_message(server: ChatServer, tmp_path: Path) -> None:
+    server.script = [Answered(f"your key is {KEY}"), error(400, f"bad request with {KEY} and sk-other-987654321")]
+    asked = client(server, tmp_path)
+    assert asked.ask(ask("x")).text == "your key is (key)"
+    assert asked.ask(ask("y")).failure == "status 400: bad request with (key) and (key)"
+    assert KEY not in everything_in(tmp_path)
+    assert "sk-other" not in everything_in(tmp_path)
+
+
+def test_a_missing_key_of_the_hosted_service_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("SU3D_TEST_KEY", raising=False)
+    monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
+    assert HOSTED == "https://api.openai.com/v1"
+    with pytest.raises(ModelMissing, match=r"\$SU3D_TEST_KEY is not set"):
+        ChatClient(quick_config(base_url=""), ReplyStore(tmp_path)).ask(ask("x"))
+
+
+def test_a_server_of_ones_own_needs_no_key(server: ChatServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("SU3D_TEST_KEY")
+    monkeypatch.setenv("OPENAI_BASE_URL", server.url)
+    assert client(server, tmp_path, base_url="").ask(ask("x")).text == "ok"
+
+
+def test_the_missing_package_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = builtins.__import__
+
+    def absent(name: str, *words: Any, **more: Any) -> Any:
+        if name == "openai":
+            raise ImportError(name)
+        return real(name, *words, **more)
+
+    monkeypatch.setattr(builtins, "__import__", absent)
+    with pytest.raises(ModelMissing, match=r"pip install 'su3d-bench\[models\]'"):
+        ChatClient(quick_config(), ReplyStore(tmp_path)).ask(ask("x"))
+
+
+def test_parameters_that_a_server_refuses_are_left_out_and_recorded(server: ChatServer, tmp_path: Path) -> None:
+    server.script = [
+        error(400, "Unsupported parameter: 'max_tokens' is not supported; use 'max_completion_tokens' instead"),
+        error(400, "seed is not supported by this model"),
+    ]
+    asked = client(server, tmp_path)
+    assert asked.ask(ask("x")).dropped == ("max_tokens", "seed")
+    assert asked.ask(ask("y")).dropped == ("max_tokens", "seed")
+    assert server.n_asked == 4
+    assert "seed" not in server.bodies[-1]
+    assert server.bodies[-1]["max_completion_tokens"] == 20
+    assert ReplyStore(tmp_path).load(ask("x").key) == asked.ask(ask("x"))
+
+
+def test_a_damaged_reply_is_asked_for_again(server: ChatServer, tmp_path: Path) -> None:
+    client(server, tmp_path).ask(ask("x"))
+    path = ReplyStore(tmp_path).path(ask("x").key)
+    entry = json.loads(path.read_text())
+    entry["reply"]["text"] = "forged"
+    for content in (json.dumps(entry), "{", "[]", "[" * 50_000):
+        path.write_text(content)
+        assert ReplyStore(tmp_path).load(ask("x").key) is None
+    server.answer = lambda body: Answered("anew")
+    assert client(server, tmp_path).ask(ask("x")).text == "anew"
+    assert ReplyStore(tmp_path).load(ask("x").key) is not None
+
+
+def test_of_two_processes_the_first_reply_is_kept(server: ChatServer, tmp_path: Path) -> None:
+    server.answer = lambda body: Answered(f"answer {len(server.bodies)}")
+    clients = [client(server, tmp_path) for _ in range(4)]
+    replies: list[str] = []
+    threads = [threading.Thread(target=lambda one=one: replies.append(one.ask(ask("x")).text)) for one in clients]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    kept = ReplyStore(tmp_path).load(ask("x").key)
+    assert kept is not None
+    assert set(replies) == {kept.text}
+
+
+def test_equal_requests_at_once_are_sent_once(server: ChatServer, tmp_path: Path) -> None:
+    server.answer = lambda body: Answered(wait_s=0.05)
+    client(server, tmp_path, max_concurrent=8).ask_all([ask(str(k % 3)) for k in range(24)])
+    assert server.n_asked == 3
+
+
+def test_the_budget_stops_before_it_is_passed_and_goes_on_when_raised(server: ChatServer, tmp_path: Path) -> None:
+    server.answer = lambda body: Answered(usage=(30, 10))
+    questions = [ask(str(k)) for k in range(5)]
+    most = questions[0].n_input_tokens + 20  # what a request may cost
+    with pytest.raises(RunIncomplete, match="budget_tokens = .* is reached"):
+        client(server, tmp_path, budget_tokens=80 + most, max_concurrent=1).ask_all(questions)
+    assert server.n_asked == 3
+    assert len(client(server, tmp_path, budget_tokens=1000).ask_all(questions)) == 5
+    assert server.n_asked == 5
+
+
+def test_a_budget_in_dollars_needs_a_price(server: ChatServer, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="'tiny-model' has no price"):
+        client(server, tmp_path, budget_usd=1.0).ask(ask("x"))
+    priced = {"tiny-model": Price(input_usd=1e6, output_usd=2e6)}  # a dollar a token in, two a token out
+    asked = client(server, tmp_path, budget_usd=100.0, prices=priced)
+    asked.ask(ask("x"))
+    assert asked.spending.usd == 10 * 1 + 5 * 2
+    with pytest.raises(RunIncomplete, match="budget_usd = 30 is reached"):
+        client(server, tmp_path, budget_usd=30.0, prices=priced).ask(ask("y"))
+    assert server.n_asked == 1
+
+
+def test_an_estimate_counts_what_is_stored_and_sends_nothing(server: ChatServer, tmp_path: Path) -> None:
+    priced = {"tiny-model": Price(input_usd=1.0, output_usd=2.0)}
+    asked = client(server, tmp_path, prices=priced)
+    asked.ask(ask("stored"))
+    estimate = asked.estimate([ask("stored"), ask("new"), ask("new")])
+    assert server.n_asked == 1
+    assert (estimate.n_requests, estimate.n_stored, estimate.output_tokens) == (2, 1, 20)
+    assert estimate.usd == pytest.approx((ask("new").n_input_tokens * 1.0 + 20 * 2.0) / 1e6)
+    assert client(server, tmp_path).estimate([ask("new")]).usd is None
+
+
+def test_the_rate_limit_spaces_requests(server: ChatServer, tmp_path: Path) -> None:
+    pauses: list[float] = []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("su3d_bench.perception.language.client.time.sleep", pauses.append)
+        patch.setattr("su3d_bench.perception.language.client.time.monotonic", lambda: 100.0)
+        client(server, tmp_path, requests_per_minute=30, max_concurrent=1).ask_all([ask(str(k)) for k in range(3)])
+    assert pauses == [0.0, 2.0, 4.0]
+
+
+@pytest.mark.parametrize("address", ["ftp://x", "http://user:secret@host/v1", "localhost:8000", "http://h/v1?key=1"])
+def test_an_address_that_is_none_or_holds_a_secret_is_refused(address: str) -> None:
+    with pytest.raises(ValueError, match="expected an http|keys belong in the environment"):
+        LanguageConfig(base_url=address)
+
+
+def test_the_key_of_a_picture_is_that_of_its_pixels() -> None:
+    pixels = np.arange(5 * 7 * 3, dtype=np.uint8).reshape(5, 7, 3)
+    assert Image(pixels).digest == Image(pixels.copy()).digest != Image(pixels[:, ::-1]).digest
+    assert ask("x", images=(Image(pixels),)).key != ask("x").key
+    assert max(fitted(np.zeros((100, 400, 3), np.uint8), 64).rgb.shape) == 64
+
+
+def test_picture_tokens_follow_the_rule_of_the_models() -> None:
+    # OpenAI's own examples: 1024x1024 costs 765 tokens in high detail, 2048x4096 costs 1105.
+    assert Image(np.zeros((1024, 1024, 3), np.uint8)).n_tokens("high") == 765
+    assert Image(np.zeros((4096, 2048, 3), np.uint8)).n_tokens("high") == 1105
+    assert Image(np.zeros((4096, 2048, 3), np.uint8)).n_tokens("low") == 85

@@ -1,0 +1,209 @@
+"""Segments of meshes: ScanNet's algorithm, worked by hand, against plain Python, and against the original program."""
+
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+import pytest
+
+from su3d_bench.baselines.mesh_segments import mesh_segments
+from su3d_bench.baselines.mesh_segments_kernels import _heap_sort, edges_of, sort_as_gnu, vertex_normals
+
+F = np.float32
+# std::sort of GNU's library (GCC 12) on 60 weights (k * 7919) % 5, and its make_heap with sort_heap on 37 of them
+SORTED = [
+    10, 20, 25, 15, 30, 35, 40, 45, 5, 50, 55, 0, 44, 49, 59, 39, 34, 54, 29, 24, 19, 4, 9, 14, 18, 53, 3, 38, 43, 8,
+    13, 33, 23, 28, 48, 58, 7, 52, 47, 42, 17, 22, 37, 2, 12, 32, 57, 27, 56, 51, 1, 6, 46, 41, 11, 36, 31, 16, 26, 21,
+]  # fmt: skip
+HEAP_SORTED = [
+    0, 15, 20, 25, 5, 10, 30, 35, 24, 19, 34, 4, 9, 14, 29, 33, 8, 18, 23, 3, 13, 28, 32, 7, 17, 22, 12, 2, 27, 31, 16,
+    36, 1, 21, 11, 26, 6,
+]  # fmt: skip
+
+
+def sheet(heights: list[list[float]], spacing_m: float = 0.1) -> tuple[np.ndarray, np.ndarray]:
+    """A mesh over a grid of heights, two triangles a cell, normals up."""
+    z = np.array(heights, np.float32)
+    rows, columns = z.shape
+    row, column = np.divmod(np.arange(z.size), columns)
+    vertices = np.stack([column * F(spacing_m), row * F(spacing_m), z.reshape(-1)], axis=1).astype(np.float32)
+    corner = np.flatnonzero((row < rows - 1) & (column < columns - 1))
+    low = np.stack([corner, corner + 1, corner + columns], axis=1)
+    high = np.stack([corner + 1, corner + columns + 1, corner + columns], axis=1)
+    return vertices, np.concatenate([low, high]).astype(np.int32)
+
+
+def rough_sheet(n: int) -> tuple[np.ndarray, np.ndarray]:
+    """A rough sheet with a fold, the same bits everywhere: on it the original program was run."""
+    row, column = np.divmod(np.arange(n * n), n)
+    height = ((row * row * 31 + row * column * 17 + column * column * 13) % 97).astype(np.float32) * F(0.00008)
+    height += np.where(column > n // 2, column - n // 2, 0).astype(np.float32) * F(0.015)
+    places = (row.astype(np.float32) * F(0.02), column.astype(np.float32) * F(0.02), height)
+    corner = np.flatnonzero((row < n - 1) & (column < n - 1))
+    low = np.stack([corner, corner + n, corner + 1], axis=1)
+    high = np.stack([corner + 1, corner + n, corner + n + 1], axis=1)
+    return np.stack(places, axis=1), np.concatenate([low, high]).astype(np.int32)
+
+
+@pytest.mark.parametrize(
+    ("threshold", "digest"),
+    [
+        (0.01, "377a9a292987d80c8eeea35e1ee4791e2e35f07e3534d81071f2995121d12877"),
+        (0.1, "e5f59faf2641adc5b7b7609b5d9bbb713cf98b1079bea78e8e298b616ffab133"),
+    ],
+)
+def test_segments_are_those_of_scannets_program_to_the_last_id(threshold: float, digest: str) -> None:
+    """Digests of the answer of segmentator.cpp (b38b278, GCC 12) on the same triangles, as little-endian int32."""
+    segments = mesh_segments(*rough_sheet(60), threshold)
+    assert hashlib.sha256(segments.astype("<i4").tobytes()).hexdigest() == digest
+
+
+def test_equal_weights_come_in_the_order_of_gnus_sort() -> None:
+    numbers = np.arange(60, dtype=np.int32)
+    weights, edges = ((numbers * 7919) % 5).astype(np.float32), np.stack([numbers, numbers], axis=1)
+    sort_as_gnu(weights, edges)
+    assert edges[:, 0].tolist() == SORTED
+    assert (np.diff(weights) >= 0).all() and (edges[:, 0] == edges[:, 1]).all()
+
+
+def test_heap_sort_moves_equal_weights_as_gnus() -> None:
+    numbers = np.arange(40, dtype=np.int32) - 2  # not from the beginning of the list
+    weights, edges = ((numbers * 7919) % 5).astype(np.float32), np.stack([numbers, numbers], axis=1)
+    _heap_sort(weights, edges, 2, 39)
+    assert edges[2:39, 0].tolist() == HEAP_SORTED
+    assert edges[[0, 1, 39], 0].tolist() == [-2, -1, 37]
+
+
+def test_any_weights_are_sorted_and_none_is_lost() -> None:
+    rng = np.random.default_rng(3)
+    organ_pipe = np.concatenate([np.arange(500), np.arange(500)[::-1]])
+    for values in (rng.random(1), rng.random(17), np.zeros(1000), organ_pipe, rng.integers(0, 4, 3000)):
+        weights = values.astype(np.float32)
+        edges = np.stack([np.arange(len(weights))] * 2, axis=1).astype(np.int32)
+        sort_as_gnu(weights, edges)
+        assert np.array_equal(weights, np.sort(values.astype(np.float32)))
+        assert np.array_equal(np.sort(edges[:, 0]), np.arange(len(weights)))
+
+
+def test_weights_that_are_no_numbers_end_the_sort_all_the_same() -> None:
+    weights = np.where(np.arange(300) % 3 == 0, np.nan, np.arange(300) % 7).astype(np.float32)
+    edges = np.stack([np.arange(300)] * 2, axis=1).astype(np.int32)
+    sort_as_gnu(weights, edges)
+    assert np.array_equal(np.sort(edges[:, 0]), np.arange(300))
+
+
+def test_a_vertex_normal_is_the_running_mean_of_its_triangles() -> None:
+    """A horizontal triangle, then a vertical one over the edge 0-1: the mean of (0,0,1) and (0,-1,0) at both."""
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    normals = vertex_normals(vertices, np.array([[0, 1, 2], [0, 1, 3]], np.int32))
+    assert normals.tolist() == [[0, -0.5, 0.5], [0, -0.5, 0.5], [0, 0, 1], [0, -1, 0]]
+
+
+def test_a_concave_edge_weighs_one_minus_the_dot_product_and_a_convex_one_its_square() -> None:
+    """Normals (0, -.5, .5) at 0 and (0, 0, 1) at 2: 1 - 0.5; from 0 to 2 that normal leans neither way.
+
+    From 0 to 3, (0, 0, 1), the normal (0, -1, 0) of 3 leans neither way; from 2 on to nothing convex either. A roof:
+    its eaves' normals lean away from the ridge, so edges from the ridge are squared.
+    """
+    vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
+    edges, weights = edges_of(vertices, np.array([[0, 1, 2], [0, 1, 3]], np.int32))
+    assert edges.tolist() == [[0, 1], [0, 2], [2, 1], [0, 1], [0, 3], [3, 1]]
+    assert weights.tolist() == [0.5, 0.5, 0.25, 0.5, 0.5, 0.5]  # 2 -> 1: the normal (0, -.5, .5) leans along (1, -1, 0)
+
+
+def reference(vertices: np.ndarray, triangles: np.ndarray, threshold: float, min_vertices: int) -> list[int]:
+    """The same in plain Python, one number after another, for weights that are all different or bring the same."""
+    normals = [[F(0)] * 3 for _ in vertices]
+    counts = [0] * len(vertices)
+    edges: list[tuple[int, int]] = []
+    for a, b, c in triangles.tolist():
+        u = [vertices[b][k] - vertices[a][k] for k in range(3)]
+        v = [vertices[c][k] - vertices[a][k] for k in range(3)]
+        normal = [u[1] * v[2] - u[2] * v[1], u[2] * v[0] - u[0] * v[2], u[0] * v[1] - u[1] * v[0]]
+        length = np.sqrt(normal[0] * normal[0] + normal[1] * normal[1] + normal[2] * normal[2])
+        for vertex in (a, b, c):
+            share = F(1) / (F(counts[vertex]) + F(1))
+            normals[vertex] = [share * (normal[k] / length) + (F(1) - share) * normals[vertex][k] for k in range(3)]
+        for vertex in (a, b, c):
+            counts[vertex] += 1
+        edges += [(a, b), (a, c), (c, b)]
+    weighted = []
+    for a, b in edges:
+        d = [vertices[b][k] - vertices[a][k] for k in range(3)]
+        length = np.sqrt(d[0] * d[0] + d[1] * d[1] + d[2] * d[2])
+        n, m = normals[a], normals[b]
+        weight = F(1) - (n[0] * m[0] + n[1] * m[1] + n[2] * m[2])
+        leans = m[0] * (d[0] / length) + m[1] * (d[1] / length) + m[2] * (d[2] / length)
+        weighted.append((weight * weight if leans > 0 else weight, a, b))
+    order = np.arange(len(weighted), dtype=np.int32)
+    weights = np.array([weight for weight, _, _ in weighted], np.float32)
+    sort_as_gnu(weights, np.stack([order, order], axis=1))  # only for the weights; ties are broken here as they come
+    ranked = sorted(range(len(weighted)), key=lambda k: weighted[k][0])
+    assert [weighted[k][0] for k in ranked] == weights.tolist()
+    return _joined_plainly([weighted[k] for k in ranked], len(vertices), F(threshold), min_vertices)
+
+
+def _joined_plainly(edges: list, n: int, threshold: np.float32, min_vertices: int) -> list[int]:  # type: ignore[type-arg]
+    """Groups as sets, joined in the order of the edges; each vertex gets the smallest of its group."""
+    group = [{k} for k in range(n)]
+    limit = {id(one): threshold for one in group}
+
+    def join(a: int, b: int) -> set[int]:
+        merged = group[a] | group[b]
+        for vertex in merged:
+            group[vertex] = merged
+        return merged
+
+    for weight, a, b in edges:
+        if group[a] is not group[b] and weight <= limit[id(group[a])] and weight <= limit[id(group[b])]:
+            merged = join(a, b)
+            limit[id(merged)] = weight + threshold / F(len(merged))
+    for _, a, b in edges:
+        if group[a] is not group[b] and min(len(group[a]), len(group[b])) < min_vertices:
+            join(a, b)
+    return [min(one) for one in group]
+
+
+def test_segments_are_those_of_a_plain_reference_on_rough_sheets() -> None:
+    """Rough enough that weights of different edges differ: an edge of two triangles has one weight and one effect."""
+    rng = np.random.default_rng(5)
+    for n, threshold, min_vertices in ((8, 0.01, 4), (12, 0.05, 1), (12, 0.01, 20)):
+        vertices, triangles = sheet((rng.random((n, n)) * 0.06).tolist())
+        expected = reference(vertices, triangles, threshold, min_vertices)
+        segments = mesh_segments(vertices, triangles, threshold, min_vertices)
+        lowest = {s: int(np.flatnonzero(segments == s)[0]) for s in np.unique(segments)}
+        assert [lowest[s] for s in segments] == expected
+
+
+def test_a_flat_sheet_is_one_segment_and_a_step_makes_two() -> None:
+    flat = mesh_segments(*sheet([[0.0] * 12] * 12))
+    assert len(np.unique(flat)) == 1
+    step = mesh_segments(*sheet([[0.0] * 6 + [1.0] * 6] * 12))  # a riser of 1 m: its edges bend by more than 0.01
+    left, right = step.reshape(12, 12)[:, 0], step.reshape(12, 12)[:, -1]
+    assert len(np.unique(left)) == len(np.unique(right)) == 1
+    assert left[0] != right[0]
+
+
+def test_small_segments_join_a_neighbour_and_lone_vertices_stay() -> None:
+    vertices, triangles = sheet([[0.0] * 3 + [1.0] * 3] * 3)  # nine vertices a side
+    assert len(np.unique(mesh_segments(vertices, triangles, 0.01, 1))) > 1
+    assert len(np.unique(mesh_segments(vertices, triangles, 0.01, 20))) == 1
+    lonely = np.concatenate([vertices, [[9, 9, 9]]]).astype(np.float32)
+    assert mesh_segments(lonely, triangles)[-1] == len(vertices)
+
+
+def test_a_segment_is_named_after_a_vertex_in_it() -> None:
+    segments = mesh_segments(*rough_sheet(20))
+    assert np.array_equal(segments[segments], segments)
+
+
+def test_a_degenerate_triangle_breaks_nothing() -> None:
+    vertices, triangles = sheet([[0.0] * 6] * 6)
+    broken = np.concatenate([triangles, [[3, 3, 4], [0, 1, 2]]]).astype(np.int32)  # no area, both
+    segments = mesh_segments(vertices, broken)
+    assert segments.shape == (36,) and np.array_equal(segments[segments], segments)
+
+
+def test_a_mesh_without_triangles_has_a_segment_a_vertex() -> None:
+    assert mesh_segments(np.zeros((3, 3), np.float32), np.zeros((0, 3), np.int32)).tolist() == [0, 1, 2]

@@ -1,0 +1,101 @@
+"""Boxes and images on their way into and out of foundation models, on cases worked out by hand."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from su3d_bench.perception.models.box_suppression import box_overlaps, corners_of, suppress
+from su3d_bench.perception.models.model_images import (
+    normalised,
+    resized,
+    size_with_longest_side,
+    size_with_shortest_side,
+)
+from su3d_bench.types import Float32Array
+
+
+def boxes_of(*rows: tuple[float, ...]) -> Float32Array:
+    return np.array(rows, np.float32).reshape(-1, 4)
+
+
+def test_centre_and_size_become_corners_in_pixels() -> None:
+    np.testing.assert_array_equal(corners_of(boxes_of((0.5, 0.5, 1, 1)), 10, 20), boxes_of((0, 0, 20, 10)))
+    np.testing.assert_array_equal(corners_of(boxes_of((0.25, 0.5, 0.5, 0.2)), 10, 20), boxes_of((0, 4, 10, 6)))
+
+
+def test_overlap_is_intersection_over_union() -> None:
+    others = boxes_of((0, 0, 10, 10), (5, 0, 15, 10), (0, 0, 5, 10), (10, 0, 20, 10), (3, 3, 3, 3))
+    np.testing.assert_allclose(box_overlaps(boxes_of((0, 0, 10, 10))[0], others), [1, 50 / 150, 0.5, 0, 0])
+    assert np.isnan(box_overlaps(boxes_of((1, 1, 1, 4))[0], boxes_of((1, 1, 1, 4)))[0])
+
+
+def test_the_better_of_two_overlapping_boxes_stays_and_its_victim_shields_nobody() -> None:
+    # The second beats the first (IoU 0.6), which would have beaten the third (IoU 0.6); second and third share 1/3.
+    boxes = boxes_of((0, 0, 8, 1), (2, 0, 10, 1), (-2, 0, 6, 1))
+    assert suppress(boxes, np.array([0.8, 0.9, 0.7], np.float32), 0.5).tolist() == [1, 2]
+
+
+def test_an_overlap_of_exactly_the_threshold_is_no_reason_to_go() -> None:
+    boxes = boxes_of((0, 0, 10, 10), (0, 0, 5, 10))
+    scores = np.array([0.9, 0.8], np.float32)
+    assert suppress(boxes, scores, 0.5).tolist() == [0, 1]
+    assert suppress(boxes, scores, 0.49).tolist() == [0]
+
+
+def test_of_equal_scores_the_first_wins_and_boxes_without_area_overlap_nothing() -> None:
+    boxes = boxes_of((0, 0, 4, 4), (0, 0, 4, 4), (1, 1, 1, 3), (1, 1, 1, 3))
+    assert suppress(boxes, np.ones(4, np.float32), 0.3).tolist() == [0, 2, 3]
+    assert suppress(np.zeros((0, 4), np.float32), np.zeros(0, np.float32), 0.3).tolist() == []
+
+
+def test_suppression_equals_its_definition_on_random_boxes() -> None:
+    random = np.random.default_rng(3)
+    corners = random.uniform(0, 60, (200, 2))
+    boxes = np.concatenate([corners, corners + random.uniform(1, 40, (200, 2))], axis=1).astype(np.float32)
+    scores = random.integers(0, 20, 200).astype(np.float32)
+    kept: list[int] = []
+    for index in sorted(range(200), key=lambda k: (-scores[k], k)):
+        if not kept or box_overlaps(boxes[index], boxes[kept]).max() <= 0.4:
+            kept.append(index)
+    assert suppress(boxes, scores, 0.4).tolist() == kept
+    assert 20 < len(kept) < 150
+
+
+@pytest.mark.parametrize(
+    ("size", "longest", "shortest"),
+    [
+        ((680, 1200), (580, 1024), (755, 1332)),  # 1333 * 680 / 1200 = 755.37: rounded, and 755.37 * 1200 / 680 = 1333
+        ((480, 640), (768, 1024), (800, 1066)),
+        ((640, 480), (1024, 768), (1066, 800)),
+        ((100, 100), (1024, 1024), (800, 800)),
+        ((800, 900), (910, 1024), (800, 900)),
+    ],
+)
+def test_sizes_follow_the_originals_rules(
+    size: tuple[int, int], longest: tuple[int, int], shortest: tuple[int, int]
+) -> None:
+    assert size_with_longest_side(*size, 1024) == longest
+    found = size_with_shortest_side(*size, 800, 1333)
+    assert found[0] == shortest[0]
+    assert abs(found[1] - shortest[1]) <= 1
+
+
+def test_every_size_equals_that_of_transformers() -> None:
+    from transformers.image_transforms import get_size_with_aspect_ratio
+
+    random = np.random.default_rng(0)
+    for height, width in random.integers(30, 3000, (400, 2)).tolist():
+        assert size_with_shortest_side(height, width, 800, 1333) == get_size_with_aspect_ratio(
+            (height, width), 800, 1333
+        )
+
+
+def test_an_image_of_the_wanted_size_is_not_touched_and_grey_is_minus_the_mean() -> None:
+    image = np.full((4, 6, 3), 255, np.uint8)
+    assert resized(image, 4, 6) is image
+    white = normalised(image)
+    assert white.shape == (3, 4, 6)
+    np.testing.assert_allclose(
+        white[:, 0, 0], [(1 - 0.485) / 0.229, (1 - 0.456) / 0.224, (1 - 0.406) / 0.225], rtol=1e-6
+    )

@@ -1,0 +1,250 @@
+"""Segment Anything around its network: what goes in and comes out, against transformers' own steps."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tiny_models import SAM_PX, blocks, frame_of, tiny_sam
+
+from su3d_bench.errors import DataError
+from su3d_bench.perception.models import sam_onnx
+from su3d_bench.perception.models.catalogue import model_entry
+from su3d_bench.perception.models.files import ModelFiles
+from su3d_bench.perception.models.grounded_sam import Networks, SamRegions
+from su3d_bench.perception.models.pretrained import fill_sam, sam_config, sam_names
+from su3d_bench.perception.models.sam import Prompts, Sam
+from su3d_bench.perception.models.sam_networks import TorchSam
+from su3d_bench.perception.models.tagging import WordTagger
+from su3d_bench.types import BoolArray, Float32Array, UInt8Array
+
+RGB = blocks(40, 60)
+BOXES = np.array([[5, 5, 30, 30], [0, 0, 60, 40], [22.5, 3.25, 41, 39]], np.float32)
+
+
+@pytest.fixture(scope="module")
+def sam() -> Sam:
+    return Sam(TorchSam(tiny_sam()))
+
+
+def processor() -> Any:
+    from transformers.models.sam.image_processing_pil_sam import SamImageProcessorPil
+
+    side = {"height": SAM_PX, "width": SAM_PX}
+    return SamImageProcessorPil(size={"longest_edge": SAM_PX}, pad_size=side)
+
+
+@pytest.mark.parametrize("size", [(40, 60), (61, 37), (64, 64), (200, 130)])
+def test_the_image_goes_in_as_transformers_prepares_it(size: tuple[int, int]) -> None:
+    seen: list[Float32Array] = []
+
+    class Looking:
+        image_px = SAM_PX
+
+        def embed(self, pixels: Float32Array) -> Any:
+            seen.append(pixels)
+
+        def decode(self, embedding: Any, prompts: Prompts, is_single: bool) -> tuple[Any, Any]:
+            raise AssertionError("nothing is asked")
+
+    rgb = blocks(*size)
+    image = Sam(Looking()).look(rgb)
+    theirs = processor()(rgb, return_tensors="np")
+    np.testing.assert_allclose(seen[0], theirs["pixel_values"][0], atol=2e-6)
+    assert image.seen_size == tuple(theirs["reshaped_input_sizes"][0])
+    assert image.size == size
+
+
+def transformers_masks(multiple: bool, **prompt: Any) -> tuple[BoolArray, Float32Array]:
+    """Masks (B, M, H, W) and scores (B, M) by transformers' processor and model; prompts in pixels of RGB."""
+    import torch
+    from transformers.models.sam.image_processing_pil_sam import _normalize_coordinates
+
+    images = processor()
+    inputs = images(RGB, return_tensors="pt")
+    asked = {
+        name: torch.from_numpy(_normalize_coordinates(SAM_PX, values, (40, 60), name == "input_boxes")).float()[None]
+        for name, values in prompt.items()
+    }
+    with torch.inference_mode():
+        answer = tiny_sam()(pixel_values=inputs["pixel_values"], multimask_output=multiple, **asked)
+    masks = images.post_process_masks(answer.pred_masks, inputs["original_sizes"], inputs["reshaped_input_sizes"])
+    return masks[0].numpy(), answer.iou_scores[0].numpy()
+
+
+def test_masks_of_boxes_are_the_best_of_three_that_transformers_gives(sam: Sam) -> None:
+    masks, scores = sam.from_boxes(sam.look(RGB), BOXES, is_single=False)
+    theirs, predicted = transformers_masks(True, input_boxes=BOXES)
+    best = predicted.argmax(axis=1)
+    assert len(set(best.tolist())) > 1, "the choice is no choice"
+    np.testing.assert_allclose(scores, predicted.max(axis=1), atol=1e-5)
+    assert (masks != theirs[np.arange(3), best]).mean() < 1e-3
+    assert 0.05 < masks.mean() < 0.95
+
+
+def test_single_masks_of_boxes_and_of_points_are_those_of_transformers(sam: Sam) -> None:
+    image = sam.look(RGB)
+    masks, scores = sam.from_boxes(image, BOXES, is_single=True)
+    theirs, predicted = transformers_masks(False, input_boxes=BOXES)
+    np.testing.assert_allclose(scores, predicted[:, 0], atol=1e-5)
+    assert (masks != theirs[:, 0]).mean() < 1e-3
+    points = np.array([[10, 12], [33, 20], [50.5, 39]], np.float32)
+    mask, score = sam.from_points(image, points)
+    theirs, predicted = transformers_masks(False, input_points=points[None])
+    assert score == pytest.approx(float(predicted[0, 0]), abs=1e-5)
+    assert (mask != theirs[0, 0]).mean() < 1e-3
+
+
+def test_the_same_batch_gives_the_same_bytes_and_another_batch_nearly_the_same_logits(sam: Sam) -> None:
+    image = sam.look(RGB)
+    random = np.random.default_rng(0)
+    points = random.uniform(0, 40, (12, 1, 2)).astype(np.float32)
+    labels = np.ones((12, 1), np.int64)
+    whole, scores = sam.decode(image, Prompts(points, labels), is_single=False)
+    again, _ = sam.decode(image, Prompts(points, labels), is_single=False)
+    assert whole.numpy().tobytes() == again.numpy().tobytes()
+    for k in range(12):
+        one, score = sam.decode(image, Prompts(points[k : k + 1], labels[:1]), is_single=False)
+        np.testing.assert_allclose(one[0].numpy(), whole[k].numpy(), atol=2e-5)
+        np.testing.assert_allclose(score[0].numpy(), scores[k].numpy(), atol=2e-5)
+    masks = [Sam(sam.network, batch).from_boxes(image, BOXES, is_single=False)[0] for batch in (1, 2, 64)]
+    assert (masks[0] != masks[2]).mean() < 1e-3
+    assert (masks[1] != masks[2]).mean() < 1e-3
+
+
+def test_masks_of_no_boxes_are_none(sam: Sam) -> None:
+    masks, scores = sam.from_boxes(sam.look(RGB), np.zeros((0, 4), np.float32), is_single=False)
+    assert masks.shape == (0, 40, 60)
+    assert scores.shape == (0,)
+
+
+class OneColour:
+    """An encoder of two numbers."""
+
+    name = digest = "one colour"
+    dim = 2
+
+    def encode_images(self, images: Any) -> Float32Array:
+        return np.tile(np.array([0.6, 0.8], np.float32), (len(images), 1))
+
+    def encode_texts(self, texts: Any) -> Float32Array:
+        return np.tile(np.array([0.6, 0.8], np.float32), (len(texts), 1))
+
+
+def test_regions_on_demand_look_at_each_frame_once() -> None:
+    looks: list[UInt8Array] = []
+
+    class Counting(Sam):
+        def look(self, rgb: UInt8Array) -> Any:
+            looks.append(rgb)
+            return super().look(rgb)
+
+    counting = Counting(TorchSam(tiny_sam()))
+    encoder = OneColour()
+    networks = Networks(WordTagger(encoder, ("cat",), 1), lambda: None, lambda: counting, "tiny")  # type: ignore[arg-type, return-value]
+    regions = SamRegions(networks, encoder)
+    first, second = frame_of(RGB), frame_of(blocks(40, 60, seed=1), index=1)
+    masks = [regions.mask_at(frame, np.array([[10, 10], [12, 30]])) for frame in (first, first, second, first)]
+    assert len(looks) == 3
+    np.testing.assert_array_equal(masks[0][0], masks[1][0])
+    np.testing.assert_array_equal(masks[0][0], masks[3][0])
+    assert (masks[0][0] != masks[2][0]).any()
+    empty, score = regions.mask_at(first, np.zeros((0, 2), np.int64))
+    assert not empty.any() and empty.shape == (40, 60) and score == 0
+    np.testing.assert_allclose(regions.encode_regions(first, masks[0][0], np.array([[0, 0, 9, 9]])), [[0.6, 0.8]])
+
+
+@pytest.fixture(scope="module")
+def exported(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ModelFiles]:
+    entry = model_entry("sam-vit-h", "segmenter")
+    folder = tmp_path_factory.mktemp("sam-vit-h-onnx")
+    source = tmp_path_factory.mktemp("sam-vit-h")
+    tiny_sam().save_pretrained(source)
+    files = ModelFiles(entry, entry.form("transformers"), source, source / "model.safetensors")
+    manifest = sam_onnx.export_sam(files, folder)
+    assert [one.output for one in manifest.parity] == ["embedding", "logits", "iou"]
+    assert max(one.max_abs_difference for one in manifest.parity) < 1e-4
+    yield ModelFiles(entry, entry.form("onnx"), folder, folder / "manifest.json")
+
+
+def test_the_exported_network_gives_the_masks_of_torch(sam: Sam, exported: ModelFiles) -> None:
+    other = Sam(sam_onnx.load_onnx_sam(exported))
+    assert other.network.image_px == SAM_PX
+    mine, theirs = sam.look(RGB), other.look(RGB)
+    for is_single in (False, True):
+        a, scores = sam.from_boxes(mine, BOXES, is_single)
+        b, other_scores = other.from_boxes(theirs, BOXES, is_single)
+        np.testing.assert_allclose(scores, other_scores, atol=1e-4)
+        assert (a != b).mean() < 2e-3
+    points = np.array([[[10, 12]], [[33, 20]]], np.float32)
+    prompts = Prompts(points, np.array([[1], [0]]))
+    logits, predicted = sam.decode(mine, prompts, is_single=False)
+    other_logits, other_predicted = other.decode(theirs, prompts, is_single=False)
+    np.testing.assert_allclose(logits.numpy(), other_logits.numpy(), atol=1e-4)
+    np.testing.assert_allclose(predicted.numpy(), other_predicted.numpy(), atol=1e-4)
+
+
+def test_an_exported_file_that_was_changed_is_refused(exported: ModelFiles, tmp_path: Path) -> None:
+    for path in exported.folder.iterdir():
+        (tmp_path / path.name).write_bytes(path.read_bytes())
+    (tmp_path / "decoder.onnx").write_bytes(b"not what was written")
+    changed = ModelFiles(exported.entry, exported.form, tmp_path, tmp_path / "manifest.json")
+    with pytest.raises(DataError, match=r"decoder\.onnx: is not the file that the manifest describes"):
+        sam_onnx.load_onnx_sam(changed)
+
+
+ORIGINAL_NAMES = {
+    "vision_encoder.patch_embed.projection.weight": "image_encoder.patch_embed.proj.weight",
+    "vision_encoder.pos_embed": "image_encoder.pos_embed",
+    "vision_encoder.layers.1.layer_norm2.bias": "image_encoder.blocks.1.norm2.bias",
+    "vision_encoder.layers.0.attn.rel_pos_h": "image_encoder.blocks.0.attn.rel_pos_h",
+    "vision_encoder.layers.0.mlp.lin1.weight": "image_encoder.blocks.0.mlp.lin1.weight",
+    "vision_encoder.neck.conv1.weight": "image_encoder.neck.0.weight",
+    "vision_encoder.neck.layer_norm2.bias": "image_encoder.neck.3.bias",
+    "prompt_encoder.shared_embedding.positional_embedding": (
+        "prompt_encoder.pe_layer.positional_encoding_gaussian_matrix"
+    ),
+    "prompt_encoder.point_embed.3.weight": "prompt_encoder.point_embeddings.3.weight",
+    "prompt_encoder.mask_embed.layer_norm2.weight": "prompt_encoder.mask_downscaling.4.weight",
+    "prompt_encoder.mask_embed.conv3.bias": "prompt_encoder.mask_downscaling.6.bias",
+    "mask_decoder.upscale_conv2.weight": "mask_decoder.output_upscaling.3.weight",
+    "mask_decoder.upscale_layer_norm.weight": "mask_decoder.output_upscaling.1.weight",
+    "mask_decoder.transformer.layers.0.layer_norm4.weight": "mask_decoder.transformer.layers.0.norm4.weight",
+    "mask_decoder.transformer.layer_norm_final_attn.weight": "mask_decoder.transformer.norm_final_attn.weight",
+    "mask_decoder.transformer.layers.1.cross_attn_token_to_image.q_proj.weight": (
+        "mask_decoder.transformer.layers.1.cross_attn_token_to_image.q_proj.weight"
+    ),
+    "mask_decoder.iou_prediction_head.proj_in.weight": "mask_decoder.iou_prediction_head.layers.0.weight",
+    "mask_decoder.iou_prediction_head.layers.0.weight": "mask_decoder.iou_prediction_head.layers.1.weight",
+    "mask_decoder.iou_prediction_head.proj_out.weight": "mask_decoder.iou_prediction_head.layers.2.weight",
+    "mask_decoder.output_hypernetworks_mlps.2.layers.0.bias": "mask_decoder.output_hypernetworks_mlps.2.layers.1.bias",
+    "mask_decoder.output_hypernetworks_mlps.3.proj_out.bias": "mask_decoder.output_hypernetworks_mlps.3.layers.2.bias",
+}
+
+
+def test_the_original_checkpoints_names_become_those_of_transformers() -> None:
+    for theirs, original in ORIGINAL_NAMES.items():
+        assert theirs in tiny_sam().state_dict(), theirs
+        assert theirs in sam_names({original: 0}), original
+
+
+def test_a_checkpoint_fills_every_weight_or_is_refused() -> None:
+    from transformers import SamModel
+
+    state = {name: tensor for name, tensor in tiny_sam().state_dict().items() if "shared_image" not in name}
+    model = fill_sam(SamModel(tiny_sam().config), state, "sam.pth")
+    for name, tensor in tiny_sam().state_dict().items():
+        assert (model.state_dict()[name] == tensor).all(), name
+    state.pop("mask_decoder.iou_token.weight")
+    with pytest.raises(DataError, match=r"sam\.pth: is no checkpoint of this SAM: .*iou_token"):
+        fill_sam(SamModel(tiny_sam().config), state, "sam.pth")
+
+
+def test_the_published_sizes_are_the_originals() -> None:
+    tower = sam_config("sam-vit-h").vision_config
+    assert (tower.hidden_size, tower.num_hidden_layers, tower.num_attention_heads) == (1280, 32, 16)
+    assert (tower.image_size, tower.window_size, tower.mlp_dim) == (1024, 14, 5120)
+    assert list(tower.global_attn_indexes) == [7, 15, 23, 31]
