@@ -79,8 +79,8 @@ def oriented_iou(a: Sequence[OrientedBox], b: Sequence[OrientedBox]) -> Float64A
 def are_coplanar(boxes: Sequence[OrientedBox]) -> bool:
     """Whether PyTorch3D takes ``boxes``: the corners of each face lie in a plane, in single precision.
 
-    Long thin boxes far from the origin fail by rounding. As in PyTorch3D the distances of the six faces' fourth corners
-    are summed with their signs, so that those of opposite faces may cancel.
+    Boxes far from the origin fail by rounding; at the size of a building none does. As in PyTorch3D the distances of
+    the six faces' fourth corners are summed with their signs, so that those of opposite faces may cancel.
     """
     if not boxes:
         return True

@@ -86,7 +86,9 @@ def first_of_voxels(points: Float64Array, voxel_m: float) -> Int64Array:
         # The product comes before the xor, which is FNV-1; the original calls it FNV-1A.
         keys *= np.uint64(1099511628211)
         keys ^= cells[:, axis].astype(np.uint64)
-    return np.asarray(np.unique(keys, return_index=True)[1], np.int64)
+    # Neighbours in an image share voxels: only the first of a run of equal keys can be the first of its voxel.
+    runs = np.flatnonzero(np.append(True, keys[1:] != keys[:-1]))
+    return np.asarray(runs[np.unique(keys[runs], return_index=True)[1]], np.int64)
 
 
 def voxelise(cloud: GroupedCloud, voxel_m: float) -> GroupedCloud:

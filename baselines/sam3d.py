@@ -115,7 +115,6 @@ class SAM3D:
     def _clear(self) -> None:
         self._clouds: list[GroupedCloud] = []  # one a frame, or the map alone where it is incremental
         self._views: list[_View] = []
-        self._feature_dim = 0
         self._surface: Surface | None = None
         self._scene = ""
 
@@ -167,7 +166,12 @@ class SAM3D:
         """Takes one image in; with ``schedule`` incremental it is merged at once, which costs what the map costs."""
         if detections.frame_index != frame.index:
             raise DataError(f"frame {frame.index}: the detections are those of frame {detections.frame_index}")
-        self._feature_dim = len(detections.global_feature)
+        n_dimensions = detections.crop_features.shape[2]
+        if len(detections) and self._views and n_dimensions != len(self._views[0].feature):
+            raise DataError(
+                f"frame {frame.index}: features have {n_dimensions} dimensions, those of the map have "
+                f"{len(self._views[0].feature)}; make all with one encoder"
+            )
         with timer.stage("backproject"):
             pixels = valid_depth(frame.depth_m, 0.0, np.inf)
             points = back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, pixels)
@@ -263,7 +267,7 @@ class SAM3D:
             means = [np.asarray(view.feature, np.float64) for view in largest]
         else:
             means = [np.mean([self._views[v].feature for v in of], axis=0, dtype=np.float64) for of in views]
-        features = np.array(means).reshape(len(views), self._feature_dim)
+        features = np.array(means).reshape(len(views), len(self._views[0].feature) if self._views else 0)
         norms = np.linalg.norm(features, axis=1, keepdims=True)
         unit: Float32Array = (features / np.maximum(norms, np.finfo(np.float64).tiny)).astype(np.float32)
         return unit

@@ -36,6 +36,12 @@ _ESCAPES = {
 _ACCENTS = {"\u0300": "`", "\u0301": "'", "\u0302": "^", "\u0303": "~", "\u0308": '"', "\u030a": "r", "\u030c": "v"}
 _LIGATURE = re.compile(r"--|''|,,|[?!]`")
 _SAFE = "/.-_+:@"
+REPORTED = "as reported, not measured here"
+GAP_PT, SMALLEST_GAP_PT = 4, 2
+# Widths of one column and of the page in a paper of two columns (IEEEtran: 252 pt and 516 pt), a little narrower.
+FLOATS = (("table", 238), ("table*", 480))
+# Type sizes and the width of a letter: digits of Computer Modern, bold, with 10 pt as the normal size.
+SIZES = ((r"\small", 5.3), (r"\footnotesize", 4.9), (r"\scriptsize", 4.4))
 _ORIGIN = re.compile(
     r"% run=(?P<run>\S+) method=(?P<method>\S+) protocol=(?P<protocol>\S+) version=(?P<version>\d{1,6}) "
     r"metric=(?P<metric>\S+) what=(?P<what>value|ceiling|scenes) value=(?P<value>[0-9.e+-]{1,30})"
@@ -75,33 +81,59 @@ def latex(tables: Sequence[Table]) -> str:
 
 
 def _float(table: Table) -> str:
+    kind, size, gap_pt = _place(table)
     lines = [
-        r"\begin{table}[t]",
-        r"  \centering",
+        f"\\begin{{{kind}}}[t]",
+        r"  \centering\hbadness=10000",  # a caption of few words in a narrow column
         f"  \\caption{{{escape(table.caption)}}}",
         f"  \\label{{tab:{re.sub(r'[^A-Za-z0-9]+', '-', table.name).strip('-')}}}",
+        f"  {size}\\setlength{{\\tabcolsep}}{{{gap_pt}pt}}",
         f"  \\begin{{tabular}}{{@{{}}l{'r' * len(table.columns)}@{{}}}}",
         r"    \toprule",
         f"    {escape(table.head)} & {' & '.join(map(escape, table.columns))} \\\\",
     ]
+    was_reported = False
     for block in blocks_of(table.rows):
         lines.append(r"    \midrule")
+        if block[0].is_reported and not was_reported:
+            was_reported = True
+            lines.append(f"    \\multicolumn{{{len(table.columns) + 1}}}{{@{{}}l}}{{\\emph{{{REPORTED}}}}} \\\\")
         lines += [line for row in block for line in _row(row)]
     lines += [r"    \bottomrule", r"  \end{tabular}"]
     if table.notes:
-        lines += [r"", r"  \smallskip", r"  \begin{minipage}{\linewidth}", r"    \footnotesize\raggedright"]
+        lines += ["", r"  \smallskip", r"  \begin{minipage}{\linewidth}", r"    \scriptsize\raggedright"]
         lines += [f"    {escape(note)}\\par" for note in table.notes]
         lines.append(r"  \end{minipage}")
-    return "\n".join([*lines, r"\end{table}"])
+    return "\n".join([*lines, f"\\end{{{kind}}}"])
+
+
+def _place(table: Table) -> tuple[str, str, int]:
+    """The float, the type size and half the gap between columns with which the table fits a page of two columns.
+
+    Letters are counted, not measured: what does not fit in the smallest type may be wider than the page.
+    """
+    titles = [table.head, *(f"{row.label} {row.mark}" for row in table.rows)]
+    columns = [
+        [name, *(row.cells[k].whole for row in table.rows if k < len(row.cells))]
+        for k, name in enumerate(table.columns)
+    ]
+    n_letters = sum(max(map(len, texts)) for texts in (titles, *columns))
+    for kind, width_pt in FLOATS:
+        for size, letter_pt in SIZES:
+            if n_letters * letter_pt + 2 * GAP_PT * len(table.columns) <= width_pt:
+                return kind, size, GAP_PT
+    return FLOATS[-1][0], SIZES[-1][0], SMALLEST_GAP_PT
 
 
 def _row(row: TableRow) -> list[str]:
-    return [f"    {escape(row.title)}", *(f"      & {_cell(cell)}" for cell in row.cells), r"      \\"]
+    mark = f"\\textsuperscript{{{escape(row.mark)}}}" if row.mark else ""
+    return [f"    {escape(row.label)}{mark}", *(f"      & {_cell(cell)}".rstrip() for cell in row.cells), r"      \\"]
 
 
 def _cell(cell: Cell) -> str:
     text = escape(cell.text)
     text = f"\\textbf{{{text}}}" if cell.is_best else text
+    text += f" {escape(cell.beside)}" if cell.beside else ""
     return text if cell.origin is None else f"{text} {origin_comment(cell.origin)}"
 
 

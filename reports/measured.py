@@ -48,3 +48,8 @@ class Measured:
     @property
     def is_whole(self) -> bool:
         return len(self.per_scene) == self.n_planned and not self.limit
+
+    @property
+    def is_ceiling(self) -> bool:
+        """Whether the method was told the truth, or where to look for it, so that it competes with none."""
+        return self.method == "oracle" or "a ceiling, not a result" in (self.caveat or "")

@@ -27,12 +27,8 @@ class Layout:
 
 
 LAYOUTS: Mapping[PaperTable, Layout] = {
-    "II": Layout(
-        ("mAcc", "F-mIoU"), "replica-conceptgraphs-ex6", "Open-vocabulary segmentation, ConceptGraphs' evaluation"
-    ),
-    "III": Layout(
-        ("AP", "AP50", "AP25"), "replica-openmask3d", "Open-vocabulary instance segmentation, OpenMask3D's evaluation"
-    ),
+    "II": Layout(("mAcc", "F-mIoU"), "replica-conceptgraphs-ex6", "Semantic segmentation, ConceptGraphs' evaluation"),
+    "III": Layout(("AP", "AP50", "AP25"), "replica-openmask3d", "Instance segmentation, OpenMask3D's evaluation"),
 }
 
 
@@ -68,7 +64,7 @@ def paper_table(number: PaperTable, found: Sequence[Measured], shown: Shown, *, 
     for name in names:
         rows = [one for one in fitting if one.protocol == name]
         one = protocol_table(rows, replace(shown, metrics=metrics), figures)
-        tables.append(replace(one, name=f"{number}-{name}", caption=f"{layout.caption}. {one.caption}"))
+        tables.append(replace(one, name=f"{number}-{name}", caption=f"{layout.caption}."))
     return tables
 
 
@@ -90,26 +86,28 @@ def protocol_table(rows: Sequence[Measured], shown: Shown, figures: Sequence[Fig
             known = suggest(name, rows[0].metrics) or f"; it has {', '.join(rows[0].metrics)}"
             raise ConfigError(f"{rows[0].protocol}: has no metric '{printable(name, 60)}'{known}")
     shown = replace(shown, metrics=metrics, scenes_count=shown.scenes_count or not _are_alike(rows))
-    best, why = _best(rows, shown)
-    labels = _labels(rows)
+    best, why = best_rows(rows, shown)
+    labels = labels_of(rows)
     body = [
-        TableRow(label, tuple(_cells(row, shown, {name for name in metrics if k in best.get(name, ())})))
+        TableRow(label, tuple(cells_of(row, shown, {name for name in metrics if k in best.get(name, ())})))
         for k, (row, label) in enumerate(zip(rows, labels, strict=True))
     ]
     reported, sources = reported_rows(figures, metrics, len(_columns(shown)))
     return Table(
         name=rows[0].protocol,
-        caption=_caption(rows[0], shown),
+        caption=f"Protocol {rows[0].protocol}.",
         head="method",
         columns=tuple(_columns(shown)),
         rows=(*body, *reported),
-        notes=(*_notes(rows, labels), *([why] if why else []), *sources),
+        notes=(units(rows[0], shown), *run_notes(rows, labels), *([why] if why else []), *sources),
     )
 
 
-def _caption(row: Measured, shown: Shown) -> str:
-    unit = "per cent, [95 % interval over scenes]" if shown.intervals else "per cent"
-    return f"Protocol {row.protocol} (version {row.version}), {unit}."
+def units(row: Measured, shown: Shown) -> str:
+    """What the numbers of a table are."""
+    interval = "; in brackets the 95 % interval over scenes" if shown.intervals else ""
+    ceiling = "; ceil.: what the truth itself scores" if shown.ceilings else ""
+    return f"Protocol {row.protocol}, version {row.version}; per cent{interval}{ceiling}."
 
 
 def _are_alike(rows: Sequence[Measured]) -> bool:
@@ -117,7 +115,7 @@ def _are_alike(rows: Sequence[Measured]) -> bool:
     return all(row.is_whole and row.scenes == rows[0].scenes for row in rows)
 
 
-def _labels(rows: Sequence[Measured]) -> list[str]:
+def labels_of(rows: Sequence[Measured]) -> list[str]:
     """The method, with the run's name where two rows are of one method."""
     names = [row.method for row in rows]
     short = [row.run.rstrip("/").rpartition("/")[2] for row in rows]
@@ -127,20 +125,18 @@ def _labels(rows: Sequence[Measured]) -> list[str]:
 
 
 def _columns(shown: Shown) -> list[str]:
-    ceilings = [f"{name} ceiling" for name in shown.metrics] if shown.ceilings else []
+    ceilings = [f"{name} ceil." for name in shown.metrics] if shown.ceilings else []
     return [*shown.metrics, *ceilings, *(["scenes"] if shown.scenes_count else [])]
 
 
-def _cells(row: Measured, shown: Shown, best: set[str]) -> list[Cell]:
+def cells_of(row: Measured, shown: Shown, best: set[str]) -> list[Cell]:
     cells = []
     for name in shown.metrics:
         interval = row.intervals.get(name) if shown.intervals else None
         value = row.metrics[name]
-        text = percent(value)
-        if value is not None and interval is not None:
-            text += f" [{percent(interval[0])}, {percent(interval[1])}]"
+        beside = "" if interval is None else f"[{percent(interval[0])}, {percent(interval[1])}]"
         origin = None if value is None else _origin(row, name, value, interval=interval)
-        cells.append(Cell(text, name in best, origin))
+        cells.append(Cell(percent(value), beside, name in best, origin))
     for name in shown.metrics if shown.ceilings else ():
         value = row.ceilings.get(name)
         origin = None if value is None else replace(_origin(row, name, value), what="ceiling")
@@ -160,12 +156,13 @@ def percent(value: float | None) -> str:
     return NOT_MEASURED if value is None else f"{100.0 * value:.1f}"
 
 
-def _best(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int]], str | None]:
+def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int]], str | None]:
     """Metric -> the rows to mark, and what must be said of the marks; rows of other scenes are not compared.
 
     Rows that print the same best value are all marked; where only a significant best is marked, none of them.
     """
-    if len(rows) < 2:
+    competing = [k for k, row in enumerate(rows) if not row.is_ceiling] or list(range(len(rows)))
+    if len(competing) < 2:
         return {}, None
     if any(row.scenes != rows[0].scenes or row.limit != rows[0].limit for row in rows):
         return {}, "The rows are of different scenes or frames, so that none is marked as the best."
@@ -173,21 +170,21 @@ def _best(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int]], 
     tests: list[SignFlipTest | None] = []
     for name in shown.metrics:
         values = np.array([np.nan if row.metrics[name] is None else row.metrics[name] for row in rows], np.float64)
-        order = np.argsort(-np.nan_to_num(values, nan=-1.0), kind="stable")
+        order = sorted(competing, key=lambda k: -np.nan_to_num(values[k], nan=-1.0))
         if np.isnan(values[order[0]]):
             continue
-        best = {k for k, row in enumerate(rows) if percent(row.metrics[name]) == percent(float(values[order[0]]))}
+        best = {k for k in competing if percent(rows[k].metrics[name]) == percent(float(values[order[0]]))}
         if shown.only_significant:
-            test = sign_flip_test(_of_scenes(rows[int(order[0])], name) - _of_scenes(rows[int(order[1])], name))
+            test = sign_flip_test(_of_scenes(rows[order[0]], name) - _of_scenes(rows[order[1]], name))
             tests.append(test)
             best = best if len(best) == 1 and test is not None and test.p < LEVEL else set()
-        if len(best) < len(rows):
+        if len(best) < len(competing):
             found[name] = best
     if not shown.only_significant:
         return found, "Bold: the highest measured value." if any(found.values()) else None
     smallest = min((test.smallest_p for test in tests if test is not None), default=1.0)
     return found, (
-        f"Bold: the highest measured value where it differs from the second (two-sided sign-flip test over scenes, "
+        "Bold: the highest measured value where it differs from the second (two-sided sign-flip test over scenes, "
         f"p < {LEVEL}; with these scenes p cannot be below {smallest:.2g})."
     )
 
@@ -197,7 +194,7 @@ def _of_scenes(row: Measured, metric: str) -> np.ndarray:
     return np.array([np.nan if value is None else value for value in values], np.float64)
 
 
-def _notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
+def run_notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
     """What must be known of measured rows: missing scenes, partial runs, where masks come from, who names."""
     notes: dict[str, list[str]] = {}
     for row, label in zip(rows, labels, strict=True):
@@ -232,14 +229,14 @@ def reported_rows(
         values = [figure.values.get(name) if as_fractions else figure.percent(name) for name in metrics]
         if not any(values):
             continue
-        how = " (quoted there)" if figure.read_from == "quoted" else ""
-        source = f"as reported in {figure.source}{how}: {figure.setup}"
+        how = "as quoted in" if figure.read_from == "quoted" else "as reported in"
+        source = f"{how} {figure.source}: {figure.setup}"
         source += f"; {figure.note}" if figure.note else ""
         mark = marks.setdefault(source, _mark(len(marks)))
         cells = [Cell(value or NOT_MEASURED) for value in values]
         cells += [Cell("")] * (n_columns - len(cells))
         rows.append(TableRow(figure.row or figure.method, tuple(cells), is_reported=True, mark=mark))
-    notes = [f"[{mark}] {source}. Not measured here: other perception, other data." for source, mark in marks.items()]
+    notes = [f"[{mark}] {source}. Not measured here." for source, mark in marks.items()]
     return rows, notes
 
 

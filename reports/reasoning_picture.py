@@ -20,7 +20,8 @@ from su3d_bench.types import BoolArray, Float64Array, Instances, Int64Array, UIn
 DPI, PANEL_WIDTH, PANEL_HEIGHT, MARGIN = 100, 760, 640, 14
 LINE_HEIGHT, CHARACTERS_A_LINE, MOST_LINES = 22, 165, 5
 ANSWER, REFERENCE = (222, 74, 22), (32, 98, 196)
-MOST_LABELS = 14
+MOST_LABELS, LABEL_HEIGHT = 14, 20
+FEW = 4  # more boxes than these are drawn with thin lines
 PALE = 0.22  # how much of its colour an object keeps that is not spoken of
 DARK, GREY = "#222222", "#666666"
 # The corners of a box, bit i for axis i, that its twelve edges join.
@@ -128,19 +129,44 @@ def _draw_spoken_of(axes: Any, camera: Camera, instances: Instances, spoken_of: 
     halo = [withStroke(linewidth=3, foreground="white")]
     centres = instances.centroids.astype(np.float64)
     for row in spoken_of.answer[:MOST_LABELS]:
-        if spoken_of.reference and row not in spoken_of.reference:
-            others = np.array(spoken_of.reference)
+        others = np.array([one for one in spoken_of.reference if one != row and not _touch(instances, one, row)], int)
+        if len(others):
             nearest = int(others[np.argmin(np.linalg.norm(centres[others] - centres[row], axis=1))])
             ends = project(camera, centres[[row, nearest]])
             axes.plot(ends[:, 0], ends[:, 1], color=DARK, linewidth=1.2, linestyle=(0, (4, 3)), path_effects=halo)
+    placed: list[Float64Array] = []
+    edges: dict[str, Any] = (
+        {"linewidth": 1.4, "path_effects": halo} if len(spoken_of.rows) <= FEW else {"linewidth": 0.9}
+    )
     for row in spoken_of.rows[:MOST_LABELS]:
         shade = "#{:02x}{:02x}{:02x}".format(*spoken_of.colour(row))
         low, high = instances.boxes[row].astype(np.float64)
         corners = np.array([[high[i] if k >> i & 1 else low[i] for i in range(3)] for k in range(8)])
         pixels = project(camera, corners)
         for a, b in EDGES:
-            axes.plot(pixels[[a, b], 0], pixels[[a, b], 1], color=shade, linewidth=1.4, path_effects=halo)
-        top = pixels[np.nanargmin(pixels[:, 1])] if np.isfinite(pixels).any() else np.zeros(2)
-        x, y = np.clip(top, [40, 16], [PANEL_WIDTH - 40, PANEL_HEIGHT - 16])
+            axes.plot(pixels[[a, b], 0], pixels[[a, b], 1], color=shade, **edges)
+        x, y = _free_place(pixels, names[row], placed)
         box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": shade, "alpha": 0.92}
-        axes.text(x, y - 6, names[row], fontsize=9.5, color=shade, ha="center", va="bottom", bbox=box, parse_math=False)
+        axes.text(x, y, names[row], fontsize=9.5, color=shade, ha="center", va="center", bbox=box, parse_math=False)
+
+
+def _touch(instances: Instances, a: int, b: int) -> bool:
+    low, high = instances.boxes[[a, b], 0].max(axis=0), instances.boxes[[a, b], 1].min(axis=0)
+    return bool((low <= high).all())
+
+
+def _free_place(corners: Float64Array, name: str, placed: list[Float64Array]) -> tuple[float, float]:
+    """Where the label of a box goes: above its middle, or as near to that as labels ``placed`` before leave room."""
+    half = np.array([4.0 * len(name) + 6.0, LABEL_HEIGHT / 2])
+    seen = corners[np.isfinite(corners).all(axis=1)]
+    start = np.array([seen[:, 0].mean(), seen[:, 1].min() - 10.0]) if len(seen) else half
+    start = np.clip(start, half, [PANEL_WIDTH - half[0], PANEL_HEIGHT - half[1]])
+    for step in range(2 * MOST_LABELS):
+        place = start + [0, LABEL_HEIGHT * (step // 2 + 1) * (-1 if step % 2 else 1) if step else 0]
+        is_inside = half[1] <= place[1] <= PANEL_HEIGHT - half[1]
+        if is_inside and not any((np.abs(one[:2] - place) < one[2:] + half).all() for one in placed):
+            break
+    else:
+        place = start
+    placed.append(np.concatenate([place, half]))
+    return float(place[0]), float(place[1])

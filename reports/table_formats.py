@@ -28,7 +28,6 @@ CSV_COLUMNS = (
     "version",
     "metric",
     "mark",
-    "notes",
 )
 # A spreadsheet takes what begins so for a formula; an apostrophe before it makes it text.
 FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
@@ -54,7 +53,7 @@ def _markdown(table: Table) -> str:
 
 
 def _marked(cell: Cell) -> str:
-    return f"**{cell.text}**" if cell.is_best else cell.text
+    return f"**{cell.text}** {cell.beside}".rstrip() if cell.is_best else cell.whole
 
 
 def _pipes(text: str) -> str:
@@ -63,12 +62,11 @@ def _pipes(text: str) -> str:
 
 
 def csv_text(tables: Sequence[Table]) -> str:
-    """One line a cell, measured values in full precision as fractions; reported ones stand in ``text`` alone."""
+    """One line a cell, then one a note; measured values also in full precision, as fractions."""
     text = io.StringIO()
     writer = csv.DictWriter(text, CSV_COLUMNS, restval="", lineterminator="\n")
     writer.writeheader()
     for table in tables:
-        notes = " / ".join(table.notes)
         for row in table.rows:
             for column, cell in zip(table.columns, row.cells, strict=True):
                 values: dict[str, str | int | float] = {
@@ -76,10 +74,9 @@ def csv_text(tables: Sequence[Table]) -> str:
                     "kind": "reported" if row.is_reported else "measured",
                     "row": row.label,
                     "column": column,
-                    "text": cell.text,
+                    "text": cell.whole,
                     "is_best": int(cell.is_best),
                     "mark": row.mark,
-                    "notes": notes,
                 }
                 if (origin := cell.origin) is not None:
                     low, high = origin.interval or ("", "")
@@ -87,6 +84,8 @@ def csv_text(tables: Sequence[Table]) -> str:
                     values |= {"method": origin.method, "protocol": origin.protocol, "version": origin.version}
                     values |= {"metric": origin.metric}
                 writer.writerow({key: _harmless(value) for key, value in values.items()})
+        for note in table.notes:
+            writer.writerow({"table": _harmless(table.name), "kind": "note", "text": _harmless(note)})
     return text.getvalue()
 
 
@@ -126,7 +125,7 @@ def _html(table: Table) -> str:
 
 
 def _strong(cell: Cell) -> str:
-    return f"<strong>{_text(cell.text)}</strong>" if cell.is_best else _text(cell.text)
+    return f"<strong>{_text(cell.text)}</strong> {_text(cell.beside)}".rstrip() if cell.is_best else _text(cell.whole)
 
 
 def _text(text: str) -> str:

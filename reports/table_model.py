@@ -27,11 +27,19 @@ class Origin:
 
 @dataclass(frozen=True)
 class Cell:
-    """``text`` as it is shown, without the mark of the best; ``origin`` is None for what a paper reports."""
+    """``text`` as it is shown, without the mark of the best, and ``beside`` it, an interval, which is never marked.
+
+    ``origin`` is None for what a paper reports.
+    """
 
     text: str
+    beside: str = ""
     is_best: bool = False
     origin: Origin | None = None
+
+    @property
+    def whole(self) -> str:
+        return f"{self.text} {self.beside}" if self.beside else self.text
 
 
 @dataclass(frozen=True)

@@ -83,7 +83,7 @@ class ChatServer:
     def respond(self, handler: BaseHTTPRequestHandler, body: Body) -> None:
         with self._lock:
             self.bodies.append(body)
-            self.headers.append(dict(handler.headers))
+            self.headers.append({name.lower(): value for name, value in handler.headers.items()})
             answered = self.script.pop(0) if self.script else self.answer(body)
         self.stop.wait(answered.wait_s)
         content = answered.raw if answered.raw is not None else completion(body, answered)

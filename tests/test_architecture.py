@@ -37,7 +37,7 @@ LAYERS = (
     {"scene_tools"},
     {"scene_feeding"},
     {"scene_run"},
-    {"method_names"},
+    {"method_names", "ablation"},
     {"planning"},
     {"evaluation_truth", "evaluation_scenes", "evaluation_texts", "evaluation_checks", "evaluation_bound"},
     {"evaluation_scoring"},

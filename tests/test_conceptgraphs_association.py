@@ -114,14 +114,16 @@ def test_the_union_of_axis_aligned_boxes_is_larger_by_1e_10() -> None:
     assert axis_aligned_iou(tiny, tiny)[0, 0] == pytest.approx(0.5)
 
 
-TURNED = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
-FAR_AWAY = OrientedBox(np.array([900.0, 800, 700]), np.array([8, 0.02, 0.02]), TURNED)
+def random_boxes(reach_m: float) -> list[OrientedBox]:
+    rng = np.random.default_rng(0)
+    turns = np.linalg.qr(rng.normal(size=(50, 3, 3)))[0]
+    return [OrientedBox(rng.normal(0, reach_m, 3), np.array([3, 0.5, 0.02]), turn) for turn in turns]
 
 
-def test_a_box_far_from_the_origin_is_not_flat_sided_in_single_precision() -> None:
-    assert not are_coplanar([FAR_AWAY])
-    assert are_coplanar([replace(FAR_AWAY, centre=np.zeros(3))])
+def test_boxes_far_from_the_origin_are_not_flat_sided_in_single_precision() -> None:
+    assert are_coplanar(random_boxes(10))
     assert are_coplanar([])
+    assert sum(not are_coplanar([one]) for one in random_boxes(10_000)) > 25
 
 
 def test_one_such_box_makes_axis_aligned_boxes_gate_the_whole_frame() -> None:
@@ -131,7 +133,7 @@ def test_one_such_box_makes_axis_aligned_boxes_gate_the_whole_frame() -> None:
     rod = an_object(along * [1, 1, 1] + jitter)
     beside = an_object(along * [1, 1, 1] + jitter + [0.3, 0, 0])
     assert box_iou([rod], [beside])[0, 0] == 0
-    strange = replace(rod, box=FAR_AWAY)
+    strange = replace(rod, box=next(one for one in random_boxes(10_000) if not are_coplanar([one])))
     assert box_iou([rod], [beside, strange])[0, 0] > 0.1
 
 

@@ -10,11 +10,14 @@ from conceptgraphs_scene import SCENE, Plate, at_cosine, axis, contents, look, m
 
 from su3d_bench import registry
 from su3d_bench.baselines.conceptgraphs import ConceptGraphs
+from su3d_bench.baselines.conceptgraphs_config import MappingConfig
 from su3d_bench.baselines.conceptgraphs_detector import ConceptGraphsDetector, DetectorConfig
 from su3d_bench.timing import Timer
 
 QUIET = DetectorConfig(noise_m=0.0, max_bbox_area_ratio=1.0)
 LEFT, RIGHT = Plate((-0.5, 0.0), name="desk"), Plate((0.0, 0.5), name="lamp", feature=axis(1), text=axis(1))
+WHOLE = replace(LEFT, x=(-0.5, 0.5))
+ALL_STAY = QUIET.model_copy(update={"obj_min_detections": 0})
 WALL = Plate((-0.9, -0.6), name="wall", feature=axis(2))
 OTHER_WALL = Plate((0.6, 0.9), name="wall", feature=axis(3))
 
@@ -74,30 +77,28 @@ def test_background_may_be_skipped_and_is_then_not_asked_for() -> None:
     assert skipping.needs.background_names == ("wall", "floor", "ceiling")
 
 
-def test_a_merge_at_the_end_needs_names_that_are_alike() -> None:
-    # seen as halves, then as a whole: the other half lies in the whole
-    halves = [[LEFT], [replace(LEFT, x=(0.0, 0.5))], [replace(LEFT, x=(-0.5, 0.5))]]
-    config = QUIET.model_copy(update={"obj_min_detections": 0})
-    assert len(mapped(ConceptGraphsDetector(config), halves).finish()) == 1
-    for cosine, n in ((0.69, 2), (0.72, 1)):
-        halves[1] = [replace(LEFT, x=(0.0, 0.5), text=at_cosine(cosine))]
-        if n == 2:  # the whole joins the right half or the left one; then its text lies between
-            halves[2] = [replace(LEFT, x=(-0.5, 0.5), text=axis(0))]
-        assert len(mapped(ConceptGraphsDetector(config), halves).finish()) in {n, 1}
+def in_parts(cosine: float) -> list[list[Plate]]:
+    """The larger part of a plate, the rest under a name of that ``cosine`` to its own, then the whole."""
+    return [[replace(LEFT, x=(-0.5, 0.1))], [replace(LEFT, x=(0.1, 0.5), text=at_cosine(cosine))], [WHOLE]]
 
 
-def test_names_keep_apart_at_the_overlap_merge_what_class_agnostic_masks_merge() -> None:
-    halves = [[LEFT], [replace(LEFT, x=(0.0, 0.5), text=axis(3))], [replace(LEFT, x=(-0.5, 0.5))]]
-    config = QUIET.model_copy(update={"obj_min_detections": 0})
-    agnostic = ConceptGraphs().config.model_copy(update=config.model_dump(exclude={"skip_bg", "background_names"}))
-    assert len(mapped(ConceptGraphsDetector(config), halves).finish()) == 2
-    assert len(mapped(ConceptGraphs(agnostic), halves).finish()) == 1
+@pytest.mark.parametrize(("cosine", "n_left"), [(0.69, 2), (0.71, 1)])
+def test_the_overlap_merge_needs_names_that_are_alike(cosine: float, n_left: int) -> None:
+    method = mapped(ConceptGraphsDetector(ALL_STAY), in_parts(cosine))
+    assert method.n_instances == 2
+    assert len(method.finish()) == n_left
+
+
+def test_class_agnostic_masks_merge_what_names_keep_apart() -> None:
+    shared = ALL_STAY.model_dump(exclude={"skip_bg", "background_names"})
+    assert len(mapped(ConceptGraphs(MappingConfig(**shared)), in_parts(0.0)).finish()) == 1
+    assert len(mapped(ConceptGraphsDetector(ALL_STAY), in_parts(0.0)).finish()) == 2
 
 
 def test_objects_are_merged_at_the_end_only() -> None:
-    halves = [[LEFT], [replace(LEFT, x=(0.0, 0.5))], *[[replace(LEFT, x=(-0.5, 0.5))]] * 40]
-    assert mapped(ConceptGraphsDetector(QUIET), halves).n_instances == 2
-    assert len(mapped(ConceptGraphsDetector(QUIET), halves).finish()) == 1
+    method = mapped(ConceptGraphsDetector(ALL_STAY), [*in_parts(1.0), *[[WHOLE]] * 17])
+    assert method.n_instances == 2
+    assert len(method.finish()) == 1
 
 
 def test_finish_midway_changes_nothing() -> None:

@@ -55,7 +55,7 @@ def test_two_clouds_merge_as_in_the_original() -> None:
     for i, each in enumerate(clouds):
         assert each.points.tobytes() == case[f"vox_coord{i}"].tobytes()
         assert each.group.tolist() == case[f"vox_group{i}"].tolist()
-    merged = merge(*clouds, RULES, Timer())
+    merged = merge(clouds[0], clouds[1], RULES, Timer())
     assert merged is not None and merged.n_groups == 10
     assert merged.points.tobytes() == case["out_coord"].tobytes()
     assert merged.group.tolist() == case["out_group"].tolist()
@@ -294,8 +294,8 @@ def test_unlabelled_points_of_both_clouds_inherit() -> None:
 def test_groups_below_fifty_points_are_dropped_before_a_merge_from_a_cloud_that_stays_alone_too() -> None:
     valid = cloud(patch(10, 10), np.repeat([0, 3], [49, 51]), [0, 3], [0, 1])
     broken = cloud(np.full((60, 3), np.nan), np.zeros(60), [0], [2])
-    for pair in ((valid, broken), (broken, valid)):
-        merged = merge(*pair, RULES, Timer())
+    for first, second in ((valid, broken), (broken, valid)):
+        merged = merge(first, second, RULES, Timer())
         assert merged is not None
         assert merged.group.tolist() == [-1] * 49 + [3] * 51  # not renumbered
         assert (merged.view_group.tolist(), merged.views.tolist()) == ([3], [1])

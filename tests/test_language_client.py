@@ -76,7 +76,7 @@ def test_the_request_is_that_of_a_chat_completion(server: ChatServer, tmp_path: 
     words, image = body["messages"][1]["content"]
     assert words == {"type": "text", "text": "what is it?"}
     assert image["image_url"]["url"].startswith("data:image/png;base64,")
-    assert server.headers[0]["Authorization"] == f"Bearer {KEY}"
+    assert server.headers[0]["authorization"] == f"Bearer {KEY}"
     assert (tmp_path / "images" / f"{picture.digest}.png").is_file()
 
 
@@ -123,9 +123,9 @@ def test_the_pause_that_a_server_asks_for_is_kept(server: ChatServer, tmp_path: 
     pauses: list[float] = []
     server.script = [error(429, "slow down", retry_after="0.25"), error(500)]
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("su3d_bench.perception.language.client.time.sleep", pauses.append)
+        patch.setattr("su3d_bench.perception.language.client.sleep", pauses.append)
         client(server, tmp_path, backoff_s=0.1).ask(ask("x"))
-    assert pauses == [0.25, 0.1]
+    assert pauses == [0.25, 0.2]  # the second by itself: 0.1 s, doubled once
 
 
 def test_a_pause_longer_than_the_limit_is_a_failure(server: ChatServer, tmp_path: Path) -> None:
@@ -303,7 +303,7 @@ def test_the_budget_stops_before_it_is_passed_and_goes_on_when_raised(server: Ch
     server.answer = lambda body: Answered(usage=(30, 10))
     questions = [ask(str(k)) for k in range(5)]
     most = questions[0].n_input_tokens + 20  # what a request may cost
-    with pytest.raises(RunIncomplete, match="budget_tokens = .* is reached"):
+    with pytest.raises(RunIncomplete, match=r"budget_tokens = .* is reached"):
         client(server, tmp_path, budget_tokens=80 + most, max_concurrent=1).ask_all(questions)
     assert server.n_asked == 3
     assert len(client(server, tmp_path, budget_tokens=1000).ask_all(questions)) == 5
@@ -336,15 +336,15 @@ def test_an_estimate_counts_what_is_stored_and_sends_nothing(server: ChatServer,
 def test_the_rate_limit_spaces_requests(server: ChatServer, tmp_path: Path) -> None:
     pauses: list[float] = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("su3d_bench.perception.language.client.time.sleep", pauses.append)
-        patch.setattr("su3d_bench.perception.language.client.time.monotonic", lambda: 100.0)
+        patch.setattr("su3d_bench.perception.language.client.sleep", pauses.append)
+        patch.setattr("su3d_bench.perception.language.client.monotonic", lambda: 100.0)
         client(server, tmp_path, requests_per_minute=30, max_concurrent=1).ask_all([ask(str(k)) for k in range(3)])
     assert pauses == [0.0, 2.0, 4.0]
 
 
 @pytest.mark.parametrize("address", ["ftp://x", "http://user:secret@host/v1", "localhost:8000", "http://h/v1?key=1"])
 def test_an_address_that_is_none_or_holds_a_secret_is_refused(address: str) -> None:
-    with pytest.raises(ValueError, match="expected an http|keys belong in the environment"):
+    with pytest.raises(ValueError, match=r"expected an http|keys belong in the environment"):
         LanguageConfig(base_url=address)
 
 

@@ -101,15 +101,11 @@ def test_a_vertex_normal_is_the_running_mean_of_its_triangles() -> None:
 
 
 def test_a_concave_edge_weighs_one_minus_the_dot_product_and_a_convex_one_its_square() -> None:
-    """Normals (0, -.5, .5) at 0 and (0, 0, 1) at 2: 1 - 0.5; from 0 to 2 that normal leans neither way.
-
-    From 0 to 3, (0, 0, 1), the normal (0, -1, 0) of 3 leans neither way; from 2 on to nothing convex either. A roof:
-    its eaves' normals lean away from the ridge, so edges from the ridge are squared.
-    """
+    """Of the two triangles above: the product is 0.5 along each edge; only from 2 to 1 the end's normal leans away."""
     vertices = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], np.float32)
     edges, weights = edges_of(vertices, np.array([[0, 1, 2], [0, 1, 3]], np.int32))
     assert edges.tolist() == [[0, 1], [0, 2], [2, 1], [0, 1], [0, 3], [3, 1]]
-    assert weights.tolist() == [0.5, 0.5, 0.25, 0.5, 0.5, 0.5]  # 2 -> 1: the normal (0, -.5, .5) leans along (1, -1, 0)
+    assert weights.tolist() == [0.5, 0.5, 0.25, 0.5, 0.5, 0.5]
 
 
 def reference(vertices: np.ndarray, triangles: np.ndarray, threshold: float, min_vertices: int) -> list[int]:

@@ -234,6 +234,12 @@ def test_detections_of_another_frame_or_size_are_refused() -> None:
         method.update(frame, replace(detections, masks=detections.masks[:, ::2, ::2]), Timer())
 
 
+def test_features_of_another_encoder_are_refused() -> None:
+    method = run([look([LEFT], 0)])
+    with pytest.raises(DataError, match="frame 1: features have 3 dimensions, those of the map have 4"):
+        method.update(*look([LEFT], 1, n_axes=3), Timer())
+
+
 @pytest.mark.parametrize(
     "options", ['{"voxel": 0.1}', '{"voxel_m": 0}', '{"ratio": 1.5}', '{"schedule": "fold"}', '{"stride": 0}']
 )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import string
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,6 +20,10 @@ DIM = 24
 def write_tiny_clip(folder: Path, seed: int = 0, weights: str = "model.safetensors") -> Path:
     """A CLIP of two layers as transformers saves it; ``weights`` may be ``pytorch_model.bin``, the older form."""
     import torch
+
+    from su3d_bench.perception.models.devices import require_transformers
+
+    require_transformers("this test")  # quiet from here on
     from transformers import CLIPConfig, CLIPModel
 
     torch.manual_seed(seed)
@@ -36,7 +41,7 @@ def write_tiny_clip(folder: Path, seed: int = 0, weights: str = "model.safetenso
         },
         projection_dim=DIM,
     )
-    model = CLIPModel(config).eval()
+    model: Any = CLIPModel(config)
     _spread(model)
     model.save_pretrained(str(folder))
     if weights != "model.safetensors":
@@ -52,6 +57,10 @@ def write_tiny_siglip(folder: Path, seed: int = 0) -> Path:
     """A SigLIP of two layers as transformers saves it, with a ``tokenizer.json`` of whole words."""
     import torch
     from tokenizers import Tokenizer, models, pre_tokenizers
+
+    from su3d_bench.perception.models.devices import require_transformers
+
+    require_transformers("this test")
     from transformers import SiglipConfig, SiglipModel
 
     torch.manual_seed(seed)
@@ -65,7 +74,7 @@ def write_tiny_siglip(folder: Path, seed: int = 0) -> Path:
         vision_config={**layers, "image_size": IMAGE_SIZE, "patch_size": 8},
         text_config={**layers, "vocab_size": len(words), "max_position_embeddings": N_TOKENS, "pad_token_id": 1},
     )
-    model = SiglipModel(config).eval()
+    model: Any = SiglipModel(config)
     _spread(model)
     model.save_pretrained(str(folder))
     half = [0.5, 0.5, 0.5]
@@ -76,11 +85,10 @@ def write_tiny_siglip(folder: Path, seed: int = 0) -> Path:
     return folder
 
 
-def _spread(model: object) -> None:
+def _spread(model: Any) -> None:
     """Larger random weights than a fresh model has, so that different inputs give clearly different features."""
     import torch
 
-    assert isinstance(model, torch.nn.Module)
     with torch.no_grad():
         for parameter in model.parameters():
             if parameter.ndim > 1:

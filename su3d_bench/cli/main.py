@@ -10,6 +10,7 @@ from typing import Any
 
 from su3d_bench import __version__
 from su3d_bench.cli import (
+    ablate,
     ask,
     attribute,
     check,
@@ -73,6 +74,7 @@ def build_parser() -> Parser:
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
     for module in (
         run,
+        ablate,
         evaluate,
         check,
         compare,

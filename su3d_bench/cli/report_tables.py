@@ -34,7 +34,7 @@ def add_parser(actions: Any) -> None:
         ),
         call,
     )
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of runs; for Table I of an ablation")
+    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of finished runs")
     parser.add_argument("--format", choices=FORMATS, default="markdown", help="(default: markdown)")
     parser.add_argument("--table", nargs="+", choices=PAPER_TABLES, default=[], help="of the paper (default: none)")
     for name, what in (("methods", "these rows, in this order"), ("protocols", "under these"), ("metrics", "columns")):
@@ -75,6 +75,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _tables(arguments: argparse.Namespace) -> list[Table]:
+    from su3d_bench.reports.ablation_table import ablation_table
     from su3d_bench.reports.paper_tables import Shown, paper_table, selection_tables
     from su3d_bench.table_sources import choose, measured_results
 
@@ -91,7 +92,10 @@ def _tables(arguments: argparse.Namespace) -> list[Table]:
         return selection_tables(found, shown, with_published=with_published)
     tables = []
     for number in dict.fromkeys(arguments.table):
-        tables += paper_table(number, found, shown, with_published=with_published)
+        if number == "I":
+            tables.append(ablation_table(found, shown, with_published=with_published))
+        else:
+            tables += paper_table(number, found, shown, with_published=with_published)
     return tables
 
 

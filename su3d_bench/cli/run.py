@@ -29,10 +29,15 @@ def add_parser(verbs: Any) -> None:
         ),
         call,
     )
-    parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="addresses or patterns (default: 'rooms/*')")
     parser.add_argument(
-        "--methods", nargs="+", metavar="METHOD", help="names, file.py:Class, or all (default: opensu3d)"
+        "--methods", nargs="+", metavar="METHOD", help="names, variants, file.py:Class, or all (default: opensu3d)"
     )
+    add_run_flags(parser)
+
+
+def add_run_flags(parser: argparse.ArgumentParser) -> None:
+    """The flags of every verb that runs methods, but which methods."""
+    parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="addresses or patterns (default: 'rooms/*')")
     parser.add_argument("--profile", help="who supplies perception: auto, embedded, oracle, stored (default: auto)")
     parser.add_argument(
         "--protocols", nargs="+", metavar="PROTOCOL", help="evaluations (default: those of the dataset)"
@@ -60,17 +65,20 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
+    plan = plan_of(arguments)
+    for note in plan.notes:
+        remark(note, quiet=arguments.quiet)
+    return show_plan(plan, arguments) if arguments.dry_run else carry_out(plan, arguments)
+
+
+def plan_of(arguments: argparse.Namespace) -> Plan:
+    """The plan of what was asked for, in a process that leaves the cores to the scenes side by side."""
     from su3d_bench.executors import limit_threads
 
     limit_threads()  # before numerical libraries are loaded
     from su3d_bench.planning import make_plan
 
-    plan = make_plan(settings_of(arguments), arguments.set, arguments.out)
-    for note in plan.notes:
-        remark(note, quiet=arguments.quiet)
-    if arguments.dry_run:
-        return _show_plan(plan, arguments)
-    return _carry_out(plan, arguments)
+    return make_plan(settings_of(arguments), arguments.set, arguments.out)
 
 
 def settings_of(arguments: argparse.Namespace) -> Settings:
@@ -82,7 +90,7 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
     return settings + Settings(tuple(Setting((n,), value, f"--{n}") for n, value in flags if value is not None))
 
 
-def _carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
+def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
     from su3d_bench.cli.progress import progress
     from su3d_bench.runner import run_plan
 
@@ -111,7 +119,7 @@ def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
     remark(f"run folder: {result.plan.folder.path}", quiet=arguments.quiet)
 
 
-def _show_plan(plan: Plan, arguments: argparse.Namespace) -> int:
+def show_plan(plan: Plan, arguments: argparse.Namespace) -> int:
     from su3d_bench.estimate import estimate
 
     rows = estimate(plan)

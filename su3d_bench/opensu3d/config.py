@@ -5,8 +5,8 @@ Defaults are the paper's (section IV-A) where it states one; a comment says so w
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated, Literal
+from dataclasses import asdict, dataclass
+from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
@@ -38,6 +38,24 @@ SCHEMES: dict[Scheme, Fusion] = {
     "scheme3": Fusion("weighted", "direct", _WIDE),
     "scheme4": Fusion("weighted", "global", _WIDE),
 }
+
+INCREMENT = 0.2  # "a scaling ratio increment of 0.2"
+
+
+def crop_levels(k: int) -> tuple[float, ...]:
+    """The crop ratios of ``k`` levels: S_r = [0.8, 1, 1.2] for 3, and larger crops for more, as the paper says.
+
+    One level is the best-fit crop alone, which its equations compare with.
+
+    >>> crop_levels(1), crop_levels(3), crop_levels(5)
+    ((1.0,), (0.8, 1.0, 1.2), (0.8, 1.0, 1.2, 1.4, 1.6))
+    """
+    if not isinstance(k, int) or not 1 <= k <= 20:
+        raise ValueError(f"crop levels are a whole number from 1 to 20, not {k!r}")
+    if k == 1:
+        return (BEST_FIT_RATIO,)
+    return tuple(round(_NARROW[0] + INCREMENT * level, 10) for level in range(k))
+
 
 Ratio = Annotated[float, Field(gt=0)]
 Metres = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -101,6 +119,10 @@ class OpenSU3DConfig(BaseModel):
             self.multi_view or preset.multi_view,
             self.crop_ratios or preset.crop_ratios,
         )
+
+    def effective(self) -> dict[str, Any]:
+        """The settings with the scheme's own written out, so that equal behaviour is equal."""
+        return {**self.model_dump(exclude={"scheme"}), **asdict(self.fusion)}
 
     @property
     def needs(self) -> PerceptionNeeds:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from functools import cache
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
 from su3d_bench.errors import DataError
 from su3d_bench.opensu3d.association import assign_ids, count_overlaps, overlap_ratios
-from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig
+from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig, crop_levels
 from su3d_bench.opensu3d.frame_cloud import FrameCloud, frame_cloud
 from su3d_bench.opensu3d.id_image import NO_DETECTION
 from su3d_bench.opensu3d.postprocess import segments_of, to_instances
@@ -36,6 +36,12 @@ class OpenSU3D:
     name = "opensu3d"
     Config = OpenSU3DConfig
     presets: ClassVar[Mapping[str, Mapping[str, str]]] = {scheme: {"scheme": scheme} for scheme in SCHEMES}
+    # The paper's letters, as its ablation (Table I) varies them.
+    short_names: ClassVar[Mapping[str, tuple[str, Callable[[Any], Any]]]] = {
+        "m": ("top_m", lambda value: value),
+        "k": ("crop_ratios", crop_levels),
+        "ratios": ("crop_ratios", lambda value: value),
+    }
 
     def __init__(self, config: OpenSU3DConfig | None = None) -> None:
         self.config = config or OpenSU3DConfig()

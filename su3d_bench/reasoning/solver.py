@@ -13,7 +13,7 @@ import numpy as np
 from su3d_bench.reasoning.answers import Answer, unsettled
 from su3d_bench.reasoning.named_objects import Meant, NearestName, meant_by
 from su3d_bench.reasoning.question_words import ANYTHING, Phrase, Question, Relation, Size, read_question
-from su3d_bench.reasoning.relations import holds, is_between, is_container, is_left_of, is_room_surface
+from su3d_bench.reasoning.relations import NEAR_M, holds, is_between, is_container, is_left_of, is_room_surface
 from su3d_bench.reasoning.scene_map import MapObject, SceneMap
 from su3d_bench.types import Float64Array
 
@@ -213,6 +213,9 @@ class Solver:
 
     def _list(self, question: Question) -> _Solved:
         found, held = self._objects(question.subject)
+        if question.subject.relation in ("left of", "right of"):
+            found = tuple(one for one in found if any(holds("near", one.box, other.box) for other in held))
+            self._notes.append(f"no farther than {NEAR_M:g} m from it")
         if not found:
             return f"nothing: the map has no '{_shown(question.subject)}'", (), (), None
         return _listed(found), found, held, None

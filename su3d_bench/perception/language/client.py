@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from time import monotonic, sleep
 from typing import Protocol
 
 from su3d_bench.errors import ModelMissing, StoreError
@@ -107,7 +107,7 @@ class ChatClient:
                     return self._failed(f"{failed}; it asks to wait {asked_for:.0f} s", failed)
                 if is_last:
                     return self._failed(f"{failed}; tried {attempt + 1} times", failed)
-                time.sleep(wait_s if asked_for is None else asked_for)
+                sleep(wait_s if asked_for is None else asked_for)
                 wait_s = min(2 * wait_s, self._config.max_wait_s)
                 continue
             self._count(failed=False)
@@ -143,7 +143,7 @@ class _Pace:
         if not self._gap_s:
             return
         with self._lock:
-            now = time.monotonic()
+            now = monotonic()
             start = max(now, self._next)
             self._next = start + self._gap_s
-        time.sleep(start - now)
+        sleep(start - now)

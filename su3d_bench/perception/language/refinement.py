@@ -18,6 +18,7 @@ from su3d_bench.perception.language.parsing import chosen_name
 from su3d_bench.perception.language.prompts import REFINE, REFINE_FORM, list_of_names
 from su3d_bench.types import Instances
 
+MOST_ANSWER_TOKENS = 200  # a name needs few; models that think aloud need more
 Source = Literal["model", "vote", "label"]
 
 
@@ -92,7 +93,7 @@ class ModelRefiner:
                 config.text_model,
                 f"{REFINE}. {REFINE_FORM}",
                 list_of_names(top.names),
-                max_answer_tokens=config.max_answer_tokens,
+                max_answer_tokens=min(config.max_answer_tokens, MOST_ANSWER_TOKENS),
                 temperature=config.temperature,
                 seed=config.seed,
             )

@@ -169,7 +169,7 @@ class Transport:
             raise self._judged(error) from None
         except openai.APITimeoutError:
             raise TryAgain(f"no answer within {self._config.total_timeout_s:g} s") from None
-        except openai.APIConnectionError as error:
+        except (openai.APIConnectionError, _TooLarge, _TooLate) as error:
             raise self._unconnected(error) from None
         except (openai.OpenAIError, ValueError) as error:
             raise GiveUp(self._shown(str(error))) from None

@@ -17,6 +17,8 @@ CPU = "cpu"
 LARGEST_BATCH = 256
 # float16 has units of its own from compute capability 7.0 (Volta) on; before it, half is no faster or not there.
 HALF_CAPABILITY = (7, 0)
+EXTRA_PACKAGES = {"torch", "transformers", "safetensors", "onnx", "tokenizers", "openai"}
+INSTALLED_AS = {"open_clip": "open_clip_torch", "ram": "git+https://github.com/xinyu1205/recognize-anything"}
 _log = logging.getLogger(__name__)
 
 
@@ -27,12 +29,9 @@ def require(package: str, needed_by: str) -> Any:
     try:
         return importlib.import_module(package)
     except ImportError as error:
-        missing = error.name or package
-        raise ModelMissing(
-            f"{needed_by} needs the package '{missing}': pip install 'su3d-bench[models]'"
-            if missing in {"torch", "transformers", "safetensors", "onnx", "tokenizers"}
-            else f"{needed_by} needs the package '{missing}': pip install {missing}"
-        ) from error
+        missing = (error.name or package).partition(".")[0]
+        command = INSTALLED_AS.get(missing, "'su3d-bench[models]'" if missing in EXTRA_PACKAGES else missing)
+        raise ModelMissing(f"{needed_by} needs the package '{missing}': pip install {command}") from error
 
 
 def require_transformers(needed_by: str) -> Any:

@@ -15,9 +15,9 @@ from su3d_bench.perception.models.files import ModelFiles, locate
 from su3d_bench.perception.models.grounded_sam import Networks
 from su3d_bench.perception.models.grounding_dino import GroundingDino
 from su3d_bench.perception.models.loading import encoder_files
-from su3d_bench.perception.models.onnx_session import open_session
+from su3d_bench.perception.models.onnx_session import Provider, open_session
 from su3d_bench.perception.models.paper_config import PaperConfig
-from su3d_bench.perception.models.pretrained import load_grounding_dino, load_sam
+from su3d_bench.perception.models.pretrained import kept, load_grounding_dino, load_sam
 from su3d_bench.perception.models.sam import Sam
 from su3d_bench.perception.models.sam_onnx import load_onnx_sam
 from su3d_bench.perception.models.tagging import (
@@ -63,7 +63,7 @@ def load_networks(config: PaperConfig, models: ModelsConfig, encoder: Encoder, j
     tagger = _tagger(config, models, encoder, place)
     digests = [text for files in (sam, detector) for pair in sorted(files.digests().items()) for text in pair]
     if config.sam_runtime == "onnx":
-        provider = models.provider or ("cpu" if device == "cpu" else "cuda")
+        provider: Provider = models.provider or ("cpu" if device == "cpu" else "cuda")
         index = 0 if provider == "cpu" else int(device.partition(":")[2] or 0)
         load = partial(_onnx_sam, sam, provider, index)
         digests.append(provider)
@@ -94,8 +94,8 @@ def _torch_sam(files: ModelFiles, place: _Place) -> Sam:
     return Sam(load_sam(files, place.device, place.precision))
 
 
-def _onnx_sam(files: ModelFiles, provider: str, device_index: int) -> Sam:
-    return Sam(load_onnx_sam(files, provider, device_index))
+def _onnx_sam(files: ModelFiles, provider: Provider, device_index: int) -> Sam:
+    return Sam(kept(files, (provider, str(device_index)), lambda: load_onnx_sam(files, provider, device_index)))
 
 
 def _detector(files: ModelFiles, place: _Place) -> GroundingDino:
@@ -114,7 +114,8 @@ def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, place: 
         else:
             digests = [text for pair in sorted(files.digests().items()) for text in pair]
             # RAM++'s own code mixes float32 in, so it runs in float32 wherever it runs.
-            return RamTagger(partial(load_ram, files, place.device), place.device, content_key(*digests))
+            load = partial(kept, files, (place.device,), partial(load_ram, files, place.device))
+            return RamTagger(load, place.device, content_key(*digests))
     if config.tagger in ("ram-onnx", "auto"):
         try:
             files = _locate(models, TAGGER, ("onnx",))

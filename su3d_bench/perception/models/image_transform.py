@@ -1,9 +1,8 @@
 """From a crop of any size to the pixels that an encoder was trained on.
 
 Two conventions exist for the same recipe. ``original`` is what open_clip and OpenAI's CLIP do, through torchvision on
-PIL images; ``transformers`` is what that library's PIL image processors do. They resize alike. They differ in the
-centre crop (where the surplus is 3, 7, 11 ... pixels, the window lies one pixel apart) and in the last bit of the
-values (one divides by 255 in float32, the other multiplies by 1/255 in float64 first).
+PIL images; ``transformers`` is what that library's PIL image processors do. They differ in the centre crop alone:
+where the surplus is 3, 7, 11 ... pixels, the windows lie one pixel apart.
 """
 
 from __future__ import annotations
@@ -11,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, TypeGuard
 
 import numpy as np
 
@@ -77,11 +76,8 @@ class ImageTransform:
 
     def _values(self, square: UInt8Array) -> Float32Array:
         mean, std = np.array(self.mean, np.float32), np.array(self.std, np.float32)
-        if self.convention == "original":
-            values = square.astype(np.float32) / np.float32(255)
-        else:
-            values = (square.astype(np.float64) * (1 / 255)).astype(np.float32)
-        return np.asarray((values - mean) / std, np.float32)
+        # transformers multiplies by 1/255 in float64 instead, which gives the same float32 for all 256 values
+        return np.asarray((square.astype(np.float32) / np.float32(255) - mean) / std, np.float32)
 
 
 def check_image(image: UInt8Array, row: int) -> UInt8Array:
@@ -122,23 +118,23 @@ def _size(path: Path, content: Mapping[str, Any]) -> tuple[Literal["shortest", "
             crop = content.get("crop_size", shortest)
             crop = set(crop.values()) if isinstance(crop, Mapping) else {crop}
             if crop == {shortest}:
-                return "shortest", int(shortest)
+                return "shortest", shortest
         elif not does_crop and square[0] == square[1] and _is_size(square[0]):
-            return "squash", int(square[0])
+            return "squash", square[0]
     raise DataError(
         f"{path}: size {str(asked)[:80]} with crop_size {str(content.get('crop_size'))[:80]}; expected a shortest edge "
         "with a crop of the same size, or a square without one"
     )
 
 
-def _is_size(value: Any) -> bool:
+def _is_size(value: Any) -> TypeGuard[int]:
     return isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= LARGEST_SIZE
 
 
 def _triple(path: Path, content: Mapping[str, Any], key: str) -> Triple:
     values = content.get(key)
-    is_number = isinstance(values, list) and len(values) == 3 and all(isinstance(v, float | int) for v in values)
-    if not is_number or not np.isfinite(values).all() or (key == "image_std" and min(values) <= 0):
-        raise DataError(f"{path}: {key} is {str(values)[:80]}; expected three numbers")
-    red, green, blue = (float(value) for value in values)
-    return red, green, blue
+    if isinstance(values, list) and len(values) == 3 and all(isinstance(value, float | int) for value in values):
+        red, green, blue = (float(value) for value in values)
+        if np.isfinite((red, green, blue)).all() and (key == "image_mean" or min(red, green, blue) > 0):
+            return red, green, blue
+    raise DataError(f"{path}: {key} is {str(values)[:80]}; expected three numbers, those of a deviation above 0")

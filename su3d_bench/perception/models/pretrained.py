@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import re
-from functools import lru_cache
-from typing import Any
+from collections import OrderedDict
+from collections.abc import Callable
+from typing import Any, TypeVar, cast
 
 from su3d_bench.errors import DataError
 from su3d_bench.perception.models.devices import make_deterministic, require
@@ -47,16 +48,40 @@ _SAM_NAMES = (
 _SAM_POSITIONS = "shared_image_embedding.positional_embedding"
 
 
-@lru_cache(maxsize=2)
+Loaded = TypeVar("Loaded")
+# A worker segments one scene after another; a segmenter, a detector and a tagger stay in memory.
+MOST_KEPT = 3
+_kept: OrderedDict[tuple[object, ...], object] = OrderedDict()
+
+
+def kept(files: ModelFiles, place: tuple[str, ...], load: Callable[[], Loaded]) -> Loaded:
+    """What ``load`` makes of ``files`` at ``place``, from memory where they are unchanged since it was last asked."""
+    status = files.weights.stat()
+    key = (files.entry.name, str(files.weights), status.st_size, status.st_mtime_ns, *place)
+    if key not in _kept:
+        while len(_kept) >= MOST_KEPT:
+            _kept.popitem(last=False)
+        _kept[key] = load()
+    _kept.move_to_end(key)
+    return cast("Loaded", _kept[key])
+
+
 def load_sam(files: ModelFiles, device: str, precision: str) -> TorchSam:
-    """SAM ready to run; the last two are kept, because a worker segments one scene after another."""
-    model = _original_sam(files) if files.form.form == "original" else _pretrained(files, "SamModel")
-    return TorchSam(_on_device(model, device, precision))
+    """SAM ready to run."""
+
+    def load() -> TorchSam:
+        model = _original_sam(files) if files.form.form == "original" else _pretrained(files, "SamModel")
+        return TorchSam(_on_device(model, device, precision))
+
+    return kept(files, (device, precision), load)
 
 
-@lru_cache(maxsize=2)
 def load_grounding_dino(files: ModelFiles, device: str, precision: str) -> GroundingDino:
-    """GroundingDINO with its tokenizer ready to run; the last two are kept."""
+    """GroundingDINO with its tokenizer ready to run."""
+    return kept(files, (device, precision), lambda: _grounding_dino(files, device, precision))
+
+
+def _grounding_dino(files: ModelFiles, device: str, precision: str) -> GroundingDino:
     model = _pretrained(files, "GroundingDinoForObjectDetection")
     transformers = require("transformers", f"detector '{files.entry.name}'")
     try:

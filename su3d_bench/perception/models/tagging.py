@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import cached_property, lru_cache
+from functools import cached_property
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -168,9 +168,8 @@ def read_word_list(path: Path | None) -> tuple[str, ...]:
     return words
 
 
-@lru_cache(maxsize=1)
 def load_ram(files: ModelFiles, device: str) -> Any:
-    """RAM++ of the package ``ram`` with its published weights, kept; raises ``ModelMissing`` where it is not there."""
+    """RAM++ of the package ``ram`` with its published weights; raises ``ModelMissing`` where it is not there."""
     try:
         models = require("ram.models", "tagger 'ram-plus'")
     except ModelMissing as error:

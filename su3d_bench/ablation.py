@@ -1,0 +1,135 @@
+"""A sweep over settings of one method, as variants of it in one run: perception is computed once for all."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import re
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ValidationError
+
+from su3d_bench import registry
+from su3d_bench.config import parse_value
+from su3d_bench.errors import ConfigError, StoreError, suggest
+from su3d_bench.store import read_json, write_json
+from su3d_bench.toml_text import toml_value
+
+FILE = "ablation.json"
+MOST_VARIANTS = 1000
+_COMMA_OUTSIDE_BRACKETS = re.compile(r",(?![^\[]*\])")
+Short = tuple[str, Callable[[Any], Any]]
+
+
+@dataclass(frozen=True)
+class AblationRow:
+    """One value of one parameter, as it was asked for, and the variant of the method that has it."""
+
+    parameter: str
+    value: str
+    method: str
+    is_default: bool
+
+
+@dataclass(frozen=True)
+class _Choice:
+    parameter: str
+    text: str
+    key: str
+    value: Any
+
+
+def ablation_rows(method: str, vary: Sequence[str], *, is_grid: bool) -> tuple[AblationRow, ...]:
+    """The rows of a sweep: each ``KEY=V1,V2`` of ``vary`` on its own, or every combination where ``is_grid``.
+
+    ``KEY`` is a setting of the method or a short name that its class has in ``short_names``; values are TOML. Rows
+    whose settings are the defaults have the method itself. ``ConfigError`` for an unknown key or a wrong value.
+    """
+    method_class = registry.load("method", method)
+    choices = [_choices(method, method_class, text) for text in vary]
+    n_rows = _product(map(len, choices)) if is_grid else sum(map(len, choices))
+    if n_rows > MOST_VARIANTS:
+        raise ConfigError(f"ablate: {n_rows} variants; at most {MOST_VARIANTS} make one run")
+    combinations = itertools.product(*choices) if is_grid else ((one,) for each in choices for one in each)
+    names = {_effective(method_class.Config()): str(method_class.name)}
+    return tuple(_row(method_class, combination, names) for combination in combinations)
+
+
+def _product(counts: Any) -> int:
+    total = 1
+    for count in counts:
+        total *= count
+    return total
+
+
+def _choices(method: str, method_class: Any, text: str) -> list[_Choice]:
+    parameter, equals, values = text.partition("=")
+    parameter = parameter.strip()
+    if not equals or not values.strip():
+        raise ConfigError(f"--vary {text}: expected KEY=VALUE,VALUE such as top_m=1,5,10")
+    shorts: Mapping[str, Short] = getattr(method_class, "short_names", {})
+    known = [*shorts, *method_class.Config.model_fields]
+    if parameter not in known:
+        raise ConfigError(f"--vary {text}: {method} has no setting '{parameter}'{suggest(parameter, known)}")
+    key, change = shorts.get(parameter, (parameter, lambda value: value))
+    found = []
+    for part in _COMMA_OUTSIDE_BRACKETS.split(values):
+        try:
+            found.append(_Choice(parameter, part.strip(), key, change(parse_value(part))))
+        except (TypeError, ValueError) as error:
+            raise ConfigError(f"--vary {text}: '{part.strip()}': {error}") from error
+    return found
+
+
+def _row(method_class: Any, combination: Sequence[_Choice], names: dict[str, str]) -> AblationRow:
+    """``names``: what settings are called by their effect; a new one is entered."""
+    keys = [one.key for one in combination]
+    if len(set(keys)) < len(keys):
+        raise ConfigError(f"--vary: '{keys[0]}' is varied twice in one variant; name it once")
+    values = {one.key: one.value for one in combination}
+    try:
+        # Through JSON, because strict models take a list for a tuple only there.
+        effective = _effective(method_class.Config.model_validate_json(json.dumps(values)))
+    except ValidationError as error:
+        reason = error.errors()[0]["msg"].removeprefix("Value error, ")
+        text = f"{combination[0].parameter}={combination[0].text}"
+        raise ConfigError(f"--vary {text}: {reason[:1].lower()}{reason[1:]}") from error
+    variant = ",".join(f"{key}={_bare(value)}" for key, value in values.items()).replace(" ", "")
+    return AblationRow(
+        parameter=" x ".join(one.parameter for one in combination),
+        value=" x ".join(one.text for one in combination),
+        method=names.setdefault(effective, f"{method_class.name}@{variant}"),
+        is_default=effective == next(iter(names)),
+    )
+
+
+def _effective(config: BaseModel) -> str:
+    """What a model of settings comes to; one whose settings override each other has ``effective``."""
+    return str(config.effective() if hasattr(config, "effective") else config.model_dump())
+
+
+def _bare(value: Any) -> str:
+    """A value in TOML, plain words without their quotes: the name of a variant is a folder's name too."""
+    return value if isinstance(value, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", value) else toml_value(value)
+
+
+def write_rows(folder: Path, rows: Sequence[AblationRow]) -> None:
+    """Leave the rows beside the run's metrics, for whoever makes a table of them."""
+    write_json(folder / FILE, {"rows": [asdict(row) for row in rows]})
+
+
+def read_rows(folder: Path) -> tuple[AblationRow, ...]:
+    """The rows that ``write_rows`` left; ``StoreError`` where the run is no sweep."""
+    if not (folder / FILE).is_file():
+        raise StoreError(f"{folder}: holds no {FILE}; make a sweep with su3d-bench ablate --vary KEY=V1,V2")
+    value = read_json(folder / FILE)
+    try:
+        return tuple(
+            AblationRow(str(one["parameter"]), str(one["value"]), str(one["method"]), bool(one["is_default"]))
+            for one in value["rows"]
+        )
+    except (TypeError, KeyError, RecursionError) as error:
+        raise StoreError(f"{folder}: {FILE} is not as ablate writes it; run the sweep again") from error

@@ -1,0 +1,84 @@
+"""Sweeps: the variants that a request stands for, and one run of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+from painted import colour_perception
+
+from su3d_bench import scene_run
+from su3d_bench.ablation import ablation_rows, read_rows
+from su3d_bench.cli.main import main
+from su3d_bench.errors import ConfigError, StoreError
+
+PAINTED = f"{Path(__file__).parent}/painted.py"
+
+
+def test_the_papers_sweep_has_its_nine_rows_and_the_default_is_the_method_itself() -> None:
+    rows = ablation_rows(
+        "opensu3d", ["m=1,5,10", "k=1,3,5", "ratios=[0.1,1,1.1],[0.8,1,1.2],[0.5,1,1.5]"], is_grid=False
+    )
+    assert [(row.parameter, row.value) for row in rows[:4]] == [("m", "1"), ("m", "5"), ("m", "10"), ("k", "1")]
+    assert [row.method for row in rows if row.is_default] == ["opensu3d"] * 3
+    assert rows[0].method == "opensu3d@top_m=1"
+    assert rows[5].method == "opensu3d@crop_ratios=[0.8,1.0,1.2,1.4,1.6]"
+    assert len({row.method for row in rows}) == 7
+
+
+def test_a_grid_has_every_combination() -> None:
+    rows = ablation_rows("opensu3d", ["m=1,5", "overlap_rule=smaller-segment,as-printed"], is_grid=True)
+    assert [row.value for row in rows] == [
+        "1 x smaller-segment",
+        "1 x as-printed",
+        "5 x smaller-segment",
+        "5 x as-printed",
+    ]
+    assert [row.method for row in rows] == [
+        "opensu3d@top_m=1,overlap_rule=smaller-segment",
+        "opensu3d@top_m=1,overlap_rule=as-printed",
+        "opensu3d",
+        "opensu3d@top_m=5,overlap_rule=as-printed",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("vary", "message"),
+    [
+        (["n=1"], "opensu3d has no setting 'n'"),
+        (["top_n=1"], "did you mean 'top_m'"),
+        (["m"], "expected KEY=VALUE"),
+        (["m="], "expected KEY=VALUE"),
+        (["m=0"], "--vary m=0: input should be greater"),
+        (["k=0.5"], "crop levels are a whole number"),
+        (["m=" + ",".join(map(str, range(1, 1100)))], "1099 variants; at most 1000"),
+    ],
+)
+def test_a_wrong_sweep_is_one_line(vary: list[str], message: str) -> None:
+    with pytest.raises(ConfigError, match=f"(?i){message}"):
+        ablation_rows("opensu3d", vary, is_grid=False)
+
+
+def test_one_setting_cannot_have_two_values_at_once() -> None:
+    with pytest.raises(ConfigError, match="varied twice"):
+        ablation_rows("opensu3d", ["k=1", "ratios=[1.0]"], is_grid=True)
+
+
+def test_a_sweep_is_one_run_with_its_rows_beside_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    words = ["ablate", "--method", f"{PAINTED}:Collector", "--vary", "stride=1,2", "drop=0,1", "--no-pictures"]
+    words += ["--scenes", f"{PAINTED}:Painted/a", "--protocols", "rooms-semantic", "--jobs", "1"]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 0
+    rows = read_rows(tmp_path / "out")
+    assert [row.method for row in rows] == ["collector", "collector@stride=2", "collector", "collector@drop=1"]
+    results = json.loads((tmp_path / "out" / "metrics.json").read_text())["results"]
+    assert [one["method"] for one in results] == ["collector", "collector@stride=2", "collector@drop=1"]
+
+
+def test_a_run_that_is_no_sweep_says_so(tmp_path: Path) -> None:
+    with pytest.raises(StoreError, match="ablate --vary"):
+        read_rows(tmp_path)
+    (tmp_path / "ablation.json").write_text('{"rows": [1]}')
+    with pytest.raises(StoreError, match="run the sweep again"):
+        read_rows(tmp_path)

@@ -1,0 +1,328 @@
+"""3D proposals: read from files, made from the mesh's shape, carried over from the truth; each rule by hand."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from damage import damages, outcomes, truncations
+from prediction_files import TorchFile, write_openmask3d, write_openyolo3d, write_scannet_text
+from pydantic import ValidationError
+from test_mesh_segments import sheet
+
+from su3d_bench.baselines.proposal_components import (
+    PartRules,
+    density_clusters,
+    linked_within,
+    split_into_parts,
+    voted_by_segments,
+)
+from su3d_bench.baselines.proposal_files import digest_of_folder, read_proposals
+from su3d_bench.baselines.proposals import ProposalConfig, make_proposals
+from su3d_bench.baselines.segment_tree import SegmentTree, contacts_of, is_within, merge_cost, merge_tree
+from su3d_bench.baselines.surface_proposals import NodeChoice, chosen_nodes, contrast, segments_of, surface_proposals
+from su3d_bench.errors import DataError, PredictionError
+from su3d_bench.types import Proposals, SceneTools, Surface
+
+MASKS = np.array([[1, 1, 0, 0, 0, 0], [0, 1, 1, 1, 0, 0], [0, 0, 0, 0, 0, 0]], bool)  # two overlap, one is empty
+SCENE: dict[str, Any] = {
+    "name": "room0",
+    "masks": MASKS,
+    "scores": np.array([0.9, 0.4, 0.2]),
+    "labels": np.array([0, 0, 0]),
+    "files": [f"pred_mask/room0_{k}.txt" for k in range(3)],
+}
+
+
+def flat(n: int = 6) -> Surface:
+    points = np.array([(k, 0, 0) for k in range(n)], np.float32)
+    return Surface(points, np.zeros((0, 3), np.int32))
+
+
+def masks_of(proposals: Proposals) -> list[list[int]]:
+    return [proposals.mask(k).tolist() for k in range(len(proposals))]
+
+
+def made(points: np.ndarray, *masks: Sequence[int], scores: Sequence[float] | None = None) -> Proposals:
+    return Proposals(
+        points=points.astype(np.float32),
+        indptr=np.cumsum([0, *(len(mask) for mask in masks)]).astype(np.int64),
+        indices=np.array([k for mask in masks for k in mask], np.int32),
+        scores=np.ones(len(masks)) if scores is None else np.array(scores, np.float64),
+        source="made",
+    )
+
+
+class TestFiles:
+    def test_mask3ds_and_segment3ds_export_is_read_from_its_last_decoder(self, tmp_path: Path) -> None:
+        write_scannet_text(tmp_path / "decoder_-1", SCENE | {"labels": ["0.0"] * 3})
+        found = read_proposals(tmp_path, "room0", flat())
+        assert masks_of(found) == [[0, 1], [1, 2, 3], []]
+        assert found.scores.tolist() == [0.9, 0.4, 0.2] and "scannet-text" in found.source
+
+    def test_openmask3ds_matrix_is_read_without_its_features(self, tmp_path: Path) -> None:
+        write_openmask3d(tmp_path, SCENE, np.zeros((3, 4)))
+        found = read_proposals(tmp_path, "room0", flat())
+        assert masks_of(found) == [[0, 1], [1, 2, 3], []] and found.scores.tolist() == [1, 1, 1]
+
+    def test_masks_with_scores_are_read_too(self, tmp_path: Path) -> None:
+        write_openyolo3d(tmp_path, SCENE)
+        assert np.allclose(read_proposals(tmp_path, "room0", flat()).scores, [0.9, 0.4, 0.2])
+
+    @pytest.mark.parametrize("write", [write_scannet_text, write_openyolo3d])
+    def test_masks_of_another_mesh_are_one_clear_error(self, tmp_path: Path, write: Any) -> None:
+        write(tmp_path, SCENE)
+        with pytest.raises(
+            PredictionError, match=r"proposals of 6 points, but the mesh of 'room0' has 7 vertices; take"
+        ):
+            read_proposals(tmp_path, "room0", flat(7))
+
+    def test_groups_of_points_are_masks_and_maps_with_own_points_are_not(self, tmp_path: Path) -> None:
+        np.save(tmp_path / "room0.npy", np.array([0, 0, 1, -1, 1, 1]))
+        assert masks_of(read_proposals(tmp_path, "room0", flat())) == [[0, 1], [2, 4, 5]]
+        other = tmp_path / "labels"
+        other.mkdir()
+        (other / "room0.txt").write_text("1\n2\n" * 3)
+        with pytest.raises(PredictionError, match="'scannet-semantic-text' holds no masks over the mesh"):
+            read_proposals(other, "room0", flat())
+
+    def test_a_scene_that_is_not_there_is_named(self, tmp_path: Path) -> None:
+        write_openyolo3d(tmp_path, SCENE)
+        with pytest.raises(PredictionError, match="has no prediction of scene 'room1'"):
+            read_proposals(tmp_path, "room1", flat())
+
+    def test_an_empty_list_is_no_proposal(self, tmp_path: Path) -> None:
+        (tmp_path / "room0.txt").write_text("")
+        assert len(read_proposals(tmp_path, "room0", flat())) == 0
+
+    def test_damaged_lists_and_matrices_are_refused_in_one_line_or_read(self, tmp_path: Path) -> None:
+        write_scannet_text(tmp_path / "text", SCENE)
+        write_openmask3d(tmp_path / "torch", SCENE, np.zeros((3, 4)))
+        for file in (tmp_path / "text" / "room0.txt", tmp_path / "torch" / "room0_masks.pt"):
+            content = file.read_bytes()
+
+            def read(damaged: bytes, file: Path = file) -> Proposals:
+                file.write_bytes(damaged)
+                found = read_proposals(file.parent, "room0", flat())
+                assert found.indices.max(initial=0) < 6 and len(found.indptr) == len(found) + 1
+                return found
+
+            copies = [*list(truncations(content))[:: max(1, len(content) // 50)], *damages(content, 250)]
+            n_read, n_refused = outcomes(read, iter(copies), must_name=file.parent.name, refusal=PredictionError)
+            assert n_refused > 50 and n_read + n_refused == len(copies)
+
+    def test_the_digest_moves_with_content_and_names_alone(self, tmp_path: Path) -> None:
+        write_scannet_text(tmp_path, SCENE)
+        first = digest_of_folder(tmp_path)
+        (tmp_path / "room0.txt").touch()
+        assert digest_of_folder(tmp_path) == first
+        mask = tmp_path / SCENE["files"][0]
+        mask.write_text(mask.read_text()[::-1].strip() + "\n")
+        assert digest_of_folder(tmp_path) != first
+        assert digest_of_folder(tmp_path / "missing") == digest_of_folder(tmp_path / "neither")
+
+
+class TestParts:
+    ROW = np.array([(x, 0, 0) for x in (0.0, 0.9, 1.8, 3.0, 3.5, 9.0)])
+
+    def test_with_one_point_parts_are_what_gaps_up_to_eps_link(self) -> None:
+        """0, 0.9 and 1.8 are linked by gaps of 0.9, 3.0 and 3.5 by 0.5; from 1.8 to 3.0 it is too far."""
+        assert linked_within(self.ROW, 0.95).tolist() == [0, 0, 0, 1, 1, 2]
+        assert linked_within(self.ROW[:2], 0.9).tolist() == [0, 0]  # a gap of eps itself links
+
+    def test_linked_points_are_those_of_dbscan(self) -> None:
+        from sklearn.cluster import DBSCAN
+
+        rng = np.random.default_rng(0)
+        for gap_m in (0.1, 0.3, 1.0):
+            points = rng.random((300, 3)) * (2, 2, 1)
+            expected = DBSCAN(eps=gap_m, min_samples=1).fit_predict(points)
+            assert linked_within(points, gap_m).tolist() == expected.tolist()
+
+    def test_density_leaves_noise_out(self) -> None:
+        assert density_clusters(self.ROW.astype(np.float32), 0.95, 3).tolist() == [0, 0, 0, -1, -1, -1]
+        assert density_clusters(np.zeros((0, 3), np.float32), 0.95, 3).tolist() == []
+
+    def test_each_part_is_a_mask_with_its_masks_score_the_best_first(self) -> None:
+        proposals = made(self.ROW, [0, 1, 3, 4], [5], [1, 2], scores=[0.2, 0.9, 0.2])
+        parts = split_into_parts(proposals, PartRules(0.95, 1, 0, 1.0))
+        assert masks_of(parts) == [[5], [0, 1], [3, 4], [1, 2]] and parts.scores.tolist() == [0.9, 0.2, 0.2, 0.2]
+
+    def test_small_parts_go_and_of_five_the_best_four_fifths_stay(self) -> None:
+        points = np.array([(x, 0, 0) for x in range(12)])
+        masks = [[0, 1], [2, 3], [4, 5], [6, 7], [8, 9], [10]]
+        proposals = made(points, *masks, scores=[0.1, 0.6, 0.5, 0.4, 0.3, 0.9])
+        parts = split_into_parts(proposals, PartRules(1.0, 1, 1, 0.8))  # [10] has no more than one point
+        assert masks_of(parts) == [[2, 3], [4, 5], [6, 7], [8, 9]]
+        assert len(split_into_parts(made(points, [0]), PartRules(1.0, 1, 0, 0.8))) == 0  # floor(0.8)
+
+    def test_a_mask_takes_segments_of_which_it_holds_more_than_half(self) -> None:
+        segments = np.array([0, 0, 1, 1, 1, 2])
+        voted = voted_by_segments(made(self.ROW, [0, 2, 3], [5], [0]), segments)
+        assert masks_of(voted) == [[2, 3, 4], [5], []]  # half of segment 0 is not more than half
+
+
+def box_on_a_floor() -> Surface:
+    """A floor of 4 x 4 m with a box of 1 x 1 x 1 m on it, in vertices 10 cm apart; the box's bottom is open."""
+    heights = np.zeros((41, 41))
+    vertices, triangles = sheet(heights.tolist(), 0.1)
+    under = ((vertices[:, :2] > 1.55) & (vertices[:, :2] < 2.45)).all(axis=1)
+    floor = triangles[~under[triangles].any(axis=1)]
+    parts, faces, start = [vertices], [floor], len(vertices)
+    side, side_faces = sheet(np.zeros((11, 11)).tolist(), 0.1)
+    flipped = side_faces[:, [0, 2, 1]]
+    x, y = side[:, 0], side[:, 1]
+    for points, corners in (
+        (np.stack([x + 1.5, y + 1.5, np.ones_like(x)], 1), side_faces),
+        (np.stack([x + 1.5, np.full_like(x, 1.5), y], 1), side_faces),
+        (np.stack([x + 1.5, np.full_like(x, 2.5), y], 1), flipped),
+        (np.stack([np.full_like(x, 1.5), x + 1.5, y], 1), flipped),
+        (np.stack([np.full_like(x, 2.5), x + 1.5, y], 1), side_faces),
+    ):
+        parts.append(points.astype(np.float32))
+        faces.append(corners + start)
+        start += len(points)
+    merged, inverse = np.unique(np.round(np.concatenate(parts), 4), axis=0, return_inverse=True)
+    return Surface(merged.astype(np.float32), inverse.reshape(-1)[np.concatenate(faces)].astype(np.int32))
+
+
+class TestTree:
+    def test_the_cheapest_pair_is_merged_first(self) -> None:
+        """Three flat squares in a row, 0 and 1 level, 2 leaning: 0 and 1 become node 3, all of them node 4."""
+        flat_part, flat_faces = sheet(np.zeros((4, 4)).tolist(), 0.01)
+        parts = [flat_part, flat_part + np.float32((0.04, 0, 0)), flat_part[:, [2, 1, 0]] + np.float32((0.08, 0, 0))]
+        vertices = np.concatenate(parts).astype(np.float32)
+        triangles = np.concatenate([flat_faces + 16 * k for k in range(3)]).astype(np.int32)
+        contacts = contacts_of(vertices, triangles, np.repeat(np.arange(3), 16))
+        assert list(zip(contacts.first.tolist(), contacts.second.tolist(), strict=True)) == [(0, 1), (1, 2)]
+        tree = merge_tree(contacts)
+        assert tree.parent.tolist() == [3, 3, 4, 4, -1]
+        assert sorted(tree.leaves[tree.start[3] : tree.end[3]].tolist()) == [0, 1]
+        assert (tree.start[4], tree.end[4]) == (0, 3)
+        assert is_within(tree, np.array([0, 2, 3, 4]), 3).tolist() == [True, False, True, True]
+
+    def test_the_cost_grows_with_bend_and_size_and_falls_with_the_shared_border(self) -> None:
+        assert merge_cost(5.0, 10, 40, 100) == pytest.approx(0.52 * 0.76 * 10)
+        assert merge_cost(5.0, 10, 10, 100) == pytest.approx(0.52 * 0.01 * 10)
+        assert merge_cost(1.0, 10, 40, 400) == pytest.approx(0.12 * 0.76 * 20)
+
+    def test_parts_that_touch_nothing_are_roots(self) -> None:
+        vertices = np.array([[0, 0, 0], [5, 0, 0], [0, 5, 0]], np.float32)
+        tree = merge_tree(contacts_of(vertices, np.zeros((0, 3), np.int32), np.arange(3)))
+        assert tree.parent.tolist() == [-1, -1, -1] and sorted(tree.leaves.tolist()) == [0, 1, 2]
+
+    def test_contrast_is_the_borders_bend_over_its_relative_length(self) -> None:
+        """1250 patches of 4 cm² are 0.5 m²: full size; 50 of them count by the root of 0.04."""
+        tree = SegmentTree(
+            parent=np.array([-1, -1]),
+            n_patches=np.array([1250, 50]),
+            n_contacts=np.array([100, 0]),
+            bend=np.array([40.0, 0.0]),
+            leaves=np.arange(2),
+            start=np.array([0, 1]),
+            end=np.array([1, 2]),
+        )
+        expected = [0.4 / (100 / 1250**0.5 + 0.2), 0.3 * 0.04**0.5 / 0.2]
+        assert contrast(tree) == pytest.approx(expected)
+
+    def test_of_two_nested_parts_that_are_nearly_one_the_better_stays(self) -> None:
+        tree = SegmentTree(
+            parent=np.array([3, 3, 4, 4, -1]),
+            n_patches=np.array([9, 1, 10, 10, 20]),
+            n_contacts=np.ones(5, np.int64),
+            bend=np.ones(5),
+            leaves=np.arange(3),
+            start=np.array([0, 1, 2, 0, 0]),
+            end=np.array([1, 2, 3, 2, 3]),
+        )
+        points, scores = np.array([9, 1, 10]), np.array([0.8, 0.5, 0.3, 0.9, 0.1])
+        chosen = chosen_nodes(tree, points, scores, NodeChoice(10, 1, 1.0, 0.5))
+        assert chosen.tolist() == [3, 1, 2, 4]  # 0 is 9 of the 10 points of 3; 4 has twice the points: IoU 0.5 itself
+        assert chosen_nodes(tree, points, scores, NodeChoice(2, 2, 0.5, 1.0)).tolist() == [3, 0]
+
+    def test_a_box_on_a_floor_is_the_part_that_stands_out_most(self) -> None:
+        surface = box_on_a_floor()
+        found = surface_proposals(surface, segments_of(surface), NodeChoice(5, 20, 0.5, 0.5))
+        is_box = (np.abs(surface.vertices - (2, 2, 0.5)) <= 0.501).all(axis=1)
+        best = np.isin(np.arange(len(is_box)), found.mask(0))
+        assert (best & is_box).sum() / (best | is_box).sum() > 0.8
+        assert (np.diff(found.scores) <= 0).all() and "not a network's" in found.source
+
+    def test_published_segments_are_taken_where_they_are(self) -> None:
+        vertices, triangles = sheet([[0.0] * 6] * 6)
+        published = Surface(vertices, triangles, np.where(vertices[:, 0] < 0.25, 40, 7).astype(np.int32))
+        assert segments_of(published).tolist() == np.where(vertices[:, 0] < 0.25, 1, 0).tolist()
+        found = surface_proposals(published, segments_of(published), NodeChoice(5, 1, 0.9, 0.5))
+        assert sorted(len(mask) for mask in masks_of(found)) == [18, 18]
+
+    def test_a_mesh_in_the_wrong_unit_is_one_line(self) -> None:
+        vertices = np.array([[0, 0, 0], [1e9, 1e9, 1e9]], np.float32)
+        with pytest.raises(DataError, match=r"the mesh spans 1000000000 m; proposals .* need one in metres"):
+            contacts_of(vertices, np.zeros((0, 3), np.int32), np.arange(2))
+
+
+def tools(surface: Surface | None, truth: Proposals | None = None) -> SceneTools:
+    def give() -> Surface:
+        if surface is None:
+            raise DataError("tum/desk: the dataset has no mesh; this method works on one")
+        return surface
+
+    return SceneTools((), None, give, None if truth is None else lambda: truth)  # type: ignore[arg-type]
+
+
+class TestConfig:
+    def test_auto_is_files_where_a_folder_is_named_else_the_surface(self) -> None:
+        assert ProposalConfig().kind == "surface"
+        assert ProposalConfig.model_validate_json('{"proposals_folder": "masks"}').kind == "files"
+
+    @pytest.mark.parametrize(
+        ("text", "message"),
+        [
+            ('{"proposals": "files"}', "needs proposals_folder"),
+            ('{"proposals": "surface", "proposals_folder": "masks"}', "reads no proposals_folder"),
+            ('{"proposals": "oracle", "proposals_folder": "masks"}', "reads no proposals_folder"),
+            ('{"proposals": "mask3d"}', "proposals"),
+            ('{"part_kept_share": 0}', "part_kept_share"),
+        ],
+    )
+    def test_settings_that_contradict_each_other_are_refused(self, text: str, message: str) -> None:
+        with pytest.raises(ValidationError, match=message):
+            ProposalConfig.model_validate_json(text)
+
+    @pytest.mark.parametrize("kind", ["surface", "oracle"])
+    def test_without_a_mesh_the_error_names_the_proposals(self, kind: Any) -> None:
+        with pytest.raises(DataError) as caught:
+            make_proposals(ProposalConfig(proposals=kind), tools(None), "tum", "desk")
+        assert str(caught.value) == (
+            f"tum/desk: proposals '{kind}' lie on the scan's mesh: the dataset has no mesh; this method works on one"
+        )
+
+    def test_true_proposals_are_carried_to_the_nearest_vertices_overlaps_included(self) -> None:
+        truth = made(np.array([(0.1, 0, 0), (2.1, 0, 0), (4.9, 0, 0)]), [0, 1], [1, 2])
+        found = make_proposals(ProposalConfig(proposals="oracle"), tools(flat(), truth), "rooms", "room0")
+        assert masks_of(found) == [[0, 1, 2, 3], [2, 3, 4, 5]] and found.source == "made"  # 3 is 0.9 from 2.1
+        assert ProposalConfig(proposals="oracle").caveat is None
+
+    def test_files_stay_as_exported_unless_parts_are_asked_for(self, tmp_path: Path) -> None:
+        write_openyolo3d(tmp_path, SCENE | {"masks": np.array([[1, 1, 0, 0, 1, 1]] * 3, bool)})
+        segments = np.arange(6, dtype=np.int32)
+        surface = Surface(flat().vertices, flat().triangles, segments)
+        for split, expected in (("surface", [[0, 1, 4, 5]] * 3), ("never", [[0, 1, 4, 5]] * 3),
+                                ("always", [[0, 1], [4, 5]] * 3)):  # fmt: skip
+            config = ProposalConfig(proposals_folder=tmp_path, split_parts=split, part_eps_m=1.0)  # type: ignore[arg-type]
+            assert masks_of(make_proposals(config, tools(surface), "rooms", "room0")) == expected
+        assert config.caveat is None and list(config.inputs) == ["proposals"]
+
+    def test_proposals_from_the_surface_say_that_they_are_no_networks(self) -> None:
+        config = ProposalConfig(surface_min_points=20)
+        found = make_proposals(config, tools(box_on_a_floor()), "rooms", "room0")
+        assert len(found) > 0 and config.caveat == found.source and config.inputs == {}
+
+
+def test_a_tensor_with_scores_beside_another_tensor_is_no_matrix(tmp_path: Path) -> None:
+    file = TorchFile()
+    file.write(tmp_path / "room0.pt", file.tensor(np.ones((6, 3), np.float32)))
+    assert masks_of(read_proposals(tmp_path, "room0", flat())) == [list(range(6))] * 3

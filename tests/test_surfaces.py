@@ -1,0 +1,151 @@
+"""The mesh without labels, dataset by dataset, and the keys that move with its file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render
+from scannet_scan import SCAN, grid, write_mesh, write_recording
+from scannet_scan import write_truth as write_scan_truth
+from test_rgbd import write_scene
+
+from su3d_bench.datasets.ply import ListColumn, PlyElement, write_ply
+from su3d_bench.datasets.replica import Replica
+from su3d_bench.datasets.rgbd import Rgbd
+from su3d_bench.datasets.rooms import RoomOptions, Rooms
+from su3d_bench.datasets.scannet import ScanNet, ScannetOptions
+from su3d_bench.datasets.tum import Tum
+from su3d_bench.errors import DataError
+from su3d_bench.scene_tools import surface_of
+
+
+@pytest.fixture(scope="module")
+def rooms(tmp_path_factory: pytest.TempPathFactory) -> Rooms:
+    return Rooms(tmp_path_factory.mktemp("data"), RoomOptions(width=32, height=24, n_frames=4, mesh_spacing_m=0.1))
+
+
+def test_a_room_is_its_scan_in_triangles_with_the_vertices_of_the_truth(rooms: Rooms) -> None:
+    surface, truth = rooms.surface("bathroom0"), rooms.ground_truth("bathroom0", "mesh-vertices")
+    assert np.array_equal(surface.vertices, truth.points) and surface.segments is None
+    faces = rooms.scan("bathroom0").faces
+    assert surface.triangles.dtype == np.int32 and len(surface.triangles) == 2 * len(faces)
+    assert surface.triangles[:2].tolist() == [faces[0, [0, 1, 2]].tolist(), faces[0, [0, 2, 3]].tolist()]
+    assert (truth.instance[surface.triangles] == truth.instance[surface.triangles[:, :1]]).all()
+
+
+def test_replicas_surface_is_the_renders_mesh_in_fans_without_labels(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    write_original(tmp_path, QUADS, [0, 0, 5, 5], TWO_OBJECTS)
+    dataset = Replica(tmp_path)
+    with pytest.raises(DataError, match=r"replica/room0: no mesh; room0_mesh\.ply is missing in .*Replica$"):
+        dataset.surface("room0")
+    before = dataset.digest("room0")
+    write_quads(tmp_path / "Replica" / "room0_mesh.ply", 9)
+    surface = dataset.surface("room0")
+    assert surface.vertices.shape == (9, 3) and surface.segments is None
+    assert surface.triangles.tolist() == [[0, 1, 4], [0, 4, 3], [1, 2, 5], [1, 5, 4]]
+    assert dataset.digest("room0") != before
+    assert tmp_path / "Replica" / "room0_mesh.ply" in dataset.files("room0")
+
+
+def write_quads(path: Path, n_vertices: int, corners: tuple[int, ...] = (0, 1, 4, 3, 1, 2, 5, 4)) -> None:
+    points = np.array([(k % 3, k // 3, 0) for k in range(n_vertices)], np.float32)
+    vertex = PlyElement("vertex", n_vertices, {axis: points[:, i].copy() for i, axis in enumerate("xyz")})
+    indices = ListColumn(np.arange(0, len(corners) + 1, 4), np.array(corners, np.int32))
+    write_ply(path, [vertex, PlyElement("face", len(corners) // 4, {"vertex_indices": indices})])
+
+
+def test_a_mesh_that_names_a_missing_vertex_is_one_line(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    write_quads(tmp_path / "Replica" / "room0_mesh.ply", 5)
+    with pytest.raises(DataError, match=r"replica/room0: room0_mesh\.ply: face 1 names vertex 5, the mesh has 5"):
+        Replica(tmp_path).surface("room0")
+
+
+def scannet(root: Path, **options: object) -> ScanNet:
+    return ScanNet(root, ScannetOptions(**options))  # type: ignore[arg-type]
+
+
+def write_scan(root: Path, segments: list[int]) -> Path:
+    folder = root / "scans" / SCAN
+    folder.mkdir(parents=True)
+    write_recording(folder / f"{SCAN}.sens", 2)
+    write_scan_truth(folder, segments, [(0, "chair", [7])], [5] * 24)
+    return folder
+
+
+def test_scannets_surface_has_the_published_segments(tmp_path: Path) -> None:
+    write_scan(tmp_path, [7] * 10 + [4_000_000_000] * 14)
+    surface = scannet(tmp_path).surface(SCAN)
+    assert np.array_equal(surface.vertices, grid()[0]) and np.array_equal(surface.triangles, grid()[1])
+    assert surface.segments is not None and surface.segments.tolist() == [0] * 10 + [1] * 14
+
+
+def test_a_scan_without_annotation_has_a_surface_and_without_segments_too(tmp_path: Path) -> None:
+    folder = write_scan(tmp_path, [7] * 24)
+    dataset = scannet(tmp_path)
+    before = dataset.digest(SCAN)
+    (folder / f"{SCAN}.aggregation.json").unlink()
+    (folder / f"{SCAN}_vh_clean_2.labels.ply").unlink()
+    assert dataset.surface(SCAN).segments is not None
+    (folder / f"{SCAN}_vh_clean_2.0.010000.segs.json").unlink()
+    assert dataset.surface(SCAN).segments is None
+    assert dataset.digest(SCAN) != before
+    (folder / f"{SCAN}_vh_clean_2.ply").unlink()
+    with pytest.raises(DataError, match=rf"scannet/{SCAN}: no mesh; {SCAN}_vh_clean_2\.ply is missing, copy it into"):
+        dataset.surface(SCAN)
+
+
+def test_another_mesh_or_other_segments_make_another_digest(tmp_path: Path) -> None:
+    folder = write_scan(tmp_path, [7] * 24)
+    digests = {scannet(tmp_path).digest(SCAN)}
+    points, triangles = grid()
+    write_mesh(folder / f"{SCAN}_vh_clean_2.ply", points + np.float32(1), triangles)
+    digests.add(scannet(tmp_path).digest(SCAN))
+    name = folder / f"{SCAN}_vh_clean_2.0.010000.segs.json"
+    name.write_text(json.dumps(json.loads(name.read_text()) | {"segIndices": [8] * 24}))
+    digests.add(scannet(tmp_path).digest(SCAN))
+    assert len(digests) == 3
+
+
+def test_segments_of_another_mesh_are_refused(tmp_path: Path) -> None:
+    write_scan(tmp_path, [7] * 23)
+    with pytest.raises(DataError, match="has 23 vertices, .* has 24; they belong to two meshes"):
+        scannet(tmp_path).surface(SCAN)
+
+
+def test_axis_alignment_moves_the_surface_with_the_frames(tmp_path: Path) -> None:
+    folder = write_scan(tmp_path, [7] * 24)
+    turn = "0 -1 0 2 1 0 0 3 0 0 1 0 0 0 0 1"
+    (folder / f"{SCAN}.txt").write_text(f"axisAlignment = {turn}\n")
+    moved = scannet(tmp_path, axis_align=True).surface(SCAN).vertices
+    x, y, z = grid()[0].T
+    assert np.allclose(moved, np.stack([2 - y, 3 + x, z], axis=1))
+
+
+def test_a_described_folder_may_name_a_mesh(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path)
+    with pytest.raises(DataError, match=r'rgbd\.toml names no mesh; add one in the world of the poses: mesh = "mesh'):
+        Rgbd(tmp_path).surface(folder.name)
+    write_scene(tmp_path / "with", mesh="mesh.ply")
+    data = tmp_path / "with" / "rgbd" / folder.name / "data"
+    write_quads(data / "mesh.ply", 9)
+    dataset = Rgbd(tmp_path / "with")
+    assert dataset.surface(folder.name).triangles.shape == (4, 3)
+    before = dataset.digest(folder.name)
+    write_quads(data / "mesh.ply", 12)
+    assert Rgbd(tmp_path / "with").digest(folder.name) != before
+
+
+def test_a_mesh_outside_the_described_folder_is_refused(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path, mesh="../mesh.ply")
+    with pytest.raises(DataError, match="leads out of the folder"):
+        Rgbd(tmp_path).surface(folder.name)
+
+
+def test_a_dataset_without_meshes_says_so(tmp_path: Path) -> None:
+    with pytest.raises(DataError, match="tum/desk: the dataset has no mesh; this method works on one"):
+        surface_of(Tum(tmp_path), "desk")
