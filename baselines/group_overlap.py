@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 
@@ -44,9 +45,9 @@ class GroupedCloud:
     def __len__(self) -> int:
         return len(self.points)
 
-    @property
+    @cached_property
     def n_groups(self) -> int:
-        return len(np.unique(self.group[self.group != NO_GROUP]))
+        return int(np.count_nonzero(_sizes(self.group)))
 
 
 @dataclass(frozen=True)

@@ -110,6 +110,7 @@ class SAM3D:
     def __init__(self, config: SAM3DConfig | None = None) -> None:
         self.config = config or SAM3DConfig()
         self._tools: SceneTools | None = None
+        self.finish_costs: dict[str, float | int] = {}  # the tree's stages, for it merges in ``finish`` alone
         self._clear()
 
     def _clear(self) -> None:
@@ -208,18 +209,23 @@ class SAM3D:
 
         A segment of the ensemble that no group claims has no feature and is no instance.
         """
-        cloud = merge_regions(self._clouds, self.config.rules, Timer())
+        timer = Timer()
+        cloud = merge_regions(self._clouds, self.config.rules, timer)
         if cloud is None:
             logger.warning("%s: no frame of sam3d has a valid point; its map is empty", self._scene)
-            cloud = voxelise(_EMPTY, self.config.voxel_m)
+            cloud = _EMPTY
         cloud = numbered(without_small_groups(cloud, self.config.th))
         points, group = cloud.points.astype(np.float32), cloud.group
         if self._surface is not None:
             points = self._surface.vertices
-            group = groups_on_surface(cloud, points, self.config.max_distance_m)
+            with timer.stage("surface"):
+                group = groups_on_surface(cloud, points, self.config.max_distance_m)
             if self.config.ensemble:
-                group, cloud = self._in_segments(group, cloud, self._surface)
-        return self._instances(points, group, cloud)
+                with timer.stage("ensemble"):
+                    group, cloud = self._in_segments(group, cloud, self._surface)
+        instances = self._instances(points, group, cloud)
+        self.finish_costs = {f"{stage}_ms": round(spent, 3) for stage, spent in timer.take().items()}
+        return instances
 
     def _in_segments(self, group: Int64Array, cloud: GroupedCloud, surface: Surface) -> tuple[Int64Array, GroupedCloud]:
         """Groups of the vertices after the ensemble, and the cloud with its views under the new numbers."""

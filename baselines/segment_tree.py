@@ -1,7 +1,7 @@
 """A tree over the segments of a mesh: which parts belong together, from the surface's shape alone.
 
-Our own design, no published method's. Segments touch where they share a small cube of space, not only along edges, so
-that a crack in a scan parts nothing. Two regions are merged the sooner the less the surface bends into the room's
+Our own design, no published method's. Segments touch along edges and where they share a small cube of space, so that a
+crack in a scan parts nothing. Two regions are merged the sooner the less the surface bends into the room's
 inside between them, the larger the share of the smaller one's border that lies between them, and the smaller they are.
 """
 
@@ -15,7 +15,7 @@ import numpy as np
 from su3d_bench.errors import DataError
 from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 
-PATCH_M = 0.02  # side of the cubes; scans have a vertex each 1 to 2 cm
+LEAST_PATCH_M = 0.02  # side of the cubes, where the mesh's edges are not longer
 FLAT_BEND = 0.01  # of a contact without any bend, so that flat borders still count by their length
 CONVEX_SHARE = 0.5  # a convex edge is an object's own edge more often than a border: its bend is squared and halved
 # Added to the mean bend and taken from the share, so that neither factor of a cost is ever 0.
@@ -28,7 +28,7 @@ Border = dict[int, tuple[int, float]]  # region -> contacts with it, and their s
 class Contacts:
     """Borders between segments: E pairs ``first`` < ``second`` with how many contacts they have and their summed bend.
 
-    ``n_patches`` (S,) is the size of each of S segments in cubes of ``PATCH_M``.
+    ``n_patches`` (S,) is the size of each of S segments in cubes of side ``patch_m``.
     """
 
     first: Int64Array
@@ -36,6 +36,7 @@ class Contacts:
     n: Int64Array
     bend: Float64Array
     n_patches: Int64Array
+    patch_m: float
 
 
 @dataclass(frozen=True)
@@ -53,22 +54,24 @@ class SegmentTree:
     leaves: Int64Array
     start: Int64Array
     end: Int64Array
+    patch_m: float
 
 
 def contacts_of(vertices: Float32Array, triangles: Int32Array, segments: Int64Array) -> Contacts:
-    """Contacts between ``segments`` (V,), numbered 0 to S - 1: patches in one cube or in two that share a face.
+    """Contacts between ``segments`` (V,), numbered 0 to S - 1: patches with a common edge, or in cubes that touch.
 
-    A patch is what one segment has in one cube. The bend of a contact is (1 - cos) / 2 of the angle between the normals
+    A patch is what one segment has in one cube; cubes touch that are one or share a face. The bend of a contact is (1 - cos) / 2 of the angle between the normals
     of its patches, less where the surface is convex there.
     """
     n_segments = int(segments.max()) + 1 if len(segments) else 0
-    cells, step = _cells(vertices, n_segments)
+    patch_m = _patch_size_m(vertices, triangles)
+    cells, step = _cells(vertices, n_segments, patch_m)
     patch, owner, inverse = _distinct(cells * max(n_segments, 1) + segments, max(n_segments, 1))
     n = np.bincount(inverse, minlength=len(patch))
     centres = _sums(inverse, vertices, len(patch)) / n[:, None]
     normals = _sums(inverse, _vertex_normals(vertices, triangles), len(patch))
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
-    a, b = _touching(patch, owner, step)
+    a, b = _touching(patch, owner, step, inverse[triangles])
     bend = (1 - np.einsum("ij,ij->i", normals[a], normals[b])) / 2
     is_convex = np.einsum("ij,ij->i", normals[b] - normals[a], centres[b] - centres[a]) > 0
     bend = np.where(is_convex, CONVEX_SHARE * bend * bend, bend) + FLAT_BEND
@@ -80,18 +83,27 @@ def contacts_of(vertices: Float32Array, triangles: Int32Array, segments: Int64Ar
         n=np.bincount(of_pair, minlength=len(pairs)),
         bend=np.bincount(of_pair, bend, len(pairs)).astype(np.float64),
         n_patches=np.bincount(owner, minlength=n_segments),
+        patch_m=patch_m,
     )
 
 
-def _cells(vertices: Float32Array, n_segments: int) -> tuple[Int64Array, tuple[int, int, int]]:
+def _patch_size_m(vertices: Float32Array, triangles: Int32Array) -> float:
+    """The median length of an edge, so that neighbours lie in cubes that touch; decimated scans have 3 cm and more."""
+    if not len(triangles):
+        return LEAST_PATCH_M
+    edges = vertices[triangles].astype(np.float64)
+    return max(LEAST_PATCH_M, float(np.median(np.linalg.norm(edges[:, 1] - edges[:, 0], axis=1))))
+
+
+def _cells(vertices: Float32Array, n_segments: int, patch_m: float) -> tuple[Int64Array, tuple[int, int, int]]:
     """A number for the cube of each vertex, and what a step along each axis adds to it."""
     extent_m = np.ptp(vertices.astype(np.float64), axis=0) if len(vertices) else np.zeros(3)
-    sizes = [int(side / PATCH_M) + 3 for side in extent_m]  # a free layer on both sides: steps never wrap around
+    sizes = [int(side / patch_m) + 3 for side in extent_m]  # a free layer on both sides: steps never wrap around
     if sizes[0] * sizes[1] * sizes[2] * max(n_segments, 1) > 2**62:
         raise DataError(f"the mesh spans {extent_m.max():.0f} m; proposals from its surface need one in metres")
     step = (sizes[1] * sizes[2], sizes[2], 1)
     low = vertices.min(axis=0).astype(np.float64) if len(vertices) else np.zeros(3)
-    grid = np.floor((vertices - low) / PATCH_M).astype(np.int64) + 1
+    grid = np.floor((vertices - low) / patch_m).astype(np.int64) + 1
     return grid @ np.array(step, np.int64), step
 
 
@@ -112,18 +124,22 @@ def _vertex_normals(vertices: Float32Array, triangles: Int32Array) -> Float64Arr
     return sum((_sums(triangles[:, k], normals, len(vertices)) for k in range(3)), np.zeros((len(vertices), 3)))
 
 
-def _touching(cube: Int64Array, owner: Int64Array, step: tuple[int, int, int]) -> tuple[Int64Array, Int64Array]:
-    """Pairs of patches of two segments in one cube or in neighbouring ones; ``cube`` ascends."""
-    firsts, seconds = [], []
+def _touching(
+    cube: Int64Array, owner: Int64Array, step: tuple[int, int, int], triangles: Int64Array
+) -> tuple[Int64Array, Int64Array]:
+    """Pairs of patches of two segments, each pair once; ``cube`` ascends, ``triangles`` (T, 3) name patches."""
+    pairs = []
     for offset in (0, *step):
         begin = np.searchsorted(cube, cube + offset, "left")
         n = np.searchsorted(cube, cube + offset, "right") - begin
         a = np.repeat(np.arange(len(cube)), n)
         b = np.arange(len(a)) - np.repeat(np.cumsum(n) - n - begin, n)
-        is_pair = (owner[a] != owner[b]) & ((a < b) | (offset > 0))
-        firsts.append(a[is_pair])
-        seconds.append(b[is_pair])
-    return np.concatenate(firsts), np.concatenate(seconds)
+        pairs.append(np.stack([a, b]))
+    pairs += [np.sort(triangles[:, ends].T, axis=0) for ends in ([0, 1], [1, 2], [2, 0])]
+    a, b = np.concatenate(pairs, axis=1)
+    is_pair = (owner[a] != owner[b]) & (a < b)
+    keys = np.unique(a[is_pair] * len(cube) + b[is_pair])
+    return keys // max(len(cube), 1), keys % max(len(cube), 1)
 
 
 def merge_cost(bend: float, n: int, n_smaller_border: int, n_patches: int) -> float:
@@ -177,6 +193,7 @@ def merge_tree(contacts: Contacts) -> SegmentTree:
         leaves=leaves,
         start=start,
         end=end,
+        patch_m=contacts.patch_m,
     )
 
 

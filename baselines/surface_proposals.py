@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.baselines.mesh_segments import MIN_VERTICES, THRESHOLD, mesh_segments
-from su3d_bench.baselines.segment_tree import PATCH_M, SegmentTree, contacts_of, is_within, merge_tree
+from su3d_bench.baselines.segment_tree import SegmentTree, contacts_of, is_within, merge_tree
 from su3d_bench.types import Float64Array, Int64Array, Proposals, Surface
 
 SOURCE = "weight-free proposals from the mesh's shape, not a network's"
@@ -71,7 +71,7 @@ def contrast(tree: SegmentTree) -> Float64Array:
     """
     mean_bend = np.where(tree.n_contacts > 0, tree.bend / np.maximum(tree.n_contacts, 1), LONE_BEND)
     border = tree.n_contacts / np.sqrt(tree.n_patches)
-    size = np.minimum(1.0, np.sqrt(tree.n_patches * PATCH_M**2 / FULL_AREA_M2))
+    size = np.minimum(1.0, np.sqrt(tree.n_patches * tree.patch_m**2 / FULL_AREA_M2))
     result: Float64Array = mean_bend * size / (border + LEAST_BORDER)
     return result
 

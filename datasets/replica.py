@@ -177,9 +177,7 @@ class Replica:
         self._folder(scene)
         mesh = self._render_mesh(scene)
         if not mesh.exists():
-            raise DataError(
-                f"{self._where(scene)}: no mesh; {mesh.name} of the render is missing in {self.tree.folder}"
-            )
+            raise DataError(f"{self._where(scene)}: no mesh; {mesh.name} is missing in {self.tree.folder}")
         return read_surface(mesh, f"{self._where(scene)}: {mesh.name}")
 
     def _where(self, scene: str) -> str:

@@ -1,10 +1,9 @@
-"""Table I: what one parameter of a method changes, from runs that hold the method and its variants."""
+"""Table I: what single parameters of a method change, from a sweep."""
 
 from __future__ import annotations
 
-import re
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 from su3d_bench.errors import ConfigError
 from su3d_bench.reports.measured import Measured
@@ -19,86 +18,57 @@ from su3d_bench.reports.paper_tables import (
     units,
 )
 from su3d_bench.reports.published import published
-from su3d_bench.reports.table_model import NOT_MEASURED, Cell, Table, TableRow
+from su3d_bench.reports.table_model import Cell, Table, TableRow
 
 SIDES = (LAYOUTS["II"], LAYOUTS["III"])  # its columns are those of Tables II and III together
 METRICS = tuple(name for side in SIDES for name in side.metrics)
-M, K, RATIOS = "images m", "crop levels k", "crop ratios"
-OWN_VALUES = {M: "5", K: "3", RATIOS: "0.8,1,1.2"}  # OpenSU3D, section IV-A: the method itself is in every group
-_REPORTED = {"m": M, "k": K, "ratios": RATIOS}
-_VARIANT = re.compile(r"(?P<base>[^@]+)@(?P<key>\w+)=(?P<value>[^=]+)")
-Groups = Mapping[str, Mapping[str, str]]
 
 
-def ablation_table(found: Sequence[Measured], shown: Shown, *, with_published: bool) -> Table:
-    """A row for each value of a parameter, the best of each parameter marked.
+@dataclass(frozen=True)
+class SweepRow:
+    """A value of a parameter, and the method of the run that has it."""
 
-    Variants are methods such as ``opensu3d@top_m=1``; lists of crop ratios that are not three long count as other
-    numbers of crop levels. ``ConfigError`` where ``found`` has no variants, or those of several methods.
+    parameter: str
+    value: str
+    method: str
+
+
+def ablation_table(
+    found: Sequence[Measured], sweep: Sequence[SweepRow], shown: Shown, *, with_published: bool
+) -> Table:
+    """A row for each of ``sweep``, the best of each parameter marked.
+
+    Raises ``ConfigError`` where ``found`` lacks one of its methods, or a protocol of either kind.
     """
-    groups = _groups(found)
     sides = [_of_protocol(found, side) for side in SIDES]
+    looks = [replace(shown, metrics=side.metrics, ceilings=False, scenes_count=False) for side in SIDES]
     rows: list[TableRow] = []
-    for group, values in groups.items():
-        cells: dict[str, list[Cell]] = {value: [] for value in values}
-        for side, members in zip(SIDES, sides, strict=True):
-            _add_cells(cells, values, members, replace(shown, metrics=side.metrics, ceilings=False, scenes_count=False))
-        rows += [TableRow(f"{group} = {value}", tuple(of_row), group=group) for value, of_row in cells.items()]
+    for parameter in dict.fromkeys(one.parameter for one in sweep):
+        members = [one for one in sweep if one.parameter == parameter]
+        halves = [_cells(members, side, look) for side, look in zip(sides, looks, strict=True)]
+        rows += [
+            TableRow(f"{parameter} = {one.value}", (*left, *right), group=parameter)
+            for one, left, right in zip(members, *halves, strict=True)
+        ]
+    used = {one.method for one in sweep}
     notes: dict[str, None] = {}
-    used = {method for values in groups.values() for method in values.values()}
-    for side, members in zip(SIDES, sides, strict=True):
-        own = [one for method, one in members.items() if method in used]
-        notes[f"{', '.join(side.metrics)}: {units(own[0], replace(shown, ceilings=False))}"] = None
-        notes |= dict.fromkeys(run_notes(own, [f"{one.method}, {one.scenes_text} scenes" for one in own]))
+    for side, look in zip(sides, looks, strict=True):
+        own = [one for method, one in side.items() if method in used]
+        notes[f"{', '.join(look.metrics)}: {units(own[0], look)}"] = None
+        labels = [one.method if one.is_whole else f"{one.method} ({one.scenes_text} scenes)" for one in own]
+        notes |= dict.fromkeys(run_notes(own, labels))
     figures = [figure for figure in published() if figure.table == "I"] if with_published else []
     reported, sources = reported_rows(figures, METRICS, len(METRICS))
-    named = [_named(row) for row in reported]
-    return Table("I", "Ablation of single parameters.", "parameter", METRICS, (*rows, *named), (*notes, *sources))
-
-
-def _groups(found: Sequence[Measured]) -> Groups:
-    """Parameter -> value -> method, values in ascending order."""
-    groups: dict[str, dict[str, str]] = {}
-    bases: dict[str, None] = {}
-    for name in dict.fromkeys(one.method for one in found):
-        match = _VARIANT.fullmatch(name)
-        if match is not None:
-            bases[match["base"]] = None
-            group, value = _place_of(match["key"], match["value"])
-            groups.setdefault(group, {})[value] = name
-    if len(bases) != 1:
-        what = f"these runs have some of {', '.join(bases)}; name those of one with --methods"
-        raise ConfigError(
-            "Table I: needs variants of one method with one parameter changed, such as opensu3d@top_m=1; "
-            + (what if bases else "these runs have none")
-        )
-    (base,) = bases
-    if any(one.method == base for one in found):
-        for group, values in groups.items():
-            values.setdefault(OWN_VALUES.get(group, "its own"), base)
-    return {group: dict(sorted(values.items(), key=lambda one: _order(one[0]))) for group, values in groups.items()}
-
-
-def _place_of(key: str, text: str) -> tuple[str, str]:
-    value = text.strip("[]").replace(" ", "").replace(".0,", ",").removesuffix(".0")
-    if key == "crop_ratios":
-        n_levels = value.count(",") + 1
-        return (RATIOS, value) if n_levels == 3 else (K, str(n_levels))
-    return {"top_m": M}.get(key, key), value
-
-
-def _order(value: str) -> tuple[int, float, str]:
-    try:
-        return (0, float(value), "")
-    except ValueError:
-        return (1, 0.0, value)
+    return Table(
+        "I", "Ablation of single parameters.", "parameter", METRICS, (*rows, *map(_named, reported)), (*notes, *sources)
+    )
 
 
 def _of_protocol(found: Sequence[Measured], side: Layout) -> dict[str, Measured]:
     """Method -> its numbers under the protocol of that side's set-up, or the first that has its metrics."""
     fitting = [one for one in found if all(name in one.metrics for name in side.metrics)]
     if not fitting:
-        raise ConfigError(f"Table I: needs {', '.join(side.metrics)}; score the run under {side.protocol} too")
+        raise ConfigError(f"Table I: needs {', '.join(side.metrics)}; score the sweep under {side.protocol} too")
     names = [one.protocol for one in fitting]
     chosen = side.protocol if side.protocol in names else names[0]
     members: dict[str, Measured] = {}
@@ -108,20 +78,20 @@ def _of_protocol(found: Sequence[Measured], side: Layout) -> dict[str, Measured]
     return members
 
 
-def _add_cells(
-    cells: Mapping[str, list[Cell]], values: Mapping[str, str], members: Mapping[str, Measured], shown: Shown
-) -> None:
-    present = [value for value, method in values.items() if method in members]
-    rows = [members[values[value]] for value in present]
+def _cells(sweep: Sequence[SweepRow], side: Mapping[str, Measured], shown: Shown) -> list[list[Cell]]:
+    for one in sweep:
+        if one.method not in side:
+            raise ConfigError(
+                f"Table I: no scores of {one.method} for {', '.join(shown.metrics)}; run the sweep again, it goes on "
+                "where it stopped"
+            )
+    rows = [side[one.method] for one in sweep]
     best, _ = best_rows(rows, shown)
-    for value, of_row in cells.items():
-        if value in present:
-            k = present.index(value)
-            of_row += cells_of(rows[k], shown, {name for name in shown.metrics if k in best.get(name, ())})
-        else:
-            of_row += [Cell(NOT_MEASURED)] * len(shown.metrics)
+    return [
+        cells_of(row, shown, {name for name in shown.metrics if k in best.get(name, ())}) for k, row in enumerate(rows)
+    ]
 
 
 def _named(row: TableRow) -> TableRow:
-    key, _, value = row.label.partition("=")
-    return replace(row, label=f"{_REPORTED[key]} = {value}", group=_REPORTED[key])
+    parameter, _, value = row.label.partition("=")
+    return replace(row, label=f"{parameter} = {value}", group=parameter)

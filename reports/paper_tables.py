@@ -19,16 +19,16 @@ LEVEL = 0.05
 
 @dataclass(frozen=True)
 class Layout:
-    """A table of the paper: its metrics, the protocol that comes nearest to its set-up, and its caption."""
+    """A table of the paper: its metrics, the protocol of its set-up, and its subject."""
 
     metrics: tuple[str, ...]
     protocol: str
-    caption: str
+    subject: str
 
 
 LAYOUTS: Mapping[PaperTable, Layout] = {
-    "II": Layout(("mAcc", "F-mIoU"), "replica-conceptgraphs-ex6", "Semantic segmentation, ConceptGraphs' evaluation"),
-    "III": Layout(("AP", "AP50", "AP25"), "replica-openmask3d", "Instance segmentation, OpenMask3D's evaluation"),
+    "II": Layout(("mAcc", "F-mIoU"), "replica-conceptgraphs-ex6", "Semantic segmentation"),
+    "III": Layout(("AP", "AP50", "AP25"), "replica-openmask3d", "Instance segmentation"),
 }
 
 
@@ -64,7 +64,8 @@ def paper_table(number: PaperTable, found: Sequence[Measured], shown: Shown, *, 
     for name in names:
         rows = [one for one in fitting if one.protocol == name]
         one = protocol_table(rows, replace(shown, metrics=metrics), figures)
-        tables.append(replace(one, name=f"{number}-{name}", caption=f"{layout.caption}."))
+        setup = "" if name == layout.protocol else ", not the paper's set-up"
+        tables.append(replace(one, name=f"{number}-{name}", caption=f"{layout.subject} under {name}{setup}."))
     return tables
 
 

@@ -146,6 +146,9 @@ def _draw_spoken_of(axes: Any, camera: Camera, instances: Instances, spoken_of: 
         for a, b in EDGES:
             axes.plot(pixels[[a, b], 0], pixels[[a, b], 1], color=shade, **edges)
         x, y = _free_place(pixels, names[row], placed)
+        middle = np.nanmean(pixels, axis=0)
+        if not ((pixels[:, 1].min() - 2 * LABEL_HEIGHT <= y) & (y <= pixels[:, 1].max())):
+            axes.plot([x, middle[0]], [y, middle[1]], color=shade, linewidth=0.6, alpha=0.6)
         box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": shade, "alpha": 0.92}
         axes.text(x, y, names[row], fontsize=9.5, color=shade, ha="center", va="center", bbox=box, parse_math=False)
 
@@ -161,8 +164,9 @@ def _free_place(corners: Float64Array, name: str, placed: list[Float64Array]) ->
     seen = corners[np.isfinite(corners).all(axis=1)]
     start = np.array([seen[:, 0].mean(), seen[:, 1].min() - 10.0]) if len(seen) else half
     start = np.clip(start, half, [PANEL_WIDTH - half[0], PANEL_HEIGHT - half[1]])
-    for step in range(2 * MOST_LABELS):
-        place = start + [0, LABEL_HEIGHT * (step // 2 + 1) * (-1 if step % 2 else 1) if step else 0]
+    for step in range(4 * MOST_LABELS):
+        down = LABEL_HEIGHT / 2 * (step // 2) * (-1 if step % 2 else 1)
+        place = start + np.array([0.0, down])
         is_inside = half[1] <= place[1] <= PANEL_HEIGHT - half[1]
         if is_inside and not any((np.abs(one[:2] - place) < one[2:] + half).all() for one in placed):
             break

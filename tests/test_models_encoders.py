@@ -467,6 +467,7 @@ def test_a_setting_that_would_do_nothing_is_refused(tmp_path: Path) -> None:
         ModelsConfig(runtime="onnx", precision="float16")
 
 
+@needs_models
 def test_without_transformers_one_line_names_the_extra(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "transformers", None)
     with pytest.raises(ModelMissing, match=r"needs the package 'transformers': pip install 'su3d-bench\[models\]'"):
@@ -482,5 +483,6 @@ def test_without_open_clip_one_line_names_the_package(tmp_path: Path, monkeypatc
         load_encoder(config(tmp_path, runtime="open_clip"))
 
 
+@needs_models
 def test_the_space_of_the_tiny_encoder_is_known_without_its_weights(folder: Path) -> None:
     assert load_encoder(config(folder)).dim == DIM

@@ -140,7 +140,10 @@ def test_every_update_tells_its_stages_and_the_tree_merges_at_the_end() -> None:
         method, timer = run(views[:1], config), Timer()
         method.update(*views[1], timer)
         stages.append(set(timer.take()))
-    assert stages == [{"backproject", "paint", "voxelise"}, {"backproject", "paint", "voxelise", "match", "merge"}]
+        method.finish()
+        stages.append(set(method.finish_costs))
+    per_frame, at_the_end = {"backproject", "paint", "voxelise"}, {"merge_ms", "match_ms", "voxelise_ms"}
+    assert stages == [per_frame, at_the_end, per_frame | {"match", "merge"}, set()]
 
 
 def test_the_tree_holds_all_frames_and_the_map_only_itself() -> None:

@@ -90,7 +90,7 @@ def test_a_prediction_comes_back_as_it_was(tmp_path: Path, prediction: Instances
     assert type(again) is type(prediction)
     for name in prediction.__dataclass_fields__:
         before, after = getattr(prediction, name), getattr(again, name)
-        assert type(before) is type(after)
+        assert isinstance(after, type(before))
         np.testing.assert_array_equal(before, after)
         assert getattr(before, "dtype", None) == getattr(after, "dtype", None)
 

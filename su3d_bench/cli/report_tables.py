@@ -75,7 +75,8 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _tables(arguments: argparse.Namespace) -> list[Table]:
-    from su3d_bench.reports.ablation_table import ablation_table
+    from su3d_bench.ablation import read_rows
+    from su3d_bench.reports.ablation_table import SweepRow, ablation_table
     from su3d_bench.reports.paper_tables import Shown, paper_table, selection_tables
     from su3d_bench.table_sources import choose, measured_results
 
@@ -93,7 +94,9 @@ def _tables(arguments: argparse.Namespace) -> list[Table]:
     tables = []
     for number in dict.fromkeys(arguments.table):
         if number == "I":
-            tables.append(ablation_table(found, shown, with_published=with_published))
+            rows = [row for run in arguments.runs for row in read_rows(run)]
+            sweep = [SweepRow(row.parameter, row.value, row.method) for row in rows]
+            tables.append(ablation_table(found, sweep, shown, with_published=with_published))
         else:
             tables += paper_table(number, found, shown, with_published=with_published)
     return tables

@@ -1,0 +1,193 @@
+"""Where models are looked for, in which order, and what is said of one that is not there."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import pytest
+
+from su3d_bench.errors import ConfigError, ModelMissing
+from su3d_bench.perception.models import files as model_files
+from su3d_bench.perception.models.catalogue import MODELS, PROFILE_MODELS, model_entry
+from su3d_bench.perception.models.files import file_sha256, locate
+
+CLIP_FILES = ("model.safetensors", "config.json", "preprocessor_config.json", "tokenizer.json")
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Every place that is searched lies below the test's own folder."""
+    monkeypatch.setenv("SU3D_MODELS", str(tmp_path / "models"))
+    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
+    monkeypatch.delenv("HF_HUB_CACHE", raising=False)
+    return tmp_path
+
+
+def fill(folder: Path, names: tuple[str, ...] = CLIP_FILES) -> Path:
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        (folder / name).write_text(name)
+    return folder
+
+
+def snapshot(root: Path, repository: str, revision: str, *, is_main: bool) -> Path:
+    folder = root / f"models--{repository.replace('/', '--')}"
+    if is_main:
+        (folder / "refs").mkdir(parents=True, exist_ok=True)
+        (folder / "refs" / "main").write_text(revision + "\n")
+    return fill(folder / "snapshots" / revision)
+
+
+def test_every_entry_is_complete() -> None:
+    assert {entry.kind for entry in MODELS.values()} == {"encoder", "segmenter", "detector", "tagger"}
+    for name, entry in MODELS.items():
+        assert entry.name == name
+        assert entry.licence in {"MIT", "Apache-2.0"}
+        assert len({form.form for form in entry.forms}) == len(entry.forms)
+        assert all(len(digest) == 64 for form in entry.forms for digest in form.sha256.values())
+        assert all(form.architecture for form in entry.forms if form.form == "open_clip")
+        # float32: four bytes a parameter, which is what the published files hold
+        published = entry.forms[0].size_mb
+        assert abs(entry.memory_mb(4) - published) / published < 0.05, name
+    assert {name for names in PROFILE_MODELS.values() for name in names} <= set(MODELS)
+
+
+def test_the_papers_models_are_those_of_the_paper() -> None:
+    assert "laion2b_s32b_b79k" in MODELS["clip-vit-h-14"].summary
+    assert PROFILE_MODELS["paper"] == ("clip-vit-h-14", "sam-vit-h", "grounding-dino", "ram-plus")
+    assert "sam_vit_h_4b8939.pth" in MODELS["sam-vit-h"].form("original").files
+    assert "groundingdino_swint_ogc.pth" in MODELS["grounding-dino"].form("original").files
+    assert "ram_plus_swin_large_14m.pth" in MODELS["ram-plus"].form("original").files
+
+
+def test_a_model_lies_below_su3d_models_under_its_short_name_or_its_repositorys(home: Path) -> None:
+    for place in ("clip-vit-h-14", "laion/CLIP-ViT-H-14-laion2B-s32B-b79K", "CLIP-ViT-H-14-laion2B-s32B-b79K"):
+        folder = fill(home / "models" / place)
+        found = locate("clip-vit-h-14")
+        assert (found.folder, found.form.form, found.weights.name) == (folder, "transformers", "model.safetensors")
+        for name in CLIP_FILES:
+            (folder / name).unlink()
+
+
+def test_the_hugging_face_cache_is_searched_last_and_its_main_revision_counts(home: Path) -> None:
+    repository = "openai/clip-vit-base-patch32"
+    main = snapshot(home / "hf" / "hub", repository, "aa11", is_main=True)
+    snapshot(home / "hf" / "hub", repository, "bb22", is_main=False)
+    assert locate("clip-vit-b-32").folder == main
+    ours = snapshot(home / "models", repository, "cc33", is_main=True)
+    assert locate("clip-vit-b-32").folder == ours
+    nearest = fill(home / "models" / "clip-vit-b-32")
+    assert locate("clip-vit-b-32").folder == nearest
+
+
+def test_two_snapshots_without_a_main_one_are_not_guessed_among(home: Path) -> None:
+    repository = "openai/clip-vit-base-patch32"
+    only = snapshot(home / "hf" / "hub", repository, "aa11", is_main=False)
+    assert locate("clip-vit-b-32").folder == only
+    snapshot(home / "hf" / "hub", repository, "bb22", is_main=False)
+    with pytest.raises(ConfigError, match=r"holds 2 snapshots and no refs/main; name one with models\.paths"):
+        locate("clip-vit-b-32")
+
+
+def test_a_revision_that_would_leave_the_cache_is_not_followed(home: Path) -> None:
+    outside = fill(home / "outside")
+    folder = home / "hf" / "hub" / "models--openai--clip-vit-base-patch32"
+    (folder / "refs").mkdir(parents=True)
+    (folder / "snapshots").mkdir()
+    (folder / "refs" / "main").write_text(os.path.relpath(outside, folder / "snapshots"))
+    with pytest.raises(ModelMissing):
+        locate("clip-vit-b-32")
+
+
+def test_the_cache_may_be_named_by_either_variable(home: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HF_HUB_CACHE", str(home / "elsewhere"))
+    folder = snapshot(home / "elsewhere", "openai/clip-vit-base-patch32", "aa11", is_main=True)
+    assert locate("clip-vit-b-32").folder == folder
+
+
+def test_safetensors_are_preferred_and_two_files_of_words_serve_for_one(home: Path) -> None:
+    folder = home / "models" / "clip-vit-b-32"
+    fill(folder, ("pytorch_model.bin", "config.json", "preprocessor_config.json", "vocab.json", "merges.txt"))
+    assert locate("clip-vit-b-32").weights.name == "pytorch_model.bin"
+    fill(folder, ("model.safetensors",))
+    assert locate("clip-vit-b-32").weights.name == "model.safetensors"
+    (folder / "merges.txt").unlink()
+    with pytest.raises(ModelMissing):
+        locate("clip-vit-b-32")
+
+
+def test_an_original_checkpoint_may_lie_in_the_folder_of_models_itself(home: Path) -> None:
+    fill(home / "models", ("sam_vit_h_4b8939.pth",))
+    found = locate("sam-vit-h")
+    assert (found.form.form, found.weights) == ("original", home / "models" / "sam_vit_h_4b8939.pth")
+
+
+def test_a_configured_path_is_used_and_nothing_beside_it(home: Path) -> None:
+    fill(home / "models" / "clip-vit-b-32")
+    mine = fill(home / "mine")
+    assert locate("clip-vit-b-32", path=mine).folder == mine
+    assert locate("clip-vit-b-32", path=mine / "model.safetensors").folder == mine
+    (mine / "config.json").unlink()
+    with pytest.raises(ModelMissing, match=r"mine lacks config\.json; fetch model\.safetensors, config\.json"):
+        locate("clip-vit-b-32", path=mine)
+    with pytest.raises(ModelMissing, match="there is no .*absent; mend the path or fetch"):
+        locate("clip-vit-b-32", path=home / "absent")
+    with pytest.raises(ConfigError, match=r"is no file that it is read from; name a folder with model\.safetensors"):
+        locate("clip-vit-b-32", path=fill(home / "other", ("x.bin",)) / "x.bin")
+    renamed = fill(home / "other", ("my_sam.pth",)) / "my_sam.pth"
+    assert locate("sam-vit-h", path=renamed).weights == renamed
+
+
+def test_a_missing_model_is_one_line_with_what_to_fetch_from_where_into_which_folder(home: Path) -> None:
+    with pytest.raises(ModelMissing) as caught:
+        locate("clip-vit-h-14")
+    assert str(caught.value) == (
+        "model 'clip-vit-h-14': not found; fetch model.safetensors, config.json, preprocessor_config.json, "
+        "tokenizer.json (3.9 GB) from https://huggingface.co/laion/CLIP-ViT-H-14-laion2B-s32B-b79K into "
+        f"{home / 'models' / 'clip-vit-h-14'}, or set SU3D_MODELS"
+    )
+
+
+def test_an_unknown_name_or_form_is_one_line() -> None:
+    with pytest.raises(ConfigError, match="unknown model 'clip-vit-h14'; did you mean 'clip-vit-h-14'"):
+        locate("clip-vit-h14")
+    with pytest.raises(ConfigError, match="unknown encoder 'sam-vit-h'"):
+        model_entry("sam-vit-h", "encoder")
+    with pytest.raises(ConfigError, match="does not come in the form 'open_clip'; known: transformers"):
+        locate("siglip-base-224", ("open_clip",))
+
+
+def test_digests_are_of_the_weights_and_of_every_file_that_moves_an_answer(home: Path) -> None:
+    folder = fill(home / "models" / "clip-vit-b-32", (*CLIP_FILES, "README.md"))
+    digests = locate("clip-vit-b-32").digests()
+    assert set(digests) == set(CLIP_FILES)
+    assert digests["config.json"] == hashlib.sha256((folder / "config.json").read_bytes()).hexdigest()
+
+
+def test_a_checkpoint_that_is_not_the_published_one_is_named(home: Path) -> None:
+    fill(home / "models", ("sam_vit_h_4b8939.pth",))
+    wrong = locate("sam-vit-h").wrong_digests()
+    assert len(wrong) == 1
+    assert "published is a7bf3b02f3eb" in wrong[0]
+
+
+def test_the_digest_of_a_large_file_is_read_again_only_when_the_file_has_changed(
+    home: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = home / "weights.safetensors"
+    path.write_bytes(bytes(2**20 + 1))
+    n_read: list[Path] = []
+    digest_file = model_files.digest_file
+    monkeypatch.setattr(model_files, "digest_file", lambda path: (n_read.append(path), digest_file(path))[1])
+    first = file_sha256(path)
+    assert (file_sha256(path), len(n_read)) == (first, 1)
+    path.write_bytes(bytes(2**20 + 2))
+    assert file_sha256(path) == hashlib.sha256(bytes(2**20 + 2)).hexdigest()
+    assert len(n_read) == 2
+    for note in model_files.digest_cache().iterdir():
+        note.write_text("{")  # a damaged note counts as absent
+    file_sha256(path)
+    assert len(n_read) == 3

@@ -1,0 +1,165 @@
+"""PointFusion as gradslam has it: projection, unique matches, confidence-weighted means, on hand-worked values."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from box_room import INTRINSICS, images, pose
+
+from su3d_bench.baselines.pixel_features import picked
+from su3d_bench.baselines.point_fusion import ABSENT, PointFusion, View, alpha, normals_of, view_of
+from su3d_bench.errors import DataError
+from su3d_bench.types import Frame
+
+TOWARDS = np.array([0.0, 0.0, 1.0])
+
+
+def row_of_pixels(width: int = 4, depth_m: float = 1.0) -> View:
+    """One row of pixels a metre apart at depth 1 m, seen by a camera of focal length 1 at the origin."""
+    points = np.stack([np.arange(width) * depth_m, np.zeros(width), np.full(width, depth_m)], axis=1)
+    return View(
+        1, width, points, np.tile(TOWARDS, (width, 1)), np.ones(width, bool), np.ones(width), np.eye(3), np.eye(4)
+    )
+
+
+def a_map(
+    *points: tuple[float, float, float], counts: list[float] | None = None, distance_m: float = 10
+) -> PointFusion:
+    fusion = PointFusion(distance_m, 20.0)
+    n = len(points)
+    shown = View(
+        1, n, np.array(points, float), np.tile(TOWARDS, (n, 1)), np.ones(n, bool),
+        np.array(counts or [1.0] * n), np.eye(3), np.eye(4),
+    )  # fmt: skip
+    fusion.insert(shown, np.full(n, ABSENT, np.int64))
+    return fusion
+
+
+def test_alpha_falls_with_the_distance_to_the_camera_and_stands_at_its_floor_beyond_3_4_metres() -> None:
+    distances = np.array([0.0, 0.6, 1.2, 3.40, 3.41, 8.0])
+    values = alpha(np.stack([np.zeros(6), np.zeros(6), distances], axis=1), 0.6)
+    assert values[:3] == pytest.approx([1.0, np.exp(-0.5), np.exp(-2.0)])
+    assert values[3] > 1e-7
+    assert values[4:].tolist() == [1e-7, 1e-7]
+
+
+def test_normals_are_the_cross_product_of_the_steps_right_and_down_and_the_last_ones_repeat() -> None:
+    x, y = np.meshgrid(np.arange(3.0), np.arange(2.0))
+    flat = normals_of(np.stack([x, y, np.full_like(x, 2.0)], axis=-1))
+    assert flat.tolist() == [[[0, 0, 1]] * 3] * 2
+    tilted = normals_of(np.stack([x, y, x], axis=-1))  # right (1, 0, 1), down (0, 1, 0): (-1, 0, 1) / sqrt 2
+    assert tilted == pytest.approx(np.broadcast_to(np.array([-1, 0, 1]) / np.sqrt(2), (2, 3, 3)))
+    folded = np.stack([x, y, np.array([[0.0, 0, 1], [0, 0, 1]])], axis=-1)
+    assert normals_of(folded)[0, :, 0].tolist() == pytest.approx([0, -(0.5**0.5), -(0.5**0.5)])
+
+
+def test_a_pixel_without_depth_has_no_point_no_normal_and_makes_no_map_point() -> None:
+    depth_m = np.array([[1.0, 0.0], [np.nan, 1.0]], np.float32)
+    frame = Frame(0, 0.0, np.zeros((2, 2, 3), np.uint8), depth_m, np.eye(4), np.eye(3))
+    view = view_of(frame, picked(2, 2), picked(2, 2), 0.6)
+    assert view.has_depth.tolist() == [True, False, False, True]
+    assert not view.points[1:3].any() and not view.normals[1:3].any()
+    fusion = PointFusion(0.05, 20.0)
+    assert fusion.insert(view, fusion.associate(view)).tolist() == [0, 3]
+
+
+def test_intrinsics_shrink_with_the_image_and_pixels_are_taken_by_floor() -> None:
+    depth_m = np.arange(1, 25, dtype=np.float32).reshape(4, 6)
+    intrinsics = np.array([[6.0, 0, 3], [0, 4.0, 2], [0, 0, 1]])
+    frame = Frame(0, 0.0, np.zeros((4, 6, 3), np.uint8), depth_m, np.eye(4), intrinsics)
+    view = view_of(frame, picked(4, 2), picked(6, 4), 0.6)
+    assert view.intrinsics.tolist() == [[4, 0, 2], [0, 2, 1], [0, 0, 1]]
+    assert view.points[:, 2].tolist() == [1, 2, 4, 5, 13, 14, 16, 17]
+    assert view.points[5].tolist() == [(1 - 2) / 4 * 14, 0.0, 14]
+
+
+@pytest.mark.parametrize(
+    ("u", "pixel"), [(0.5, 0), (0.51, 1), (1.5, 2), (2.4, 2), (-0.0005, 0), (3.0005, 3), (-0.002, None), (3.002, None)]
+)
+def test_a_map_point_goes_to_the_nearest_pixel_and_out_of_the_outermost_centres_to_none(
+    u: float, pixel: int | None
+) -> None:
+    matched = a_map((u, 0, 1)).associate(row_of_pixels())
+    assert np.flatnonzero(matched != ABSENT).tolist() == ([] if pixel is None else [pixel])
+
+
+def test_points_behind_the_camera_match_nothing() -> None:
+    assert (a_map((0, 0, -1)).associate(row_of_pixels()) == ABSENT).all()
+
+
+def test_a_match_is_strictly_nearer_than_the_distance_and_within_the_angle() -> None:
+    view = row_of_pixels(2)
+    for z, matches in ((1.0499, True), (1.05, False), (0.96, True)):
+        assert (a_map((0, 0, z), distance_m=0.05).associate(view)[0] == 0) == matches, z
+    for degrees, matches in ((19.9, True), (20.1, False)):
+        turned = np.array([np.sin(np.deg2rad(degrees)), 0, np.cos(np.deg2rad(degrees))])
+        seen = replace(view, normals=np.tile(turned, (2, 1)))
+        assert (a_map((0, 0, 1)).associate(seen)[0] == 0) == matches, degrees
+
+
+def test_of_several_points_the_most_confident_is_matched_then_the_nearest_then_the_oldest() -> None:
+    near, far = (0.0, 0.0, 1.01), (0.0, 0.0, 1.04)
+    view = row_of_pixels(2)
+    assert a_map(near, far, counts=[1, 2], distance_m=0.05).associate(view).tolist() == [1, ABSENT]
+    assert a_map(far, near, counts=[1, 1], distance_m=0.05).associate(view).tolist() == [1, ABSENT]
+    assert a_map(near, near, counts=[1, 1], distance_m=0.05).associate(view).tolist() == [0, ABSENT]
+
+
+def test_a_matched_point_moves_to_the_weighted_mean_and_its_normal_is_not_normalised() -> None:
+    fusion = a_map((0, 0, 1.04), counts=[0.5], distance_m=0.05)
+    tilt = np.array([0.28, 0, 0.96])
+    view = replace(row_of_pixels(2), alpha=np.array([0.25, 1.0]), normals=np.tile(tilt, (2, 1)))
+    matched = fusion.associate(view)
+    fusion.fuse(view, matched)
+    assert fusion.points[0].tolist() == pytest.approx([0, 0, (0.5 * 1.04 + 0.25 * 1.0) / 0.75])
+    assert fusion.normals[0].tolist() == pytest.approx([0.28 / 3, 0, (2 + 0.96) / 3])
+    assert fusion.counts.tolist() == [0.75]
+    assert fusion.insert(view, matched).tolist() == [1]
+    assert fusion.points[1].tolist() == [1, 0, 1]
+
+
+def fused(transform: np.ndarray) -> tuple[PointFusion, list[list[int]]]:
+    fusion, matches = PointFusion(0.05, 20.0), []
+    for index in range(4):
+        rgb, depth_m = images(index)
+        frame = Frame(index, 0.0, rgb, depth_m.astype(np.float32), transform @ pose(index), INTRINSICS)
+        view = view_of(frame, picked(36, 30), picked(48, 40), 0.6)
+        matches.append(fusion.associate(view).tolist())
+        fusion.fuse(view, np.array(matches[-1]))
+        fusion.insert(view, np.array(matches[-1]))
+    return fusion, matches
+
+
+def test_poses_relative_to_the_first_frame_give_the_same_map_moved() -> None:
+    """gradslam moves the poses; which points match and how they count does not change."""
+    world, matches = fused(np.eye(4))
+    to_first = np.linalg.inv(pose(0))
+    relative, same = fused(to_first)
+    assert matches == same
+    assert sum(one != ABSENT for one in matches[3]) > 100
+    np.testing.assert_allclose(world.points @ to_first[:3, :3].T + to_first[:3, 3], relative.points, atol=1e-12)
+    np.testing.assert_allclose(world.counts, relative.counts, rtol=1e-12)
+
+
+def test_what_counts_is_the_distance_to_the_camera_not_the_place_in_the_world() -> None:
+    counts = []
+    for distance in (1.0, 2.0):
+        depth_m = np.full((2, 2), distance, np.float32)
+        camera = np.eye(4)
+        camera[2, 3] = 5.0 - distance  # the same wall at 5 m, seen from nearer or farther
+        frame = Frame(0, 0.0, np.zeros((2, 2, 3), np.uint8), depth_m, camera, np.diag([1e9, 1e9, 1.0]))
+        fusion = PointFusion(0.05, 20.0)
+        view = view_of(frame, picked(2, 2), picked(2, 2), 0.6)
+        fusion.insert(view, fusion.associate(view))
+        assert fusion.points[:, 2].tolist() == [5.0] * 4
+        counts.append(fusion.counts[0])
+    assert counts == pytest.approx([np.exp(-1 / 0.72), np.exp(-4 / 0.72)])
+
+
+def test_intrinsics_without_a_focal_length_are_one_line() -> None:
+    flat = np.diag([0.0, 1.0, 1.0])
+    frame = Frame(3, 0.0, np.zeros((2, 2, 3), np.uint8), np.ones((2, 2), np.float32), np.eye(4), flat)
+    with pytest.raises(DataError, match=r"^frame 3: the intrinsics .* have no focal length$"):
+        view_of(frame, picked(2, 2), picked(2, 2), 0.6)
