@@ -12,6 +12,7 @@ from su3d_bench.types import (
     GroundTruth,
     Instances,
     Int32Array,
+    MethodAbout,
     PerceptionNeeds,
     SceneInfo,
     StageTimer,
@@ -22,6 +23,13 @@ class Oracle:
     """Hands back the ground truth as a map: one mask an instance, labelled with its class, scored 1."""
 
     name = "oracle"
+    about = MethodAbout(
+        paper="",
+        source="",
+        licence="that of this project",
+        needs=("ground truth",),
+        status="scores 1 where a protocol allows it; where it does not, its score is the ceiling",
+    )
 
     class Config(BaseModel):
         model_config = ConfigDict(extra="forbid", frozen=True)

@@ -8,10 +8,10 @@ and named so: a feature a group, and 1.0 for every score.
 from __future__ import annotations
 
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
@@ -92,10 +92,17 @@ class _View:
 
 
 class SAM3D:
-    """Groups by bidirectional overlap; ``finish`` gives the groups so far and changes nothing."""
+    """Masks of single images merged into groups by how many of their points overlap; features play no part in it.
+
+    ``finish`` gives the groups so far and changes nothing.
+    """
 
     name = "sam3d"
     Config = SAM3DConfig
+    presets: ClassVar[Mapping[str, Mapping[str, object]]] = {
+        "incremental": {"schedule": "incremental"},
+        "ensemble": {"ensemble": True},
+    }
     about = MethodAbout(
         paper="Yang, Wu, He, Zhao, Liu: SAM3D: Segment Anything in 3D Scenes, 2023",
         source="https://github.com/Pointcept/SegmentAnything3D, commit 2aaa8c9",
@@ -126,8 +133,11 @@ class SAM3D:
 
     @property
     def caveat(self) -> str:
-        """The original has neither features nor scores."""
-        return f"sam3d has no features of its own: ours are '{self.config.features}', and every score is 1"
+        """The original has neither features nor scores, and ends on the vertices of ScanNet's meshes."""
+        return (
+            f"sam3d has no features of its own: ours are '{self.config.features}', and every score is 1; its groups "
+            "are on the scan's mesh where the dataset has one, else on its merged cloud"
+        )
 
     @property
     def n_points(self) -> int:
@@ -138,6 +148,12 @@ class SAM3D:
     def n_instances(self) -> int:
         """Groups held: of the map, or of all frames while they wait for the tree."""
         return sum(cloud.n_groups for cloud in self._clouds)
+
+    @property
+    def map_bytes(self) -> int:
+        """What points, groups and the numbers of views take; the views' features come on top."""
+        parts = [(cloud.points, cloud.group, cloud.view_group, cloud.views) for cloud in self._clouds]
+        return sum(array.nbytes for arrays in parts for array in arrays)
 
     def receive_tools(self, tools: SceneTools) -> None:
         """Take the way to the scan's mesh."""

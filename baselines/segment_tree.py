@@ -60,8 +60,8 @@ class SegmentTree:
 def contacts_of(vertices: Float32Array, triangles: Int32Array, segments: Int64Array) -> Contacts:
     """Contacts between ``segments`` (V,), numbered 0 to S - 1: patches with a common edge, or in cubes that touch.
 
-    A patch is what one segment has in one cube; cubes touch that are one or share a face. The bend of a contact is (1 - cos) / 2 of the angle between the normals
-    of its patches, less where the surface is convex there.
+    A patch is what one segment has in one cube; cubes touch that are one or share a face. The bend of a contact is
+    (1 - cos) / 2 of the angle between the normals of its patches, less where the surface is convex there.
     """
     n_segments = int(segments.max()) + 1 if len(segments) else 0
     patch_m = _patch_size_m(vertices, triangles)

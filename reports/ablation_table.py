@@ -43,25 +43,26 @@ def ablation_table(
     sides = [_of_protocol(found, side) for side in SIDES]
     looks = [replace(shown, metrics=side.metrics, ceilings=False, scenes_count=False) for side in SIDES]
     rows: list[TableRow] = []
+    notes: dict[str, None] = {}
+    marks: dict[str, None] = {}
     for parameter in dict.fromkeys(one.parameter for one in sweep):
         members = [one for one in sweep if one.parameter == parameter]
-        halves = [_cells(members, side, look) for side, look in zip(sides, looks, strict=True)]
+        halves = [_cells(members, side, look, marks) for side, look in zip(sides, looks, strict=True)]
         rows += [
             TableRow(f"{parameter} = {one.value}", (*left, *right), group=parameter)
             for one, left, right in zip(members, *halves, strict=True)
         ]
     used = {one.method for one in sweep}
-    notes: dict[str, None] = {}
     for side, look in zip(sides, looks, strict=True):
         own = [one for method, one in side.items() if method in used]
         notes[f"{', '.join(look.metrics)}: {units(own[0], look)}"] = None
         labels = [one.method if one.is_whole else f"{one.method} ({one.scenes_text} scenes)" for one in own]
         notes |= dict.fromkeys(run_notes(own, labels))
-    figures = [figure for figure in published() if figure.table == "I"] if with_published else []
+    is_papers = with_published and sweep[0].method.partition("@")[0] == "opensu3d"
+    figures = [figure for figure in published() if figure.table == "I"] if is_papers else []
     reported, sources = reported_rows(figures, METRICS, len(METRICS))
-    return Table(
-        "I", "Ablation of single parameters.", "parameter", METRICS, (*rows, *map(_named, reported)), (*notes, *sources)
-    )
+    body = (*rows, *map(_named, reported))
+    return Table("I", "Ablation of single parameters.", "parameter", METRICS, body, (*notes, *marks, *sources))
 
 
 def _of_protocol(found: Sequence[Measured], side: Layout) -> dict[str, Measured]:
@@ -78,7 +79,10 @@ def _of_protocol(found: Sequence[Measured], side: Layout) -> dict[str, Measured]
     return members
 
 
-def _cells(sweep: Sequence[SweepRow], side: Mapping[str, Measured], shown: Shown) -> list[list[Cell]]:
+def _cells(
+    sweep: Sequence[SweepRow], side: Mapping[str, Measured], shown: Shown, marks: dict[str, None]
+) -> list[list[Cell]]:
+    """The cells of one parameter's rows; what must be said of the best of them is entered in ``marks``."""
     for one in sweep:
         if one.method not in side:
             raise ConfigError(
@@ -86,7 +90,8 @@ def _cells(sweep: Sequence[SweepRow], side: Mapping[str, Measured], shown: Shown
                 "where it stopped"
             )
     rows = [side[one.method] for one in sweep]
-    best, _ = best_rows(rows, shown)
+    best, why = best_rows(rows, shown)
+    marks |= {why: None} if why else {}
     return [
         cells_of(row, shown, {name for name in shown.metrics if k in best.get(name, ())}) for k, row in enumerate(rows)
     ]

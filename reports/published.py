@@ -81,7 +81,9 @@ def read_published(path: Path = FILE) -> tuple[Figure, ...]:
 def _explain(error: ValidationError | TypeError, table: dict[str, object], shown: str) -> str:
     if isinstance(error, TypeError):
         return f"{shown}: 'figure' is no list; write each as [[figure]]"
-    first = error.errors()[0]
+    faults = error.errors()
+    # a misspelt key is also a missing one; the misspelling says more
+    first = next((one for one in faults if one["type"] == "extra_forbidden"), faults[0])
     place = [str(part) for part in first["loc"]]
     where = shown
     if len(place) > 1:

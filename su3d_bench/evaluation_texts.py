@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -100,7 +101,8 @@ def read_text_features(path: Path) -> TextFeatures:
 def encoder_for(rules: ProtocolRules, n_dimensions: int, given: TextFeatures | None, *, is_own: bool) -> Encoder | str:
     """What names features of ``n_dimensions`` under a protocol, or the reason why nothing here can.
 
-    ``is_own``: the features come from a run of ours, whose encoder is the embedded one.
+    ``is_own``: the features come from a run of ours; those of the embedded encoder are told by their dimensions. The
+    protocol's encoder serves where its files are here.
     """
     if given is not None:
         missing = given.missing(rules)
@@ -117,4 +119,30 @@ def encoder_for(rules: ProtocolRules, n_dimensions: int, given: TextFeatures | N
     how = "give features of its class names with --text-features FILE.npz (names, features)"
     if rules.encoder is None:
         return f"no encoder of {n_dimensions} dimensions is here to name the features with; {how}"
-    return f"needs the encoder '{rules.encoder}' to name the features with, which is not here; {how}"
+    if (encoder := _real_encoder(rules.encoder)) is None:
+        return f"needs the encoder '{rules.encoder}' to name the features with, which is not here; {how}"
+    if encoder.dim != n_dimensions:
+        return (
+            f"the features have {n_dimensions} dimensions, those of the encoder '{rules.encoder}' {encoder.dim}; {how}"
+        )
+    return encoder
+
+
+def _real_encoder(name: str) -> Encoder | None:
+    """The foundation model that protocols call ``name``; None where it is none or its files are not here."""
+    from su3d_bench.perception.models.catalogue import encoder_known_as
+    from su3d_bench.perception.models.inspection import model_state
+
+    entry = encoder_known_as(name)
+    found = () if entry is None else model_state(entry).found
+    folder = next((files.folder for files in found if files.form.form == "transformers"), None)
+    return None if entry is None or folder is None else _loaded(entry.name, folder)
+
+
+@lru_cache(maxsize=2)
+def _loaded(name: str, folder: Path) -> Encoder:
+    """The encoder in ``folder``, kept with the features of the texts that it was asked for."""
+    from su3d_bench.perception.models.config import ModelsConfig
+    from su3d_bench.perception.models.loading import load_encoder
+
+    return load_encoder(ModelsConfig(encoder=name, paths={name: folder}))

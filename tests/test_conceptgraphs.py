@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import csv
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,11 +23,14 @@ from conceptgraphs_scene import (
     look,
     mapped,
 )
+from painted import colour_perception
 
+from su3d_bench import scene_run
 from su3d_bench.baselines.conceptgraphs import ConceptGraphs
 from su3d_bench.baselines.conceptgraphs_config import MappingConfig
 from su3d_bench.baselines.conceptgraphs_regions import kept_regions, lift, subtract_contained
 from su3d_bench.baselines.object_clouds import bounding_box, largest_cluster, voxel_average
+from su3d_bench.cli.main import main
 from su3d_bench.errors import DataError
 from su3d_bench.geometry import back_project
 from su3d_bench.opensu3d.config import OpenSU3DConfig
@@ -418,3 +424,20 @@ def test_halves_of_an_object_stay_two_until_the_overlap_merge() -> None:
     assert found_by(views, late) == 1  # the last overlap merge joins them anyhow
     assert found_by(views, late.model_copy(update={"merge_overlap_thresh": 0.0})) == 2
     assert opensu3d_finds(views) == 2
+
+
+def test_a_run_maps_painted_scenes_and_times_the_stages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    painted = f"{Path(__file__).parent}/painted.py:Painted/a"
+    settings = ["conceptgraphs.stride=1", "conceptgraphs.max_bbox_area_ratio=1.0", "conceptgraphs.denoise_interval=2"]
+    protocols = ["--protocols", "rooms-semantic", "rooms-instance"]
+    out = [*protocols, "--no-pictures", "--jobs", "1", "--out", str(tmp_path / "out")]
+    assert main(["run", "--scenes", painted, "--methods", "conceptgraphs", "--set", *settings, *out]) == 0
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    values = {name: value for one in metrics["results"] for name, value in one["result"]["metrics"].items()}
+    assert values["mAcc"] > 0.9
+    assert values["AP50"] == 1.0
+    (table,) = (tmp_path / "out").rglob("conceptgraphs/updates.csv")
+    columns = set(next(csv.reader(table.open())))
+    assert columns >= {f"{name}_ms" for name in ("filter", "backproject", "match", "merge", "denoise")}
+    assert columns >= {"n_points", "n_instances"}

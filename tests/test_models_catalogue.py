@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from su3d_bench.digests import digest_file
 from su3d_bench.errors import ConfigError, ModelMissing
 from su3d_bench.perception.models import files as model_files
 from su3d_bench.perception.models.catalogue import MODELS, PROFILE_MODELS, model_entry
@@ -133,7 +134,7 @@ def test_a_configured_path_is_used_and_nothing_beside_it(home: Path) -> None:
     (mine / "config.json").unlink()
     with pytest.raises(ModelMissing, match=r"mine lacks config\.json; fetch model\.safetensors, config\.json"):
         locate("clip-vit-b-32", path=mine)
-    with pytest.raises(ModelMissing, match="there is no .*absent; mend the path or fetch"):
+    with pytest.raises(ModelMissing, match=r"there is no .*absent; mend the path or fetch"):
         locate("clip-vit-b-32", path=home / "absent")
     with pytest.raises(ConfigError, match=r"is no file that it is read from; name a folder with model\.safetensors"):
         locate("clip-vit-b-32", path=fill(home / "other", ("x.bin",)) / "x.bin")
@@ -180,8 +181,12 @@ def test_the_digest_of_a_large_file_is_read_again_only_when_the_file_has_changed
     path = home / "weights.safetensors"
     path.write_bytes(bytes(2**20 + 1))
     n_read: list[Path] = []
-    digest_file = model_files.digest_file
-    monkeypatch.setattr(model_files, "digest_file", lambda path: (n_read.append(path), digest_file(path))[1])
+
+    def counted(path: Path) -> str:
+        n_read.append(path)
+        return digest_file(path)
+
+    monkeypatch.setattr(model_files, "digest_file", counted)
     first = file_sha256(path)
     assert (file_sha256(path), len(n_read)) == (first, 1)
     path.write_bytes(bytes(2**20 + 2))

@@ -240,14 +240,35 @@ def test_the_digest_moves_with_all_that_moves_a_feature(folder: Path, tmp_path: 
     digest = load_encoder(config(folder)).digest
     assert load_encoder(config(folder, batch=4)).digest == digest
     assert load_encoder(config(folder, transform="transformers")).digest != digest
-    for name, change in (
-        ("merges.txt", lambda path: path.write_text(path.read_text() + "x y</w>\n")),
-        ("model.safetensors", lambda path: path.write_bytes(path.read_bytes()[:-1] + b"\x01")),
-        ("preprocessor_config.json", lambda path: path.write_text(path.read_text().replace("0.48145466", "0.5"))),
-    ):
-        shutil.copytree(folder / "clip-vit-h-14", tmp_path / name / "clip-vit-h-14")
-        change(tmp_path / name / "clip-vit-h-14" / name)
+    changed = {
+        "merges.txt": lambda content: content + b"x y</w>\n",
+        "model.safetensors": lambda content: content[:-1] + b"\x01",
+        "preprocessor_config.json": lambda content: content.replace(b"0.48145466", b"0.5"),
+    }
+    for name, change in changed.items():
+        path = Path(shutil.copytree(folder / "clip-vit-h-14", tmp_path / name / "clip-vit-h-14")) / name
+        content: bytes = path.read_bytes()
+        path.write_bytes(change(content))
         assert load_encoder(config(tmp_path / name)).digest != digest, name
+
+
+@needs_models
+def test_an_encoder_knows_its_own_digest_of_another_device(folder: Path, tmp_path: Path) -> None:
+    here = load_encoder(config(folder))
+    other = load_encoder(config(folder, precision="bfloat16"))
+    assert isinstance(here, FoundationEncoder)
+    assert here.is_same_space(other.digest)
+    write_tiny_clip(tmp_path / "clip-vit-h-14", seed=1)
+    assert not here.is_same_space(load_encoder(config(tmp_path)).digest)
+    assert not here.is_same_space(load_encoder(config(folder, transform="transformers")).digest)
+
+
+@needs_models
+def test_the_towers_are_read_once_however_many_encoders_are_made(folder: Path) -> None:
+    first, second = load_encoder(config(folder)), load_encoder(config(folder))
+    first.encode_images(noise_images(1))
+    second.encode_images(noise_images(1))
+    assert first._towers is second._towers  # type: ignore[attr-defined]
 
 
 class _CountingTowers:

@@ -184,7 +184,9 @@ def box_on_a_floor() -> Surface:
         faces.append(corners + start)
         start += len(points)
     merged, inverse = np.unique(np.round(np.concatenate(parts), 4), axis=0, return_inverse=True)
-    return Surface(merged.astype(np.float32), inverse.reshape(-1)[np.concatenate(faces)].astype(np.int32))
+    corners = inverse.reshape(-1)[np.concatenate(faces)]
+    used, renumbered = np.unique(corners, return_inverse=True)
+    return Surface(merged[used].astype(np.float32), renumbered.reshape(corners.shape).astype(np.int32))
 
 
 class TestTree:

@@ -151,6 +151,8 @@ def test_the_tree_holds_all_frames_and_the_map_only_itself() -> None:
     waiting, merged = run(views, TREE), run(views, INCREMENTAL)
     assert (waiting.n_instances, merged.n_instances) == (6, 2)
     assert waiting.n_points == 3 * merged.n_points > 0
+    # 3 coordinates and a group a point, a group and a number a view, 8 bytes each; every mask of every frame is a view
+    assert merged.map_bytes == 8 * (4 * merged.n_points + 2 * 6)
 
 
 def test_a_feature_is_the_mean_of_the_views_or_that_of_the_largest() -> None:

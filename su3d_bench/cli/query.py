@@ -34,6 +34,9 @@ def add_parser(verbs: Any) -> None:
     )
     parser.add_argument("--method", default="opensu3d", help="whose map (default: opensu3d)")
     parser.add_argument("--top", type=int, default=10, metavar="N", help="how many instances to list (default: 10)")
+    parser.add_argument(
+        "--device", default="cpu", help="of the text's encoder, where it is no small one (default: cpu)"
+    )
     parser.add_argument("--out", type=Path, metavar="FILE", help="where the picture goes (default: beside the map)")
 
 
@@ -44,7 +47,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.opensu3d.retrieval import rank
     from su3d_bench.reports.pictures import draw_heat_map
     from su3d_bench.store import RunFolder, read_prediction
-    from su3d_bench.types import Instances
+    from su3d_bench.types import DenseFeatures, Instances
 
     if arguments.top < 1:
         raise ConfigError(f"--top {arguments.top}: at least 1 instance must be listed")
@@ -54,8 +57,9 @@ def call(arguments: argparse.Namespace) -> int:
         raise StoreError(f"{run.path}: holds no map of {arguments.scene} by {arguments.method}; {_advice(arguments)}")
     prediction = read_prediction(job.prediction)
     if not isinstance(prediction, Instances):
-        raise PredictionError(f"{job.prediction}: holds no instances, so there is nothing to rank")
-    ranking = rank(prediction, arguments.text, encoder_of(run))
+        what = "one feature a point and no instances" if isinstance(prediction, DenseFeatures) else "no instances"
+        raise PredictionError(f"{job.prediction}: has {what}, so there is nothing to rank; choose another --method")
+    ranking = rank(prediction, arguments.text, encoder_of(run, arguments.device))
     rows = _rows(prediction, ranking, arguments.top)
     picture = arguments.out or job.pictures / f"query-{_file_name(arguments.text)}.png"
     lines = [f"{row['rank']}. {row['name']}  {row['similarity']:.3f}" for row in rows]
@@ -104,20 +108,35 @@ def _advice(arguments: argparse.Namespace) -> str:
     return f"run: su3d-bench run --scenes {arguments.scene} --methods {arguments.method} --out {arguments.run}"
 
 
-def encoder_of(run: RunFolder) -> Encoder:
-    """The text tower that the run's features go with; another version of it is an error, never a wrong ranking."""
-    from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
+def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
+    """The text tower that the run's features go with, on ``device``; another one is an error, never a wrong ranking."""
+    from su3d_bench.config import read_file, resolve
+    from su3d_bench.perception.cache import FrameCache
+    from su3d_bench.perception.config import PerceptionConfig
+    from su3d_bench.perception.models.catalogue import encoder_known_as
+    from su3d_bench.perception.models.encoder import FoundationEncoder
+    from su3d_bench.perception.models.loading import load_encoder
+    from su3d_bench.planning import cache_root
     from su3d_bench.store import read_json
 
     record = read_json(run.path / "run.json")
-    encoder: Encoder = EmbeddedEncoder()
-    made_with = record.get("encoder_digest") if isinstance(record, dict) else None
-    if made_with not in (None, encoder.digest):
-        raise PredictionError(
-            f"{run.path}: its features were made by encoder {record['encoder']} ({made_with[:12]}), here is "
-            f"{encoder.name} ({encoder.digest[:12]}); run it again"
-        )
-    return encoder
+    record = record if isinstance(record, dict) else {}
+    made_by, made_with = record.get("encoder"), record.get("encoder_digest")
+    entry = encoder_known_as(made_by)
+    config = PerceptionConfig()
+    if entry is not None:
+        config = resolve(read_file(run.path / "run.toml"), ("perception",), PerceptionConfig)
+    here = {"device": device, "precision": "auto", "provider": None, "batch": 0}
+    models = config.models.model_copy(update={**here, "encoder": entry.name if entry else None})
+    encoder = load_encoder(models, cache=FrameCache(cache_root() if config.cache else None))
+    if made_with in (None, encoder.digest):
+        return encoder
+    if isinstance(encoder, FoundationEncoder) and encoder.is_same_space(made_with):
+        return encoder
+    raise PredictionError(
+        f"{run.path}: its features were made by encoder {made_by} ({made_with[:12]}), here is "
+        f"{encoder.name} ({encoder.digest[:12]}); run it again"
+    )
 
 
 def _file_name(text: str) -> str:

@@ -14,7 +14,7 @@ from su3d_bench.errors import EXIT_DONE, ConfigError, PredictionError, StoreErro
 if TYPE_CHECKING:
     from su3d_bench.perception.language.refined_names import NameRecords
     from su3d_bench.perception.language.refinement import RefinedName, TopNames
-    from su3d_bench.store import JobFolder
+    from su3d_bench.store import JobFolder, RunFolder
     from su3d_bench.types import Instances
 
 REFINERS = ("vote", "model")
@@ -72,19 +72,31 @@ def call(arguments: argparse.Namespace) -> int:
 
 def _jobs(arguments: argparse.Namespace) -> dict[str, JobFolder]:
     """Scene -> folder of its map, of the scenes asked for."""
-    from su3d_bench.finished_run import read_run
+    from su3d_bench.store import RunFolder
 
-    run = read_run(arguments.run)
-    run_scenes = run.scenes
+    run = RunFolder(arguments.run)
+    known = _scenes(run)
     for scene in arguments.scenes or ():
-        if scene not in run_scenes:
-            hint = suggest(scene, run_scenes) or f"; it has {', '.join(run_scenes[:8])}"
-            raise ConfigError(f"{run.name}: holds no scene '{scene}'{hint}")
-    jobs = {scene: run.folder.job(scene, arguments.method) for scene in arguments.scenes or run_scenes}
+        if scene not in known:
+            hint = suggest(scene, known) or f"; it has {', '.join(known[:8])}"
+            raise ConfigError(f"{run.path}: holds no scene '{scene}'{hint}")
+    jobs = {scene: run.job(scene, arguments.method) for scene in arguments.scenes or known}
     found = {scene: job for scene, job in jobs.items() if job.prediction.is_file()}
     if not found:
-        raise StoreError(f"{run.name}: holds no map by '{arguments.method}'; it has {', '.join(run.methods)}")
+        raise StoreError(f"{run.path}: holds no map by '{arguments.method}'; name another with --method")
     return found
+
+
+def _scenes(run: RunFolder) -> list[str]:
+    """The scenes that the run was asked for."""
+    from su3d_bench.plain_text import printable
+    from su3d_bench.store import read_json
+
+    record = read_json(run.path / "run.json")
+    scenes = record.get("scenes") if isinstance(record, dict) else None
+    if not isinstance(scenes, list) or not all(isinstance(one, str) and ".." not in one for one in scenes):
+        raise StoreError(f"{run.path}: run.json is not as a run writes it; name the folder of a run")
+    return [printable(one, 200) for one in scenes]
 
 
 def _map(job: JobFolder) -> Instances:

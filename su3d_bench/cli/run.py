@@ -11,7 +11,7 @@ from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
 from su3d_bench.errors import EXIT_DONE, EXIT_INCOMPLETE
 
 if TYPE_CHECKING:
-    from su3d_bench.config import Settings
+    from su3d_bench.config import KeyPath, Settings
     from su3d_bench.planning import Plan
     from su3d_bench.runner import RunResult
 
@@ -38,7 +38,10 @@ def add_parser(verbs: Any) -> None:
 def add_run_flags(parser: argparse.ArgumentParser) -> None:
     """The flags of every verb that runs methods, but which methods."""
     parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="addresses or patterns (default: 'rooms/*')")
-    parser.add_argument("--profile", help="who supplies perception: auto, embedded, oracle, stored (default: auto)")
+    parser.add_argument(
+        "--profile", help="who supplies perception: auto, embedded, oracle, stored, paper (default: auto)"
+    )
+    parser.add_argument("--device", help="of foundation models: cpu, cuda (all GPUs, by job) or cuda:1 (default: cpu)")
     parser.add_argument(
         "--protocols", nargs="+", metavar="PROTOCOL", help="evaluations (default: those of the dataset)"
     )
@@ -86,8 +89,9 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
     from su3d_bench.config import Setting, Settings, read_file
 
     settings = Settings() if arguments.config is None else read_file(arguments.config)
-    flags = [(name, getattr(arguments, name)) for name in FLAGS_OF_KEYS]
-    return settings + Settings(tuple(Setting((n,), value, f"--{n}") for n, value in flags if value is not None))
+    flags: list[tuple[KeyPath, Any]] = [((name,), getattr(arguments, name)) for name in FLAGS_OF_KEYS]
+    flags.append((("perception", "models", "device"), arguments.device))
+    return settings + Settings(tuple(Setting(key, value, f"--{key[-1]}") for key, value in flags if value is not None))
 
 
 def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:

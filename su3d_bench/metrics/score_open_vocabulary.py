@@ -19,6 +19,7 @@ from su3d_bench.metrics.scene_score import SceneScore, n_predictions
 from su3d_bench.metrics.score_instances import distance_to_masks
 from su3d_bench.metrics.score_semantic import has_feature
 from su3d_bench.protocols import ProtocolRules
+from su3d_bench.row_blocks import release_pages
 from su3d_bench.types import (
     DenseFeatures,
     Encoder,
@@ -181,6 +182,7 @@ def _similarity_blocks(
     text = text_features(rules, truth.prompts, features, known)
     for start in range(0, len(used), _BLOCK_UNITS):
         yield cosines(features[used[start : start + _BLOCK_UNITS]], text)
+        release_pages(features)
 
 
 def _features(

@@ -24,6 +24,7 @@ from su3d_bench.types import (
     Instances,
     Int32Array,
     Int64Array,
+    MethodAbout,
     PerceptionNeeds,
     SceneInfo,
     StageTimer,
@@ -31,10 +32,18 @@ from su3d_bench.types import (
 
 
 class OpenSU3D:
-    """The reference pipeline; ``finish`` gives the map so far and changes nothing."""
+    """Masks of single images, fused and tracked into one map of instances, frame by frame: the reference pipeline."""
 
     name = "opensu3d"
     Config = OpenSU3DConfig
+    about = MethodAbout(
+        paper="Mohiuddin et al.: OpenSU3D: Open World 3D Scene Understanding using Foundation Models",
+        source="written from the paper; no code of its authors was read",
+        licence="that of this project",
+        needs=("masks of named objects with scores", "an encoder of images and texts"),
+        status="each step is tested on hand-worked cases; never run beside the original, and no figure of its paper "
+        "has been reproduced",
+    )
     presets: ClassVar[Mapping[str, Mapping[str, str]]] = {scheme: {"scheme": scheme} for scheme in SCHEMES}
     # The paper's letters, as its ablation (Table I) varies them.
     short_names: ClassVar[Mapping[str, tuple[str, Callable[[Any], Any]]]] = {

@@ -34,7 +34,7 @@ ABOVE_SHARE, ABOVE_PAD_M, ABOVE_M = 0.15, 0.1, 2.2  # rooms_truth: share of the 
 UNDER_SHARE = 0.2  # rooms_truth: a rug and what stands on it
 MIN_BEARING_RAD = 0.05  # rooms_truth: two things nearer to one line of sight are neither left nor right
 BETWEEN_ENDS = 0.05  # ours: share of the way, at either end, that is not between
-BETWEEN_ASIDE, BETWEEN_ASIDE_M = 0.25, 0.3  # ours: aside by this share of the way, or by this much
+BETWEEN_SLOPE, BETWEEN_ASIDE_M = 0.5, 0.3  # ours: 27 degrees off the way from either end, or aside by this much
 
 CONTAINERS = frozenset(
     {"basket", "bin", "box", "bag", "backpack", "bathtub", "sink", "bucket", "drawer", "pot", "bowl", "vase", "crate"}
@@ -176,7 +176,7 @@ def is_between(a: Float64Array, b: Float64Array, c: Float64Array) -> bool:
     along = float((a - b)[:2] @ way) / length
     aside = abs(float(way[0] * (a - b)[1] - way[1] * (a - b)[0])) / length
     is_on_the_way = BETWEEN_ENDS * length < along < (1 - BETWEEN_ENDS) * length
-    return is_on_the_way and aside <= max(BETWEEN_ASIDE * length, BETWEEN_ASIDE_M)
+    return is_on_the_way and aside <= max(BETWEEN_SLOPE * min(along, length - along), BETWEEN_ASIDE_M)
 
 
 def bearing_rad(eye: Float64Array, a: Float64Array, b: Float64Array) -> float:

@@ -31,7 +31,7 @@ _REFUSAL = re.compile(
 )
 _FENCE = re.compile(r"```[a-zA-Z]*")
 _QUOTED_PAIR = re.compile(
-    rf"[{_QUOTE}]+(?P<name>[^\n:]{{1,80}}?)[{_QUOTE}]+\s*(?:[:：=]|[-–—]+>?)\s*(?P<caption>[^\n]{{1,2000}})"
+    rf"(?<!\w)[{_QUOTE}]+(?P<name>[^\n:]{{1,80}}?)[{_QUOTE}]+\s*(?:[:：=]|[-–—]+>?)\s*(?P<caption>[^\n]{{1,2000}})"
 )
 _LABELLED = re.compile(
     rf"[{_QUOTE}]*\b(?P<key>name|object|label|title|description|caption)\b[{_QUOTE}]*\s*[:：=]\s*"

@@ -42,12 +42,15 @@ class ModelForm:
     size_mb: int
     repository: str | None = None
     architecture: str | None = None
-    sha256: Mapping[str, str] = field(default_factory=_no_digests)
+    sha256: Mapping[str, str] = field(default_factory=_no_digests, hash=False)
 
 
 @dataclass(frozen=True)
 class ModelEntry:
-    """One model: ``n_parameters_million`` rules the memory that it takes; ``forms`` in the order they are tried."""
+    """One model: ``n_parameters_million`` rules the memory that it takes; ``forms`` in the order they are tried.
+
+    ``known_as``: architecture and training in open_clip's words, which protocols and run records use for encoders.
+    """
 
     name: str
     kind: Kind
@@ -56,6 +59,7 @@ class ModelEntry:
     n_parameters_million: int
     forms: tuple[ModelForm, ...]
     remark: str = ""
+    known_as: str = ""
 
     def memory_mb(self, bytes_a_weight: int) -> int:
         """What the weights alone take on the device, in MB; activations come on top."""
@@ -110,6 +114,7 @@ _ENTRIES = (
             ),
             _exported("clip-vit-h-14", 3948),
         ),
+        known_as="ViT-H-14/laion2b_s32b_b79k",
     ),
     ModelEntry(
         "clip-vit-l-14",
@@ -123,6 +128,7 @@ _ENTRIES = (
             _exported("clip-vit-l-14", 1712),
         ),
         _TORCHSCRIPT,
+        known_as="ViT-L-14/openai",
     ),
     ModelEntry(
         "clip-vit-l-14-336",
@@ -136,6 +142,7 @@ _ENTRIES = (
             _exported("clip-vit-l-14-336", 1713),
         ),
         _TORCHSCRIPT,
+        known_as="ViT-L-14-336/openai",
     ),
     ModelEntry(
         "clip-vit-b-32",
@@ -149,6 +156,7 @@ _ENTRIES = (
             _exported("clip-vit-b-32", 606),
         ),
         _TORCHSCRIPT,
+        known_as="ViT-B-32/openai",
     ),
     ModelEntry(
         "siglip-base-224",
@@ -160,6 +168,7 @@ _ENTRIES = (
             _hub("google/siglip-base-patch16-224", 813, (*_CLIP_FILES[:3], "tokenizer.json")),
             _exported("siglip-base-224", 814),
         ),
+        known_as="ViT-B-16-SigLIP/webli",
     ),
     ModelEntry(
         "siglip-so400m-384",
@@ -171,6 +180,7 @@ _ENTRIES = (
             _hub("google/siglip-so400m-patch14-384", 3512, (*_CLIP_FILES[:3], "tokenizer.json")),
             _exported("siglip-so400m-384", 3513),
         ),
+        known_as="ViT-SO400M-14-SigLIP-384/webli",
     ),
     ModelEntry(
         "sam-vit-h",
@@ -278,3 +288,8 @@ def model_entry(name: str, kind: Kind | None = None) -> ModelEntry:
         what = kind or "model"
         raise ConfigError(f"unknown {what} '{name}'{suggest(name, known) or '; known: ' + ', '.join(known)}")
     return MODELS[name]
+
+
+def encoder_known_as(name: str | None) -> ModelEntry | None:
+    """The encoder that protocols and run records call ``name``."""
+    return next((entry for entry in _ENTRIES if entry.known_as == name and entry.kind == "encoder"), None)

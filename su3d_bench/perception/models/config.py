@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import re
 from pathlib import Path
 from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from su3d_bench.perception.models.catalogue import MODELS
+from su3d_bench.perception.models.devices import DEVICE, EXPECTED_DEVICE
 from su3d_bench.perception.models.onnx_session import Provider
 
 EMBEDDED = "embedded"
@@ -42,8 +42,8 @@ class ModelsConfig(BaseModel):
     @field_validator("device")
     @classmethod
     def _is_a_device(cls, name: str) -> str:
-        if re.fullmatch(r"cpu|cuda(:[0-9]{1,2})?", name) is None:
-            raise ValueError("expected cpu, cuda or cuda:N")
+        if DEVICE.fullmatch(name) is None:
+            raise ValueError(EXPECTED_DEVICE)
         return name
 
     @field_validator("encoder")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import os
+import re
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
@@ -14,6 +15,8 @@ from su3d_bench.errors import ConfigError, ModelMissing
 
 Item = TypeVar("Item")
 CPU = "cpu"
+DEVICE = re.compile(r"cpu|cuda(:[0-9]{1,2})?")
+EXPECTED_DEVICE = "expected cpu, cuda or cuda:N"
 LARGEST_BATCH = 256
 # float16 has units of its own from compute capability 7.0 (Volta) on; before it, half is no faster or not there.
 HALF_CAPABILITY = (7, 0)
@@ -48,6 +51,8 @@ def device_for(device: str, job_index: int) -> str:
 
     Raises ``ConfigError`` for a GPU that is not here; torch is not asked where ``device`` is ``cpu``.
     """
+    if DEVICE.fullmatch(device) is None:
+        raise ConfigError(f"device {device[:40]!r}: {EXPECTED_DEVICE}")
     if device == CPU:
         return CPU
     torch = require("torch", f"device '{device}'")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -14,6 +15,7 @@ from su3d_bench.errors import DataError
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.models.devices import Batches
 from su3d_bench.perception.models.image_transform import ImageTransform
+from su3d_bench.perception.models.onnx_session import PROVIDERS
 from su3d_bench.perception.models.text_tokens import TOKENS_VERSION, TokensKind
 from su3d_bench.types import Float32Array, Int64Array, UInt8Array
 
@@ -71,11 +73,25 @@ class FoundationEncoder:
     @cached_property
     def digest(self) -> str:
         """Moves with the weights, the tokenizer, the preparation, the precision, the device's kind and the runtime."""
+        return self._digest_of(self._identity())
+
+    def is_same_space(self, digest: str) -> bool:
+        """Whether ``digest`` is of these weights and this preparation, be it on another device or in another precision.
+
+        Features then differ by rounding alone, and texts of the one may be compared with images of the other.
+        """
+        known = dict(self._identity())
+        if "provider" in known:
+            return any(digest == self._digest_of(known | {"provider": name}) for name in PROVIDERS)
+        kinds = itertools.product(("cpu", "cuda"), ("float32", "float16", "bfloat16"))
+        return any(digest == self._digest_of(known | {"device": d, "precision": p}) for d, p in kinds)
+
+    def _digest_of(self, identity: Mapping[str, Any]) -> str:
         known = {
             "name": self.name,
             "transform": self._spec.transform.settings(),
             "tokens": [self._spec.tokens, TOKENS_VERSION, self._spec.n_tokens, self._spec.pad_id],
-            **self._identity(),
+            **identity,
         }
         return content_key("encoder", ENCODER_VERSION, json.dumps(known, sort_keys=True))
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any
 
 from su3d_bench.errors import ConfigError
@@ -68,14 +68,7 @@ def _torch_encoder(
 ) -> FoundationEncoder:
     device = device_for(config.device, job_index)
     precision = precision_for(config.precision, device)
-    name = files.entry.name
-
-    def load_towers() -> Towers:
-        if config.runtime == "open_clip":
-            model = towers_open_clip.load_model(files)
-            return towers_open_clip.OpenClipTowers(model, device, precision, config.batch)
-        model = towers_transformers.load_model(files)
-        return towers_transformers.TransformersTowers(model, device, precision, config.batch)
+    load_towers = partial(_torch_towers, files, config.runtime, device, precision, config.batch)
 
     def identity() -> Mapping[str, Any]:
         kind = device.partition(":")[0]
@@ -87,7 +80,7 @@ def _torch_encoder(
     else:
         spec = towers_transformers.read_spec(files, config.transform)
         tokeniser = _tokeniser_of(files, spec)
-    return FoundationEncoder(name, spec, load_towers, tokeniser, identity, cache)
+    return FoundationEncoder(files.entry.known_as, spec, load_towers, tokeniser, identity, cache)
 
 
 def _onnx_encoder(
@@ -103,10 +96,21 @@ def _onnx_encoder(
     def identity() -> Mapping[str, Any]:
         return {"runtime": "onnx", "files": dict(manifest.files), "provider": provider}
 
-    def load_towers() -> Towers:
-        return towers_onnx.OnnxTowers(files, provider, device_index, config.batch)
+    load_towers = partial(_onnx_towers, files, provider, device_index, config.batch)
+    return FoundationEncoder(files.entry.known_as, spec, load_towers, _tokeniser_of(files, spec), identity, cache)
 
-    return FoundationEncoder(files.entry.name, spec, load_towers, _tokeniser_of(files, spec), identity, cache)
+
+# A worker makes a new encoder for each method and scene; the towers, gigabytes of them, are kept.
+@lru_cache(maxsize=1)
+def _torch_towers(files: ModelFiles, runtime: Runtime, device: str, precision: str, batch: int) -> Towers:
+    if runtime == "open_clip":
+        return towers_open_clip.OpenClipTowers(towers_open_clip.load_model(files), device, precision, batch)
+    return towers_transformers.TransformersTowers(towers_transformers.load_model(files), device, precision, batch)
+
+
+@lru_cache(maxsize=1)
+def _onnx_towers(files: ModelFiles, provider: Provider, device_index: int, batch: int) -> Towers:
+    return towers_onnx.OnnxTowers(files, provider, device_index, batch)
 
 
 def _tokeniser_of(files: ModelFiles, spec: EncoderSpec) -> Callable[[], Tokeniser]:

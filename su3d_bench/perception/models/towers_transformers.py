@@ -35,6 +35,9 @@ def read_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
     """What ``config.json`` and ``preprocessor_config.json`` say of an encoder; raises ``DataError`` for nonsense."""
     path = files.folder / "config.json"
     config = read_settings(path)
+    kind = config.get("model_type")
+    if kind not in ("clip", "siglip"):
+        raise DataError(f"{path}: model_type is {str(kind)[:40]!r}; an encoder is 'clip' or 'siglip'")
     text, vision = (_table(path, config, key) for key in ("text_config", "vision_config"))
     for table in (config, text, vision):
         _check_limits(path, table)
@@ -44,23 +47,23 @@ def read_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
         raise DataError(
             f"{files.folder}: the image tower takes {size} px, preprocessor_config.json makes {transform.size}"
         )
-    kind = config.get("model_type")
     if kind == "clip":
         dim = config.get("projection_dim", _CLIP_DIM)
         n_tokens, n_words = text.get("max_position_embeddings", _CLIP_TOKENS), text.get("vocab_size", _CLIP_WORDS)
         return EncoderSpec(dim, n_tokens, n_words, "clip", None, transform)
-    if kind == "siglip":
-        dim = text.get("projection_size", text.get("hidden_size", _SIGLIP_WIDTH))
-        n_tokens, n_words = text.get("max_position_embeddings", _SIGLIP_TOKENS), text.get("vocab_size", _SIGLIP_WORDS)
-        return EncoderSpec(dim, n_tokens, n_words, "siglip", text.get("pad_token_id", 1), transform)
-    raise DataError(f"{path}: model_type is {str(kind)[:40]!r}; an encoder is 'clip' or 'siglip'")
+    dim = text.get("projection_size", text.get("hidden_size", _SIGLIP_WIDTH))
+    n_tokens, n_words = text.get("max_position_embeddings", _SIGLIP_TOKENS), text.get("vocab_size", _SIGLIP_WORDS)
+    return EncoderSpec(dim, n_tokens, n_words, "siglip", text.get("pad_token_id", 1), transform)
 
 
 def _table(path: Any, config: Mapping[str, Any], key: str) -> Mapping[str, Any]:
-    table = config.get(key, {})
-    if not isinstance(table, dict):
-        raise DataError(f"{path}: {key} is no table; fetch the file anew")
-    return table
+    table: dict[str, Any] = {}
+    for name in (key, f"{key}_dict"):  # older files, LAION's among them, repeat a part there, and that counts
+        part = config.get(name)
+        if not isinstance(part, dict | None):
+            raise DataError(f"{path}: {name} is no table; fetch the file anew")
+        table |= part or {}
+    return {name: value for name, value in table.items() if value is not None}
 
 
 def _check_limits(path: Any, table: Mapping[str, Any]) -> None:

@@ -1,0 +1,282 @@
+"""``su3d-bench ask`` and ``su3d-bench refine`` as whoever types them meets them."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from chat_server import KEY, Answered, ChatServer, chat_server, error
+from scored_room import instances
+
+from su3d_bench.cli.main import build_parser, main
+from su3d_bench.reports.reasoning_picture import SpokenOf, draw_reasoning
+from su3d_bench.store import JobFolder, RunFolder, write_json, write_prediction
+from su3d_bench.types import Instances
+
+SCENE = "rooms/made"
+QUICK = ["backoff_s=0.001", "max_retries=1", "total_timeout_s=1.0", "max_failures_in_a_row=50"]
+
+
+def cube(x: float, y: float, z: float, side: float) -> np.ndarray:
+    """Points on a grid in a cube."""
+    steps = np.linspace(0, side, 6)
+    return np.stack(np.meshgrid(x + steps, y + steps, z + steps), axis=-1).reshape(-1, 3).astype(np.float32)
+
+
+def made_map() -> Instances:
+    """A bed, two sinks and a lamp on the bed; the nearer sink has id 30."""
+    clouds = [cube(0, 0, 0, 1.0), cube(3, 0, 0, 0.5), cube(0, 2, 0, 0.5), cube(0.3, 0.3, 1.0, 0.2)]
+    first = np.cumsum([0, *map(len, clouds)])
+    masks = [np.arange(a, b) for a, b in itertools.pairwise(first)]
+    made = instances(np.concatenate(clouds), masks, None)
+    return replace(
+        made,
+        names=("bed", "sink", "sink", "lamp"),
+        captions=("a bed in a scene", "a white sink in a scene", "a grey sink in a scene", ""),
+        boxes=np.array([[c.min(axis=0), c.max(axis=0)] for c in clouds]),
+        centroids=np.array([c.mean(axis=0) for c in clouds]),
+        ids=np.array([10, 20, 30, 40], np.int32),
+        view_indptr=np.array([0, 3, 4, 5, 6]),
+        views=np.zeros((6, 2), np.int32),
+        view_names=("bed", "sofa", "sofa", "sink", "basin", "lamp"),
+        view_scores=np.array([0.6, 0.5, 0.4, 0.9, 0.9, 0.9]),
+    )
+
+
+@pytest.fixture
+def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> JobFolder:
+    """A run in the folder ``runs/made`` below the working directory."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("OPENAI_API_KEY", KEY)
+    monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
+    job = RunFolder(Path("runs/made")).job(SCENE, "opensu3d")
+    job.prepare()
+    write_prediction(job.prediction, made_map())
+    write_json(Path("runs/made/run.json"), {"scenes": [SCENE]})
+    return job
+
+
+@pytest.fixture(scope="module")
+def shared() -> Iterator[ChatServer]:
+    with chat_server() as server:
+        yield server
+
+
+@pytest.fixture
+def server(shared: ChatServer) -> ChatServer:
+    pytest.importorskip("openai", reason="the models extra is not installed")
+    shared.bodies.clear()
+    shared.script.clear()
+    shared.answer = lambda body: Answered('{"answer": "the grey sink", "object_ids": [30, 10]}')
+    return shared
+
+
+def llm(server: ChatServer, *more: str) -> list[str]:
+    settings = [f"perception.language.{one}" for one in QUICK]
+    return ["--solver", "llm", "--model", "tiny", "--base-url", server.url, *more, "--set", *settings]
+
+
+def test_a_question_is_answered_with_ids_and_a_picture(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["ask", SCENE, "Which sink is closer to bed?"]) == 0
+    said = capsys.readouterr()
+    assert said.out == "sink #30 is closest to bed #10: 1.79 m; sink #20 2.77 m\n"
+    picture = job.pictures / "ask-which-sink-is-closer-to-bed.png"
+    assert f"picture: {picture}" in said.err
+    assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_json_tells_everything(job: JobFolder, capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out = tmp_path / "deep" / "answer.png"
+    words = ["ask", SCENE, "What is on the bed?", "--run", "runs/made", "--json", "--out", str(out)]
+    assert main(words) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["object_ids"], told["reference_ids"], told["is_settled"]) == ([40], [10], True)
+    assert (told["solver"], told["names"], told["picture"]) == ("built-in", "labels n", str(out))
+    assert out.is_file()
+
+
+def test_what_cannot_be_settled_is_said_and_not_drawn(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["ask", SCENE, "I am cold, what should I do?", "--out", "x.png"]) == 0
+    said = capsys.readouterr()
+    assert said.out.startswith("I cannot settle this: ")
+    assert "x.png: not drawn" in said.err
+    assert not Path("x.png").exists()
+
+
+def test_the_eye_decides_what_is_left(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
+    answers = []
+    for eye in (["-5", "1", "0"], ["5", "1", "0"]):
+        assert main(["ask", SCENE, "Is the bed left of the lamp?", "--quiet", "--eye", *eye]) == 0
+        answers.append(capsys.readouterr().out[:3])
+        assert main(["ask", SCENE, "Is there a sink left of the bed?", "--quiet", "--eye", *eye]) == 0
+        answers.append(capsys.readouterr().out[:3])
+    assert answers[1] == "yes"
+    assert answers[1] != answers[3]
+
+
+def test_a_model_answers_once_and_then_from_the_run(
+    job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["ask", SCENE, "Which sink is closer to bed?", "--json", *llm(server)]
+    assert main(words) == 0
+    first = capsys.readouterr().out
+    assert json.loads(first)["object_ids"] == [30, 10]
+    assert json.loads(first)["solver"] == "llm"
+    assert main(words) == 0
+    assert capsys.readouterr().out == first
+    assert main([*words, "--offline"]) == 0
+    assert capsys.readouterr().out == first
+    assert server.n_asked == 1
+    stored = list(Path("runs/made/language").glob("*.json"))
+    assert len(stored) == 1
+    assert KEY not in stored[0].read_text()
+
+
+def test_a_dry_run_says_what_it_would_cost_and_asks_nothing(
+    job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["ask", SCENE, "Where am I?", "--dry-run", "--solver", "llm"]) == 0
+    assert "1 requests, 0 of them answered before; 1 to send to gpt-4-1106-preview: about " in capsys.readouterr().out
+    assert main(["ask", SCENE, "Where am I?", "--dry-run", *llm(server)]) == 0
+    assert "no price in the table" in capsys.readouterr().out
+    assert main(["ask", SCENE, "Where am I?", "--dry-run"]) == 0
+    assert "nothing to pay" in capsys.readouterr().out
+    assert server.n_asked == 0
+    assert not Path("runs/made/language").exists()
+
+
+def test_prices_and_budget_come_from_a_file(
+    job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    Path("run.toml").write_text(
+        '[perception.language]\nbudget_usd = 0.000001\n[perception.language.prices."tiny"]\n'
+        "input_usd = 1.0\noutput_usd = 1.0\n"
+    )
+    assert main(["ask", SCENE, "Where am I?", *llm(server), "--config", "run.toml"]) == 3
+    assert "budget_usd = 1e-06 is reached" in capsys.readouterr().err
+    assert server.n_asked == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["ask", SCENE, " "], "the question is empty"),
+        (["ask", "rooms/none", "x"], "no run in runs/ holds rooms/none by opensu3d"),
+        (["ask", SCENE, "x", "--run", "runs/none"], "runs/none: holds no map of rooms/made by opensu3d"),
+        (["ask", SCENE, "x", "--names", "refined"], "has no labels n'; make them with su3d-bench refine"),
+        (["ask", SCENE, "x", "--solver", "lm"], "unknown --solver 'lm'; did you mean 'llm'?"),
+        (["ask", SCENE, "x", "--eye", "nan", "0", "0"], "expected three finite numbers of metres"),
+        (["ask", SCENE, "x", "--solver", "llm", "--offline"], "holds no reply to this ask request"),
+        (
+            ["ask", SCENE, "x", "--solver", "llm", "--base-url", "http://a:b@c/v1"],
+            "--base-url: language.base_url = 'http://a:b@c/v1': holds a name, a password or a query; keys belong in",
+        ),
+        (
+            ["ask", SCENE, "x", "--solver", "llm", "--set", "perception.language.temprature=1"],
+            "unknown key 'temprature'; did you mean 'temperature'?",
+        ),
+        (
+            ["ask", SCENE, "x", "--solver", "llm", "--set", "perception.cache=false"],
+            "only perception.language.KEY=VALUE is of use here",
+        ),
+    ],
+)
+def test_wrong_input_is_one_line(
+    job: JobFolder, capsys: pytest.CaptureFixture[str], words: list[str], line: str
+) -> None:
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert line in said
+    assert said.count("\n") == 1
+
+
+def test_a_missing_key_is_one_line(
+    job: JobFolder, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("openai", reason="the models extra is not installed")
+    monkeypatch.delenv("OPENAI_API_KEY")
+    assert main(["ask", SCENE, "x", "--solver", "llm"]) == 2
+    assert "su3d-bench: $OPENAI_API_KEY is not set" in capsys.readouterr().err
+
+
+def test_labels_n_prime_by_vote_are_what_ask_uses(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["refine", "runs/made"]) == 0
+    said = capsys.readouterr().out
+    assert "rooms/made: 4 instances, 2 names changed" in said
+    assert "10  bed -> sofa" in said
+    assert "30  sink -> basin" in said
+    assert main(["ask", SCENE, "Where is the sofa?", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["object_ids"], told["names"]) == ([10], "labels n' by vote")
+    assert main(["ask", SCENE, "Where is the sofa?", "--names", "label"]) == 0
+    assert "I cannot settle this" in capsys.readouterr().out
+
+
+def test_labels_n_prime_by_a_model_are_asked_for_once(
+    job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    server.answer = lambda body: Answered("I'm sorry." if "basin" in body["messages"][1]["content"] else "furniture")
+    words = ["refine", "runs/made", "--refiner", "model", "--model", "tiny", "--base-url", server.url]
+    assert main(words) == 0
+    said = capsys.readouterr()
+    assert "10  bed -> furniture" in said.out
+    assert "label n stays for 1 instances: the model refused" in said.err
+    records = (job.path / "refined_names.json").read_bytes()
+    assert server.n_asked == 4
+    assert main([*words, "--offline"]) == 0
+    assert (job.path / "refined_names.json").read_bytes() == records
+    assert server.n_asked == 4
+
+
+def test_a_refinement_over_a_failing_server_ends_complete(
+    job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    server.answer = lambda body: error(500, "down")
+    settings = [f"perception.language.{one}" for one in QUICK]
+    words = ["refine", "runs/made", "--refiner", "model", "--base-url", server.url, "--set", *settings]
+    assert main(words) == 0
+    assert "label n stays for 4 instances: status 500: down; tried 2 times" in capsys.readouterr().err
+    assert server.n_asked == 8
+    assert main([*words, "--dry-run"]) == 0
+    assert "4 requests, 4 of them answered before; 0 to send" in capsys.readouterr().out
+
+
+def test_a_map_without_names_of_views_cannot_be_refined(job: JobFolder, capsys: pytest.CaptureFixture[str]) -> None:
+    write_prediction(job.prediction, replace(made_map(), view_names=None, view_scores=None))
+    assert main(["refine", "runs/made"]) == 2
+    assert "keeps no names of views to choose from" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("verb", ["ask", "refine"])
+def test_the_help_ends_with_two_examples_that_parse(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([verb, "--help"]) == 0
+    lines = capsys.readouterr().out.rstrip().splitlines()[-2:]
+    for line in lines:
+        assert build_parser().parse_args(shlex.split(line)[1:]).verb == verb
+
+
+def test_the_built_in_solver_loads_no_language_package(job: JobFolder) -> None:
+    code = (
+        "import sys; from su3d_bench.cli.main import main\n"
+        f"code = main(['ask', {SCENE!r}, 'How many sinks are there?', '--quiet'])\n"
+        "print('heavy:', sorted({'openai', 'torch', 'transformers', 'onnxruntime'} & set(sys.modules)), code)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.splitlines() == ["2: sink #20, sink #30", "heavy: [] 0"], done.stderr
+
+
+def test_hostile_names_are_drawn_as_text(tmp_path: Path) -> None:
+    names = ["$\\frac{1}{0}$", "a\x1b[31mb", "x" * 500, "<b>"]
+    path = tmp_path / "picture.png"
+    draw_reasoning(made_map(), SpokenOf((0, 1, 2), (3,)), names, path, "$x_{$", ["$\\bad$" * 200])
+    first = path.read_bytes()
+    draw_reasoning(made_map(), SpokenOf((0, 1, 2), (3,)), names, path, "$x_{$", ["$\\bad$" * 200])
+    assert path.read_bytes() == first

@@ -1,0 +1,304 @@
+"""Maps with one feature a point, within bounds: on disk as in memory, stored beside the map, resumed, cleared."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from box_room import INTRINSICS, images, pose
+from painted import colour_perception
+
+from su3d_bench import scene_run, store
+from su3d_bench.baselines import feature_table
+from su3d_bench.baselines.conceptfusion import ConceptFusion, ConceptFusionConfig
+from su3d_bench.baselines.feature_table import FeatureTable, scratch_folder
+from su3d_bench.cli.main import main
+from su3d_bench.errors import PredictionError, StoreError
+from su3d_bench.metrics.labelling import most_similar
+from su3d_bench.metrics.score_semantic import has_feature
+from su3d_bench.predictions.own_runs import OwnRuns
+from su3d_bench.store import features_beside, npz_bytes, read_prediction, write_prediction
+from su3d_bench.timing import Timer
+from su3d_bench.types import DenseFeatures, Detections, Frame, Partition, SceneInfo
+
+HERE = Path(__file__).parent
+POINTS = np.arange(12, dtype=np.float32).reshape(4, 3)
+ROWS = np.arange(20, dtype=np.float16).reshape(4, 5)
+
+
+# ---- on disk as in memory
+
+
+def in_the_box(index: int) -> tuple[Frame, Detections]:
+    rgb, depth_m = images(index)
+    masks = np.array([(rgb == colour).all(-1) for colour in np.unique(rgb.reshape(-1, 3), axis=0)])
+    features = np.random.default_rng(index).normal(size=(len(masks) + 1, 48)).astype(np.float32)
+    features /= np.linalg.norm(features, axis=1, keepdims=True)
+    found = Detections(
+        index, masks, np.tile(np.array([0, 0, 48, 36], np.float32), (len(masks), 1)),
+        np.ones(len(masks), np.float32), ("side",) * len(masks), ("",) * len(masks), (1.0,),
+        features[1:, None], features[0],
+    )  # fmt: skip
+    return Frame(index, 0.0, rgb, depth_m.astype(np.float32), pose(index), INTRINSICS), found
+
+
+def fused(features_in: Any) -> ConceptFusion:
+    method = ConceptFusion(ConceptFusionConfig(height=36, width=48, features_in=features_in))
+    method.start(SceneInfo("made", "box", 6, 1, "camera"))
+    for index in range(6):
+        method.update(*in_the_box(index), Timer())
+    return method
+
+
+def test_features_on_disk_equal_those_in_memory_to_the_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(feature_table, "BLOCK_ROWS", 100)  # many blocks
+    on_disk, in_memory = fused("disk"), fused("memory")
+    disk, memory = on_disk.finish(), in_memory.finish()
+    assert isinstance(disk.features, np.memmap) and not isinstance(memory.features, np.memmap)
+    assert disk.features.dtype == memory.features.dtype == np.float16
+    np.testing.assert_array_equal(disk.features.view(np.uint16), memory.features.view(np.uint16))
+    np.testing.assert_array_equal(disk.points, memory.points)
+    assert on_disk.n_points > 1.2 * 36 * 48  # it grew, so that the file was mapped at several sizes
+    assert on_disk.map_bytes == in_memory.map_bytes
+    for prediction in (disk, memory):
+        assert not prediction.features.flags.writeable
+
+
+def test_blocks_of_any_size_give_the_same_bits(monkeypatch: pytest.MonkeyPatch) -> None:
+    whole = fused("disk").finish()
+    monkeypatch.setattr(feature_table, "BLOCK_ROWS", 7)
+    np.testing.assert_array_equal(fused("disk").finish().features, whole.features)
+
+
+def test_the_mean_is_that_of_float32_rounded_to_half_precision_once_an_update() -> None:
+    table = FeatureTable(2, "memory")
+    first, second = np.array([[0.1, 1.0]], np.float16), np.array([[0.3, -1.0]], np.float16)
+    table.append(first, np.zeros(1, np.int32), np.array([3.0]))
+    table.average(np.array([0]), second, np.zeros(1, np.int32), np.array([1.0]))
+    expected = np.float32(0.75) * first.astype(np.float32) + np.float32(0.25) * second.astype(np.float32)
+    np.testing.assert_array_equal(table.features(), expected.astype(np.float16))
+    assert table.confidences.tolist() == [4.0]
+
+
+# ---- scratch
+
+
+def test_features_lie_in_a_file_without_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    monkeypatch.setattr(feature_table.tempfile, "tempdir", None)
+    table = FeatureTable(4, "disk")
+    table.append(np.ones((1, 4), np.float16), np.zeros(9, np.int32), np.ones(9))
+    held = table.features()
+    assert scratch_folder() == tmp_path
+    assert list(tmp_path.iterdir()) == []
+    table.close()
+    assert held.sum() == 36  # what was handed out stays readable
+
+
+def test_a_killed_run_leaves_no_scratch_behind(tmp_path: Path) -> None:
+    code = (
+        "import os, signal, sys, numpy as np\n"
+        "from su3d_bench.baselines.feature_table import FeatureTable\n"
+        "table = FeatureTable(64, 'disk')\n"
+        "table.append(np.ones((1, 64), np.float16), np.zeros(5000, np.int32), np.ones(5000))\n"
+        "assert table.features().sum() == 5000 * 64\n"
+        "os.kill(os.getpid(), signal.SIGKILL)\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], env=os.environ | {"TMPDIR": str(tmp_path)}, check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_full_disk_is_one_line(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    table = FeatureTable(4, "disk")
+
+    class Full:
+        def seek(self, offset: int) -> None:
+            pass
+
+        def write(self, content: bytes) -> None:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    table._file = Full()  # type: ignore[assignment]
+    with pytest.raises(StoreError, match=r"cannot write features to .*: No space left on device; set TMPDIR"):
+        table.append(np.ones((1, 4), np.float16), np.zeros(9, np.int32), np.ones(9))
+    monkeypatch.setattr(feature_table, "scratch_folder", lambda: tmp_path / "none")
+    with pytest.raises(StoreError, match=r"cannot write features to .*none: No such file"):
+        FeatureTable(4, "disk")
+
+
+# ---- the store
+
+
+def test_the_features_of_a_dense_map_are_a_file_of_their_own_that_is_mapped_when_read(tmp_path: Path) -> None:
+    path = tmp_path / "prediction.npz"
+    write_prediction(path, DenseFeatures(POINTS, ROWS))
+    assert sorted(child.name for child in tmp_path.iterdir()) == ["prediction.features.npy", "prediction.npz"]
+    with np.load(path) as archive:
+        assert set(archive.files) == {"kind", "points"}
+    again = read_prediction(path)
+    assert isinstance(again, DenseFeatures) and isinstance(again.features, np.memmap)
+    np.testing.assert_array_equal(again.features, ROWS)
+    np.testing.assert_array_equal(np.load(features_beside(path)), ROWS)
+
+
+def test_features_written_in_blocks_are_the_file_that_numpy_saves(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(store, "ROWS_AT_ONCE", 3)
+    write_prediction(tmp_path / "a.npz", DenseFeatures(POINTS, ROWS))
+    np.save(tmp_path / "b.npy", ROWS)
+    assert (tmp_path / "a.features.npy").read_bytes() == (tmp_path / "b.npy").read_bytes()
+    mapped = read_prediction(tmp_path / "a.npz")
+    write_prediction(tmp_path / "c.npz", mapped)
+    assert (tmp_path / "c.features.npy").read_bytes() == (tmp_path / "b.npy").read_bytes()
+
+
+def test_an_empty_dense_map_comes_back_empty(tmp_path: Path) -> None:
+    write_prediction(tmp_path / "a.npz", DenseFeatures(POINTS[:0], ROWS[:0]))
+    again = read_prediction(tmp_path / "a.npz")
+    assert isinstance(again, DenseFeatures) and again.features.shape == (0, 5)
+    assert OwnRuns().read(tmp_path / "a.npz", "a").content.features.shape == (0, 5)  # type: ignore[union-attr]
+
+
+def test_another_kind_of_map_in_its_place_takes_the_features_away_and_is_stored_as_ever(tmp_path: Path) -> None:
+    path = tmp_path / "prediction.npz"
+    write_prediction(path, DenseFeatures(POINTS, ROWS))
+    partition = Partition(POINTS, np.zeros(4, np.int32), ROWS[:1].astype(np.float32))
+    write_prediction(path, partition)
+    assert [child.name for child in tmp_path.iterdir()] == ["prediction.npz"]
+    assert path.read_bytes() == npz_bytes(store.prediction_arrays(partition))
+
+
+@pytest.mark.parametrize("damage", ["missing", "cut", "text", "rows", "integers"])
+def test_features_that_are_missing_or_damaged_are_one_line_for_both_readers(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "prediction.npz"
+    write_prediction(path, DenseFeatures(POINTS, ROWS))
+    beside = features_beside(path)
+    if damage == "missing":
+        beside.unlink()
+    elif damage == "cut":
+        beside.write_bytes(beside.read_bytes()[:-3])
+    elif damage == "text":
+        beside.write_text("not numbers")
+    else:
+        np.save(beside, ROWS[:3] if damage == "rows" else ROWS.astype(np.int16))
+    with pytest.raises(StoreError, match=r"prediction\.features\.npy: .*run again$"):
+        read_prediction(path)
+    with pytest.raises(PredictionError, match=r"prediction(\.features)?\.npy?z?: "):
+        OwnRuns().read(path, "prediction")
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        b"{'descr': '<f2', 'fortran_order': False, 'shape': (4, 999999999999), }",
+        b"{'descr': '|O', 'fortran_order': False, 'shape': (4, 5), }",
+        b"{'descr': '<f2', 'fortran_order': True, 'shape': (4, 5), }",
+        b"__import__('os').abort()",
+    ],
+)
+def test_hostile_features_are_refused(tmp_path: Path, header: bytes) -> None:
+    path = tmp_path / "prediction.npz"
+    write_prediction(path, DenseFeatures(POINTS, ROWS))
+    padded = header + b" " * (117 - len(header)) + b"\n"
+    content = b"\x93NUMPY\x01\x00" + len(padded).to_bytes(2, "little") + padded + ROWS.tobytes()
+    features_beside(path).write_bytes(content)
+    with pytest.raises(PredictionError, match=r"prediction\.features\.npy: "):
+        OwnRuns().read(path, "prediction")
+
+
+def test_a_seal_vouches_for_the_features_too(tmp_path: Path) -> None:
+    job = store.RunFolder(tmp_path).job("rooms/living0", "dense")
+    job.prepare()
+    write_prediction(job.prediction, DenseFeatures(POINTS, ROWS))
+    job.seal("predict", {"method": "dense"}, [job.prediction])
+    assert job.is_done("predict", {"method": "dense"})
+    beside = features_beside(job.prediction)
+    content = bytearray(beside.read_bytes())
+    content[-1] ^= 1
+    beside.write_bytes(content)
+    assert not job.is_done("predict", {"method": "dense"})
+
+
+# ---- scoring in blocks
+
+
+def test_labels_of_a_mapped_table_are_those_of_the_same_rows_in_memory(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(20_000, 16)).astype(np.float16)
+    features[::7] = 0
+    write_prediction(tmp_path / "a.npz", DenseFeatures(np.zeros((20_000, 3), np.float32), features))
+    mapped = read_prediction(tmp_path / "a.npz")
+    assert isinstance(mapped, DenseFeatures)
+    text = rng.normal(size=(9, 16)).astype(np.float32)
+    np.testing.assert_array_equal(most_similar(mapped.features, text), most_similar(features, text))
+    np.testing.assert_array_equal(has_feature(mapped), np.arange(20_000) % 7 != 0)
+
+
+def test_a_map_larger_than_what_it_takes_is_fused_written_read_and_scored() -> None:
+    """256 MB of features: no step may hold them all; benchmarks/dense_memory.py measures 2 M points x 1024 so."""
+    words = ["--points", "250000", "--dimensions", "512"]
+    script = HERE.parent / "benchmarks" / "dense_memory.py"
+    done = subprocess.run([sys.executable, script, *words], capture_output=True, text=True, check=True)
+    steps = {line["step"]: line for line in map(json.loads, done.stdout.splitlines())}
+    scored = steps["read and score"]
+    assert scored["features_bytes"] == 250_000 * 512 * 2
+    assert scored["mAcc"] == scored["F-mIoU"] == 1.0
+    if scored["peak_bytes"] is None:
+        pytest.skip("this system does not tell the memory of a process")
+    most = max(step["peak_bytes"] for step in steps.values()) - steps["start"]["peak_bytes"]
+    assert most < 0.9 * scored["features_bytes"]
+
+
+# ---- runs
+
+
+@pytest.fixture
+def in_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def run(*more: str) -> int:
+    words = ["run", "--scenes", f"{HERE}/painted.py:Painted/a", "--methods", "conceptfusion", "conceptfusion-sam"]
+    settings = ["--stride", "1", "--set", "conceptfusion.height=24", "--set", "conceptfusion.width=32"]
+    protocols = ["--protocols", "rooms-semantic", "rooms-instance", "--jobs", "1", "--out", "out"]
+    return main([*words, *settings, *protocols, *more])
+
+
+def test_a_run_of_both_is_scored_resumed_and_mended(in_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run() == 0
+    results = json.loads(Path("out/metrics.json").read_text())["results"]
+    assert {one["method"] for one in results} == {"conceptfusion", "conceptfusion-sam"}
+    assert all(one["result"]["metrics"]["mAcc"] > 0.9 for one in results if one["protocol"] == "rooms-semantic")
+    job = Path("out/scenes/painted.a/conceptfusion")
+    assert "needs instances, and the method gives one feature a point" in (job / "done.json").read_text()
+    beside = job / "prediction.features.npy"
+    whole, inode = beside.read_bytes(), beside.stat().st_ino
+    assert run() == 0
+    assert beside.stat().st_ino == inode  # resumed: nothing was written
+    beside.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
+    assert run() == 0
+    assert beside.read_bytes() == whole
+    (job / ".prediction.features.npy.123.tmp").write_bytes(b"half")
+    beside.unlink()
+    assert run() == 0
+    assert beside.read_bytes() == whole
+    assert not list(job.glob(".*"))
+
+
+def test_a_query_of_a_dense_map_is_one_clear_line(in_folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--no-pictures") == 0
+    capsys.readouterr()
+    assert main(["query", "painted/a", "chair", "--run", "out", "--method", "conceptfusion"]) != 0
+    assert "has one feature a point and no instances" in capsys.readouterr().err

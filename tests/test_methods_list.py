@@ -1,0 +1,86 @@
+"""What the list of methods says of each, and which ones stand for all."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from su3d_bench import registry
+from su3d_bench.cli.main import main
+from su3d_bench.config import Setting, Settings
+from su3d_bench.planning import make_plan
+from su3d_bench.reports.published import figures_of
+from su3d_bench.types import MethodAbout
+
+SYSTEMS = (
+    "opensu3d",
+    "conceptfusion",
+    "conceptfusion-sam",
+    "conceptgraphs",
+    "conceptgraphs-detector",
+    "openmask3d",
+    "openmask3d-segment3d",
+    "sam3d",
+)
+
+
+def told(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    capsys.readouterr()
+    assert main(["methods", *words]) == 0
+    return capsys.readouterr().out
+
+
+def test_every_method_says_where_it_is_from_what_it_needs_and_what_was_shown(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    rows = {row["name"]: row for row in json.loads(told(capsys, "--json"))}
+    assert tuple(rows)[: len(SYSTEMS)] == SYSTEMS
+    for name in SYSTEMS:
+        row = rows[name]
+        assert all(row[field] for field in ("summary", "paper", "source", "licence", "needs", "status")), name
+        assert "reproduces the paper" not in row["status"], name
+
+
+@pytest.mark.parametrize("name", [*registry.METHODS])
+def test_what_is_said_of_a_method_is_made_of_texts(name: str) -> None:
+    about = registry.load("method", name).about
+    assert isinstance(about, MethodAbout)
+    assert all(isinstance(text, str) for text in (about.paper, about.source, about.licence, about.status, *about.needs))
+
+
+def test_a_method_shows_its_settings_and_what_papers_report(capsys: pytest.CaptureFixture[str]) -> None:
+    text = told(capsys, "conceptgraphs-detector")
+    assert "[method.conceptgraphs-detector]" in text
+    assert "# mAcc 38.72, F-mIoU 35.82: ConceptGraphs (Gu et al.), Table II" in text
+    assert "# as reported, each in its own set-up; no two need be comparable" in text
+    value = json.loads(told(capsys, "conceptgraphs-detector", "--json"))
+    assert len(value["published"]) == len(figures_of("conceptgraphs-detector"))
+    assert value["settings"]
+
+
+def test_the_settings_that_are_shown_can_be_used_as_they_stand(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    from su3d_bench.config import read_file
+
+    (tmp_path / "mine.toml").write_text(told(capsys, "opensu3d"))
+    assert read_file(tmp_path / "mine.toml").under(("method", "opensu3d"))
+
+
+def test_a_method_that_no_paper_reports_says_nothing_of_papers(capsys: pytest.CaptureFixture[str]) -> None:
+    assert "as reported" not in told(capsys, "oracle")
+
+
+def test_all_means_the_eight_systems_not_the_truth_nor_programs_of_others(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path))
+
+    def methods(*names: str) -> tuple[str, ...]:
+        entries = (Setting(("scenes",), ["rooms/living0"], "--scenes"), Setting(("methods",), list(names), "--methods"))
+        return make_plan(Settings(entries), (), tmp_path / "run").methods
+
+    assert methods("all") == SYSTEMS
+    assert methods("all", "oracle", "sam3d") == (*SYSTEMS, "oracle")

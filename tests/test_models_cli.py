@@ -1,0 +1,193 @@
+"""``su3d-bench models``: what each verb answers with models here, with none, and with wrong ones."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import socket
+import subprocess
+import sys
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from tiny_encoders import write_tiny_clip
+
+from su3d_bench.cli.main import build_parser, main
+from su3d_bench.perception.models.catalogue import MODELS
+
+needs_models = pytest.mark.skipif(
+    any(find_spec(name) is None for name in ("torch", "transformers", "onnx")),
+    reason="torch, transformers or onnx is not installed: pip install 'su3d-bench[models]'",
+)
+HEAVY = ("torch", "transformers", "onnxruntime", "open3d", "sklearn", "pandas", "matplotlib", "numba")
+
+
+@pytest.fixture(autouse=True)
+def home(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """No model is here, and a connection to anywhere is an error."""
+    monkeypatch.setenv("SU3D_MODELS", str(tmp_path / "models"))
+    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("HF_HOME", str(tmp_path / "hf"))
+    monkeypatch.delenv("HF_HUB_CACHE", raising=False)
+
+    def refuse(*_: object) -> None:
+        raise AssertionError("a command about models reached out to the network")
+
+    monkeypatch.setattr(socket.socket, "connect", refuse)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def tiny_clip(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return write_tiny_clip(tmp_path_factory.mktemp("tiny") / "clip-vit-b-32")
+
+
+@pytest.fixture
+def found(home: Path, tiny_clip: Path) -> Path:
+    """The tiny encoder where ``clip-vit-b-32`` is looked for."""
+    return Path(shutil.copytree(tiny_clip, home / "models" / "clip-vit-b-32"))
+
+
+def test_the_examples_of_every_action_parse() -> None:
+    for words in (
+        "models list --json",
+        "models check clip-vit-h-14 sam-vit-h",
+        "models export clip-vit-h-14 --out models/clip-vit-h-14-onnx",
+        "models warm --profile paper --device cuda",
+    ):
+        assert build_parser().parse_args(words.split()).verb == "models"
+
+
+@pytest.mark.parametrize("words", [["models", "--help"], ["models", "list"], ["models", "check", "--help"]])
+def test_listing_models_loads_nothing_heavy(words: list[str]) -> None:
+    code = (
+        "import sys; from su3d_bench.cli.main import main\n"
+        f"code = main({words!r})\n"
+        f"print('heavy:', ' '.join(sorted(set({HEAVY!r}) & set(sys.modules))), code)"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.splitlines()[-1].split() == ["heavy:", "0"], done.stderr
+
+
+def test_the_list_names_every_model_with_size_licence_and_that_it_is_missing(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    assert main(["models", "list"]) == 0
+    out, err = capsys.readouterr()
+    lines = {line.split()[0]: line for line in out.splitlines()}
+    assert set(lines) == set(MODELS)
+    assert lines["clip-vit-h-14"].split()[1:] == ["encoder", "3.9", "GB", "MIT", "missing", "(profile", "paper)"]
+    assert f"{len(MODELS)} missing; su3d-bench models check clip-vit-h-14 says what to fetch" in err
+
+
+@needs_models
+def test_the_list_says_where_a_model_lies(found: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["models", "list", "--json"]) == 0
+    rows = {row["name"]: row for row in json.loads(capsys.readouterr().out)}
+    assert rows["clip-vit-b-32"]["found"] == {"transformers": str(found)}
+    assert rows["clip-vit-b-32"]["missing"] is None
+    assert rows["clip-vit-b-32"]["memory_mb"] == {"float32": 604, "float16": 302}
+    assert "fetch model.safetensors" in rows["clip-vit-h-14"]["missing"]
+
+
+@needs_models
+def test_check_tells_the_digests_of_a_whole_model(found: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["models", "check"]) == 0
+    out = capsys.readouterr().out
+    assert out.splitlines()[0] == f"clip-vit-b-32 (transformers): {found}: whole"
+    assert main(["models", "check", "clip-vit-b-32", "--json"]) == 0
+    (row,) = json.loads(capsys.readouterr().out)
+    assert row["problems"] == []
+    assert set(row["sha256"]) >= {"model.safetensors", "config.json", "preprocessor_config.json"}
+    assert all(f"{digest}  {name}" in out for name, digest in row["sha256"].items())
+
+
+@needs_models
+def test_check_names_what_is_wrong_and_answers_1(found: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (found / "config.json").write_text('{"model_type": "bert"}')
+    assert main(["models", "check", "clip-vit-b-32"]) == 1
+    assert "config.json: model_type is 'bert'" in capsys.readouterr().out
+
+
+@needs_models
+def test_check_finds_weights_that_are_cut_short(found: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    weights = found / "model.safetensors"
+    weights.write_bytes(weights.read_bytes()[:3000])
+    assert main(["models", "check"]) == 1
+    assert "model.safetensors: not readable as safetensors" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["models", "check"], "none of the models is here"),
+        (["models", "check", "clip-h"], "unknown model 'clip-h'"),
+        (["models", "warm", "clip-vit-b-32"], "model 'clip-vit-b-32': not found; fetch model.safetensors"),
+        (["models", "warm", "clip-vit-b"], "unknown encoder 'clip-vit-b'; did you mean 'clip-vit-b-32'?"),
+        (["models", "warm", "embedded", "--device", "gpu"], "device = 'gpu': expected cpu, cuda or cuda:N"),
+        (["models", "warm", "embedded", "--profile", "paper"], "give an encoder or --profile, not both"),
+        (["models", "warm", "--profile", "papper"], "unknown profile 'papper'; did you mean 'paper'?"),
+        (["models", "warm"], "not found; fetch"),
+        (["models", "list", "--set", "perception.models.folder"], "expected KEY=VALUE"),
+        (["models", "list", "--set", "perception.models.foldr=x"], "did you mean 'folder'?"),
+    ],
+)
+def test_what_cannot_be_done_is_one_line(words: list[str], said: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words) == 2
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert said in err
+    assert len(err.splitlines()) == 1
+
+
+@needs_models
+def test_export_without_weights_or_of_a_model_that_is_not_exported_is_one_line(
+    home: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["models", "export", "clip-vit-h-14", "--out", str(home / "made")]) == 2
+    assert "not found; fetch model.safetensors" in capsys.readouterr().err
+    assert main(["models", "export", "ram-plus", "--out", str(home / "made")]) == 2
+    assert "'ram-plus' is not exported by this program; known: clip-vit-h-14" in capsys.readouterr().err
+    assert not (home / "made").exists()
+
+
+def test_a_named_model_that_is_missing_is_what_to_fetch(home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["models", "check", "sam-vit-h"]) == 1
+    assert capsys.readouterr().out.startswith("model 'sam-vit-h': not found; fetch model.safetensors")
+
+
+@needs_models
+def test_an_export_is_found_checked_and_run(found: Path, home: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = home / "models" / "clip-vit-b-32-onnx"
+    assert main(["models", "export", "clip-vit-b-32", "--out", str(out)]) == 0
+    answer = capsys.readouterr().out
+    assert "image: torch and ONNX Runtime differ by at most" in answer
+    assert "text: torch and ONNX Runtime differ by at most" in answer
+    assert main(["models", "check", "clip-vit-b-32", "--json"]) == 0
+    assert [row["form"] for row in json.loads(capsys.readouterr().out)] == ["transformers", "onnx"]
+    assert main(["models", "warm", "clip-vit-b-32", "--set", "perception.models.runtime=onnx", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["what"] == "ViT-B-32/openai"
+    (out / "text.onnx").write_bytes(b"")
+    assert main(["models", "check", "clip-vit-b-32"]) == 1
+    assert "text.onnx: is not the file that the manifest describes" in capsys.readouterr().out
+
+
+@needs_models
+def test_warm_tells_time_and_memory_and_the_digest_of_run_records(
+    found: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from su3d_bench.perception.models.config import ModelsConfig
+    from su3d_bench.perception.models.loading import load_encoder
+
+    assert main(["models", "warm", "clip-vit-b-32"]) == 0
+    out = capsys.readouterr().out
+    assert "ViT-B-32/openai: loaded and first run" in out
+    assert f"(process); digest {load_encoder(ModelsConfig(encoder='clip-vit-b-32')).digest[:12]}" in out
+
+
+def test_a_profile_without_files_can_be_warmed_too(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["models", "warm", "--profile", "embedded", "--json"]) == 0
+    row = json.loads(capsys.readouterr().out)
+    assert set(row["stages_ms"]) >= {"segment", "encode"}
+    assert row["memory_of"] == "process"

@@ -1,0 +1,164 @@
+"""GroundingDINO around its network: texts, boxes and names, by hand and against transformers' own steps."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from tiny_models import DINO_PX, blocks, tiny_dino, tiny_tokenizer
+
+from su3d_bench.perception.models.grounding_dino import (
+    CONCEPTGRAPHS_BOXES,
+    BoxConfig,
+    GroundingDino,
+    is_in_phrase,
+    tag_of,
+    text_prompt,
+)
+from su3d_bench.types import Float32Array
+
+RGB = blocks(40, 60)
+TAGS = ("cat", "coffee table", "sofa")
+
+
+@pytest.fixture(scope="module")
+def tokenizer(tmp_path_factory: pytest.TempPathFactory) -> Any:
+    return tiny_tokenizer(tmp_path_factory.mktemp("tokenizer"))
+
+
+@pytest.fixture(scope="module")
+def detector(tokenizer: Any) -> GroundingDino:
+    return GroundingDino(tiny_dino(), tokenizer, *DINO_PX)
+
+
+def test_a_prompt_closes_every_tag_with_a_full_stop() -> None:
+    assert text_prompt(["Cat", " coffee  table", "T.V."]) == "cat. coffee table. t v."
+
+
+def test_a_phrase_stands_for_itself_then_for_the_first_tag_in_it() -> None:
+    tags = ["table", "coffee table", "cat"]
+    assert tag_of("coffee table", tags) == "coffee table"
+    assert tag_of("black coffee table", tags) == "table"
+    assert tag_of("dog", tags) is None
+
+
+def test_tokens_above_the_threshold_name_a_box_but_not_the_ends_of_the_text() -> None:
+    probabilities = np.array([[0.9, 0.3, 0.25, 0.26, 0.9, 0.9], [0.9, 0.1, 0.1, 0.1, 0.9, 0.9]], np.float32)
+    chosen = is_in_phrase(probabilities, 0.25, n_tokens=5)
+    assert chosen.tolist() == [[False, True, False, True, False, False], [False] * 6]
+
+
+@pytest.mark.parametrize("size", [(40, 60), (60, 40), (30, 90), (48, 48)])
+def test_the_image_goes_in_as_transformers_prepares_it(detector: GroundingDino, size: tuple[int, int]) -> None:
+    from transformers.models.grounding_dino.image_processing_pil_grounding_dino import GroundingDinoImageProcessorPil
+
+    processor = GroundingDinoImageProcessorPil(size={"shortest_edge": DINO_PX[0], "longest_edge": DINO_PX[1]})
+    rgb = blocks(*size)
+    theirs = processor(rgb, return_tensors="np")["pixel_values"][0]
+    np.testing.assert_allclose(detector.pixels(rgb), theirs, atol=2e-6)
+
+
+def transformers_answer(detector: GroundingDino, box: float, text: float) -> dict[str, Any]:
+    """Boxes, scores and phrases by transformers' own reading of the same network's answer."""
+    import torch
+    from transformers.models.grounding_dino.processing_grounding_dino import GroundingDinoProcessor
+
+    tokens = detector.tokenizer(text_prompt(TAGS), return_tensors="pt", return_token_type_ids=True)
+    pixels = torch.from_numpy(detector.pixels(RGB)[None])
+    with torch.inference_mode():
+        outputs = tiny_dino()(pixel_values=pixels, **tokens)
+    processor = SimpleNamespace(batch_decode=detector.tokenizer.batch_decode)
+    read = GroundingDinoProcessor.post_process_grounded_object_detection
+    answer: dict[str, Any] = read(processor, outputs, tokens["input_ids"], box, text, [RGB.shape[:2]])[0]
+    return answer
+
+
+@pytest.mark.parametrize(("box", "text"), [(0.25, 0.25), (0.5, 0.7), (0.9, 0.999)])
+def test_boxes_scores_and_phrases_are_those_of_transformers(detector: GroundingDino, box: float, text: float) -> None:
+    theirs = transformers_answer(detector, box, text)
+    found = detector.detect(RGB, TAGS, BoxConfig(box_threshold=box, text_threshold=text, nms_iou=1.0))
+    phrases = [" ".join(one.replace(".", "").replace("[SEP]", "").split()) for one in theirs["text_labels"]]
+    order = np.argsort(-theirs["scores"].numpy(), kind="stable")
+    order = np.array([k for k in order if phrases[k]])
+    assert len(order) > 1
+    assert found.names == tuple(phrases[k] for k in order)
+    np.testing.assert_allclose(found.scores, theirs["scores"].numpy()[order], atol=1e-5)
+    boxes = np.clip(theirs["boxes"].numpy()[order], 0, [60, 40, 60, 40])
+    np.testing.assert_allclose(found.boxes, boxes, atol=1e-3)
+
+
+class Told(GroundingDino):
+    """A detector whose network says what it is told: token probabilities and boxes."""
+
+    def __init__(
+        self, tokenizer: Any, probabilities: Float32Array, boxes: Float32Array, longest_text: int = 32
+    ) -> None:
+        self.tokenizer = tokenizer
+        self._sides_px = DINO_PX
+        self._max_tokens = longest_text
+        self._told = probabilities, boxes
+        self.texts: list[str] = []
+
+    def answer(self, pixels: Float32Array, text: str) -> tuple[Float32Array, Float32Array, list[int]]:
+        self.texts.append(text)
+        return (*self._told, self.tokenizer(text)["input_ids"])
+
+
+# [CLS] cat . coffee table . [SEP]
+PROBABILITIES = np.array(
+    [
+        [0, 0.6, 0.9, 0.0, 0.0, 0.0, 0.0, 0],  # cat .
+        [0, 0.1, 0.0, 0.1, 0.8, 0.0, 0.0, 0],  # table
+        [0, 0.0, 0.0, 0.26, 0.3, 0.0, 0.0, 0],  # coffee table, in the place of the one before
+        [0, 0.0, 0.7, 0.0, 0.0, 0.0, 0.0, 0],  # a full stop alone
+        [0, 0.25, 0.0, 0.0, 0.0, 0.0, 0.0, 0],  # not above 0.25
+    ],
+    np.float32,
+)
+CENTRES = np.array(
+    [[0.25, 0.5, 0.5, 1], [0.75, 0.5, 0.5, 1], [0.75, 0.5, 0.5, 0.5], [0.5, 0.5, 0.1, 0.1], [0.5, 0.5, 1, 1]],
+    np.float32,
+)
+
+
+def test_boxes_are_thresholded_suppressed_and_called_by_their_phrases(tokenizer: Any) -> None:
+    told = Told(tokenizer, PROBABILITIES, CENTRES)
+    found = told.detect(RGB, ["Cat", "coffee table", "cat"], BoxConfig())
+    assert told.texts == ["cat. coffee table."], "each tag is asked for once"
+    # The third overlaps the second by exactly one half, more than 0.4; the fourth has no name.
+    assert found.names == ("cat", "table")
+    np.testing.assert_allclose(found.scores, [0.9, 0.8])
+    np.testing.assert_allclose(found.boxes, [[0, 0, 30, 40], [30, 0, 60, 40]])
+
+
+def test_boxes_may_be_called_by_tags_and_go_where_they_stand_for_none(tokenizer: Any) -> None:
+    found = Told(tokenizer, PROBABILITIES, CENTRES).detect(RGB, ["cat", "coffee table"], CONCEPTGRAPHS_BOXES)
+    # "table" stands for no tag; "coffee table" overlaps it by one half, which 0.5 allows.
+    assert found.names == ("cat", "coffee table", "cat")
+    np.testing.assert_allclose(found.scores, [0.9, 0.3, 0.25])
+
+
+def test_tags_that_one_text_cannot_hold_are_asked_for_in_a_second(tokenizer: Any) -> None:
+    told = Told(tokenizer, PROBABILITIES, CENTRES, longest_text=7)
+    told.detect(RGB, ["cat", "coffee table", "sofa", "lamp", "book"], BoxConfig())
+    assert told.texts == ["cat. coffee table.", "sofa. lamp.", "book."]
+
+
+def test_without_tags_nothing_is_asked(tokenizer: Any) -> None:
+    told = Told(tokenizer, PROBABILITIES, CENTRES)
+    found = told.detect(RGB, ["", " . "], BoxConfig())
+    assert told.texts == [] and found.names == () and found.boxes.shape == (0, 4)
+
+
+def test_presets_hold_the_published_values() -> None:
+    paper = BoxConfig()
+    assert (paper.box_threshold, paper.text_threshold, paper.nms_iou, paper.names) == (0.25, 0.25, 0.4, "phrase")
+    other = CONCEPTGRAPHS_BOXES
+    assert (other.box_threshold, other.text_threshold, other.nms_iou, other.names) == (0.2, 0.2, 0.5, "tag")
+
+
+def test_a_tokenizer_is_read_from_its_words(tokenizer: Any, tmp_path: Path) -> None:
+    assert tokenizer("cat. sofas.")["input_ids"] == [101, 200, 1012, 206, 208, 1012, 102]

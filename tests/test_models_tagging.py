@@ -1,0 +1,204 @@
+"""Tags of an image: RAM++ through its package or exported, and words of a list that an encoder finds likeliest."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+import pytest
+from tiny_models import blocks
+
+from su3d_bench.errors import DataError, ModelMissing
+from su3d_bench.perception.models.catalogue import model_entry
+from su3d_bench.perception.models.files import ModelFiles
+from su3d_bench.perception.models.tagging import (
+    RAM_PX,
+    OnnxRamTagger,
+    RamTagger,
+    WordTagger,
+    chosen_tags,
+    load_ram,
+    ram_pixels,
+    read_word_list,
+)
+from su3d_bench.perception.naming import vocabulary
+from su3d_bench.perception.tagging_words import ADDED_TAGS, BACKGROUND_TAGS, STOP_WORDS
+from su3d_bench.types import Float32Array, UInt8Array
+
+RGB = blocks(40, 60)
+
+
+class ByColour:
+    """An encoder whose directions are red, green and blue: of an image its mean colour, of a text the word in it."""
+
+    name = digest = "colours"
+    dim = 3
+
+    def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
+        means = np.array([image.reshape(-1, 3).mean(axis=0) for image in images])
+        return (means / np.linalg.norm(means, axis=1, keepdims=True)).astype(np.float32)
+
+    def encode_texts(self, texts: Sequence[str]) -> Float32Array:
+        return np.array([[word in text for word in ("red", "green", "blue")] for text in texts], np.float32)
+
+
+def test_the_likeliest_words_are_those_that_some_part_of_the_image_shows() -> None:
+    image = np.zeros((40, 60, 3), np.uint8)
+    image[:, :, 0] = 200
+    image[20:, 30:] = 0, 0, 255
+    tagger = WordTagger(ByColour(), ("green", "blue", "red"), n_tags=2)
+    # Most of the image is red and three quarters are nothing else; one is blue: both 1, in the order of the list.
+    assert tagger.tags(image) == ("blue", "red")
+    assert WordTagger(ByColour(), ("green", "blue", "red"), n_tags=9).tags(image) == ("blue", "red", "green")
+    assert tagger.caveat is not None and "RAM++ is not here" in tagger.caveat
+
+
+def test_words_in_another_order_or_number_are_another_tagger() -> None:
+    digests = {WordTagger(ByColour(), words, n).digest for words in (("a", "b"), ("b", "a")) for n in (1, 2)}
+    assert len(digests) == 4
+
+
+def test_tags_that_contain_a_stop_word_go_and_added_ones_come_last() -> None:
+    found = ["bed", " lamp ", "bedroom", "Blue", "wall lamp", "bed", ""]
+    expected = ("bed", "lamp", "other item", "wall", "floor", "ceiling")
+    assert chosen_tags(found, STOP_WORDS, (*ADDED_TAGS, *BACKGROUND_TAGS)) == expected
+    assert chosen_tags(found, (), ()) == ("bed", "lamp", "bedroom", "Blue", "wall lamp")
+    assert len(STOP_WORDS) == 26
+
+
+def test_a_word_list_is_read_without_empty_lines_and_remarks(tmp_path: Path) -> None:
+    path = tmp_path / "words.txt"
+    path.write_text("# things\nbed\n\n  coffee table \n")
+    assert read_word_list(path) == ("bed", "coffee table")
+    assert read_word_list(None) == vocabulary()
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"# nothing\n", "has 0 words"),
+        (b"\xff\xfe", "is no UTF-8 text"),
+        (b"a" * 101, "is no word"),
+        (b"be\x07d\n", "is no word"),
+        (b"ab\n" * 20_001, "has 20001 words"),
+        (b"a" * (2**21 + 1), "bytes; expected a list of words"),
+    ],
+)
+def test_what_is_no_word_list_is_one_line(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "words.txt"
+    path.write_bytes(content)
+    with pytest.raises(DataError, match=message) as caught:
+        read_word_list(path)
+    assert str(caught.value).isprintable()
+    with pytest.raises(DataError, match="cannot be read"):
+        read_word_list(tmp_path / "absent.txt")
+
+
+class AnsweringSession:
+    """A session of ONNX Runtime that has seen a lamp and a sofa."""
+
+    def __init__(self) -> None:
+        self.shapes: list[tuple[int, ...]] = []
+
+    def get_inputs(self) -> list[Any]:
+        return [type("Input", (), {"name": "image"})()]
+
+    def run(self, names: None, fed: dict[str, Float32Array]) -> list[Float32Array]:
+        self.shapes.append(fed["image"].shape)
+        return [np.array([[0, 1, 0, 1]], np.float32)]
+
+
+def test_an_exported_tagger_names_what_its_list_holds() -> None:
+    session = AnsweringSession()
+    tagger = OnnxRamTagger(lambda: session, ("bed", "lamp", "room", "sofa"), "digest")
+    assert tagger.tags(RGB) == ("lamp", "sofa")
+    assert session.shapes == [(1, 3, RAM_PX, RAM_PX)]
+    assert tagger.caveat is None
+    with pytest.raises(DataError, match=r"answers \(1, 4\), ram_tag_list.txt has 3 tags"):
+        OnnxRamTagger(lambda: session, ("bed", "lamp", "room"), "digest").tags(RGB)
+
+
+def test_images_are_squeezed_to_a_square_for_ram() -> None:
+    pixels = ram_pixels(np.full((10, 30, 3), 255, np.uint8))
+    assert pixels.shape == (3, RAM_PX, RAM_PX)
+    np.testing.assert_allclose(
+        pixels[:, 5, 5], [(1 - 0.485) / 0.229, (1 - 0.456) / 0.224, (1 - 0.406) / 0.225], rtol=1e-5
+    )
+
+
+@pytest.fixture
+def ram_package(monkeypatch: pytest.MonkeyPatch) -> list[dict[str, Any]]:
+    """A package ``ram`` with the published interface and a network of one layer; what it is asked for."""
+    import torch
+
+    asked: list[dict[str, Any]] = []
+
+    class Network(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.tagging_head = torch.nn.Linear(3, 2)
+            self.register_buffer("relative_position_index", torch.arange(4))
+
+        def generate_tag(self, image: Any) -> tuple[list[str], list[str]]:
+            scores = self.tagging_head(image.mean(dim=(2, 3)))[0]
+            names = [name for name, score in zip(("bed", "coffee table"), scores, strict=True) if score > 0]
+            return [" | ".join(names)], ["..."]
+
+    def ram_plus(**settings: Any) -> Network:
+        asked.append(settings)
+        return Network()
+
+    package, models = ModuleType("ram"), ModuleType("ram.models")
+    models.ram_plus = ram_plus  # type: ignore[attr-defined]
+    package.models = models  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "ram", package)
+    monkeypatch.setitem(sys.modules, "ram.models", models)
+    return asked
+
+
+def ram_files(folder: Path, tensors: dict[str, Any]) -> ModelFiles:
+    import torch
+
+    entry = model_entry("ram-plus", "tagger")
+    path = folder / "ram_plus_swin_large_14m.pth"
+    torch.save({"model": tensors}, path)
+    return ModelFiles(entry, entry.form("original"), folder, path)
+
+
+def test_the_published_package_gets_its_weights_as_plain_tensors(
+    ram_package: list[dict[str, Any]], tmp_path: Path
+) -> None:
+    import torch
+
+    # An older name of the head, and a buffer of another window, as the published file has them.
+    tensors = {
+        "vision_multi.weight": torch.zeros(2, 3),
+        "vision_multi.bias": torch.tensor([-1.0, 1.0]),
+        "relative_position_index": torch.arange(9),
+    }
+    files = ram_files(tmp_path, tensors)
+    tagger = RamTagger(lambda: load_ram(files, "cpu"), "cpu", "digest")
+    assert tagger.tags(RGB) == ("coffee table",)
+    assert ram_package == [{"pretrained": "", "image_size": 384, "vit": "swin_l"}]
+    tensors["vision_multi.bias"] = torch.tensor([-1.0, -1.0])
+    silent = ram_files(tmp_path, tensors)
+    assert RamTagger(lambda: load_ram(silent, "cpu"), "cpu", "digest").tags(RGB) == ()
+
+
+def test_weights_that_lack_a_part_of_ram_are_refused(ram_package: list[dict[str, Any]], tmp_path: Path) -> None:
+    import torch
+
+    files = ram_files(tmp_path, {"vision_multi.weight": torch.zeros(2, 3)})
+    with pytest.raises(DataError, match=r"lacks 1 tensors, such as tagging_head\.bias; fetch it from https"):
+        load_ram(files, "cpu")
+
+
+def test_without_the_package_ram_says_how_to_get_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "ram", None)
+    files = ram_files(tmp_path, {})
+    with pytest.raises(ModelMissing, match=r"its package is not installed .*set perception\.paper\.tagger to words"):
+        load_ram(files, "cpu")
