@@ -112,6 +112,7 @@ class Command:
 
     name = "command"
     Config = CommandConfig
+    has_own_perception = True
     about = MethodAbout(
         paper="",
         source="",
@@ -246,7 +247,7 @@ class Command:
         if self.config.runner == "docker":
             return words
         # The program runs in a folder of its own: files that were named from here must be found from there.
-        return [str(path.absolute()) if "/" in w and (path := Path(w)).is_file() else w for w in words]
+        return [str(Path(w).absolute()) if (k or "/" in w) and Path(w).is_file() else w for k, w in enumerate(words)]
 
     def _docker_words(self, container: str, id_file: Path, folders: Mapping[str, Path]) -> list[str]:
         mounts = [

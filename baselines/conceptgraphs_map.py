@@ -64,9 +64,9 @@ class ObjectMap:
         with timer.stage("backproject"):
             lifted = list(lift(frame, rows, masks, self._config, self._seed))
         found = [self._object_of(region, detections, text_features) for region in lifted]
-        with timer.stage("background"):
-            for one in found:
-                self._merge_background(one)
+        if self._background:
+            with timer.stage("background"):
+                self._merge_background(found)
         foreground = [one for one in found if one.sightings[0].name not in self._background]
         if not foreground:  # the original goes on to the next frame here, past the periodic steps too
             return
@@ -91,11 +91,12 @@ class ObjectMap:
             sightings=(seen,),
         )
 
-    def _merge_background(self, one: MapObject) -> None:
-        name = one.sightings[0].name
-        if name in self._background:
-            before = self._background[name]
-            self._background[name] = one if before is None else merged(before, one, self._config, with_dbscan=False)
+    def _merge_background(self, found: Sequence[MapObject]) -> None:
+        for one in found:
+            name = one.sightings[0].name
+            if name in self._background:
+                before = self._background[name]
+                self._background[name] = one if before is None else merged(before, one, self._config, with_dbscan=False)
 
     def _associate(self, found: Sequence[MapObject], timer: StageTimer) -> None:
         """All similarities are those before the first merge; no clustering here."""

@@ -79,10 +79,11 @@ def lift(
         raise DataError(f"frame {frame.index}: masks are {columns_px}x{rows_px} and the image is {width}x{height}")
     has_depth = valid_depth(frame.depth_m, 0.0, np.inf)
     points = back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, has_depth)
+    row_of_pixel = np.cumsum(has_depth.ravel()) - 1
     noise = np.random.default_rng([seed, frame.index])
     to_world = frame.camera_to_world[:3, :3]
     for detection, mask in zip(rows, masks, strict=True):
-        cloud = points[mask[has_depth]]
+        cloud = points[row_of_pixel[np.flatnonzero(mask & has_depth)]]
         if len(cloud) < max(config.min_points_threshold, LEAST_POINTS):
             continue
         if config.noise_m > 0:

@@ -5,14 +5,11 @@ Source: concept-graphs at commit 5c4da70, ``conceptgraph/slam/utils.py``, whose 
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.types import BoolArray, Float64Array, OrientedBox
-
-if TYPE_CHECKING:
-    import open3d
+from su3d_bench.types import BoolArray, Float64Array, Int32Array, Int64Array, OrientedBox
 
 LEAST_CLUSTER = 5  # points; a smaller largest cluster is not trusted and the whole cloud stays
 LEAST_FOR_ORIENTED_BOX = 4  # points that span a volume
@@ -28,13 +25,25 @@ def voxel_average(points: Float64Array, voxel_m: float) -> Float64Array:
         return points
     from su3d_bench.baselines import object_clouds_kernels as kernels
 
-    points = np.ascontiguousarray(points, np.float64)
-    table = np.full(1 << (2 * len(points)).bit_length(), kernels.ABSENT, np.int32)
-    cells = np.empty((len(points), 3), np.int64)
-    means, counts = np.zeros((len(points), 3)), np.zeros(len(points), np.int64)
-    n = kernels.voxel_means(points, points.min(axis=0) - voxel_m / 2, voxel_m, table, cells, means, counts)
-    averaged: Float64Array = means[:n].copy()
+    grid = _grid(points, points.min(axis=0) - voxel_m / 2, voxel_m)
+    averaged: Float64Array = kernels.means(points, grid.cell_of_point, grid.n_cells)
     return averaged
+
+
+def density_clusters(points: Float64Array, eps_m: float, min_points: int) -> Int64Array:
+    """DBSCAN's cluster (N,) of each point, -1 for none; the labels of Open3D's ``cluster_dbscan``.
+
+    A point is a neighbour of itself.
+    """
+    if not len(points):
+        return np.zeros(0, np.int64)
+    from su3d_bench.baselines import object_clouds_kernels as kernels
+
+    grid = _grid(points, points.min(axis=0), eps_m)
+    labels: Int64Array = kernels.density_labels(
+        points, eps_m, min_points, grid.table, grid.cells, grid.cell_of_point, grid.n_cells
+    )
+    return labels
 
 
 def largest_cluster(points: Float64Array, eps_m: float, min_points: int) -> Float64Array:
@@ -42,7 +51,7 @@ def largest_cluster(points: Float64Array, eps_m: float, min_points: int) -> Floa
 
     Of clusters of equal size the one whose first point comes first, as Python's ``Counter`` counts them.
     """
-    labels = np.asarray(_cloud(points).cluster_dbscan(eps_m, min_points), np.int64)
+    labels = density_clusters(points, eps_m, min_points)
     found, first, sizes = np.unique(labels[labels >= 0], return_index=True, return_counts=True)
     if not len(found) or sizes.max() < LEAST_CLUSTER:
         return points
@@ -53,8 +62,10 @@ def largest_cluster(points: Float64Array, eps_m: float, min_points: int) -> Floa
 
 def bounding_box(points: Float64Array, *, oriented: bool) -> OrientedBox:
     """The box around ``points``: along the principal axes of their convex hull, else along the world's axes."""
-    cloud = _cloud(points)
     if oriented and len(points) >= LEAST_FOR_ORIENTED_BOX:
+        import open3d as o3d
+
+        cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
         try:
             box = cloud.get_oriented_bounding_box(robust=True)
             return OrientedBox(np.array(box.center), np.array(box.extent), np.array(box.R))
@@ -64,7 +75,21 @@ def bounding_box(points: Float64Array, *, oriented: bool) -> OrientedBox:
     return OrientedBox((low + high) / 2, high - low, np.eye(3))
 
 
-def _cloud(points: Float64Array) -> open3d.geometry.PointCloud:
-    import open3d as o3d
+@dataclass(frozen=True)
+class _Grid:
+    """Which cell each point lies in, and the hash that finds the cells."""
 
-    return o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
+    table: Int32Array
+    cells: Int64Array
+    cell_of_point: Int64Array
+    n_cells: int
+
+
+def _grid(points: Float64Array, origin: Float64Array, side_m: float) -> _Grid:
+    from su3d_bench.baselines import object_clouds_kernels as kernels
+
+    n = len(points)
+    table = np.full(1 << (2 * n).bit_length(), kernels.ABSENT, np.int32)
+    cells, cell_of_point = np.empty((n, 3), np.int64), np.empty(n, np.int64)
+    n_cells = kernels.cells_of(points, origin, side_m, table, cells, cell_of_point)
+    return _Grid(table, cells, cell_of_point, n_cells)

@@ -1,7 +1,8 @@
 """A user's text queries with the objects that they speak of: a TOML file of ``[[query]]`` tables, or a CSV file.
 
 Each has ``scene`` (``room0`` or ``replica/room0``), ``text``, and ``objects``: instance ids of the ground truth, a
-list in TOML, separated by blanks in CSV.
+list in TOML, separated by blanks in CSV. It may have ``kind`` (instance, affordance, ...) and ``source``. Texts are
+data: anything but control characters stands in them as it is.
 """
 
 from __future__ import annotations
@@ -9,7 +10,9 @@ from __future__ import annotations
 import csv
 import io
 import tomllib
-from collections.abc import Iterator, Mapping
+import unicodedata
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -22,28 +25,52 @@ from su3d_bench.plain_text import printable
 from su3d_bench.types import GroundTruth
 
 COLUMNS = ("scene", "text", "objects")
+MORE_COLUMNS = ("kind", "source")  # may be there, in any order behind the others
 MOST_OBJECTS_ID = 2**31 - 1
 MOST_BYTES = 16 << 20  # some hundred thousand queries
+MOST_CHARACTERS = 20_000  # of one text
 VARIANT = "query-objects"
 
 
-def read_query_file(path: Path) -> dict[str, tuple[TextQuery, ...]]:
-    """The queries of each scene, in the order of the file; scenes are called without the dataset."""
+@dataclass(frozen=True)
+class QueryRow:
+    """One query as the file has it; ``at`` says where it stands, for messages."""
+
+    at: str
+    scene: str
+    text: str
+    objects: tuple[int, ...]
+    kind: str = ""
+    source: str = ""
+
+
+def read_query_rows(path: Path) -> list[QueryRow]:
+    """Every query of a file in its order; ``objects`` is empty where nobody knows them."""
     where = printable(str(path), 200)
     if path.is_file() and path.stat().st_size > MOST_BYTES:
         raise DataError(f"{where}: has more than {MOST_BYTES >> 20} MiB; split it")
     text = read_text(path, where)
-    rows = _csv_rows(text, where) if path.suffix.lower() == ".csv" else _toml_rows(text, where)
-    found: dict[str, list[TextQuery]] = {}
-    for at, scene, query, objects in rows:
-        if len(set(objects)) != len(objects):
-            raise DataError(f"{at}: an object stands there twice; name each once")
-        queries = found.setdefault(scene.rpartition("/")[2], [])
-        if any(one.text == query for one in queries):
-            raise DataError(f"{at}: the query '{printable(query, 60)}' stands there twice for {printable(scene, 60)}")
-        queries.append(TextQuery(query, objects))
-    if not found:
+    rows = list(_csv_rows(text, where) if path.suffix.lower() == ".csv" else _toml_rows(text, where))
+    for row in rows:
+        if len(set(row.objects)) != len(row.objects):
+            raise DataError(f"{row.at}: an object stands there twice; name each once")
+    if not rows:
         raise DataError(f"{where}: holds no query; expected {', '.join(COLUMNS)}")
+    return rows
+
+
+def read_query_file(path: Path) -> dict[str, tuple[TextQuery, ...]]:
+    """The queries of each scene, in the order of the file; scenes are called without the dataset."""
+    found: dict[str, list[TextQuery]] = {}
+    for row in read_query_rows(path):
+        if not row.objects:
+            raise DataError(f"{row.at}: 'objects' must name at least one instance id above 0")
+        queries = found.setdefault(row.scene.rpartition("/")[2], [])
+        if any(one.text == row.text for one in queries):
+            raise DataError(
+                f"{row.at}: the query '{printable(row.text, 60)}' stands there twice for {printable(row.scene, 60)}"
+            )
+        queries.append(TextQuery(row.text, row.objects))
     return {scene: tuple(queries) for scene, queries in found.items()}
 
 
@@ -62,10 +89,7 @@ def query_truth(truth: GroundTruth, queries: tuple[TextQuery, ...], where: str) 
     return QueryTruth(truth.points, owner, queries, VARIANT, f"queries of a file, objects from {truth.source}")
 
 
-Row = tuple[str, str, str, tuple[int, ...]]
-
-
-def _toml_rows(text: str, where: str) -> Iterator[Row]:
+def _toml_rows(text: str, where: str) -> Iterator[QueryRow]:
     try:
         content = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
@@ -75,40 +99,53 @@ def _toml_rows(text: str, where: str) -> Iterator[Row]:
         raise DataError(f"{where}: expected tables [[query]] and nothing else")
     for number, table in enumerate(tables, 1):
         at = f"{where}: query {number}"
-        if not isinstance(table, Mapping) or set(table) != set(COLUMNS):
-            raise DataError(f"{at}: expected the keys {', '.join(COLUMNS)}")
+        if not isinstance(table, Mapping) or not set(COLUMNS) <= set(table) <= {*COLUMNS, *MORE_COLUMNS}:
+            raise DataError(f"{at}: expected the keys {', '.join(COLUMNS)}, and kind or source where they are known")
         objects = table["objects"]
         if not isinstance(objects, list) or not all(type(one) is int for one in objects):
             raise DataError(f"{at}: 'objects' must be a list of instance ids")
-        yield at, _text(table["scene"], at), _text(table["text"], at), _ids(objects, at)
+        yield _row(at, table, objects)
 
 
-def _csv_rows(text: str, where: str) -> Iterator[Row]:
+def _csv_rows(text: str, where: str) -> Iterator[QueryRow]:
     try:
-        rows = list(csv.reader(io.StringIO(text), strict=True))
+        rows = list(csv.reader(io.StringIO(text, newline=""), strict=True))
     except csv.Error as error:
         raise DataError(f"{where}: not CSV ({printable(str(error), 120)})") from error
-    if not rows or tuple(word.strip() for word in rows[0]) != COLUMNS:
-        raise DataError(f"{where}: the first line must be {','.join(COLUMNS)}")
+    header = tuple(word.strip() for word in rows[0]) if rows else ()
+    more = header[len(COLUMNS) :]
+    if header[: len(COLUMNS)] != COLUMNS or not set(more) <= set(MORE_COLUMNS) or len(set(more)) < len(more):
+        raise DataError(f"{where}: the first line must be {','.join(COLUMNS)}, and kind or source may follow")
     for number, row in enumerate(rows[1:], 2):
         at = f"{where}: row {number}"
         if not row:
             continue
-        if len(row) != len(COLUMNS):
-            raise DataError(f"{at}: has {len(row)} columns; expected {','.join(COLUMNS)}")
+        if len(row) != len(header):
+            raise DataError(f"{at}: has {len(row)} columns; expected {','.join(header)}")
         words = row[2].split()
         if not all(word.isascii() and word.isdigit() and len(word) < 11 for word in words):
             raise DataError(f"{at}: 'objects' must be instance ids with blanks between them")
-        yield at, _text(row[0], at), _text(row[1], at), _ids([int(word) for word in words], at)
+        yield _row(at, dict(zip(header, row, strict=True)), [int(word) for word in words])
+
+
+def _row(at: str, values: Mapping[str, Any], objects: Sequence[int]) -> QueryRow:
+    if not all(0 < one <= MOST_OBJECTS_ID for one in objects):
+        raise DataError(f"{at}: 'objects' must name instance ids above 0")
+    scene, text = (_text(values[name], at) for name in ("scene", "text"))
+    kind, source = (_text(values[name], at) if values.get(name) else "" for name in MORE_COLUMNS)
+    return QueryRow(at, scene, text, tuple(objects), kind, source)
 
 
 def _text(value: Any, at: str) -> str:
-    if not isinstance(value, str) or not value.strip() or not value.isprintable():
+    if not isinstance(value, str) or not value.strip() or not is_text(value):
         raise DataError(f"{at}: 'scene' and 'text' must be words; found {printable(repr(value), 40)}")
     return value.strip()
 
 
-def _ids(values: list[int], at: str) -> tuple[int, ...]:
-    if not values or not all(0 < one <= MOST_OBJECTS_ID for one in values):
-        raise DataError(f"{at}: 'objects' must name at least one instance id above 0")
-    return tuple(values)
+def is_text(value: str) -> bool:
+    """Whether ``value`` is short enough and free of control characters and lone surrogates.
+
+    >>> is_text("\u202eright to left \U0001f600"), is_text("\x1b[2J")
+    (True, False)
+    """
+    return len(value) <= MOST_CHARACTERS and not any(unicodedata.category(one) in ("Cc", "Cs") for one in value)

@@ -21,7 +21,7 @@ from su3d_bench.datasets.rooms_noise import LEVELS, add_noise
 from su3d_bench.datasets.rooms_render import RenderedFrame, Renderer, camera_intrinsics
 from su3d_bench.datasets.rooms_scan import RoomScan, read_scan, scan_room, write_scan
 from su3d_bench.datasets.rooms_trajectory import walk
-from su3d_bench.datasets.rooms_truth import RoomObject, RoomTruth, truth_of
+from su3d_bench.datasets.rooms_truth import Query, RoomObject, RoomTruth, queries, truth_of
 from su3d_bench.errors import DataError, GroundTruthMissing, suggest
 from su3d_bench.types import (
     Float64Array,
@@ -142,6 +142,10 @@ class Rooms:
 
     def objects(self, scene: str) -> tuple[RoomObject, ...]:
         return self._room(scene).truth.objects
+
+    def queries(self, scene: str) -> tuple[Query, ...]:
+        """Texts of four kinds with all right answers, on what the walk sees."""
+        return queries(self.truth(scene), self.visible_vertices(scene))
 
     def trajectory(self, scene: str) -> Float64Array:
         """Camera-to-world poses (n_frames, 4, 4), OpenCV axes, z up, metres."""

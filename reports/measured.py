@@ -39,6 +39,11 @@ class Measured:
         return frozenset(self.per_scene)
 
     @property
+    def datasets(self) -> str:
+        """The datasets of the scenes, which are named ``dataset/scene``."""
+        return ", ".join(dict.fromkeys(scene.partition("/")[0] for scene in self.per_scene)) or "no scene"
+
+    @property
     def scenes_text(self) -> str:
         """``8``, ``7/8`` where some are missing, ``8 partial`` where only the first frames were used."""
         n = len(self.per_scene)

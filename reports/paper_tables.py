@@ -65,7 +65,9 @@ def paper_table(number: PaperTable, found: Sequence[Measured], shown: Shown, *, 
         rows = [one for one in fitting if one.protocol == name]
         one = protocol_table(rows, replace(shown, metrics=metrics), figures)
         setup = "" if name == layout.protocol else ", not the paper's set-up"
-        tables.append(replace(one, name=f"{number}-{name}", caption=f"{layout.subject} under {name}{setup}."))
+        where = next((row.datasets for row in rows if row.per_scene), "no scene")
+        caption = f"{layout.subject} on {where}, {name}{setup}."
+        tables.append(replace(one, name=f"{number}-{name}", caption=caption))
     return tables
 
 
@@ -79,8 +81,16 @@ def selection_tables(found: Sequence[Measured], shown: Shown, *, with_published:
     return tables
 
 
-def protocol_table(rows: Sequence[Measured], shown: Shown, figures: Sequence[Figure]) -> Table:
-    """The table of measured ``rows`` of one protocol, reported ``figures`` beneath them."""
+def protocol_table(measured: Sequence[Measured], shown: Shown, figures: Sequence[Figure]) -> Table:
+    """The table of what was ``measured`` under one protocol, reported ``figures`` beneath.
+
+    A method that failed has a row without values; one that the protocol cannot score is named in a note.
+    """
+    rows = [one for one in measured if one.per_scene or one.failed]
+    if not rows:
+        raise ConfigError(f"{measured[0].protocol}: scored none of {', '.join(one.method for one in measured)}")
+    first = next((one for one in rows if one.per_scene), rows[0])
+    left_out = [one.method for one in measured if one not in rows]
     metrics = shown.metrics or rows[0].headline
     for name in metrics:
         if name not in rows[0].metrics:
@@ -96,11 +106,17 @@ def protocol_table(rows: Sequence[Measured], shown: Shown, figures: Sequence[Fig
     reported, sources = reported_rows(figures, metrics, len(_columns(shown)))
     return Table(
         name=rows[0].protocol,
-        caption=f"Protocol {rows[0].protocol}.",
+        caption=f"Protocol {rows[0].protocol} on {first.datasets}.",
         head="method",
         columns=tuple(_columns(shown)),
         rows=(*body, *reported),
-        notes=(units(rows[0], shown), *run_notes(rows, labels), *([why] if why else []), *sources),
+        notes=(
+            units(first, shown),
+            *run_notes(rows, labels),
+            *([f"not scored under this protocol: {', '.join(left_out)}"] if left_out else []),
+            *([why] if why else []),
+            *sources,
+        ),
     )
 
 
@@ -108,7 +124,7 @@ def units(row: Measured, shown: Shown) -> str:
     """What the numbers of a table are."""
     interval = "; in brackets the 95 % interval over scenes" if shown.intervals else ""
     ceiling = "; ceil.: what the truth itself scores" if shown.ceilings else ""
-    return f"Protocol {row.protocol}, version {row.version}; per cent{interval}{ceiling}."
+    return f"Protocol {row.protocol}, version {row.version}, on {row.datasets}; per cent{interval}{ceiling}."
 
 
 def _are_alike(rows: Sequence[Measured]) -> bool:
@@ -162,10 +178,11 @@ def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int
 
     Rows that print the same best value are all marked; where only a significant best is marked, none of them.
     """
-    competing = [k for k, row in enumerate(rows) if not row.is_ceiling] or list(range(len(rows)))
+    scored = [k for k, row in enumerate(rows) if row.per_scene]
+    competing = [k for k in scored if not rows[k].is_ceiling] or scored
     if len(competing) < 2:
         return {}, None
-    if any(row.scenes != rows[0].scenes or row.limit != rows[0].limit for row in rows):
+    if len({(rows[k].scenes, rows[k].limit) for k in competing}) > 1:
         return {}, "The rows are of different scenes or frames, so that none is marked as the best."
     found: dict[str, set[int]] = {}
     tests: list[SignFlipTest | None] = []

@@ -14,6 +14,7 @@ import numpy as np
 from su3d_bench.plain_text import printable
 from su3d_bench.reports.pictures import DRAWN_SPACING_M, NO_INSTANCE, Cloud, Colour, instance_colours, thinned
 from su3d_bench.reports.render import OVERSAMPLING, Camera, View, colour, render, room_bounds, view_cameras
+from su3d_bench.reports.scene_picture import drawable
 from su3d_bench.store import make_folder, write_bytes
 from su3d_bench.types import BoolArray, Float64Array, Instances, Int64Array, UInt8Array
 
@@ -21,6 +22,7 @@ DPI, PANEL_WIDTH, PANEL_HEIGHT, MARGIN = 100, 760, 640, 14
 LINE_HEIGHT, CHARACTERS_A_LINE, MOST_LINES = 22, 165, 5
 ANSWER, REFERENCE = (222, 74, 22), (32, 98, 196)
 MOST_LABELS, LABEL_HEIGHT = 14, 20
+MOST_CHARACTERS = 40  # of a label
 FEW = 4  # more boxes than these are drawn with thin lines
 PALE = 0.22  # how much of its colour an object keeps that is not spoken of
 DARK, GREY = "#222222", "#666666"
@@ -50,6 +52,7 @@ def draw_reasoning(
     from matplotlib.backends.backend_agg import FigureCanvasAgg
     from matplotlib.figure import Figure
 
+    names = [drawable(printable(name, MOST_CHARACTERS)) for name in names]
     written = [part for line in lines for part in textwrap.wrap(printable(line), CHARACTERS_A_LINE)][:MOST_LINES]
     header = 52 + LINE_HEIGHT * len(written)
     width, height = 2 * PANEL_WIDTH + 3 * MARGIN, header + PANEL_HEIGHT + MARGIN
@@ -77,7 +80,7 @@ def draw_reasoning(
 
 
 def _write(figure: Any, x: float, y: float, text: str, size: float, shade: str, **more: Any) -> None:
-    figure.text(x, y, text, fontsize=size, color=shade, va="top", parse_math=False, **more)
+    figure.text(x, y, drawable(text), fontsize=size, color=shade, va="top", parse_math=False, **more)
 
 
 def _cloud(instances: Instances) -> Cloud:

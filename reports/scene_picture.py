@@ -109,7 +109,7 @@ class _Page:
     def text(self, x: float, y: float, text: str, size: float, colour: str = DARK, **more: Any) -> None:
         place = x / WIDTH, 1 - y / self.height
         style = {"va": "top", "fontsize": size, "color": colour, "parse_math": False} | more
-        self.figure.text(*place, _drawable(printable(text)), **style)
+        self.figure.text(*place, drawable(printable(text)), **style)
 
     def axes(self, x: float, y: float, width: float, height: float) -> Any:
         """Axes without a frame at this place."""
@@ -305,7 +305,7 @@ def _draw_frames(page: _Page, look: SceneLook, top: int, height: int) -> None:
     bar.tick_params(labelsize=9)
 
 
-def _drawable(text: str) -> str:
+def drawable(text: str) -> str:
     """``text`` with what the font cannot draw written as its escape."""
     from matplotlib.font_manager import findfont, get_font
 

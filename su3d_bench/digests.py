@@ -13,10 +13,20 @@ from typing import Any
 
 PACKAGE_ROOT = Path(__file__).resolve().parent
 # What moves a number; the command line and the reports only show it.
-NUMERIC_FOLDERS = ("", "metrics", "opensu3d", "perception", "datasets", "baselines", "rules")
+NUMERIC_FOLDERS = (
+    "",
+    "metrics",
+    "opensu3d",
+    "perception",
+    "perception/language",
+    "perception/models",
+    "datasets",
+    "baselines",
+    "rules",
+)
 NUMERIC_SUFFIXES = {".py", ".toml", ".json", ".tsv", ".csv", ".onnx", ".txt"}
 NUMERIC_PACKAGES = ("numpy", "scipy", "scikit-learn", "opencv-python-headless", "onnxruntime", "open3d", "numba")
-RECORDED_PACKAGES = ("su3d-bench", *NUMERIC_PACKAGES, "pandas", "pydantic")
+RECORDED_PACKAGES = ("su3d-bench", *NUMERIC_PACKAGES, "pandas", "pydantic", "torch", "transformers")
 
 
 def digest_bytes(content: bytes) -> str:

@@ -32,7 +32,7 @@ class _Record(BaseModel):
     is_partial: bool
     code: str
     hardware: str
-    processor: str
+    processor: str = ""  # runs of the first version do not say
     profile: str | None
     encoder_digest: str | None
     data_digests: dict[str, str]

@@ -52,18 +52,48 @@ class TransferRules(BaseModel):
     evaluation_voxel_m: Annotated[float, Field(ge=0)] = 0.0
 
 
+class MergeRules(BaseModel):
+    """When a mask is faulty: over-merged or under-merged.
+
+    ``over_merged_share``: of the object vertices that it covers, at least this share belongs to other objects than the
+    one that it covers most. ``under_merged_share``: of the vertices of that object that any instance of it covers, it
+    covers less than this share.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    over_merged_share: Annotated[float, Field(gt=0, le=1)]
+    under_merged_share: Annotated[float, Field(ge=0, le=1)]
+
+
+class AnswerRules(BaseModel):
+    """How far a distance may be off: ``distance_m`` or ``distance_share`` of the true one, whichever is more."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    distance_m: Annotated[float, Field(ge=0)]
+    distance_share: Annotated[float, Field(ge=0)]
+
+
+_SECTIONS: dict[str, type[BaseModel]] = {"transfer": TransferRules, "merging": MergeRules, "answers": AnswerRules}
+
 CATEGORIES = ("synonyms", "depictions", "vis_sim", "clutter", "missing", "incorrect")
 AP_NAMES = ("AP", "AP50", "AP25")
 VALUES_OF_METRIC: dict[str, tuple[str, ...]] = {
     "openlex3d-topn": CATEGORIES,
     "openlex3d-ranking": ("overall", "synonyms", "secondary"),
     "query-ap": AP_NAMES,
+    "retrieval": ("instance", "affordance", "property", "relative", "all", "reachable"),
+    "annotation": ("label n", "label n'", "well-merged", "under-merged", "over-merged"),
+    "reasoning": ("answer", "objects"),
 }
+SHARE_KINDS = ("retrieval", "annotation", "reasoning")  # their counts are how many were judged and how many are right
 _METRICS = {
     "semantic": ("conceptgraphs", "scannet", "hovsg"),
     "instance": ("scannet",),
     "queries": ("query-ap",),
     "categories": ("openlex3d-topn", "openlex3d-ranking"),
+    **{kind: (kind,) for kind in SHARE_KINDS},
 }
 _CONFIDENCES = {"instance": ("ones", "prediction"), "queries": ("similarity", "similarity-min-max")}
 _CANDIDATES = {
@@ -71,6 +101,7 @@ _CANDIDATES = {
     "instance": ("map-points",),
     "queries": ("each-mask", "map-points"),
     "categories": ("object-points",),
+    **dict.fromkeys(SHARE_KINDS, ("map-points",)),
 }
 
 
@@ -78,7 +109,11 @@ class ProtocolRules(BaseModel):
     """One evaluation, complete: the same rules and the same prediction give the same number.
 
     ``kind``: ``semantic`` (a class a point), ``instance`` (masks with a class), ``queries`` (masks ranked for each
-    text) or ``categories`` (how near a point's label comes to those of its object). ``classes`` is the label set in
+    text), ``categories`` (how near a point's label comes to those of its object), or what people are asked otherwise:
+    ``retrieval`` (the first mask of each text), ``annotation`` (names and shapes of masks), ``reasoning`` (questions
+    that boxes settle). ``questions`` are those of the ``dataset`` itself or ``generated`` from the truth, ``per_kind``
+    of each kind at most; ``synonyms`` names the table of other names of classes. Protocols that are not ``by_default``
+    run where they are named. ``classes`` is the label set in
     the order of the original; ``ignore`` names classes that are known but not scored, and for ``categories`` labels
     whose objects are not. ``vocabulary``: the classifier chooses among ``all`` classes, the ``scored`` ones, or those
     scored ones that the ``scene``'s ground truth contains. ``prompt`` has ``{}`` for the class name, which
@@ -94,9 +129,20 @@ class ProtocolRules(BaseModel):
     name: str
     version: Annotated[int, Field(ge=1)]
     summary: str
-    kind: Literal["semantic", "instance", "queries", "categories"]
-    metric: Literal["conceptgraphs", "scannet", "hovsg", "query-ap", "openlex3d-topn", "openlex3d-ranking"]
+    kind: Literal["semantic", "instance", "queries", "categories", "retrieval", "annotation", "reasoning"]
+    metric: Literal[
+        "conceptgraphs",
+        "scannet",
+        "hovsg",
+        "query-ap",
+        "openlex3d-topn",
+        "openlex3d-ranking",
+        "retrieval",
+        "annotation",
+        "reasoning",
+    ]
     datasets: tuple[str, ...]
+    by_default: bool = True
     label_space: str
     ground_truth: str
     classes: tuple[ClassEntry, ...] = ()
@@ -113,6 +159,11 @@ class ProtocolRules(BaseModel):
     thresholds: tuple[float, ...] = ()
     confidence: Literal["ones", "prediction", "similarity", "similarity-min-max"] | None = None
     top_k: Annotated[int, Field(ge=1)] | None = None
+    questions: Literal["dataset", "generated"] | None = None
+    per_kind: Annotated[int, Field(ge=1)] | None = None
+    synonyms: Literal["lexicon"] | None = None
+    merging: MergeRules | None = None
+    answers: AnswerRules | None = None
     aggregate: Literal["pooled", "scene-mean"] = "pooled"
     headline: Annotated[tuple[str, ...], Field(min_length=1)]
     not_comparable_with: tuple[str, ...] = ()
@@ -143,7 +194,10 @@ class ProtocolRules(BaseModel):
             raise ValueError("class_agnostic: takes no prompt, vocabulary or encoder")
         if (self.vocabulary is None) == (self.kind in ("semantic", "instance") and self.class_agnostic is None):
             raise ValueError("vocabulary: belongs to protocols that choose among classes, and these need it")
-        if self.class_agnostic is None and (self.prompt is None) == (not self.prompts):
+        if self.kind in ("annotation", "reasoning"):
+            if texts or self.encoder:
+                raise ValueError(f"prompt: kind '{self.kind}' compares no features; it takes no prompt and no encoder")
+        elif self.class_agnostic is None and (self.prompt is None) == (not self.prompts):
             raise ValueError("prompt: give either prompt or prompts")
         without = [text for text in texts if "{}" not in text]
         if without:
@@ -158,8 +212,10 @@ class ProtocolRules(BaseModel):
         known = VALUES_OF_METRIC.get(self.metric, AP_NAMES if has_curve else ("mAcc", "mIoU", "F-mIoU"))
         if not set(self.headline) <= set(known):
             raise ValueError(f"headline: a protocol of kind '{self.kind}' has {', '.join(known)}")
-        if not has_curve and (self.min_region_size or self.thresholds or self.confidence):
-            raise ValueError("min_region_size, thresholds and confidence belong to kind 'instance' or 'queries'")
+        if not has_curve and (self.thresholds or self.confidence):
+            raise ValueError("thresholds and confidence belong to kind 'instance' or 'queries'")
+        if not has_curve and self.kind not in SHARE_KINDS and self.min_region_size:
+            raise ValueError("min_region_size: no rule of this kind")
         if has_curve and not {0.25, 0.5} <= set(self.thresholds):
             raise ValueError("thresholds: 0.25 and 0.5 must be among them")
         if has_curve and self.confidence not in _CONFIDENCES[self.kind]:
@@ -167,6 +223,23 @@ class ProtocolRules(BaseModel):
         if (self.metric == "openlex3d-topn") != (self.top_k is not None) and self.kind != "queries":
             raise ValueError("top_k: belongs to kind 'queries' and to metric 'openlex3d-topn', which needs it")
         self._check_transfer()
+        self._check_questions()
+
+    def _check_questions(self) -> None:
+        asks = self.kind in ("retrieval", "reasoning")
+        if (self.questions is not None) != asks or (self.kind in SHARE_KINDS and self.min_region_size is None):
+            raise ValueError("questions: kinds 'retrieval' and 'reasoning' need them, and min_region_size")
+        if self.kind == "reasoning" and self.questions != "generated":
+            raise ValueError("questions: kind 'reasoning' takes 'generated'")
+        if self.per_kind is not None and self.questions != "generated":
+            raise ValueError("per_kind: belongs to generated questions")
+        needs_names = self.kind == "annotation" or self.questions == "generated"
+        if (self.synonyms is not None) != needs_names:
+            raise ValueError("synonyms: kind 'annotation' and generated questions need a table, others take none")
+        if (self.merging is not None) != (self.kind == "annotation"):
+            raise ValueError("merging: kind 'annotation' needs it, others take none")
+        if (self.answers is not None) != (self.kind == "reasoning"):
+            raise ValueError("answers: kind 'reasoning' needs it, others take none")
 
     def _check_transfer(self) -> None:
         transfer = self.transfer
@@ -177,6 +250,8 @@ class ProtocolRules(BaseModel):
             raise ValueError("transfer.cap_m: 'each-mask' needs one, and no evaluation_voxel_m")
         if transfer.neighbours > 1 and self.kind != "semantic":
             raise ValueError("transfer.neighbours: belongs to kind 'semantic'")
+        if self.kind in SHARE_KINDS and transfer.cap_m is None:
+            raise ValueError(f"transfer.cap_m: kind '{self.kind}' needs one")
 
     def is_ignored(self, name: str) -> bool:
         """Whether the class ``name`` is left out, by exact name or, under the substring rule, by a part of it."""
@@ -212,7 +287,8 @@ def protocol_names() -> list[str]:
 
 def protocols_for(dataset: str) -> list[str]:
     """The protocols under which a dataset is scored unless others are named."""
-    return [name for name in protocol_names() if dataset in load_protocol(name).datasets]
+    known = map(load_protocol, protocol_names())
+    return [rules.name for rules in known if rules.by_default and dataset in rules.datasets]
 
 
 def not_comparable_with(rules: ProtocolRules) -> list[str]:
@@ -290,7 +366,12 @@ def _first_line(path: Path, error: ValidationError) -> str:
     key = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
         last = str(first["loc"][-1])
-        fields = TransferRules.model_fields if key.startswith("transfer.") else ProtocolRules.model_fields
+        sections: dict[str, type[BaseModel]] = {
+            "transfer": TransferRules,
+            "merging": MergeRules,
+            "answers": AnswerRules,
+        }
+        fields = sections.get(key.partition(".")[0], ProtocolRules).model_fields
         return f"{_line_of(path, last)}: unknown key '{key}'{suggest(last, fields)}"
     if first["type"] == "missing":
         return f"{path}: the key '{key}' is missing"

@@ -103,7 +103,8 @@ class MethodOutcome:
 def caveat_of(method: Method, perception: Perception) -> str | None:
     """What must be said beside every number: where the masks, or the method's own proposals, come from."""
     own = TRUE_PROPOSALS_CAVEAT if method.needs.true_proposals else getattr(method, "caveat", None)
-    parts = [perception.caveat if method.needs.frames else None, own]
+    is_seen_by_profile = method.needs.frames and not getattr(method, "has_own_perception", False)
+    parts = [perception.caveat if is_seen_by_profile else None, own]
     return "; ".join(part for part in parts if part) or None
 
 

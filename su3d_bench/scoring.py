@@ -17,35 +17,55 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.errors import DataError, PredictionError
-from su3d_bench.metrics import instance_ap, object_means, semantic, transfer
+from su3d_bench.metrics import instance_ap, object_means, semantic, shares, transfer
 from su3d_bench.metrics.openlex3d import OpenLexTruth
 from su3d_bench.metrics.query_ap import QueryTruth
+from su3d_bench.metrics.question_truths import AnnotationTruth, ReasoningTruth, RetrievalTruth
 from su3d_bench.metrics.results import Counts, ProtocolResult, form_result
 from su3d_bench.metrics.scene_score import SceneScore
 from su3d_bench.metrics.score_instances import score_instances
 from su3d_bench.metrics.score_open_vocabulary import NEEDS_FEATURES, score_categories, score_queries
+from su3d_bench.metrics.score_questions import labels_n, score_annotation, score_reasoning, score_retrieval
 from su3d_bench.metrics.score_semantic import score_semantic
 from su3d_bench.protocols import ProtocolRules
 from su3d_bench.types import DenseFeatures, Encoder, GroundTruth, Instances, Partition, Prediction
 
 __all__ = ["SceneScore", "Truth", "combine", "pack_scores", "score_scene", "unpack_scores", "why_not_scorable"]
 
-Truth = GroundTruth | OpenLexTruth | QueryTruth
-_TRUTH_OF_KIND: dict[str, type] = {"queries": QueryTruth, "categories": OpenLexTruth}
+QuestionTruth = RetrievalTruth | AnnotationTruth | ReasoningTruth
+Truth = GroundTruth | OpenLexTruth | QueryTruth | QuestionTruth
+_TRUTH_OF_KIND: dict[str, type] = {
+    "queries": QueryTruth,
+    "categories": OpenLexTruth,
+    "retrieval": RetrievalTruth,
+    "annotation": AnnotationTruth,
+    "reasoning": ReasoningTruth,
+}
 _COUNTS: dict[str, type[Counts]] = {
     "semantic": semantic.SemanticCounts,
     "instance": instance_ap.InstanceCounts,
     "objects": object_means.ObjectCounts,
+    "shares": shares.ShareCounts,
 }
 
 
 def why_not_scorable(rules: ProtocolRules, prediction: Prediction) -> str | None:
     """A sentence where this kind of prediction cannot be scored under the protocol at all."""
-    if rules.kind in ("instance", "queries") and isinstance(prediction, DenseFeatures):
+    if rules.kind not in ("semantic", "categories") and isinstance(prediction, DenseFeatures):
         return f"{rules.name}: needs instances, and the method gives one feature a point"
-    compares = rules.kind == "queries" or rules.metric == "openlex3d-ranking"
+    if rules.kind in ("annotation", "reasoning"):
+        return _why_no_names(rules, prediction)
+    compares = rules.kind in ("queries", "retrieval") or rules.metric == "openlex3d-ranking"
     if compares and isinstance(prediction, Instances) and prediction.features is None and len(prediction):
         return f"{rules.name}: {NEEDS_FEATURES}"
+    return None
+
+
+def _why_no_names(rules: ProtocolRules, prediction: Prediction) -> str | None:
+    if not isinstance(prediction, Instances):
+        return f"{rules.name}: needs instances with names, and the method gives a partition"
+    if len(prediction) and not any(labels_n(prediction)):
+        return f"{rules.name}: needs names, and the method gives its instances none"
     return None
 
 
@@ -55,11 +75,12 @@ def score_scene(rules: ProtocolRules, truth: Truth, prediction: Prediction, enco
     ``encoder`` names the features of predictions that bring no labels. Raises ``PredictionError`` for a prediction that
     cannot be scored and ``DataError`` for a truth that does not fit the protocol.
     """
-    space = truth.labels.space if isinstance(truth, GroundTruth) else truth.space
+    base = truth.scene if isinstance(truth, QuestionTruth) else truth
+    space = base.labels.space if isinstance(base, GroundTruth) else base.space
     if space != rules.label_space:
         raise DataError(f"{rules.name}: scores the label space '{rules.label_space}', the truth has '{space}'")
-    if truth.variant != rules.ground_truth or not isinstance(truth, _TRUTH_OF_KIND.get(rules.kind, GroundTruth)):
-        raise DataError(f"{rules.name}: scores the truth '{rules.ground_truth}', this one is '{truth.variant}'")
+    if base.variant != rules.ground_truth or not isinstance(truth, _TRUTH_OF_KIND.get(rules.kind, GroundTruth)):
+        raise DataError(f"{rules.name}: scores the truth '{rules.ground_truth}', this one is '{base.variant}'")
     reason = why_not_scorable(rules, prediction)
     if reason:
         raise PredictionError(reason)
@@ -71,7 +92,20 @@ def score_scene(rules: ProtocolRules, truth: Truth, prediction: Prediction, enco
     assert not isinstance(prediction, DenseFeatures)  # why_not_scorable says so of the kinds that are left
     if isinstance(truth, QueryTruth):
         return score_queries(rules, truth, prediction, encoder)
+    if isinstance(truth, QuestionTruth):
+        return _score_questions(rules, truth, prediction, encoder)
     return score_instances(rules, truth, prediction, encoder)
+
+
+def _score_questions(
+    rules: ProtocolRules, truth: QuestionTruth, prediction: Instances | Partition, encoder: Encoder | None
+) -> SceneScore:
+    if isinstance(truth, RetrievalTruth):
+        return score_retrieval(rules, truth, prediction, encoder)
+    assert isinstance(prediction, Instances)  # why_not_scorable says so
+    if isinstance(truth, AnnotationTruth):
+        return score_annotation(rules, truth, prediction)
+    return score_reasoning(rules, truth, prediction, encoder)
 
 
 def _check_points(rules: ProtocolRules, prediction: Prediction) -> None:

@@ -53,9 +53,9 @@ class _Metrics(BaseModel):
 
 
 def measured_results(folders: Sequence[Path]) -> list[Measured]:
-    """Every scored method and protocol of the runs, after it is known that those of one protocol may stand together.
+    """Every method and protocol of the runs, after it is known that those of one protocol may stand together.
 
-    Raises ``ConfigError`` where data, rules or encoder of two runs differ.
+    Raises ``ConfigError`` where data, rules or encoder of two runs differ, or where nothing was scored.
     """
     runs = {str(folder): read_run(folder) for folder in dict.fromkeys(folders)}
     found: list[Measured] = []
@@ -68,7 +68,7 @@ def measured_results(folders: Sequence[Path]) -> list[Measured]:
                 refuse_unlike(Side(other, known.method), Side(run, one.method), one.protocol, common)
             first.setdefault(one.protocol, (run, one))
             found.append(one)
-    if not found:
+    if not any(one.per_scene for one in found):
         raise ConfigError(f"{', '.join(runs)}: no scene was scored, so there is nothing for a table")
     return found
 
@@ -79,29 +79,36 @@ def _results_of(name: str, run: FinishedRun) -> list[Measured]:
     except (ValidationError, RecursionError) as error:
         key = ".".join(map(str, error.errors()[0]["loc"])) if isinstance(error, ValidationError) else "it"
         raise StoreError(f"{run.name}: metrics.json: {printable(key, 120)} is not as a run writes it") from error
-    return [
-        Measured(
-            run=name,
-            method=one.method,
-            protocol=one.protocol,
-            version=one.version,
-            kind=one.kind,
-            headline=one.headline,
-            metrics=one.result.metrics,
-            intervals=one.result.intervals,
-            per_scene=one.result.per_scene,
-            ceilings=one.ceiling or {},
-            n_planned=one.n_planned,
-            failed=one.failed,
-            unscored=one.unscored,
-            limit=metrics.limit,
-            profile=one.profile,
-            encoder=one.encoder,
-            caveat=one.caveat,
-        )
-        for one in metrics.results
-        if one.result is not None
-    ]
+    names: dict[str, list[str]] = {}
+    for one in metrics.results:
+        if one.result is not None:
+            names.setdefault(one.protocol, list(one.result.metrics))
+    return [_measured(name, metrics.limit, one, names.get(one.protocol, one.headline)) for one in metrics.results]
+
+
+def _measured(run: str, limit: int, one: _Result, names: Sequence[str]) -> Measured:
+    """``names`` of the protocol's metrics, for a method without any value."""
+    nothing = _Values(metrics=dict.fromkeys(names), intervals={}, per_scene={})
+    values = one.result or nothing
+    return Measured(
+        run=run,
+        method=one.method,
+        protocol=one.protocol,
+        version=one.version,
+        kind=one.kind,
+        headline=one.headline,
+        metrics=values.metrics,
+        intervals=values.intervals,
+        per_scene=values.per_scene,
+        ceilings=one.ceiling or {},
+        n_planned=one.n_planned,
+        failed=one.failed,
+        unscored=one.unscored,
+        limit=limit,
+        profile=one.profile,
+        encoder=one.encoder,
+        caveat=one.caveat,
+    )
 
 
 def choose(found: Sequence[Measured], methods: Sequence[str], protocols: Sequence[str]) -> list[Measured]:

@@ -366,7 +366,8 @@ class Dataset(Protocol):
 
     It may have: ``places()``, the folders that it searches; ``status(scene)``, a word on a scene from a quick look;
     ``groups()``, names for sets of scenes such as ``val``; ``problems(scene)``, every fault of its files, a line each;
-    ``surface(scene)``, the scan's mesh without labels.
+    ``surface(scene)``, the scan's mesh without labels; ``queries(scene)``, texts with ``kind`` and ``answers``, the
+    ids of all objects that answer them.
     """
 
     name: str
@@ -410,7 +411,8 @@ class Method(Protocol):
     It may have ``receive_tools(tools: SceneTools)``, called before ``start``; ``n_points`` and ``n_instances``, the
     size of its map after an update; ``close()``, called when the prediction is written; ``caveat``, what must be said
     beside its numbers; ``about``, a ``MethodAbout``; ``inputs``, digests of files outside the configuration that move
-    its numbers, by name; ``finish_costs``, numbers on the last ``finish`` that stand beside its time.
+    its numbers, by name; ``finish_costs``, numbers on the last ``finish`` that stand beside its time;
+    ``has_own_perception``, so that the caveat of the run's perception is not its.
     """
 
     name: str

@@ -57,7 +57,7 @@ def test_the_module_is_the_command() -> None:
     assert (done.returncode, done.stdout) == (0, "su3d-bench 0.1.0\n")
 
 
-@pytest.mark.parametrize("verb", ["run", "evaluate", "query", "datasets", "methods", "protocols", "export"])
+@pytest.mark.parametrize("verb", ["run", "evaluate", "query", "datasets", "methods", "protocols", "export", "report"])
 def test_the_help_of_every_verb_ends_with_two_examples(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     parser = verbs()[verb]
     assert len(examples(parser)) == 2
@@ -65,7 +65,7 @@ def test_the_help_of_every_verb_ends_with_two_examples(verb: str, capsys: pytest
     assert capsys.readouterr().out.rstrip().endswith(examples(parser)[-1])
 
 
-@pytest.mark.parametrize("verb", ["run", "evaluate", "query", "datasets", "methods", "protocols", "export"])
+@pytest.mark.parametrize("verb", ["run", "evaluate", "query", "datasets", "methods", "protocols", "export", "report"])
 def test_the_examples_of_every_verb_parse(verb: str) -> None:
     for example in examples(verbs()[verb]):
         arguments = build_parser().parse_args(shlex.split(example)[1:])
@@ -244,7 +244,7 @@ def test_json_answers_are_the_metrics_file(capsys: pytest.CaptureFixture[str]) -
 def test_a_query_ranks_the_map_and_draws_it(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(query, "encoder_of", lambda run: colour_perception().encoder)
+    monkeypatch.setattr(query, "encoder_of", lambda run, device: colour_perception().encoder)
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a"]) == 0
     capsys.readouterr()
     words = ["query", "painted/a", "a red sofa", "--method", "collector"]
@@ -266,7 +266,7 @@ def test_a_query_ranks_the_map_and_draws_it(
 def test_a_map_without_features_cannot_be_queried(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(query, "encoder_of", lambda run: colour_perception().encoder)
+    monkeypatch.setattr(query, "encoder_of", lambda run, device: colour_perception().encoder)
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a", "--quiet"]) == 0
     capsys.readouterr()
     assert main(["query", "painted/a", "sofa", "--method", "oracle"]) == 2

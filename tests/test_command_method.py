@@ -3,94 +3,33 @@
 from __future__ import annotations
 
 import json
-import os
 import shutil
 import sys
-import time
 import tomllib
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import numpy as np
-import psutil
 import pytest
-from painted import INTRINSICS, ColourPerception, Painted, colour_perception
-from pydantic import ValidationError
+from made_programs import MASKS, SCENE, SURFACE, fed, frames, method, program, refused
+from painted import INTRINSICS, ColourPerception, colour_perception
 
 from su3d_bench import scene_run
 from su3d_bench.baselines.command import Command, CommandConfig
 from su3d_bench.baselines.command_frames import FrameFolder, write_mesh
 from su3d_bench.baselines.command_prediction import ClassNames, as_prediction, class_names
-from su3d_bench.baselines.command_process import ContainerWatch, run_program
 from su3d_bench.cli.main import main
 from su3d_bench.datasets.replica_truth import read_surface
 from su3d_bench.datasets.rgbd import Rgbd
-from su3d_bench.errors import ConfigError, DataError, PredictionError
+from su3d_bench.errors import ConfigError, PredictionError
 from su3d_bench.predictions.base import VertexLabels, VertexMasks
 from su3d_bench.scene_tools import no_detections
 from su3d_bench.timing import Timer
-from su3d_bench.types import Frame, Instances, SceneInfo, SceneTools, Surface
+from su3d_bench.types import Instances, Surface
 
 HERE = Path(__file__).parent
-SCENE = SceneInfo("rooms", "a b", 6, 1, "rendered-rooms", seed=7)
-SURFACE = Surface(
-    np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 2], [3, 0, 0]], np.float32),
-    np.array([[0, 1, 2], [0, 1, 3]], np.int32),
-)
-# Two masks over five vertices as ScanNet's text has them, with the class ids of chair and wall in the rooms.
-MASKS = """
-import os, sys
-out = sys.argv[1]
-os.mkdir(out + "/masks")
-open(out + "/scene.txt", "w").write("masks/0.txt 20 0.9\\nmasks/1.txt 93 0.5\\n")
-open(out + "/masks/0.txt", "w").write("1\\n1\\n0\\n0\\n0\\n")
-open(out + "/masks/1.txt", "w").write("0\\n0\\n0\\n1\\n1\\n")
-"""
-
-
-def frames(n: int = 3) -> list[Frame]:
-    dataset = Painted(Path(), Painted.Options(n_frames=n))
-    return list(dataset.frames("a", 1))
-
-
-def program(tmp_path: Path, text: str) -> Path:
-    path = tmp_path / "program.py"
-    path.write_text(text)
-    return path
-
-
-def method(tmp_path: Path, text: str, *words: str, surface: Surface | None = SURFACE, **config: Any) -> Command:
-    """The method around the Python program ``text``, fed with three frames."""
-    command = (sys.executable, str(program(tmp_path, text)), *(words or ("{output}",)))
-    return fed(Command(CommandConfig(command=command, **config)), surface)
-
-
-def fed(one: Command, surface: Surface | None = SURFACE, shots: Sequence[Frame] | None = None) -> Command:
-    def give() -> Surface:
-        if surface is None:
-            raise DataError("rooms/a b: the dataset has no mesh")
-        return surface
-
-    shots = frames() if shots is None else shots
-    one.receive_tools(SceneTools(shots, None, give))  # type: ignore[arg-type]
-    one.start(SCENE)
-    for frame in shots:
-        one.update(frame, no_detections(frame, one.needs), Timer())
-    return one
-
-
-def refused(one: Command) -> str:
-    with pytest.raises(PredictionError) as caught:
-        one.finish()
-    text = str(caught.value)
-    assert "\n" not in text
-    assert "\x1b" not in text
-    assert len(text) < 700
-    one.close()
-    return text
 
 
 def test_the_exported_folder_reads_back_as_the_frames_that_went_in(tmp_path: Path) -> None:
@@ -225,63 +164,22 @@ def test_class_numbers_that_two_lists_read_differently_ask_for_a_protocol() -> N
         ("", {}, "it ended without an error and left nothing in {output}"),
         ("import sys; open(sys.argv[1] + '/x.bin', 'wb').write(b'?')", {}, "{output}: in none of the known formats"),
         ("import sys; open(sys.argv[1] + '/p.npz', 'wb').write(b'?')", {"format": "openmask3d"}, "{output}"),
-        (
-            "import sys, time; print('loading', file=sys.stderr, flush=True); time.sleep(60)",
-            {"timeout_s": 0.5},
-            "was ended after 0.5 s (timeout_s); its last line: loading",
-        ),
     ],
-    ids=["exit-code", "signal", "nothing", "unknown-format", "wrong-format", "timeout"],
+    ids=["exit-code", "signal", "nothing", "unknown-format", "wrong-format"],
 )
 def test_what_goes_wrong_is_one_line_that_says_it(tmp_path: Path, text: str, config: dict[str, Any], line: str) -> None:
     assert line in refused(method(tmp_path, text, **config))
 
 
+def test_a_program_that_takes_too_long_is_ended_and_its_last_line_told() -> None:
+    # a shell starts at once, however busy the machine is
+    one = fed(Command(CommandConfig(command="echo loading >&2; sleep 60", shell=True, timeout_s=2.0)))
+    assert "was ended after 2 s (timeout_s); its last line: loading" in refused(one)
+
+
 def test_a_program_that_is_not_there_is_named(tmp_path: Path) -> None:
     one = fed(Command(CommandConfig(command=("./nowhere", "{output}"))))
     assert "'./nowhere' cannot be started: No such file" in refused(one)
-
-
-def test_a_timeout_ends_children_too_even_those_that_left_the_group(tmp_path: Path) -> None:
-    text = f"""
-import subprocess, sys, time
-for away in (False, True):
-    child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], start_new_session=away)
-    print(child.pid, file=open({str(tmp_path)!r} + "/pids", "a"))
-time.sleep(60)
-"""
-    refused(method(tmp_path, text, timeout_s=1.5))
-    pids = [int(line) for line in (tmp_path / "pids").read_text().split()]
-    assert len(pids) == 2
-    deadline = time.monotonic() + 10
-    while any(_runs(pid) for pid in pids) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not any(_runs(pid) for pid in pids)
-
-
-def _runs(pid: int) -> bool:
-    return bool(psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
-
-
-def test_memory_and_time_are_those_of_the_program_and_its_children(tmp_path: Path) -> None:
-    child = "import time; held = bytearray(150_000_000); time.sleep(0.6)"
-    text = f"import subprocess, sys; held = bytearray(100_000_000); subprocess.run([sys.executable, '-c', {child!r}])"
-    done = run_program(
-        [sys.executable, "-c", text], folder=tmp_path, environment={"PATH": os.environ["PATH"]}, timeout_s=60
-    )
-    assert done.exit_code == 0
-    assert done.peak_memory_bytes is not None
-    assert 250e6 <= done.peak_memory_bytes < 400e6
-    assert done.wall_s >= 0.6
-
-
-def test_a_flood_of_output_is_kept_from_its_end_only(tmp_path: Path) -> None:
-    text = "import sys\nfor i in range(40000): print('line', i)\nsys.stderr.write('end')"
-    done = run_program([sys.executable, "-c", text], folder=tmp_path, environment={}, timeout_s=60)
-    assert len(done.stdout) < 101_000
-    assert done.stdout.startswith("[")
-    assert done.stdout.endswith("line 39999\n")
-    assert done.stderr == "end"
 
 
 def test_only_the_variables_that_are_allowed_reach_the_program(
@@ -319,18 +217,41 @@ def test_a_line_is_split_into_words_and_a_shell_reads_it_only_when_asked(tmp_pat
     assert CommandConfig(command="a 'b c' {output}").words == ("a", "b c", "{output}")
 
 
+def test_a_file_named_from_here_is_found_from_the_programs_own_folder(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    program(tmp_path, MASKS)
+    monkeypatch.chdir(tmp_path)
+    one = fed(Command(CommandConfig(command=(sys.executable, "program.py", "{output}"))))
+    assert "file program.py" in one.inputs
+    assert _n_masks(one) == 2
+    one.close()
+
+
 def test_finish_midway_gives_the_map_of_the_frames_so_far_and_changes_nothing(tmp_path: Path) -> None:
-    text = "import sys, os; n = len(os.listdir(sys.argv[2] + '/colour')); assert not os.listdir(sys.argv[1]); " + (
-        "import numpy as np; np.savez(sys.argv[1] + '/prediction.npz', kind='Partition', points=np.zeros((n, 3), 'f4'),"
-        " instance=np.zeros(n, 'i4'), features=np.ones((1, 4), 'f4'))"
-    )
-    one = method(tmp_path, text, "{output}", "{frames}")
-    assert [len(one.finish().points) for _ in range(2)] == [3, 3]
+    text = """
+import os, sys
+out, frames = sys.argv[1:]
+assert not os.listdir(out)
+names = [name[:-4] for name in os.listdir(frames + "/colour")]
+open(out + "/scene.txt", "w").writelines(f"masks/{name}.txt 20 1\\n" for name in names)
+os.mkdir(out + "/masks")
+for name in names:
+    open(out + f"/masks/{name}.txt", "w").write("1\\n" * 5)
+"""
+    one = method(tmp_path, text, "{output}", "{frames}", format="scannet-text")
+    assert [_n_masks(one) for _ in range(2)] == [3, 3]
     late = frames(4)[3]
     one.update(late, no_detections(late, one.needs), Timer())
-    assert len(one.finish().points) == 4
+    assert _n_masks(one) == 4
     assert one.finish_costs["program_s"] > 0
     one.close()
+
+
+def _n_masks(one: Command) -> int:
+    found = one.finish()
+    assert isinstance(found, Instances)
+    return len(found)
 
 
 def test_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -341,113 +262,6 @@ def test_nothing_is_left_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     assert list((tmp_path / "scratch").iterdir())
     one.close()
     assert not list((tmp_path / "scratch").iterdir())
-
-
-def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, body: str) -> Path:
-    """A program called ``name``, first on PATH, that writes down its arguments and then does ``body``."""
-    folder = tmp_path / "bin"
-    folder.mkdir(exist_ok=True)
-    log = tmp_path / f"{name}.jsonl"
-    (folder / name).write_text(
-        f"#!{sys.executable}\nimport json, os, sys\nwords = sys.argv[1:]\n"
-        f"print(json.dumps(words), file=open({str(log)!r}, 'a'))\n{body}"
-    )
-    (folder / name).chmod(0o755)
-    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
-    return log
-
-
-FAKE_DOCKER = """
-if words[0] == "run":
-    open(words[words.index("--cidfile") + 1], "w").write("abc123")
-    here = next(w.split(":")[0] for w in words if w.endswith(":/su3d/output"))
-    sys.argv = ["", here]
-"""
-
-
-def test_docker_gets_read_only_frames_no_network_and_the_paths_inside(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    log = fake(tmp_path, monkeypatch, "docker", FAKE_DOCKER + MASKS)
-    monkeypatch.setenv("MY_MODEL", "large")
-    config = CommandConfig(
-        command=("run.py", "{frames}", "{output}"),
-        runner="docker",
-        image="their/image:1",
-        gpus="all",
-        mounts=("/data/weights:/weights",),
-        pass_variables=("PATH", "MY_MODEL"),
-    )
-    one = fed(Command(config))
-    assert len(one.finish().scores) == 2  # type: ignore[union-attr]
-    one.close()
-    (words,) = [json.loads(line) for line in log.read_text().splitlines()]
-    assert words[:3] == ["run", "--rm", "--init"]
-    assert words[-4:] == ["their/image:1", "run.py", "/su3d/frames", "/su3d/output"]
-    volumes = [words[i + 1] for i, word in enumerate(words) if word == "--volume"]
-    assert volumes[0].endswith("/frames:/su3d/frames:ro")
-    assert volumes[3] == "/data/weights:/weights:ro"
-    assert [words[i + 1] for i, word in enumerate(words) if word == "--env"] == ["MY_MODEL"]
-    assert words[words.index("--network") + 1] == "none"
-    assert words[words.index("--user") + 1] == f"{os.getuid()}:{os.getgid()}"
-    assert words[words.index("--gpus") + 1] == "all"
-
-
-def test_a_container_that_takes_too_long_is_killed_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    log = fake(tmp_path, monkeypatch, "docker", "import time\nif words[0] == 'run': time.sleep(60)")
-    one = fed(Command(CommandConfig(command="x {output}", runner="docker", image="i", timeout_s=1.0)))
-    assert "was ended after 1 s" in refused(one)
-    started, killed = (json.loads(line) for line in log.read_text().splitlines())
-    assert killed == ["kill", started[started.index("--name") + 1]]
-
-
-@pytest.mark.parametrize("place", ["system.slice/docker-abc123.scope/memory.peak", "docker/abc123/memory.peak"])
-def test_a_containers_peak_is_what_its_cgroup_says(tmp_path: Path, place: str) -> None:
-    (tmp_path / place).parent.mkdir(parents=True)
-    told = []
-    for identity, peak in (("abc123", ""), ("../../etc", "99"), ("abc123", "123456\n")):
-        (tmp_path / "id").write_text(identity)
-        (tmp_path / place).write_text(peak)
-        watch = ContainerWatch("name", tmp_path / "id", lambda name: None, cgroups=tmp_path)
-        watch.look()
-        told.append((watch.peak_bytes, watch.source))
-    unread = (None, "not measured: the cgroup cannot be read here")
-    assert told == [unread, unread, (123456, "the container's cgroup")]
-
-
-@pytest.mark.parametrize(("environment", "kind"), [("theirs", "--name"), ("/envs/theirs", "--prefix")])
-def test_conda_runs_the_command_in_the_environment(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: str, kind: str
-) -> None:
-    log = fake(tmp_path, monkeypatch, "conda", "sys.argv = ['', words[-1]]" + MASKS)
-    one = fed(Command(CommandConfig(command="python run.py {output}", runner="conda", environment=environment)))
-    assert len(one.finish().scores) == 2  # type: ignore[union-attr]
-    one.close()
-    (words,) = [json.loads(line) for line in log.read_text().splitlines()]
-    assert words[:6] == ["run", "--no-capture-output", kind, environment, "python", "run.py"]
-
-
-@pytest.mark.parametrize(
-    ("config", "reason"),
-    [
-        ({"command": ["a", "{frame}"]}, "'{frame}' stands for nothing; known: {frames}"),
-        ({"command": ["a"], "shell": True}, "shell = true takes the command as one line"),
-        ({"command": "a 'b"}, "No closing quotation"),
-        ({"command": ["a"], "runner": "docker"}, "runner 'docker' needs image"),
-        ({"command": ["a"], "runner": "conda"}, "runner 'conda' needs environment"),
-        ({"command": ["a"], "image": "x"}, "belong to runner 'docker'"),
-        ({"command": ["a"], "environment": "x"}, "belongs to runner 'conda'"),
-        ({"command": ["a"], "runner": "docker", "image": "i", "mounts": ["w:/w"]}, "is not HERE:THERE"),
-        ({"command": ["a"], "runner": "docker", "image": "--privileged"}, "String should match pattern"),
-        ({"command": ["a"], "format": "zip"}, "unknown format 'zip'"),
-        ({"command": ["a"], "pass_variables": ["A=B"]}, "pattern"),
-        ({"command": ["a"], "timeout_s": 0}, "greater than 0"),
-    ],
-)
-def test_a_configuration_that_cannot_work_is_refused(config: dict[str, Any], reason: str) -> None:
-    with pytest.raises(ValidationError) as caught:
-        CommandConfig.model_validate_json(json.dumps(config))
-    assert reason in str(caught.value)
 
 
 def test_without_a_program_there_is_no_method() -> None:

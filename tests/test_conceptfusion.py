@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from box_room import SIZE, write_box_room
+from scannet_scan import SCAN, write_recording
 
 from su3d_bench.baselines.conceptfusion import ConceptFusion, ConceptFusionConfig
 from su3d_bench.baselines.conceptfusion_sam import ConceptFusionSam
 from su3d_bench.baselines.pixel_features import mixed_features, mixing_weights, paint
+from su3d_bench.datasets.replica import Replica
+from su3d_bench.datasets.scannet import ScanNet
 from su3d_bench.errors import DataError
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
@@ -29,7 +34,8 @@ def rows(*features: Any) -> Float32Array:
 
 
 def unit(*values: float) -> np.ndarray:
-    return np.array(values) / np.linalg.norm(values)
+    direction: np.ndarray = np.array(values) / np.linalg.norm(values)
+    return direction
 
 
 # ---- 4.1: weights and mixtures
@@ -71,7 +77,8 @@ def field_of(features: list[np.ndarray], overlaps: Any = "sum", boxes: Any = Non
     masks = np.ones((len(features), 1, 1), bool)
     boxes = np.tile(BOX, (len(features), 1)) if boxes is None else rows(*boxes)
     painted = paint(masks, boxes, np.array(features), overlaps, 1, 1)
-    return painted.features[painted.row[0, 0]].astype(float)
+    of_pixel: np.ndarray = painted.features[painted.row[0, 0]].astype(float)
+    return of_pixel
 
 
 def test_where_masks_overlap_the_last_counts_as_much_as_all_before_it() -> None:
@@ -246,6 +253,27 @@ def test_what_does_not_fit_is_one_line() -> None:
     small = replace(seen(1, (EVERYWHERE, A)), masks=np.ones((1, 4, 6), bool))
     with pytest.raises(DataError, match="frame 1: masks are 6x4 and the image is 8x8"):
         method.update(wall(1), small, Timer())
+
+
+def test_frames_of_recordings_fuse_into_the_room_that_they_show(tmp_path: Path) -> None:
+    """Replica's layout and ScanNet's .sens files, at the size of the depth image and below."""
+    write_box_room(tmp_path, n_frames=4)
+    folder = tmp_path / "scans" / SCAN
+    folder.mkdir(parents=True)
+    write_recording(folder / f"{SCAN}.sens", n_frames=4)
+    for dataset, scene, far in ((Replica(tmp_path), "room0", SIZE), (ScanNet(tmp_path), SCAN, None)):
+        frames = dataset.frames(scene, 1)
+        height, width = frames[0].depth_m.shape
+        method = ConceptFusion(ConceptFusionConfig(height=height, width=width))
+        method.start(SCENE)
+        for k, frame in enumerate(frames):
+            none = replace(seen(frame.index), masks=np.zeros((0, height, width), bool))
+            method.update(frame, none, Timer())
+            assert k or method.n_points == (frame.depth_m > 0).sum()
+        points = method.finish().points.astype(float)
+        assert len(points) < (len(frames) - 1) * height * width  # the views overlap
+        off = np.abs(points[:, 2]) if far is None else np.minimum(np.abs(points), np.abs(points - far)).min(axis=1)
+        assert off.max() < 0.02
 
 
 # ---- what it does unlike the others

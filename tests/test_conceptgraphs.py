@@ -1,4 +1,4 @@
-"""ConceptGraphs from regions to a map: what is lifted and how, what the map keeps, when it is cleaned up."""
+"""ConceptGraphs' map of objects: what joins what, when it is cleaned up, what it tells, how it differs from others."""
 
 from __future__ import annotations
 
@@ -10,15 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conceptgraphs_scene import (
-    DIMENSION,
-    HEIGHT,
     QUIET,
     SCENE,
-    WIDTH,
     Plate,
     at_cosine,
     axis,
-    block,
     contents,
     look,
     mapped,
@@ -28,225 +24,17 @@ from painted import colour_perception
 from su3d_bench import scene_run
 from su3d_bench.baselines.conceptgraphs import ConceptGraphs
 from su3d_bench.baselines.conceptgraphs_config import MappingConfig
-from su3d_bench.baselines.conceptgraphs_regions import kept_regions, lift, subtract_contained
-from su3d_bench.baselines.object_clouds import bounding_box, largest_cluster, voxel_average
 from su3d_bench.cli.main import main
-from su3d_bench.errors import DataError
-from su3d_bench.geometry import back_project
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.timing import Timer
-from su3d_bench.types import Detections
 
-RNG = np.random.default_rng(3)
 LEFT, RIGHT = Plate((-0.5, 0.0)), Plate((0.0, 0.5))
-PUBLISHED = MappingConfig()
 BARE = QUIET.model_copy(update={"obj_min_detections": 0})
 
 
 def found_by(views: list[list[Plate]], config: MappingConfig = BARE) -> int:
     return len(mapped(ConceptGraphs(config), views).finish())
-
-
-# Clouds
-
-
-def test_a_voxel_average_is_the_mean_of_its_points_on_a_grid_from_half_a_voxel_below_the_minimum() -> None:
-    along_x = np.array([5.0, 5.01, 5.013, 5.04])  # cells 0, 0, 1, 2 of 25 mm from 4.9875 m
-    points = np.stack([along_x, np.zeros(4), np.zeros(4)], axis=1)
-    assert voxel_average(points, 0.025)[:, 0].tolist() == pytest.approx([5.005, 5.013, 5.04])
-
-
-def test_voxel_averages_are_those_of_open3d() -> None:
-    import open3d as o3d
-
-    points = RNG.normal(0, 0.3, (4000, 3)) + np.array([10, -20, 30])
-    theirs = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)).voxel_down_sample(0.1)
-    ours = voxel_average(points, 0.1)
-    assert sorted(map(tuple, ours)) == sorted(map(tuple, np.asarray(theirs.points)))
-
-
-def test_the_grid_moves_with_the_cloud_so_that_averaging_again_moves_points() -> None:
-    points = RNG.random((500, 3))
-    assert voxel_average(points + 0.037, 0.1) == pytest.approx(voxel_average(points, 0.1) + 0.037)
-    along_x = np.array([[5.0, 0, 0], [5.012, 0, 0], [5.028, 0, 0], [5.04, 0, 0]])
-    once = voxel_average(along_x, 0.025)
-    assert once[:, 0].tolist() == pytest.approx([5.006, 5.028, 5.04])
-    assert voxel_average(once, 0.025)[:, 0].tolist() == pytest.approx([5.006, 5.034])
-    assert voxel_average(np.zeros((0, 3)), 0.1).shape == (0, 3)
-
-
-def row_of_points(n: int, start: float, step: float = 0.01) -> np.ndarray:
-    return np.stack([start + step * np.arange(n), np.zeros(n), np.zeros(n)], axis=1)
-
-
-def test_the_largest_cluster_stays() -> None:
-    small, large = row_of_points(11, 0.0), row_of_points(12, 1.0)
-    assert largest_cluster(np.concatenate([small, large]), 0.1, 10).tolist() == large.tolist()
-
-
-def test_of_equal_clusters_the_one_that_comes_first_stays() -> None:
-    first, second = row_of_points(12, 1.0), row_of_points(12, 0.0)
-    assert largest_cluster(np.concatenate([first, second]), 0.1, 10).tolist() == first.tolist()
-
-
-def test_a_cloud_without_a_cluster_of_five_stays_whole() -> None:
-    scattered = row_of_points(30, 0.0, step=0.2)
-    assert largest_cluster(scattered, 0.1, 10) is scattered
-    four = np.concatenate([row_of_points(4, 0.0), row_of_points(3, 1.0)])
-    assert largest_cluster(four, 0.1, 2) is four
-    five = np.concatenate([row_of_points(5, 0.0), row_of_points(3, 1.0)])
-    assert len(largest_cluster(five, 0.1, 2)) == 5
-
-
-def test_a_box_lies_along_the_object_and_one_of_three_points_along_the_world() -> None:
-    turn = np.array([[0.8, -0.6, 0], [0.6, 0.8, 0], [0, 0, 1]])
-    points = block((0, 0, 0), (1.0, 0.4, 0.2)) @ turn.T
-    box = bounding_box(points, oriented=True)
-    # the last points are a step before the end; the corners of the hull are joggled, hence not all of them count
-    assert sorted(box.sizes) == pytest.approx([0.15, 0.35, 0.95], rel=0.15)
-    assert abs(box.rotation[:, np.argmax(box.sizes)] @ turn[:, 0]) > 0.99
-    assert box.distance_outside(points).max() < 1e-6
-    for flat in (bounding_box(points, oriented=False), bounding_box(points[:3], oriented=True)):
-        assert flat.rotation.tolist() == np.eye(3).tolist()
-    assert bounding_box(points, oriented=False).sizes == pytest.approx(np.ptp(points, axis=0))
-
-
-# Regions
-
-
-def region(area_px: int = 400, box: tuple[int, int, int, int] = (0, 0, 40, 40), score: float = 1.0) -> Detections:
-    """One region of so many pixels in a 96x72 image; the box need not be the mask's."""
-    mask = (np.arange(WIDTH * HEIGHT) < area_px).reshape(1, HEIGHT, WIDTH)
-    features = np.ones((1, 1, DIMENSION), np.float32)
-    scores = np.array([score], np.float32)
-    return Detections(0, mask, np.array([box], np.float32), scores, ("item",), ("",), (1.0,), features, features[0, 0])
-
-
-def is_kept(one: Detections, config: MappingConfig = PUBLISHED, *, background: bool = False) -> bool:
-    return len(kept_regions(one, np.array([background]), config)) == 1
-
-
-def test_masks_below_25_pixels_are_left_out_and_below_10_whatever_is_configured() -> None:
-    assert is_kept(region(25))
-    assert not is_kept(region(24))
-    config = MappingConfig(mask_area_threshold=3)
-    assert is_kept(region(10), config)
-    assert not is_kept(region(9), config)
-
-
-def test_masks_below_the_confidence_are_left_out() -> None:
-    assert is_kept(region(score=0.95))
-    assert not is_kept(region(score=0.949))
-
-
-def test_scores_on_a_scale_of_their_own_have_a_threshold_of_their_own() -> None:
-    unsure = replace(region(score=0.3), score_scale="own")
-    assert is_kept(unsure)
-    assert not is_kept(unsure, MappingConfig(own_scale_conf_threshold=0.5))
-    assert not is_kept(region(score=0.3))
-
-
-def test_boxes_above_half_the_image_are_left_out_but_not_background() -> None:
-    half, more = (0, 0, 48, 72), (0, 0, 49, 72)
-    assert is_kept(region(box=half))
-    assert not is_kept(region(box=more))
-    assert is_kept(region(box=more), background=True)
-
-
-def boxes_and_masks(*boxes: tuple[int, int, int, int]) -> tuple[np.ndarray, np.ndarray]:
-    masks = np.zeros((len(boxes), 40, 40), np.bool_)
-    for mask, (x0, y0, x1, y1) in zip(masks, boxes, strict=True):
-        mask[y0:y1, x0:x1] = True
-    return np.array(boxes, np.float32), masks
-
-
-def test_a_contained_mask_is_cut_out_of_its_container() -> None:
-    result = subtract_contained(*boxes_and_masks((0, 0, 20, 20), (5, 5, 15, 15)))
-    assert result.sum(axis=(1, 2)).tolist() == [300, 100]
-    assert not (result[0] & result[1]).any()
-
-
-def test_containment_is_less_than_070_of_the_container_and_more_than_080_of_the_contained() -> None:
-    def cut(*boxes: tuple[int, int, int, int]) -> int:
-        boxes_px, masks = boxes_and_masks(*boxes)
-        return int(masks[0].sum() - subtract_contained(boxes_px, masks)[0].sum())
-
-    assert cut((0, 0, 10, 10), (0, 0, 10, 7)) == 0  # 70 of 100: not below 0.7
-    assert cut((0, 0, 10, 10), (0, 0, 3, 23)) == 0  # 30 of 69 is no 0.8
-    assert cut((0, 0, 10, 10), (6, 0, 11, 5)) == 0  # 20 of 25: not above 0.8
-    assert cut((0, 0, 20, 20), (11, 0, 21, 10)) == 90  # 90 of 100
-
-
-def test_masks_are_cut_one_after_the_other_with_what_is_left_of_them() -> None:
-    # the middle box holds 6 / 6.5 of the inner one and lies in the outer one, which holds only 5 / 6.5 of the inner one
-    boxes, masks = boxes_and_masks((0, 0, 25, 25), (14, 5, 25, 17), (21, 6, 25, 8))
-    boxes[1], boxes[2] = (14, 5, 26, 17), (20, 6, 26.5, 8)
-    outer_first = subtract_contained(boxes, masks)
-    assert not outer_first[0][masks[1]].any()  # the middle one was whole when it was cut out of the outer one
-    order = [1, 0, 2]
-    middle_first = subtract_contained(boxes[order], masks[order])
-    assert middle_first[1][masks[2]].all()  # now it had lost the inner one, which thus stays in the outer one
-
-
-def test_a_box_without_area_contains_nothing_and_is_in_nothing() -> None:
-    boxes, masks = boxes_and_masks((0, 0, 20, 20), (5, 5, 15, 15))
-    boxes[1] = 5, 5, 5, 5
-    assert subtract_contained(boxes, masks).tolist() == masks.tolist()
-
-
-def lifted(plates: list[Plate], config: MappingConfig = QUIET, index: int = 0, seed: int = 0) -> list:  # type: ignore[type-arg]
-    frame, detections = look(plates, index)
-    return list(lift(frame, np.arange(len(detections)), detections.masks, config, seed))
-
-
-def test_without_noise_a_region_is_lifted_to_the_voxel_averages_of_its_pixels() -> None:
-    frame, detections = look([LEFT])
-    points = back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, detections.masks[0])
-    (one,) = lifted([LEFT])
-    assert one.points == pytest.approx(voxel_average(points, 0.025), abs=1e-12)
-
-
-def test_noise_of_4_mm_comes_from_the_seed_and_the_frame() -> None:
-    fine = QUIET.model_copy(update={"downsample_voxel_size": 1e-4, "dbscan_remove_noise": False})
-    noisy = fine.model_copy(update={"noise_m": 0.004})
-    (still,), (moved,) = lifted([LEFT], fine), lifted([LEFT], noisy)
-    offsets = moved.points - still.points
-    assert offsets.std(axis=0) == pytest.approx(np.full(3, 0.004), rel=0.1)
-    assert np.abs(offsets.mean(axis=0)).max() < 5e-4
-    assert lifted([LEFT], noisy)[0].points.tobytes() == moved.points.tobytes()
-    assert lifted([LEFT], noisy, seed=1)[0].points.tobytes() != moved.points.tobytes()
-    assert lifted([LEFT], noisy, index=1)[0].points.tobytes() != moved.points.tobytes()
-
-
-def test_a_region_of_fewer_than_16_points_with_depth_is_left_out() -> None:
-    frame, detections = look([LEFT])
-    rows, columns = np.nonzero(detections.masks[0])
-    depth = frame.depth_m.copy()
-    depth[rows[16:], columns[16:]] = 0
-    # 16 pixels of a row 2 cm apart: without noise their box has no volume
-    noisy = QUIET.model_copy(update={"noise_m": 0.004})
-    assert len(list(lift(replace(frame, depth_m=depth), np.array([0]), detections.masks, noisy, 0))) == 1
-    depth[rows[15], columns[15]] = np.nan
-    assert not list(lift(replace(frame, depth_m=depth), np.array([0]), detections.masks, noisy, 0))
-
-
-def test_a_region_whose_box_is_below_one_cubic_centimetre_is_left_out() -> None:
-    flat = np.full((HEIGHT, WIDTH), 1.5, np.float32)
-    frame, detections = look([LEFT])
-    assert len(lifted([LEFT])) == 1
-    assert not list(lift(replace(frame, depth_m=flat), np.array([0]), detections.masks, QUIET, 0))
-
-
-def test_masks_of_another_size_than_the_image_are_refused() -> None:
-    frame, detections = look([LEFT])
-    with pytest.raises(DataError, match="frame 0: masks are 90x72 and the image is 96x72"):
-        list(lift(frame, np.array([0]), detections.masks[:, :, :90], QUIET, 0))
-    with pytest.raises(DataError, match="frame 3: the detections are those of frame 0"):
-        ConceptGraphs().update(replace(frame, index=3), detections, Timer())
-
-
-# The map
 
 
 def test_in_the_first_frame_every_region_becomes_an_object_however_alike_they_are() -> None:
@@ -291,7 +79,7 @@ def test_every_twentieth_frame_objects_are_denoised_and_overlapping_ones_merged(
     told = [stages(method, [LEFT], index) for index in range(40)]
     assert [k for k, names in enumerate(told) if "denoise" in names] == [19, 39]
     assert [k for k, names in enumerate(told) if "overlap" in names] == [19, 39]
-    assert told[1] == {"filter", "backproject", "background", "match", "merge"}
+    assert told[1] == {"filter", "backproject", "match", "merge"}
 
 
 def test_a_frame_without_regions_is_counted_but_not_followed_by_cleaning_up() -> None:

@@ -8,6 +8,7 @@ import os
 import signal
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from typing import Any
 
@@ -93,7 +94,7 @@ def test_the_mean_is_that_of_float32_rounded_to_half_precision_once_an_update() 
 
 def test_features_lie_in_a_file_without_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TMPDIR", str(tmp_path))
-    monkeypatch.setattr(feature_table.tempfile, "tempdir", None)
+    monkeypatch.setattr(tempfile, "tempdir", None)
     table = FeatureTable(4, "disk")
     table.append(np.ones((1, 4), np.float16), np.zeros(9, np.int32), np.ones(9))
     held = table.features()

@@ -143,7 +143,9 @@ def test_the_paper_s_prompt_goes_with_each_crop() -> None:
         (Spoken("", failure="status 500: down"), "status 500: down"),
     ],
 )
-def test_where_the_model_refuses_the_tagger_s_name_stands(model: Spoken, reason: str) -> None:
+def test_where_the_model_refuses_the_tagger_s_name_stands(
+    model: Spoken, reason: str, caplog: pytest.LogCaptureFixture
+) -> None:
     crop = np.zeros((8, 8, 3), np.uint8)
     found = Captioner(model, LanguageConfig()).captions([crop, crop], ["indoor-plant", ""])
     assert [(one.name, one.caption) for one in found] == [
@@ -151,6 +153,7 @@ def test_where_the_model_refuses_the_tagger_s_name_stands(model: Spoken, reason:
         ("object", "an object in a scene"),
     ]
     assert {(one.source, one.reason) for one in found} == {("fallback", reason)}
+    assert [record.getMessage().partition("was: ")[2] for record in caplog.records] == [reason]
 
 
 def test_a_name_without_a_description_gets_the_simple_caption() -> None:

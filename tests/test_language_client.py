@@ -225,6 +225,19 @@ def test_the_key_stands_in_no_file_and_no_message(server: ChatServer, tmp_path: 
     assert "sk-other" not in everything_in(tmp_path)
 
 
+def test_a_redirect_is_not_followed_so_the_key_stays_where_it_was_sent(server: ChatServer, tmp_path: Path) -> None:
+    server.script = [Answered(status=302, headers={"Location": f"{server.url}/elsewhere"})]
+    assert "status 302" in client(server, tmp_path).ask(ask("x")).failure
+    assert server.n_asked == 1
+
+
+def test_a_key_that_no_header_can_hold_is_one_line_without_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SU3D_TEST_KEY", "secret\nX-Other: 1")
+    with pytest.raises(ConfigError, match="holds characters that no key has") as caught:
+        ChatClient(quick_config(), ReplyStore(tmp_path))
+    assert "secret" not in str(caught.value)
+
+
 def test_a_missing_key_of_the_hosted_service_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("SU3D_TEST_KEY", raising=False)
     monkeypatch.delenv("OPENAI_BASE_URL", raising=False)

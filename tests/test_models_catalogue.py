@@ -12,7 +12,9 @@ from su3d_bench.digests import digest_file
 from su3d_bench.errors import ConfigError, ModelMissing
 from su3d_bench.perception.models import files as model_files
 from su3d_bench.perception.models.catalogue import MODELS, PROFILE_MODELS, model_entry
+from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.files import file_sha256, locate
+from su3d_bench.perception.models.inspection import models_record
 
 CLIP_FILES = ("model.safetensors", "config.json", "preprocessor_config.json", "tokenizer.json")
 
@@ -126,13 +128,22 @@ def test_an_original_checkpoint_may_lie_in_the_folder_of_models_itself(home: Pat
     assert (found.form.form, found.weights) == ("original", home / "models" / "sam_vit_h_4b8939.pth")
 
 
+def test_a_form_that_is_not_read_does_not_count_as_found(home: Path) -> None:
+    fill(home / "models", ("groundingdino_swint_ogc.pth",))
+    with pytest.raises(ModelMissing, match=r"fetch model\.safetensors"):
+        locate("grounding-dino")
+    assert locate("grounding-dino", ("original",)).folder == home / "models"
+
+
 def test_a_configured_path_is_used_and_nothing_beside_it(home: Path) -> None:
     fill(home / "models" / "clip-vit-b-32")
     mine = fill(home / "mine")
     assert locate("clip-vit-b-32", path=mine).folder == mine
     assert locate("clip-vit-b-32", path=mine / "model.safetensors").folder == mine
     (mine / "config.json").unlink()
-    with pytest.raises(ModelMissing, match=r"mine lacks config\.json; fetch model\.safetensors, config\.json"):
+    with pytest.raises(
+        ModelMissing, match=r"mine lacks config\.json; fetch model\.safetensors or pytorch_model\.bin, config\.json"
+    ):
         locate("clip-vit-b-32", path=mine)
     with pytest.raises(ModelMissing, match=r"there is no .*absent; mend the path or fetch"):
         locate("clip-vit-b-32", path=home / "absent")
@@ -146,8 +157,9 @@ def test_a_missing_model_is_one_line_with_what_to_fetch_from_where_into_which_fo
     with pytest.raises(ModelMissing) as caught:
         locate("clip-vit-h-14")
     assert str(caught.value) == (
-        "model 'clip-vit-h-14': not found; fetch model.safetensors, config.json, preprocessor_config.json, "
-        "tokenizer.json (3.9 GB) from https://huggingface.co/laion/CLIP-ViT-H-14-laion2B-s32B-b79K into "
+        "model 'clip-vit-h-14': not found; fetch model.safetensors or pytorch_model.bin, config.json, "
+        "preprocessor_config.json, tokenizer.json (3.9 GB) from "
+        "https://huggingface.co/laion/CLIP-ViT-H-14-laion2B-s32B-b79K into "
         f"{home / 'models' / 'clip-vit-h-14'}, or set SU3D_MODELS"
     )
 
@@ -196,3 +208,14 @@ def test_the_digest_of_a_large_file_is_read_again_only_when_the_file_has_changed
         note.write_text("{")  # a damaged note counts as absent
     file_sha256(path)
     assert len(n_read) == 3
+
+
+def test_a_runs_record_holds_the_digest_of_every_file_of_the_models_that_are_here(home: Path) -> None:
+    folder = fill(home / "models" / "clip-vit-b-32")
+    record = models_record(("clip-vit-b-32", "sam-vit-h", "clip-vit-b-32"), ModelsConfig())
+    assert set(record) == {"clip-vit-b-32"}
+    assert record["clip-vit-b-32"]["config.json"] == digest_file(folder / "config.json")
+    mine = fill(home / "mine")
+    (mine / "config.json").write_text("another")
+    record = models_record(("clip-vit-b-32",), ModelsConfig(paths={"clip-vit-b-32": mine}))
+    assert record["clip-vit-b-32"]["config.json"] == digest_file(mine / "config.json")

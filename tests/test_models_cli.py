@@ -11,10 +11,18 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
-from tiny_encoders import write_tiny_clip
+from tiny_encoders import DIM, write_tiny_clip
 
 from su3d_bench.cli.main import build_parser, main
+from su3d_bench.cli.query import encoder_of
+from su3d_bench.errors import ModelMissing, PredictionError
+from su3d_bench.evaluation_texts import encoder_for
 from su3d_bench.perception.models.catalogue import MODELS
+from su3d_bench.perception.models.config import ModelsConfig
+from su3d_bench.perception.models.loading import load_encoder
+from su3d_bench.protocols import load_protocol
+from su3d_bench.store import RunFolder
+from su3d_bench.types import Encoder
 
 needs_models = pytest.mark.skipif(
     any(find_spec(name) is None for name in ("torch", "transformers", "onnx")),
@@ -177,9 +185,6 @@ def test_an_export_is_found_checked_and_run(found: Path, home: Path, capsys: pyt
 def test_warm_tells_time_and_memory_and_the_digest_of_run_records(
     found: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from su3d_bench.perception.models.config import ModelsConfig
-    from su3d_bench.perception.models.loading import load_encoder
-
     assert main(["models", "warm", "clip-vit-b-32"]) == 0
     out = capsys.readouterr().out
     assert "ViT-B-32/openai: loaded and first run" in out
@@ -191,3 +196,45 @@ def test_a_profile_without_files_can_be_warmed_too(capsys: pytest.CaptureFixture
     row = json.loads(capsys.readouterr().out)
     assert set(row["stages_ms"]) >= {"segment", "encode"}
     assert row["memory_of"] == "process"
+
+
+def test_a_device_that_is_none_is_refused_before_any_work(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--scenes", "rooms/living0", "--device", "gpu", "--dry-run"]) == 2
+    assert "--device: models.device = 'gpu': expected cpu, cuda or cuda:N" in capsys.readouterr().err
+
+
+def _finished_run(folder: Path, made_by: str | None, made_with: str) -> RunFolder:
+    folder.mkdir(exist_ok=True)
+    (folder / "run.json").write_text(json.dumps({"encoder": made_by, "encoder_digest": made_with}))
+    (folder / "run.toml").write_text('[perception.models]\nencoder = "clip-vit-b-32"\nprecision = "bfloat16"\n')
+    return RunFolder(folder)
+
+
+@needs_models
+def test_a_query_reads_the_encoder_that_the_run_was_made_with(found: Path, home: Path) -> None:
+    made = load_encoder(ModelsConfig(encoder="clip-vit-b-32", precision="bfloat16"))
+    encoder = encoder_of(_finished_run(home / "run", made.name, made.digest))
+    # the text runs in float32, whatever the images ran in
+    assert encoder.digest == load_encoder(ModelsConfig(encoder="clip-vit-b-32")).digest != made.digest
+    assert encoder.encode_texts(["chair"]).shape == (1, DIM)
+
+
+@needs_models
+def test_a_query_over_features_of_other_weights_is_an_error(found: Path, home: Path) -> None:
+    with pytest.raises(PredictionError, match=r"made by encoder ViT-B-32/openai \(000000000000\), here is ViT-B-32/op"):
+        encoder_of(_finished_run(home / "run", "ViT-B-32/openai", "0" * 64))
+    with pytest.raises(PredictionError, match="here is su3d-embedded"):
+        encoder_of(_finished_run(home / "run", "su3d-embedded", "0" * 64))
+    with pytest.raises(ModelMissing, match="model 'clip-vit-l-14': not found"):
+        encoder_of(_finished_run(home / "run", "ViT-L-14/openai", "0" * 64))
+
+
+@needs_models
+def test_an_evaluation_names_features_with_the_protocols_encoder_where_it_is_here(tiny_clip: Path, home: Path) -> None:
+    rules = load_protocol("replica-conceptgraphs-ex6")
+    assert "which is not here" in str(encoder_for(rules, DIM, None, is_own=False))
+    shutil.copytree(tiny_clip, home / "models" / "clip-vit-h-14")
+    encoder = encoder_for(rules, DIM, None, is_own=False)
+    assert isinstance(encoder, Encoder)
+    assert encoder.name == rules.encoder
+    assert "the features have 25 dimensions" in str(encoder_for(rules, 25, None, is_own=False))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -354,7 +355,7 @@ class TestVariants:
         """Two rows of points 30 cm apart, and a lone point: one part, but for Segment3D two and noise."""
         points = np.array([(0.01 * k, y, 0) for y in (0, 0.3) for k in range(20)] + [(0.1, 0.15, 0)], np.float32)
         surface = Surface(points, np.zeros((0, 3), np.int32), np.zeros(41, np.int32))
-        shared = {"segment_vote": False, "surface_max_share": 1.0, "surface_min_points": 1}
+        shared: dict[str, Any] = {"segment_vote": False, "surface_max_share": 1.0, "surface_min_points": 1}
         sizes = {}
         for cls in (OpenMask3D, OpenMask3DSegment3D):
             method = cls(cls.Config(**shared))

@@ -29,8 +29,8 @@ def test_auto_is_embedded_on_either_kind_of_image() -> None:
 def test_an_unknown_profile_is_refused_with_the_nearest_name() -> None:
     with pytest.raises(ConfigError, match=r"unknown profile 'orcale'; did you mean 'oracle'\?"):
         resolve_profile("orcale", "camera")
-    with pytest.raises(ConfigError, match="known: auto, embedded, oracle, stored"):
-        resolve_profile("papers", "camera")
+    with pytest.raises(ConfigError, match="known: auto, embedded, paper, oracle, stored"):
+        resolve_profile("foundation", "camera")
 
 
 def test_embedded_warns_on_camera_images_only_and_names_the_profile_to_use(tmp_path: Path) -> None:

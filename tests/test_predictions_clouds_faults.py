@@ -24,9 +24,9 @@ from damage import damages, outcomes, truncations
 from prediction_files import refused
 
 from su3d_bench.errors import PredictionError
-from su3d_bench.predictions import pickle_machine, pickles
+from su3d_bench.plain_pickles import pickle_machine, pickles
+from su3d_bench.plain_pickles.pickle_constructors import CONSTRUCTORS
 from su3d_bench.predictions.formats import READERS
-from su3d_bench.predictions.pickle_constructors import CONSTRUCTORS
 
 
 class Bomb:

@@ -1,4 +1,4 @@
-"""The profile ``paper`` as a whole, on tiny models with random weights: rooms, real recordings, and no models at all."""
+"""The profile ``paper`` as a whole on tiny models with random weights: rooms, real recordings, no models at all."""
 
 from __future__ import annotations
 
@@ -181,6 +181,20 @@ def test_a_vision_model_gives_names_and_captions_where_it_is_asked_for(models: P
     assert asked.digest != plain.digest
 
 
+def test_the_exported_segmenter_gives_the_regions_of_torch(models: Path, tmp_path: Path) -> None:
+    words = ["models", "export", "sam-vit-h", "--out", str(tmp_path / "x"), "--quiet"]
+    assert main([*words, "--set", f"perception.models.folder={models}"]) == 0
+    content = config_of(models).model_dump()
+    content["models"]["paths"] = {"sam-vit-h": tmp_path / "x"}
+    content["paper"]["sam_runtime"] = "onnx"
+    other = built(PerceptionConfig.model_validate(content), tmp_path)
+    mine = built(config_of(models), tmp_path)
+    assert other.digest != mine.digest
+    a, b = (one.detect(FRAME, PerceptionNeeds(), Timer()) for one in (mine, other))
+    assert a.names == b.names
+    assert (a.masks != b.masks).mean() < 5e-3
+
+
 def test_auto_is_paper_on_camera_images_where_the_models_are(models: Path, no_models: Path) -> None:
     here, away = config_of(models), config_of(no_models)
     assert resolve_profile("auto", "camera", here) == "paper"
@@ -211,6 +225,8 @@ def ask(root: Path, models: Path, scene: str, *words: str) -> int:
     """``su3d-bench run`` on the tiny models."""
     settings = [f"perception.models.folder={models}", "perception.models.encoder=embedded"]
     settings += ["perception.paper.n_tags=6", "perception.paper.grounded.boxes.box_threshold=0.3"]
+    # Random masks are scattered over the image; their own boxes would be too large to count.
+    settings += ["perception.paper.grounded.region_boxes=detector"]
     settings += ["perception.paper.automatic.points_per_side=2", "perception.paper.automatic.pred_iou_thresh=0"]
     settings += ["perception.paper.automatic.stability_score_thresh=0", "perception.paper.automatic.box_nms_thresh=1.0"]
     options = ["--profile", "paper", "--out", str(root / "out"), "--quiet", "--jobs", "1", *words]
@@ -219,12 +235,12 @@ def ask(root: Path, models: Path, scene: str, *words: str) -> int:
 
 def test_a_room_runs_end_to_end(models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
-    words = ("--limit", "2", "--no-pictures", "--protocols", "rooms-semantic")
+    words = ("--methods", "opensu3d", "sam3d", "--limit", "2", "--no-pictures", "--protocols", "rooms-semantic")
     assert ask(tmp_path, models, "rooms/living0", *words) == 0
-    found = read_prediction(next((tmp_path / "out").glob("scenes/*/opensu3d/prediction.npz")))
-    assert isinstance(found, Instances) and len(found) > 0
-    record = str(read_json(tmp_path / "out" / "run.json"))
-    assert "paper" in record and "RAM++ is not here" in record
+    for method in ("opensu3d", "sam3d"):  # named masks, and masks of everything
+        found = read_prediction(next((tmp_path / "out").glob(f"scenes/*/{method}/prediction.npz")))
+        assert isinstance(found, Instances) and len(found) > 0
+    assert "RAM++ is not here" in str(read_json(tmp_path / "out" / "metrics.json"))
 
 
 @pytest.mark.skipif(not DATA.is_dir(), reason="needs the real recordings in ../shared/realdata")

@@ -131,14 +131,15 @@ class TestParts:
         assert linked_within(self.ROW, 0.95).tolist() == [0, 0, 0, 1, 1, 2]
         assert linked_within(self.ROW[:2], 0.9).tolist() == [0, 0]  # a gap of eps itself links
 
-    def test_linked_points_are_those_of_dbscan(self) -> None:
+    @pytest.mark.parametrize("min_points", [1, 2, 5])
+    def test_clusters_are_those_of_dbscan(self, min_points: int) -> None:
         from sklearn.cluster import DBSCAN
 
         rng = np.random.default_rng(0)
-        for gap_m in (0.1, 0.3, 1.0):
-            points = rng.random((300, 3)) * (2, 2, 1)
-            expected = DBSCAN(eps=gap_m, min_samples=1).fit_predict(points)
-            assert linked_within(points, gap_m).tolist() == expected.tolist()
+        for eps_m in (0.1, 0.2, 1.0):
+            points = (rng.random((300, 3)) * (2, 2, 0.3)).astype(np.float32)
+            expected = DBSCAN(eps=eps_m, min_samples=min_points).fit_predict(points.astype(np.float64))
+            assert density_clusters(points, eps_m, min_points).tolist() == expected.tolist()
 
     def test_density_leaves_noise_out(self) -> None:
         assert density_clusters(self.ROW.astype(np.float32), 0.95, 3).tolist() == [0, 0, 0, -1, -1, -1]

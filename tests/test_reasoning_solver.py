@@ -17,7 +17,9 @@ from su3d_bench.datasets.rooms import Rooms
 from su3d_bench.errors import PredictionError
 from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.perception.language.config import LanguageConfig
-from su3d_bench.reasoning.generated import generate_questions
+from su3d_bench.reasoning.answers import Answer
+from su3d_bench.reasoning.generated import GeneratedQuestion, generate_questions
+from su3d_bench.reasoning.judging import box_iou, is_right, same_objects
 from su3d_bench.reasoning.language_solver import LanguageSolver
 from su3d_bench.reasoning.prompting import by_relevance, context_for, system_prompt
 from su3d_bench.reasoning.question_words import Phrase, read_phrase, read_question
@@ -44,7 +46,8 @@ def box(x: float, y: float, z: float, dx: float, dy: float, dz: float) -> Float6
 
 
 def moved(bounds: Float64Array, x: float, y: float, z: float) -> Float64Array:
-    return bounds + np.array([x, y, z])
+    placed: Float64Array = bounds + np.array([x, y, z])
+    return placed
 
 
 def thing(object_id: int, name: str, bounds: Float64Array, caption: str = "") -> MapObject:
@@ -408,3 +411,51 @@ def test_a_question_in_words_is_read() -> None:
     read = read_question("What is the distance between sofa with blanket and door?")
     assert read is not None
     assert (read.kind, read.subject.relation, read.other) == ("distance", "with", Phrase("door"))
+
+
+def test_an_answer_is_judged_over_the_objects_that_are_the_same() -> None:
+    truth = bedroom()
+    # The same map with other ids, one cup lost, and the bed cut in two.
+    kept = [replace(one, id=100 + one.id) for one in truth.objects if one.id not in (1, 8)]
+    halves = [thing(201, "bed", box(0, 0, 0, 2, 1.0, 0.5)), thing(202, "bed", box(0, 1.0, 0, 2, 0.3, 0.5))]
+    scene = SceneMap((*kept, *halves))
+    same = same_objects(scene, truth)
+    assert same[109] == 9
+    assert same[201] == 1  # 5/8 of the bed
+    assert 202 not in same  # 3/16 of it
+    solver, true = Solver(scene), Solver(truth)
+
+    def judged(text: str, kind: str) -> bool:
+        return is_right(GeneratedQuestion(text, kind, true.answer(text)), solver.answer(text), same)
+
+    assert judged("Which sink is closer to the bed?", "closer")
+    assert judged("What is on the shelf?", "what on")
+    assert not judged("What is on the table?", "what on")  # a cup is lost
+    assert not judged("How many cups are there?", "count")
+    assert judged("Is there a lamp on the table?", "is on")
+    assert judged("What is the distance between the table and the basket?", "distance")
+    # The nearer part of the bed is 3.43 m away, the whole one 3.68 m: a tenth is allowed.
+    assert judged("What is the distance between the bed and the table?", "distance")
+    far = GeneratedQuestion(
+        "How far?", "distance", replace(true.answer("How far is the bed from the table?"), value=3.0)
+    )
+    assert not is_right(far, solver.answer("How far is the bed from the table?"), same)
+
+
+def test_answers_in_words_are_judged_by_their_yes_or_number() -> None:
+    truth = Solver(bedroom())
+
+    def judged(text: str, said: str) -> bool:
+        return is_right(GeneratedQuestion(text, "any", truth.answer(text)), Answer(said), {})
+
+    assert judged("How many cups are there?", "There are 2 cups (ID #7 and #8)")
+    assert not judged("How many cups are there?", "There are 3")
+    assert judged("Is there a piano?", "No, there is none")
+    assert not judged("Is there a piano?", "perhaps")
+    assert judged("What is the distance between the bed and the table?", "about 3.7 m")
+
+
+def test_boxes_overlap_by_hand() -> None:
+    assert box_iou(box(0, 0, 0, 2, 1, 1), box(1, 0, 0, 2, 1, 1)) == pytest.approx(1 / 3)
+    assert box_iou(box(0, 0, 0, 1, 1, 1), box(2, 0, 0, 1, 1, 1)) == 0.0
+    assert box_iou(box(0, 0, 0, 0, 0, 0), box(0, 0, 0, 0, 0, 0)) == 0.0

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import json
 import string
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from su3d_bench.types import UInt8Array
 
+needs_models = pytest.mark.skipif(
+    find_spec("torch") is None or find_spec("transformers") is None,
+    reason="torch and transformers are not installed: pip install 'su3d-bench[models]'",
+)
 WORDS = ("chair", "table", "lamp", "a", "the", "in", "scene", "red", "cup", "image", "of", "an", "on", "tv", "screen")
 N_TOKENS = 16
 IMAGE_SIZE = 32

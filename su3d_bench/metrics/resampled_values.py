@@ -10,12 +10,12 @@ from typing import cast
 
 import numpy as np
 
-from su3d_bench.metrics import object_means, resampling
+from su3d_bench.metrics import object_means, resampling, shares
 from su3d_bench.metrics.instance_ap import InstanceCounts
 from su3d_bench.metrics.labelling import scored_classes
 from su3d_bench.metrics.results import CURVE_KINDS, Counts
 from su3d_bench.metrics.semantic import SemanticCounts
-from su3d_bench.protocols import VALUES_OF_METRIC, ProtocolRules
+from su3d_bench.protocols import SHARE_KINDS, VALUES_OF_METRIC, ProtocolRules
 from su3d_bench.types import Float64Array, Int64Array
 
 
@@ -36,6 +36,9 @@ def resampled_metrics(
     elif rules.kind == "categories":
         values = object_means.resampled(cast("Sequence[object_means.ObjectCounts]", counts), weights)
         pooled = dict(zip(VALUES_OF_METRIC[rules.metric], values.T, strict=True))
+    elif rules.kind in SHARE_KINDS:
+        values = shares.resampled(cast("Sequence[shares.ShareCounts]", counts), weights)
+        pooled = dict(zip(VALUES_OF_METRIC[rules.metric], values.T, strict=True))
     else:
         is_scored = scored_classes(rules) if rules.metric == "hovsg" else None
         pooled = resampling.resampled_semantic(
@@ -53,17 +56,17 @@ def _weighted_mean(values: Sequence[float], weights: Int64Array) -> Float64Array
 
 
 def class_columns(rules: ProtocolRules) -> tuple[str, ...]:
-    """What is known of a single class: its AP values, or its recall and IoU; nothing under kind ``categories``."""
+    """What is known of a single class: its AP values, or its recall and IoU; nothing where a protocol has no classes."""
     if rules.kind in CURVE_KINDS:
         return tuple(name for name in ("AP", "AP50", "AP25") if name in rules.headline)
-    return () if rules.kind == "categories" else ("recall", "IoU")
+    return () if rules.kind == "categories" or rules.kind in SHARE_KINDS else ("recall", "IoU")
 
 
 def resampled_classes(
     rules: ProtocolRules, counts: Sequence[Counts], weights: Int64Array
 ) -> dict[str, dict[str, Float64Array]]:
     """Class -> column -> value (R,) of the scenes drawn ``weights`` (R, S) times; NaN where it has no truth there."""
-    if rules.kind == "categories":
+    if rules.kind == "categories" or rules.kind in SHARE_KINDS:
         return {}
     if rules.kind in CURVE_KINDS:
         columns = class_columns(rules)

@@ -9,13 +9,13 @@ from typing import Any, cast
 
 import numpy as np
 
-from su3d_bench.metrics import instance_ap, object_means, resampling, semantic
+from su3d_bench.metrics import instance_ap, object_means, resampling, semantic, shares
 from su3d_bench.metrics.labelling import scored_classes
-from su3d_bench.protocols import AP_NAMES, VALUES_OF_METRIC, ProtocolRules
+from su3d_bench.protocols import AP_NAMES, SHARE_KINDS, VALUES_OF_METRIC, ProtocolRules
 from su3d_bench.statistics import percentile_interval, resample_weights
 from su3d_bench.types import Float64Array, Int64Array
 
-Counts = instance_ap.InstanceCounts | semantic.SemanticCounts | object_means.ObjectCounts
+Counts = instance_ap.InstanceCounts | semantic.SemanticCounts | object_means.ObjectCounts | shares.ShareCounts
 CURVE_KINDS = ("instance", "queries")  # their counts are those of a precision-recall curve
 GROUP_COLUMNS = {"mAcc": "recall", "mIoU": "IoU"}  # what a group of classes is called by, and what it averages
 
@@ -117,6 +117,8 @@ def metric_values(rules: ProtocolRules, counts: Sequence[Counts], *, pooled: boo
     if rules.kind == "categories":
         means = object_means.combine(cast("Sequence[object_means.ObjectCounts]", counts))
         return dict(zip(VALUES_OF_METRIC[rules.metric], means.tolist(), strict=True))
+    if rules.kind in SHARE_KINDS:
+        return _share_values(rules, shares.combine(cast("Sequence[shares.ShareCounts]", counts)))
     metrics = _semantic_metrics(rules, counts, pooled=pooled)
     return {
         "mAcc": metrics.mean_accuracy,
@@ -129,6 +131,13 @@ def metric_values(rules: ProtocolRules, counts: Sequence[Counts], *, pooled: boo
         "n_classes": len(metrics.class_index),
         **{f"n_IoU>{level:.2f}": n for level, n in zip(semantic.IOU_LEVELS, metrics.n_classes_above, strict=True)},
     }
+
+
+def _share_values(rules: ProtocolRules, counts: shares.ShareCounts) -> dict[str, float]:
+    """The share of right judgements under each value's name, and how many there were under ``n_<name>``."""
+    names = VALUES_OF_METRIC[rules.metric]
+    n_judged = {f"n_{name}": n for name, n in zip(names, counts.n_judged.tolist(), strict=True)}
+    return dict(zip(names, shares.shares(counts).tolist(), strict=True)) | n_judged
 
 
 def _semantic_metrics(rules: ProtocolRules, counts: Sequence[Counts], *, pooled: bool) -> semantic.SemanticMetrics:
@@ -156,7 +165,7 @@ def _keep_columns(confusion: Int64Array, keep: Int64Array) -> Int64Array:
 
 
 def _class_values(rules: ProtocolRules, counts: Sequence[Counts]) -> dict[str, dict[str, float]]:
-    if rules.kind == "categories":
+    if rules.kind == "categories" or rules.kind in SHARE_KINDS:
         return {}
     if rules.kind in CURVE_KINDS:
         ap = instance_ap.combine(cast("Sequence[instance_ap.InstanceCounts]", counts), rules.thresholds)
@@ -204,6 +213,9 @@ def _resampled(rules: ProtocolRules, counts: Sequence[Counts], weights: Int64Arr
         return resampling.resampled_ap(instances, weights, rules.thresholds)
     if rules.kind == "categories":
         values = object_means.resampled(cast("Sequence[object_means.ObjectCounts]", counts), weights)
+        return dict(zip(VALUES_OF_METRIC[rules.metric], values.T, strict=True))
+    if rules.kind in SHARE_KINDS:
+        values = shares.resampled(cast("Sequence[shares.ShareCounts]", counts), weights)
         return dict(zip(VALUES_OF_METRIC[rules.metric], values.T, strict=True))
     confusions = cast("Sequence[semantic.SemanticCounts]", counts)
     is_scored = scored_classes(rules) if rules.metric == "hovsg" else None

@@ -24,7 +24,7 @@ from su3d_bench.types import (
 
 CAMERA_CAVEAT = (
     "embedded perception on camera images: its encoder has seen rendered rooms only, so names and labels mean little "
-    "here; use --profile stored with detections made by real models"
+    "here; use --profile paper, or --profile stored with detections made by real models"
 )
 
 

@@ -104,7 +104,7 @@ class LabelImagePerception:
         self._namer = Namer(config.naming, encoder)
         self._crops = CropEncoder(encoder, cache)
         self._names = NameEncoder(encoder)
-        self.digest = content_key(self.profile, _content_digest(self._images.files), self._namer.digest, encoder.digest)
+        self.digest = content_key(self.profile, content_digest(self._images.files), self._namer.digest, encoder.digest)
 
     def detect(self, frame: Frame, needs: PerceptionNeeds, timer: StageTimer) -> Detections:
         with timer.stage("cache"):
@@ -166,10 +166,11 @@ class StoredRegions:
 
 def _files_digest(folder: Path, scene: SceneInfo) -> str:
     """A digest of the names and contents of the scene's files."""
-    return _content_digest(sorted(stored_path(folder, scene.dataset, scene.scene, 0).parent.glob("*.npz")))
+    return content_digest(sorted(stored_path(folder, scene.dataset, scene.scene, 0).parent.glob("*.npz")))
 
 
-def _content_digest(files: Iterable[Path]) -> str:
+def content_digest(files: Iterable[Path]) -> str:
+    """A digest of the names and contents of ``files``, in their order."""
     hasher = hashlib.sha256()
     for path in files:
         hasher.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())

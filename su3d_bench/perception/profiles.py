@@ -107,6 +107,10 @@ def build_perception(
             raise ConfigError("profile 'stored': perception.stored.folder is not set; name the folder of detections")
         if config.stored.images is not None:
             return LabelImagePerception(config, scene, encoder, cache)
+        if config.stored.detections is not None:
+            from su3d_bench.perception.profile_gsa import GsaPerception
+
+            return GsaPerception(config.stored.folder, config.stored.detections, scene, encoder, cache)
         return StoredPerception(config.stored.folder, scene, encoder, cache)
     if resolved == "paper":
         return _paper(config, encoder, cache, cache_root, job_index)

@@ -34,21 +34,26 @@ _OPTIONAL = ("captions", *_FEATURES)
 
 
 class StoredConfig(BaseModel):
-    """Where the detections of the profile ``stored`` lie: npz files, or label images where ``images`` is a pattern.
+    """Where the detections of the profile ``stored`` lie: npz files, unless one of the two patterns is set.
 
-    ``images`` (``frame-{index}.segm.png``) is relative to ``folder``; ``names`` is a TOML or JSON file of names.
+    ``images`` (``frame-{index}.segm.png``) names label images, ``detections``
+    (``{scene}/gsa_detections_none/frame{index}.pkl.gz``) ConceptGraphs' files, both relative to ``folder``; ``names``
+    is a TOML or JSON file of names for the values of label images.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     folder: Path | None = None
     images: str | None = None
+    detections: str | None = None
     names: Path | None = None
 
     @model_validator(mode="after")
     def _names_are_of_images(self) -> StoredConfig:
         if self.names is not None and self.images is None:
             raise ValueError("names are given to the values of label images; set stored.images too")
+        if self.images is not None and self.detections is not None:
+            raise ValueError("stored.images and stored.detections name two makers of masks; set one of them")
         return self
 
 

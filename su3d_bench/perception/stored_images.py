@@ -44,7 +44,7 @@ class LabelImages:
     def __init__(self, folder: Path, pattern: str, names: Path | None, scene: SceneInfo) -> None:
         self._where = f"{scene.dataset}/{scene.scene}"
         self._pattern = pattern
-        self._images = _numbered(folder, pattern, scene, self._where)
+        self._images = numbered_files(folder, pattern, scene, self._where)
         self._name_of = {} if names is None else read_names(names, self._where)
         self.files = (*(() if names is None else (names,)), *self._images.values())
 
@@ -70,7 +70,7 @@ def _box(mask: BoolArray) -> tuple[int, int, int, int]:
     return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
 
 
-def _inside(folder: Path, name: str, where: str) -> Path:
+def _inside(folder: Path, name: str, where: str, key: str) -> Path:
     """``folder / name``, unless that leads out of the folder."""
     path = folder / name
     is_plain = name.isprintable() and bool(name) and not name.startswith("/") and ".." not in PurePosixPath(name).parts
@@ -79,12 +79,14 @@ def _inside(folder: Path, name: str, where: str) -> Path:
             return path
     except (OSError, RuntimeError):  # a name too long for the file system, or links in a circle
         pass
-    raise ConfigError(f"{where}: perception.stored.images: {name[:80]!r} leads out of {folder}; name files inside it")
+    raise ConfigError(f"{where}: {key}: {name[:80]!r} leads out of {folder}; name files inside it")
 
 
-def _numbered(folder: Path, pattern: str, scene: SceneInfo, where: str) -> dict[int, Path]:
-    """Frame number -> image."""
-    key = "perception.stored.images"
+def numbered_files(
+    folder: Path, pattern: str, scene: SceneInfo, where: str, what: str = "label image", key: str = "images"
+) -> dict[int, Path]:
+    """Frame number -> file; ``what`` such a file is, and the ``key`` of the configuration that holds ``pattern``."""
+    key = f"perception.stored.{key}"
     filled = pattern.replace("{dataset}", scene.dataset).replace("{scene}", scene.scene)
     directory, _, name_pattern = filled.rpartition("/")
     if INDEX not in name_pattern or filled.count(INDEX) > 1 or "{" in filled.replace(INDEX, ""):
@@ -92,7 +94,7 @@ def _numbered(folder: Path, pattern: str, scene: SceneInfo, where: str) -> dict[
             f"{key} = {pattern[:80]!r}: expected one {{index}} in the file's name, such as 'frame{{index}}.png', and "
             "no other braces but {dataset} and {scene}"
         )
-    parent = _inside(folder, directory or ".", where)
+    parent = _inside(folder, directory or ".", where, key)
     before, _, behind = name_pattern.partition(INDEX)
     form = re.compile(re.escape(before) + r"(\d{1,18})" + re.escape(behind), re.ASCII)
     found: dict[int, Path] = {}
@@ -102,13 +104,13 @@ def _numbered(folder: Path, pattern: str, scene: SceneInfo, where: str) -> dict[
                 number = int(match[1])
                 if number in found:
                     raise DataError(
-                        f"{where}: {found[number].name} and {path.name} are of one frame; expected one image"
+                        f"{where}: {found[number].name} and {path.name} are of one frame; expected one file"
                     )
-                found[number] = _inside(folder, path.relative_to(folder).as_posix(), where)
+                found[number] = _inside(folder, path.relative_to(folder).as_posix(), where, key)
     except OSError as error:
-        raise DataError(f"{where}: {parent}: cannot be read: {error.strerror}; it should hold label images") from error
+        raise DataError(f"{where}: {parent}: cannot be read: {error.strerror}; it should hold {what}s") from error
     if not found:
-        raise DataError(f"{where}: no label image in {parent} matches {pattern!r}")
+        raise DataError(f"{where}: no {what} in {parent} matches {pattern!r}")
     return dict(sorted(found.items()))
 
 

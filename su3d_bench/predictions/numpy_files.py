@@ -14,10 +14,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.errors import PredictionError
+from su3d_bench.plain_pickles.pickle_constructors import MOST_DIMENSIONS, SIMPLE_TYPE, RefusedError, check_texts
+from su3d_bench.plain_pickles.pickles import read_pickle
 from su3d_bench.plain_text import printable
 from su3d_bench.predictions.base import shown
-from su3d_bench.predictions.pickle_constructors import MOST_DIMENSIONS, SIMPLE_TYPE, RefusedError, check_texts
-from su3d_bench.predictions.pickles import read_pickle
 from su3d_bench.predictions.zip_files import opened_zip, read_member
 
 MAGIC = b"\x93NUMPY"

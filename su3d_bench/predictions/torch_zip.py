@@ -14,8 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.errors import PredictionError
-from su3d_bench.predictions.base import shown
-from su3d_bench.predictions.pickle_constructors import (
+from su3d_bench.plain_pickles.pickle_constructors import (
     CONSTRUCTORS,
     Budget,
     Constructor,
@@ -28,7 +27,8 @@ from su3d_bench.predictions.pickle_constructors import (
     is_word,
     named,
 )
-from su3d_bench.predictions.pickles import read_pickle
+from su3d_bench.plain_pickles.pickles import read_pickle
+from su3d_bench.predictions.base import shown
 from su3d_bench.predictions.zip_files import opened_zip, read_member
 
 Kind = Literal["tensor", "sparse", "array", "dict", "tuple", "other"]

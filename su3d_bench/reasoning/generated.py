@@ -13,13 +13,15 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.reasoning.answers import Answer
-from su3d_bench.reasoning.relations import PairRelation, is_room_surface, relations_of
+from su3d_bench.reasoning.relations import PairRelation, is_between, is_room_surface, relations_of
 from su3d_bench.reasoning.scene_map import MapObject, SceneMap
 from su3d_bench.reasoning.solver import Solver
 from su3d_bench.types import Float64Array
 
 MARGIN_M = 0.25  # by which the closest leads
 SIZE_MARGIN = 1.3  # by which the largest leads
+FEW_BETWEEN = 4  # more things between two are no answer that one would give
+MOST_SINGLE = 30  # of the objects whose name no other has, so many are asked about: there are cubically many triples
 ASKED_RELATIONS: tuple[PairRelation, ...] = ("on", "under", "above", "next to", "in")
 
 
@@ -39,7 +41,7 @@ def generate_questions(
     random = np.random.default_rng(seed)
     solver = Solver(scene, eye)
     found: list[GeneratedQuestion] = []
-    for kind, texts in _texts(scene, eye is not None).items():
+    for kind, texts in _texts(scene, random, eye is not None).items():
         distinct = sorted(dict.fromkeys(texts))
         chosen = [distinct[k] for k in sorted(random.permutation(len(distinct))[:n_each])]
         answers = [(text, solver.answer(text)) for text in chosen]
@@ -47,10 +49,11 @@ def generate_questions(
     return tuple(found)
 
 
-def _texts(scene: SceneMap, with_sides: bool) -> dict[str, list[str]]:
+def _texts(scene: SceneMap, random: np.random.Generator, with_sides: bool) -> dict[str, list[str]]:
     things = [one for one in scene.objects if one.name and not is_room_surface(one.name)]
     n_of = Counter(one.name for one in things)
     single = [one for one in things if n_of[one.name] == 1]
+    single = [single[k] for k in sorted(random.permutation(len(single))[:MOST_SINGLE])]
     kinds: dict[str, list[str]] = {
         "closer": list(_closer(things, single, n_of)),
         "nearest": list(_nearest(things, single)),
@@ -59,7 +62,7 @@ def _texts(scene: SceneMap, with_sides: bool) -> dict[str, list[str]]:
         "count": [f"How many {_plural(name)} are there?" for name in n_of],
         "largest": list(_largest(things, n_of)),
         "compare": list(_compared(single)),
-        "between": [],
+        "between": list(_between(things, single)),
     }
     return kinds | _related(scene, things, single, n_of) | (_sides(single) if with_sides else {})
 
@@ -101,6 +104,13 @@ def _compared(single: list[MapObject]) -> Iterator[str]:
         for a, b in _pairs([one for one in single if one is not reference]):
             if abs(_away_m(a, reference) - _away_m(b, reference)) >= MARGIN_M:
                 yield f"Which is closer to the {reference.name}, the {a.name} or the {b.name}?"
+
+
+def _between(things: list[MapObject], single: list[MapObject]) -> Iterator[str]:
+    for a, b in _pairs(single):
+        n_between = sum(is_between(one.centroid, a.centroid, b.centroid) for one in things if one not in (a, b))
+        if 0 < n_between <= FEW_BETWEEN:
+            yield f"What is between the {a.name} and the {b.name}?"
 
 
 def _largest(things: list[MapObject], n_of: Counter[str]) -> Iterator[str]:

@@ -61,6 +61,8 @@ def meant_by(noun: str, scene: SceneMap, nearest: NearestName | None = None) -> 
         held = tuple(one for one in named if _has(one, adjectives))
         if held:
             return Meant(held)
+    if asked in _class_of_words():
+        return Meant(())  # a word that is known, for a thing that is not there
     return _by_encoder(noun, scene, nearest)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -13,6 +14,8 @@ from su3d_bench.perception.language.parsing import described, is_refusal
 from su3d_bench.perception.language.prompts import DESCRIBE
 from su3d_bench.perception.naming import scene_caption
 from su3d_bench.types import UInt8Array
+
+logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -52,13 +55,16 @@ class Captioner:
         ]
 
     def captions(self, crops: Sequence[UInt8Array], tagger_names: Sequence[str]) -> list[CropCaption]:
-        """One caption a crop; ``tagger_names`` are what the fallback calls them."""
+        """One caption a crop; ``tagger_names`` are what the fallback calls them. Reasons of fallbacks go to the log."""
         requests = self.requests(crops)
         replies = self._model.ask_all(requests)
-        return [
+        found = [
             caption_from(reply, name, request.key)
             for request, reply, name in zip(requests, replies, tagger_names, strict=True)
         ]
+        for reason in dict.fromkeys(one.reason for one in found if one.source == "fallback"):
+            logger.warning("captions: the tagger's name and the simple caption stand where the answer was: %s", reason)
+        return found
 
 
 def caption_from(reply: Reply, tagger_name: str, key: str) -> CropCaption:

@@ -83,7 +83,7 @@ class Transport:
     def __init__(self, config: LanguageConfig) -> None:
         self._config = config
         self._address = _address_of(config)
-        self._key = os.environ.get(config.key_variable, "")
+        self._key = _key_of(config)
         self._lock = threading.Lock()
         self._client: Any = None
         self._dropped: tuple[str, ...] = ()
@@ -255,6 +255,13 @@ def _address_of(config: LanguageConfig) -> str:
         except ValueError as error:
             raise ConfigError(f"$OPENAI_BASE_URL: {error}") from error
     return address.rstrip("/") or HOSTED
+
+
+def _key_of(config: LanguageConfig) -> str:
+    key = os.environ.get(config.key_variable, "").strip()
+    if not all("!" <= character <= "~" for character in key):
+        raise ConfigError(f"${config.key_variable}: holds characters that no key has; set it anew")
+    return key
 
 
 def _without(body: dict[str, Any], dropped: tuple[str, ...]) -> dict[str, Any]:

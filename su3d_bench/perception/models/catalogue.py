@@ -33,7 +33,7 @@ class ModelForm:
     """One set of files in which a model comes; the first of ``files`` is the weights.
 
     ``repository`` is its name on the Hugging Face hub, ``source`` where a person fetches it; ``architecture`` what
-    open_clip calls the model; ``sha256`` by file name.
+    open_clip calls the model; ``sha256`` by file name; ``is_read`` false: named here to be recognised, not loaded.
     """
 
     form: FormName
@@ -43,6 +43,7 @@ class ModelForm:
     repository: str | None = None
     architecture: str | None = None
     sha256: Mapping[str, str] = field(default_factory=_no_digests, hash=False)
+    is_read: bool = True
 
 
 @dataclass(frozen=True)
@@ -83,8 +84,11 @@ def _open_clip(architecture: str, repository: str, size_mb: int, sha256: Mapping
     return ModelForm("open_clip", _OPEN_CLIP_FILES, source, size_mb, repository, architecture, sha256 or _no_digests())
 
 
-def _original(file: str, source: str, size_mb: int, sha256: str, repository: str | None = None) -> ModelForm:
-    return ModelForm("original", (file,), source, size_mb, repository, sha256=MappingProxyType({file: sha256}))
+def _original(
+    file: str, source: str, size_mb: int, sha256: str, repository: str | None = None, is_read: bool = True
+) -> ModelForm:
+    digests = MappingProxyType({file: sha256})
+    return ModelForm("original", (file,), source, size_mb, repository, sha256=digests, is_read=is_read)
 
 
 def _exported(name: str, size_mb: int) -> ModelForm:
@@ -247,8 +251,10 @@ _ENTRIES = (
                 694,
                 "3b3ca2563c77c69f651d7bd133e97139c186df06231157a64c507099c52bc799",
                 "ShilongLiu/GroundingDINO",
+                is_read=False,
             ),
         ),
+        "the original .pth is not loaded; the hub's form holds the same weights",
     ),
     ModelEntry(
         "ram-plus",

@@ -111,14 +111,14 @@ class FoundationEncoder:
         found = {text: row for text in new if (row := self._stored(text)) is not None}
         missing = [text for text in new if text not in found]
         if missing:
-            rows = unit_rows(np.concatenate(self._text_batches.run(missing, self._text_work)), self.name)
-            found |= dict(zip(missing, rows, strict=True))
+            made = unit_rows(np.concatenate(self._text_batches.run(missing, self._text_work)), self.name)
+            found |= dict(zip(missing, made, strict=True))
             for text in missing:
                 self._cache.save(self._text_key(text), {"feature": found[text]})
-        known = self._texts | found
-        if len(known) <= LARGEST_MEMORY_OF_TEXTS:
-            self._texts = known
-        return np.array([known[text] for text in texts], np.float32).reshape(len(texts), self.dim)
+        if len(self._texts) + len(found) <= LARGEST_MEMORY_OF_TEXTS:
+            self._texts |= found
+        rows = [self._texts[text] if text in self._texts else found[text] for text in texts]
+        return np.array(rows, np.float32).reshape(len(texts), self.dim)
 
     def _text_work(self, batch: Sequence[str]) -> Float32Array:
         return self._towers.text_features(self._tokeniser(batch))

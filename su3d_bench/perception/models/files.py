@@ -82,13 +82,14 @@ def locate(
     path: Path | None = None,
     folder: Path | None = None,
 ) -> ModelFiles:
-    """The files of model ``name`` in the first of ``forms`` (all that it comes in) that is whole.
+    """The files of model ``name`` in the first of ``forms`` (all that are read) that is whole.
 
     ``path``: the configured file or folder, beside which nothing is searched; ``folder``: searched instead of
     ``$SU3D_MODELS``. Raises ``ModelMissing`` with what to fetch from where, and ``ConfigError`` for an unknown name.
     """
     entry = model_entry(name)
-    wanted = entry.forms if forms is None else tuple(entry.form(form) for form in forms)
+    read = tuple(form for form in entry.forms if form.is_read)
+    wanted = read if forms is None else tuple(entry.form(form) for form in forms)
     if path is not None:
         return _at(entry, wanted, path.expanduser())
     for form in wanted:
@@ -96,14 +97,6 @@ def locate(
             if (weights := _weights(form, candidate)) is not None and not _lacking(form, candidate):
                 return ModelFiles(entry, form, candidate, weights)
     raise ModelMissing(_advice(entry, wanted, folder))
-
-
-def is_found(entry: ModelEntry, form: ModelForm, folder: Path | None = None) -> ModelFiles | None:
-    """The files of ``entry`` in one form, or None."""
-    try:
-        return locate(entry.name, (form.form,), folder=folder)
-    except ModelMissing:
-        return None
 
 
 def _at(entry: ModelEntry, forms: Sequence[ModelForm], path: Path) -> ModelFiles:
@@ -179,7 +172,8 @@ def _lacking(form: ModelForm, folder: Path) -> list[str]:
 def _what_to_fetch(form: ModelForm) -> str:
     if form.form == "onnx":
         return f"make it: {form.source}"
-    names = ", ".join(_names(requirement)[0] for requirement in form.files)
+    weights = " or ".join(_names(form.files[0]))
+    names = ", ".join([weights, *(_names(requirement)[0] for requirement in form.files[1:])])
     return f"fetch {names} ({form.size_mb / 1000:.1f} GB) from {form.source}"
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,7 +12,8 @@ import numpy as np
 
 from su3d_bench.errors import ConfigError, DataError, ModelMissing
 from su3d_bench.perception.models import sam_onnx, towers_onnx, towers_transformers
-from su3d_bench.perception.models.catalogue import MODELS, PROFILE_MODELS, ModelEntry
+from su3d_bench.perception.models.catalogue import MODELS, PROFILE_MODELS, ModelEntry, model_entry
+from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.files import ModelFiles, locate
 from su3d_bench.perception.models.weights import PICKLED, read_settings, read_weights
 from su3d_bench.timing import Timer
@@ -38,6 +40,8 @@ def model_state(entry: ModelEntry, path: Path | None = None, folder: Path | None
     """Which forms of ``entry`` are here, at ``path`` or where models are looked for."""
     found = []
     for form in entry.forms:
+        if not form.is_read:
+            continue
         try:
             found.append(locate(entry.name, (form.form,), path=path, folder=folder))
         except (ModelMissing, ConfigError):
@@ -85,6 +89,12 @@ def _problems_of_export(files: ModelFiles) -> list[str]:
     if manifest.name != files.entry.name:
         wrong.append(f"{files.folder}: holds '{manifest.name}', not '{files.entry.name}'; mend models.paths")
     return wrong
+
+
+def models_record(names: Sequence[str], config: ModelsConfig) -> dict[str, dict[str, str]]:
+    """For a run's record: the SHA-256 of every file of the models ``names`` that are here, by model and file name."""
+    states = [model_state(model_entry(name), config.path_of(name), config.folder) for name in dict.fromkeys(names)]
+    return {state.entry.name: state.found[0].digests() for state in states if state.found}
 
 
 @dataclass(frozen=True)

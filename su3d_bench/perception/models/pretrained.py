@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import os
 import re
 from collections import OrderedDict
 from collections.abc import Callable
 from typing import Any, TypeVar, cast
 
 from su3d_bench.errors import DataError
-from su3d_bench.perception.models.devices import make_deterministic, require
+from su3d_bench.perception.models.devices import make_deterministic, require, require_transformers
 from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.grounding_dino import GroundingDino
 from su3d_bench.perception.models.sam_networks import TorchSam
@@ -83,7 +82,7 @@ def load_grounding_dino(files: ModelFiles, device: str, precision: str) -> Groun
 
 def _grounding_dino(files: ModelFiles, device: str, precision: str) -> GroundingDino:
     model = _pretrained(files, "GroundingDinoForObjectDetection")
-    transformers = require("transformers", f"detector '{files.entry.name}'")
+    transformers = require_transformers(f"detector '{files.entry.name}'")
     try:
         tokenizer = transformers.BertTokenizer.from_pretrained(str(files.folder), local_files_only=True)
     except (OSError, ValueError, KeyError, TypeError) as error:
@@ -106,7 +105,7 @@ def sam_names(tensors: dict[str, Any]) -> dict[str, Any]:
 
 def sam_config(name: str) -> Any:
     """``transformers``' configuration of the published SAM called ``name``."""
-    transformers = require("transformers", f"segmenter '{name}'")
+    transformers = require_transformers(f"segmenter '{name}'")
     width, n_layers, n_heads, global_layers = _SAM_TOWERS[name]
     tower = {
         "hidden_size": width,
@@ -127,15 +126,14 @@ def fill_sam(model: Any, tensors: dict[str, Any], where: str) -> Any:
 
 
 def _original_sam(files: ModelFiles) -> Any:
-    transformers = require("transformers", f"segmenter '{files.entry.name}'")
+    transformers = require_transformers(f"segmenter '{files.entry.name}'")
     tensors = read_weights(files.weights)
     return fill_sam(transformers.SamModel(sam_config(files.entry.name)), tensors, str(files.weights))
 
 
 def _pretrained(files: ModelFiles, class_name: str) -> Any:
     """A transformers model in float32 on the CPU; weights that are missing are an error, never random."""
-    os.environ.setdefault("HF_HUB_OFFLINE", "1")  # everything lies in the folder; nothing is to be asked for
-    transformers = require("transformers", f"model '{files.entry.name}'")
+    transformers = require_transformers(f"model '{files.entry.name}'")
     model_class = getattr(transformers, class_name)
     told = read_settings(files.folder / "config.json").get("model_type")
     if told != model_class.config_class.model_type:

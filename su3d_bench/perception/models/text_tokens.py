@@ -11,11 +11,12 @@ import numpy as np
 
 from su3d_bench.errors import DataError
 from su3d_bench.perception.models.devices import require, require_transformers
-from su3d_bench.perception.models.weights import bounded, read_settings
+from su3d_bench.perception.models.weights import bounded, check_settings_size, read_settings
 from su3d_bench.types import Int64Array
 
 TokensKind = Literal["clip", "siglip"]
 Tokeniser = Callable[[Sequence[str]], Int64Array]
+_CLIP_FILES = ("tokenizer.json", "vocab.json", "merges.txt", "tokenizer_config.json", "special_tokens_map.json")
 TOKENS_VERSION = "1"
 
 
@@ -44,6 +45,8 @@ def read_tokeniser(folder: Path, kind: TokensKind, n_tokens: int, pad_id: int | 
 
 def _clip(folder: Path, n_tokens: int) -> Callable[[list[str]], Any]:
     transformers = require_transformers("the tokenizer of CLIP")
+    for name in _CLIP_FILES:
+        check_settings_size(folder / name)
     tokenizer = _load(folder, lambda: transformers.CLIPTokenizer.from_pretrained(str(folder), local_files_only=True))
     return lambda texts: tokenizer(texts, padding="max_length", truncation=True, max_length=n_tokens)["input_ids"]
 

@@ -38,6 +38,8 @@ def read_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
     kind = config.get("model_type")
     if kind not in ("clip", "siglip"):
         raise DataError(f"{path}: model_type is {str(kind)[:40]!r}; an encoder is 'clip' or 'siglip'")
+    if "quantization_config" in config:
+        raise DataError(f"{path}: the weights are quantised, which is not the published encoder; fetch the folder anew")
     text, vision = (_table(path, config, key) for key in ("text_config", "vision_config"))
     for table in (config, text, vision):
         _check_limits(path, table)
@@ -89,11 +91,12 @@ def load_model(files: ModelFiles) -> Any:
             use_safetensors=files.weights.suffix == ".safetensors",
             weights_only=True,
             dtype=torch.float32,
+            attn_implementation="sdpa",
             output_loading_info=True,
         )
     except Exception as error:
         if type(error).__module__.startswith("safetensors") or isinstance(
-            error, OSError | ValueError | RuntimeError | KeyError
+            error, OSError | ValueError | RuntimeError | KeyError | ImportError
         ):
             raise DataError(f"{files.weights}: cannot be loaded: {bounded(error)}; fetch the folder anew") from error
         raise

@@ -63,11 +63,16 @@ def _read_pickled(path: Path, device: str) -> Any:
         raise DataError(f"{path}: not readable as torch weights: {bounded(error)}; fetch it anew") from error
 
 
+def check_settings_size(path: Path) -> None:
+    """Refuse a file of settings or words that is far larger than any model's; one that is not there is fine."""
+    if path.is_file() and path.stat().st_size > LARGEST_SETTINGS:
+        raise DataError(f"{path}: has {path.stat().st_size} bytes; a model's settings have at most {LARGEST_SETTINGS}")
+
+
 def read_settings(path: Path) -> dict[str, Any]:
     """The table in a JSON file of a model's folder, of bounded size; raises ``DataError`` for anything else."""
+    check_settings_size(path)
     try:
-        if path.stat().st_size > LARGEST_SETTINGS:
-            raise DataError(f"{path}: has {path.stat().st_size} bytes; a model's settings have some thousands")
         content = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); fetch it from where the weights come") from error

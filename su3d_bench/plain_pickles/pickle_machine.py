@@ -10,7 +10,7 @@ import struct
 from collections.abc import Callable, Iterable
 from typing import BinaryIO
 
-from su3d_bench.predictions.pickle_constructors import (
+from su3d_bench.plain_pickles.pickle_constructors import (
     Budget,
     Constructors,
     Forgotten,

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import BinaryIO, cast
 
 from su3d_bench.errors import PredictionError
-from su3d_bench.predictions.base import shown
-from su3d_bench.predictions.pickle_constructors import CONSTRUCTORS, Constructors, Forgotten, Inert, RefusedError
-from su3d_bench.predictions.pickle_machine import PickleMachine
+from su3d_bench.plain_pickles.pickle_constructors import CONSTRUCTORS, Constructors, Forgotten, Inert, RefusedError
+from su3d_bench.plain_pickles.pickle_machine import PickleMachine
+from su3d_bench.plain_text import printable
 
 __all__ = ["Forgotten", "Inert", "read_pickle", "read_pickle_file"]
 
@@ -27,7 +27,7 @@ def read_pickle_file(path: Path, *, forget: Iterable[str] = ()) -> object:
     Payloads below a dict key in ``forget`` are read past and leave ``Forgotten`` in their place; settings and paths
     become ``Inert``. Raises ``PredictionError`` for whatever is damaged or not plain data.
     """
-    where = shown(path)
+    where = printable(str(path), 300)
     try:
         with path.open("rb") as stream:
             is_gzip = stream.read(2) == GZIP_START

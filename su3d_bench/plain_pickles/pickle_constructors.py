@@ -53,7 +53,7 @@ class Named:
 
 
 class Inert:
-    """The place of an object that has no meaning here (settings, paths): it takes any state and keeps none."""
+    """The place of an object without meaning here (settings, paths, pictures): it takes any state and keeps none."""
 
 
 class Forgotten:
@@ -264,4 +264,6 @@ _SETTINGS: dict[str, Constructor | None] = {
         for name in ("Path", "PosixPath", "PurePath", "PurePosixPath", "PureWindowsPath", "WindowsPath")
     },
 }
-CONSTRUCTORS: Constructors = named({**_NUMPY, **_PLAIN, **_SETTINGS})
+# The crops that ConceptGraphs stores beside its detections.
+_IMAGES: dict[str, Constructor | None] = {"PIL.Image.Image": inert}
+CONSTRUCTORS: Constructors = named({**_NUMPY, **_PLAIN, **_SETTINGS, **_IMAGES})

@@ -1,0 +1,75 @@
+"""What is asked of a map and what the truth answers, for the protocols whose judgement people give otherwise."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from su3d_bench.types import Encoder, GroundTruth, Instances, Int64Array
+
+
+@dataclass(frozen=True)
+class AskedText:
+    """A text of a kind such as ``property``, and the ids of every object that answers it."""
+
+    kind: str
+    text: str
+    answers: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class RetrievalTruth:
+    """The objects of a scene and the texts that ask for them."""
+
+    scene: GroundTruth
+    asked: tuple[AskedText, ...]
+
+
+@dataclass(frozen=True)
+class RefinedNames:
+    """Labels n' of a map, one an instance, and who chose them."""
+
+    names: tuple[str, ...]
+    source: str
+
+
+@dataclass(frozen=True)
+class AnnotationTruth:
+    """The objects of a scene and how they may be called.
+
+    ``object_ids``: those that are judged; ``is_called`` tells whether a label names the object of an id; ``refined``
+    gives labels n' of a map, None where it has none.
+    """
+
+    scene: GroundTruth
+    object_ids: tuple[int, ...]
+    is_called: Callable[[str, int], bool]
+    refined: Callable[[Instances], RefinedNames | None]
+
+
+@dataclass(frozen=True)
+class TrueAnswer:
+    """``value``: a count, metres or yes and no; None where the objects are the answer. ``object_ids`` are named."""
+
+    text: str
+    kind: str
+    value: float | int | bool | None
+    object_ids: tuple[int, ...]
+
+
+@dataclass(frozen=True)
+class GivenAnswer:
+    """What a solver said of a map: ``rows`` are the instances that it names; nothing where it ``is_settled`` not."""
+
+    value: float | int | bool | None
+    rows: Int64Array
+    is_settled: bool
+
+
+@dataclass(frozen=True)
+class ReasoningTruth:
+    """Questions with true answers, and the solver that is asked about a map."""
+
+    scene: GroundTruth
+    asked: tuple[TrueAnswer, ...]
+    solve: Callable[[Instances, Encoder | None], Sequence[GivenAnswer]]

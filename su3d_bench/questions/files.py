@@ -1,0 +1,99 @@
+"""Question sets in files: read from TOML and CSV, and from the forms of ScanRefer, Nr3D and SQA3D; written as TOML, CSV.
+
+A CSV is data for programs: a text that begins with ``=`` stays as it is, so open it as text in a spreadsheet.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import tomllib
+from collections.abc import Sequence
+from pathlib import Path
+
+from su3d_bench.datasets.query_files import COLUMNS, MORE_COLUMNS, read_query_rows
+from su3d_bench.errors import DataError
+from su3d_bench.plain_text import printable
+from su3d_bench.questions.foreign_files import is_foreign, read_foreign
+from su3d_bench.questions.model import ALL_KINDS, KINDS, Question, new_question
+from su3d_bench.store import write_text
+from su3d_bench.toml_text import toml_value
+
+PAPER = Path(__file__).parent / "paper_queries.toml"
+
+
+def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ...]:
+    """The questions of a file, each scene as ``<dataset>/<scene>``; ``dataset`` completes scenes that name none.
+
+    A query without a kind is one of kind instance. The same question of the same scene may stand there once.
+    """
+    if is_foreign(path):
+        return _each_once(read_foreign(path))
+    found: dict[str, Question] = {}
+    for row in read_query_rows(path):
+        kind = row.kind or KINDS[0]
+        if kind not in ALL_KINDS:
+            raise DataError(f"{row.at}: unknown kind '{printable(kind, 40)}'; known: {', '.join(ALL_KINDS)}")
+        if "/" not in row.scene and dataset is None:
+            raise DataError(f"{row.at}: of which dataset is scene '{printable(row.scene, 60)}'? write dataset/scene")
+        scene = row.scene if "/" in row.scene else f"{dataset}/{row.scene}"
+        source = row.source or printable(path.name, 100)
+        one = new_question(scene, kind, row.text, row.objects or None, source)
+        if one.id in found:
+            raise DataError(f"{row.at}: '{printable(row.text, 60)}' stands there twice for {printable(scene, 60)}")
+        found[one.id] = one
+    return tuple(found.values())
+
+
+def _each_once(questions: Sequence[Question]) -> tuple[Question, ...]:
+    """The first of each id: people wrote some sentences twice; where their objects differ, all are right."""
+    answers: dict[str, set[int]] = {}
+    for one in questions:
+        answers.setdefault(one.id, set()).update(one.answers or ())
+    first = {one.id: one for one in reversed(questions)}
+    return tuple(
+        new_question(one.scene, one.kind, one.text, tuple(answers[one.id]) or None, one.source, one.reply)
+        for one in (first[key] for key in dict.fromkeys(each.id for each in questions))
+    )
+
+
+def paper_queries() -> tuple[Question, ...]:
+    """The queries that the paper's page shows, for each of its 13 scenes; no answers are published."""
+    content = tomllib.loads(PAPER.read_text(encoding="utf-8"))
+    asked = [(kind, text) for kind in KINDS for text in content["queries"][kind]]
+    return tuple(
+        new_question(scene, kind, text, None, "opensu3d.github.io")
+        for scene in content["scenes"]
+        for kind, text in asked
+    )
+
+
+def write_questions(path: Path, questions: Sequence[Question]) -> None:
+    """Write a set as ``read_questions`` reads it, TOML or CSV by the file's name; answers in words are not kept."""
+    suffix = path.suffix.lower()
+    if suffix not in (".toml", ".csv"):
+        raise DataError(
+            f"{printable(str(path), 200)}: unknown form '{printable(suffix, 20)}'; name a .toml or .csv file"
+        )
+    write_text(path, csv_text(questions) if suffix == ".csv" else toml_text(questions))
+
+
+def toml_text(questions: Sequence[Question]) -> str:
+    """The set as ``[[query]]`` tables."""
+    blocks = []
+    for one in questions:
+        values = {"scene": one.scene, "kind": one.kind, "text": one.text}
+        values_more = {"objects": list(one.answers or ()), "source": one.source}
+        lines = [f"{key} = {toml_value(value)}" for key, value in (values | values_more).items()]
+        blocks.append("\n".join(["[[query]]", *lines]))
+    return "\n\n".join(blocks) + "\n"
+
+
+def csv_text(questions: Sequence[Question]) -> str:
+    """The set as rows."""
+    text = io.StringIO(newline="")
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow((*COLUMNS, *MORE_COLUMNS))
+    for one in questions:
+        rows.writerow((one.scene, one.text, " ".join(map(str, one.answers or ())), one.kind, one.source))
+    return text.getvalue()

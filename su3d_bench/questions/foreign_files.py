@@ -1,0 +1,152 @@
+"""Sentences that people wrote about ScanNet's scenes: files of ScanRefer, Nr3D (Sr3D) and SQA3D as question sets.
+
+ScanRefer: a JSON list of ``scene_id``, ``object_id``, ``description``. Nr3D: a CSV with ``scan_id``, ``target_id``,
+``utterance``. SQA3D: a JSON with ``questions`` of ``scene_id``, ``situation``, ``question``, ``question_id``, whose
+answers stand in a file of annotations beside it. Object ids are ScanNet's own, one less than the truth's here.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.datasets.query_files import MOST_OBJECTS_ID, is_text
+from su3d_bench.errors import DataError
+from su3d_bench.plain_text import printable
+from su3d_bench.questions.model import REASONING, Question, new_question
+
+DATASET = "scannet"
+MOST_BYTES = 256 << 20  # ScanRefer's training set has some 40 MB
+MOST_QUESTIONS = 1_000_000
+NR3D_COLUMNS = ("scan_id", "target_id", "utterance")
+_FIRST_BYTES = 65536
+
+
+def is_foreign(path: Path) -> bool:
+    """Whether a file is of one of these forms, by its ending or, for a CSV, its first line."""
+    if path.suffix.lower() == ".json":
+        return True
+    if path.suffix.lower() != ".csv" or not path.is_file():
+        return False
+    with path.open("rb") as file:
+        line = file.read(_FIRST_BYTES).partition(b"\n")[0].decode("utf-8", "replace")
+    return set(NR3D_COLUMNS) <= {word.strip().strip('"').lstrip("\ufeff") for word in line.split(",")}
+
+
+def read_foreign(path: Path) -> tuple[Question, ...]:
+    """The sentences of a file: descriptions and utterances as relative queries, SQA3D's as reasoning questions."""
+    where = printable(str(path), 200)
+    text = _text_of(path, where)
+    if path.suffix.lower() == ".csv":
+        return tuple(_utterances(text, where))
+    content = _json_of(text, where)
+    if isinstance(content, list):
+        return tuple(_descriptions(content, where))
+    if isinstance(content, dict) and isinstance(content.get("questions"), list):
+        return tuple(_situated(content["questions"], _replies(path), where))
+    raise DataError(f"{where}: is neither a list of descriptions (ScanRefer) nor has it 'questions' (SQA3D)")
+
+
+def _text_of(path: Path, where: str) -> str:
+    try:
+        size = path.stat().st_size
+        if size > MOST_BYTES:
+            raise DataError(f"{where}: has {size} bytes; expected at most {MOST_BYTES}")
+        return path.read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise DataError(f"{where}: cannot be read: {error.strerror or error}") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{where}: not a text file in UTF-8") from error
+
+
+def _json_of(text: str, where: str) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{where}: not JSON ({printable(str(error), 120)})") from error
+
+
+def _descriptions(rows: list[Any], where: str) -> Iterator[Question]:
+    for number, row in enumerate(_bounded(rows, where), 1):
+        at = f"{where}: entry {number}"
+        scene, text = _word(row, "scene_id", at), _sentence(row, "description", at)
+        yield new_question(f"{DATASET}/{scene}", "relative", text, _answer(row, "object_id", at), "ScanRefer")
+
+
+def _utterances(text: str, where: str) -> Iterator[Question]:
+    try:
+        rows = list(csv.DictReader(io.StringIO(text, newline=""), strict=True))
+    except csv.Error as error:
+        raise DataError(f"{where}: not CSV ({printable(str(error), 120)})") from error
+    for number, row in enumerate(_bounded(rows, where), 2):
+        at = f"{where}: row {number}"
+        scene, sentence = _word(row, "scan_id", at), _sentence(row, "utterance", at)
+        yield new_question(f"{DATASET}/{scene}", "relative", sentence, _answer(row, "target_id", at), "Nr3D")
+
+
+def _situated(rows: list[Any], replies: Mapping[str, str], where: str) -> Iterator[Question]:
+    for number, row in enumerate(_bounded(rows, where), 1):
+        at = f"{where}: question {number}"
+        scene, asked = _word(row, "scene_id", at), _sentence(row, "question", at)
+        situation = _sentence(row, "situation", at) if row.get("situation") else ""
+        text = f"{situation} {asked}".strip()
+        reply = replies.get(str(row.get("question_id")), "")
+        yield new_question(f"{DATASET}/{scene}", REASONING, text, None, "SQA3D", reply)
+
+
+def _replies(path: Path) -> dict[str, str]:
+    """The first answer to each question, from ``..._sqa_annotations_...`` beside ``..._questions_...``."""
+    beside = path.with_name(path.name.replace("_questions_", "_sqa_annotations_"))
+    if beside == path or not beside.is_file():
+        return {}
+    where = printable(str(beside), 200)
+    content = _json_of(_text_of(beside, where), where)
+    rows = content.get("annotations") if isinstance(content, dict) else None
+    if not isinstance(rows, list):
+        raise DataError(f"{where}: has no 'annotations'")
+    found = {}
+    for number, row in enumerate(_bounded(rows, where), 1):
+        answers = row.get("answers") if isinstance(row, Mapping) else None
+        if not isinstance(answers, list) or not answers:
+            raise DataError(f"{where}: annotation {number}: has no answers")
+        found[str(row.get("question_id"))] = _sentence(answers[0], "answer", f"{where}: annotation {number}")
+    return found
+
+
+def _bounded(rows: list[Any], where: str) -> list[Any]:
+    if not rows or len(rows) > MOST_QUESTIONS:
+        raise DataError(f"{where}: has {len(rows)} entries; expected 1 to {MOST_QUESTIONS}")
+    return rows
+
+
+def _value(row: Any, key: str, at: str) -> Any:
+    if not isinstance(row, Mapping) or row.get(key) is None:
+        raise DataError(f"{at}: has no '{key}'")
+    return row[key]
+
+
+def _word(row: Any, key: str, at: str) -> str:
+    value = _value(row, key, at)
+    if not isinstance(value, str) or not value or not value.replace("_", "").isalnum() or len(value) > 100:
+        raise DataError(f"{at}: '{key}' must be a scene such as scene0000_00; found {printable(repr(value), 40)}")
+    return value
+
+
+def _sentence(row: Any, key: str, at: str) -> str:
+    """The text on one line: what people typed holds line ends and tabs."""
+    value = _value(row, key, at)
+    text = " ".join(value.split()) if isinstance(value, str) else ""
+    if not text or not is_text(text):
+        raise DataError(f"{at}: '{key}' must be a sentence; found {printable(repr(value), 40)}")
+    return text
+
+
+def _answer(row: Any, key: str, at: str) -> tuple[int, ...]:
+    value = str(_value(row, key, at)).strip()
+    if not (value.isascii() and value.isdigit() and len(value) < 11 and int(value) < MOST_OBJECTS_ID):
+        raise DataError(f"{at}: '{key}' must be an object id; found {printable(value, 40)}")
+    return (int(value) + 1,)

@@ -1,0 +1,126 @@
+"""Questions with known answers, made from any ground truth that has classes: names, uses, sizes, colours, relations.
+
+All objects that answer are carried; what more than a third of a scene's objects answer is dropped, as the built-in
+rooms have it. What is true but not known here (a class without an entry in the table of uses) is not counted right.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from su3d_bench.perception.captions_lexicon import AFFORDANCES, SYNONYMS
+from su3d_bench.perception.naming import with_article
+from su3d_bench.questions.known_objects import plain_name
+from su3d_bench.questions.model import KINDS, Question, new_question
+from su3d_bench.reasoning.named_objects import meant_by
+from su3d_bench.reasoning.relations import holds, is_between, is_container, is_next_to, relations_of
+from su3d_bench.reasoning.scene_map import MapObject, SceneMap
+
+SOURCE = "generated"
+MAX_ANSWER_SHARE = 1 / 3  # rooms_truth.MAX_ANSWER_SHARE
+MOST_SYNONYMS = 2  # of a class, so that common classes do not fill the set
+LARGE = 1.5  # ours: volume of the box, as a multiple of the median of its name, from which a thing is called large
+BETWEEN_M = 3.0  # ours: nobody looks farther for what something is between
+
+
+def generate(scene: str, objects: SceneMap, per_kind: int | None = None) -> tuple[Question, ...]:
+    """The questions of all four kinds, ``per_kind`` of each at most, drawn by a digest of the text: always the same."""
+    found: dict[tuple[str, str], set[int]] = {}
+    for kind, text, answers in _texts(objects):
+        found.setdefault((kind, text), set()).update(answers)
+    limit = max(1, int(len(objects) * MAX_ANSWER_SHARE))
+    kept = [
+        new_question(scene, kind, text, tuple(ids), SOURCE) for (kind, text), ids in found.items() if len(ids) <= limit
+    ]
+    return tuple(one for kind in KINDS for one in chosen([each for each in kept if each.kind == kind], per_kind))
+
+
+def chosen(questions: Sequence[Question], n: int | None) -> list[Question]:
+    """At most ``n`` questions by a digest of their text, sorted by text."""
+    drawn = sorted(questions, key=lambda one: hashlib.sha256(one.text.encode()).digest())[:n]
+    return sorted(drawn, key=lambda one: one.text)
+
+
+def _texts(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
+    """Kind, text and answers; the same text may come several times with some of its answers each."""
+    names = sorted({one.name for one in objects.objects})
+    for name in names:
+        yield "instance", name, _ids(objects, name)
+    for name, others in SYNONYMS.items():
+        if plain_name(name) in names:
+            for other in others[:MOST_SYNONYMS]:
+                yield "instance", other, _ids(objects, other)
+    for phrase, classes in AFFORDANCES.items():
+        answers = tuple(one for name in classes for one in _ids(objects, name))
+        if answers:
+            yield "affordance", phrase, answers
+    yield from _sizes(objects)
+    yield from _attributes(objects)
+    yield from _relations(objects)
+    yield from _between(objects)
+
+
+def _ids(objects: SceneMap, name: str) -> tuple[int, ...]:
+    return tuple(one.id for one in meant_by(name, objects).objects)
+
+
+def _sizes(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
+    """Large and small things among those of one name, by the volume of the box."""
+    for name, n in Counter(one.name for one in objects.objects).items():
+        if n < 2:
+            continue
+        named = [one for one in objects.objects if one.name == name]
+        volume = np.array([float(np.prod(one.size)) for one in named])
+        middle = float(np.median(volume))
+        for word, is_so in (("large", volume >= LARGE * middle), ("small", volume * LARGE <= middle)):
+            if is_so.any():
+                yield "property", f"{word} {name}", tuple(named[k].id for k in np.flatnonzero(is_so))
+
+
+def _attributes(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
+    """The words that are known of an object before its name: "red chair"."""
+    for one in objects.objects:
+        for word in one.caption.split():
+            yield "property", f"{word} {one.name}", (one.id,)
+
+
+def _relations(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
+    things = objects.objects
+    boxes = np.array([one.box for one in things]).reshape(-1, 2, 3)
+    links = list(relations_of(boxes, [one.name for one in things]))
+    on = {(link.subject, link.object) for link in links if link.relation == "on"}
+    for link in links:
+        if link.relation == "in" and (link.subject, link.object) in on:
+            continue  # a cushion is within the box of a sofa, and on it
+        subject, holder = things[link.subject], things[link.object]
+        yield "relative", f"{subject.name} {link.relation} {with_article(holder.name)}", (subject.id,)
+
+
+def _between(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
+    """What stands between two things of which the scene has one each, on one level with both."""
+    n_of = Counter(one.name for one in objects.objects)
+    single = [one for one in objects.objects if n_of[one.name] == 1]
+    for k, first in enumerate(single):
+        for second in single[k + 1 :]:
+            if float(np.linalg.norm(first.centroid - second.centroid)) > BETWEEN_M or _touch(first, second):
+                continue
+            for one in objects.objects:
+                if one is not first and one is not second and _stands_between(one, first, second):
+                    yield "relative", f"{one.name} between the {first.name} and the {second.name}", (one.id,)
+
+
+def _stands_between(one: MapObject, first: MapObject, second: MapObject) -> bool:
+    if any(min(one.box[1][2], other.box[1][2]) <= max(one.box[0][2], other.box[0][2]) for other in (first, second)):
+        return False
+    return is_between(one.centroid, first.centroid, second.centroid)
+
+
+def _touch(a: MapObject, b: MapObject) -> bool:
+    """Whether nothing can be between the two: they stand side by side, or one holds the other."""
+    return is_next_to(a.box, b.box) or any(
+        holds("on", x.box, y.box, b_is_container=is_container(y.name)) for x, y in ((a, b), (b, a))
+    )

@@ -1,0 +1,70 @@
+"""The objects of a ground truth as a map with true names, from which questions and their answers are made."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from su3d_bench.perception.captions_lexicon import GROUPS
+from su3d_bench.perception.embedded_text import words
+from su3d_bench.reasoning.named_objects import meant_by
+from su3d_bench.reasoning.relations import is_room_surface
+from su3d_bench.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.types import GroundTruth
+
+STRAY_PERCENT = 1.0  # ours: of an object's vertices at either end of an axis, which in a scan are often a neighbour's
+
+
+def known_objects(truth: GroundTruth, min_vertices: int, captions: Mapping[int, str] | None = None) -> SceneMap:
+    """The objects of at least ``min_vertices`` vertices, without the room's own surfaces, by ascending id.
+
+    An object's class is that of most of its vertices. ``captions``: words on an object, such as its colour.
+    """
+    found = []
+    order = np.argsort(truth.instance, kind="stable")
+    ids, starts = np.unique(truth.instance[order], return_index=True)
+    for one, rows in zip(ids.tolist(), np.split(order, starts[1:]), strict=True):
+        classes = np.bincount(truth.semantic[rows].clip(min=0))
+        class_id = int(classes.argmax())
+        if one <= 0 or class_id == 0 or len(rows) < min_vertices:
+            continue
+        name = plain_name(truth.labels.name_of(class_id))
+        if not is_room_surface(name):
+            points = truth.points[rows].astype(np.float64)
+            box = np.percentile(points, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
+            found.append(MapObject(one, name, (captions or {}).get(one, ""), points.mean(axis=0), box))
+    return SceneMap(tuple(found))
+
+
+def plain_name(name: str) -> str:
+    """A class name as people say it.
+
+    >>> plain_name("indoor-plant")
+    'indoor plant'
+    """
+    return " ".join(name.replace("-", " ").replace("_", " ").split())
+
+
+def is_called(label: str, class_name: str) -> bool:
+    """Whether a label is right for an object of a class, by the lexicon's other names and by what it is a kind of.
+
+    A more special name is right ("office chair" for a chair), a more general one too ("chair" for an office chair), a
+    word for many classes ("furniture") is not.
+
+    >>> is_called("couch", "sofa"), is_called("paper towel", "towel"), is_called("furniture", "sofa")
+    (True, False, False)
+    """
+    asked, known = words(label), words(class_name)
+    if not asked or not known:
+        return False
+    if asked == known:
+        return True
+    if " ".join(asked) in GROUPS:
+        return False
+    return bool(meant_by(class_name, _only(label)).objects) or bool(meant_by(label, _only(class_name)).objects)
+
+
+def _only(name: str) -> SceneMap:
+    nowhere = np.zeros(3)
+    return SceneMap((MapObject(1, name, "", nowhere, np.zeros((2, 3))),))

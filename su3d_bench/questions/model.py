@@ -1,0 +1,63 @@
+"""What people, or a program, are asked of a scene: a text, and where they are known the objects that answer it."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import dataclass
+
+from su3d_bench.errors import DataError
+from su3d_bench.plain_text import printable
+
+KINDS = ("instance", "affordance", "property", "relative")
+REASONING = "reasoning"
+ALL_KINDS = (*KINDS, REASONING)
+_DIGEST_LENGTH = 12
+
+
+def question_id(scene: str, kind: str, text: str) -> str:
+    """A short key that is the same wherever the same question is asked of the same scene.
+
+    >>> question_id("rooms/living0", "instance", "chair")
+    '3f6958fff541'
+    """
+    return hashlib.sha256("\0".join((scene, kind, text)).encode()).hexdigest()[:_DIGEST_LENGTH]
+
+
+@dataclass(frozen=True)
+class Question:
+    """One question to one scene.
+
+    ``scene``: ``<dataset>/<scene>``; ``kind``: one of ``KINDS``, or ``reasoning``; ``answers``: ids of all instances
+    of the ground truth that are right, ascending, None where nobody knows; ``source``: where the question comes from.
+    ``reply``: the right answer in words, where a question has one besides objects.
+    """
+
+    id: str
+    scene: str
+    kind: str
+    text: str
+    answers: tuple[int, ...] | None
+    source: str
+    reply: str = ""
+
+    def __post_init__(self) -> None:
+        where = f"question '{printable(self.text, 60)}'"
+        if self.kind not in ALL_KINDS:
+            raise DataError(f"{where}: unknown kind '{printable(self.kind, 40)}'; known: {', '.join(ALL_KINDS)}")
+        if self.id != question_id(self.scene, self.kind, self.text):
+            raise DataError(f"{where}: its id '{printable(self.id, 40)}' is not that of its scene, kind and text")
+        if self.answers is not None and list(self.answers) != sorted({one for one in self.answers if one > 0}):
+            raise DataError(f"{where}: answers must be instance ids above 0, ascending, each once")
+
+    @property
+    def is_known(self) -> bool:
+        """Whether an object is known that answers it."""
+        return bool(self.answers)
+
+
+def new_question(
+    scene: str, kind: str, text: str, answers: tuple[int, ...] | None, source: str, reply: str = ""
+) -> Question:
+    """A question with the id that its scene, kind and text give it."""
+    found = None if answers is None else tuple(sorted(set(answers)))
+    return Question(question_id(scene, kind, text), scene, kind, text, found, source, reply)

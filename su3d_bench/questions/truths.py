@@ -1,0 +1,104 @@
+"""What a scene's ground truth says to the questions of a protocol: the truth that scoring takes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.metrics.question_truths import (
+    AnnotationTruth,
+    AskedText,
+    GivenAnswer,
+    ReasoningTruth,
+    RefinedNames,
+    RetrievalTruth,
+    TrueAnswer,
+)
+from su3d_bench.protocols import ProtocolRules
+from su3d_bench.questions.generator import generate
+from su3d_bench.questions.known_objects import is_called, known_objects
+from su3d_bench.questions.model import Question, new_question
+from su3d_bench.reasoning.generated import generate_questions
+from su3d_bench.reasoning.named_objects import nearest_by
+from su3d_bench.reasoning.scene_map import map_of
+from su3d_bench.reasoning.solver import Solver
+from su3d_bench.scoring import QuestionTruth
+from su3d_bench.types import Encoder, GroundTruth, Instances
+
+Refine = Callable[[Instances], RefinedNames | None]
+MOST_NAMES = 5  # the paper's m: n' comes from the names of so many best views
+
+
+def has_own_queries(dataset: Any) -> bool:
+    """Whether a dataset (class or object) knows questions and answers itself."""
+    return hasattr(dataset, "queries")
+
+
+def own_questions(dataset: Any, scene: str) -> tuple[Question, ...]:
+    """The questions that the dataset itself knows of a scene, with all right answers."""
+    address = f"{dataset.name}/{scene}"
+    return tuple(
+        new_question(address, one.kind, one.text, one.answers, f"{dataset.name} truth")
+        for one in dataset.queries(scene)
+    )
+
+
+def question_truth(
+    rules: ProtocolRules, dataset: Any, scene: str, truth: GroundTruth, refine: Refine | None = None
+) -> QuestionTruth:
+    """The truth of a scene under a protocol that asks questions; ``refine`` gives labels n', by vote where absent."""
+    assert rules.min_region_size is not None
+    if rules.kind == "retrieval":
+        if rules.questions == "dataset":
+            asked = own_questions(dataset, scene)
+        else:
+            asked = generate(f"{dataset.name}/{scene}", known_objects(truth, rules.min_region_size), rules.per_kind)
+        return RetrievalTruth(truth, tuple(AskedText(one.kind, one.text, one.answers or ()) for one in asked))
+    if rules.kind == "annotation":
+        return _annotation_truth(rules.min_region_size, truth, refine or voted_names)
+    return _reasoning_truth(rules, truth, refine or voted_names)
+
+
+def _annotation_truth(min_vertices: int, truth: GroundTruth, refine: Refine) -> AnnotationTruth:
+    name_of = {one.id: one.name for one in known_objects(truth, min_vertices).objects}
+    return AnnotationTruth(truth, tuple(name_of), lambda label, one: is_called(label, name_of[one]), refine)
+
+
+def _reasoning_truth(rules: ProtocolRules, truth: GroundTruth, refine: Refine) -> ReasoningTruth:
+    assert rules.min_region_size is not None
+    objects = known_objects(truth, rules.min_region_size)
+    asked = generate_questions(objects, n_each=rules.per_kind or len(objects) ** 2)
+    texts = [one.text for one in asked]
+
+    def solve(instances: Instances, encoder: Encoder | None) -> Sequence[GivenAnswer]:
+        refined = refine(instances)
+        scene = map_of(instances, None if refined is None else refined.names)
+        solver = Solver(scene, None, None if encoder is None else nearest_by(encoder))
+        return [_given(solver.answer(text), {one.id: one.row for one in scene.objects}) for text in texts]
+
+    known = {one.id for one in objects.objects}
+    true = [
+        TrueAnswer(
+            one.text, one.kind, one.answer.value, tuple(sorted(set(one.answer.object_ids) & known))
+        )
+        for one in asked
+    ]  # fmt: skip
+    return ReasoningTruth(truth, tuple(true), solve)
+
+
+def _given(answer: Any, row_of: dict[int, int]) -> GivenAnswer:
+    return GivenAnswer(
+        answer.value, np.array([row_of[one] for one in answer.object_ids], np.int64), bool(answer.is_settled)
+    )
+
+
+def voted_names(instances: Instances) -> RefinedNames | None:
+    """Label n' by vote: of the names that the best views gave, the one with the greatest sum of prediction scores."""
+    from su3d_bench.perception.language.refinement import top_names, vote
+
+    if instances.view_names is None or instances.view_scores is None:
+        return None
+    names = tuple(vote(top).name for top in top_names(instances, MOST_NAMES))
+    return RefinedNames(names, f"the vote of the names of {MOST_NAMES} views, no language model")

@@ -1,0 +1,67 @@
+"""Generated questions judged without a person: whether an answer about one map is the true one about another."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+
+import numpy as np
+
+from su3d_bench.reasoning.answers import Answer
+from su3d_bench.reasoning.generated import GeneratedQuestion
+from su3d_bench.reasoning.scene_map import SceneMap
+from su3d_bench.types import Float64Array
+
+LEAST_IOU = 0.25  # the loosest overlap at which ScanNet's benchmark takes two instances for one
+DISTANCE_M, DISTANCE_SHARE = 0.1, 0.1  # ours: a distance is right within 0.1 m or a tenth
+
+
+def box_iou(a: Float64Array, b: Float64Array) -> float:
+    """Intersection over union of two boxes (2, 3); 0 where both are empty."""
+    shared = float(np.prod(np.clip(np.minimum(a[1], b[1]) - np.maximum(a[0], b[0]), 0.0, None)))
+    union = float(np.prod(a[1] - a[0]) + np.prod(b[1] - b[0])) - shared
+    return shared / union if union > 0 else 0.0
+
+
+def same_objects(scene: SceneMap, truth: SceneMap) -> dict[int, int]:
+    """Id in ``scene`` -> id in ``truth`` of the box that it overlaps most, where that is enough."""
+    found = {}
+    for one in scene.objects:
+        overlaps = [(box_iou(one.box, other.box), -other.id) for other in truth.objects]
+        iou, negative_id = max(overlaps, default=(0.0, 0))
+        if iou >= LEAST_IOU:
+            found[one.id] = -negative_id
+    return found
+
+
+def is_right(question: GeneratedQuestion, answer: Answer, same: Mapping[int, int]) -> bool:
+    """Whether ``answer`` says what is true; its ids are those of the map whose objects ``same`` leads to the truth.
+
+    Lists must be complete and hold nothing else; of a "which" question the first object counts. An answer in words
+    alone is read for its yes or no, or its first number.
+    """
+    if not answer.is_settled:
+        return False
+    true = question.answer.value
+    if true is None:
+        ids = [same.get(one) for one in answer.object_ids]
+        if question.kind.startswith(("what ", "between")):
+            return set(ids) == set(question.answer.object_ids)
+        return ids[:1] == list(question.answer.object_ids[:1])
+    said = _value(answer, true)
+    if said is None:
+        return False
+    if isinstance(true, float):
+        return abs(said - true) <= max(DISTANCE_M, DISTANCE_SHARE * true)
+    return said == true
+
+
+def _value(answer: Answer, like: float | int | bool) -> float | int | bool | None:
+    if answer.value is not None:
+        return answer.value
+    text = answer.text.lower()
+    if isinstance(like, bool):
+        word = re.search(r"\b(yes|no)\b", text)
+        return None if word is None else word[1] == "yes"
+    number = re.search(r"(?<![\w#.])\d+(?:\.\d+)?", text)
+    return None if number is None else float(number[0])

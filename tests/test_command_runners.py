@@ -1,0 +1,163 @@
+"""How programs of others are run, measured and ended: as they are, in docker, in conda."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from made_programs import MASKS, fed, refused
+from pydantic import ValidationError
+
+from su3d_bench.baselines.command import Command, CommandConfig
+from su3d_bench.baselines.command_process import ContainerWatch, run_program
+
+
+def test_a_timeout_ends_children_too_even_those_that_left_the_group(tmp_path: Path) -> None:
+    line = f"sleep 60 & echo $! >> {tmp_path}/pids; setsid sleep 60 & echo $! >> {tmp_path}/pids; wait"
+    refused(fed(Command(CommandConfig(command=line, shell=True, timeout_s=2.0))))
+    pids = [int(line) for line in (tmp_path / "pids").read_text().split()]
+    assert len(pids) == 2
+    deadline = time.monotonic() + 10
+    while any(_runs(pid) for pid in pids) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert not any(_runs(pid) for pid in pids)
+
+
+def _runs(pid: int) -> bool:
+    return bool(psutil.pid_exists(pid) and psutil.Process(pid).status() != psutil.STATUS_ZOMBIE)
+
+
+def test_memory_and_time_are_those_of_the_program_and_its_children(tmp_path: Path) -> None:
+    child = "import time; held = bytearray(150_000_000); time.sleep(1.5)"
+    text = f"import subprocess, sys; held = bytearray(100_000_000); subprocess.run([sys.executable, '-c', {child!r}])"
+    done = run_program(
+        [sys.executable, "-c", text], folder=tmp_path, environment={"PATH": os.environ["PATH"]}, timeout_s=60
+    )
+    assert done.exit_code == 0
+    assert done.peak_memory_bytes is not None
+    assert 250e6 <= done.peak_memory_bytes < 400e6
+    assert done.wall_s >= 1.5
+
+
+def test_a_flood_of_output_is_kept_from_its_end_only(tmp_path: Path) -> None:
+    text = "import sys\nfor i in range(40000): print('line', i)\nsys.stderr.write('end')"
+    done = run_program([sys.executable, "-c", text], folder=tmp_path, environment={}, timeout_s=60)
+    assert len(done.stdout) < 101_000
+    assert done.stdout.startswith("[")
+    assert done.stdout.endswith("line 39999\n")
+    assert done.stderr == "end"
+
+
+def fake(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, name: str, body: str) -> Path:
+    """A program called ``name``, first on PATH, that writes down its arguments and then does ``body``."""
+    folder = tmp_path / "bin"
+    folder.mkdir(exist_ok=True)
+    log = tmp_path / f"{name}.jsonl"
+    (folder / name).write_text(
+        f"#!{sys.executable}\nimport json, os, sys\nwords = sys.argv[1:]\n"
+        f"print(json.dumps(words), file=open({str(log)!r}, 'a'))\n{body}"
+    )
+    (folder / name).chmod(0o755)
+    monkeypatch.setenv("PATH", f"{folder}{os.pathsep}{os.environ['PATH']}")
+    return log
+
+
+FAKE_DOCKER = """
+if words[0] == "run":
+    open(words[words.index("--cidfile") + 1], "w").write("abc123")
+    here = next(w.split(":")[0] for w in words if w.endswith(":/su3d/output"))
+    sys.argv = ["", here]
+"""
+
+
+def test_docker_gets_read_only_frames_no_network_and_the_paths_inside(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    log = fake(tmp_path, monkeypatch, "docker", FAKE_DOCKER + MASKS)
+    monkeypatch.setenv("MY_MODEL", "large")
+    config = CommandConfig(
+        command=("run.py", "{frames}", "{output}"),
+        runner="docker",
+        image="their/image:1",
+        gpus="all",
+        mounts=("/data/weights:/weights",),
+        pass_variables=("PATH", "MY_MODEL"),
+    )
+    one = fed(Command(config))
+    assert len(one.finish().scores) == 2  # type: ignore[union-attr]
+    one.close()
+    (words,) = [json.loads(line) for line in log.read_text().splitlines()]
+    assert words[:3] == ["run", "--rm", "--init"]
+    assert words[-4:] == ["their/image:1", "run.py", "/su3d/frames", "/su3d/output"]
+    volumes = [words[i + 1] for i, word in enumerate(words) if word == "--volume"]
+    assert volumes[0].endswith("/frames:/su3d/frames:ro")
+    assert volumes[3] == "/data/weights:/weights:ro"
+    assert [words[i + 1] for i, word in enumerate(words) if word == "--env"] == ["MY_MODEL"]
+    assert words[words.index("--network") + 1] == "none"
+    assert words[words.index("--user") + 1] == f"{os.getuid()}:{os.getgid()}"
+    assert words[words.index("--gpus") + 1] == "all"
+
+
+def test_a_container_that_takes_too_long_is_killed_by_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    fake(tmp_path, monkeypatch, "docker", "")
+    docker, log = tmp_path / "bin" / "docker", tmp_path / "docker.log"
+    docker.write_text(f'#!/bin/sh\necho "$@" >> {log}\nif [ "$1" = run ]; then sleep 60; fi\n')
+    one = fed(Command(CommandConfig(command="x {output}", runner="docker", image="i", timeout_s=2.0)))
+    assert "was ended after 2 s" in refused(one)
+    started, killed = (line.split() for line in log.read_text().splitlines())
+    assert killed == ["kill", started[started.index("--name") + 1]]
+
+
+@pytest.mark.parametrize("place", ["system.slice/docker-abc123.scope/memory.peak", "docker/abc123/memory.peak"])
+def test_a_containers_peak_is_what_its_cgroup_says(tmp_path: Path, place: str) -> None:
+    (tmp_path / place).parent.mkdir(parents=True)
+    told = []
+    for identity, peak in (("abc123", ""), ("../../etc", "99"), ("abc123", "123456\n")):
+        (tmp_path / "id").write_text(identity)
+        (tmp_path / place).write_text(peak)
+        watch = ContainerWatch("name", tmp_path / "id", lambda name: None, cgroups=tmp_path)
+        watch.look()
+        told.append((watch.peak_bytes, watch.source))
+    unread = (None, "not measured: the cgroup cannot be read here")
+    assert told == [unread, unread, (123456, "the container's cgroup")]
+
+
+@pytest.mark.parametrize(("environment", "kind"), [("theirs", "--name"), ("/envs/theirs", "--prefix")])
+def test_conda_runs_the_command_in_the_environment(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, environment: str, kind: str
+) -> None:
+    log = fake(tmp_path, monkeypatch, "conda", "sys.argv = ['', words[-1]]" + MASKS)
+    one = fed(Command(CommandConfig(command="python run.py {output}", runner="conda", environment=environment)))
+    assert len(one.finish().scores) == 2  # type: ignore[union-attr]
+    one.close()
+    (words,) = [json.loads(line) for line in log.read_text().splitlines()]
+    assert words[:6] == ["run", "--no-capture-output", kind, environment, "python", "run.py"]
+
+
+@pytest.mark.parametrize(
+    ("config", "reason"),
+    [
+        ({"command": ["a", "{frame}"]}, "'{frame}' stands for nothing; known: {frames}"),
+        ({"command": ["a"], "shell": True}, "shell = true takes the command as one line"),
+        ({"command": "a 'b"}, "No closing quotation"),
+        ({"command": ["a"], "runner": "docker"}, "runner 'docker' needs image"),
+        ({"command": ["a"], "runner": "conda"}, "runner 'conda' needs environment"),
+        ({"command": ["a"], "image": "x"}, "belong to runner 'docker'"),
+        ({"command": ["a"], "environment": "x"}, "belongs to runner 'conda'"),
+        ({"command": ["a"], "runner": "docker", "image": "i", "mounts": ["w:/w"]}, "is not HERE:THERE"),
+        ({"command": ["a"], "runner": "docker", "image": "--privileged"}, "String should match pattern"),
+        ({"command": ["a"], "format": "zip"}, "unknown format 'zip'"),
+        ({"command": ["a"], "pass_variables": ["A=B"]}, "pattern"),
+        ({"command": ["a"], "timeout_s": 0}, "greater than 0"),
+    ],
+)
+def test_a_configuration_that_cannot_work_is_refused(config: dict[str, Any], reason: str) -> None:
+    with pytest.raises(ValidationError) as caught:
+        CommandConfig.model_validate_json(json.dumps(config))
+    assert reason in str(caught.value)

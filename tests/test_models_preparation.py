@@ -1,0 +1,151 @@
+"""How images and texts are prepared for encoders: equal to the originals to the bit, and nothing skipped."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from tiny_encoders import (
+    IMAGE_SIZE,
+    N_TOKENS,
+    needs_models,
+    noise_images,
+    write_clip_tokenizer,
+)
+
+from su3d_bench.errors import DataError
+from su3d_bench.perception.models.image_transform import CLIP_MEAN, CLIP_STD, ImageTransform, read_transform
+from su3d_bench.perception.models.text_tokens import canonical_text
+
+
+def test_the_window_of_the_centre_crop_is_rounded_as_each_library_does() -> None:
+    # 7 wide after the resize, 4 kept: a surplus of 3. torchvision: round(1.5) = 2; transformers: 3 // 2 = 1.
+    columns = np.arange(7, dtype=np.uint8) * 10
+    image = np.tile(columns[None, :, None], (4, 1, 3))
+    plain = {"mean": (0.0, 0.0, 0.0), "std": (1.0, 1.0, 1.0)}
+    original = ImageTransform(4, **plain).pixels([image])  # type: ignore[arg-type]
+    other = ImageTransform(4, convention="transformers", **plain).pixels([image])  # type: ignore[arg-type]
+    assert np.array_equal(np.rint(original[0, 0, 0] * 255), [20, 30, 40, 50])
+    assert np.array_equal(np.rint(other[0, 0, 0] * 255), [10, 20, 30, 40])
+
+
+def test_pixels_are_divided_by_255_then_normalised_in_float32() -> None:
+    image = np.full((4, 4, 3), 200, np.uint8)
+    expected = (np.float32(200) / np.float32(255) - np.float32(CLIP_MEAN[1])) / np.float32(CLIP_STD[1])
+    pixels = ImageTransform(4).pixels([image])
+    assert pixels.dtype == np.float32
+    assert (pixels[0, 1] == expected).all()
+
+
+def test_squash_stretches_both_sides_and_crops_nothing() -> None:
+    image = np.zeros((8, 32, 3), np.uint8)
+    image[:, :16] = 255
+    pixels = ImageTransform(8, "squash", (0.5,) * 3, (0.5,) * 3).pixels([image])
+    assert (pixels[0, 0, :, :3] == 1).all()
+    assert (pixels[0, 0, :, 5:] == -1).all()
+
+
+@needs_models
+def test_clip_images_are_prepared_as_transformers_prepares_them_to_the_bit() -> None:
+    from transformers.models.clip.image_processing_pil_clip import CLIPImageProcessorPil
+
+    side = {"height": IMAGE_SIZE, "width": IMAGE_SIZE}
+    theirs = CLIPImageProcessorPil(size={"shortest_edge": IMAGE_SIZE}, crop_size=side)
+    ours = ImageTransform(IMAGE_SIZE, convention="transformers")
+    random = np.random.default_rng(5)
+    for _ in range(40):
+        image = random.integers(0, 256, (*random.integers(1, 90, 2), 3), dtype=np.uint8)
+        answer = theirs(images=[image], return_tensors="np", input_data_format="channels_last")["pixel_values"]
+        assert np.array_equal(ours.pixels([image]), answer), image.shape
+
+
+@needs_models
+def test_siglip_images_are_prepared_as_transformers_prepares_them_to_the_bit() -> None:
+    from transformers.models.siglip.image_processing_pil_siglip import SiglipImageProcessorPil
+
+    theirs = SiglipImageProcessorPil(size={"height": IMAGE_SIZE, "width": IMAGE_SIZE})
+    ours = ImageTransform(IMAGE_SIZE, "squash", (0.5,) * 3, (0.5,) * 3, convention="transformers")
+    for image in noise_images(5):
+        answer = theirs(images=[image], return_tensors="np", input_data_format="channels_last")["pixel_values"]
+        assert np.array_equal(ours.pixels([image]), answer), image.shape
+
+
+def test_dividing_by_255_and_multiplying_by_its_inverse_give_the_same_float32() -> None:
+    values = np.arange(256, dtype=np.uint8)
+    multiplied = (values.astype(np.float64) * (1 / 255)).astype(np.float32)
+    assert np.array_equal(values.astype(np.float32) / np.float32(255), multiplied)
+
+
+def test_the_two_conventions_agree_where_the_windows_do() -> None:
+    images = [image for image in noise_images(5) if image.shape[0] == image.shape[1]]
+    other = ImageTransform(IMAGE_SIZE, convention="transformers")
+    assert np.array_equal(ImageTransform(IMAGE_SIZE).pixels(images), other.pixels(images))
+
+
+def test_a_processor_file_of_either_age_gives_the_transform(tmp_path: Path) -> None:
+    path = tmp_path / "preprocessor_config.json"
+    usual = {"image_mean": [0.1, 0.2, 0.3], "image_std": [1, 2, 3], "resample": 3}
+    path.write_text(json.dumps(usual | {"size": 224, "crop_size": 224, "do_center_crop": True}))
+    expected = ImageTransform(224, "shortest", (0.1, 0.2, 0.3), (1.0, 2.0, 3.0))
+    assert read_transform(path, "original") == expected
+    crop = {"height": 224, "width": 224}
+    path.write_text(json.dumps(usual | {"size": {"shortest_edge": 224}, "crop_size": crop, "do_center_crop": True}))
+    assert read_transform(path, "original") == expected
+    path.write_text(json.dumps(usual | {"size": crop, "image_processor_type": "SiglipImageProcessor"}))
+    assert read_transform(path, "original").fit == "squash"
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"do_normalize": False}, "do_normalize is False"),
+        ({"rescale_factor": 1}, "rescale_factor is 1"),
+        ({"size": {"longest_edge": 9}}, "expected a shortest edge"),
+        ({"crop_size": 100}, "expected a shortest edge"),
+        ({"size": 10**9, "crop_size": 10**9}, "expected a shortest edge"),
+        ({"image_std": [0, 1, 1]}, "above 0"),
+        ({"image_mean": ["a", 1, 1]}, "expected three numbers"),
+        ({"resample": "cubic"}, "0 to 5"),
+    ],
+)
+def test_a_processor_file_that_asks_for_another_recipe_is_refused(
+    tmp_path: Path, change: dict[str, Any], said: str
+) -> None:
+    path = tmp_path / "preprocessor_config.json"
+    usual = {"size": 32, "crop_size": 32, "image_mean": [0, 0, 0], "image_std": [1, 1, 1], "do_center_crop": True}
+    path.write_text(json.dumps(usual | change))
+    with pytest.raises(DataError, match=said):
+        read_transform(path, "original")
+
+
+# ---- texts
+
+
+def test_siglip_texts_lose_capitals_and_punctuation() -> None:
+    assert canonical_text(" A  TV-screen, in the scene. ") == "a tvscreen in the scene"
+
+
+@needs_models
+def test_long_texts_are_cut_and_keep_their_end(tmp_path: Path) -> None:
+    from su3d_bench.perception.models.text_tokens import read_tokeniser
+
+    write_clip_tokenizer(tmp_path)
+    words = json.loads((tmp_path / "vocab.json").read_text())
+    tokens = read_tokeniser(tmp_path, "clip", N_TOKENS, None, len(words))(["chair", "chair " * 50])
+    end = words["<|endoftext|>"]
+    assert tokens.shape == (2, N_TOKENS)
+    assert tokens[0, :3].tolist() == [words["<|startoftext|>"], words["chair</w>"], end]
+    assert tokens[1, -1] == end
+    assert (tokens[1, 1:-1] == words["chair</w>"]).all()
+
+
+@needs_models
+def test_a_tokenizer_of_another_model_is_refused(tmp_path: Path) -> None:
+    from su3d_bench.perception.models.text_tokens import read_tokeniser
+
+    write_clip_tokenizer(tmp_path)
+    with pytest.raises(DataError, match="the text tower knows 20 words"):
+        read_tokeniser(tmp_path, "clip", N_TOKENS, None, 20)(["chair"])

@@ -1,0 +1,172 @@
+"""ConceptGraphs' detections as perception: files written as its script writes them, and files that are damaged."""
+
+from __future__ import annotations
+
+import gzip
+import pickle
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from perception_fakes import CountingEncoder, still_life
+from PIL import Image
+
+from su3d_bench.errors import ConfigError, DataError, PredictionError
+from su3d_bench.perception.gsa_files import GsaFiles
+from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
+from su3d_bench.timing import Timer
+from su3d_bench.types import Float32Array, PerceptionNeeds, SceneInfo
+
+SCENE = SceneInfo("replica", "room0", n_frames=1, stride=1, image_domain="camera")
+PATTERN = "{scene}/gsa_detections_none/frame{index}.pkl.gz"
+FRAME = still_life(40)
+
+
+def masks() -> np.ndarray:
+    found = np.zeros((3, *FRAME.depth_m.shape), bool)
+    found[0, 40:80, 20:60] = found[1, 50:90, 90:120] = True  # the third is empty
+    return found
+
+
+def detections(**changes: Any) -> dict[str, Any]:
+    """What the script writes for three regions."""
+    features = np.zeros((3, 8), np.float32)
+    features[[0, 1, 2], [1, 3, 5]] = 1
+    return {
+        "xyxy": np.array([[20.5, 40, 60, 80], [90, 50, 200, 90], [1, 1, 5, 5]]),
+        "confidence": np.array([0.97, 1.01, 0.9]),
+        "class_id": np.array([0, 1, 0]),
+        "mask": masks(),
+        "classes": ["item", " coffee table "],
+        "image_crops": [Image.new("RGB", (9, 7), (1, 2, 3)) for _ in range(3)],
+        "image_feats": features,
+        "text_feats": features,
+        **changes,
+    }
+
+
+def write(folder: Path, content: Any, name: str = "frame000040.pkl.gz", protocol: int = 4) -> Path:
+    path = folder / "room0" / "gsa_detections_none" / name
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_bytes(gzip.compress(pickle.dumps(content, protocol)))
+    return path
+
+
+@pytest.mark.parametrize("protocol", [2, 4, 5])
+def test_regions_are_those_of_the_file_and_pictures_are_passed_over(tmp_path: Path, protocol: int) -> None:
+    write(tmp_path, detections(), protocol=protocol)
+    found = GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
+    assert found.regions.names == ("item", "coffee table")
+    np.testing.assert_array_equal(found.regions.masks, masks()[:2])
+    np.testing.assert_array_equal(found.regions.boxes, np.array([[20.5, 40, 60, 80], [90, 50, 160, 90]], np.float32))
+    np.testing.assert_array_equal(found.regions.scores, np.array([0.97, 1], np.float32))
+    assert found.image_features is not None and found.image_features.argmax(axis=1).tolist() == [1, 3]
+
+
+def test_a_frame_without_detections_has_no_regions(tmp_path: Path) -> None:
+    empty = {key: np.zeros(0) for key in ("xyxy", "confidence", "class_id", "mask")}
+    write(tmp_path, detections(**empty, image_crops=[], image_feats=[], text_feats=[]))
+    found = GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
+    assert found.regions.masks.shape == (0, *FRAME.depth_m.shape) and found.regions.names == ()
+
+
+def perception(folder: Path, encoder: CountingEncoder) -> Perception:
+    config = PerceptionConfig.model_validate({"stored": {"folder": folder, "detections": PATTERN}})
+    return build_perception("stored", config, scene=SCENE, cache_root=folder / "c", mesh=None, encoder=encoder)
+
+
+def test_every_method_can_be_fed_from_them(tmp_path: Path) -> None:
+    write(tmp_path, detections())
+    fed = perception(tmp_path, CountingEncoder())
+    found = fed.detect(FRAME, PerceptionNeeds(crop_ratios=(0.8, 1.0), name_features=True), Timer())
+    assert found.names == ("item", "coffee table")
+    assert found.captions == ("an item in a scene", "a coffee table in a scene")
+    assert found.crop_features.shape[:2] == (2, 2) and found.name_features is not None
+    assert found.score_scale == "published"
+    mask, share = fed.regions().mask_at(FRAME, np.array([[25, 45], [30, 60]]))
+    np.testing.assert_array_equal(mask, masks()[0])
+    assert share == 1
+
+
+def test_their_features_count_where_the_run_has_the_encoder_and_the_crops_that_made_them(tmp_path: Path) -> None:
+    write(tmp_path, detections())
+    needs = PerceptionNeeds(crop_ratios=(1.0,), crop_padding_px=20)
+
+    class Same(CountingEncoder):
+        name = "clip-vit-h-14"
+        dim = 8
+
+        def encode_images(self, images: Any) -> Float32Array:
+            return np.tile(np.eye(8, dtype=np.float32)[7], (len(images), 1))
+
+    same = perception(tmp_path, Same()).detect(FRAME, needs, Timer())
+    assert same.crop_features[:, 0].argmax(axis=1).tolist() == [1, 3]
+    unpadded = perception(tmp_path, Same()).detect(FRAME, PerceptionNeeds(), Timer())
+    assert unpadded.crop_features[:, 0].argmax(axis=1).tolist() == [7, 7]
+
+
+def test_the_digest_moves_with_the_files(tmp_path: Path) -> None:
+    write(tmp_path, detections())
+    before = perception(tmp_path, CountingEncoder()).digest
+    write(tmp_path, detections(confidence=np.array([0.96, 1, 0.9])))
+    assert perception(tmp_path, CountingEncoder()).digest != before
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mask": masks()[:, :-1]}, r"masks are \(3, 119, 160\), the frame has height 120 and width 160"),
+        ({"mask": masks()[:2]}, r"and 3 detections"),
+        ({"class_id": np.array([0, 2, 0])}, "class number 2; 'classes' has 2 names"),
+        ({"class_id": np.array([0, -1, 0])}, "class number -1"),
+        ({"class_id": np.array([0.0, 1.0, 0.0])}, "3 class numbers of type float64"),
+        ({"classes": ["item", ""]}, "a class has an empty name"),
+        ({"classes": "item"}, "'classes' is no list of names"),
+        ({"xyxy": np.zeros((2, 4))}, r"xyxy is \(2, 4\)"),
+        ({"xyxy": np.full((3, 4), np.nan)}, "boxes of finite numbers"),
+        ({"confidence": np.array([np.nan, 1, 1])}, "a confidence is not finite"),
+        ({"confidence": None}, "'confidence' is no array of numbers"),
+        ({"confidence": np.ones(2001)}, "has 2001 detections"),
+        ({"image_feats": np.ones((3, 8))}, r"image_feats are \(3, 8\); expected 3 rows of length 1"),
+    ],
+)
+def test_what_does_not_fit_is_one_line(tmp_path: Path, changes: dict[str, Any], message: str) -> None:
+    write(tmp_path, detections(**changes))
+    with pytest.raises(DataError, match=message) as caught:
+        GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
+    assert str(caught.value).isprintable() and "frame000040.pkl.gz" in str(caught.value)
+
+
+def test_a_frame_without_a_file_and_a_folder_without_files_are_named(tmp_path: Path) -> None:
+    write(tmp_path, detections(), name="frame000000.pkl.gz")
+    with pytest.raises(DataError, match="no detections of frame 40"):
+        GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
+    with pytest.raises(DataError, match="no file of detections in"):
+        GsaFiles(tmp_path, PATTERN.replace("frame", "image"), SCENE)
+    with pytest.raises(ConfigError, match=r"perception\.stored\.detections: .*leads out of"):
+        GsaFiles(tmp_path, "../frame{index}.pkl.gz", SCENE)
+
+
+class Calling:
+    def __reduce__(self) -> Any:
+        return (exec, ("raise AssertionError('code of a file was run')",))
+
+
+def test_a_file_that_asks_for_code_is_refused(tmp_path: Path) -> None:
+    write(tmp_path, detections(image_crops=[Calling()]))
+    with pytest.raises(PredictionError, match="exec"):
+        GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
+    write(tmp_path, [1, 2])
+    with pytest.raises(DataError, match="holds a list"):
+        GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
+
+
+def test_a_file_cut_short_is_one_line(tmp_path: Path) -> None:
+    small = detections(image_crops=[])
+    path = write(tmp_path, small)
+    content = path.read_bytes()
+    for cut in (0, 1, 10, len(content) // 2, len(content) - 1):
+        path.write_bytes(content[:cut])
+        with pytest.raises((DataError, PredictionError)):
+            GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)

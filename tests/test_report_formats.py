@@ -1,0 +1,164 @@
+"""Tables for papers: every format, and what hostile texts may do to it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import re
+import shutil
+import subprocess
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+from measured_rows import measured, measured_instances
+
+from su3d_bench.reports.ablation_table import SweepRow, ablation_table
+from su3d_bench.reports.latex import escape, latex, origin_comment, printed_cells
+from su3d_bench.reports.paper_tables import Shown, paper_table, protocol_table
+from su3d_bench.reports.published import Figure
+from su3d_bench.reports.table_formats import csv_text, html_page, markdown
+from su3d_bench.reports.table_model import Cell, Origin, Table, TableRow
+
+HOSTILE = (
+    "\\input{/etc/passwd}",
+    "% run=x method=y",
+    "a & b \\\\ c",
+    "$x^2_3$ #1 ~{}",
+    "=HYPERLINK(\"http://x\")",
+    "<script>alert(1)</script>",
+    "[2pt] *",
+    "naïve \u0142 日本 \u202e",
+    "line\nbreak\x1b[31m",
+    "a | b -- ''q'' ?`",
+)  # fmt: skip
+
+
+def hostile_table() -> Table:
+    rows = [measured(name, 0.1 + 0.05 * k, caveat=name) for k, name in enumerate(HOSTILE)]
+    figures = [
+        Figure(method=name, dataset="d", setup=name, source=name, values={"mAcc": "1.0"}) for name in HOSTILE[:3]
+    ]
+    table = protocol_table(rows, Shown(intervals=True), figures)
+    return replace(table, caption=" ".join(HOSTILE), head=HOSTILE[2], columns=(HOSTILE[4], HOSTILE[5]))
+
+
+def test_no_text_can_be_a_latex_command() -> None:
+    text = latex([hostile_table()])
+    body = "\n".join(line.split("% run=")[0] if "value=" in line else line for line in text.splitlines()[1:])
+    assert "\\input" not in body
+    assert "\x1b" not in text
+    assert text.isascii()
+    allowed = {"begin", "end", "centering", "hbadness", "caption", "label", "small", "footnotesize", "scriptsize"}
+    allowed |= {"setlength", "tabcolsep", "toprule", "midrule", "bottomrule", "multicolumn", "emph", "textbf", "par"}
+    allowed |= {"textsuperscript", "smallskip", "linewidth", "raggedright", "textbackslash", "textasciitilde"}
+    allowed |= {"textasciicircum", "textless", "textgreater", "textbar", "textasciigrave", "i"}
+    assert set(re.findall(r"\\([A-Za-z]+)", body)) <= allowed
+    assert not re.search(r"(?<!\\)[#$^~]", body)
+    rows = [line for line in text.splitlines() if line.strip() == r"\\"]
+    assert len(rows) == len(HOSTILE) + 3
+
+
+@pytest.mark.parametrize(
+    ("text", "shown"),
+    [
+        ("a_b%c", r"a\_b\%c"),
+        ("--", "-{}-"),
+        ("[x]*", "{[}x{]}{*}"),
+        ("\\", r"\textbackslash{}"),
+        ("é ß ł", r"\'{e} U+00DF U+0142"),
+        ("ï", r"\"{\i}"),
+        ("?`", r"?{}\textasciigrave{}"),
+    ],
+)
+def test_letters_are_shown_as_they_are(text: str, shown: str) -> None:
+    assert escape(text) == shown
+
+
+class _Page(HTMLParser):
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: set[str] = set()
+        self.attributes: set[str] = set()
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.add(tag)
+        self.attributes |= {name for name, _ in attrs}
+
+
+def test_no_text_can_be_html() -> None:
+    page = _Page()
+    page.feed(html_page([hostile_table()]))
+    assert page.tags <= {
+        "html", "meta", "title", "style", "section", "div", "table", "caption", "thead", "tbody", "tr", "th", "td",
+        "strong", "ul", "li",
+    }  # fmt: skip
+    assert page.attributes <= {"lang", "charset", "name", "content", "class", "scope"}
+    assert "<script" not in markdown([hostile_table()])
+
+
+def test_no_text_can_be_a_formula_of_a_spreadsheet() -> None:
+    table = Table("=1+1", "c", "h", ("+x",), (TableRow("@SUM(A1)", (Cell("-"), )), TableRow("\t=x", (Cell("=2"),))), ("-n",))  # fmt: skip  # noqa: E501
+    for line in csv.reader(io.StringIO(csv_text([table]))):
+        for value in line:
+            assert value == "-" or not value.startswith(("=", "+", "-", "@", "\t", "\r"))
+    assert "'@SUM(A1)" in csv_text([table])
+
+
+def test_markdown_keeps_its_columns_whatever_the_names() -> None:
+    lines = [line for line in markdown([hostile_table()]).splitlines() if line.startswith("|")]
+    assert len({len(line) for line in lines}) == 1
+    assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {4}
+
+
+def test_csv_has_full_precision_and_every_note_once() -> None:
+    table = protocol_table([measured(accuracy=1 / 3)], Shown(intervals=True), [])
+    lines = list(csv.DictReader(io.StringIO(csv_text([table]))))
+    assert float(lines[0]["value"]) == 1 / 3
+    assert float(lines[0]["low"]) == 1 / 3 - 0.05
+    assert [line["text"] for line in lines if line["kind"] == "note"] == list(table.notes)
+
+
+def test_a_comment_reads_back_as_its_cell_whatever_the_names() -> None:
+    for name in HOSTILE:
+        origin = Origin(f"runs/{name}", name, "rooms-semantic", 3, "F-mIoU", "value", 1 / 3, (0.1, 0.2))
+        line = f"      & \\textbf{{33.3}} {{[}}10.0, 20.0{{]}} {origin_comment(origin)}"
+        assert "\n" not in line
+        (cell,) = printed_cells(line)
+        assert cell.origin == origin
+        assert cell.numbers == ["33.3", "10.0", "20.0"]
+
+
+def test_damaged_comments_are_found_as_cells_without_an_origin() -> None:
+    for line in ("& 1.0 % run=a method=b", "& 1.0 % run=a method=b protocol=c version=1 metric=d what=value value=1e"):
+        (cell,) = printed_cells(line)
+        assert cell.origin is None
+
+
+@pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex is not installed (texlive-latex-base, booktabs)")
+def test_the_tables_compile_without_a_warning(tmp_path: Path) -> None:
+    shown = Shown(intervals=True, ceilings=True, scenes_count=True)
+    rows = [measured("opensu3d", 0.41), measured("conceptgraphs-detector", 0.387), measured("sam3d@a=[1.0,2.0]", 0.2)]
+    instances = [measured_instances("opensu3d", 0.41), measured_instances("openmask3d-segment3d", 0.387)]
+    tables = [
+        *paper_table("II", rows, Shown(), with_published=True),
+        *paper_table("II", rows, shown, with_published=True),
+        *paper_table("III", instances, shown, with_published=True),
+        ablation_table([*rows, *instances], [SweepRow("m", "5", "opensu3d")], Shown(), with_published=True),
+        replace(hostile_table(), columns=("=f", "<b>")),
+    ]
+    tables = [replace(table, name=f"{table.name} {k}") for k, table in enumerate(tables)]
+    (tmp_path / "tables.tex").write_text(latex(tables))
+    (tmp_path / "paper.tex").write_text(
+        "\\documentclass[10pt,twocolumn]{article}\n\\usepackage{booktabs}\n\\usepackage[margin=2cm]{geometry}\n"
+        "\\begin{document}\n\\input{tables}\n\\end{document}\n"
+    )
+    for _ in range(2):
+        done = subprocess.run(
+            ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "-no-shell-escape", "paper.tex"],
+            cwd=tmp_path, capture_output=True, text=True, timeout=120, errors="replace",
+        )  # fmt: skip
+        assert done.returncode == 0, done.stdout[-2000:]
+    faults = re.findall(r".*(?:Warning|Overfull|Underfull).*", done.stdout)
+    assert not faults, faults

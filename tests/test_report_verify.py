@@ -1,0 +1,174 @@
+"""Tables for papers: from runs, on the command line, and checked again from LaTeX."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from painted import ColourPerception, colour_perception
+
+from su3d_bench import scene_run
+from su3d_bench.cli.main import build_parser, main
+from su3d_bench.errors import ConfigError
+from su3d_bench.reports.latex import latex
+from su3d_bench.reports.paper_tables import Shown, selection_tables
+from su3d_bench.table_sources import check_paper, choose, measured_results
+
+HERE = Path(__file__).parent
+
+
+@pytest.fixture(scope="module")
+def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run over four painted scenes with a method and two variants of it."""
+    out = tmp_path_factory.mktemp("sweep") / "runs" / "a run"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        patch.setattr(ColourPerception, "regions", lambda self: None, raising=False)
+        patch.setenv("SU3D_DATA", str(out.parent / "data"))
+        words = ["ablate", "--method", f"{HERE}/painted.py:Collector", "--vary", "noise_m=0.0,0.3", "drop=1"]
+        words += ["--scenes", f"{HERE}/painted.py:Painted/*", "--protocols", "rooms-semantic", "rooms-instance"]
+        assert main([*words, "--no-pictures", "--out", str(out), "--jobs", "1", "--quiet"]) == 0
+    return out
+
+
+def told(capsys: pytest.CaptureFixture[str], *words: str) -> str:
+    capsys.readouterr()
+    assert main(["report", *words]) == 0
+    return capsys.readouterr().out
+
+
+def test_tables_of_a_run_hold_what_its_record_holds(sweep: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tables = json.loads(told(capsys, "tables", str(sweep), "--table", "II", "III", "--json"))
+    record = json.loads((sweep / "metrics.json").read_text())
+    expected = {
+        (one["method"], name): one["result"]["metrics"][name] for one in record["results"] for name in one["headline"]
+    }
+    found = {
+        (cell["origin"]["method"], cell["origin"]["metric"]): cell["origin"]["value"]
+        for table in tables
+        for row in table["rows"]
+        for cell in row["cells"]
+        if cell["origin"] is not None
+    }
+    assert found == expected
+
+
+def test_verify_finds_every_cell_that_was_changed_by_hand(
+    sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(sweep.parent.parent)
+    paper = tmp_path / "paper.tex"
+    words = ["--format", "latex", "--intervals", "--ceilings", "--scenes-count", "--out", str(paper), "--table"]
+    told(capsys, "tables", "runs/a run", *words, "I", "III")
+    assert re.search(r"^(\d+) cells checked, 0 differ$", told(capsys, "verify", str(paper)), re.MULTILINE)
+    told(capsys, "tables", "runs/a run", *words, "II")
+    assert re.search(r"^(\d+) cells checked, 0 differ$", told(capsys, "verify", str(paper)), re.MULTILINE)
+    text = paper.read_text()
+    changes: list[Callable[[str], str]] = [
+        lambda t: t.replace("& 67.5 ", "& 67.6 ", 1),
+        lambda t: re.sub(r"(& 67\.5 \{\[\})(\d\d\.\d)", r"\g<1>11.1", t, count=1),
+        lambda t: t.replace("& 4 % run", "& 5 % run", 1),
+        lambda t: t.replace("method=collector ", "method=colector ", 1),
+        lambda t: t.replace("run=runs/a%20run", "run=runs/gone", 1),
+        lambda t: t.replace("version=1", "version=2", 1),
+        lambda t: t.replace("metric=mAcc", "metric=mAccuracy", 1),
+        lambda t: t.replace("value=1.0", "value=1.x", 1),
+        lambda t: t.replace("\\textbf{100.0}", "\\textbf{99.9}", 1),
+        lambda t: t.replace("protocol=rooms-semantic", "protocol=replica-ovo51", 1),
+    ]
+    for change in changes:
+        paper.write_text(change(text))
+        assert paper.read_text() != text
+        assert main(["report", "verify", str(paper)]) == 1
+        out = capsys.readouterr().out
+        assert ", 1 differ" in out, out
+    paper.write_text(text)
+    (paper.parent / "empty.tex").write_text("no table")
+    assert main(["report", "verify", str(paper.parent / "empty.tex")]) == 2
+    assert "no cell names its run" in capsys.readouterr().err
+    monkeypatch.chdir(tmp_path)
+    assert main(["report", "verify", str(paper)]) == 1
+    capsys.readouterr()
+    assert main(["report", "verify", str(paper), "--root", str(sweep.parent.parent)]) == 0
+
+
+def test_numbers_come_from_the_counts_not_from_the_record(sweep: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(sweep, copy)
+    record = json.loads((copy / "metrics.json").read_text())
+    for one in record["results"]:
+        one["result"]["metrics"] = dict.fromkeys(one["result"]["metrics"], 0.123)
+    (copy / "metrics.json").write_text(json.dumps(record))
+    found = measured_results([copy])
+    paper = tmp_path / "paper.tex"
+    paper.write_text(latex(selection_tables(found, Shown(), with_published=False)))
+    assert sum(check.fault is not None for check in check_paper(paper)) == len(found) / 2 * 5
+
+
+def test_runs_on_other_data_do_not_stand_in_one_table(sweep: Path, tmp_path: Path) -> None:
+    copy = tmp_path / "other"
+    shutil.copytree(sweep, copy)
+    record = json.loads((copy / "run.json").read_text())
+    record["data_digests"] = dict.fromkeys(record["data_digests"], "0" * 64)
+    (copy / "run.json").write_text(json.dumps(record))
+    with pytest.raises(ConfigError, match="cannot be compared: data digest of painted/a"):
+        measured_results([sweep, copy])
+    assert len(measured_results([sweep, sweep])) == len(measured_results([sweep]))
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--table", "IV"], "Table IV: is made of answers to text queries"),
+        (["--table", "V"], "Table V: is made of labels and merges"),
+        (["--methods", "colector"], "hold no scores of the method 'colector'; did you mean 'collector'?"),
+        (["--protocols", "rooms"], "hold no scores of the protocol 'rooms'"),
+        (["--metrics", "mAc"], "has no metric 'mAc'; did you mean 'mAcc'?"),
+    ],
+)
+def test_what_a_run_cannot_tell_is_one_line(
+    sweep: Path, capsys: pytest.CaptureFixture[str], words: list[str], line: str
+) -> None:
+    assert main(["report", "tables", str(sweep), *words]) == 2
+    error = capsys.readouterr().err
+    assert line in error
+    assert error.count("\n") == 1
+
+
+def test_a_run_that_is_no_sweep_makes_no_table_i(
+    sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(sweep, copy)
+    (copy / "ablation.json").unlink()
+    assert main(["report", "tables", str(copy), "--table", "I"]) == 2
+    assert "make a sweep with su3d-bench ablate" in capsys.readouterr().err
+
+
+def test_a_damaged_record_is_named(sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    copy = tmp_path / "run"
+    shutil.copytree(sweep, copy)
+    record = json.loads((copy / "metrics.json").read_text())
+    record["results"][0]["result"]["per_scene"] = {"a": {"mAcc": "high"}}
+    (copy / "metrics.json").write_text(json.dumps(record))
+    assert main(["report", "tables", str(copy)]) == 2
+    assert "metrics.json: results.0.result.per_scene.a.mAcc is not as a run writes it" in capsys.readouterr().err
+
+
+def test_methods_and_protocols_stand_in_the_order_asked_for(sweep: Path) -> None:
+    found = measured_results([sweep])
+    names = list(dict.fromkeys(one.method for one in found))
+    chosen = choose(found, names[::-1], ["rooms-instance"])
+    assert [(one.method, one.protocol) for one in chosen] == [(name, "rooms-instance") for name in names[::-1]]
+
+
+@pytest.mark.parametrize("name", ["tables", "verify"])
+def test_the_help_ends_with_two_examples_that_parse(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    lines = told(capsys, name, "--help").rstrip().splitlines()
+    examples = [line.split()[1:] for line in lines[-2:]]
+    for words in examples:
+        assert build_parser().parse_args(words).action == name
