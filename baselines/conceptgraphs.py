@@ -12,10 +12,10 @@ CROP_PADDING_PX = 20  # the original's crops: the box and 20 px on every side
 
 
 class ConceptGraphs:
-    """The SAM-only variant; ``finish`` gives the map so far and changes nothing.
+    """Class-agnostic masks joined to objects where overlap in space and likeness of features sum to 1.2.
 
-    Every region is an "item" to it: walls, floor and ceiling are objects like others unless their box is too large, and
-    names are carried along only to be shown.
+    The SAM-only variant of the original; ``finish`` gives the map so far and changes nothing. Every region is an "item"
+    to it: walls, floor and ceiling are objects like others unless their box is too large, and names are only shown.
     """
 
     name = "conceptgraphs"
@@ -26,8 +26,8 @@ class ConceptGraphs:
         source="https://github.com/concept-graphs/concept-graphs, commit 5c4da70",
         licence="MIT",
         needs=("class-agnostic masks", "an image encoder"),
-        status="every step is tested on hand-worked values, voxel averages and clusters against Open3D; never run beside the "
-        "original, and no figure of the paper has been reproduced",
+        status="every step is tested on hand-worked values, voxel averages and clusters against Open3D; never run "
+        "beside the original, and no figure of the paper has been reproduced",
     )
 
     def __init__(self, config: MappingConfig | None = None) -> None:

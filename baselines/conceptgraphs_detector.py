@@ -24,10 +24,10 @@ class DetectorConfig(MappingConfig):
 
 
 class ConceptGraphsDetector:
-    """The variant with names; all regions of a background class are one object, whatever they look like.
+    """ConceptGraphs with named masks of a tagger and a detector; walls, floor and ceiling are one object a class.
 
-    As in the original's evaluation the feature of an object decides its class, not its detections' names; background
-    objects have their own name as label.
+    Background regions are merged whatever they look like. As in the original's evaluation the feature of an object
+    decides its class, not its detections' names; background objects have their own name as label.
     """
 
     name = "conceptgraphs-detector"

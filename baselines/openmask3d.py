@@ -35,7 +35,8 @@ class OpenMask3D:
         licence="MIT",
         needs=("a mesh of the scan", "Mask3D's exported masks; without them weight-free proposals from the mesh"),
         status="projection, view selection, crops and means are tested on hand-worked values, its file formats on made "
-        "files; never run beside the original, and no figure of the paper has been reproduced",
+        "files; segments equal those of ScanNet's program on made meshes; never run beside the original, and no figure "
+        "of the paper has been reproduced",
     )
 
     def __init__(self, config: MaskPipelineConfig | None = None) -> None:

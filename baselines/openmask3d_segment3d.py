@@ -32,7 +32,7 @@ class OpenMask3DSegment3D(OpenMask3D):
     """OpenMask3D with Segment3D's proposals: many fine parts, small and weak ones dropped."""
 
     name = "openmask3d-segment3d"
-    Config = OpenMask3DSegment3DConfig
+    Config: type[MaskPipelineConfig] = OpenMask3DSegment3DConfig
     about = MethodAbout(
         paper="Huang et al.: Segment3D: Learning Fine-Grained Class-Agnostic 3D Segmentation without Manual Labels, "
         "ECCV 2024, with the features of OpenMask3D (NeurIPS 2023)",
@@ -44,5 +44,5 @@ class OpenMask3DSegment3D(OpenMask3D):
         "public file of these proposals was found, and no figure has been reproduced",
     )
 
-    def __init__(self, config: OpenMask3DSegment3DConfig | None = None) -> None:
+    def __init__(self, config: MaskPipelineConfig | None = None) -> None:
         super().__init__(config or OpenMask3DSegment3DConfig())

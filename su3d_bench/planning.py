@@ -17,6 +17,7 @@ from su3d_bench.errors import ConfigError, DataError, suggest
 from su3d_bench.method_names import NamedMethod, named_method
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig
 from su3d_bench.protocols import ProtocolRules, load_protocol, protocols_for
+from su3d_bench.questions.truths import has_own_queries
 from su3d_bench.scene_run import (
     CEILING_METHOD,
     FIELDS_KNOWN_LATER,
@@ -272,6 +273,8 @@ def why_not_fitting(rules: ProtocolRules, dataset: Any) -> str | None:
         return f"it scores the labels of '{rules.label_space}', {dataset.name} has those of '{dataset.label_space}'"
     if rules.ground_truth not in dataset.variants:
         return f"it needs ground truth '{rules.ground_truth}', {dataset.name} has {', '.join(dataset.variants)}"
+    if rules.questions == "dataset" and not has_own_queries(dataset):
+        return f"it needs a dataset that knows questions and answers itself, which {dataset.name} does not"
     return None
 
 

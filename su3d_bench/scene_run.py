@@ -22,11 +22,13 @@ from su3d_bench.digests import NUMERIC_PACKAGES, code_digest, digest_json, packa
 from su3d_bench.errors import GroundTruthMissing, StoreError, Su3dError
 from su3d_bench.executors import Report
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
-from su3d_bench.protocols import load_protocol
+from su3d_bench.protocols import SHARE_KINDS, ProtocolRules, load_protocol
+from su3d_bench.questions.refined import refined_digest, refined_names
+from su3d_bench.questions.truths import question_truth
 from su3d_bench.reports.pictures import draw_scene
 from su3d_bench.scene_feeding import Feeding
 from su3d_bench.scene_tools import FirstFrames, surface_of, true_proposals
-from su3d_bench.scoring import SceneScore, pack_scores, score_scene, why_not_scorable
+from su3d_bench.scoring import SceneScore, Truth, pack_scores, score_scene, why_not_scorable
 from su3d_bench.store import JobFolder, RunFolder, read_prediction, write_bytes, write_text
 from su3d_bench.timing import device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.types import (
@@ -42,6 +44,7 @@ from su3d_bench.types import (
 
 CEILING_METHOD = "oracle"
 TRUE_PROPOSALS_CAVEAT = "proposals from the ground truth; a ceiling, not a result"
+NAMED_KINDS = ("annotation", "reasoning")  # labels n' of a file beside the map move their numbers
 FIELDS_KNOWN_LATER = ("data", "profile", "perception")
 
 
@@ -245,6 +248,8 @@ class _Scene:
         score_key = {"predict": digest_json(key), "encoder": perception.encoder.digest}
         score_key |= {"pictures": str(self.job.pictures)}
         score_key |= {f"protocol.{name}": load_protocol(name).digest for name in self.job.protocols}
+        if any(load_protocol(name).kind in NAMED_KINDS for name in self.job.protocols):
+            score_key |= refined_digest(folder)
         if not folder.is_done("score", score_key):
             self._score(part, perception, folder, score_key, log)
             was_resumed = False
@@ -312,11 +317,11 @@ class _Scene:
     def _score(self, part: Part, perception: Perception, folder: JobFolder, key: Mapping[str, str], log: _Log) -> None:
         """Score under every protocol that has a truth here, draw the map, and seal; reasons for the others go along."""
         prediction = read_prediction(folder.prediction)
-        scores, unscored = self._scores(part, perception, prediction)
+        scores, unscored = self._scores(part, perception, prediction, folder)
         files = [folder.counts]
         write_bytes(folder.counts, pack_scores(scores))
         for share in self.job.anytime if build_method(part).needs.frames else ():
-            early, _ = self._scores(part, perception, read_prediction(folder.anytime(share)))
+            early, _ = self._scores(part, perception, read_prediction(folder.anytime(share)), None)
             write_bytes(folder.anytime_counts(share), pack_scores(early))
             files.append(folder.anytime_counts(share))
         if self.job.pictures:
@@ -326,7 +331,7 @@ class _Scene:
         folder.seal("score", key, files, remarks)
 
     def _scores(
-        self, part: Part, perception: Perception, prediction: Prediction
+        self, part: Part, perception: Perception, prediction: Prediction, refined_in: JobFolder | None
     ) -> tuple[dict[str, SceneScore], dict[str, str]]:
         """The scores under every protocol that can score the map, and why the others cannot."""
         scores: dict[str, SceneScore] = {}
@@ -341,8 +346,15 @@ class _Scene:
                 unscored[rules.name] = reason
                 continue
             told = self._prediction_in_words_of(truth, part, prediction)
-            scores[rules.name] = score_scene(rules, truth, told, perception.encoder)
+            asked = self._truth_of(rules, truth, refined_in)
+            scores[rules.name] = score_scene(rules, asked, told, perception.encoder)
         return scores, unscored
+
+    def _truth_of(self, rules: ProtocolRules, truth: GroundTruth, refined_in: JobFolder | None) -> Truth:
+        if rules.kind not in SHARE_KINDS:
+            return truth
+        refine = None if refined_in is None else partial(refined_names, refined_in)
+        return question_truth(rules, self.dataset, self.job.scene_name, truth, refine)
 
     def _prediction_in_words_of(self, truth: GroundTruth, part: Part, prediction: Prediction) -> Prediction:
         """``prediction``; that of a method that was told the truth is told anew where ``truth`` names its classes

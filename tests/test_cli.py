@@ -244,7 +244,7 @@ def test_json_answers_are_the_metrics_file(capsys: pytest.CaptureFixture[str]) -
 def test_a_query_ranks_the_map_and_draws_it(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(query, "encoder_of", lambda run, device: colour_perception().encoder)
+    monkeypatch.setattr(query, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a"]) == 0
     capsys.readouterr()
     words = ["query", "painted/a", "a red sofa", "--method", "collector"]
@@ -266,7 +266,7 @@ def test_a_query_ranks_the_map_and_draws_it(
 def test_a_map_without_features_cannot_be_queried(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(query, "encoder_of", lambda run, device: colour_perception().encoder)
+    monkeypatch.setattr(query, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a", "--quiet"]) == 0
     capsys.readouterr()
     assert main(["query", "painted/a", "sofa", "--method", "oracle"]) == 2

@@ -33,7 +33,7 @@ def read_text(folder: Path, scene: str) -> VertexMasks:
 def run_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
     """A finished run of two scenes by two methods."""
     monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.setattr(query, "encoder_of", lambda run, device: colour_perception().encoder)
+    monkeypatch.setattr(query, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
     words = ["run", "--scenes", f"{PAINTED}/a", f"{PAINTED}/b", "--methods", COLLECTOR, "oracle", "--jobs", "1"]

@@ -55,7 +55,8 @@ def frame(index: int = 0, depth_m: float = 1.0, x_m: float = 0.0) -> Frame:
 
 
 def seen(points: Sequence[Sequence[float]], view: Frame, tolerance_m: float = 0.2) -> list[int]:
-    return visible_pixels(np.array(points, np.float32), view, view.intrinsics, tolerance_m).tolist()
+    pixels = visible_pixels(np.array(points, np.float32), view, view.intrinsics, tolerance_m)
+    return [int(pixel) for pixel in pixels]
 
 
 def made(points: np.ndarray, *masks: Sequence[int], scores: Sequence[float] | None = None) -> Proposals:

@@ -168,7 +168,7 @@ def box_on_a_floor() -> Surface:
     """A floor of 4 x 4 m with a box of 1 x 1 x 1 m on it, in vertices 10 cm apart; the box's bottom is open."""
     heights = np.zeros((41, 41))
     vertices, triangles = sheet(heights.tolist(), 0.1)
-    under = ((vertices[:, :2] > 1.55) & (vertices[:, :2] < 2.45)).all(axis=1)
+    under = np.all((vertices[:, :2] > 1.55) & (vertices[:, :2] < 2.45), axis=1)
     floor = triangles[~under[triangles].any(axis=1)]
     parts, faces, start = [vertices], [floor], len(vertices)
     side, side_faces = sheet(np.zeros((11, 11)).tolist(), 0.1)
@@ -194,7 +194,11 @@ class TestTree:
     def test_the_cheapest_pair_is_merged_first(self) -> None:
         """Three flat squares in a row, 0 and 1 level, 2 leaning: 0 and 1 become node 3, all of them node 4."""
         flat_part, flat_faces = sheet(np.zeros((4, 4)).tolist(), 0.01)
-        parts = [flat_part, flat_part + np.float32((0.04, 0, 0)), flat_part[:, [2, 1, 0]] + np.float32((0.08, 0, 0))]
+        parts = [
+            flat_part,
+            flat_part + np.array((0.04, 0, 0), np.float32),
+            flat_part[:, [2, 1, 0]] + np.array((0.08, 0, 0), np.float32),
+        ]
         vertices = np.concatenate(parts).astype(np.float32)
         triangles = np.concatenate([flat_faces + 16 * k for k in range(3)]).astype(np.int32)
         contacts = contacts_of(vertices, triangles, np.repeat(np.arange(3), 16))

@@ -1,4 +1,4 @@
-"""Question sets in files: read from TOML and CSV, and from the forms of ScanRefer, Nr3D and SQA3D; written as TOML, CSV.
+"""Question sets in files: read from TOML, CSV and the forms of ScanRefer, Nr3D and SQA3D; written as TOML and CSV.
 
 A CSV is data for programs: a text that begins with ``=`` stays as it is, so open it as text in a spreadsheet.
 """

@@ -17,14 +17,24 @@ from su3d_bench.perception.naming import with_article
 from su3d_bench.questions.known_objects import plain_name
 from su3d_bench.questions.model import KINDS, Question, new_question
 from su3d_bench.reasoning.named_objects import meant_by
-from su3d_bench.reasoning.relations import holds, is_between, is_container, is_next_to, relations_of
+from su3d_bench.reasoning.relations import (
+    PairRelation,
+    RelationFound,
+    holds,
+    is_between,
+    is_container,
+    is_next_to,
+    relations_of,
+)
 from su3d_bench.reasoning.scene_map import MapObject, SceneMap
 
 SOURCE = "generated"
 MAX_ANSWER_SHARE = 1 / 3  # rooms_truth.MAX_ANSWER_SHARE
 MOST_SYNONYMS = 2  # of a class, so that common classes do not fill the set
 LARGE = 1.5  # ours: volume of the box, as a multiple of the median of its name, from which a thing is called large
-BETWEEN_M = 3.0  # ours: nobody looks farther for what something is between
+BETWEEN_M = 2.0  # ours: nobody looks farther for what something is between
+FLAT_M = 0.1  # ours: a rug is under the table that stands on it, a cabinet is not under its vase
+_RESTING: tuple[PairRelation, ...] = ("on", "in")
 
 
 def generate(scene: str, objects: SceneMap, per_kind: int | None = None) -> tuple[Question, ...]:
@@ -92,12 +102,28 @@ def _relations(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
     things = objects.objects
     boxes = np.array([one.box for one in things]).reshape(-1, 2, 3)
     links = list(relations_of(boxes, [one.name for one in things]))
-    on = {(link.subject, link.object) for link in links if link.relation == "on"}
+    held = {(link.subject, link.relation, link.object) for link in links}
+    resting = {link.subject for link in links if link.relation in ("on", "in")}
     for link in links:
-        if link.relation == "in" and (link.subject, link.object) in on:
-            continue  # a cushion is within the box of a sofa, and on it
         subject, holder = things[link.subject], things[link.object]
-        yield "relative", f"{subject.name} {link.relation} {with_article(holder.name)}", (subject.id,)
+        if subject.name != holder.name and _is_said(link, held, resting, things):
+            yield "relative", f"{subject.name} {link.relation} {with_article(holder.name)}", (subject.id,)
+
+
+def _is_said(
+    link: RelationFound, held: set[tuple[int, PairRelation, int]], resting: set[int], things: Sequence[MapObject]
+) -> bool:
+    """Whether people would say so: a cushion is on a sofa, not in it; a book stands on its board, not above another."""
+    a, b = link.subject, link.object
+    if link.relation == "in":
+        return (a, "on", b) not in held
+    if link.relation == "above":
+        return a not in resting
+    if link.relation == "under":
+        bears = (b, "on", a) in held
+        is_flat = float(things[a].size[2]) < FLAT_M
+        return not any((a, one, b) in held for one in _RESTING) and (is_flat if bears else b not in resting)
+    return True
 
 
 def _between(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:

@@ -137,7 +137,8 @@ class GroundingDino:
 
     def pixels(self, rgb: UInt8Array) -> Float32Array:
         """``rgb`` (H, W, 3) as the network takes it, (3, h, w)."""
-        return normalised(resized(rgb, *size_with_shortest_side(*rgb.shape[:2], *self._sides_px)))
+        height, width = rgb.shape[:2]
+        return normalised(resized(rgb, *size_with_shortest_side(height, width, *self._sides_px)))
 
     def _found(self, rgb: UInt8Array, tags: Sequence[str], config: BoxConfig) -> NamedBoxes:
         """Everything above the thresholds, in the network's order."""

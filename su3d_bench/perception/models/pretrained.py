@@ -45,6 +45,7 @@ _SAM_NAMES = (
     (r"(\.output_hypernetworks_mlps\.\d+|\.iou_prediction_head)\.layers\.1\.", r"\1.layers.0."),
 )
 _SAM_POSITIONS = "shared_image_embedding.positional_embedding"
+_SAM_NO_WEIGHTS = ("pixel_mean", "pixel_std")  # of the image, which some copies of the checkpoint hold
 
 
 Loaded = TypeVar("Loaded")
@@ -94,6 +95,8 @@ def sam_names(tensors: dict[str, Any]) -> dict[str, Any]:
     """The tensors of an original SAM checkpoint under the names of ``transformers``' SamModel."""
     renamed = {}
     for name, tensor in tensors.items():
+        if name in _SAM_NO_WEIGHTS:
+            continue
         for old, new in _SAM_NAMES:
             name = re.sub(old, new, name)
         renamed[name] = tensor

@@ -1,0 +1,265 @@
+"""What a set of annotation sheets is: items without a word on who made them, the key kept apart, and answers.
+
+``sheet.json`` goes to annotators, ``key.json`` does not. Ids begin with a letter, so that no spreadsheet takes one
+for a number.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal, TypeVar
+
+from pydantic import ConfigDict, TypeAdapter, ValidationError
+
+from su3d_bench.digests import digest_json
+from su3d_bench.errors import DataError
+from su3d_bench.plain_text import printable
+from su3d_bench.store import write_json
+
+SCHEMA = 1
+SHEET_FILE, KEY_FILE = "sheet.json", "key.json"
+PICTURES = "pictures"  # folder of the pictures, beside sheet.json
+MOST_BYTES = 64 << 20  # of sheet.json or key.json: a hundred thousand items
+SheetKind = Literal["retrieval", "annotation", "reasoning"]
+SHEET_KINDS: tuple[SheetKind, ...] = ("retrieval", "annotation", "reasoning")
+# Columns of a file of answers; others may follow and are for the reader alone.
+ANSWER_COLUMNS = ("sheet_id", "item_id", "annotator", "question", "answer", "check")
+RIGHT, WRONG, CANNOT_TELL = "right", "wrong", "cannot tell"
+JUDGEMENTS = (RIGHT, WRONG, CANNOT_TELL)
+# The names that metrics/score_questions.py has for the merging of a mask.
+MERGES = ("well-merged", "under-merged", "over-merged", CANNOT_TELL)
+_DIGITS = 12
+_STRICT = ConfigDict(extra="forbid", strict=True)
+
+
+@dataclass(frozen=True)
+class Ask:
+    """A question that is put of an item: ``name`` stands in the answers, ``text`` is read, one of ``choices`` is right.
+
+    ``meanings``: what each choice means, in their order.
+    """
+
+    __pydantic_config__ = _STRICT
+    name: str
+    text: str
+    choices: tuple[str, ...]
+    meanings: tuple[str, ...] = ()
+
+
+ASKS: Mapping[SheetKind, tuple[Ask, ...]] = {
+    "retrieval": (
+        Ask(
+            "retrieval",
+            "Is the outlined object what the text asks for?",
+            JUDGEMENTS,
+            ("the outlined object answers the text", "it does not", "the picture does not show it"),
+        ),
+    ),
+    "annotation": (
+        Ask(
+            "label 1",
+            "Is label 1 a right name of the outlined object?",
+            JUDGEMENTS,
+            ("a fitting name, general or special", "a name of something else", "the picture does not show it"),
+        ),
+        Ask(
+            "label 2",
+            "Is label 2 a right name of the outlined object?",
+            JUDGEMENTS,
+            ("a fitting name, general or special", "a name of something else", "the picture does not show it"),
+        ),
+        Ask(
+            "merging",
+            "How much of the object does the mask hold?",
+            MERGES,
+            (
+                "one whole object and little else",
+                "only a part: one thing taken for several",
+                "more than one thing taken for one",
+                "the picture does not show it",
+            ),
+        ),
+    ),
+    "reasoning": (
+        Ask(
+            "answer",
+            "Is the answer right?",
+            JUDGEMENTS,
+            ("the answer is true of this room", "it is not", "the picture does not show it"),
+        ),
+        Ask(
+            "objects",
+            "Are the objects that the answer names right?",
+            JUDGEMENTS,
+            ("all of them, and none is missing", "one is wrong or missing", "the picture does not show it"),
+        ),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class SheetItem:
+    """One thing to judge: ``text`` is the query, the labels, or question and answer; ``asks`` names what is asked.
+
+    ``pictures`` are file names below ``PICTURES``, ``picture_digests`` their SHA-256; ``check`` changes with all of it.
+    """
+
+    __pydantic_config__ = _STRICT
+    id: str
+    text: str
+    asks: tuple[str, ...]
+    pictures: tuple[str, ...]
+    picture_digests: tuple[str, ...]
+    check: str
+
+
+@dataclass(frozen=True)
+class AnnotatorShare:
+    """Ids of the items that one annotator gets, in that annotator's order."""
+
+    __pydantic_config__ = _STRICT
+    name: str
+    item_ids: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Sheet:
+    """What all annotators of a set together see; ``id`` is a digest of it and begins with the kind."""
+
+    __pydantic_config__ = _STRICT
+    id: str
+    kind: SheetKind
+    seed: int
+    asks: tuple[Ask, ...]
+    items: tuple[SheetItem, ...]
+    annotators: tuple[AnnotatorShare, ...]
+    schema_version: int = SCHEMA
+
+    def ask(self, name: str) -> Ask:
+        return next(one for one in self.asks if one.name == name)
+
+
+@dataclass(frozen=True)
+class KeyItem:
+    """What an item is: the instance ``instance_id`` of a map of ``scene`` (``<dataset>/<scene>``).
+
+    ``methods``: all whose answer this is, a variant such as ``opensu3d@scheme4`` a name; ``instance_ids`` its id in the
+    map of each of them (-1 where an answer names several or none). ``question_id`` and ``question_kind`` are those of
+    the question that was asked ('' in annotation sheets). ``stands_for``: what an ask judges where that is hidden:
+    ``{"label 1": ("n", "n'")}``. ``automatic``: ask -> the choice that the ground truth makes, where it is known.
+    """
+
+    __pydantic_config__ = _STRICT
+    id: str
+    scene: str
+    methods: tuple[str, ...]
+    instance_ids: tuple[int, ...]
+    question_id: str
+    question_kind: str
+    stands_for: Mapping[str, tuple[str, ...]]
+    automatic: Mapping[str, str]
+
+
+@dataclass(frozen=True)
+class Key:
+    """What the maintainer keeps: ``sheet_id`` ties it to its sheet, ``run`` names the run folder, ``run_digest`` its
+    code."""
+
+    __pydantic_config__ = _STRICT
+    sheet_id: str
+    kind: SheetKind
+    run: str
+    run_digest: str
+    methods: tuple[str, ...]
+    automatic_rule: str
+    items: tuple[KeyItem, ...]
+    schema_version: int = SCHEMA
+
+
+def new_item(
+    set_id: str, item_id: str, text: str, asks: Sequence[str], pictures: Sequence[str], digests: Sequence[str]
+) -> SheetItem:
+    """An item with the check that its contents give it."""
+    check = item_check(set_id, item_id, text, asks, digests)
+    return SheetItem(item_id, text, tuple(asks), tuple(pictures), tuple(digests), check)
+
+
+def item_check(set_id: str, item_id: str, text: str, asks: Sequence[str], digests: Sequence[str]) -> str:
+    """A short key of what an annotator saw of an item.
+
+    >>> item_check("retrieval-1", "item-0001", "chair", ["retrieval"], []) == item_check(
+    ...     "retrieval-1", "item-0001", "table", ["retrieval"], [])
+    False
+    """
+    return "c" + digest_json([set_id, item_id, text, list(asks), list(digests)])[:_DIGITS]
+
+
+def sheet_id_of(kind: SheetKind, seed: int, contents: Any) -> str:
+    """The id of a set: the kind and a digest of all that is in it."""
+    return f"{kind}-" + digest_json([SCHEMA, kind, seed, contents])[:_DIGITS]
+
+
+def write_sheet(folder: Path, sheet: Sheet) -> Path:
+    """Write ``sheet.json`` into ``folder``; its path."""
+    write_json(folder / SHEET_FILE, asdict(sheet))
+    return folder / SHEET_FILE
+
+
+def write_key(folder: Path, key: Key) -> Path:
+    """Write ``key.json`` into ``folder``; its path."""
+    write_json(folder / KEY_FILE, asdict(key))
+    return folder / KEY_FILE
+
+
+def read_sheet(path: Path) -> Sheet:
+    """The set in a ``sheet.json``; a ``DataError`` where the file is not as ``sheets make`` writes it."""
+    sheet = _read(path, Sheet)
+    where = printable(str(path), 200)
+    known = [one.id for one in sheet.items]
+    if len(set(known)) != len(known):
+        raise DataError(f"{where}: two items have one id; make the sheets again")
+    names = {one.name for one in sheet.asks}
+    for one in sheet.items:
+        if not set(one.asks) <= names:
+            raise DataError(f"{where}: item '{printable(one.id, 40)}' asks what the sheet does not; make it again")
+        if one.check != item_check(sheet.id, one.id, one.text, one.asks, one.picture_digests):
+            raise DataError(f"{where}: item '{printable(one.id, 40)}' was changed; make the sheets again")
+    for share in sheet.annotators:
+        if not set(share.item_ids) <= set(known):
+            raise DataError(f"{where}: annotator '{printable(share.name, 40)}' has an unknown item; make it again")
+    return sheet
+
+
+def read_key(path: Path) -> Key:
+    """The key in a ``key.json``; a ``DataError`` where the file is not as ``sheets make`` writes it."""
+    key = _read(path, Key)
+    for one in key.items:
+        if len(one.methods) != len(one.instance_ids):
+            raise DataError(
+                f"{printable(str(path), 200)}: item '{printable(one.id, 40)}' names {len(one.methods)} methods and "
+                f"{len(one.instance_ids)} instances; make the sheets again"
+            )
+    return key
+
+
+_Read = TypeVar("_Read", Sheet, Key)
+
+
+def _read(path: Path, kind: type[_Read]) -> _Read:
+    where = printable(str(path), 200)
+    try:
+        if path.stat().st_size > MOST_BYTES:
+            raise DataError(f"{where}: has more than {MOST_BYTES >> 20} MiB; it is no file of su3d-bench sheets make")
+        content = path.read_bytes()
+    except OSError as error:
+        raise DataError(f"{where}: cannot be read: {error.strerror}") from error
+    try:
+        found = TypeAdapter(kind).validate_json(content)
+    except ValidationError as error:
+        place = printable(".".join(map(str, error.errors()[0]["loc"])), 120) or "it"
+        raise DataError(f"{where}: {place} is not as su3d-bench sheets make writes it; make them again") from error
+    if found.schema_version != SCHEMA:
+        raise DataError(f"{where}: has schema {found.schema_version}, this version reads {SCHEMA}; make them again")
+    return found
