@@ -46,9 +46,7 @@ def read_answers(path: Path) -> list[AnswerRow]:
     where = printable(str(path), 200)
     suffix = path.suffix.lower()
     if suffix not in (".csv", ".xlsx"):
-        raise DataError(
-            f"{where}: is neither .csv nor .xlsx; export a CSV from the page, or save the workbook as .xlsx"
-        )
+        raise DataError(f"{where}: is neither .csv nor .xlsx; export a CSV from the page or save an .xlsx workbook")
     try:
         size = path.stat().st_size
         if size > (MOST_TEXT_BYTES if suffix == ".csv" else MOST_BYTES):

@@ -8,9 +8,11 @@ from dataclasses import dataclass
 
 from su3d_bench.errors import DataError, suggest
 from su3d_bench.plain_text import printable
+from su3d_bench.questions.model import KINDS, REASONING
 from su3d_bench.sheets.answers import AnswerRow
 from su3d_bench.sheets.items import Key, Sheet, SheetItem
 
+LABELS = ("n", "n'")  # as the paper calls them: the name of the best view, and that out of the names of several
 SHOWN_ITEMS = 5  # of many that are missing
 
 
@@ -48,10 +50,13 @@ def check_key(sheet: Sheet, key: Key) -> None:
     if set(keyed) != known or len(keyed) != len(known):
         raise DataError(f"key: has {len(keyed)} items, the sheet {len(known)}; give the key that was made with it")
     asks = {one.id: one.asks for one in sheet.items}
+    kinds = {"retrieval": KINDS, "annotation": ("",), "reasoning": (REASONING,)}[sheet.kind]
     for one in key.items:
-        for name, choice in one.automatic.items():
-            if name not in asks[one.id] or choice not in sheet.ask(name).choices:
-                raise DataError(f"key: item '{printable(one.id, 40)}' judges what is not asked; make the sheets again")
+        labels = {label for named in one.stands_for.values() for label in named}
+        is_known = set(one.methods) <= set(key.methods) and one.question_kind in kinds and labels <= set(LABELS)
+        judged = [name in asks[one.id] and choice in sheet.ask(name).choices for name, choice in one.automatic.items()]
+        if not is_known or not all(judged):
+            raise DataError(f"key: item '{printable(one.id, 40)}' does not fit the sheet; make the sheets again")
 
 
 def check_answers(sheet: Sheet, rows: Sequence[AnswerRow]) -> Checked:

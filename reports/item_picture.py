@@ -1,0 +1,195 @@
+"""The picture of one item of an annotation sheet, to be judged in two seconds: photograph, zoom, map and place.
+
+Composed with Pillow: a sheet has hundreds of pictures, and a plotting library takes half a second for each.
+"""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.plain_text import printable
+from su3d_bench.types import BoolArray, Float64Array, UInt8Array
+
+WIDTH, MARGIN, CAPTION = 960, 10, 24
+PHOTO_WIDTH, ZOOM_WIDTH = 560, 370
+TOP_HEIGHT, LOW_HEIGHT = 420, 300
+TITLE_SIZE, TITLE_LINE, MOST_TITLE_LINES = 25, 33, 3
+OUTLINE, HALO = (255, 64, 200), (255, 255, 255)  # a pink that neither heat scale has, on white
+INK, GREY, PAPER, PANEL = (26, 26, 26), (96, 96, 96), (255, 255, 255), (244, 244, 242)
+ZOOM_GROWTH = 1.7  # sides of the part that is shown, as a multiple of those of the object
+PNG_COLOURS = 160  # of the palette; more make the file larger and the picture no clearer
+
+
+@dataclass(frozen=True)
+class Panel:
+    """A picture (h, w, 3) with where the object is in it (h, w), and the words above it."""
+
+    title: str
+    picture: UInt8Array
+    mask: BoolArray | None = None
+
+
+@dataclass(frozen=True)
+class ItemParts:
+    """What stands in the picture of an item; ``heat_scale`` (256, 3) are the colours of its legend, None for none.
+
+    ``title``: lines at the top, the first one large. ``photo`` is None where no frame shows the object.
+    """
+
+    title: tuple[str, ...]
+    photo: Panel | None
+    map_view: Panel
+    place: Panel
+    heat_scale: UInt8Array | None = None
+
+
+def compose(parts: ItemParts) -> UInt8Array:
+    """The picture (h, 960, 3) of an item."""
+    from PIL import Image, ImageDraw
+
+    lines = _title_lines(parts.title)
+    top = MARGIN + TITLE_LINE * len(lines) + 6
+    low = top + CAPTION + TOP_HEIGHT + MARGIN
+    page = Image.new("RGB", (WIDTH, low + CAPTION + LOW_HEIGHT + MARGIN), PAPER)
+    draw = ImageDraw.Draw(page)
+    for k, (text, size) in enumerate(lines):
+        _write(draw, (MARGIN, MARGIN + TITLE_LINE * k), text, size, INK if k == 0 else GREY, is_bold=k == 0)
+    right = MARGIN + PHOTO_WIDTH + MARGIN
+    if parts.photo is not None:
+        _place(page, draw, parts.photo, (MARGIN, top), (PHOTO_WIDTH, TOP_HEIGHT))
+        _place(page, draw, zoomed(parts.photo), (right, top), (ZOOM_WIDTH, TOP_HEIGHT))
+    else:
+        box = (MARGIN, top + CAPTION, WIDTH - MARGIN, top + CAPTION + TOP_HEIGHT)
+        draw.rectangle(box, fill=PANEL)
+        _write(draw, (MARGIN + 20, top + CAPTION + 20), "no frame shows this object", 18, GREY)
+    _place(page, draw, parts.map_view, (MARGIN, low), (PHOTO_WIDTH, LOW_HEIGHT))
+    _place(page, draw, parts.place, (right, low), (ZOOM_WIDTH, LOW_HEIGHT))
+    if parts.heat_scale is not None:
+        _draw_scale(page, draw, parts.heat_scale, (MARGIN + 8, low + CAPTION + LOW_HEIGHT - 26))
+    return np.asarray(page, np.uint8).copy()
+
+
+def zoomed(photo: Panel) -> Panel:
+    """The part of a photograph around the object, as wide for its height as its panel."""
+    assert photo.mask is not None
+    height, width = photo.picture.shape[:2]
+    rows, columns = np.nonzero(photo.mask)
+    if not len(rows):
+        return Panel("closer", photo.picture, photo.mask)
+    x0, x1, y0, y1 = columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
+    aspect = ZOOM_WIDTH / TOP_HEIGHT
+    tall = max((y1 - y0) * ZOOM_GROWTH, (x1 - x0) * ZOOM_GROWTH / aspect, 72.0)
+    tall = min(tall, float(height), width / aspect)
+    wide = tall * aspect
+    left = int(np.clip((x0 + x1 - wide) / 2, 0, width - wide))
+    upper = int(np.clip((y0 + y1 - tall) / 2, 0, height - tall))
+    part = (slice(upper, upper + max(1, round(tall))), slice(left, left + max(1, round(wide))))
+    return Panel("closer", photo.picture[part], photo.mask[part])
+
+
+def outlined(picture: UInt8Array, mask: BoolArray | None, size: tuple[int, int], line: int = 3) -> UInt8Array:
+    """``picture`` at ``size`` (width, height) with a line around ``mask``, light on both sides so that it shows."""
+    import cv2
+
+    is_smaller = size[0] < picture.shape[1]
+    resized = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if is_smaller else cv2.INTER_CUBIC)
+    if mask is not None and mask.any():
+        smooth = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+        contours, _ = cv2.findContours((smooth > 0.5).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+        cv2.drawContours(resized, contours, -1, HALO, line + 3, cv2.LINE_AA)
+        cv2.drawContours(resized, contours, -1, OUTLINE, line, cv2.LINE_AA)
+    result: UInt8Array = resized
+    return result
+
+
+def marked_place(picture: UInt8Array, mask: BoolArray, camera_xy: Float64Array | None) -> UInt8Array:
+    """A view from above with a ring around the object, and the way from where the photograph was taken."""
+    import cv2
+
+    marked = picture.copy()
+    rows, columns = np.nonzero(mask)
+    if not len(rows):
+        return marked
+    middle = np.array([columns.mean(), rows.mean()])
+    radius = max(14, round(0.75 * max(np.ptp(columns), np.ptp(rows))))
+    if camera_xy is not None:
+        away = middle - camera_xy
+        length = float(np.linalg.norm(away))
+        start, end = camera_xy, middle - away / max(length, 1.0) * min(radius + 3, length)
+        ends = [tuple(int(v) for v in np.rint(one)) for one in (start, end)]
+        for shade, width in ((HALO, 5), (INK, 2)):
+            cv2.arrowedLine(
+                marked, ends[0], ends[1], shade, width, cv2.LINE_AA, tipLength=min(0.3, 12 / max(length, 1))
+            )
+        cv2.circle(marked, ends[0], 5, INK, -1, cv2.LINE_AA)
+    centre = (round(middle[0]), round(middle[1]))
+    cv2.circle(marked, centre, radius, HALO, 6, cv2.LINE_AA)
+    cv2.circle(marked, centre, radius, OUTLINE, 3, cv2.LINE_AA)
+    return marked
+
+
+def png_bytes(picture: UInt8Array) -> bytes:
+    """A PNG of at most ``PNG_COLOURS`` colours: the same bytes for the same picture."""
+    from PIL import Image
+
+    buffer = io.BytesIO()
+    image = Image.fromarray(picture).quantize(PNG_COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    image.save(buffer, format="PNG", compress_level=9)
+    return buffer.getvalue()
+
+
+def _place(page: Any, draw: Any, panel: Panel, at: tuple[int, int], size: tuple[int, int]) -> None:
+    from PIL import Image
+
+    _write(draw, (at[0], at[1] + 3), panel.title, 14, GREY)
+    shown = outlined(panel.picture, panel.mask, size)
+    page.paste(Image.fromarray(shown), (at[0], at[1] + CAPTION))
+
+
+def _draw_scale(page: Any, draw: Any, scale: UInt8Array, at: tuple[int, int]) -> None:
+    """The legend of a heat map."""
+    from PIL import Image
+
+    bar = np.repeat(scale[None, ::2], 10, axis=0)
+    words, wide = "less similar", 88
+    draw.rectangle((at[0] - 4, at[1] - 4, at[0] + 2 * wide + bar.shape[1] + 20, at[1] + 20), fill=PAPER)
+    _write(draw, (at[0], at[1]), words, 13, INK)
+    page.paste(Image.fromarray(bar), (at[0] + wide, at[1] + 4))
+    _write(draw, (at[0] + wide + bar.shape[1] + 8, at[1]), "more similar", 13, INK)
+
+
+def _title_lines(title: tuple[str, ...]) -> list[tuple[str, int]]:
+    """Lines and their sizes; what does not fit ends in dots."""
+    import textwrap
+
+    lines: list[tuple[str, int]] = []
+    for k, text in enumerate(title):
+        size = TITLE_SIZE if k == 0 else TITLE_SIZE - 6
+        wide = 60 if k == 0 else 88
+        wrapped = textwrap.wrap(printable(text, 3 * wide), wide) or [""]
+        lines += [(one, size) for one in wrapped]
+    if len(lines) > MOST_TITLE_LINES:
+        lines = [*lines[: MOST_TITLE_LINES - 1], (lines[MOST_TITLE_LINES - 1][0][:56] + "...", TITLE_SIZE)]
+    return lines
+
+
+def _write(draw: Any, at: tuple[int, int], text: str, size: int, shade: tuple[int, ...], is_bold: bool = False) -> None:
+    from su3d_bench.reports.scene_picture import drawable
+
+    draw.text(at, drawable(text), font=_font(size, is_bold), fill=shade)
+
+
+@cache
+def _font(size: int, is_bold: bool) -> Any:
+    from matplotlib import get_data_path
+    from PIL import ImageFont
+
+    name = "DejaVuSans-Bold.ttf" if is_bold else "DejaVuSans.ttf"
+    path = Path(get_data_path()) / "fonts" / "ttf" / name
+    return ImageFont.truetype(str(path), size, layout_engine=ImageFont.Layout.BASIC)

@@ -1,0 +1,104 @@
+"""What sheets take from a finished run: maps, frames and ground truth of its scenes."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+
+from su3d_bench import registry
+from su3d_bench.config import Setting, Settings, resolve
+from su3d_bench.errors import ConfigError, DataError, GroundTruthMissing, PredictionError, StoreError, suggest
+from su3d_bench.finished_run import FinishedRun
+from su3d_bench.plain_text import printable
+from su3d_bench.planning import data_root, dataset_targets, why_not_fitting
+from su3d_bench.protocols import ProtocolRules, load_protocol, protocol_names
+from su3d_bench.scene_run import Part, build_dataset
+from su3d_bench.store import read_prediction
+from su3d_bench.types import Frame, GroundTruth, Instances
+
+MOST_FRAMES = 48  # of a scene, among which the best view of an object is looked for
+
+
+class RunSource:
+    """The maps of a run and the data that they were made from; other data are refused."""
+
+    def __init__(self, run: FinishedRun, methods: Sequence[str] = (), scenes: Sequence[str] = ()) -> None:
+        self.run = run
+        self.methods = tuple(dict.fromkeys(methods)) or run.methods
+        for method in self.methods:
+            if method not in run.methods:
+                hint = suggest(method, run.methods) or f"; it has {', '.join(run.methods)}"
+                raise ConfigError(f"{run.name}: has no method '{printable(method, 80)}'{hint}")
+        self.scenes = tuple(dict.fromkeys(scenes)) or run.scenes
+        for scene in self.scenes:
+            if scene not in run.scenes:
+                hint = suggest(scene, run.scenes) or f"; it has {', '.join(run.scenes)}"
+                raise ConfigError(f"{run.name}: has no scene '{printable(scene, 80)}'{hint}")
+        self.instances = lru_cache(maxsize=len(self.methods))(self._instances)
+        self.frames = lru_cache(maxsize=1)(self._frames)
+
+    def _instances(self, scene: str, method: str) -> Instances:
+        """The map of a scene; a ``PredictionError`` where it has no instances."""
+        job = self.run.folder.job(scene, method)
+        if not job.prediction.is_file():
+            raise StoreError(
+                f"{self.run.name}: holds no map of {printable(scene, 100)} by {printable(method, 80)}; run it again, or "
+                "leave it out with --methods or --scenes"
+            )
+        found = read_prediction(job.prediction)
+        if not isinstance(found, Instances):
+            raise PredictionError(
+                f"{printable(str(job.prediction), 200)}: holds no instances that people could judge; leave "
+                f"{printable(method, 80)} out with --methods"
+            )
+        return found
+
+    @cached_property
+    def _datasets(self) -> dict[str, Any]:
+        settings = Settings(tuple(Setting(path, value, "run.toml") for path, value in self.run.settings.items()))
+        found = {}
+        for target in dataset_targets([str(each) for each in self.run.settings.get(("scenes",), ())]):
+            cls = registry.load("dataset", target)
+            options = resolve(settings, ("dataset", cls.name), cls.Options)
+            found[cls.name] = build_dataset(Part(target, cls.name, options.model_dump_json()), data_root())
+        return found
+
+    def dataset(self, scene: str) -> Any:
+        """The dataset of a scene, whose data are those of the run."""
+        name, _, of_dataset = scene.partition("/")
+        if name not in self._datasets:
+            raise DataError(f"{printable(scene, 100)}: run.toml names no dataset '{printable(name, 60)}'")
+        dataset = self._datasets[name]
+        if dataset.digest(of_dataset) != self.run.data_digests.get(scene):
+            raise DataError(f"{printable(scene, 100)}: its data are not those of the run; run it again")
+        return dataset
+
+    def _frames(self, scene: str, method: str) -> tuple[Frame, ...]:
+        """Some of the frames that the map was made from, spread over the scene."""
+        frames = self.dataset(scene).frames(scene.partition("/")[2], 1)
+        of_views = np.unique(self.instances(scene, method).views[:, 0])
+        indices = of_views[(of_views >= 0) & (of_views < len(frames))] if len(of_views) else np.arange(len(frames))
+        chosen = np.unique(np.linspace(0, len(indices) - 1, min(MOST_FRAMES, len(indices))).astype(np.int64))
+        return tuple(frames[int(indices[k])] for k in chosen)
+
+    def rules(self, scene: str, kind: str) -> ProtocolRules | None:
+        """The rules that judge a scene automatically, the first that fit; None where there are none."""
+        name = scene.partition("/")[0]
+        for protocol in protocol_names():
+            rules = load_protocol(protocol)
+            if rules.kind == kind and name in rules.datasets and why_not_fitting(rules, self.dataset(scene)) is None:
+                return rules
+        return None
+
+    def truth(self, scene: str, rules: ProtocolRules | None) -> GroundTruth | None:
+        """The ground truth that ``rules`` ask for; None where nobody has it."""
+        if rules is None:
+            return None
+        try:
+            truth: GroundTruth = self.dataset(scene).ground_truth(scene.partition("/")[2], rules.ground_truth)
+        except GroundTruthMissing:
+            return None
+        return truth
