@@ -83,13 +83,18 @@ def csv_text(tables: Sequence[Table]) -> str:
                     values |= {"value": origin.value, "low": low, "high": high, "what": origin.what, "run": origin.run}
                     values |= {"method": origin.method, "protocol": origin.protocol, "version": origin.version}
                     values |= {"metric": origin.metric}
-                writer.writerow({key: _harmless(value) for key, value in values.items()})
+                writer.writerow({key: harmless(value) for key, value in values.items()})
         for note in table.notes:
-            writer.writerow({"table": _harmless(table.name), "kind": "note", "text": _harmless(note)})
+            writer.writerow({"table": harmless(table.name), "kind": "note", "text": harmless(note)})
     return text.getvalue()
 
 
-def _harmless(value: str | int | float) -> str | int | float:
+def harmless(value: str | int | float) -> str | int | float:
+    """A cell on one line that no spreadsheet takes for a formula.
+
+    >>> harmless("=1+1"), harmless("-"), harmless(-1)
+    ("'=1+1", '-', -1)
+    """
     if not isinstance(value, str):
         return value
     line = printable(value, 2000)

@@ -29,6 +29,7 @@ class RunConfig(BaseModel):
 
     ``protocols`` empty: those of each dataset; ``stride`` 0: the method's own; ``jobs`` 0: one a scene, at most one a
     CPU core; ``limit`` 0: all frames, otherwise the first ``limit`` frames of each scene, and the run is partial;
+    ``offline``: no language model is asked, replies that are stored with the run are used;
     ``anytime``: shares of the updates after which the map so far is scored too, such as 0.1 0.25 0.5.
     """
 
@@ -43,6 +44,7 @@ class RunConfig(BaseModel):
     limit: int = Field(default=0, ge=0)
     jobs: int = Field(default=0, ge=0)
     pictures: bool = True
+    offline: bool = False
     anytime: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = ()
 
 

@@ -22,6 +22,7 @@ from su3d_bench.evaluation_openlex import (
     score_on_objects,
     why_not_lex_content,
 )
+from su3d_bench.evaluation_questions import score_on_questions
 from su3d_bench.evaluation_result import Evaluation, ProtocolEvaluation, SceneOutcomes, form_evaluation
 from su3d_bench.evaluation_scenes import OWN_FORMAT, Match, Source, match_scenes, open_sources, planned_scenes
 from su3d_bench.evaluation_scoring import (
@@ -49,7 +50,7 @@ from su3d_bench.metrics.query_ap import QueryTruth, TextQuery
 from su3d_bench.planning import data_root, why_not_fitting
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexMasks, shown
 from su3d_bench.predictions.scannet_text import ScannetText
-from su3d_bench.protocols import ProtocolRules, load_protocol, protocol_names
+from su3d_bench.protocols import SHARE_KINDS, ProtocolRules, load_protocol, protocol_names
 from su3d_bench.types import Encoder, GroundTruth, Instances
 
 __all__ = ["Evaluation", "ProtocolEvaluation", "Request", "evaluate"]
@@ -255,10 +256,13 @@ def _why_not_truth(rules: ProtocolRules, ground: _Ground, *, is_named: bool) -> 
             return None
         return "needs --queries FILE" if is_named else f"{NOT_MEANT} scenes without queries"
     if ground.dataset is not None:
-        if not is_named and ground.dataset_name not in rules.datasets:
-            return f"{NOT_MEANT} {ground.dataset_name}"
+        if not is_named and (ground.dataset_name not in rules.datasets or not rules.by_default):
+            named = ground.dataset_name not in rules.datasets
+            return f"{NOT_MEANT} {ground.dataset_name}" if named else "runs where it is named with --protocol"
         return why_not_fitting(rules, ground.dataset)
     assert ground.text is not None
+    if rules.kind in SHARE_KINDS:
+        return "needs the objects of a dataset; name one with --dataset"
     if rules.kind == "instance" and not ground.text.has_instances:
         return "needs instances, the ground truth holds class ids alone (expected class id * 1000 + instance)"
     if is_named:
@@ -307,7 +311,7 @@ class _Scoring:
         """The reason why a scene cannot be scored under the protocol; None where it was."""
         content = prediction.content
         has_points = self._ground.text is None
-        if self._ground.lex is not None or rules.ground_truth == QUERY_OBJECTS:
+        if self._ground.lex is not None or rules.ground_truth == QUERY_OBJECTS or rules.kind in SHARE_KINDS:
             reason = why_not_lex_content(rules, content)
         else:
             reason = why_not_content(rules, content, has_points=has_points)
@@ -354,6 +358,8 @@ class _Scoring:
         if rules.ground_truth == QUERY_OBJECTS:
             return score_on_objects(rules, self._ground.query_truth(scene), scene, content, encoder)
         truth = self._ground.truth(scene, rules.ground_truth)
+        if rules.kind in SHARE_KINDS:
+            return score_on_questions(rules, self._ground.dataset, scene, truth, content, encoder)
         try:
             check_length(scene, content, len(truth.points))
         except PredictionError as error:

@@ -28,7 +28,7 @@ from su3d_bench.metrics.query_ap import QueryTruth
 from su3d_bench.metrics.transfer import masks_of
 from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
 from su3d_bench.protocols import ProtocolRules
-from su3d_bench.scoring import score_scene, why_not_scorable
+from su3d_bench.scoring import QuestionTruth, score_scene, why_not_scorable
 from su3d_bench.types import Encoder, Instances, Prediction
 
 DATASET = "replica"  # of those that OpenLex3D labels, the one whose mesh can be read here
@@ -89,18 +89,23 @@ def why_not_lex_content(rules: ProtocolRules, content: Content) -> str | None:
 
 
 def score_on_objects(
-    rules: ProtocolRules, truth: OpenLexTruth | QueryTruth, scene: str, content: Content, encoder: Encoder | None
+    rules: ProtocolRules,
+    truth: OpenLexTruth | QueryTruth | QuestionTruth,
+    scene: str,
+    content: Content,
+    encoder: Encoder | None,
 ) -> SceneOutcome:
     """The outcome against objects with labels or queries; an empty prediction where ``content`` has no points."""
     prediction: Prediction = _nothing() if isinstance(content, VertexMasks | VertexLabels) else content
-    told = check_cloud(scene, prediction.points, truth.points)
+    base = truth.scene if isinstance(truth, QuestionTruth) else truth
+    told = check_cloud(scene, prediction.points, base.points)
     facts = None
     if isinstance(prediction, Instances):
         masks = masks_of(prediction)
         facts = mask_facts(masks, np.asarray(prediction.scores, np.float64), len(prediction.points))
         told += empty_warnings(scene, facts, masks, prediction.names)
     if rules.kind == "queries":
-        told.append(NO_CEILING if truth.variant in VARIANTS else NO_QUERY_CEILING)
+        told.append(NO_CEILING if base.variant in VARIANTS else NO_QUERY_CEILING)
     return SceneOutcome(score_scene(rules, truth, prediction, encoder), None, None, facts, tuple(told))
 
 

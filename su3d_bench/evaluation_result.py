@@ -15,7 +15,7 @@ from su3d_bench.evaluation_scoring import SceneOutcome
 from su3d_bench.metrics.instance_ap import InstanceCounts
 from su3d_bench.metrics.results import ProtocolResult, metric_values
 from su3d_bench.metrics.scene_score import SceneScore
-from su3d_bench.protocols import ProtocolRules
+from su3d_bench.protocols import SHARE_KINDS, ProtocolRules
 from su3d_bench.scoring import combine
 
 SCHEMA = 1
@@ -25,6 +25,7 @@ KEYS = {
     "AP": "ap", "AP50": "ap50", "AP25": "ap25", "mAcc": "macc", "mIoU": "miou", "F-mIoU": "fmiou", "pAcc": "pacc",
     "recall": "acc", "precision": "precision", "IoU": "iou", "F1": "f1", "mPrecision": "mprecision", "mF1": "mf1",
 }  # fmt: skip
+OWN_NAMES = ("categories", *SHARE_KINDS)  # kinds all of whose metrics are reported
 MAIN = ("ap", "ap50", "ap25", "macc", "miou", "fmiou")
 
 
@@ -103,7 +104,7 @@ class ProtocolEvaluation:
             "version": result.version,
             "kind": self.kind,
             "n_scenes": result.n_scenes,
-            "metrics": {key: value for key, value in metrics.items() if key in MAIN or self.kind == "categories"},
+            "metrics": {key: value for key, value in metrics.items() if key in MAIN or self.kind in OWN_NAMES},
             "intervals": _renamed(result.intervals),
             "pooled": _renamed(result.pooled),
             "scene_mean": _renamed(result.scene_mean),

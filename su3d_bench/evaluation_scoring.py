@@ -44,6 +44,7 @@ from su3d_bench.types import (
     Prediction,
 )
 
+NAMED_KINDS = ("annotation", "reasoning")  # go by names alone
 # Ground truths of ScanNet and whose class ids they hold.
 ID_LISTS = {"nyu40-vertices": "ids of NYU40 do", "scannet200-vertices": "ids of ScanNet200 do"}
 
@@ -115,12 +116,14 @@ def _why_no_labels(rules: ProtocolRules, content: Prediction) -> str | None:
 
 def n_feature_dimensions(rules: ProtocolRules, content: Content) -> int | None:
     """The dimensions of the features that must be named; None where labels are there or the protocol needs none."""
-    if rules.class_agnostic is not None or isinstance(content, VertexLabels):
+    if rules.class_agnostic is not None or isinstance(content, VertexLabels) or rules.kind in NAMED_KINDS:
         return None
     if isinstance(content, VertexMasks):
         has_labels = content.class_numbers is not None
     else:
-        compares = rules.kind == "queries" or rules.metric == "openlex3d-ranking"  # with texts, whatever the labels
+        compares = (
+            rules.kind in ("queries", "retrieval") or rules.metric == "openlex3d-ranking"
+        )  # with texts, whatever the labels
         has_labels = has_every_label(content) and not compares
     features = content.features
     return None if has_labels or features is None or not len(features) else int(features.shape[1])

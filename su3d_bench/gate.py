@@ -26,7 +26,7 @@ SPREADS = 2.0  # a value may leave the taught ones by this many times their rang
 ACROSS_MACHINES = 0.02  # 2 points: what ONNX Runtime's and BLAS's kernels of other processors may move a headline value
 COST_LIMIT = 1.4  # an update may cost so many times the reference's; single runs scatter by a tenth to a fifth
 # Settings that name what was asked for or move no number; scenes, methods and protocols are compared one by one.
-NOT_COMPARED = ("scenes", "methods", "protocols", "jobs", "pictures", "perception.cache")
+NOT_COMPARED = ("scenes", "methods", "protocols", "jobs", "pictures", "offline", "perception.cache")
 _SHARES = ("recall", "precision", "IoU", "F1", "F1-conceptgraphs", "mPrecision", "mF1", "mF1-conceptgraphs", "pAcc")
 HIGHER_IS_BETTER = frozenset({"AP", "AP50", "AP25", "mAcc", "mIoU", "F-mIoU", "synonyms", "overall", *_SHARES})
 

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeVar
 
-import numpy as np
 from pydantic import BaseModel, Field, ValidationError
 
 from su3d_bench.attribution import EncoderOf, attribute
@@ -27,6 +25,7 @@ from su3d_bench.update_times import summarise
 MOST_PAIRS = 40  # pairs of methods that are compared: all of nine methods, and a few seconds
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Values = dict[str, Number | None]
+Model = TypeVar("Model", bound=BaseModel)
 Progress = Callable[[str], None]
 
 
@@ -123,12 +122,14 @@ def _results(run: FinishedRun) -> tuple[_Result, ...]:
     return _read(_Metrics, run, "metrics.json").results
 
 
-def _read[Model: BaseModel](model: type[Model], run: FinishedRun, name: str) -> Model:
+def _read(model: type[Model], run: FinishedRun, name: str) -> Model:
     try:
         return model.model_validate(read_json(run.folder.path / name))
     except (ValidationError, RecursionError) as error:
         key = ".".join(map(str, error.errors()[0]["loc"])) if isinstance(error, ValidationError) else "it"
-        raise StoreError(f"{run.name}: {name}: {printable(key, 120)} is not as a run writes it; run it again") from error
+        raise StoreError(
+            f"{run.name}: {name}: {printable(key, 120)} is not as a run writes it; run it again"
+        ) from error
 
 
 def _about(run: FinishedRun) -> dict[str, Any]:

@@ -92,7 +92,10 @@ def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | N
     )
     chosen, notes = expand_scenes(config.scenes, parts.datasets)
     folder = out or Path("runs") / _run_name(config, parts)
-    jobs = tuple(_scene_job(config, parts, folder, target, scene) for target, scene in chosen)
+    jobs = tuple(
+        replace(_scene_job(config, parts, folder, target, scene), index=index)
+        for index, (target, scene) in enumerate(chosen)
+    )
     n_workers = min(config.jobs or os.cpu_count() or 1, len(jobs))
     plan = Plan(config, settings, RunFolder(folder), jobs, n_workers, notes)
     _refuse_other_runs(plan)
@@ -279,7 +282,7 @@ def why_not_fitting(rules: ProtocolRules, dataset: Any) -> str | None:
 
 
 def _run_name(config: RunConfig, parts: _Parts) -> str:
-    request = config.model_dump(mode="json", exclude={"jobs", "pictures"})
+    request = config.model_dump(mode="json", exclude={"jobs", "pictures", "offline"})
     options = [part.options for part in (*parts.methods, *parts.datasets.values())]
     key = digest_json([request, options, parts.perception, code_digest()])[:8]
     return "-".join([*(part.name for part in parts.datasets.values()), config.profile, key])
@@ -302,6 +305,7 @@ def _scene_job(config: RunConfig, parts: _Parts, folder: Path, target: str, scen
         folder=folder,
         data_root=data_root(),
         cache_root=cache_root(),
+        is_offline=config.offline,
     )
 
 

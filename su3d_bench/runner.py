@@ -16,6 +16,7 @@ from typing import Any
 from su3d_bench.config import KeyPath, flatten
 from su3d_bench.digests import code_digest, git_state, package_versions
 from su3d_bench.executors import SCENE_DONE, Event, Report, run_inline, run_processes
+from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.planning import Plan
 from su3d_bench.protocols import ProtocolRules, load_protocol
 from su3d_bench.scene_run import CEILING_METHOD, MethodOutcome, SceneJob, failed_outcomes, run_scene
@@ -189,6 +190,16 @@ def _join(texts: Iterable[str | None], separator: str = ", ") -> str | None:
     return separator.join(dict.fromkeys(text for text in texts if text)) or None
 
 
+def _model_files(plan: Plan, outcomes: Sequence[MethodOutcome]) -> dict[str, dict[str, str]]:
+    """SHA-256 of every weight file of the profiles that the run used, by model and file name."""
+    from su3d_bench.perception.models.catalogue import PROFILE_MODELS
+    from su3d_bench.perception.models.inspection import models_record
+
+    used = [profile for one in outcomes for profile in (one.profile or "").split(", ")]
+    names = [name for profile in dict.fromkeys(used) for name in PROFILE_MODELS.get(profile, ())]
+    return models_record(names, PerceptionConfig.model_validate_json(plan.jobs[0].perception).models) if names else {}
+
+
 def _record(plan: Plan, outcomes: Sequence[MethodOutcome], status: str) -> dict[str, Any]:
     """What ``run.json`` holds: where the numbers come from."""
     rules = [load_protocol(name) for name in dict.fromkeys(name for job in plan.jobs for name in job.protocols)]
@@ -204,6 +215,7 @@ def _record(plan: Plan, outcomes: Sequence[MethodOutcome], status: str) -> dict[
         "n_workers": plan.n_workers,
         "seed": plan.config.seed,
         "profile": _join(one.profile for one in outcomes) or plan.config.profile,
+        "models": _model_files(plan, outcomes),
         "encoder": _join(one.encoder for one in outcomes),
         "encoder_digest": _join(one.encoder_digest for one in outcomes),
         "data_digests": {one.scene: one.data_digest for one in outcomes if one.data_digest is not None},

@@ -43,6 +43,8 @@ from su3d_bench.types import (
 )
 
 CEILING_METHOD = "oracle"
+# Settings of perception that move no number, or whose part that does is in perception's digest.
+MOVES_NO_NUMBER = ("perception.cache", "perception.models.folder", "perception.models.paths", "perception.language.")
 TRUE_PROPOSALS_CAVEAT = "proposals from the ground truth; a ceiling, not a result"
 NAMED_KINDS = ("annotation", "reasoning")  # labels n' of a file beside the map move their numbers
 FIELDS_KNOWN_LATER = ("data", "profile", "perception")
@@ -59,7 +61,7 @@ class Part:
 
 @dataclass(frozen=True)
 class SceneJob:
-    """Everything that a worker needs to know of one scene."""
+    """Everything that a worker needs to know of one scene; ``index`` counts the scenes of the run."""
 
     scene: str
     dataset: Part
@@ -76,6 +78,8 @@ class SceneJob:
     folder: Path
     data_root: Path
     cache_root: Path
+    index: int = 0
+    is_offline: bool = False
 
     @property
     def scene_name(self) -> str:
@@ -128,7 +132,7 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
     for prefix, options in sections:
         for path, value in flatten(json.loads(options)):
             key[".".join((prefix, *path))] = json.dumps(value, ensure_ascii=False)
-    key.pop("perception.cache", None)  # a cache moves no number
+    key = {name: text for name, text in key.items() if not name.startswith(MOVES_NO_NUMBER)}
     if hasattr(method, "inputs"):
         key |= {f"input.{name}": digest for name, digest in method.inputs.items()}
     return (
@@ -230,7 +234,16 @@ class _Scene:
         config: PerceptionConfig = PerceptionConfig.model_validate_json(self.job.perception)
         profile = resolve_profile(self.job.profile, info.image_domain, config)
         mesh = self.mesh if profile == "oracle" else None
-        return build_perception(profile, config, scene=info, cache_root=self.job.cache_root, mesh=mesh)
+        return build_perception(
+            profile,
+            config,
+            scene=info,
+            cache_root=self.job.cache_root,
+            mesh=mesh,
+            job_index=self.job.index,
+            replies=self.job.folder / "language",
+            is_offline=self.job.is_offline,
+        )
 
     def run(self, part: Part, folder: JobFolder, log: _Log) -> MethodOutcome:
         """Predict and score one method, each step only where its seal is missing or broken."""

@@ -40,7 +40,7 @@ class ByColour:
 
     def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
         means = np.array([image.reshape(-1, 3).mean(axis=0) for image in images])
-        return (means / np.linalg.norm(means, axis=1, keepdims=True)).astype(np.float32)
+        return np.asarray(means / np.linalg.norm(means, axis=1, keepdims=True), np.float32)
 
     def encode_texts(self, texts: Sequence[str]) -> Float32Array:
         return np.array([[word in text for word in ("red", "green", "blue")] for text in texts], np.float32)

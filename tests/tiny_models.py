@@ -48,7 +48,7 @@ def tiny_sam() -> Any:
         prompt_encoder_config={"hidden_size": 8, "image_size": SAM_PX, "patch_size": 8, "mask_input_channels": 4},
         mask_decoder_config={"hidden_size": 8, "mlp_dim": 16, "num_attention_heads": 2, "iou_head_hidden_dim": 8},
     )  # fmt: skip
-    model = SamModel(config)
+    model: Any = SamModel(config)
     with torch.no_grad():
         for parameter in model.parameters():
             # Weights that carry signals on; as initialised the network says the same of every image.
@@ -64,11 +64,12 @@ def tiny_dino() -> Any:
     from transformers import BertConfig, GroundingDinoConfig, GroundingDinoForObjectDetection, SwinConfig
 
     torch.manual_seed(2)
+    tower: dict[str, Any] = {
+        "embed_dim": 8, "depths": [1, 1, 1, 1], "num_heads": [1, 1, 2, 2], "window_size": 4, "image_size": 64,
+        "out_features": ["stage2", "stage3", "stage4"],
+    }  # fmt: skip
     config = GroundingDinoConfig(
-        backbone_config=SwinConfig(
-            embed_dim=8, depths=[1, 1, 1, 1], num_heads=[1, 1, 2, 2], window_size=4, image_size=64,
-            out_features=["stage2", "stage3", "stage4"],
-        ),
+        backbone_config=SwinConfig(**tower),
         text_config=BertConfig(
             hidden_size=16, num_hidden_layers=1, num_attention_heads=2, intermediate_size=32, vocab_size=1100,
             max_position_embeddings=64,
@@ -76,7 +77,7 @@ def tiny_dino() -> Any:
         num_queries=10, encoder_layers=1, decoder_layers=2, encoder_ffn_dim=32, decoder_ffn_dim=32, d_model=32,
         encoder_attention_heads=4, decoder_attention_heads=4, encoder_n_points=2, decoder_n_points=2, max_text_len=32,
     )  # fmt: skip
-    model = GroundingDinoForObjectDetection(config)
+    model: Any = GroundingDinoForObjectDetection(config)
     with torch.no_grad():
         for parameter in model.parameters():
             parameter.add_(torch.randn_like(parameter) * 0.1)

@@ -15,7 +15,19 @@ if TYPE_CHECKING:
     from su3d_bench.planning import Plan
     from su3d_bench.runner import RunResult
 
-FLAGS_OF_KEYS = ("scenes", "methods", "profile", "protocols", "stride", "seed", "limit", "jobs", "pictures", "anytime")
+FLAGS_OF_KEYS = (
+    "scenes",
+    "methods",
+    "profile",
+    "protocols",
+    "stride",
+    "seed",
+    "limit",
+    "jobs",
+    "pictures",
+    "offline",
+    "anytime",
+)
 
 
 def add_parser(verbs: Any) -> None:
@@ -53,6 +65,9 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--jobs", type=int, metavar="N", help="scenes side by side (default: the CPU cores)")
     parser.add_argument(
         "--pictures", action=argparse.BooleanOptionalAction, help="draw the maps into the run folder (default: yes)"
+    )
+    parser.add_argument(
+        "--offline", action=argparse.BooleanOptionalAction, help="use stored replies of language models, ask nobody"
     )
     parser.add_argument(
         "--anytime", nargs="+", type=float, metavar="SHARE", help="score the map after these shares of the updates too"

@@ -56,7 +56,7 @@ def _weighted_mean(values: Sequence[float], weights: Int64Array) -> Float64Array
 
 
 def class_columns(rules: ProtocolRules) -> tuple[str, ...]:
-    """What is known of a single class: its AP values, or its recall and IoU; nothing where a protocol has no classes."""
+    """What is known of a single class: its AP values, or its recall and IoU; nothing where there are no classes."""
     if rules.kind in CURVE_KINDS:
         return tuple(name for name in ("AP", "AP50", "AP25") if name in rules.headline)
     return () if rules.kind == "categories" or rules.kind in SHARE_KINDS else ("recall", "IoU")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from functools import cached_property
 
 import numpy as np
 
@@ -35,6 +34,9 @@ from su3d_bench.types import (
     StageTimer,
 )
 
+# What of the language model's settings moves a caption; times, prices and limits do not.
+MOVES_CAPTIONS = {"vision_model", "temperature", "seed", "max_answer_tokens", "image_detail", "max_image_px"}
+
 
 class PaperPerception:
     """Foundation models; a method gets the masks that its own program makes of them where it names the settings."""
@@ -59,14 +61,10 @@ class PaperPerception:
         self._grounded: Mapping[str, GroundedConfig] = {"paper": config.paper.grounded, **GROUNDED_MASKS}
         self._automatic: Mapping[str, AutomaticMaskConfig] = {**AUTOMATIC_MASKS, "sam": config.paper.automatic}
         self._segmenters: dict[tuple[str, str], Segmenter] = {}
-        self._language = config.language.model_dump_json() if captioner is not None else ""
-
-    @cached_property
-    def digest(self) -> str:
-        """Moves with the weights, the settings of every kind of mask, and the model that is asked for names."""
-        grounded = [GroundedSam(self._networks, config).digest for config in self._grounded.values()]
-        automatic = [AutomaticSam(self._networks, config).digest for config in self._automatic.values()]
-        return content_key(self.profile, *grounded, *automatic, self.encoder.digest, self._language)
+        language = config.language.model_dump_json(include=MOVES_CAPTIONS) if captioner is not None else ""
+        grounded = [GroundedSam(networks, settings).digest for settings in self._grounded.values()]
+        automatic = [AutomaticSam(networks, settings).digest for settings in self._automatic.values()]
+        self.digest = content_key(self.profile, *grounded, *automatic, encoder.digest, language)
 
     def detect(self, frame: Frame, needs: PerceptionNeeds, timer: StageTimer) -> Detections:
         assert needs.masks != "none", "the runner asks nothing for a method that needs no masks"

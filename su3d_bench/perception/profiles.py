@@ -48,7 +48,9 @@ class Perception(Protocol):
     profile: str
     encoder: Encoder
     caveat: str | None
-    digest: str
+
+    @property
+    def digest(self) -> str: ...
 
     def detect(self, frame: Frame, needs: PerceptionNeeds, timer: StageTimer) -> Detections: ...
 
@@ -84,10 +86,13 @@ def build_perception(
     mesh: InstanceMesh | None,
     encoder: Encoder | None = None,
     job_index: int = 0,
+    replies: Path | None = None,
+    is_offline: bool = False,
 ) -> Perception:
     """Perception for one scene; ``mesh`` for the oracle alone.
 
     Without ``encoder`` the configured one is loaded, or the profile's own; ``job_index`` chooses among several GPUs.
+    ``replies``: where those of a language model are kept (None: in the cache); ``is_offline``: only these are used.
     """
     resolved = resolve_profile(profile, scene.image_domain, config)
     cache = FrameCache(cache_root if config.cache else None)
@@ -113,12 +118,12 @@ def build_perception(
             return GsaPerception(config.stored.folder, config.stored.detections, scene, encoder, cache)
         return StoredPerception(config.stored.folder, scene, encoder, cache)
     if resolved == "paper":
-        return _paper(config, encoder, cache, cache_root, job_index)
+        return _paper(config, encoder, cache, replies or cache_root / REPLIES, is_offline, job_index)
     return EmbeddedPerception(config, scene, encoder, cache)
 
 
 def _paper(
-    config: PerceptionConfig, encoder: Encoder, cache: FrameCache, cache_root: Path, job_index: int
+    config: PerceptionConfig, encoder: Encoder, cache: FrameCache, replies: Path, is_offline: bool, job_index: int
 ) -> Perception:
     from su3d_bench.perception.models.front_end import load_networks
     from su3d_bench.perception.profile_paper import PaperPerception
@@ -129,7 +134,7 @@ def _paper(
         from su3d_bench.perception.language.client import ChatClient
         from su3d_bench.perception.language.reply_store import ReplyStore
 
-        client = ChatClient(config.language, ReplyStore(cache_root / REPLIES))
+        client = ChatClient(config.language, ReplyStore(replies), offline=is_offline)
         captioner = Captioner(client, config.language)
     networks = load_networks(config.paper, config.models, encoder, job_index)
     return PaperPerception(config, networks, encoder, cache, captioner)

@@ -45,7 +45,7 @@ class RunSource:
         job = self.run.folder.job(scene, method)
         if not job.prediction.is_file():
             raise StoreError(
-                f"{self.run.name}: holds no map of {printable(scene, 100)} by {printable(method, 80)}; run it again, or "
+                f"{self.run.name}: holds no map of {printable(scene, 100)} by {printable(method, 80)}; run it, or "
                 "leave it out with --methods or --scenes"
             )
         found = read_prediction(job.prediction)

@@ -103,8 +103,7 @@ def is_cut_by_crop(boxes: Float32Array, crop: Crop, height: int, width: int) -> 
     """Which boxes (K, 4), in pixels of the image, reach an edge of ``crop`` that is no edge of the image."""
     near_crop = np.abs(boxes - np.array(crop.box, np.float32)) <= CROP_EDGE_PX
     near_image = np.abs(boxes - np.array([0, 0, width, height], np.float32)) <= CROP_EDGE_PX
-    is_cut: BoolArray = (near_crop & ~near_image).any(axis=1)
-    return is_cut
+    return np.asarray((near_crop & ~near_image).any(axis=1), np.bool_)
 
 
 def without_small_parts(mask: BoolArray, min_area_px: int, part: Literal["holes", "islands"]) -> tuple[BoolArray, bool]:
@@ -138,7 +137,7 @@ class _Found:
     @property
     def boxes(self) -> Float32Array:
         """The original's boxes: first and last pixel, which makes them a pixel smaller than the windows."""
-        return (self.windows - np.array([0, 0, 1, 1])).astype(np.float32)
+        return np.asarray(self.windows - np.array([0, 0, 1, 1]), np.float32)
 
     def at(self, kept: Int64Array) -> _Found:
         return _Found([self.cuts[k] for k in kept], self.windows[kept], self.scores[kept], self.crop_areas[kept])

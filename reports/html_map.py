@@ -1,0 +1,197 @@
+"""A map in the form in which a page shows it: thinned, quantised, ordered along a curve and deflated.
+
+The content of a map is ``JSON length (uint32, little endian) | JSON | planes``. The JSON names the planes in order; a
+plane of 16 bits is its low bytes and then its high bytes, which deflate far better apart. Positions are differences
+from the point before, modulo 2**16, in steps of ``step`` metres from ``origin``.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.geometry import voxel_coordinates
+from su3d_bench.metrics.transfer import nearest, row_ids
+from su3d_bench.types import (
+    DenseFeatures,
+    Float32Array,
+    Float64Array,
+    Instances,
+    Int32Array,
+    Int64Array,
+    Prediction,
+    UInt8Array,
+)
+
+LEAST_SPACING_M = 0.015  # of the drawn points; a finer one shows nothing more on a screen
+COARSER = 1.15  # from one spacing that is tried to the next
+STEPS_A_SPACING = 2  # a point stands at the nearest of these, so the grid itself does not show
+NO_TRUTH_NEAR, NOT_SCORED = 0xFFFF, 0xFFFE
+NEAR_M = 0.05  # a truth farther than this says nothing of a point of the map
+COLOUR_NEAR_M = 0.06  # frames are sampled every few centimetres
+COLOUR_BITS = 5  # of each channel that are kept; no eye sees more on single points
+
+
+@dataclass(frozen=True)
+class Cloud:
+    """The points of a map that are drawn: ``rows`` (n,) of the map's points, ``spacing_m`` apart, in drawing order."""
+
+    rows: Int64Array
+    points: Float32Array
+    spacing_m: float
+
+
+def thinned(points: Float32Array, most: int) -> Cloud:
+    """At most ``most`` of ``points``, one of each cell of the least spacing at which so few are left."""
+    spacing = LEAST_SPACING_M
+    rows = _first_of_cells(points, spacing)
+    while len(rows) > most:
+        spacing *= COARSER
+        rows = _first_of_cells(points, spacing)
+    order = np.argsort(_curve(points[rows], spacing), kind="stable")
+    return Cloud(rows[order], points[rows[order]], spacing)
+
+
+def _first_of_cells(points: Float32Array, spacing_m: float) -> Int64Array:
+    if not len(points):
+        return np.zeros(0, np.int64)
+    _, first = np.unique(row_ids(voxel_coordinates(points, spacing_m)), return_index=True)
+    return np.sort(first)
+
+
+def _curve(points: Float32Array, spacing_m: float) -> Int64Array:
+    """Where each point stands on a Z-order curve, along which neighbours have like values."""
+    cells = voxel_coordinates(points, spacing_m)
+    if not len(cells):
+        return np.zeros(0, np.int64)
+    cells = np.minimum(cells - cells.min(axis=0), (1 << 20) - 1)
+    key = np.zeros(len(cells), np.int64)
+    for bit in range(20):
+        for axis in range(3):
+            key |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    return key
+
+
+def point_owners(prediction: Prediction, rows: Int64Array) -> Int32Array:
+    """The instance of each of the points ``rows``, -1 for none; of masks that overlap the smaller one is seen.
+
+    Dense features have no instance.
+    """
+    if isinstance(prediction, DenseFeatures):
+        return np.full(len(rows), -1, np.int32)
+    if not isinstance(prediction, Instances):
+        return prediction.instance[rows]
+    owner = np.full(len(prediction.points), -1, np.int32)
+    sizes: Int64Array = np.diff(prediction.indptr)
+    for k in np.argsort(-sizes, kind="stable"):
+        owner[prediction.mask(int(k))] = k
+    return owner[rows]
+
+
+def nearest_colours(points: Float32Array, seen: Float32Array, seen_rgb: UInt8Array) -> UInt8Array | None:
+    """The colour (n, 3) of what frames saw nearest to each point, grey where they saw nothing near; None without any."""
+    if not len(seen) or not len(points):
+        return None
+    _, found = nearest(seen, points, COLOUR_NEAR_M)
+    return np.where(found[:, None] >= 0, seen_rgb[found], np.uint8(128))
+
+
+def nearest_classes(points: Float32Array, truth: Float32Array, classes: Int64Array) -> Int64Array:
+    """The true class (n,) near each point; ``NOT_SCORED`` where the truth there has none, ``NO_TRUTH_NEAR``."""
+    _, found = nearest(truth, points, NEAR_M)
+    if not len(truth):
+        return np.full(len(points), NO_TRUTH_NEAR)
+    classes = np.where(classes >= 0, classes, NOT_SCORED)
+    return np.where(found >= 0, classes[found], NO_TRUTH_NEAR)
+
+
+def pack_map(cloud: Cloud, planes: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> str:
+    """A map in base64. ``planes`` (n,) or (n, 3) uint8 or uint16 go beside the positions; ``about`` is plain values."""
+    low = cloud.points.min(axis=0).astype(np.float64) if len(cloud.points) else np.zeros(3)
+    step = cloud.spacing_m / STEPS_A_SPACING
+    if len(cloud.points):
+        step = max(step, float((cloud.points.max(axis=0) - low).max()) / 0xFFFF)
+    grid = np.rint((cloud.points.astype(np.float64) - low) / step).astype(np.int64)
+    stored: dict[str, NDArray[Any]] = {"position": _differences(grid).astype(np.uint16), **planes}
+    header = {
+        "n": len(cloud.points),
+        "origin": [round(float(value), 6) for value in low],
+        "step": step,
+        "spacing": cloud.spacing_m,
+        "planes": [
+            {"name": name, "bytes": plane.dtype.itemsize, "width": plane.reshape(len(plane), -1).shape[1] or 1}
+            if len(plane)
+            else {"name": name, "bytes": plane.dtype.itemsize, "width": 1}
+            for name, plane in stored.items()
+        ],
+        **about,
+    }
+    text = json.dumps(header, ensure_ascii=False, allow_nan=False, separators=(",", ":")).encode()
+    parts = [len(text).to_bytes(4, "little"), text, *(_plane_bytes(plane) for plane in stored.values())]
+    return base64.b64encode(zlib.compress(b"".join(parts), 9)).decode("ascii")
+
+
+def _differences(grid: Int64Array) -> Int64Array:
+    return np.diff(grid, axis=0, prepend=np.zeros((1, 3), np.int64)) % (1 << 16)
+
+
+def _plane_bytes(plane: NDArray[Any]) -> bytes:
+    """Column after column; of 16 bits the low bytes of a column first."""
+    columns = plane.reshape(len(plane), -1).T if len(plane) else plane.reshape(1, 0)
+    if plane.dtype == np.uint16:
+        return b"".join((column & 255).astype(np.uint8).tobytes() + (column >> 8).astype(np.uint8).tobytes() for column in columns)
+    return np.ascontiguousarray(columns, np.uint8).tobytes()
+
+
+def colour_plane(colours: UInt8Array) -> UInt8Array:
+    """Colours (n, 3) with ``COLOUR_BITS`` a channel, spread over 0..255 again."""
+    kept = colours >> (8 - COLOUR_BITS)
+    spread: UInt8Array = (kept << (8 - COLOUR_BITS)) | (kept >> (2 * COLOUR_BITS - 8))
+    return spread
+
+
+def index_plane(values: Int32Array | Int64Array) -> NDArray[np.uint16]:
+    """Indices from 0, -1 and whatever does not fit as 65535."""
+    return np.where((values >= 0) & (values < 0xFFFF), values, 0xFFFF).astype(np.uint16)
+
+
+def frame_cover(views: Sequence[Sequence[int]], most: int) -> list[int]:
+    """At most ``most`` frames in which as many as possible of the instances are seen, the frame with most first.
+
+    ``views`` holds the frames of each instance; of equal frames the earlier one is taken.
+
+    >>> frame_cover([[0, 5], [5], [9], []], 2)
+    [5, 9]
+    """
+    left = [set(frames) for frames in views if frames]
+    chosen: list[int] = []
+    while left and len(chosen) < most:
+        counts: dict[int, int] = {}
+        for frames in left:
+            for frame in frames:
+                counts[frame] = counts.get(frame, 0) + 1
+        best = min(counts, key=lambda frame: (-counts[frame], frame))
+        chosen.append(best)
+        left = [frames for frames in left if best not in frames]
+    return chosen
+
+
+def box_in_view(
+    points: Float32Array, camera_to_world: Float64Array, intrinsics: Float64Array, width: int, height: int
+) -> list[float] | None:
+    """Where points are in an image, as left, top, right, bottom in 0..1; None where nothing of them is in it."""
+    relative = (points.astype(np.float64) - camera_to_world[:3, 3]) @ camera_to_world[:3, :3]
+    relative = relative[relative[:, 2] > 0.05]  # m before the camera
+    pixels = relative @ intrinsics.T
+    place = pixels[:, :2] / pixels[:, 2:] / np.array([width, height])
+    place = place[((place >= 0) & (place <= 1)).all(axis=1)]
+    if not len(place):
+        return None
+    return [round(float(value), 3) for value in (*place.min(axis=0), *place.max(axis=0))]

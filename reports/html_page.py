@@ -1,0 +1,58 @@
+"""One page for some runs: a single file that loads nothing, in which every text of a run is data and never markup."""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import json
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).parent
+SCRIPTS = ("page_elements.js", "page_map.js", "page_sections.js", "page_scene.js", "page.js")  # in the order they run
+STYLE = "page.css"
+TEMPLATE = "page.html.j2"
+
+
+def page_html(
+    title: str, numbers: Mapping[str, Any], scenes: Sequence[Mapping[str, Any]], maps: Sequence[str]
+) -> str:
+    """The page. ``numbers`` and ``scenes`` are plain values; ``maps`` are in base64, in the order of ``numbers``."""
+    from jinja2 import Environment
+
+    style = _file(STYLE)
+    script = "(() => {\n'use strict';\n" + "\n".join(_file(name) for name in SCRIPTS) + "\n})();\n"
+    # Nothing is loaded, sent or run but what stands in the page itself, by its digest.
+    policy = (
+        f"default-src 'none'; script-src '{_digest(script)}'; style-src '{_digest(style)}'; img-src data:; "
+        "base-uri 'none'; form-action 'none'"
+    )
+    template = Environment(autoescape=True, keep_trailing_newline=True).from_string(_file(TEMPLATE))
+    return template.render(
+        policy=policy,
+        title=title,
+        style=style,
+        script=script,
+        data=embedded_json(numbers),
+        scenes=[embedded_json(one) for one in scenes],
+        maps=maps,
+    )
+
+
+def embedded_json(value: Any) -> str:
+    """JSON that may stand in a script element: no ``<``, so that no text ends the element or begins a comment.
+
+    >>> embedded_json({"name": "</script><!--"})
+    '{"name":"\\\\u003c/script>\\\\u003c!--"}'
+    """
+    text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+
+
+def _file(name: str) -> str:
+    return (HERE / name).read_text(encoding="utf-8")
+
+
+def _digest(text: str) -> str:
+    return "sha256-" + base64.b64encode(hashlib.sha256(text.encode()).digest()).decode("ascii")

@@ -1,0 +1,76 @@
+"""What somebody should look at again after sheets were scored, as a page with pictures and as CSV."""
+
+from __future__ import annotations
+
+import csv
+import html
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+from urllib.parse import quote
+
+from su3d_bench.plain_text import printable
+from su3d_bench.reports.table_formats import harmless
+
+COLUMNS = ("item_id", "question", "reason", "answers", "truth", "scene", "methods", "text", "pictures")
+STYLE = (
+    "body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:60rem;padding:0 1rem;color-scheme:light dark}"
+    "article{border-top:1px solid #8888;padding:1rem 0}img{max-width:100%;height:auto;background:#fff}"
+    "h1,h2{font-weight:600}h1{font-size:1.4rem}h2{font-size:1.05rem;margin:0;overflow-wrap:anywhere}"
+    "p{margin:.3rem 0;overflow-wrap:anywhere}.reason{font-weight:600}"
+)
+POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src 'self' file:"
+
+
+def second_looks_csv(looks: Sequence[Mapping[str, Any]]) -> str:
+    """One line an item and question."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    writer.writerow(COLUMNS)
+    for one in looks:
+        row = (one["item_id"], one["ask"], one["reason"], _answers(one), one["automatic"], one["scene"])
+        row += (", ".join(one["methods"]), one["text"], ", ".join(one["pictures"]))
+        writer.writerow([harmless(cell) for cell in row])
+    return text.getvalue()
+
+
+def second_looks_page(looks: Sequence[Mapping[str, Any]], pictures: str, sheet_id: str) -> str:
+    """A page without scripts; ``pictures`` is where its picture files are, as the page sees it."""
+    body = "\n".join(_article(one, pictures) for one in looks) or "<p>Nothing: all agree.</p>"
+    return (
+        '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n'
+        f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>Second looks</title>\n'
+        f"<style>{STYLE}</style>\n<h1>Second looks at {_text(sheet_id)}: {len(looks)}</h1>\n{body}\n</html>\n"
+    )
+
+
+def _article(one: Mapping[str, Any], pictures: str) -> str:
+    images = "".join(
+        f'<p><img loading="lazy" alt="{_text(one["item_id"])}" src="{html.escape(quote(f"{pictures}/{name}"))}"></p>'
+        for name in one["pictures"]
+        if is_file_name(name)
+    )
+    truth = f"; ground truth: {_text(one['automatic'])}" if one["automatic"] else ""
+    return (
+        f'<article><h2 dir="auto">{_text(one["text"])}</h2>'
+        f'<p><span class="reason">{_text(one["reason"])}</span>, {_text(one["ask"])}: {_text(_answers(one))}{truth}</p>'
+        f"<p>{_text(one['item_id'])}, {_text(one['scene'])}, {_text(', '.join(one['methods']))}</p>{images}</article>"
+    )
+
+
+def is_file_name(name: str) -> bool:
+    """Whether ``name`` is of a file in the folder itself.
+
+    >>> is_file_name("item-1.png"), is_file_name("../item-1.png"), is_file_name("..")
+    (True, False, False)
+    """
+    return bool(name.strip(".")) and not any(one in name for one in "/\\:\0")
+
+
+def _answers(one: Mapping[str, Any]) -> str:
+    return "; ".join(f"{name}: {answer}" for name, answer in one["answers"].items())
+
+
+def _text(text: str) -> str:
+    return html.escape(printable(text, 2000))

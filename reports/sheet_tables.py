@@ -1,0 +1,154 @@
+"""What people's answers to sheets add up to, as tables, from the content of ``scores.json``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from su3d_bench.reports.comparison_table import signed
+from su3d_bench.reports.paper_tables import percent
+from su3d_bench.reports.table_model import NOT_MEASURED, Cell, Table, TableRow
+
+SUBJECTS = {
+    "retrieval": "Retrieval by text: is the instance ranked first right?",
+    "annotation": "Labels and merging of instances",
+    "reasoning": "Spatial reasoning: is the answer right, and are the objects that it names?",
+}
+JUDGES = {"people": "people", "automatic": "ground truth, same items"}
+SHOWN_TESTS = 60  # pairs of methods under one metric; scores.json has all
+
+
+def sheet_tables(scores: Mapping[str, Any]) -> list[Table]:
+    """Accuracies of each dataset, tests between methods, agreement, and people against the ground truth."""
+    datasets = dict.fromkeys(cell["dataset"] for cell in scores["cells"])
+    tables = [_accuracies(scores, dataset) for dataset in datasets]
+    tables += [_tests(scores["tests"])] if scores["tests"] else []
+    tables += [_agreements(scores["agreements"])] if scores["agreements"] else []
+    pairs = [(one["ask"], pair) for one in scores["agreements"] for pair in one["agreement"]["pairs"]]
+    tables += [_pairs(pairs)] if pairs else []
+    return [*tables, *(_confusion(one, scores["automatic_rule"]) for one in scores["confusions"])]
+
+
+def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
+    cells = {(c["judge"], c["method"], c["metric"]): c for c in scores["cells"] if c["dataset"] == dataset}
+    metrics = list(dict.fromkeys(metric for _, _, metric in cells))
+    rows = []
+    for judge, what in JUDGES.items():
+        methods = dict.fromkeys(method for who, method, _ in cells if who == judge)
+        for method in methods:
+            row = tuple(_accuracy(cells.get((judge, method, metric))) for metric in metrics)
+            rows.append(TableRow(f"{method} ({what})", row, group=judge))
+    n_scenes = len({scene for cell in cells.values() for scene in cell["per_scene"]})
+    unclear = sum(c["n_cannot_tell"] for c in cells.values() if c["judge"] == "people" and c["metric"] in metrics[-1:])
+    people = ", ".join(f"{name} {n}" for name, n in scores["annotators"].items())
+    return Table(
+        name=f"{scores['kind']}-{dataset}",
+        caption=f"{SUBJECTS[scores['kind']]} {dataset}, {n_scenes} scene{'s' if n_scenes != 1 else ''}.",
+        head="method",
+        columns=tuple(metrics),
+        rows=tuple(rows),
+        notes=(
+            "Per cent; in brackets the 95 % interval over resampled items, then the number of items. An item that "
+            "several people judged counts once, with the share of them that said so",
+            f"set {scores['sheet_id']} of run {scores['run']}; {scores['n_judged']} of {scores['n_items']} items "
+            f"judged; judgements by {people}",
+            *([f"'cannot tell' is left out: {unclear} under {metrics[-1]}"] if unclear else []),
+            *([f"no answers from {', '.join(scores['silent'])}"] if scores["silent"] else []),
+        ),
+    )
+
+
+def _accuracy(cell: Mapping[str, Any] | None) -> Cell:
+    if cell is None or cell["value"] is None:
+        return Cell(NOT_MEASURED)
+    return Cell(percent(cell["value"]), f"{_bracket(cell['interval'])}n={cell['n_items']}")
+
+
+def _bracket(interval: Sequence[float] | None) -> str:
+    return "" if interval is None else f"[{percent(interval[0])}, {percent(interval[1])}] "
+
+
+def _tests(tests: Sequence[Mapping[str, Any]]) -> Table:
+    rows = []
+    for one in tests[:SHOWN_TESTS]:
+        low_high = one["interval"]
+        beside = "" if low_high is None else f"[{signed(low_high[0])}, {signed(low_high[1])}]"
+        texts = (one["metric"], str(one["n_items"]), str(one["n_differ"]))
+        p = f"{one['p']:.3g}" if one["is_exact"] else f"about {one['p']:.2g}"
+        cells = (*map(Cell, texts), Cell(signed(one["difference"]), beside), Cell(p), Cell(f"{one['smallest_p']:.2g}"))
+        rows.append(TableRow(f"{one['right']} - {one['left']} ({one['dataset']})", cells))
+    left_out = len(tests) - len(rows)
+    return Table(
+        name="differences",
+        caption="Differences between methods, as people judged them.",
+        head="difference",
+        columns=("metric", "n", "differ", "points", "p", "smallest p"),
+        rows=tuple(rows),
+        notes=(
+            "p: two-sided sign-flip test over what differs (McNemar's exact test where each is judged once); smallest "
+            "p: the least that so many can give; not corrected for the number of tests",
+            *([f"{left_out} more differences are in scores.json"] if left_out else []),
+        ),
+    )
+
+
+def _agreements(found: Sequence[Mapping[str, Any]]) -> Table:
+    rows = []
+    for one in found:
+        of = one["agreement"]
+        share = f"{of['n_equal']}/{of['n_items']}"
+        low_high = of["interval"]
+        beside = "" if low_high is None else f"[{low_high[0]:.2f}, {low_high[1]:.2f}]"
+        fleiss = f"(n={of['n_fleiss']}, {of['n_raters']} each)" if of["fleiss"] is not None else ""
+        cells = (Cell(str(of["n_annotators"])), Cell(share), Cell(_coefficient(of["alpha"]), beside))
+        rows.append(TableRow(one["ask"], (*cells, Cell(_coefficient(of["fleiss"]), fleiss))))
+    return Table(
+        name="agreement",
+        caption="Agreement of annotators.",
+        head="question",
+        columns=("annotators", "all equal", "Krippendorff's alpha", "Fleiss' kappa"),
+        rows=tuple(rows),
+        notes=(
+            "1: they agree on all, 0: as chance would have it; over items with two answers or more; 'cannot tell' is "
+            "an answer; in brackets the 95 % interval over resampled items",
+        ),
+    )
+
+
+def _pairs(pairs: Sequence[tuple[str, Mapping[str, Any]]]) -> Table:
+    rows = [
+        TableRow(
+            f"{pair['left']}, {pair['right']}",
+            (Cell(ask), Cell(f"{pair['n_equal']}/{pair['n']}"), Cell(_coefficient(pair["kappa"]))),
+        )
+        for ask, pair in pairs
+    ]
+    return Table(
+        name="pairs",
+        caption="Agreement of each pair of annotators.",
+        head="annotators",
+        columns=("question", "equal", "Cohen's kappa"),
+        rows=tuple(rows),
+        notes=("over the items that both judged; -: undefined, for want of items or of a second answer",),
+    )
+
+
+def _coefficient(value: float | None) -> str:
+    return NOT_MEASURED if value is None else f"{value:.3f}"
+
+
+def _confusion(one: Mapping[str, Any], rule: str) -> Table:
+    columns = [k for k, _ in enumerate(one["choices"]) if any(row[k] for row in one["counts"])]
+    rows = [
+        TableRow(f"people: {choice}", tuple(Cell(str(one["counts"][k][column])) for column in columns))
+        for k, choice in enumerate(one["choices"])
+    ]
+    share = f"{one['n_equal']} of {one['n']} judgements are those of the ground truth" if one["n"] else "none is clear"
+    return Table(
+        name=f"confusion-{one['ask']}",
+        caption=f"People against the ground truth: {one['ask']}.",
+        head="judgements",
+        columns=tuple(f"truth: {one['choices'][k]}" for k in columns),
+        rows=tuple(rows),
+        notes=(f"{share}; Cohen's kappa {_coefficient(one['kappa'])}; truth: {rule}",),
+    )

@@ -1,0 +1,151 @@
+"""``su3d-bench questions``: make sets of queries with known answers, and look at sets from anywhere."""
+
+from __future__ import annotations
+
+import argparse
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.errors import EXIT_DONE, ConfigError, suggest
+
+if TYPE_CHECKING:
+    from su3d_bench.questions.model import Question
+
+ACTIONS = ("make", "show")
+PAPER = "paper"
+SOURCES = ("auto", "generated")
+N_SHOWN = 20
+MOST_CHARACTERS = 80
+
+
+def add_parser(verbs: Any) -> None:
+    parser = add_verb(
+        verbs,
+        "questions",
+        "Make sets of queries with known answers from ground truth, or show a set.",
+        (
+            "su3d-bench questions make --scenes 'rooms/*' --per-kind 40 --out queries.toml",
+            "su3d-bench questions show paper",
+        ),
+        call,
+    )
+    parser.add_argument("action", metavar="make|show")
+    parser.add_argument("file", nargs="?", help="show: a set (.toml, .csv, ScanRefer, Nr3D, SQA3D), or 'paper'")
+    parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="addresses or patterns such as 'rooms/*'")
+    parser.add_argument("--per-kind", type=int, metavar="N", help="at most N of each kind and scene (default: all)")
+    parser.add_argument(
+        "--source",
+        default="auto",
+        metavar="auto|generated",
+        help="auto: what the dataset itself knows, else generated from classes and boxes",
+    )
+    parser.add_argument("--colours", action="store_true", help="look up colours of objects in the scene's frames")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="make: where to write, .toml or .csv")
+
+
+def call(arguments: argparse.Namespace) -> int:
+    if arguments.action not in ACTIONS:
+        hint = suggest(arguments.action, ACTIONS) or f"; known: {', '.join(ACTIONS)}"
+        raise ConfigError(f"questions: unknown action '{arguments.action}'{hint}")
+    return _make(arguments) if arguments.action == "make" else _show(arguments)
+
+
+def _make(arguments: argparse.Namespace) -> int:
+    from su3d_bench.questions.files import write_questions
+
+    if arguments.file is not None:
+        raise ConfigError("questions make: takes no file; name it with --out")
+    if not arguments.scenes or arguments.out is None:
+        raise ConfigError("questions make: needs --scenes and --out FILE.toml")
+    if arguments.per_kind is not None and arguments.per_kind < 1:
+        raise ConfigError(f"questions make: --per-kind is {arguments.per_kind}; expected 1 or more")
+    if arguments.source not in SOURCES:
+        hint = suggest(arguments.source, SOURCES) or f"; known: {', '.join(SOURCES)}"
+        raise ConfigError(f"questions make: unknown source '{arguments.source}'{hint}")
+    made = _made(arguments)
+    write_questions(arguments.out, made)
+    remark(f"{len(made)} questions: {arguments.out}", quiet=arguments.quiet)
+    _answer_counts(made, arguments)
+    return EXIT_DONE
+
+
+def _made(arguments: argparse.Namespace) -> list[Question]:
+    from su3d_bench.planning import data_root, dataset_targets, expand_scenes
+    from su3d_bench.questions.making import questions_of
+    from su3d_bench.scene_run import Part, build_dataset
+
+    parts = {target: _part(target, Part) for target in dataset_targets(arguments.scenes)}
+    scenes, notes = expand_scenes(arguments.scenes, parts)
+    for note in notes:
+        remark(note, quiet=arguments.quiet)
+    made: list[Question] = []
+    datasets = {target: build_dataset(part, data_root()) for target, part in parts.items()}
+    for target, scene in scenes:
+        found = questions_of(
+            datasets[target],
+            scene,
+            per_kind=arguments.per_kind,
+            own=arguments.source == "auto",
+            colours=arguments.colours,
+        )
+        remark(f"{target}/{scene}: {len(found)} questions", quiet=arguments.quiet)
+        made += found
+    return made
+
+
+def _part(target: str, part_class: Any) -> Any:
+    from su3d_bench import registry
+
+    dataset_class = registry.load("dataset", target)
+    return part_class(target, str(dataset_class.name), dataset_class.Options().model_dump_json())
+
+
+def _show(arguments: argparse.Namespace) -> int:
+    from su3d_bench.questions.files import paper_queries, read_questions
+
+    if arguments.file is None:
+        raise ConfigError("questions show: name a file, or 'paper' for the queries that the paper's page shows")
+    found: Sequence[Question]
+    found = paper_queries() if arguments.file == PAPER else read_questions(Path(arguments.file), "")
+    if arguments.json:
+        answer_json([_row(one) for one in found])
+        return EXIT_DONE
+    _answer_counts(found, arguments)
+    for one in found[:N_SHOWN]:
+        answer("  ".join(str(value) for value in _printable_row(one)))
+    if len(found) > N_SHOWN:
+        answer(f"... and {len(found) - N_SHOWN} more; --json shows all")
+    return EXIT_DONE
+
+
+def _row(one: Question) -> dict[str, Any]:
+    return {
+        "id": one.id,
+        "scene": one.scene,
+        "kind": one.kind,
+        "text": one.text,
+        "answers": None if one.answers is None else list(one.answers),
+        "reply": one.reply,
+        "source": one.source,
+    }
+
+
+def _printable_row(one: Question) -> tuple[str, ...]:
+    from su3d_bench.plain_text import printable
+
+    ids = "unknown" if one.answers is None else " ".join(map(str, one.answers))
+    return printable(one.scene, 60), one.kind, printable(one.text, MOST_CHARACTERS), f"-> {ids}"
+
+
+def _answer_counts(found: Sequence[Question], arguments: argparse.Namespace) -> None:
+    counts = Counter(one.kind for one in found)
+    n_known = sum(one.is_known for one in found)
+    if arguments.json:
+        answer_json({"n": len(found), "n_known": n_known, "kinds": dict(counts)})
+        return
+    kinds = ", ".join(f"{n} {kind}" for kind, n in counts.items())
+    n_scenes = len({one.scene for one in found})
+    answer(f"{len(found)} questions on {n_scenes} scenes ({kinds}); {n_known} with known answers")

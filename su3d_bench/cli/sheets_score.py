@@ -1,0 +1,142 @@
+"""``su3d-bench sheets score``: what annotators' answers add up to."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.errors import EXIT_DONE, DataError
+
+if TYPE_CHECKING:
+    from su3d_bench.sheets.scores import Scores
+
+NAME = "score"
+SHOWN_FAULTS = 200  # lines; the number of all is told
+
+
+def add_parser(actions: Any) -> None:
+    parser = add_verb(
+        actions,
+        NAME,
+        "Check the answers of all annotators and add them up: accuracies, tests, agreement, people beside the truth.",
+        (
+            "su3d-bench sheets score ann.csv bob.xlsx --key key/key.json --out scores",
+            "su3d-bench sheets score answers/*.csv --sheet sheet/sheet.json --key key/key.json --json",
+        ),
+        call,
+    )
+    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="answers: .csv or .xlsx, in any mixture")
+    parser.add_argument("--key", type=Path, required=True, metavar="FILE", help="key.json of the set, or its folder")
+    parser.add_argument(
+        "--sheet",
+        type=Path,
+        metavar="FILE",
+        help="sheet.json of the set, or its folder (default: looked for beside the key and the answers)",
+    )
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="write scores.json, tables and a list of what to look at again there"
+    )
+
+
+def call(arguments: argparse.Namespace) -> int:
+    from dataclasses import asdict
+
+    from su3d_bench.reports.sheet_tables import sheet_tables
+    from su3d_bench.reports.table_formats import markdown
+    from su3d_bench.sheets.answers import read_answers
+    from su3d_bench.sheets.items import KEY_FILE, read_key, read_sheet
+    from su3d_bench.sheets.scores import score
+    from su3d_bench.sheets.validation import check_answers, check_key
+
+    key_file = arguments.key / KEY_FILE if arguments.key.is_dir() else arguments.key
+    sheet_file = _sheet_file(arguments, key_file)
+    sheet, key = read_sheet(sheet_file), read_key(key_file)
+    check_key(sheet, key)
+    rows, faults = [], []
+    for file in dict.fromkeys(arguments.files):
+        try:
+            rows += read_answers(file)
+        except DataError as error:
+            faults.append(str(error))
+    checked = check_answers(sheet, rows)
+    faults += checked.faults
+    if faults:
+        _refuse(faults, arguments)
+    if not checked.judgements:
+        raise DataError(f"{', '.join(map(str, arguments.files))}: no answer is in these files")
+    if checked.silent:
+        remark(f"no answers from {', '.join(checked.silent)}", quiet=arguments.quiet)
+    scores = score(sheet, key, checked.judgements, checked.silent)
+    content = asdict(scores)
+    if arguments.out is not None:
+        _write(arguments.out, scores, sheet_file.parent)
+        remark(f"written: {arguments.out}", quiet=arguments.quiet)
+    if arguments.json:
+        answer_json(content)
+    else:
+        answer(markdown(sheet_tables(content)) + _looks_line(scores))
+    return EXIT_DONE
+
+
+def _sheet_file(arguments: argparse.Namespace, key_file: Path) -> Path:
+    """``sheet.json`` as given, or the only one beside the key, the folder above it, and the answers."""
+    from su3d_bench.sheets.items import SHEET_FILE
+
+    if arguments.sheet is not None:
+        given: Path = arguments.sheet
+        return given / SHEET_FILE if given.is_dir() else given
+    folders = [key_file.parent, *sorted(key_file.parent.parent.glob("*/")), *(file.parent for file in arguments.files)]
+    found = [folder / SHEET_FILE for folder in folders if (folder / SHEET_FILE).is_file()]
+    if not found:
+        raise DataError(f"{SHEET_FILE} is neither beside the key nor beside the answers; give it with --sheet")
+    if len({one.resolve() for one in found}) > 1:
+        raise DataError(f"{found[0]} and {found[-1]} could both be meant; give one with --sheet")
+    return found[0]
+
+
+def _refuse(faults: Sequence[str], arguments: argparse.Namespace) -> None:
+    """Tell all faults, then raise."""
+    if arguments.json:
+        answer_json({"faults": list(faults)})
+    else:
+        for fault in faults[:SHOWN_FAULTS]:
+            remark(fault)
+        if len(faults) > SHOWN_FAULTS:
+            remark(f"... and {len(faults) - SHOWN_FAULTS} more")
+    n = len(faults)
+    raise DataError(f"answers: {n} fault{'s' if n != 1 else ''}, listed above; nothing was scored; mend them first")
+
+
+def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
+    import os
+    from dataclasses import asdict
+
+    from su3d_bench.reports.second_looks import second_looks_csv, second_looks_page
+    from su3d_bench.reports.sheet_tables import sheet_tables
+    from su3d_bench.reports.table_formats import csv_text, html_page, markdown
+    from su3d_bench.sheets.items import PICTURES
+    from su3d_bench.sheets.score_file import write_scores
+    from su3d_bench.store import make_folder, write_text
+
+    make_folder(folder)
+    content = asdict(scores)
+    write_scores(folder, scores)
+    tables = sheet_tables(content)
+    for name, text in (
+        ("tables.md", markdown(tables)),
+        ("tables.csv", csv_text(tables)),
+        ("tables.html", html_page(tables)),
+    ):
+        write_text(folder / name, text)
+    pictures = Path(os.path.relpath((sheet_folder / PICTURES).resolve(), folder.resolve())).as_posix()
+    write_text(folder / "second_looks.csv", second_looks_csv(content["second_looks"]))
+    write_text(folder / "second_looks.html", second_looks_page(content["second_looks"], pictures, scores.sheet_id))
+
+
+def _looks_line(scores: Scores) -> str:
+    n_disagree = sum(one.reason == "annotators disagree" for one in scores.second_looks)
+    n_against = len(scores.second_looks) - n_disagree
+    return f"\nTo look at again: {n_disagree} where annotators disagree, {n_against} against the ground truth.\n"

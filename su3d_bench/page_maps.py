@@ -1,0 +1,348 @@
+"""The maps of some runs for their page: what frames saw, what the truth is, what each map says, scene after scene."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench import registry
+from su3d_bench.attribution import EncoderOf
+from su3d_bench.config import Setting, Settings, resolve
+from su3d_bench.errors import Su3dError
+from su3d_bench.finished_run import FinishedRun
+from su3d_bench.metrics.labelling import (
+    candidate_classes,
+    class_index_of_ids,
+    classes_of_prediction,
+    cosines,
+    scored_classes,
+)
+from su3d_bench.metrics.scene_score import present
+from su3d_bench.plain_text import printable, printable_json
+from su3d_bench.planning import data_root, dataset_targets
+from su3d_bench.protocols import ProtocolRules, load_protocol
+from su3d_bench.reports.html_map import (
+    Cloud,
+    box_in_view,
+    colour_plane,
+    frame_cover,
+    index_plane,
+    nearest_classes,
+    nearest_colours,
+    pack_map,
+    point_owners,
+    thinned,
+)
+from su3d_bench.reports.scene_look import SceneLook, look_at
+from su3d_bench.scene_run import Part, build_dataset
+from su3d_bench.store import read_prediction
+from su3d_bench.types import DenseFeatures, Encoder, Frame, GroundTruth, Instances, Int64Array, Prediction
+
+QUERIES = (
+    "somewhere to sit",
+    "somewhere to sleep",
+    "a lamp that gives light",
+    "a plant",
+    "something to read",
+    "an electronic device",
+    "a place to store things",
+    "something to eat or drink from",
+)
+MOST_POINTS, LEAST_POINTS = 60_000, 3_000  # of one map: what a phone draws at once, what still shows a room
+BYTES_A_POINT = 6.0  # in the page, measured on the rooms: position, colour, owner and truth, deflated, in base64
+SHARE_OF_POINTS = 0.6  # of the page; the rest is for instances, pictures and tables
+THUMBNAILS = 14  # frames of a scene that are shown
+THUMBNAIL_WIDTH, JPEG_QUALITY = 240, 62
+MOST_VIEWS = 12  # frames of an instance that are named
+MOST_CAPTION = 240  # characters
+MapOfRun = tuple[int, FinishedRun, str, str]
+
+
+@dataclass(frozen=True)
+class PageMap:
+    """A map as the page holds it; ``content`` is empty and ``reason`` says why where it cannot be shown."""
+
+    run: int
+    scene: str
+    method: str
+    content: str
+    reason: str | None
+
+    def listed(self, scene: str) -> dict[str, Any]:
+        """What the page's list of maps says of it."""
+        return {"run": self.run, "scene": scene, "method": printable(self.method, 200), "reason": self.reason}
+
+
+@dataclass(frozen=True)
+class PageScene:
+    """Thumbnails of a scene: pairs of a frame's index and its JPEG in base64; ``remarks``: what is not known of it."""
+
+    scene: str
+    thumbnails: tuple[tuple[int, str], ...]
+    maps: tuple[PageMap, ...]
+    remarks: tuple[str, ...]
+
+    def listed(self) -> dict[str, Any]:
+        """The scene as the page holds it, its maps aside."""
+        return {"scene": self.scene, "thumbnails": dict(self.thumbnails), "remarks": list(self.remarks)}
+
+
+def points_of_each(n_maps: int, most_bytes: int) -> int:
+    """How many points a map may have for a page of ``most_bytes``.
+
+    >>> points_of_each(2, 30_000_000), points_of_each(160, 30_000_000)
+    (60000, 18750)
+    """
+    share = int(SHARE_OF_POINTS * most_bytes / BYTES_A_POINT / max(1, n_maps))
+    return min(MOST_POINTS, max(LEAST_POINTS, share))
+
+
+def page_scenes(
+    maps: Sequence[MapOfRun],
+    encoder_of: EncoderOf,
+    queries: Sequence[str],
+    most_points: int,
+    progress: Callable[[str], None] = lambda line: None,
+) -> Iterator[PageScene]:
+    """The scenes of ``maps`` in their order. What fails of a map is a reason on the page, never a page without it."""
+    known = _Known(encoder_of, tuple(queries))
+    for scene in dict.fromkeys(one[2] for one in maps):
+        progress(f"{printable(scene, 120)}: maps")
+        yield _Scene(scene, [one for one in maps if one[2] == scene], known).page(most_points)
+
+
+class _Known:
+    """Encoders of the runs and the features of the queries under each, made once."""
+
+    def __init__(self, encoder_of: EncoderOf, queries: tuple[str, ...]) -> None:
+        self.queries = queries
+        self._encoder_of = encoder_of
+        self._encoders: dict[Path, tuple[Encoder, Any]] = {}
+
+    def encoder(self, run: FinishedRun) -> tuple[Encoder, Any]:
+        path = run.folder.path
+        if path not in self._encoders:
+            encoder = self._encoder_of(run.folder)
+            self._encoders[path] = encoder, encoder.encode_texts(list(self.queries))
+        return self._encoders[path]
+
+
+class _Scene:
+    """One scene under all methods of all runs."""
+
+    def __init__(self, scene: str, maps: Sequence[MapOfRun], known: _Known) -> None:
+        self._scene = scene
+        self._maps = maps
+        self._known = known
+        self._remarks: list[str] = []
+
+    def page(self, most_points: int) -> PageScene:
+        read = {key[:1] + key[3:]: self._read(key) for key in self._maps}
+        frames = self._thumbnail_frames([one for one in read.values() if isinstance(one, Instances)])
+        made = []
+        for index, run, scene, method in self._maps:
+            prediction = read[index, method]
+            if isinstance(prediction, str):
+                made.append(PageMap(index, scene, method, "", prediction))
+                continue
+            made.append(PageMap(index, scene, method, self._pack(run, prediction, frames, most_points), None))
+        thumbnails = tuple((index, _jpeg(frame)) for index, frame in frames.items())
+        remarks = tuple(printable(line) for line in dict.fromkeys(self._remarks))
+        return PageScene(printable(self._scene, 200), thumbnails, tuple(made), remarks)
+
+    def _read(self, key: MapOfRun) -> Prediction | str:
+        _, run, scene, method = key
+        try:
+            return read_prediction(run.folder.job(scene, method).prediction)
+        except Su3dError as error:
+            return printable(str(error))
+
+    @cached_property
+    def _dataset(self) -> Any:
+        """The dataset where its data are those of the runs, else None."""
+        run = self._maps[0][1]
+        settings = Settings(tuple(Setting(path, value, "run.toml") for path, value in run.settings.items()))
+        name, _, scene = self._scene.partition("/")
+        try:
+            for target in dataset_targets([str(each) for each in run.settings.get(("scenes",), ())]):
+                cls = registry.load("dataset", target)
+                if cls.name != name:
+                    continue
+                options = resolve(settings, ("dataset", name), cls.Options)
+                dataset = build_dataset(Part(target, name, options.model_dump_json()), data_root())
+                if dataset.digest(scene) == run.data_digests.get(self._scene):
+                    return dataset
+            self._remarks.append("its data here are not those of the run: no colours, views and truth")
+        except Su3dError as error:
+            self._remarks.append(f"no colours, views and truth: {error}")
+        return None
+
+    @cached_property
+    def _look(self) -> SceneLook | None:
+        if self._dataset is None:
+            return None
+        try:
+            return look_at(self._dataset, self._scene.partition("/")[2])
+        except Su3dError as error:
+            self._remarks.append(f"no colours: {error}")
+            return None
+
+    def _thumbnail_frames(self, maps: Sequence[Instances]) -> dict[int, Frame]:
+        if self._dataset is None:
+            return {}
+        chosen = frame_cover([_frames_of(one, k) for one in maps for k in range(len(one))], THUMBNAILS)
+        found = {}
+        try:
+            frames = self._dataset.frames(self._scene.partition("/")[2], 1)
+            for index in sorted(chosen):
+                if 0 <= index < len(frames) and (frame := frames[index]).index == index:
+                    found[index] = frame
+        except Su3dError as error:
+            self._remarks.append(f"no views: {error}")
+        return found
+
+    def _rules(self, run: FinishedRun) -> ProtocolRules | None:
+        """The rules whose classes the map is shown in: of points before those of instances."""
+        rules = [load_protocol(name) for name in run.protocols]
+        fitting = [one for one in rules if one.kind in ("semantic", "instance") and one.classes]
+        fitting = [one for one in fitting if one.class_agnostic is None]
+        fitting = [one for one in fitting if one.version == run.protocols[one.name][0]]
+        return min(fitting, key=lambda one: one.kind != "semantic", default=None)
+
+    def _truth(self, rules: ProtocolRules) -> GroundTruth | None:
+        if self._dataset is None:
+            return None
+        try:
+            truth: GroundTruth = self._dataset.ground_truth(self._scene.partition("/")[2], rules.ground_truth)
+        except Su3dError as error:
+            self._remarks.append(f"no truth: {error}")
+            return None
+        return truth
+
+    def _pack(self, run: FinishedRun, prediction: Prediction, frames: Mapping[int, Frame], most_points: int) -> str:
+        cloud = thinned(prediction.points, most_points)
+        rules = self._rules(run)
+        truth = None if rules is None else self._truth(rules)
+        planes: dict[str, Any] = {"owner": index_plane(point_owners(prediction, cloud.rows))}
+        look = self._look
+        colours = None if look is None else nearest_colours(cloud.points, look.seen, look.seen_rgb)
+        if colours is not None:
+            planes["colour"] = colour_plane(colours)
+        about: dict[str, Any] = {"protocol": None, "classes": [], "instances": [], "queries": []}
+        classes: Int64Array | None = None
+        if rules is not None:
+            about |= {"protocol": rules.name, "classes": [entry.name for entry in rules.classes]}
+            of_truth = None if truth is None else class_index_of_ids(rules, truth.semantic)
+            if truth is not None and of_truth is not None:
+                of_truth = np.where((of_truth >= 0) & scored_classes(rules)[of_truth], of_truth, -1)
+                planes["truth"] = nearest_classes(cloud.points, truth.points, of_truth).astype(np.uint16)
+            classes = self._classes(run, rules, prediction, of_truth, cloud)
+        if isinstance(prediction, DenseFeatures):
+            if classes is not None:
+                planes["class"] = index_plane(classes)
+        else:
+            similarity = self._similarity(run, prediction)
+            about["queries"] = [] if similarity is None else list(self._known.queries)
+            about["instances"] = [
+                _instance_data(prediction, k, classes, similarity, frames) for k in range(_n_instances(prediction))
+            ]
+        return pack_map(cloud, planes, printable_json(about))
+
+    def _classes(
+        self, run: FinishedRun, rules: ProtocolRules, prediction: Prediction, truth: Int64Array | None, cloud: Cloud
+    ) -> Int64Array | None:
+        """The class of each instance, or of each drawn point of dense features."""
+        if isinstance(prediction, DenseFeatures):
+            prediction = DenseFeatures(cloud.points, np.asarray(prediction.features[cloud.rows]))
+        is_present = scored_classes(rules) if truth is None else present(truth, len(rules.classes))
+        try:
+            candidates = candidate_classes(rules, is_present & scored_classes(rules))
+            return classes_of_prediction(rules, prediction, self._encoder(run, prediction), candidates)
+        except Su3dError as error:
+            self._remarks.append(f"no classes: {error}")
+            return None
+
+    def _encoder(self, run: FinishedRun, prediction: Prediction) -> Encoder | None:
+        labels = getattr(prediction, "labels", None)
+        return None if labels is not None and all(labels) else self._known.encoder(run)[0]
+
+    def _similarity(self, run: FinishedRun, prediction: Prediction) -> Any:
+        """The cosine (K, Q) of each instance with each query; None where the map has no features."""
+        features = prediction.features
+        if features is None or not len(features) or not self._known.queries:
+            return None
+        try:
+            texts = self._known.encoder(run)[1]
+        except Su3dError as error:
+            self._remarks.append(f"no similarities: {error}")
+            return None
+        return cosines(features, texts) if texts.shape[1] == features.shape[1] else None
+
+
+def _n_instances(prediction: Prediction) -> int:
+    return len(prediction) if isinstance(prediction, Instances) else len(prediction.features)
+
+
+def _frames_of(instances: Instances, k: int) -> list[int]:
+    rows = (
+        instances.views[instances.view_indptr[k] : instances.view_indptr[k + 1]] if len(instances.view_indptr) else []
+    )
+    return list(dict.fromkeys(int(frame) for frame, _ in rows))
+
+
+def _instance_data(
+    prediction: Prediction, k: int, classes: Int64Array | None, similarity: Any, frames: Mapping[int, Frame]
+) -> dict[str, Any]:
+    """An instance: n points, c class, s similarities in thousandths, and of ``Instances`` its name, score and views."""
+    found: dict[str, Any] = {}
+    if classes is not None:
+        found["class"] = int(classes[k])
+    if similarity is not None:
+        found["similarity"] = [round(1000 * float(value)) for value in similarity[k]]
+    if not isinstance(prediction, Instances):
+        assert not isinstance(prediction, DenseFeatures)
+        return {"id": k, "points": int((prediction.instance == k).sum()), **found}
+    views = _frames_of(prediction, k)
+    own = prediction.points[prediction.mask(k)]
+    found |= {
+        "id": int(prediction.ids[k]) if len(prediction.ids) else k,
+        "name": printable((prediction.labels or prediction.names)[k] or prediction.names[k], 80),
+        "caption": printable(prediction.captions[k], MOST_CAPTION),
+        "score": round(float(prediction.scores[k]), 4),
+        "points": len(own),
+        "n_views": len(views),
+        "views": views[:MOST_VIEWS],
+    }
+    if len(own):
+        low, high = own.min(axis=0), own.max(axis=0)
+        found["centre"] = [round(float(value), 3) for value in (low + high) / 2]
+        found["size"] = [round(float(value), 3) for value in high - low]
+    boxes = {index: _box(own, frames[index]) for index in views if index in frames}
+    seen = {index: box for index, box in boxes.items() if box is not None}
+    if seen:
+        best = max(
+            seen, key=lambda index: ((seen[index][2] - seen[index][0]) * (seen[index][3] - seen[index][1]), -index)
+        )
+        found |= {"view": best, "box": seen[best]}
+    return found
+
+
+def _box(points: Any, frame: Frame) -> list[float] | None:
+    height, width = frame.depth_m.shape
+    return box_in_view(points[:: max(1, len(points) // 2000)], frame.camera_to_world, frame.intrinsics, width, height)
+
+
+def _jpeg(frame: Frame) -> str:
+    import cv2
+
+    height, width = frame.depth_m.shape
+    size = (THUMBNAIL_WIDTH, max(1, round(THUMBNAIL_WIDTH * height / width)))
+    small = cv2.resize(frame.rgb, size, interpolation=cv2.INTER_AREA)
+    _, encoded = cv2.imencode(".jpg", small[:, :, ::-1], [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    return base64.b64encode(encoded.tobytes()).decode("ascii")

@@ -1,0 +1,340 @@
+"""What is put before people, before it is shuffled and drawn: one draft for all schemes that give the same."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.errors import ConfigError
+from su3d_bench.metrics.covered_objects import Covered, covered_objects
+from su3d_bench.metrics.question_truths import AskedText, GivenAnswer, ReasoningTruth, TrueAnswer
+from su3d_bench.metrics.score_questions import (
+    are_objects_right,
+    is_answer_right,
+    judge_merging,
+    judge_retrieval,
+    labels_n,
+)
+from su3d_bench.opensu3d.retrieval import rank_all
+from su3d_bench.plain_text import printable
+from su3d_bench.protocols import ProtocolRules
+from su3d_bench.questions.generator import chosen, generate
+from su3d_bench.questions.known_objects import known_objects
+from su3d_bench.questions.model import KINDS, REASONING, Question, question_id
+from su3d_bench.questions.refined import refined_names
+from su3d_bench.questions.truths import own_questions, question_truth
+from su3d_bench.reasoning.answers import Answer
+from su3d_bench.reasoning.named_objects import nearest_by
+from su3d_bench.reasoning.scene_map import map_of
+from su3d_bench.reasoning.solver import Solver
+from su3d_bench.sheets.items import RIGHT, WRONG
+from su3d_bench.sheets.run_source import RunSource
+from su3d_bench.types import Encoder, Float64Array, GroundTruth, Instances
+
+MOST_TEXT = 1000  # characters of a query, a label or an answer that a sheet shows
+NO_LABEL = "(no label)"
+
+
+@dataclass(frozen=True)
+class Draft:
+    """An item without number and picture. ``rows`` of the map of ``methods[0]`` are outlined, ``others`` drawn too.
+
+    ``title``: lines of the picture; ``text``: what the sheet shows; ``similarity`` (K,) of the map's instances to the
+    query, ``names`` (K) as the answer calls them.
+    """
+
+    scene: str
+    methods: tuple[str, ...]
+    instance_ids: tuple[int, ...]
+    rows: tuple[int, ...]
+    title: tuple[str, ...]
+    text: str
+    asks: tuple[str, ...]
+    question_id: str = ""
+    question_kind: str = ""
+    stands_for: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    automatic: Mapping[str, str] = field(default_factory=dict)
+    similarity: Float64Array | None = None
+    others: tuple[int, ...] = ()
+    names: tuple[str, ...] = ()
+
+
+def judged(is_right: bool) -> str:
+    return RIGHT if is_right else WRONG
+
+
+def questions_of(
+    source: RunSource, scene: str, given: Sequence[Question] | None, per_kind: int | None
+) -> list[Question]:
+    """The questions of four kinds to a scene: those ``given``, else the ones that its ground truth answers."""
+    if given is None:
+        rules = source.rules(scene, "retrieval")
+        truth = source.truth(scene, rules)
+        if rules is None or truth is None:
+            raise ConfigError(
+                f"{printable(scene, 100)}: has no ground truth that questions could be made from; name a file with "
+                "--questions FILE, or --questions paper"
+            )
+        dataset, name = source.dataset(scene), scene.partition("/")[2]
+        if rules.questions == "dataset":
+            given = own_questions(dataset, name)
+        else:
+            assert rules.min_region_size is not None
+            given = generate(scene, known_objects(truth, rules.min_region_size))
+    mine = [one for one in given if one.scene == scene]
+    return [one for kind in KINDS for one in chosen([each for each in mine if each.kind == kind], per_kind)]
+
+
+def retrieval_drafts(source: RunSource, scene: str, questions: Sequence[Question], encoder: Encoder) -> list[Draft]:
+    """For each question one draft for every instance that some method ranks first, with all methods that do."""
+    rules = source.rules(scene, "retrieval")
+    truth = source.truth(scene, rules)
+    texts = [one.text for one in questions]
+    maps = {method: source.instances(scene, method) for method in source.methods}
+    rankings = {method: rank_all(found, texts, encoder) for method, found in maps.items() if len(found)}
+    objects = {method: _covered(rules, truth, maps[method]) for method in rankings}
+    drafts = []
+    for place, question in enumerate(questions):
+        groups: dict[bytes, list[str]] = {}
+        for method, ranked in rankings.items():
+            groups.setdefault(mask_digest(maps[method], [int(ranked[place].order[0])]), []).append(method)
+        for methods in groups.values():
+            first = rankings[methods[0]][place]
+            row, covered = int(first.order[0]), objects[methods[0]]
+            automatic = {}
+            if covered is not None and question.is_known:
+                asked = AskedText(question.kind, question.text, question.answers or ())
+                is_right = judge_retrieval(covered.main_object, np.array([row]), [asked])
+                automatic = {"retrieval": judged(bool(is_right[0]))}
+            drafts.append(
+                Draft(
+                    scene=scene,
+                    methods=tuple(methods),
+                    instance_ids=tuple(_id(maps[one], int(rankings[one][place].order[0])) for one in methods),
+                    rows=(row,),
+                    title=(f"Is this: {question.text}?",),
+                    text=printable(question.text, MOST_TEXT),
+                    asks=("retrieval",),
+                    question_id=question.id,
+                    question_kind=question.kind,
+                    automatic=automatic,
+                    similarity=first.similarity,
+                )
+            )
+    return drafts
+
+
+def annotation_drafts(source: RunSource, scene: str, n_most: int, random: np.random.Generator) -> list[Draft]:
+    """At most ``n_most`` instances a scene, drawn with ``random``, each with its labels n and n' in drawn order."""
+    rules = source.rules(scene, "annotation")
+    truth = source.truth(scene, rules)
+    found: dict[bytes, Draft] = {}
+    for method in source.methods:
+        instances = source.instances(scene, method)
+        refined = refined_names(source.run.folder.job(scene, method), instances)
+        judge = _annotation_judge(source, scene, rules, truth, instances)
+        labels = [labels_n(instances), None if refined is None else refined.names]
+        for row in range(len(instances)):
+            names = [printable(one[row], MOST_TEXT) or NO_LABEL for one in labels if one is not None]
+            key = mask_digest(instances, [row]) + "\0".join(names).encode()
+            if key in found:
+                found[key] = _also(found[key], method, _id(instances, row))
+            else:
+                found[key] = _annotation_draft(scene, method, instances, row, names, judge(row, names))
+    drafts = list(found.values())
+    kept = sorted(random.permutation(len(drafts))[:n_most].tolist())
+    return [_with_labels_shuffled(drafts[k], random) for k in kept]
+
+
+def _annotation_draft(
+    scene: str, method: str, instances: Instances, row: int, names: list[str], automatic: Mapping[str, str]
+) -> Draft:
+    return Draft(
+        scene=scene,
+        methods=(method,),
+        instance_ids=(_id(instances, row),),
+        rows=(row,),
+        title=tuple(names),
+        text="",
+        asks=(),
+        automatic=automatic,
+    )
+
+
+def _with_labels_shuffled(draft: Draft, random: np.random.Generator) -> Draft:
+    """The draft with label n and label n' as labels 1 and 2 in drawn order; as one where they are equal."""
+    meant: dict[str, list[str]] = {}
+    for name, what in zip(draft.title, ("n", "n'"), strict=False):
+        meant.setdefault(name, []).append(what)
+    order = random.permutation(len(meant))
+    names = [list(meant)[k] for k in order]
+    stands_for = {f"label {k + 1}": tuple(meant[name]) for k, name in enumerate(names)}
+    automatic = {ask: draft.automatic[what[0]] for ask, what in stands_for.items() if what[0] in draft.automatic}
+    if "merging" in draft.automatic:
+        automatic["merging"] = draft.automatic["merging"]
+    lines = tuple(f"Label {k + 1}: {name}" for k, name in enumerate(names))
+    asks = (*stands_for, "merging")
+    return Draft(
+        scene=draft.scene,
+        methods=draft.methods,
+        instance_ids=draft.instance_ids,
+        rows=draft.rows,
+        title=lines,
+        text="\n".join(lines),
+        asks=asks,
+        stands_for=stands_for,
+        automatic=automatic,
+    )
+
+
+Judge = Callable[[int, Sequence[str]], Mapping[str, str]]
+
+
+def _annotation_judge(
+    source: RunSource, scene: str, rules: ProtocolRules | None, truth: GroundTruth | None, instances: Instances
+) -> Judge:
+    """What the truth says of an instance and its labels: ``n``, ``n'`` and ``merging``; nothing where it is silent."""
+    covered = _covered(rules, truth, instances)
+    if covered is None or rules is None or truth is None or rules.merging is None:
+        return lambda row, names: {}
+    known: Any = question_truth(rules, source.dataset(scene), scene.partition("/")[2], truth)
+    merges, main = judge_merging(rules.merging, covered), covered.main_object
+
+    def judge(row: int, names: Sequence[str]) -> Mapping[str, str]:
+        if int(main[row]) not in known.object_ids:
+            return {}
+        labels = {
+            what: judged(known.is_called(name, int(main[row]))) for what, name in zip(("n", "n'"), names, strict=False)
+        }
+        return {**labels, "merging": merges[row]}
+
+    return judge
+
+
+def reasoning_drafts(
+    source: RunSource, scene: str, given: Sequence[Question] | None, per_kind: int, encoder: Encoder | None
+) -> list[Draft]:
+    """The built-in solver's answers about each map, one draft for all maps on which it says the same.
+
+    Asked are the questions of kind ``reasoning`` that are ``given``, else ``per_kind`` of each template, made from the
+    ground truth.
+    """
+    rules = source.rules(scene, "reasoning")
+    truth = source.truth(scene, rules)
+    known: Sequence[TrueAnswer] = ()
+    if given is None:
+        if rules is None or truth is None:
+            raise ConfigError(
+                f"{printable(scene, 100)}: has no ground truth that questions could be made from; name a file of "
+                "questions of kind reasoning with --questions FILE"
+            )
+        with_fewer = rules.model_copy(update={"per_kind": per_kind})
+        made: Any = question_truth(with_fewer, source.dataset(scene), scene.partition("/")[2], truth)
+        assert isinstance(made, ReasoningTruth)
+        known = made.asked
+        texts = [one.text for one in known]
+    else:
+        texts = [one.text for one in given if one.scene == scene and one.kind == REASONING]
+    groups: dict[bytes, Draft] = {}
+    for method in source.methods:
+        instances = source.instances(scene, method)
+        refined = refined_names(source.run.folder.job(scene, method), instances)
+        a_map = map_of(instances, None if refined is None else refined.names)
+        solver = Solver(a_map, None, None if encoder is None else nearest_by(encoder))
+        covered = _covered(rules, truth, instances)
+        row_of = {one.id: one.row for one in a_map.objects}
+        names = [""] * len(instances)
+        for one in a_map.objects:
+            names[one.row] = one.shown
+        for place, text in enumerate(texts):
+            answer = solver.answer(text)
+            rows = tuple(row_of[one] for one in answer.object_ids)
+            others = tuple(row_of[one] for one in answer.reference_ids)
+            key = text.encode() + b"\0" + answer.text.encode() + mask_digest(instances, rows)
+            if key in groups:
+                groups[key] = _also(groups[key], method, _only_id(instances, rows))
+                continue
+            automatic = {}
+            if known and covered is not None and rules is not None:
+                automatic = _judged_answer(rules, known[place], answer, row_of, covered)
+            kind = known[place].kind if known else REASONING
+            groups[key] = _reasoning_draft(
+                scene, method, text, kind, answer, rows, others, tuple(names), automatic, _only_id(instances, rows)
+            )
+    return list(groups.values())
+
+
+def _reasoning_draft(
+    scene: str,
+    method: str,
+    text: str,
+    kind: str,
+    answer: Answer,
+    rows: tuple[int, ...],
+    others: tuple[int, ...],
+    names: tuple[str, ...],
+    automatic: Mapping[str, str],
+    instance_id: int,
+) -> Draft:
+    asks = ("answer", "objects") if rows else ("answer",)
+    return Draft(
+        scene=scene,
+        methods=(method,),
+        instance_ids=(instance_id,),
+        rows=rows,
+        title=(text, f"Answer: {answer.text}"),
+        text=f"{printable(text, MOST_TEXT)}\nAnswer: {printable(answer.text, MOST_TEXT)}",
+        asks=asks,
+        question_id=question_id(scene, REASONING, text),
+        question_kind=kind,
+        automatic={ask: value for ask, value in automatic.items() if ask in asks},
+        others=others,
+        names=names,
+    )
+
+
+def _judged_answer(
+    rules: ProtocolRules, true: TrueAnswer, answer: Answer, row_of: Mapping[int, int], covered: Covered
+) -> dict[str, str]:
+    assert rules.answers is not None
+    rows = np.array([row_of[one] for one in answer.object_ids], np.int64)
+    given = GivenAnswer(answer.value, rows, answer.is_settled)
+    main = covered.main_object
+    found = {"answer": judged(is_answer_right(rules.answers, true, given, main))}
+    if true.object_ids:
+        found["objects"] = judged(are_objects_right(true, given, main))
+    return found
+
+
+def mask_digest(instances: Instances, rows: Sequence[int]) -> bytes:
+    """A key of where the instances lie, so that equal masks of several maps are known as one."""
+    total = hashlib.sha256()
+    for row in rows:
+        total.update(np.ascontiguousarray(instances.points[instances.mask(row)]).tobytes())
+        total.update(b"|")
+    return total.digest()
+
+
+def _also(draft: Draft, method: str, instance_id: int) -> Draft:
+    """The draft, said by one more method; that of a method said twice stays as it is."""
+    from dataclasses import replace
+
+    if method in draft.methods:
+        return draft
+    return replace(draft, methods=(*draft.methods, method), instance_ids=(*draft.instance_ids, instance_id))
+
+
+def _id(instances: Instances, row: int) -> int:
+    return int(instances.ids[row]) if len(instances.ids) else row
+
+
+def _only_id(instances: Instances, rows: Sequence[int]) -> int:
+    return _id(instances, rows[0]) if len(rows) == 1 else -1
+
+
+def _covered(rules: ProtocolRules | None, truth: GroundTruth | None, instances: Instances) -> Covered | None:
+    return None if rules is None or truth is None else covered_objects(rules.transfer, truth, instances)
