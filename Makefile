@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check install -c constraints.txt
 DEMO_SCENES := rooms/living0 rooms/bedroom0 rooms/kitchen0 rooms/office0
 
-.PHONY: demo test bench reference lint clean
+.PHONY: demo test bench bench-methods reference lint clean
 
 demo: $(VENV)/core
 	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods opensu3d oracle --protocols rooms-semantic rooms-instance --out runs/demo
@@ -17,6 +17,13 @@ bench: $(VENV)/test
 	@mkdir -p build
 	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-group-by=group --benchmark-columns=min,median,rounds --benchmark-json=build/bench.json
 	$(BIN)/python benchmarks/write_performance.py build/bench.json docs/performance.md
+
+# All methods on the demo rooms, and along a corridor in which every map grows: half an hour on two cores.
+CORRIDOR_METHODS := opensu3d sam3d@incremental conceptgraphs conceptgraphs-detector conceptfusion conceptfusion-sam openmask3d
+bench-methods: $(VENV)/test
+	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods all --protocols rooms-semantic rooms-instance --no-pictures --out runs/bench-rooms
+	$(BIN)/su3d-bench run --scenes benchmarks/corridor.py:Corridor/400m --profile oracle --stride 1 --methods $(CORRIDOR_METHODS) --no-pictures --out runs/bench-corridor
+	$(BIN)/python benchmarks/write_performance.py build/bench.json docs/performance.md runs/bench-rooms runs/bench-corridor
 
 # Learns the reference that .ci/run holds the demo run against; commit it with the change that moves the numbers.
 reference: demo

@@ -14,12 +14,13 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.plain_text import printable
-from su3d_bench.types import BoolArray, Float64Array, UInt8Array
+from su3d_bench.types import BoolArray, UInt8Array
 
 WIDTH, MARGIN, CAPTION = 960, 10, 24
 PHOTO_WIDTH, ZOOM_WIDTH = 560, 370
-TOP_HEIGHT, LOW_HEIGHT = 420, 300
+TOP_HEIGHT, LOW_HEIGHT = 420, 320
 TITLE_SIZE, TITLE_LINE, MOST_TITLE_LINES = 25, 33, 3
+MOST_TAGS, MOST_TAG_TEXT, TAG_LINE = 8, 28, 19
 OUTLINE, HALO = (255, 64, 200), (255, 255, 255)  # a pink that neither heat scale has, on white
 INK, GREY, PAPER, PANEL = (26, 26, 26), (96, 96, 96), (255, 255, 255), (244, 244, 242)
 ZOOM_GROWTH = 1.7  # sides of the part that is shown, as a multiple of those of the object
@@ -27,12 +28,30 @@ PNG_COLOURS = 160  # of the palette; more make the file larger and the picture n
 
 
 @dataclass(frozen=True)
+class Tag:
+    """A name at a place of a picture."""
+
+    text: str
+    x: float
+    y: float
+    colour: tuple[int, int, int]
+
+
+@dataclass(frozen=True)
 class Panel:
-    """A picture (h, w, 3) with where the object is in it (h, w), and the words above it."""
+    """A picture (h, w, 3) with where the object is in it (h, w), and the words above it.
+
+    ``tags``: names in it, at shares of its width and height. ``ring``: around the object, centre and radius in shares
+    of width, height and width; ``eye``: where the camera of the photograph was, in shares.
+    """
 
     title: str
     picture: UInt8Array
     mask: BoolArray | None = None
+    tags: tuple[Tag, ...] = ()
+    ring: tuple[float, float, float] | None = None
+    eye: tuple[float, float] | None = None
+    line: int = 3
 
 
 @dataclass(frozen=True)
@@ -108,30 +127,25 @@ def outlined(picture: UInt8Array, mask: BoolArray | None, size: tuple[int, int],
     return result
 
 
-def marked_place(picture: UInt8Array, mask: BoolArray, camera_xy: Float64Array | None) -> UInt8Array:
-    """A view from above with a ring around the object, and the way from where the photograph was taken."""
+def _draw_ring(shown: UInt8Array, ring: tuple[float, float, float], eye: tuple[float, float] | None) -> None:
+    """A ring around the object, and the way to it from where the photograph was taken."""
     import cv2
 
-    marked = picture.copy()
-    rows, columns = np.nonzero(mask)
-    if not len(rows):
-        return marked
-    middle = np.array([columns.mean(), rows.mean()])
-    radius = max(14, round(0.75 * max(np.ptp(columns), np.ptp(rows))))
-    if camera_xy is not None:
-        away = middle - camera_xy
+    size = np.array([shown.shape[1], shown.shape[0]])
+    middle, radius = np.array(ring[:2]) * size, max(14, round(ring[2] * size[0]))
+    if eye is not None:
+        start = np.array(eye) * size
+        away = middle - start
         length = float(np.linalg.norm(away))
-        start, end = camera_xy, middle - away / max(length, 1.0) * min(radius + 3, length)
-        ends = [tuple(int(v) for v in np.rint(one)) for one in (start, end)]
+        end = middle - away / max(length, 1.0) * min(radius + 3, length)
+        first, last = (tuple(int(v) for v in np.rint(one)) for one in (start, end))
         for shade, width in ((HALO, 5), (INK, 2)):
-            cv2.arrowedLine(
-                marked, ends[0], ends[1], shade, width, cv2.LINE_AA, tipLength=min(0.3, 12 / max(length, 1))
-            )
-        cv2.circle(marked, ends[0], 5, INK, -1, cv2.LINE_AA)
+            tip = min(0.3, 12 / max(length, 1))
+            cv2.arrowedLine(shown, first, last, shade, width, cv2.LINE_AA, tipLength=tip)
+        cv2.circle(shown, first, 5, INK, -1, cv2.LINE_AA)
     centre = (round(middle[0]), round(middle[1]))
-    cv2.circle(marked, centre, radius, HALO, 6, cv2.LINE_AA)
-    cv2.circle(marked, centre, radius, OUTLINE, 3, cv2.LINE_AA)
-    return marked
+    cv2.circle(shown, centre, radius, HALO, 6, cv2.LINE_AA)
+    cv2.circle(shown, centre, radius, OUTLINE, 3, cv2.LINE_AA)
 
 
 def png_bytes(picture: UInt8Array) -> bytes:
@@ -148,8 +162,34 @@ def _place(page: Any, draw: Any, panel: Panel, at: tuple[int, int], size: tuple[
     from PIL import Image
 
     _write(draw, (at[0], at[1] + 3), panel.title, 14, GREY)
-    shown = outlined(panel.picture, panel.mask, size)
-    page.paste(Image.fromarray(shown), (at[0], at[1] + CAPTION))
+    height, width = panel.picture.shape[:2]
+    scale = min(size[0] / width, size[1] / height)
+    fitted = (max(1, round(width * scale)), max(1, round(height * scale)))
+    shown = outlined(panel.picture, panel.mask, fitted, panel.line)
+    if panel.ring is not None:
+        _draw_ring(shown, panel.ring, panel.eye)
+    corner = (at[0] + (size[0] - fitted[0]) // 2, at[1] + CAPTION + (size[1] - fitted[1]) // 2)
+    page.paste(Image.fromarray(shown), corner)
+    _draw_tags(draw, panel.tags, corner, fitted)
+
+
+def _draw_tags(draw: Any, tags: tuple[Tag, ...], at: tuple[int, int], size: tuple[int, int]) -> None:
+    """Names at their places, moved down where they would cover each other."""
+    taken: list[tuple[float, float, float]] = []
+    for tag in tags[:MOST_TAGS]:
+        text = printable(tag.text, MOST_TAG_TEXT)
+        wide = 8.0 * len(text) + 8
+        x = float(np.clip(tag.x * size[0] - wide / 2, 2, max(2.0, size[0] - wide - 2)))
+        y = float(np.clip(tag.y * size[1] - 30, 2, size[1] - TAG_LINE - 2))
+        while any(abs(y - other[1]) < TAG_LINE and x < other[0] + other[2] and other[0] < x + wide for other in taken):
+            y += TAG_LINE
+        taken.append((x, y, wide))
+        if y > size[1] - TAG_LINE:
+            continue
+        place = (at[0] + round(x), at[1] + round(y))
+        box = draw.textbbox(place, text, font=_font(13, False))
+        draw.rectangle((box[0] - 3, box[1] - 2, box[2] + 3, box[3] + 2), fill=PAPER, outline=tag.colour)
+        _write(draw, place, text, 13, tag.colour)
 
 
 def _draw_scale(page: Any, draw: Any, scale: UInt8Array, at: tuple[int, int]) -> None:

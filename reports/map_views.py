@@ -8,23 +8,42 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.reports.pictures import DRAWN_SPACING_M, NO_INSTANCE, Cloud, thinned
+from su3d_bench.reports.reasoning_picture import project
 from su3d_bench.reports.render import OVERSAMPLING, Camera, View, colour, render, room_bounds, view_cameras
-from su3d_bench.types import BoolArray, Instances, Int32Array, Int64Array, UInt8Array
+from su3d_bench.types import BoolArray, Float64Array, Instances, Int32Array, Int64Array, UInt8Array
 
 PALE_GREY = 232
+RENDERED = 1.5  # times the size of the picture, for the room fills only a part of a view from a corner
+BORDER = 4  # pixels around what is drawn
 
 
 @dataclass(frozen=True)
 class MapView:
-    """One view of a map; ``point`` of ``view`` are rows of the drawn points, ``camera`` is at twice the size."""
+    """One view of a map; ``point`` of ``view`` are rows of the drawn points, ``camera`` is at twice the size.
+
+    Of it the part ``box`` (x0, y0, x1, y1 in pixels of the picture) is shown.
+    """
 
     camera: Camera
     view: View
+    box: tuple[int, int, int, int]
+
+    @property
+    def part(self) -> tuple[slice, slice]:
+        x0, y0, x1, y1 = self.box
+        return slice(y0, y1), slice(x0, x1)
 
     def shows(self, is_member: BoolArray) -> BoolArray:
         """Where the view shows a point of those that ``is_member`` marks: (h, w) of the picture."""
         seen = np.append(is_member, False)[self.view.point]
-        return seen[::OVERSAMPLING, ::OVERSAMPLING] | seen[1::OVERSAMPLING, 1::OVERSAMPLING]
+        small: BoolArray = seen[::OVERSAMPLING, ::OVERSAMPLING] | seen[1::OVERSAMPLING, 1::OVERSAMPLING]
+        return small[self.part]
+
+    def project(self, points: Float64Array) -> Float64Array:
+        """Columns and rows (N, 2) of world points as shares of the width and height that are shown."""
+        x0, y0, x1, y1 = self.box
+        shares: Float64Array = (project(self.camera, points) - np.array([x0, y0])) / np.array([x1 - x0, y1 - y0])
+        return shares
 
 
 @dataclass(frozen=True)
@@ -45,16 +64,19 @@ class DrawnMap:
 
     def view(self, camera: Camera) -> MapView:
         # 2.6: no gaps in a surface whose points lie up to two cells apart, as pictures.py draws it
-        return MapView(camera, render(self.instances.points[self.rows], 2.6 * DRAWN_SPACING_M, camera))
+        view = render(self.instances.points[self.rows], 2.6 * DRAWN_SPACING_M, camera)
+        return MapView(camera, view, _filled_part(view, camera.width / camera.height))
 
-    def cameras(self, width: int, height: int) -> tuple[Camera, Camera, Camera]:
-        """From above and from two opposite corners, for pictures of this size."""
-        return view_cameras(room_bounds(self.instances.points), width, height)
+    def views(self, width: int, height: int) -> tuple[MapView, MapView, MapView]:
+        """From above and from two opposite corners, of the shape of this size and at least as large."""
+        grown = [round(RENDERED * side) for side in (width, height)]
+        above, first, second = view_cameras(room_bounds(self.instances.points), *grown)
+        return self.view(above), self.view(first), self.view(second)
 
     def paint(self, view: MapView, colours: UInt8Array) -> UInt8Array:
         """The picture of a view, instance k in ``colours[k]``."""
         palette = np.concatenate([colours.reshape(-1, 3), np.array([NO_INSTANCE], np.uint8)])
-        return colour(view.view, palette[self.owner])
+        return colour(view.view, palette[self.owner])[view.part]
 
 
 def drawn_map(instances: Instances) -> DrawnMap:
@@ -65,6 +87,21 @@ def drawn_map(instances: Instances) -> DrawnMap:
         owner[instances.mask(int(k))] = k
     rows = thinned(Cloud(instances.points, np.arange(len(instances.points), dtype=np.int32))).owner
     return DrawnMap(instances, rows, owner[rows])
+
+
+def _filled_part(view: View, aspect: float) -> tuple[int, int, int, int]:
+    """The smallest part of a view of that shape, width by height, that holds all that is drawn."""
+    height, width = (side // OVERSAMPLING for side in view.point.shape)
+    rows, columns = np.nonzero(view.point >= 0)
+    if not len(rows):
+        return 0, 0, width, height
+    left, right = columns.min() / OVERSAMPLING - BORDER, columns.max() / OVERSAMPLING + BORDER
+    upper, lower = rows.min() / OVERSAMPLING - BORDER, rows.max() / OVERSAMPLING + BORDER
+    tall = min(max(lower - upper, (right - left) / aspect), float(height), width / aspect)
+    wide = tall * aspect
+    x0 = int(np.clip((left + right - wide) / 2, 0, width - wide))
+    y0 = int(np.clip((upper + lower - tall) / 2, 0, height - tall))
+    return x0, y0, x0 + int(wide), y0 + int(tall)
 
 
 def pale(colours: UInt8Array, share: float) -> UInt8Array:

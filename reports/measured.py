@@ -7,12 +7,14 @@ from dataclasses import dataclass
 
 from su3d_bench.reports.table_model import Interval
 
+BY_PEOPLE = "-people"  # ends the name of what stands in a protocol's place where people judged
+
 
 @dataclass(frozen=True)
 class Measured:
     """The numbers of ``metrics.json`` for one method and protocol, as fractions, None where undefined.
 
-    ``run`` is the folder as it was named; ``limit``: how many frames of a scene, 0 for all; ``ceilings`` are empty
+    What people judged is of this form too, from ``scores.json`` instead. ``run`` is the folder as it was named; ``limit``: how many frames of a scene, 0 for all; ``ceilings`` are empty
     where there is none. ``per_scene`` is scene -> metric -> value.
     """
 
@@ -33,6 +35,10 @@ class Measured:
     profile: str | None
     encoder: str | None
     caveat: str | None
+
+    @property
+    def is_by_people(self) -> bool:
+        return self.protocol.endswith(BY_PEOPLE)
 
     @property
     def scenes(self) -> frozenset[str]:

@@ -122,7 +122,9 @@ def protocol_table(measured: Sequence[Measured], shown: Shown, figures: Sequence
 
 def units(row: Measured, shown: Shown) -> str:
     """What the numbers of a table are."""
-    interval = "; in brackets the 95 % interval over scenes" if shown.intervals else ""
+    interval = ""
+    if shown.intervals:
+        interval = f"; in brackets the 95 % interval over {'items' if row.is_by_people else 'scenes'}"
     ceiling = "; ceil.: what the truth itself scores" if shown.ceilings else ""
     return f"Protocol {row.protocol}, version {row.version}, on {row.datasets}; per cent{interval}{ceiling}."
 

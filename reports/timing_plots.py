@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -45,15 +46,21 @@ def _figure(width: float, height: float, n_axes: int = 1) -> tuple[Figure, list[
     return figure, list(axes)
 
 
-def _save(figure: Figure, path: Path) -> Path:
-    import io
+def draw_update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, kind: str) -> bytes:
+    """The cost of an update against the points of the map, as a ``png`` or ``pdf`` file."""
+    return _rendered(_update_cost(times, warm_up), kind)
 
+
+def _save(figure: Figure, path: Path) -> Path:
+    write_bytes(path, _rendered(figure, path.suffix[1:]))
+    return path
+
+
+def _rendered(figure: Figure, kind: str) -> bytes:
     buffer = io.BytesIO()
     # Without dates, so that one run gives one file.
-    metadata = {"CreationDate": None} if path.suffix == ".pdf" else None
-    figure.savefig(buffer, format=path.suffix[1:], dpi=150, metadata=metadata)
-    write_bytes(path, buffer.getvalue())
-    return path
+    figure.savefig(buffer, format=kind, dpi=150, metadata={"CreationDate": None} if kind == "pdf" else None)
+    return buffer.getvalue()
 
 
 def _label(times: Sequence[UpdateTimes], several_runs: bool) -> str:

@@ -212,10 +212,9 @@ class ProtocolRules(BaseModel):
         known = VALUES_OF_METRIC.get(self.metric, AP_NAMES if has_curve else ("mAcc", "mIoU", "F-mIoU"))
         if not set(self.headline) <= set(known):
             raise ValueError(f"headline: a protocol of kind '{self.kind}' has {', '.join(known)}")
-        if not has_curve and (self.thresholds or self.confidence):
-            raise ValueError("thresholds and confidence belong to kind 'instance' or 'queries'")
-        if not has_curve and self.kind not in SHARE_KINDS and self.min_region_size:
-            raise ValueError("min_region_size: no rule of this kind")
+        has_size = self.min_region_size is not None and self.kind not in SHARE_KINDS
+        if not has_curve and (has_size or self.thresholds or self.confidence):
+            raise ValueError("min_region_size, thresholds and confidence belong to kind 'instance' or 'queries'")
         if has_curve and not {0.25, 0.5} <= set(self.thresholds):
             raise ValueError("thresholds: 0.25 and 0.5 must be among them")
         if has_curve and self.confidence not in _CONFIDENCES[self.kind]:

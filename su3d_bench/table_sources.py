@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -15,10 +15,13 @@ from su3d_bench.finished_run import FinishedRun, read_run
 from su3d_bench.metrics.results import ProtocolResult
 from su3d_bench.plain_text import printable
 from su3d_bench.reports.latex import PrintedCell, printed_cells
-from su3d_bench.reports.measured import Measured
+from su3d_bench.reports.measured import BY_PEOPLE, Measured
 from su3d_bench.reports.table_model import Origin
 from su3d_bench.scene_run import CEILING_METHOD
 from su3d_bench.scoring import combine
+from su3d_bench.sheets.score_file import FILE as SCORES_FILE
+from su3d_bench.sheets.score_file import read_scores
+from su3d_bench.sheets.scores import ScoreCell, Scores
 from su3d_bench.store import read_json
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
@@ -55,10 +58,13 @@ class _Metrics(BaseModel):
 def measured_results(folders: Sequence[Path]) -> list[Measured]:
     """Every method and protocol of the runs, after it is known that those of one protocol may stand together.
 
+    A folder or file of ``scores.json`` gives what people judged.
+
     Raises ``ConfigError`` where data, rules or encoder of two runs differ, or where nothing was scored.
     """
-    runs = {str(folder): read_run(folder) for folder in dict.fromkeys(folders)}
-    found: list[Measured] = []
+    paths = dict.fromkeys(folders)
+    runs = {str(folder): read_run(folder) for folder in paths if not is_scores(folder)}
+    found = [one for path in paths if is_scores(path) for one in _judged_by_people(path)]
     first: dict[str, tuple[FinishedRun, Measured]] = {}
     for name, run in runs.items():
         for one in _results_of(name, run):
@@ -69,8 +75,54 @@ def measured_results(folders: Sequence[Path]) -> list[Measured]:
             first.setdefault(one.protocol, (run, one))
             found.append(one)
     if not any(one.per_scene for one in found):
-        raise ConfigError(f"{', '.join(runs)}: no scene was scored, so there is nothing for a table")
+        raise ConfigError(f"{', '.join(map(str, paths))}: no scene was scored, so there is nothing for a table")
     return found
+
+
+def is_scores(path: Path) -> bool:
+    """Whether ``path`` is what ``sheets score`` writes, rather than a run."""
+    return path.suffix == ".json" or ((path / SCORES_FILE).is_file() and not (path / "run.json").exists())
+
+
+def _judged_by_people(path: Path) -> list[Measured]:
+    """What people say of each method and dataset."""
+    scores = read_scores(path)
+    groups: dict[tuple[str, str], list[ScoreCell]] = {}
+    for cell in scores.cells:
+        if cell.judge == "people":
+            groups.setdefault((cell.dataset, cell.method), []).append(cell)
+    found = []
+    for (dataset, method), cells in groups.items():
+        scenes = sorted({scene for cell in cells for scene in cell.per_scene})
+        found.append(
+            Measured(
+                run=str(path),
+                method=method,
+                protocol=f"{dataset}-{scores.kind}{BY_PEOPLE}",
+                version=scores.schema_version,
+                kind=scores.kind,
+                headline=tuple(cell.metric for cell in cells),
+                metrics={cell.metric: cell.value for cell in cells},
+                intervals={cell.metric: cell.interval for cell in cells},
+                per_scene={one: {cell.metric: cell.per_scene.get(one) for cell in cells} for one in scenes},
+                ceilings={},
+                n_planned=len(scenes),
+                failed=(),
+                unscored=(),
+                limit=0,
+                profile=None,
+                encoder=None,
+                caveat=_who_judged(scores, cells),
+            )
+        )
+    return found
+
+
+def _who_judged(scores: Scores, cells: Sequence[ScoreCell]) -> str:
+    n_people = len(scores.annotators)
+    n_items = max(cell.n_items for cell in cells)
+    of = "" if scores.n_judged == scores.n_items else f", {scores.n_judged} of the set's {scores.n_items} judged"
+    return f"judged by {n_people} {'person' if n_people == 1 else 'people'}, {n_items} items{of}"
 
 
 def _results_of(name: str, run: FinishedRun) -> list[Measured]:
@@ -137,6 +189,16 @@ class CellCheck:
     fault: str | None
 
 
+@dataclass(frozen=True)
+class _Numbers:
+    """What a cell is held against."""
+
+    version: int
+    n_scenes: int
+    metrics: Mapping[str, float | None]
+    intervals: Mapping[str, tuple[float, float] | None]
+
+
 class _Recomputed:
     """Numbers from the counts of runs, each run and protocol scored once."""
 
@@ -152,7 +214,26 @@ class _Recomputed:
             self._runs[name] = read_run(path)
         return self._runs[name]
 
-    def result(self, origin: Origin) -> ProtocolResult:
+    def numbers(self, origin: Origin) -> _Numbers:
+        """Raises ``Su3dError`` where they cannot be had, or are of another version than the cell."""
+        if origin.protocol.endswith(BY_PEOPLE):
+            found = self._of_people(origin)
+        else:
+            result = self._result(origin)
+            found = _Numbers(result.version, result.n_scenes, result.metrics, result.intervals)
+        if found.version != origin.version:
+            raise ConfigError(f"the cell is of version {origin.version} of {origin.protocol}, the run {found.version}")
+        return found
+
+    def _of_people(self, origin: Origin) -> _Numbers:
+        places = [root / origin.run for root in self._roots]
+        path = next((place for place in places if place.exists()), places[0])
+        for one in _judged_by_people(path):
+            if (one.protocol, one.method) == (origin.protocol, origin.method):
+                return _Numbers(one.version, len(one.scenes), one.metrics, one.intervals)
+        raise ConfigError(f"{path}: holds no scores of '{printable(origin.method, 80)}' by people")
+
+    def _result(self, origin: Origin) -> ProtocolResult:
         key = (origin.run, origin.method, origin.protocol, "ceiling" if origin.what == "ceiling" else "value")
         if key not in self._results:
             run = self._run(origin.run)
@@ -165,10 +246,7 @@ class _Recomputed:
                 perfect = run.scores(CEILING_METHOD)[rules.name]
                 scores = {scene: perfect[scene] for scene in scores if scene in perfect}
             self._results[key] = combine(rules, scores)
-        result = self._results[key]
-        if result.version != origin.version:
-            raise ConfigError(f"the cell is of version {origin.version} of {origin.protocol}, the run {result.version}")
-        return result
+        return self._results[key]
 
 
 def check_paper(file: Path, root: Path | None = None) -> list[CellCheck]:
@@ -196,7 +274,7 @@ def _check(cell: PrintedCell, file: str, recomputed: _Recomputed) -> CellCheck:
     if cell.origin is None:
         return CellCheck(file, cell.line, text, None, "the comment that names its run is damaged")
     try:
-        result = recomputed.result(cell.origin)
+        result = recomputed.numbers(cell.origin)
     except Su3dError as error:
         return CellCheck(file, cell.line, text, None, f"cannot be recomputed: {error}")
     numbers = _numbers(cell.origin, result)
@@ -213,7 +291,7 @@ def _check(cell: PrintedCell, file: str, recomputed: _Recomputed) -> CellCheck:
     return CellCheck(file, cell.line, text, found, None)
 
 
-def _numbers(origin: Origin, result: ProtocolResult) -> list[float] | None:
+def _numbers(origin: Origin, result: _Numbers) -> list[float] | None:
     """What the cell should show: per cent, and the interval where it has one; None where the run lacks it."""
     if origin.what == "scenes":
         return [float(result.n_scenes)]

@@ -12,7 +12,14 @@ from su3d_bench.cli.protocols import read_remarks
 from su3d_bench.datasets.rooms_classes import CLASSES
 from su3d_bench.errors import ConfigError
 from su3d_bench.metrics.instance_ap import MIN_REGION_SIZE, THRESHOLDS
-from su3d_bench.protocols import RULES, load_protocol, not_comparable_with, protocol_names, protocols_for
+from su3d_bench.protocols import (
+    RULES,
+    SHARE_KINDS,
+    load_protocol,
+    not_comparable_with,
+    protocol_names,
+    protocols_for,
+)
 
 CASES = Path(__file__).parent / "cases"
 NAMES = {
@@ -20,7 +27,8 @@ NAMES = {
     "openlex3d-ranking", "openlex3d-topn", "query-ap", "replica-conceptgraphs-ex1", "replica-conceptgraphs-ex4",
     "replica-conceptgraphs-ex6", "replica-hovsg", "replica-hovsg-exact", "replica-mesh-ex6", "replica-openmask3d",
     "replica-openmask3d-released", "replica-ovo51", "rooms-instance", "rooms-semantic", "scannet-instance",
-    "scannet-semantic", "scannet200-instance", "scannet200-semantic",
+    "scannet-semantic", "scannet200-instance", "scannet200-semantic", "rooms-retrieval", "replica-retrieval",
+    "scannet-retrieval", "rooms-annotation", "replica-annotation", "scannet-annotation", "rooms-reasoning",
 }  # fmt: skip
 
 
@@ -79,7 +87,8 @@ def test_instance_protocols_use_the_original_thresholds_and_size(name: str) -> N
         n_points = MIN_REGION_SIZE if rules.kind == "instance" else 1
         assert (rules.thresholds, rules.min_region_size) == (THRESHOLDS, n_points)
     else:
-        assert (rules.thresholds, rules.min_region_size, rules.confidence) == ((), None, None)
+        n_points = MIN_REGION_SIZE if rules.kind in SHARE_KINDS else None
+        assert (rules.thresholds, rules.min_region_size, rules.confidence) == ((), n_points, None)
 
 
 def test_the_51_classes_of_ovo_fall_into_three_thirds() -> None:
@@ -244,7 +253,7 @@ def test_show_prints_every_rule_with_what_its_file_says_of_it(name: str, capsys:
     assert main(["protocols", "show", name]) == 0
     text = capsys.readouterr().out
     rules = load_protocol(name)
-    for key in rules.model_dump(exclude={"transfer", "prompt_names", "classes"}):
+    for key in rules.model_dump(exclude={"transfer", "prompt_names", "classes", "merging", "answers"}):
         assert f"\n{key} " in text
     for line in (RULES / f"{name}.toml").read_text().splitlines():
         comment = line.partition("  # ")[2] or line.partition("# ")[2] * line.startswith("#")

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from painted import ColourPerception, colour_perception
 
-from su3d_bench import scene_run
+from su3d_bench import scene_feeding, scene_run
 from su3d_bench.cli.main import main
 
 HERE = Path(__file__).parent
@@ -98,7 +98,7 @@ def test_updates_hold_a_row_a_frame_with_its_stages() -> None:
     rows = list(csv.DictReader((job() / "updates.csv").open()))
     assert [row["frame"] for row in rows] == ["0", "2", "4"]
     assert list(rows[0])[:5] == ["update", "frame", "n_detections", "n_points", "n_instances"]
-    assert list(rows[0])[5:] == ["decode_ms", "segment_ms", "collect_ms", "total_ms"]
+    assert list(rows[0])[5:] == ["rss_bytes", "decode_ms", "segment_ms", "collect_ms", "total_ms"]
     assert [int(row["n_points"]) for row in rows] == [768, 1536, 2304]
 
 
@@ -112,7 +112,7 @@ def test_metrics_hold_no_path_date_or_time() -> None:
 def test_the_same_command_again_does_nothing_and_gives_the_same_bytes(monkeypatch: pytest.MonkeyPatch) -> None:
     assert run() == 0
     before = Path("out/metrics.json").read_bytes()
-    monkeypatch.setattr(scene_run, "write_prediction", None)
+    monkeypatch.setattr(scene_feeding, "write_prediction", None)
     monkeypatch.setattr(scene_run, "pack_scores", None)
     assert run() == 0
     assert Path("out/metrics.json").read_bytes() == before

@@ -26,6 +26,7 @@ from su3d_bench.cli import (
     refine,
     report,
     run,
+    sheets,
 )
 from su3d_bench.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_WRONG_INPUT, ConfigError, Su3dError, suggest
 
@@ -81,6 +82,7 @@ def build_parser() -> Parser:
         compare,
         attribute,
         report,
+        sheets,
         query,
         questions,
         ask,

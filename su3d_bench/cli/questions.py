@@ -54,7 +54,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _make(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.files import write_questions
+    from su3d_bench.questions.files import check_form, write_questions
 
     if arguments.file is not None:
         raise ConfigError("questions make: takes no file; name it with --out")
@@ -65,6 +65,7 @@ def _make(arguments: argparse.Namespace) -> int:
     if arguments.source not in SOURCES:
         hint = suggest(arguments.source, SOURCES) or f"; known: {', '.join(SOURCES)}"
         raise ConfigError(f"questions make: unknown source '{arguments.source}'{hint}")
+    check_form(arguments.out)
     made = _made(arguments)
     write_questions(arguments.out, made)
     remark(f"{len(made)} questions: {arguments.out}", quiet=arguments.quiet)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.flags import add_verb, answer, remark
-from su3d_bench.errors import EXIT_DONE, ConfigError
+from su3d_bench.errors import EXIT_DONE
 
 if TYPE_CHECKING:
     from su3d_bench.reports.table_model import Table
@@ -17,10 +17,6 @@ if TYPE_CHECKING:
 NAME = "tables"
 FORMATS = ("markdown", "latex", "csv", "html")
 PAPER_TABLES = ("I", "II", "III", "IV", "V")
-JUDGED = {
-    "IV": "answers to text queries by fusion scheme, judged right or wrong",
-    "V": "labels and merges of instances, judged right or wrong",
-}
 
 
 def add_parser(actions: Any) -> None:
@@ -30,11 +26,13 @@ def add_parser(actions: Any) -> None:
         "Make tables for a paper from runs: those of OpenSU3D's paper by number, or one for each protocol.",
         (
             "su3d-bench report tables runs/my-run --table II III --format latex --out tables.tex",
-            "su3d-bench report tables runs/my-run --metrics mAcc mIoU --intervals --ceilings",
+            "su3d-bench report tables runs/my-run scores --table IV V --intervals",
         ),
         call,
     )
-    parser.add_argument("runs", nargs="+", type=Path, metavar="RUN", help="folders of finished runs")
+    parser.add_argument(
+        "runs", nargs="+", type=Path, metavar="RUN", help="folders of finished runs, or of what sheets score wrote"
+    )
     parser.add_argument("--format", choices=FORMATS, default="markdown", help="(default: markdown)")
     parser.add_argument("--table", nargs="+", choices=PAPER_TABLES, default=[], help="of the paper (default: none)")
     for name, what in (("methods", "these rows, in this order"), ("protocols", "under these"), ("metrics", "columns")):
@@ -60,9 +58,6 @@ def add_parser(actions: Any) -> None:
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.store import json_text, make_folder, write_text
 
-    for number, what in JUDGED.items():
-        if number in arguments.table:
-            raise ConfigError(f"Table {number}: is made of {what}; a run holds no such scores")
     tables = _tables(arguments)
     text = json_text([asdict(one) for one in tables]) if arguments.json else _formatter(arguments.format)(tables)
     if arguments.out is None:
@@ -77,8 +72,9 @@ def call(arguments: argparse.Namespace) -> int:
 def _tables(arguments: argparse.Namespace) -> list[Table]:
     from su3d_bench.ablation import read_rows
     from su3d_bench.reports.ablation_table import SweepRow, ablation_table
+    from su3d_bench.reports.judged_tables import JUDGED, judged_table
     from su3d_bench.reports.paper_tables import Shown, paper_table, selection_tables
-    from su3d_bench.table_sources import choose, measured_results
+    from su3d_bench.table_sources import choose, is_scores, measured_results
 
     shown = Shown(
         metrics=tuple(arguments.metrics),
@@ -94,9 +90,11 @@ def _tables(arguments: argparse.Namespace) -> list[Table]:
     tables = []
     for number in dict.fromkeys(arguments.table):
         if number == "I":
-            rows = [row for run in arguments.runs for row in read_rows(run)]
+            rows = [row for run in arguments.runs if not is_scores(run) for row in read_rows(run)]
             sweep = [SweepRow(row.parameter, row.value, row.method) for row in rows]
             tables.append(ablation_table(found, sweep, shown, with_published=with_published))
+        elif number in JUDGED:
+            tables += judged_table(number, found, shown, with_published=with_published)
         else:
             tables += paper_table(number, found, shown, with_published=with_published)
     return tables

@@ -52,7 +52,8 @@ def first_instances(
     if prediction.features is None or encoder is None:
         raise PredictionError(f"{rules.name}: needs features and an encoder to compare texts with them")
     text = text_features(rules, list(texts), prediction.features, encoder)
-    return cosines(prediction.features, text).argmax(axis=0).astype(np.int64)
+    first: Int64Array = cosines(prediction.features, text).argmax(axis=0)
+    return first
 
 
 def judge_retrieval(main_object: Int64Array, first: Int64Array, asked: Sequence[AskedText]) -> BoolArray:

@@ -68,14 +68,16 @@ def paper_queries() -> tuple[Question, ...]:
     )
 
 
+def check_form(path: Path) -> None:
+    """``DataError`` where the name of a file to be written says no form."""
+    if path.suffix.lower() not in (".toml", ".csv"):
+        raise DataError(f"{printable(str(path), 200)}: is neither .toml nor .csv; name the file so")
+
+
 def write_questions(path: Path, questions: Sequence[Question]) -> None:
     """Write a set as ``read_questions`` reads it, TOML or CSV by the file's name; answers in words are not kept."""
-    suffix = path.suffix.lower()
-    if suffix not in (".toml", ".csv"):
-        raise DataError(
-            f"{printable(str(path), 200)}: unknown form '{printable(suffix, 20)}'; name a .toml or .csv file"
-        )
-    write_text(path, csv_text(questions) if suffix == ".csv" else toml_text(questions))
+    check_form(path)
+    write_text(path, csv_text(questions) if path.suffix.lower() == ".csv" else toml_text(questions))
 
 
 def toml_text(questions: Sequence[Question]) -> str:

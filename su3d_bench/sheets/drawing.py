@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -15,20 +14,20 @@ from su3d_bench.reports.item_picture import (
     ZOOM_WIDTH,
     ItemParts,
     Panel,
+    Tag,
     compose,
-    marked_place,
     png_bytes,
 )
 from su3d_bench.reports.map_views import DrawnMap, MapView, drawn_map, pale
 from su3d_bench.reports.pictures import instance_colours
-from su3d_bench.reports.reasoning_picture import project
-from su3d_bench.sheets.drafts import Draft
+from su3d_bench.sheets.drafts import Draft, mask_digest
 from su3d_bench.sheets.items import SheetKind
 from su3d_bench.sheets.run_source import RunSource
 from su3d_bench.types import BoolArray, Float64Array, Frame, Instances, UInt8Array
 
 ANSWER_COLOUR, OTHER_COLOUR = (222, 74, 22), (32, 98, 196)  # those of reasoning_picture
 PALE_SHARE = 0.3
+OUTLINED = {"retrieval": "what was found", "annotation": "the mask", "reasoning": "what the answer names"}
 
 
 class Artist:
@@ -36,7 +35,7 @@ class Artist:
 
     def __init__(self, source: RunSource, kind: SheetKind, scale: Scale = "paper") -> None:
         self._source, self._kind, self._scale = source, kind, scale
-        self._map = lru_cache(maxsize=len(source.methods))(self._make_map)
+        self._maps: dict[bytes, _ShownMap] = {}
 
     def draw(self, draft: Draft) -> bytes:
         """The PNG of a draft."""
@@ -48,15 +47,23 @@ class Artist:
         members = shown.drawn.members(draft.rows)
         photo, eye = self._photo(draft, shown)
         best = max(shown.corners, key=lambda view: int(view.shows(members).sum()))
-        colours = self._colours(draft, shown)
-        map_view = Panel(self._map_title(), shown.drawn.paint(best, colours), best.shows(members))
+        map_view = Panel(
+            self._map_title(),
+            shown.drawn.paint(best, self._colours(draft, shown)),
+            best.shows(members),
+            _tags(draft, shown.instances, best),
+            line=2,
+        )
         place_colours = pale(shown.colours, PALE_SHARE)
         place_colours[list(draft.others)] = OTHER_COLOUR
         place_colours[list(draft.rows)] = ANSWER_COLOUR
-        above = shown.drawn.paint(shown.above, place_colours)
-        eye_xy = None if eye is None else project(shown.above.camera, eye[None])[0]
-        ring = marked_place(above, shown.above.shows(members), _inside(eye_xy, above))
-        place = Panel("its place, from above" + (" (arrow: from the camera)" if eye is not None else ""), ring)
+        place = Panel(
+            "its place, from above" + (" (arrow: from the camera)" if eye is not None else ""),
+            shown.drawn.paint(shown.above, place_colours),
+            tags=_tags(draft, shown.instances, shown.above),
+            ring=_ring(draft, shown),
+            eye=None if eye is None else _inside(shown.above.project(eye[None])[0]),
+        )
         scale = scale_stops(self._scale) if draft.similarity is not None else None
         return compose(ItemParts(draft.title, photo, map_view, place, scale))
 
@@ -91,27 +98,56 @@ class Artist:
         frame: Frame = frames[view.frame]
         bounds = np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float64)
         mask = _at_full_size(mask_in_frame(frame, shown.tree, is_member, bounds), frame)
-        what = "outlined: what was found" if self._kind == "retrieval" else "outlined: what is spoken of"
-        return Panel(what, frame.rgb, mask), frame.camera_to_world[:3, 3]
+        return Panel(f"outlined: {OUTLINED[self._kind]}", frame.rgb, mask), frame.camera_to_world[:3, 3]
 
-    def _make_map(self, scene: str, method: str) -> _ShownMap:
-        return _ShownMap(self._source.instances(scene, method))
+    def _map(self, scene: str, method: str) -> _ShownMap:
+        """The views of a map; those of another method where it has the same masks."""
+        instances = self._source.instances(scene, method)
+        key = mask_digest(instances, range(len(instances)))
+        if key not in self._maps:
+            if any(scene != one.scene for one in self._maps.values()):
+                self._maps.clear()
+            self._maps[key] = _ShownMap(scene, instances)
+        return self._maps[key]
 
 
 class _ShownMap:
     """A map with its views and the tree of its points."""
 
-    def __init__(self, instances: Instances) -> None:
+    def __init__(self, scene: str, instances: Instances) -> None:
         from scipy.spatial import KDTree
 
-        self.instances = instances
+        self.scene, self.instances = scene, instances
         self.drawn: DrawnMap = drawn_map(instances)
-        above = self.drawn.cameras(ZOOM_WIDTH, LOW_HEIGHT)[0]
-        corners = self.drawn.cameras(PHOTO_WIDTH, LOW_HEIGHT)[1:]
-        self.above: MapView = self.drawn.view(above)
-        self.corners: tuple[MapView, ...] = tuple(self.drawn.view(camera) for camera in corners)
+        self.above: MapView = self.drawn.views(ZOOM_WIDTH, LOW_HEIGHT)[0]
+        self.corners: tuple[MapView, ...] = self.drawn.views(PHOTO_WIDTH, LOW_HEIGHT)[1:]
         self.colours = np.array(instance_colours(instances.names), np.uint8).reshape(-1, 3)
         self.tree: Any = KDTree(instances.points, balanced_tree=False, compact_nodes=False)
+
+
+def _tags(draft: Draft, instances: Instances, view: MapView) -> tuple[Tag, ...]:
+    """The names of what an answer speaks of, where it is."""
+    if not draft.names:
+        return ()
+    rows = tuple(dict.fromkeys((*draft.rows, *draft.others)))
+    places = view.project(instances.centroids[list(rows)].astype(np.float64).reshape(-1, 3))
+    return tuple(
+        Tag(draft.names[row], float(x), float(y), ANSWER_COLOUR if row in draft.rows else OTHER_COLOUR)
+        for row, (x, y) in zip(rows, places, strict=True)
+        if np.isfinite([x, y]).all()
+    )
+
+
+def _ring(draft: Draft, shown: _ShownMap) -> tuple[float, float, float] | None:
+    """Around what is outlined, from above; none around several things, which have names."""
+    if len(draft.rows) != 1 or draft.names:
+        return None
+    points = shown.instances.points[shown.instances.mask(draft.rows[0])]
+    if not len(points):
+        return None
+    low, high = shown.above.project(np.percentile(points, [2, 98], axis=0).astype(np.float64))
+    x, y = (low + high) / 2
+    return float(x), float(y), float(0.6 * np.abs(high - low).max())
 
 
 def _at_full_size(mask: BoolArray, frame: Frame) -> BoolArray:
@@ -124,9 +160,7 @@ def _at_full_size(mask: BoolArray, frame: Frame) -> BoolArray:
     return full
 
 
-def _inside(place: Float64Array | None, picture: UInt8Array) -> Float64Array | None:
+def _inside(place: Float64Array) -> tuple[float, float] | None:
     """``place`` where it is in the picture."""
-    if place is None or not np.isfinite(place).all():
-        return None
-    height, width = picture.shape[:2]
-    return place if 0 <= place[0] < width and 0 <= place[1] < height else None
+    x, y = float(place[0]), float(place[1])
+    return (x, y) if 0 <= x <= 1 and 0 <= y <= 1 else None

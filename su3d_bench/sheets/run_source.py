@@ -38,7 +38,7 @@ class RunSource:
                 hint = suggest(scene, run.scenes) or f"; it has {', '.join(run.scenes)}"
                 raise ConfigError(f"{run.name}: has no scene '{printable(scene, 80)}'{hint}")
         self.instances = lru_cache(maxsize=len(self.methods))(self._instances)
-        self.frames = lru_cache(maxsize=1)(self._frames)
+        self._frames_at = lru_cache(maxsize=len(self.methods))(self._read_frames)
 
     def _instances(self, scene: str, method: str) -> Instances:
         """The map of a scene; a ``PredictionError`` where it has no instances."""
@@ -76,13 +76,17 @@ class RunSource:
             raise DataError(f"{printable(scene, 100)}: its data are not those of the run; run it again")
         return dataset
 
-    def _frames(self, scene: str, method: str) -> tuple[Frame, ...]:
+    def frames(self, scene: str, method: str) -> tuple[Frame, ...]:
         """Some of the frames that the map was made from, spread over the scene."""
-        frames = self.dataset(scene).frames(scene.partition("/")[2], 1)
+        n = len(self.dataset(scene).frames(scene.partition("/")[2], 1))
         of_views = np.unique(self.instances(scene, method).views[:, 0])
-        indices = of_views[(of_views >= 0) & (of_views < len(frames))] if len(of_views) else np.arange(len(frames))
+        indices = of_views[(of_views >= 0) & (of_views < n)] if len(of_views) else np.arange(n)
         chosen = np.unique(np.linspace(0, len(indices) - 1, min(MOST_FRAMES, len(indices))).astype(np.int64))
-        return tuple(frames[int(indices[k])] for k in chosen)
+        return self._frames_at(scene, tuple(int(indices[k]) for k in chosen))
+
+    def _read_frames(self, scene: str, indices: tuple[int, ...]) -> tuple[Frame, ...]:
+        frames = self.dataset(scene).frames(scene.partition("/")[2], 1)
+        return tuple(frames[index] for index in indices)
 
     def rules(self, scene: str, kind: str) -> ProtocolRules | None:
         """The rules that judge a scene automatically, the first that fit; None where there are none."""

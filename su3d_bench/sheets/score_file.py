@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import asdict
+from functools import cache
 from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
@@ -34,7 +35,7 @@ def read_scores(path: Path) -> Scores:
     except OSError as error:
         raise DataError(f"{where}: cannot be read: {error.strerror}") from error
     try:
-        found = TypeAdapter(Scores).validate_json(content, strict=True)
+        found = _reader().validate_json(content, strict=True)
     except ValidationError as error:
         place = printable(".".join(map(str, error.errors()[0]["loc"])), 120) or "it"
         raise DataError(f"{where}: {place} is not as su3d-bench sheets score writes it; score again") from error
@@ -43,6 +44,11 @@ def read_scores(path: Path) -> Scores:
     if not all(_is_sound(cell) for cell in found.cells):
         raise DataError(f"{where}: holds a number that is no share or a metric that is none; score again")
     return found
+
+
+@cache
+def _reader() -> TypeAdapter[Scores]:
+    return TypeAdapter(Scores)
 
 
 def _is_sound(cell: ScoreCell) -> bool:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import combinations
 from typing import Literal
 
@@ -14,7 +15,7 @@ from su3d_bench.questions.model import ALL_KINDS
 from su3d_bench.sheets.agreement import Agreement, Interval, agreement, cohen_kappa
 from su3d_bench.sheets.items import CANNOT_TELL, MERGES, RIGHT, Key, KeyItem, Sheet
 from su3d_bench.sheets.validation import LABELS, Judgement
-from su3d_bench.statistics import bootstrap_interval, sign_flip_test
+from su3d_bench.statistics import percentile_interval, resample_weights, sign_flip_test
 from su3d_bench.types import Float64Array
 
 Judge = Literal["people", "automatic"]
@@ -241,8 +242,16 @@ def _cell(judge: Judge, method: str, dataset: str, metric: str, group: Sequence[
 
 
 def _interval(means: Float64Array) -> Interval | None:
-    """Of the mean, over items drawn with replacement."""
-    return bootstrap_interval(lambda weights: weights @ means / len(means), len(means))
+    """Of the mean, over items drawn with replacement; None for a single one."""
+    if len(means) < 2:
+        return None
+    return percentile_interval(_draws(len(means)) @ means / len(means))
+
+
+@lru_cache(maxsize=4)
+def _draws(n_items: int) -> Float64Array:
+    """How often each item is drawn (R, N), the same for every number of as many items."""
+    return resample_weights(n_items).astype(np.float64)
 
 
 def _method_tests(key: Key, values: Sequence[_Value]) -> list[PairTest]:
@@ -278,8 +287,7 @@ def _test(
     left: str, right: str, dataset: str, metric: str, before: Mapping[str, float], after: Mapping[str, float]
 ) -> PairTest:
     changes = np.array([after[unit] - before[unit] for unit in before if unit in after], np.float64)
-    differ = changes[changes != 0]  # those that do not change no sign can move
-    test = sign_flip_test(differ)
+    p, smallest_p, is_exact = paired_p(changes)
     return PairTest(
         left=left,
         right=right,
@@ -288,11 +296,35 @@ def _test(
         difference=float(changes.mean()) if len(changes) else 0.0,
         interval=_interval(changes),
         n_items=len(changes),
-        n_differ=len(differ),
-        p=1.0 if test is None else test.p,
-        smallest_p=1.0 if test is None else test.smallest_p,
-        is_exact=test is None or test.is_exact,
+        n_differ=int(np.count_nonzero(changes)),
+        p=p,
+        smallest_p=smallest_p,
+        is_exact=is_exact,
     )
+
+
+def paired_p(changes: Float64Array) -> tuple[float, float, bool]:
+    """The two-sided p of the sign-flip test of ``changes``, the least that so many can give, and whether it is exact.
+
+    What does not change no sign can move. Where the others are equally large, as when each item is judged once, the
+    number of those above 0 is binomial: McNemar's exact test, whatever their number.
+
+    >>> paired_p(np.array([1.0, 1.0, 1.0, 0.0]))
+    (0.25, 0.25, True)
+    """
+    differ = changes[changes != 0]
+    n = len(differ)
+    if n == 0:
+        return 1.0, 1.0, True
+    if np.ptp(np.abs(differ)) > 0:
+        test = sign_flip_test(differ)
+        assert test is not None
+        return test.p, test.smallest_p, test.is_exact
+    from scipy.stats import binom
+
+    n_above = int(np.count_nonzero(differ > 0))
+    p = 2.0 * float(binom.sf(max(n_above, n - n_above) - 1, n, 0.5))
+    return min(1.0, p), min(1.0, 2.0 ** (1 - n)), True
 
 
 def _confusion(sheet: Sheet, ask: str, told: Sequence[tuple[KeyItem, str, str]]) -> Confusion | None:

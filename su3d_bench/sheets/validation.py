@@ -77,10 +77,11 @@ def check_answers(sheet: Sheet, rows: Sequence[AnswerRow]) -> Checked:
             given[place] = answer
         if fault is not None:
             faults.append(f"{row.at}: {fault}")
-    answered = {name for name, _, _ in first}
+    there = {(row.annotator, row.item_id, row.question) for row in own}  # with a fault of its own or without
+    answered = {name for name, _, _ in there}
     for share in sheet.annotators:
         if share.name in answered:
-            faults += _left_out(share.name, [items[one] for one in share.item_ids], first)
+            faults += _left_out(share.name, [items[one] for one in share.item_ids], there)
     order = {one.id: k for k, one in enumerate(sheet.items)}
     names = {one.name: k for k, one in enumerate(sheet.asks)}
     places = sorted(given, key=lambda place: (order[place[1]], names[place[2]], place[0]))
@@ -140,9 +141,9 @@ def _choice(sheet: Sheet, row: AnswerRow) -> tuple[str, str | None]:
     return "", f"unknown answer '{printable(row.answer, 40)}' to '{row.question}'{near}"
 
 
-def _left_out(who: str, share: Sequence[SheetItem], first: dict[tuple[str, str, str], AnswerRow]) -> list[str]:
+def _left_out(who: str, share: Sequence[SheetItem], there: set[tuple[str, str, str]]) -> list[str]:
     """A line for the items of an annotator of which rows are missing."""
-    missing = Counter(one.id for one in share for ask in one.asks if (who, one.id, ask) not in first)
+    missing = Counter(one.id for one in share for ask in one.asks if (who, one.id, ask) not in there)
     if not missing:
         return []
     names = ", ".join(list(missing)[:SHOWN_ITEMS]) + (", ..." if len(missing) > SHOWN_ITEMS else "")

@@ -1,0 +1,160 @@
+// Elements of the page. Texts reach the document as text nodes alone.
+
+const SVG = 'http://www.w3.org/2000/svg';
+const byId = (id) => document.getElementById(id);
+
+function fill(node, attributes, children) {
+  for (const [name, value] of Object.entries(attributes || {})) {
+    if (value === null || value === undefined || value === false) continue;
+    if (name.startsWith('on')) node.addEventListener(name.slice(2), value);
+    else node.setAttribute(name, value === true ? '' : value);
+  }
+  node.append(...children.flat(Infinity).filter((one) => one !== null && one !== undefined));
+  return node;
+}
+
+const h = (tag, attributes, ...children) => fill(document.createElement(tag), attributes, children);
+const svg = (tag, attributes, ...children) => fill(document.createElementNS(SVG, tag), attributes, children);
+
+let nextId = 0;
+const freshId = (stem) => `${stem}-${++nextId}`;
+
+function select(label, options, chosen, onChange) {
+  // Options are pairs of value and text; returns the field with `.input`.
+  const input = h('select', { id: freshId('select'), onchange: () => onChange(input.value) });
+  const field = h('div', { class: 'field' }, h('label', { for: input.id }, label), input);
+  field.input = input;
+  field.setOptions = (pairs, value) => {
+    input.replaceChildren(...pairs.map(([key, text]) => h('option', { value: key }, text)));
+    if (pairs.some(([key]) => String(key) === String(value))) input.value = value;
+  };
+  field.setOptions(options, chosen);
+  return field;
+}
+
+const isNumber = (value) => typeof value === 'number' && Number.isFinite(value);
+// Counts and ratios are told apart by their names, as in metrics.json.
+const isCount = (metric) => metric.startsWith('n_');
+const percent = (value, digits = 1) => (isNumber(value) ? (100 * value).toFixed(digits) : '–');
+const metricText = (metric, value) =>
+  isNumber(value) && isCount(metric) ? String(Math.round(value)) : percent(value);
+const signed = (value) => (isNumber(value) ? (value >= 0 ? '+' : '−') + Math.abs(100 * value).toFixed(1) : '–');
+const msText = (value) => (!isNumber(value) ? '–' : value >= 100 ? value.toFixed(0) : value.toPrecision(3).replace(/\.?0+$/, ''));
+const countText = (value) => (isNumber(value) ? value.toLocaleString('en-US') : '–');
+const plural = (n, what) => `${n} ${what}${n === 1 ? '' : 's'}`;
+
+function compareValues(a, b) {
+  const missing = (value) => value === null || value === undefined || Number.isNaN(value);
+  if (missing(a) || missing(b)) return missing(a) - missing(b);
+  return typeof a === 'number' && typeof b === 'number' ? a - b : String(a).localeCompare(String(b), 'en', { numeric: true });
+}
+
+// A table that sorts by its headers and, with `filter`, shows the rows whose text holds what is typed.
+// Columns: {label, value(row), show(row), num, best}; rows of `onRow` can be chosen by mouse and keyboard.
+function dataTable({ caption, columns, rows, filter, tall, sortBy, descending, onRow, foot }) {
+  const state = { column: sortBy === undefined ? null : sortBy, down: !!descending, text: '' };
+  const body = h('tbody');
+  const headers = columns.map((column, index) =>
+    h('th', { scope: 'col', class: column.num ? 'num' : null },
+      h('button', { type: 'button', class: 'sort', onclick: () => sort(index) }, column.label)));
+  const node = h('table', null, h('caption', null, caption), h('thead', null, h('tr', null, headers)), body, foot || null);
+  const counter = h('span', { class: 'count', role: 'status' });
+  const box = h('div', null);
+  if (filter) {
+    const input = h('input', { type: 'search', id: freshId('filter'), placeholder: 'any text', autocomplete: 'off',
+      oninput: () => { state.text = input.value.trim().toLowerCase(); draw(); } });
+    box.append(h('div', { class: 'toolbar' },
+      h('div', { class: 'field' }, h('label', { for: input.id }, `Filter ${filter}`), input), counter));
+  }
+  box.append(h('div', { class: tall ? 'wide tall' : 'wide', tabindex: '0', role: 'region', 'aria-label': caption }, node));
+
+  function sort(index) {
+    state.down = state.column === index ? !state.down : !!columns[index].num;
+    state.column = index;
+    draw();
+  }
+  function draw() {
+    headers.forEach((header, index) => {
+      if (index === state.column) header.setAttribute('aria-sort', state.down ? 'descending' : 'ascending');
+      else header.removeAttribute('aria-sort');
+    });
+    let shown = rows.filter((row) => !state.text || columns.some((column) =>
+      String(column.value(row) ?? '').toLowerCase().includes(state.text)));
+    if (state.column !== null) {
+      const value = columns[state.column].value;
+      const missing = (row) => { const v = value(row); return v === null || v === undefined || Number.isNaN(v); };
+      shown = [...shown].sort((a, b) => (missing(a) - missing(b)) || (state.down ? -1 : 1) * compareValues(value(a), value(b)));
+    }
+    counter.textContent = shown.length === rows.length ? `${rows.length} rows` : `${shown.length} of ${rows.length} rows`;
+    body.replaceChildren(...shown.map(line));
+  }
+  function line(row) {
+    const cells = columns.map((column, index) => {
+      const content = column.show ? column.show(row) : String(column.value(row) ?? '–');
+      const classes = [column.num ? 'num' : '', column.best && column.best(row) ? 'best' : ''].join(' ').trim();
+      return h(index ? 'td' : 'th', { class: classes || null, scope: index ? null : 'row' }, content);
+    });
+    const attributes = onRow ? { tabindex: '0', 'aria-selected': String(!!row.selected), onclick: () => onRow(row),
+      onkeydown: (event) => { if (event.key === 'Enter' || event.key === ' ') { event.preventDefault(); onRow(row); } } } : null;
+    const made = h('tr', attributes, cells);
+    row.node = made;
+    return made;
+  }
+  draw();
+  box.redraw = draw;
+  return box;
+}
+
+function whisker(value, interval, ceiling) {
+  // 0 to 100 %: a dot at the value, a line over its interval, a tick at the ceiling.
+  const width = 104, x = (v) => 2 + Math.min(1, Math.max(0, v)) * (width - 4);
+  if (!isNumber(value)) return null;
+  return svg('svg', { width, height: 10, viewBox: `0 0 ${width} 10`, 'aria-hidden': 'true' },
+    svg('line', { class: 'track', x1: 2, x2: width - 2, y1: 5, y2: 5 }),
+    interval ? svg('line', { class: 'whisker', x1: x(interval[0]), x2: x(interval[1]), y1: 5, y2: 5 }) : null,
+    isNumber(ceiling) ? svg('line', { class: 'tick', x1: x(ceiling), x2: x(ceiling), y1: 1, y2: 9 }) : null,
+    svg('circle', { class: 'dot', cx: x(value), cy: 5, r: 3.2 }));
+}
+
+function niceTicks(low, high, most) {
+  const raw = (high - low || 1) / most, power = 10 ** Math.floor(Math.log10(raw));
+  const step = [1, 2, 5, 10].map((m) => m * power).find((s) => s >= raw);
+  const ticks = [];
+  for (let value = Math.ceil(low / step) * step; value <= high + step * 1e-9; value += step) ticks.push(Number(value.toPrecision(12)));
+  return ticks;
+}
+
+const DASHES = [null, '6 3', '2 3', '9 3 2 3', '4 2', '1 2', '12 4', '7 2 2 2'];
+
+function linePlot({ label, lines, xLabel, yLabel, xFromZero }) {
+  // Lines: {name, style, x: [], y: [], marks}; styles differ in colour and dash.
+  const width = 760, height = 300, left = 62, right = 12, top = 22, bottom = 42;
+  const xs = lines.flatMap((one) => one.x), ys = lines.flatMap((one) => one.y);
+  const plot = svg('svg', { viewBox: `0 0 ${width} ${height}`, width, role: 'img', 'aria-label': label });
+  if (!xs.length) return h('p', { class: 'intro' }, 'Nothing was timed here.');
+  const xLow = xFromZero ? 0 : Math.min(...xs), xHigh = Math.max(...xs, xLow + 1e-9), yHigh = Math.max(...ys, 1e-9) * 1.05;
+  const px = (v) => left + ((v - xLow) / (xHigh - xLow)) * (width - left - right);
+  const py = (v) => height - bottom - (v / yHigh) * (height - top - bottom);
+  for (const tick of niceTicks(0, yHigh, 5)) {
+    plot.append(svg('line', { class: 'grid', x1: left, x2: width - right, y1: py(tick), y2: py(tick) }),
+      svg('text', { x: left - 6, y: py(tick) + 4, 'text-anchor': 'end' }, countText(tick)));
+  }
+  for (const tick of niceTicks(xLow, xHigh, 7)) {
+    plot.append(svg('text', { x: px(tick), y: height - bottom + 16, 'text-anchor': 'middle' }, countText(tick)));
+  }
+  plot.append(svg('line', { class: 'axis', x1: left, x2: width - right, y1: height - bottom, y2: height - bottom }),
+    svg('text', { class: 'strong', x: (left + width - right) / 2, y: height - 6, 'text-anchor': 'middle' }, xLabel),
+    svg('text', { class: 'strong', x: left, y: 12 }, yLabel));
+  for (const one of lines) {
+    const d = one.x.map((v, i) => `${i ? 'L' : 'M'}${px(v).toFixed(1)} ${py(one.y[i]).toFixed(1)}`).join('');
+    plot.append(svg('path', { class: `line l${one.style % 8}`, d, 'stroke-dasharray': DASHES[one.style % 8] },
+      svg('title', null, one.name)));
+    if (one.x.length < 30) one.x.forEach((v, i) => plot.append(
+      svg('circle', { class: `l${one.style % 8}`, fill: 'none', 'stroke-width': 1.6, cx: px(v), cy: py(one.y[i]), r: 2.6 },
+        svg('title', null, `${one.name}: ${countText(one.y[i])}`))));
+  }
+  const key = h('ul', { class: 'key' }, lines.map((one) => h('li', null,
+    svg('svg', { width: 30, height: 8, 'aria-hidden': 'true' },
+      svg('line', { class: `line l${one.style % 8}`, x1: 0, x2: 30, y1: 4, y2: 4, 'stroke-dasharray': DASHES[one.style % 8] })), one.name)));
+  return h('div', null, key, h('div', { class: 'wide' }, plot));
+}

@@ -1,0 +1,215 @@
+"""A set of sheets from drafts: shuffled, numbered, drawn, dealt to annotators, written; the key apart."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import io
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.digests import digest_bytes
+from su3d_bench.errors import ConfigError
+from su3d_bench.plain_text import printable
+from su3d_bench.reports.sheet_page import page_html
+from su3d_bench.sheets.drafts import Draft
+from su3d_bench.sheets.items import (
+    ANSWER_COLUMNS,
+    ASKS,
+    PICTURES,
+    AnnotatorShare,
+    Key,
+    KeyItem,
+    Sheet,
+    SheetItem,
+    SheetKind,
+    new_item,
+    sheet_id_of,
+    write_key,
+    write_sheet,
+)
+from su3d_bench.sheets.workbook import workbook_bytes
+from su3d_bench.store import make_folder, remove_file, write_bytes, write_text
+
+MOST_ANNOTATORS = 100
+PAGE, WORKBOOK, TABLE = "sheet.html", "sheet.xlsx", "sheet.csv"
+FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
+TITLES = {
+    "retrieval": "Is the outlined object what is asked for?",
+    "annotation": "Are the labels right, and is the mask one object?",
+    "reasoning": "Is the answer right?",
+}
+Draw = Callable[[Draft], bytes]
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class Origin:
+    """Where the drafts come from, for the key."""
+
+    run: str
+    run_digest: str
+    methods: tuple[str, ...]
+    automatic_rule: str
+
+
+@dataclass(frozen=True)
+class MadeSheets:
+    """A set as it was made; ``pictures`` by file name."""
+
+    sheet: Sheet
+    key: Key
+    pictures: dict[str, bytes]
+
+
+def make_sheets(
+    kind: SheetKind,
+    drafts: Sequence[Draft],
+    draw: Draw,
+    origin: Origin,
+    *,
+    seed: int = 0,
+    annotators: int = 1,
+    overlap: float = 1.0,
+    progress: Progress = lambda n_done, n: None,
+) -> MadeSheets:
+    """The set of all ``drafts``, dealt evenly to ``annotators``; a share ``overlap`` of all items goes to each of them."""
+    if not drafts:
+        raise ConfigError("there is nothing to judge: no question, or no instance, in these scenes")
+    if not 1 <= annotators <= MOST_ANNOTATORS:
+        raise ConfigError(f"--annotators {annotators}: expected 1 to {MOST_ANNOTATORS}")
+    if not 0.0 <= overlap <= 1.0:
+        raise ConfigError(f"--overlap {overlap:g}: expected a share of the items from 0 to 1")
+    random = np.random.default_rng(seed)
+    number_of = random.permutation(len(drafts))
+    ids = [f"item-{number + 1:04d}" for number in number_of]
+    pictures: dict[str, bytes] = {}
+    for k, draft in enumerate(drafts):  # in the order of the scenes, whose frames are read once
+        progress(k, len(drafts))
+        pictures[f"{ids[k]}.png"] = draw(draft)
+    progress(len(drafts), len(drafts))
+    digests = {name: digest_bytes(content) for name, content in pictures.items()}
+    order = np.argsort(number_of)
+    contents = [[ids[k], drafts[k].text, list(drafts[k].asks), digests[f"{ids[k]}.png"]] for k in order]
+    set_id = sheet_id_of(kind, seed, contents)
+    items = tuple(
+        new_item(set_id, ids[k], drafts[k].text, drafts[k].asks, (f"{ids[k]}.png",), (digests[f"{ids[k]}.png"],))
+        for k in order
+    )
+    shares = dealt([one.id for one in items], annotators, overlap, random)
+    sheet = Sheet(set_id, kind, seed, ASKS[kind], items, shares)
+    key_items = tuple(_key_item(ids[k], drafts[k]) for k in order)
+    key = Key(set_id, kind, origin.run, origin.run_digest, origin.methods, origin.automatic_rule, key_items)
+    return MadeSheets(sheet, key, pictures)
+
+
+def dealt(
+    item_ids: Sequence[str], annotators: int, overlap: float, random: np.random.Generator
+) -> tuple[AnnotatorShare, ...]:
+    """Who gets what: a share of the items goes to all, the others are dealt in turn; each in an order of their own.
+
+    >>> shares = dealt(["a", "b", "c", "d"], 2, 0.5, np.random.default_rng(0))
+    >>> [len(one.item_ids) for one in shares], len(set(shares[0].item_ids) & set(shares[1].item_ids))
+    ([3, 3], 2)
+    """
+    drawn = [item_ids[k] for k in random.permutation(len(item_ids))]
+    n_shared = round(overlap * len(drawn)) if annotators > 1 else 0
+    shared, others = drawn[:n_shared], drawn[n_shared:]
+    shares = []
+    for k in range(annotators):
+        own = [*shared, *others[k::annotators]]
+        own = own if annotators == 1 else [own[place] for place in random.permutation(len(own))]
+        shares.append(AnnotatorShare(f"annotator-{k + 1}", tuple(sorted(own) if annotators == 1 else own)))
+    return tuple(shares)
+
+
+def _key_item(item_id: str, draft: Draft) -> KeyItem:
+    return KeyItem(
+        id=item_id,
+        scene=draft.scene,
+        methods=draft.methods,
+        instance_ids=draft.instance_ids,
+        question_id=draft.question_id,
+        question_kind=draft.question_kind,
+        stands_for=dict(draft.stands_for),
+        automatic=dict(draft.automatic),
+    )
+
+
+def write_sheets(made: MadeSheets, folder: Path, key_folder: Path) -> list[Path]:
+    """Write everything into ``folder`` and the key into ``key_folder``; the files for annotators, a folder each."""
+    if key_folder.resolve() == folder.resolve() or folder.resolve() in key_folder.resolve().parents:
+        raise ConfigError(f"--key {printable(str(key_folder), 200)}: lies where the sheets are; keep the key apart")
+    for path in (folder, key_folder, folder / PICTURES):
+        make_folder(path)
+    for old in (folder / PICTURES).glob("item-*.png"):
+        if old.name not in made.pictures:
+            remove_file(old)
+    for name, content in made.pictures.items():
+        write_bytes(folder / PICTURES / name, content)
+    written = []
+    for share in made.sheet.annotators:
+        own = folder / share.name
+        make_folder(own)
+        write_text(own / PAGE, page_html(TITLES[made.sheet.kind], page_data(made, share)))
+        write_bytes(own / WORKBOOK, workbook_bytes(made.sheet, share, made.pictures, TITLES[made.sheet.kind]))
+        write_text(own / TABLE, table_csv(made.sheet, share))
+        written += [own / PAGE, own / WORKBOOK, own / TABLE]
+    write_sheet(folder, made.sheet)
+    write_key(key_folder, made.key)
+    return written
+
+
+def page_data(made: MadeSheets, share: AnnotatorShare) -> dict[str, Any]:
+    """What the page of an annotator shows; nothing of the key."""
+    return {
+        "id": made.sheet.id,
+        "annotator": share.name,
+        "columns": list(ANSWER_COLUMNS),
+        "asks": [
+            {"name": one.name, "text": one.text, "choices": list(one.choices), "meanings": list(one.meanings)}
+            for one in made.sheet.asks
+        ],
+        "items": [
+            {
+                "id": one.id,
+                "text": one.text,
+                "asks": list(one.asks),
+                "check": one.check,
+                "picture": base64.b64encode(made.pictures[one.pictures[0]]).decode("ascii"),
+            }
+            for one in items_of(made.sheet, share)
+        ],
+    }
+
+
+def items_of(sheet: Sheet, share: AnnotatorShare) -> list[SheetItem]:
+    """The items of one annotator in that annotator's order."""
+    by_id = {one.id: one for one in sheet.items}
+    return [by_id[one] for one in share.item_ids]
+
+
+def table_csv(sheet: Sheet, share: AnnotatorShare) -> str:
+    """The table of one annotator, answers to be filled in; text that a spreadsheet would compute begins with ``'``."""
+    text = io.StringIO(newline="")
+    rows = csv.writer(text, lineterminator="\n")
+    rows.writerow((*ANSWER_COLUMNS, "picture", "text", "asked", "choices"))
+    for item in items_of(sheet, share):
+        for name in item.asks:
+            ask = sheet.ask(name)
+            told = (f"../{PICTURES}/{item.pictures[0]}", as_text(" / ".join(item.text.split("\n"))), ask.text)
+            rows.writerow((sheet.id, item.id, share.name, name, "", item.check, *told, " | ".join(ask.choices)))
+    return text.getvalue()
+
+
+def as_text(text: str) -> str:
+    """``text`` so that a spreadsheet takes it for text.
+
+    >>> as_text("=1+1"), as_text("chair")
+    ("'=1+1", 'chair')
+    """
+    return f"'{text}" if text.startswith(FORMULA_STARTS) else text

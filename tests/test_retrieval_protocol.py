@@ -1,0 +1,223 @@
+"""The retrieval and reasoning protocols: which object an instance stands for, hand-worked shares, a run with them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scored_room import ENCODER, NAMES, OneHotEncoder, instances, nothing, room, truth_as_prediction
+
+from su3d_bench.cli.main import main
+from su3d_bench.errors import ConfigError, PredictionError
+from su3d_bench.evaluation_openlex import why_not_lex_content
+from su3d_bench.evaluation_questions import score_on_questions
+from su3d_bench.metrics.covered_objects import covered_objects
+from su3d_bench.metrics.question_truths import AskedText, GivenAnswer, ReasoningTruth, RetrievalTruth, TrueAnswer
+from su3d_bench.metrics.results import metric_values
+from su3d_bench.metrics.score_questions import are_objects_right, is_answer_right
+from su3d_bench.metrics.shares import ShareCounts
+from su3d_bench.planning import protocols_of_run
+from su3d_bench.predictions.base import VertexMasks
+from su3d_bench.protocols import load_protocol, protocols_for, read_protocol, rules_file
+from su3d_bench.questions.truths import question_truth
+from su3d_bench.scoring import combine, pack_scores, score_scene, unpack_scores, why_not_scorable
+from su3d_bench.types import Partition
+
+RULES = load_protocol("rooms-retrieval")
+REASONING = load_protocol("rooms-reasoning")
+TRUTH = room()
+# Objects 1..8 are NAMES in order: 2 and 3 are chairs, 4 the table, 5 the lamp.
+ASKED = (
+    AskedText("instance", "chair", (2, 3)),
+    AskedText("instance", "lamp", (5,)),
+    AskedText("affordance", "lamp to read by", (5,)),
+    AskedText("property", "red table", (8,)),
+    AskedText("relative", "book on table", (7,)),
+    AskedText("relative", "cushion", (6,)),
+)
+QUESTIONS = RetrievalTruth(TRUTH, ASKED)
+PERFECT = truth_as_prediction(TRUTH, with_labels=False)
+
+
+def values(prediction: object, truth: RetrievalTruth = QUESTIONS) -> dict[str, float]:
+    score = score_scene(RULES, truth, prediction, ENCODER)  # type: ignore[arg-type]
+    return metric_values(RULES, [score.counts], pooled=True)  # type: ignore[list-item]
+
+
+def test_the_instance_ranked_first_is_right_where_it_stands_for_an_answer() -> None:
+    found = values(PERFECT)  # "red table" finds the table, which is not the answer; so does "book on table"
+    assert [found[key] for key in RULES.headline] == [1.0, 1.0, 0.0, 0.5, 4 / 6]
+    assert [found[f"n_{key}"] for key in RULES.headline] == [2, 1, 1, 2, 6]
+    assert found["reachable"] == 1.0
+
+
+def test_an_instance_stands_for_the_object_that_it_covers_most_of() -> None:
+    two = [np.flatnonzero((TRUTH.instance == 2) | (TRUTH.instance == 5))[20:], np.flatnonzero(TRUTH.instance == 0)]
+    covered = covered_objects(RULES.transfer, TRUTH, instances(TRUTH.points, two, None))
+    assert covered.main_object.tolist() == [5, 0]
+    assert covered.n_shared[0, [1, 4]].tolist() == [130, 150]
+
+
+def test_what_is_farther_than_5_cm_covers_nothing() -> None:
+    moved = replace(PERFECT, points=PERFECT.points + np.float32(20.0))
+    assert set(values(moved).values()) >= {0.0}
+    assert values(moved)["all"] == values(moved)["reachable"] == 0.0
+
+
+def test_an_empty_map_answers_nothing() -> None:
+    assert values(nothing(TRUTH))["all"] == 0.0
+
+
+def test_a_kind_that_is_not_asked_has_no_value() -> None:
+    found = values(PERFECT, RetrievalTruth(TRUTH, ASKED[:1]))
+    assert found["instance"] == found["all"] == 1.0
+    assert np.isnan(found["relative"])
+
+
+def test_a_partition_is_scored_as_its_instances_are() -> None:
+    owner = TRUTH.instance.astype(np.int32) - 1
+    assert PERFECT.features is not None
+    assert values(Partition(TRUTH.points, owner, PERFECT.features)) == values(PERFECT)
+
+
+def test_order_of_instances_and_questions_changes_nothing() -> None:
+    order = np.random.default_rng(0).permutation(len(PERFECT))
+    assert PERFECT.features is not None
+    mixed = instances(TRUTH.points, [PERFECT.mask(k) for k in order], None, PERFECT.features[order])
+    assert values(mixed, RetrievalTruth(TRUTH, ASKED[::-1])) == values(PERFECT)
+
+
+def test_scenes_pool_by_their_questions_and_counts_survive_the_file() -> None:
+    few = RetrievalTruth(TRUTH, ASKED[:1])
+    scores = {
+        "a": score_scene(RULES, QUESTIONS, PERFECT, ENCODER),
+        "b": score_scene(RULES, few, PERFECT, ENCODER),
+    }
+    stored = {scene: unpack_scores(pack_scores({RULES.name: one}))[RULES.name] for scene, one in scores.items()}
+    result = combine(RULES, stored)
+    assert result.metrics["all"] == 5 / 7
+    assert result.metrics == result.pooled
+    assert result.per_scene["b"]["all"] == 1.0
+    low, high = result.intervals["all"] or (np.nan, np.nan)
+    assert (low, high) == (pytest.approx(4 / 6), 1.0)
+
+
+def test_a_map_without_features_is_told_why() -> None:
+    labelled = truth_as_prediction(TRUTH, with_labels=True)
+    assert "needs features" in str(why_not_scorable(RULES, labelled))
+    with pytest.raises(PredictionError, match="needs features"):
+        score_scene(RULES, QUESTIONS, labelled, ENCODER)
+
+
+def test_protocols_of_questions_run_only_where_they_are_named() -> None:
+    assert not {"rooms-retrieval", "rooms-annotation", "rooms-reasoning"} & set(protocols_for("rooms"))
+    assert protocols_of_run(["rooms-retrieval"], ["rooms"]) == {"rooms": ("rooms-retrieval",)}
+    with pytest.raises(ConfigError, match="needs a dataset that knows questions and answers itself, which replica"):
+        protocols_of_run(["rooms-retrieval"], ["replica"])
+
+
+@pytest.mark.parametrize(
+    ("name", "old", "new", "line"),
+    [
+        ("rooms-retrieval", 'questions = "dataset"', "", "questions: kinds 'retrieval' and 'reasoning' need them"),
+        ("replica-retrieval", 'synonyms = "lexicon"', "", "synonyms: kind 'annotation' and generated questions need"),
+        ("rooms-retrieval", "aggregate", "per_kind = 3\naggregate", "per_kind: belongs to generated questions"),
+        ("rooms-annotation", "[merging]", "[answers]", "answers"),
+        ("rooms-reasoning", "distance_m = 0.25", "distance_n = 0.25", "unknown key 'answers.distance_n'; did you mean"),
+        ("rooms-reasoning", "cap_m = 0.05", "", "transfer.cap_m: kind 'reasoning' needs one"),
+        ("rooms-reasoning", "aggregate", 'prompt = "{}"\naggregate', "prompt: kind 'reasoning' compares no features"),
+    ],
+)
+def test_rules_that_do_not_fit_their_kind_are_refused(tmp_path: Path, name: str, old: str, new: str, line: str) -> None:
+    text = rules_file(name).read_text()
+    assert old in text
+    (tmp_path / "own.toml").write_text(text.replace(old, new, 1))
+    with pytest.raises(ConfigError, match=line.replace("[", r"\[")):
+        read_protocol(tmp_path / "own.toml")
+
+
+@pytest.mark.parametrize(
+    ("value", "given", "is_right"),
+    [
+        (2, 2, True), (2, 3, False), (True, True, True), (True, 1, False), (2.0, 2.24, True), (2.0, 2.26, False),
+        (10.0, 10.9, True), (2.0, None, False),
+    ],
+)  # fmt: skip
+def test_an_answer_is_right_within_the_rules(value: float, given: float | None, is_right: bool) -> None:
+    assert REASONING.answers is not None
+    true, told = TrueAnswer("?", "count", value, ()), GivenAnswer(given, np.zeros(0, np.int64), True)
+    assert is_answer_right(REASONING.answers, true, told, np.zeros(0, np.int64)) is is_right
+    assert not is_answer_right(REASONING.answers, true, replace(told, is_settled=False), np.zeros(0, np.int64))
+
+
+def test_objects_are_right_where_the_instances_stand_for_exactly_them() -> None:
+    main_object = np.array([4, 4, 9])
+    true = TrueAnswer("which?", "nearest", None, (4,))
+    for rows, is_right in (([0], True), ([0, 1], True), ([0, 2], False), ([], False)):
+        assert are_objects_right(true, GivenAnswer(None, np.array(rows, np.int64), True), main_object) is is_right
+
+
+def test_the_truth_answers_its_own_questions() -> None:
+    truth = question_truth(REASONING, SimpleNamespace(name="rooms"), "made", TRUTH)
+    assert isinstance(truth, ReasoningTruth)
+    assert len(truth.asked) > 10
+    whole = truth_as_prediction(TRUTH, with_labels=True)
+    parts = [TRUTH.points[whole.mask(k)] for k in range(len(whole))]
+    boxes = np.array([[np.percentile(c, 1, axis=0), np.percentile(c, 99, axis=0)] for c in parts], np.float32)
+    oracle = replace(whole, boxes=boxes, centroids=np.array([c.mean(axis=0) for c in parts], np.float32))
+    score = score_scene(REASONING, truth, oracle, None)
+    found = metric_values(REASONING, [score.counts], pooled=True)  # type: ignore[list-item]
+    assert (found["answer"], found["objects"]) == (1.0, 1.0)
+    wrong = replace(oracle, labels=tuple(reversed(oracle.labels or ())))
+    assert metric_values(REASONING, [score_scene(REASONING, truth, wrong, None).counts], pooled=True)["answer"] < 1  # type: ignore[list-item]
+
+
+def test_generated_questions_find_their_objects_by_name() -> None:
+    rules = load_protocol("replica-retrieval")
+    truth = question_truth(rules, SimpleNamespace(name="replica"), "made", TRUTH)
+    assert isinstance(truth, RetrievalTruth)
+    answers = {one.text: one.answers for one in truth.asked if one.kind == "instance"}
+    assert answers["chair"] == (2, 3)
+    assert set(NAMES) - {"wall"} <= set(answers)
+    encoder = OneHotEncoder()
+    score = score_scene(rules, truth, PERFECT, encoder)
+    assert metric_values(rules, [score.counts], pooled=True)["reachable"] == 1.0  # type: ignore[list-item]
+
+
+def test_a_run_scores_variants_under_the_protocols_of_questions(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
+    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+    words = (
+        "run --scenes rooms/bathroom0 --methods opensu3d@scheme1 opensu3d@scheme4 --profile oracle --limit 3 --jobs 1"
+    )
+    words += " --no-pictures --quiet --set rooms.width=160 --set rooms.height=120 --set rooms.n_frames=200"
+    words += " --protocols rooms-retrieval rooms-annotation rooms-reasoning --out"
+    assert main([*words.split(), str(tmp_path / "run")]) == 0
+    metrics = json.loads((tmp_path / "run/metrics.json").read_text())["results"]
+    by_name = {(one["method"], one["protocol"]): one for one in metrics}
+    assert len(by_name) == 6
+    first = by_name["opensu3d@scheme1", "rooms-retrieval"]["result"]
+    assert first["metrics"]["n_all"] == sum(first["metrics"][f"n_{kind}"] for kind in RULES.headline[:4]) > 50
+    assert by_name["opensu3d@scheme1", "rooms-retrieval"]["ceiling"] is None  # the oracle's map has no features
+    assert by_name["opensu3d@scheme4", "rooms-annotation"]["ceiling"]["label n"] == 1.0
+    assert by_name["opensu3d@scheme4", "rooms-reasoning"]["ceiling"]["answer"] > 0.9
+    shown = capsys.readouterr().out
+    assert "rooms-retrieval" in shown
+
+
+def test_predictions_from_elsewhere_are_scored_as_a_run_is() -> None:
+    rules = load_protocol("replica-retrieval")
+    dataset = SimpleNamespace(name="replica")
+    outcome = score_on_questions(rules, dataset, "made", TRUTH, PERFECT, ENCODER)
+    score = score_scene(rules, question_truth(rules, dataset, "made", TRUTH), PERFECT, ENCODER)
+    assert isinstance(outcome.score.counts, ShareCounts)
+    assert isinstance(score.counts, ShareCounts)
+    assert outcome.score.counts.n_right.tolist() == score.counts.n_right.tolist()
+    masks = VertexMasks(None, np.zeros(1, np.int64), np.zeros(0, np.int32), np.zeros(0), None, "id", None, ())
+    assert "needs a map with points of its own" in str(why_not_lex_content(rules, masks))
