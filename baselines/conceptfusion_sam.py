@@ -29,4 +29,4 @@ class ConceptFusionSam(ConceptFusion):
     @property
     def needs(self) -> PerceptionNeeds:
         """Every region of an image, of objects and of their parts, which may overlap."""
-        return PerceptionNeeds(masks="class-agnostic")
+        return PerceptionNeeds(masks="class-agnostic", automatic="conceptfusion")

@@ -129,7 +129,7 @@ class SAM3D:
     @property
     def needs(self) -> PerceptionNeeds:
         """Every region of an image, and the feature of its crop."""
-        return PerceptionNeeds(masks="class-agnostic")
+        return PerceptionNeeds(masks="class-agnostic", automatic="sam")
 
     @property
     def caveat(self) -> str:

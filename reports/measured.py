@@ -14,8 +14,9 @@ BY_PEOPLE = "-people"  # ends the name of what stands in a protocol's place wher
 class Measured:
     """The numbers of ``metrics.json`` for one method and protocol, as fractions, None where undefined.
 
-    What people judged is of this form too, from ``scores.json`` instead. ``run`` is the folder as it was named; ``limit``: how many frames of a scene, 0 for all; ``ceilings`` are empty
-    where there is none. ``per_scene`` is scene -> metric -> value.
+    What people judged is of this form too, from ``scores.json`` instead. ``run`` is the folder as it was named;
+    ``limit``: how many frames of a scene, 0 for all; ``ceilings`` are empty where there is none. ``per_scene`` is
+    scene -> metric -> value.
     """
 
     run: str

@@ -43,7 +43,7 @@ void main() {
   int r = int(reach);
   for (int i = 0; i < 8; i++) {
     ivec2 side = ivec2((i % 4 == 0 ? 0 : i < 4 ? 1 : -1), (i % 4 == 2 ? 0 : (i + 2) % 8 < 4 ? 1 : -1)) * r;
-    behind += clamp(log2(own) - log2(distanceAt(at + side)), 0.0, 0.04);
+    behind += clamp(log2(own) - log2(distanceAt(at + side)) - 0.006, 0.0, 0.04);
   }
   result = vec4(texelFetch(shown, at, 0).rgb * exp(-6.0 * behind), 1.0);
 }`;

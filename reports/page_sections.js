@@ -77,6 +77,9 @@ function bestOf(rows, value) {
   return numbers.length > 1 ? Math.max(...numbers) : null;
 }
 
+// Whether the numbers are those of all scenes together; where the two agree it does not matter.
+const isPooled = (one) => !!one.result && one.headline.every((metric) => one.result.metrics[metric] === one.result.pooled[metric]);
+
 function summarySection() {
   const section = part('summary', 'Summary', 'Per cent with the 95 % interval over scenes. The tick on a line is the ceiling: what the truth itself scores.');
   for (const [index, run] of RUNS.entries()) {
@@ -89,8 +92,8 @@ function summarySection() {
     const at = (one, metric) => (one.result ? one.result.metrics[metric] : null);
     const best = Object.fromEntries(metrics.map((metric) => [metric, bestOf(rows, (one) => at(one, metric))]));
     const covered = (one) => { const share = one.result && one.result.coverage['0.05']; return isNumber(share) ? 1 - share : null; };
-    section.append(h('h3', null, protocol), dataTable({
-      caption: `${protocol}, version ${rows[0].version}`, rows,
+    fill(section, null, [h('h3', null, protocol), dataTable({
+      caption: `Version ${rows[0].version}, ${isPooled(rows[0]) ? 'all scenes pooled' : 'mean of the scenes'}`, rows,
       columns: [
         { label: 'Method', value: nameOf },
         ...metrics.map((metric) => ({ label: metric, num: true, value: (one) => at(one, metric),
@@ -101,7 +104,7 @@ function summarySection() {
         { label: 'Scenes', num: true, value: (one) => (one.result ? one.result.scenes.length : 0), show: scenesText },
         { label: 'Within 5 cm', num: true, value: covered, show: (one) => percent(covered(one)) },
       ],
-    }), noteList(notesOf(rows)));
+    }), noteList(notesOf(rows))]);
   }
   if (!PROTOCOLS.length) section.append(h('p', { class: 'note warn' }, 'No protocol scored these runs.'));
 }
@@ -128,7 +131,7 @@ function matrixSection({ id, title, intro, what, head, metricsOf, valuesOf, extr
       .filter((row) => all.some((one) => isNumber(at(one, row.key))));
     const pooled = (one) => one.result.metrics[name];
     place.replaceChildren(dataTable({
-      caption: `${protocols.protocol()}: ${name}, ${all.some((one) => RUNS[one.run].is_partial) ? 'partial runs, ' : ''}${plural(rows.length, head.toLowerCase().replace(/s$/, ''))}`.replace(/classs$/, 'classes'),
+      caption: `${protocols.protocol()}: ${name} in per cent${all.some((one) => RUNS[one.run].is_partial) ? ' (PARTIAL)' : ''}`,
       rows, filter: head === 'Scene' ? 'scenes' : 'classes', tall: rows.length > 14,
       columns: [{ label: head, value: (row) => row.key }, ...(extra ? extra(all, name) : []), ...all.map((one) => ({
         label: nameOf(one), num: true, value: (row) => at(one, row.key), show: (row) => metricText(name, at(one, row.key)),
@@ -215,10 +218,10 @@ function errorsSection() {
   const names = [...new Set(DATA.errors.flatMap((one) => one.protocols.map((p) => p.protocol)))];
   const section = part('errors', 'Errors', 'What each kind of error costs: the gain in points of a per cent when it alone is mended and everything is scored anew. The value, all gains, overlap and rest give 100.');
   const reasons = DATA.errors.filter((one) => one.reason).map((one) => `${nameOf(one)}: not explained: ${one.reason}`);
-  if (!names.length) { section.append(noteList(reasons)); return; }
+  if (!names.length) { fill(section, null, [noteList(reasons)]); return; }
   const place = h('div'), protocols = protocolField(names), metric = select('Metric', [], null, draw);
   section.append(h('div', { class: 'toolbar' }, protocols, metric), place);
-  if (reasons.length) section.append(...noteList(reasons));
+  fill(section, null, [noteList(reasons)]);
   chosen.listeners.push(refresh);
   const explained = () => DATA.errors.flatMap((one) => one.protocols.filter((p) => p.protocol === protocols.protocol()).map((p) => ({ ...p, run: one.run, method: one.method })));
   function refresh() {
@@ -245,7 +248,7 @@ function errorsSection() {
         row('Overlap', 'all mendings together beyond their sum', (one) => signed(one.overlap[name])),
         row('Rest', 'what no mending reaches', (one) => signed(one.rest[name])),
         stages.map((stage) => row(`With true ${stage}`, 'one stage replaced by the truth', (one) => (one.stages[stage] ? percent(one.stages[stage][name]) : '–')))))),
-    ...[noteList([...new Set(DATA.errors.flatMap((one) => one.remarks))])].flat().filter(Boolean));
+    h('div', null, noteList([...new Set(DATA.errors.flatMap((one) => one.remarks))])));
   }
   refresh();
 }
@@ -353,7 +356,7 @@ function compareSection() {
       { label: 'B − A', num: true, value: (row) => row.difference, show: (row) => [signed(row.difference), row.interval ? h('small', null, ` [${signed(row.interval[0])}, ${signed(row.interval[1])}]`) : null],
         best: (row) => row.interval && (row.interval[0] > 0 || row.interval[1] < 0) },
       { label: 'p', num: true, value: (row) => row.p, show: (row) => (isNumber(row.p) ? [row.p.toPrecision(2), h('small', null, ` (${plural(row.pairs, 'scene')})`)] : '–') },
-      { label: 'Scene by scene', value: (row) => row.n, show: strip }] }), ...[noteList([...new Set([...one.remarks, ...one.protocols.flatMap((p) => p.remarks)])])].flat().filter(Boolean));
+      { label: 'Scene by scene', value: (row) => row.n, show: strip }] }), h('div', null, noteList([...new Set([...one.remarks, ...one.protocols.flatMap((p) => p.remarks)])])));
   }
   function strip(row) {
     const width = 150, most = Math.max(0.02, ...row.scenes.map(([, value]) => Math.abs(value || 0))), x = (v) => width / 2 + (v / most) * (width / 2 - 6);
@@ -373,7 +376,7 @@ function provenanceSection() {
       ['Code', run.code], ['Commit', run.git ? `${run.git.commit}${run.git.is_dirty ? ', with changes' : ''}` : 'not recorded'],
       ['Hardware', run.hardware], ['Packages', Object.entries(run.packages).map(([name, version]) => `${name} ${version}`).join(', ')]];
     section.append(h('h3', null, runNames[index]), h('dl', null, facts.flatMap(([name, text]) => [h('dt', null, name), h('dd', null, text)])));
-    if (run.warnings.length) section.append(...noteList(run.warnings));
+    fill(section, null, [noteList(run.warnings)]);
     const hash = (text) => h('span', { class: 'hash' }, text);
     section.append(h('details', null, h('summary', null, 'Rules and data'),
       dataTable({ caption: 'Protocols', rows: run.protocols, columns: [{ label: 'Protocol', value: (row) => row.name }, { label: 'Version', num: true, value: (row) => row.version }, { label: 'Digest', value: (row) => row.digest, show: (row) => hash(row.digest) }] }),

@@ -28,8 +28,8 @@ def second_looks_csv(looks: Sequence[Mapping[str, Any]]) -> str:
     writer = csv.writer(text, lineterminator="\n")
     writer.writerow(COLUMNS)
     for one in looks:
-        row = (one["item_id"], one["ask"], one["reason"], _answers(one), one["automatic"], one["scene"])
-        row += (", ".join(one["methods"]), one["text"], ", ".join(one["pictures"]))
+        row = [one["item_id"], one["ask"], one["reason"], _answers(one), one["automatic"], one["scene"]]
+        row += [", ".join(one["methods"]), one["text"], ", ".join(one["pictures"])]
         writer.writerow([harmless(cell) for cell in row])
     return text.getvalue()
 

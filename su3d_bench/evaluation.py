@@ -257,12 +257,11 @@ def _why_not_truth(rules: ProtocolRules, ground: _Ground, *, is_named: bool) -> 
         return "needs --queries FILE" if is_named else f"{NOT_MEANT} scenes without queries"
     if ground.dataset is not None:
         if not is_named and (ground.dataset_name not in rules.datasets or not rules.by_default):
-            named = ground.dataset_name not in rules.datasets
-            return f"{NOT_MEANT} {ground.dataset_name}" if named else "runs where it is named with --protocol"
+            return f"{NOT_MEANT} {ground.dataset_name} unless it is named"
         return why_not_fitting(rules, ground.dataset)
     assert ground.text is not None
     if rules.kind in SHARE_KINDS:
-        return "needs the objects of a dataset; name one with --dataset"
+        return "needs the objects of a dataset; name one with --dataset" if is_named else f"{NOT_MEANT} texts"
     if rules.kind == "instance" and not ground.text.has_instances:
         return "needs instances, the ground truth holds class ids alone (expected class id * 1000 + instance)"
     if is_named:

@@ -31,6 +31,7 @@ Progress = Callable[[str], None]
 
 class _Values(BaseModel):
     metrics: Values
+    pooled: Values = {}
     intervals: dict[str, tuple[Number, Number] | None]
     scenes: tuple[str, ...]
     per_scene: dict[str, Values]

@@ -15,7 +15,7 @@ from su3d_bench.config import RunConfig, Settings, check_keys, check_names, read
 from su3d_bench.digests import code_digest, digest_json
 from su3d_bench.errors import ConfigError, DataError, suggest
 from su3d_bench.method_names import NamedMethod, named_method
-from su3d_bench.perception.profiles import PROFILES, PerceptionConfig
+from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
 from su3d_bench.protocols import ProtocolRules, load_protocol, protocols_for
 from su3d_bench.questions.truths import has_own_queries
 from su3d_bench.scene_run import (
@@ -83,11 +83,13 @@ def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | N
     settings += read_assignments(assignments, [*{one.base for one in methods.values()}, *methods], list(datasets))
     _check_sections("method", settings, {one.base: one.target for one in methods.values()}, list(methods))
     _check_sections("dataset", settings, datasets)
+    perception = resolve(settings, ("perception",), PerceptionConfig)
+    check_models(config.profile, perception)
     parts = _Parts(
         tuple(_method_part(one, settings) for one in methods.values()),
         {target: _part("dataset", target, settings) for target in datasets.values()},
         None if CEILING_METHOD in methods else _part("method", CEILING_METHOD, settings),
-        resolve(settings, ("perception",), PerceptionConfig).model_dump_json(),
+        perception.model_dump_json(),
         protocols_of_run(config.protocols, list(datasets.values())),
     )
     chosen, notes = expand_scenes(config.scenes, parts.datasets)

@@ -56,8 +56,8 @@ class MergeRules(BaseModel):
     """When a mask is faulty: over-merged or under-merged.
 
     ``over_merged_share``: of the object vertices that it covers, at least this share belongs to other objects than the
-    one that it covers most. ``under_merged_share``: of the vertices of that object that any instance of it covers, it
-    covers less than this share.
+    one that it covers most. ``under_merged_share``: of the vertices of that object that all instances which stand for
+    it cover, one after another, it covers less than this share; so one thing twice is under-merged too.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)

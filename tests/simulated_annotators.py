@@ -58,7 +58,7 @@ def annotation_set(truths: Sequence[tuple[str, str, str]], annotators: Sequence[
     keys: list[KeyItem] = []
     for k, (first, second, merging) in enumerate(truths):
         if first == second:
-            stands_for = {"label 1": ("n", "n'")}
+            stands_for: dict[str, tuple[str, ...]] = {"label 1": ("n", "n'")}
             automatic = {"label 1": first, "merging": merging}
         elif k % 2:
             stands_for = {"label 1": ("n'",), "label 2": ("n",)}
@@ -104,7 +104,7 @@ def answered(sheet: Sheet, key: Key, error_rates: Mapping[str, float], seed: int
     """The rows of people who err in so many of their answers, choosing any other choice but "cannot tell"."""
     rng = np.random.default_rng(seed)
     truth = {one.id: one.automatic for one in key.items}
-    rows = []
+    rows: list[AnswerRow] = []
     for name, rate in error_rates.items():
         for item in sheet.items:
             for ask in item.asks:

@@ -49,7 +49,7 @@ LAYERS = (
     {"runner"},
     {"finished_run"},
     {"comparison_sides", "finished_updates", "sheets"},
-    {"comparison", "attribution", "gate", "table_sources"},
+    {"comparison", "attribution", "gate", "leaderboard", "table_sources"},
     {"page_sources", "page_maps"},
     {"inspection_checks"},
     {"inspection"},

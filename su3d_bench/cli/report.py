@@ -6,10 +6,10 @@ import argparse
 from types import ModuleType
 from typing import Any
 
-from su3d_bench.cli import report_html, report_tables, report_timing, report_verify
+from su3d_bench.cli import report_html, report_leaderboard, report_tables, report_timing, report_verify
 
 # Modules with ``NAME`` and ``add_parser(actions)``, imported for --help too, so with nothing heavy at their top.
-SUB_VERBS: tuple[ModuleType, ...] = (report_tables, report_timing, report_html, report_verify)
+SUB_VERBS: tuple[ModuleType, ...] = (report_tables, report_timing, report_html, report_leaderboard, report_verify)
 
 
 def add_parser(verbs: Any) -> None:

@@ -37,7 +37,7 @@ def add_parser(actions: Any) -> None:
     parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a run; variants stand side by side in it")
     parser.add_argument("--kind", choices=KINDS, required=True, help="what is judged")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the sheets go")
-    parser.add_argument("--key", type=Path, metavar="DIR", help="where the key goes (default: DIR-key beside the sheets)")
+    parser.add_argument("--key", type=Path, metavar="DIR", help="where the key goes (default: DIR-key)")
     parser.add_argument(
         "--questions",
         default="generated",
@@ -50,20 +50,20 @@ def add_parser(actions: Any) -> None:
         "--per-kind",
         type=int,
         metavar="N",
-        help="most items of a scene: questions of each kind (default: 5), instances (30), questions of each template (1)",
+        help="most items of a scene: questions of a kind (default: 5), instances (30), questions of a template (1)",
     )
-    parser.add_argument("--annotators", type=int, default=1, metavar="N", help="people who share the work (default: 1)")
+    parser.add_argument("--annotators", type=int, default=1, metavar="N", help="people who share the work")
     parser.add_argument(
         "--overlap", type=float, default=0.25, metavar="SHARE", help="of all items that everybody gets (default: 0.25)"
     )
-    parser.add_argument("--seed", type=int, default=0, help="of all that is drawn and shuffled (default: 0)")
-    parser.add_argument("--colours", choices=("paper", "cividis"), default="paper", help="of heat maps (default: paper)")
-    parser.add_argument("--device", default="cpu", help="of the text's encoder, where it is no small one (default: cpu)")
+    parser.add_argument("--seed", type=int, default=0, help="of the drawing and shuffling (default: 0)")
+    parser.add_argument("--colours", choices=("paper", "cividis"), default="paper", help="of the heat maps")
+    parser.add_argument("--device", default="cpu", help="of the text's encoder, if a large one (default: cpu)")
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.cli.progress import CountBar
-    from su3d_bench.executors import limit_threads
+    from su3d_bench.cli.progress import progress
+    from su3d_bench.executors import Event, limit_threads
 
     limit_threads()
     from su3d_bench.finished_run import read_run
@@ -80,7 +80,7 @@ def call(arguments: argparse.Namespace) -> int:
     rules = {rules.name for scene in source.scenes if (rules := source.rules(scene, arguments.kind)) is not None}
     artist = Artist(source, arguments.kind, arguments.colours)
     origin = Origin(source.run.name, source.run.code, source.methods, ", ".join(sorted(rules)))
-    with CountBar("pictures", is_shown=not arguments.quiet) as bar:
+    with progress(1, is_quiet=arguments.quiet, last_step="writing") as report:
         made = make_sheets(
             arguments.kind,
             drafts,
@@ -89,7 +89,7 @@ def call(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             annotators=arguments.annotators,
             overlap=arguments.overlap,
-            progress=bar.show,
+            progress=lambda n_done, n: report(Event(source.run.name, "pictures", n_done, n)),
         )
     key = arguments.key or arguments.out.with_name(f"{arguments.out.name}-key")
     files = write_sheets(made, arguments.out, key)

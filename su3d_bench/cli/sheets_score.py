@@ -34,7 +34,7 @@ def add_parser(actions: Any) -> None:
         "--sheet",
         type=Path,
         metavar="FILE",
-        help="sheet.json of the set, or its folder (default: looked for beside the key and the answers)",
+        help="sheet.json of the set, or its folder (default: looked for around the key and the answers)",
     )
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="write scores.json, tables and a list of what to look at again there"
@@ -52,8 +52,9 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.sheets.validation import check_answers, check_key
 
     key_file = arguments.key / KEY_FILE if arguments.key.is_dir() else arguments.key
-    sheet_file = _sheet_file(arguments, key_file)
-    sheet, key = read_sheet(sheet_file), read_key(key_file)
+    key = read_key(key_file)
+    sheet_file = _sheet_file(arguments, key_file, key.sheet_id)
+    sheet = read_sheet(sheet_file)
     check_key(sheet, key)
     rows, faults = [], []
     for file in dict.fromkeys(arguments.files):
@@ -81,20 +82,20 @@ def call(arguments: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def _sheet_file(arguments: argparse.Namespace, key_file: Path) -> Path:
-    """``sheet.json`` as given, or the only one beside the key, the folder above it, and the answers."""
-    from su3d_bench.sheets.items import SHEET_FILE
+def _sheet_file(arguments: argparse.Namespace, key_file: Path, sheet_id: str) -> Path:
+    """``sheet.json`` as given, or that of the key's set in the folders around the key and the answers."""
+    from su3d_bench.sheets.items import SHEET_FILE, read_sheet
 
     if arguments.sheet is not None:
         given: Path = arguments.sheet
         return given / SHEET_FILE if given.is_dir() else given
-    folders = [key_file.parent, *sorted(key_file.parent.parent.glob("*/")), *(file.parent for file in arguments.files)]
-    found = [folder / SHEET_FILE for folder in folders if (folder / SHEET_FILE).is_file()]
-    if not found:
-        raise DataError(f"{SHEET_FILE} is neither beside the key nor beside the answers; give it with --sheet")
-    if len({one.resolve() for one in found}) > 1:
-        raise DataError(f"{found[0]} and {found[-1]} could both be meant; give one with --sheet")
-    return found[0]
+    folders = [key_file.parent, *sorted(key_file.resolve().parent.parent.glob("*/"))]
+    folders += [folder for file in arguments.files for folder in (file.parent, file.resolve().parent.parent)]
+    for folder in dict.fromkeys(folders):
+        file: Path = folder / SHEET_FILE
+        if file.is_file() and read_sheet(file).id == sheet_id:
+            return file
+    raise DataError(f"{SHEET_FILE} of the set is not around the key or the answers; give it with --sheet")
 
 
 def _refuse(faults: Sequence[str], arguments: argparse.Namespace) -> None:

@@ -34,6 +34,7 @@ __all__ = [
     "Perception",
     "PerceptionConfig",
     "build_perception",
+    "check_models",
     "resolve_profile",
 ]
 
@@ -75,6 +76,18 @@ def resolve_profile(profile: str, image_domain: ImageDomain, config: PerceptionC
     from su3d_bench.perception.models.front_end import is_front_end_here
 
     return "paper" if is_front_end_here(config.paper, config.models) else "embedded"
+
+
+def check_models(profile: str, config: PerceptionConfig) -> None:
+    """Raises ``ModelMissing`` for the first model that is certainly needed and not here; nothing heavy is imported."""
+    if profile == "paper":
+        from su3d_bench.perception.models.front_end import check_front_end
+
+        check_front_end(config.paper, config.models)
+    elif config.models.encoder not in (None, EMBEDDED):
+        from su3d_bench.perception.models.loading import check_encoder
+
+        check_encoder(config.models, config.models.encoder)
 
 
 def build_perception(

@@ -15,6 +15,7 @@ from pathlib import Path
 
 from su3d_bench.errors import DataError, ModelMissing
 from su3d_bench.plain_text import printable
+from su3d_bench.reports.table_formats import FORMULA_STARTS
 from su3d_bench.sheets.items import ANSWER_COLUMNS
 
 MOST_BYTES = 256 << 20  # of one file: a workbook holds its pictures
@@ -24,8 +25,6 @@ MOST_ROWS = 200_000
 MOST_COLUMNS = 64
 MOST_CHARACTERS = 1000  # of one cell that is read
 HEADER_WITHIN = 30  # rows of a worksheet above its header, which may hold instructions
-# A file that a spreadsheet is to open has an apostrophe before text that would be taken for a formula.
-FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 
 
 @dataclass(frozen=True)
@@ -156,6 +155,7 @@ def _rows(rows: Iterable[tuple[int, Sequence[object]]], columns: dict[str, int],
 def _cell(value: object, name: str, at: str) -> str:
     """The text of a cell; what is no text, a number or a date, as the text of it."""
     text = "" if value is None else str(value).strip()
+    # as files that a spreadsheet is to open have it before text that would be taken for a formula
     if text[:1] == "'" and text[1:2] in FORMULA_STARTS:
         text = text[1:]
     if len(text) > MOST_CHARACTERS or any(unicodedata.category(one) in ("Cc", "Cs") for one in text):

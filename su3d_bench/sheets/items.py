@@ -52,7 +52,7 @@ ASKS: Mapping[SheetKind, tuple[Ask, ...]] = {
     "retrieval": (
         Ask(
             "retrieval",
-            "Is the outlined object what the text asks for?",
+            "Does the outlined object answer this?",
             JUDGEMENTS,
             ("the outlined object answers the text", "it does not", "the picture does not show it"),
         ),
@@ -60,19 +60,19 @@ ASKS: Mapping[SheetKind, tuple[Ask, ...]] = {
     "annotation": (
         Ask(
             "label 1",
-            "Is label 1 a right name of the outlined object?",
+            "Is label 1 right?",
             JUDGEMENTS,
             ("a fitting name, general or special", "a name of something else", "the picture does not show it"),
         ),
         Ask(
             "label 2",
-            "Is label 2 a right name of the outlined object?",
+            "Is label 2 right?",
             JUDGEMENTS,
             ("a fitting name, general or special", "a name of something else", "the picture does not show it"),
         ),
         Ask(
             "merging",
-            "How much of the object does the mask hold?",
+            "How is the mask merged?",
             MERGES,
             (
                 "one whole object and little else",
@@ -91,7 +91,7 @@ ASKS: Mapping[SheetKind, tuple[Ask, ...]] = {
         ),
         Ask(
             "objects",
-            "Are the objects that the answer names right?",
+            "Are the objects it names right?",
             JUDGEMENTS,
             ("all of them, and none is missing", "one is wrong or missing", "the picture does not show it"),
         ),

@@ -77,7 +77,7 @@ def make_sheets(
     overlap: float = 1.0,
     progress: Progress = lambda n_done, n: None,
 ) -> MadeSheets:
-    """The set of all ``drafts``, dealt evenly to ``annotators``; a share ``overlap`` of all items goes to each of them."""
+    """The set of all ``drafts``, dealt evenly to ``annotators``; a share ``overlap`` of it goes to each of them."""
     if not drafts:
         raise ConfigError("there is nothing to judge: no question, or no instance, in these scenes")
     if not 1 <= annotators <= MOST_ANNOTATORS:

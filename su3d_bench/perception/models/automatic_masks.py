@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.models.box_suppression import suppress
+from su3d_bench.perception.models.devices import Batches
 from su3d_bench.perception.models.sam import FULL_SIZE_AT_ONCE, MASK_THRESHOLD, OBJECT_POINT, Prompts, Sam, SeenImage
 from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int64Array, Regions, UInt8Array
 
@@ -158,6 +159,7 @@ class AutomaticMasks:
     def __init__(self, sam: Sam, config: AutomaticMaskConfig) -> None:
         self._sam = sam
         self._config = config
+        self._batches = Batches(config.points_per_batch)
 
     def regions(self, rgb: UInt8Array) -> Regions:
         """The masks of ``rgb`` in the original's order: best predicted IoU first, those of small crops before.
@@ -187,8 +189,7 @@ class AutomaticMasks:
         image = self._sam.look(np.ascontiguousarray(rgb[y0:y1, x0:x1]))
         n_side = int(self._config.points_per_side / self._config.crop_n_points_downscale_factor**crop.layer)
         points = (point_grid(max(n_side, 1)) * np.array([x1 - x0, y1 - y0])).astype(np.float32)
-        step = self._config.points_per_batch
-        batches = [self._from_points(image, points[at : at + step], crop, rgb) for at in range(0, len(points), step)]
+        batches = self._batches.run(range(len(points)), lambda part: self._from_points(image, points[part], crop, rgb))
         found = _Found.joined(batches)
         return found.at(suppress(found.boxes, found.scores, self._config.box_nms_thresh))
 

@@ -6,14 +6,15 @@ import logging
 import os
 import re
 from collections.abc import Callable, Sequence
+from importlib.util import find_spec
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from su3d_bench.errors import ConfigError, ModelMissing
 
 Item = TypeVar("Item")
+Done = TypeVar("Done")
 CPU = "cpu"
 DEVICE = re.compile(r"cpu|cuda(:[0-9]{1,2})?")
 EXPECTED_DEVICE = "expected cpu, cuda or cuda:N"
@@ -32,9 +33,18 @@ def require(package: str, needed_by: str) -> Any:
     try:
         return importlib.import_module(package)
     except ImportError as error:
-        missing = (error.name or package).partition(".")[0]
-        command = INSTALLED_AS.get(missing, "'su3d-bench[models]'" if missing in EXTRA_PACKAGES else missing)
-        raise ModelMissing(f"{needed_by} needs the package '{missing}': pip install {command}") from error
+        raise _not_installed((error.name or package).partition(".")[0], needed_by) from error
+
+
+def require_installed(package: str, needed_by: str) -> None:
+    """The same line where ``package`` is not installed; it is not imported, which for torch takes seconds."""
+    if find_spec(package) is None:
+        raise _not_installed(package, needed_by)
+
+
+def _not_installed(package: str, needed_by: str) -> ModelMissing:
+    command = INSTALLED_AS.get(package, "'su3d-bench[models]'" if package in EXTRA_PACKAGES else package)
+    return ModelMissing(f"{needed_by} needs the package '{package}': pip install {command}")
 
 
 def require_transformers(needed_by: str) -> Any:
@@ -108,9 +118,9 @@ class Batches:
         assert size >= 1
         self.size = size
 
-    def run(self, items: Sequence[Item], work: Callable[[Sequence[Item]], NDArray[Any]]) -> list[NDArray[Any]]:
+    def run(self, items: Sequence[Item], work: Callable[[Sequence[Item]], Done]) -> list[Done]:
         """What ``work`` makes of each batch of ``items``, in their order; one that does not fit alone is an error."""
-        done: list[NDArray[Any]] = []
+        done: list[Done] = []
         start = 0
         while start < len(items):
             batch = items[start : start + self.size]

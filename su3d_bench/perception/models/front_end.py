@@ -10,11 +10,11 @@ from su3d_bench.errors import ConfigError, ModelMissing
 from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.models.catalogue import FormName
 from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig
-from su3d_bench.perception.models.devices import device_for, precision_for, require
+from su3d_bench.perception.models.devices import device_for, precision_for, require, require_installed
 from su3d_bench.perception.models.files import ModelFiles, locate
 from su3d_bench.perception.models.grounded_sam import Networks
 from su3d_bench.perception.models.grounding_dino import GroundingDino
-from su3d_bench.perception.models.loading import encoder_files
+from su3d_bench.perception.models.loading import check_encoder
 from su3d_bench.perception.models.onnx_session import Provider, open_session
 from su3d_bench.perception.models.paper_config import PaperConfig
 from su3d_bench.perception.models.pretrained import kept, load_grounding_dino, load_sam
@@ -56,7 +56,7 @@ def load_networks(config: PaperConfig, models: ModelsConfig, encoder: Encoder, j
     """
     for package in PACKAGES:
         require(package, "profile 'paper'")
-    sam = _locate(models, config.segmenter, ("onnx",) if config.sam_runtime == "onnx" else _SAM_FORMS)
+    sam = _locate_sam(config, models)
     detector = _locate(models, DETECTOR, ("transformers",))
     device = device_for(models.device, job_index)
     place = _Place(device, precision_for(models.precision, device))
@@ -74,20 +74,38 @@ def load_networks(config: PaperConfig, models: ModelsConfig, encoder: Encoder, j
 
 def is_front_end_here(config: PaperConfig, models: ModelsConfig) -> bool:
     """Whether the profile can run: packages, encoder, detector and segmenter are here; tags can do without RAM++."""
-    if any(find_spec(package) is None for package in PACKAGES):
-        return False
     try:
-        if models.encoder != EMBEDDED:
-            encoder_files(models, models.encoder or PAPER_ENCODER)
-        _locate(models, config.segmenter, ("onnx",) if config.sam_runtime == "onnx" else _SAM_FORMS)
-        _locate(models, DETECTOR, ("transformers",))
+        _check_networks(config, models)
     except (ModelMissing, ConfigError):
         return False
     return True
 
 
+def check_front_end(config: PaperConfig, models: ModelsConfig) -> None:
+    """Raises ``ModelMissing`` for the first package or file that is not here; nothing heavy is imported or read."""
+    _check_networks(config, models)
+    if config.tagger == "ram":
+        require_installed("ram", "tagger 'ram'")
+        _locate(models, TAGGER, ("original",))
+    elif config.tagger == "ram-onnx":
+        _locate(models, TAGGER, ("onnx",))
+
+
+def _check_networks(config: PaperConfig, models: ModelsConfig) -> None:
+    for package in PACKAGES:
+        require_installed(package, "profile 'paper'")
+    if models.encoder != EMBEDDED:
+        check_encoder(models, models.encoder or PAPER_ENCODER)
+    _locate_sam(config, models)
+    _locate(models, DETECTOR, ("transformers",))
+
+
 def _locate(models: ModelsConfig, name: str, forms: tuple[FormName, ...]) -> ModelFiles:
     return locate(name, forms, path=models.path_of(name), folder=models.folder)
+
+
+def _locate_sam(config: PaperConfig, models: ModelsConfig) -> ModelFiles:
+    return _locate(models, config.segmenter, ("onnx",) if config.sam_runtime == "onnx" else _SAM_FORMS)
 
 
 def _torch_sam(files: ModelFiles, place: _Place) -> Sam:

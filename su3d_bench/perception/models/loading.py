@@ -11,7 +11,7 @@ from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.models import towers_onnx, towers_open_clip, towers_transformers
 from su3d_bench.perception.models.catalogue import FormName, model_entry
 from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, Runtime
-from su3d_bench.perception.models.devices import device_for, precision_for, require
+from su3d_bench.perception.models.devices import device_for, precision_for, require, require_installed
 from su3d_bench.perception.models.encoder import EncoderSpec, FoundationEncoder, Towers
 from su3d_bench.perception.models.files import ModelFiles, locate
 from su3d_bench.perception.models.onnx_session import Provider
@@ -46,6 +46,13 @@ def load_encoder(
     if config.runtime == "onnx":
         return _onnx_encoder(config, files, cache, job_index)
     return _torch_encoder(config, files, cache, job_index)
+
+
+def check_encoder(config: ModelsConfig, name: str) -> None:
+    """Raises what ``load_encoder`` would of packages and files of encoder ``name``; nothing is imported or read."""
+    encoder_files(config, name)
+    for package in PACKAGES_OF_RUNTIME[config.runtime]:
+        require_installed(package, f"encoder '{name}'")
 
 
 def encoder_files(config: ModelsConfig, name: str) -> ModelFiles:

@@ -6,11 +6,13 @@ A network that says what it sees is separate from the geometry around it: ``Torc
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
 
+from su3d_bench.perception.models.devices import Batches
 from su3d_bench.perception.models.model_images import normalised, resized, size_with_longest_side
 from su3d_bench.types import BoolArray, Float32Array, Int64Array, UInt8Array
 
@@ -64,15 +66,15 @@ class SeenImage:
 
 
 class Sam:
-    """Masks of one image after another; ``batch`` prompts are decoded at once.
+    """Masks of one image after another; ``batch`` prompts are decoded at once, fewer after a GPU's memory ran out.
 
-    On the CPU another batch may move the last digits of a logit, so a mask by single pixels; the same batch gives the
-    same bytes.
+    Another batch may move the last digits of a logit, so a mask by single pixels; on the CPU, where no batch is ever
+    halved, the same image gives the same bytes.
     """
 
     def __init__(self, network: SamNetwork, batch: int = 64) -> None:
         self.network = network
-        self.batch = batch
+        self._batches = Batches(batch)
 
     def look(self, rgb: UInt8Array) -> SeenImage:
         """The embedding of ``rgb`` (H, W, 3), for any number of prompts."""
@@ -106,13 +108,15 @@ class Sam:
         """
         masks = np.zeros((len(boxes), *image.size), bool)
         scores = np.zeros(len(boxes), np.float32)
-        for start in range(0, len(boxes), self.batch):
-            part = slice(start, start + self.batch)
+
+        def work(part: Sequence[int]) -> None:
             logits, predicted = self.decode(image, Prompts(boxes=boxes[part].astype(np.float32)), is_single)
             best = predicted.argmax(dim=1, keepdim=True)
             scores[part] = predicted.gather(1, best)[:, 0].cpu().numpy()
             chosen = logits.gather(1, best[..., None, None].expand(-1, 1, *logits.shape[2:]))[:, 0]
             masks[part] = self._masks(image, chosen)
+
+        self._batches.run(range(len(boxes)), work)
         return masks, scores
 
     def from_points(self, image: SeenImage, points: Float32Array) -> tuple[BoolArray, float]:

@@ -1,0 +1,56 @@
+"""``su3d-bench report leaderboard``: runs of many people as one ranking."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.errors import EXIT_DONE
+
+NAME = "leaderboard"
+FORMATS = ("markdown", "latex", "csv", "html")
+
+
+def add_parser(actions: Any) -> None:
+    parser = add_verb(
+        actions,
+        NAME,
+        "Rank the runs below a folder, once protocol, data and counts are known to agree.",
+        (
+            "su3d-bench report leaderboard runs",
+            "su3d-bench report leaderboard submissions --protocols rooms-instance --format html --out board.html",
+        ),
+        call,
+    )
+    parser.add_argument("folder", type=Path, metavar="DIR", help="a folder with runs anywhere below it")
+    parser.add_argument("--protocols", nargs="+", default=[], metavar="PROTOCOL", help="only these (default: all)")
+    parser.add_argument("--intervals", action="store_true", help="show the 95 %% interval over scenes")
+    parser.add_argument("--format", choices=FORMATS, default="markdown", help="(default: markdown)")
+    parser.add_argument("--out", type=Path, metavar="FILE", help="write there instead of printing")
+
+
+def call(arguments: argparse.Namespace) -> int:
+    from dataclasses import asdict
+
+    from su3d_bench.leaderboard import leaderboard, tables
+    from su3d_bench.reports.latex import latex
+    from su3d_bench.reports.table_formats import csv_text, html_page, markdown
+    from su3d_bench.store import make_folder, write_text
+
+    found = leaderboard(arguments.folder, arguments.protocols)
+    if arguments.json:
+        answer_json(asdict(found))
+        return EXIT_DONE
+    formats = {"markdown": markdown, "latex": latex, "csv": csv_text, "html": html_page}
+    text = formats[arguments.format](tables(found, intervals=arguments.intervals))
+    if arguments.out is None:
+        answer(text)
+    else:
+        make_folder(arguments.out.parent)
+        write_text(arguments.out, text)
+        remark(f"written: {arguments.out}", quiet=arguments.quiet)
+    n_entries = sum(map(len, found.boards))
+    remark(f"{n_entries} entries in {len(found.boards)} rankings, {len(found.refused)} left out", quiet=arguments.quiet)
+    return EXIT_DONE

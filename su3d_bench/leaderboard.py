@@ -1,0 +1,213 @@
+"""Runs of many people as one ranking, after it is known that their numbers answer the same question.
+
+A number enters where its run is whole, its protocol is the one installed here, to the digest, every scene's data have
+the digest that most runs have, and it follows from the run's own counts. Everything else is named with the reason.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import Counter
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+from su3d_bench.errors import ConfigError, Su3dError
+from su3d_bench.finished_run import FinishedRun, read_run
+from su3d_bench.plain_text import printable
+from su3d_bench.protocols import load_protocol, protocol_names
+from su3d_bench.reports.table_model import NOT_MEASURED, Cell, Origin, Table, TableRow
+from su3d_bench.scoring import combine
+
+MOST_RUNS = 10_000
+MOST_FOLDERS = 1_000_000  # a folder that holds more was not meant
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One number of one run that may stand in a ranking; values are fractions, in the order of ``headline``."""
+
+    run: str
+    method: str
+    protocol: str
+    version: int
+    headline: tuple[str, ...]
+    values: tuple[float | None, ...]
+    intervals: tuple[tuple[float, float] | None, ...]
+    data: tuple[tuple[str, str], ...]
+    profile: str
+    is_ceiling: bool
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        return tuple(scene for scene, _ in self.data)
+
+
+@dataclass(frozen=True)
+class Refused:
+    """What stands in no ranking, and why."""
+
+    run: str
+    what: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Leaderboard:
+    """One ranking a protocol and set of scenes, the best first."""
+
+    boards: tuple[tuple[Entry, ...], ...]
+    refused: tuple[Refused, ...]
+
+
+def leaderboard(folder: Path, protocols: Sequence[str] = ()) -> Leaderboard:
+    """The rankings of all runs below ``folder``, of all protocols or only ``protocols``; links are not followed."""
+    entries: list[Entry] = []
+    refused: list[Refused] = []
+    for path in _runs_below(folder):
+        name = printable(path.relative_to(folder).as_posix(), 200)
+        try:
+            run = read_run(path)
+        except Su3dError as error:
+            refused.append(Refused(name, "run", printable(str(error), 300)))
+            continue
+        for each in _entries(name, run, protocols):
+            (entries if isinstance(each, Entry) else refused).append(each)  # type: ignore[arg-type]
+    if not entries and not refused:
+        raise ConfigError(f"{printable(str(folder), 200)}: holds no run below it; a run has a run.json")
+    boards: list[tuple[Entry, ...]] = []
+    for key in dict.fromkeys((one.protocol, one.scenes) for one in entries):
+        alike, others = _of_same_data([one for one in entries if (one.protocol, one.scenes) == key])
+        boards.append(tuple(sorted(alike, key=_rank)))
+        refused += others
+    return Leaderboard(tuple(boards), tuple(refused))
+
+
+def _runs_below(folder: Path) -> Iterator[Path]:
+    if not folder.is_dir():
+        raise ConfigError(f"{printable(str(folder), 200)}: is no folder; name one that holds runs")
+    n_runs = 0
+    for n_folders, (path, folders, files) in enumerate(os.walk(folder, followlinks=False)):
+        if n_folders >= MOST_FOLDERS or n_runs >= MOST_RUNS:
+            raise ConfigError(f"{printable(str(folder), 200)}: holds more than {MOST_RUNS} runs; name a smaller folder")
+        folders.sort()
+        if "run.json" in files:
+            folders.clear()  # below a run there is no other
+            n_runs += 1
+            yield Path(path)
+
+
+def _entries(name: str, run: FinishedRun, protocols: Sequence[str]) -> Iterator[Entry | Refused]:
+    for (method, protocol), record in run.results.items():
+        if protocols and protocol not in protocols:
+            continue
+        what = f"{printable(method, 80)} / {printable(protocol, 80)}"
+        if reason := _why_not(run, protocol, record.failed):
+            yield Refused(name, what, reason)
+            continue
+        try:
+            scores = run.scores(method).get(protocol, {})
+            result = combine(load_protocol(protocol), scores) if scores else None
+        except Su3dError as error:
+            yield Refused(name, what, printable(str(error), 300))
+            continue
+        if result is None or record.metrics is None:
+            yield Refused(name, what, "was not scored")
+            continue
+        recomputed = result.to_json()
+        if any(recomputed["metrics"].get(key) != record.metrics.get(key) for key in record.headline):
+            yield Refused(name, what, "metrics.json does not follow from the counts; run its command again")
+            continue
+        unknown = [scene for scene in result.scenes if scene not in run.data_digests]
+        if unknown:
+            yield Refused(name, what, f"the data of {printable(unknown[0], 80)} have no digest")
+            continue
+        yield Entry(
+            run=name,
+            method=printable(method, 120),
+            protocol=protocol,
+            version=result.version,
+            headline=result.headline,
+            values=tuple(recomputed["metrics"].get(key) for key in result.headline),
+            intervals=tuple(result.intervals.get(key) for key in result.headline),
+            data=tuple((scene, run.data_digests[scene]) for scene in sorted(result.scenes)),
+            profile=printable(run.profile or "", 40),
+            is_ceiling="a ceiling, not a result" in (record.caveat or "") or method == "oracle",
+        )
+
+
+def _why_not(run: FinishedRun, protocol: str, failed: Sequence[str]) -> str | None:
+    if run.is_partial:
+        return f"is partial: the first {run.limit} frames of each scene"
+    if failed:
+        return f"is incomplete: {len(failed)} scenes failed"
+    if protocol not in protocol_names():
+        return "its protocol is none of those installed here"
+    here, (version, digest) = load_protocol(protocol), run.protocols[protocol]
+    if version != here.version:
+        return f"was scored under version {version} of the protocol, here it is {here.version}"
+    return None if digest == here.digest else "its protocol has the version of the one here and other rules"
+
+
+def _of_same_data(entries: Sequence[Entry]) -> tuple[list[Entry], list[Refused]]:
+    """The entries whose scenes have the data that most have, the first seen of equals, and the others."""
+    common, _ = Counter(one.data for one in entries).most_common(1)[0]
+    alike = [one for one in entries if one.data == common]
+    others = []
+    for one in entries:
+        if one.data != common:
+            scene = next(scene for (scene, mine), (_, other) in zip(one.data, common, strict=True) if mine != other)
+            reason = f"other data of {printable(scene, 80)} than {len(alike)} of {len(entries)} entries have"
+            others.append(Refused(one.run, f"{one.method} / {one.protocol}", reason))
+    return alike, others
+
+
+def _rank(entry: Entry) -> tuple[bool, float, str, str]:
+    first = entry.values[0]
+    return entry.is_ceiling, -(first if first is not None else -1.0), entry.method, entry.run
+
+
+def tables(found: Leaderboard, *, intervals: bool) -> list[Table]:
+    """One table a ranking; what was refused stands beneath the last one."""
+    made = [_table(board, index, intervals) for index, board in enumerate(found.boards)]
+    notes = tuple(f"Left out: {one.run}, {one.what}: {one.reason}" for one in found.refused)
+    if not made:
+        return [Table("leaderboard", "Leaderboard: no run may stand in a ranking.", "method", (), (), notes)]
+    last = made[-1]
+    made[-1] = Table(last.name, last.caption, last.head, last.columns, last.rows, (*last.notes, *notes))
+    return made
+
+
+def _table(board: Sequence[Entry], index: int, intervals: bool) -> Table:
+    first = board[0]
+    rivals = [one for one in board if not one.is_ceiling]
+    best = [
+        max((f"{100 * value:.1f}" for one in rivals if (value := one.values[k]) is not None), key=float, default="")
+        for k in range(len(first.headline))
+    ]
+    rows = []
+    for one in board:
+        cells = [_cell(one, k, best[k], intervals) for k in range(len(first.headline))]
+        rows.append(TableRow(one.method, (*cells, Cell(one.profile), Cell(one.run)), group=str(one.is_ceiling)))
+    scenes = f"{len(first.scenes)} scene{'s' if len(first.scenes) > 1 else ''}"
+    notes = [f"Scenes: {', '.join(first.scenes)}."]
+    if any(one.is_ceiling for one in board):
+        notes.append("Rows that were told the truth stand last and compete with none.")
+    return Table(
+        name=f"leaderboard-{index + 1}",
+        caption=f"{first.protocol}, version {first.version}, {scenes}; per cent.",
+        head="method",
+        columns=(*first.headline, "profile", "run"),
+        rows=tuple(rows),
+        notes=tuple(notes),
+    )
+
+
+def _cell(entry: Entry, k: int, best: str, intervals: bool) -> Cell:
+    value, interval = entry.values[k], entry.intervals[k]
+    if value is None:
+        return Cell(NOT_MEASURED)
+    text = f"{100 * value:.1f}"
+    beside = f"[{100 * interval[0]:.1f}, {100 * interval[1]:.1f}]" if intervals and interval is not None else ""
+    origin = Origin(entry.run, entry.method, entry.protocol, entry.version, entry.headline[k], "value", value, interval)
+    return Cell(text, beside, is_best=text == best and not entry.is_ceiling, origin=origin)

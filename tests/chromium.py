@@ -1,0 +1,146 @@
+"""A headless Chromium for tests, driven through its DevTools protocol over a pipe: no driver, no network."""
+
+from __future__ import annotations
+
+import json
+import os
+import select
+import shutil
+import subprocess
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any
+
+NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
+FLAGS = (
+    "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
+    "--disable-component-update", "--disable-sync", "--disable-extensions", "--disable-dev-shm-usage", "--mute-audio",
+    "--remote-debugging-pipe",
+)  # fmt: skip
+WAIT_S = 120.0
+
+
+def find_chromium() -> str | None:
+    """The browser's program; None where none is installed."""
+    return next((found for name in NAMES if (found := shutil.which(name)) is not None), None)
+
+
+class Chromium:
+    """A browser with one page; its profile is in ``folder`` and stays there, so that a second one finds it again."""
+
+    def __init__(self, folder: Path, *, width: int = 1280, height: int = 800, is_phone: bool = False) -> None:
+        program = find_chromium()
+        assert program is not None
+        to_browser, self._write = os.pipe()
+        self._read, from_browser = os.pipe()
+        self._rest, self._number = b"", 0
+        command = [program, *FLAGS, f"--user-data-dir={folder}", "about:blank"]
+        # The protocol speaks on descriptors 3 and 4.
+        shell = ["sh", "-c", f'exec "$@" 3<&{to_browser} 4>&{from_browser}', "sh", *command]
+        self._process = subprocess.Popen(
+            shell, pass_fds=(to_browser, from_browser), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
+        )
+        os.close(to_browser)
+        os.close(from_browser)
+        self.messages: list[dict[str, Any]] = []
+        target = self._call("Target.createTarget", {"url": "about:blank"}, None)["targetId"]
+        self._session = self._call("Target.attachToTarget", {"targetId": target, "flatten": True}, None)["sessionId"]
+        for domain in ("Page", "Runtime", "Log", "Network"):
+            self.call(f"{domain}.enable")
+        size = {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": is_phone}
+        self.call("Emulation.setDeviceMetricsOverride", size)
+
+    def __enter__(self) -> Chromium:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+        try:
+            self._call("Browser.close", {}, None)
+            self._process.wait(timeout=20)
+        except (OSError, AssertionError, subprocess.TimeoutExpired):
+            self._process.kill()
+            self._process.wait()
+        os.close(self._write)
+        os.close(self._read)
+
+    def call(self, method: str, values: Mapping[str, Any] | None = None) -> dict[str, Any]:
+        """Ask the page; what it says unasked in the meantime is kept in ``messages``."""
+        return self._call(method, values or {}, self._session)
+
+    def _call(self, method: str, values: Mapping[str, Any], session: str | None) -> dict[str, Any]:
+        self._number += 1
+        message: dict[str, Any] = {"id": self._number, "method": method, "params": dict(values)}
+        if session is not None:
+            message["sessionId"] = session
+        content = json.dumps(message).encode() + b"\0"
+        while content:
+            content = content[os.write(self._write, content) :]
+        end = time.monotonic() + WAIT_S
+        while True:
+            answer = self._next(end)
+            if answer.get("id") == self._number:
+                assert "error" not in answer, answer["error"]
+                result: dict[str, Any] = answer["result"]
+                return result
+            self.messages.append(answer)
+
+    def _next(self, end: float) -> dict[str, Any]:
+        while b"\0" not in self._rest:
+            ready, _, _ = select.select([self._read], [], [], max(0.0, end - time.monotonic()))
+            assert ready, "the browser does not answer"
+            part = os.read(self._read, 1 << 16)
+            assert part, "the browser has gone"
+            self._rest += part
+        line, _, self._rest = self._rest.partition(b"\0")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+    def open(self, path: Path) -> None:
+        """Open a file, as a person does who double-clicks on it."""
+        self.call("Page.navigate", {"url": path.resolve().as_uri()})
+        self.until("document.readyState === 'complete' && location.protocol === 'file:'")
+
+    def run(self, script: str) -> Any:
+        """The value of an expression in the page."""
+        answer = self.call("Runtime.evaluate", {"expression": script, "returnByValue": True, "awaitPromise": True})
+        assert "exceptionDetails" not in answer, answer["exceptionDetails"]
+        return answer["result"].get("value")
+
+    def until(self, script: str) -> None:
+        """Wait until an expression is true."""
+        end = time.monotonic() + WAIT_S
+        while not self.run(script):
+            assert time.monotonic() < end, f"it never came true: {script}"
+            time.sleep(0.02)
+
+    def press(self, *keys: str) -> None:
+        """Press keys one after another: ``1``, ``u``, ``ArrowLeft``."""
+        for key in keys:
+            self.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": key})
+            self.call("Input.dispatchKeyEvent", {"type": "keyUp", "key": key})
+
+    def downloads_to(self, folder: Path) -> None:
+        values = {"behavior": "allow", "downloadPath": str(folder)}
+        self._call("Browser.setDownloadBehavior", values, None)
+
+    def screenshot(self, path: Path) -> None:
+        import base64
+
+        path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", {"format": "png"})["data"]))
+
+    def faults(self) -> list[str]:
+        """What the page complained of: errors, refused resources, and every address beyond the file that it asked for."""
+        self.run("0")
+        found = []
+        for one in self.messages:
+            values = one.get("params", {})
+            if one.get("method") == "Runtime.exceptionThrown":
+                found.append(str(values["exceptionDetails"].get("text")))
+            elif one.get("method") == "Log.entryAdded":
+                found.append(str(values["entry"].get("text")))
+            elif one.get("method") == "Network.requestWillBeSent":
+                url = str(values["request"]["url"])
+                found += [] if url.startswith(("file:", "data:", "blob:", "about:")) else [url]
+        return found

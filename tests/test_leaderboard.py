@@ -1,0 +1,119 @@
+"""The ranking of many people's runs: what may stand in it, and what is named with the reason."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from painted import colour_perception
+
+from su3d_bench import scene_run
+from su3d_bench.cli.main import main
+from su3d_bench.leaderboard import leaderboard
+
+PAINTED = f"{Path(__file__).parent}/painted.py"
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("board")
+    words = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--no-pictures", "--jobs", "1"]
+    words += ["--protocols", "rooms-semantic", "rooms-instance"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        for name, method in (("ann/first", "Collector@drop=1"), ("bob", "Collector")):
+            assert main([*words, "--methods", f"{PAINTED}:{method}", "--out", str(folder / name)]) == 0
+    return folder
+
+
+@pytest.fixture
+def runs(made: Path, tmp_path: Path) -> Path:
+    shutil.copytree(made, tmp_path / "runs")
+    return tmp_path / "runs"
+
+
+def edit(path: Path, change: Callable[[Any], None]) -> None:
+    value = json.loads(path.read_text())
+    change(value)
+    path.write_text(json.dumps(value))
+
+
+def test_runs_of_one_protocol_and_data_are_ranked_by_the_first_headline(runs: Path) -> None:
+    found = leaderboard(runs)
+    assert [[one.run for one in board] for board in found.boards] == [["bob", "ann/first"]] * 2
+    assert found.refused == ()
+    values = [one.values[0] or 0.0 for one in found.boards[0]]
+    assert values == sorted(values, reverse=True)
+
+
+REFUSED: dict[str, tuple[str, Callable[[Any], None], str]] = {
+    "another version": ("run.json", lambda r: r["protocols"][0].update(version=7), "under version 7 of the protocol"),
+    "other rules": ("run.json", lambda r: r["protocols"][0].update(digest="f" * 64), "other rules"),
+    "edited numbers": (
+        "metrics.json",
+        lambda m: m["results"][0]["result"]["metrics"].update(mAcc=0.123),
+        "does not follow from the counts",
+    ),
+    "a partial run": ("run.json", lambda r: r.update(is_partial=True), "is partial"),
+    "a failed scene": ("metrics.json", lambda m: m["results"][0].update(failed=["painted/b"]), "is incomplete"),
+    "no record": ("run.json", lambda r: r.clear(), "is not as a run writes it"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_does_not_agree_is_left_out_with_the_reason(name: str, runs: Path) -> None:
+    file, change, reason = REFUSED[name]
+    edit(runs / "bob" / file, change)
+    found = leaderboard(runs)
+    assert any(one.run == "bob" and reason in one.reason for one in found.refused), found.refused
+    assert any([one.run for one in board] == ["ann/first"] for board in found.boards)
+
+
+def test_of_two_sets_of_data_the_one_that_most_have_is_ranked(runs: Path) -> None:
+    shutil.copytree(runs / "bob", runs / "carl")
+    edit(runs / "ann/first" / "run.json", lambda r: r["data_digests"].update({"painted/a": "other"}))
+    found = leaderboard(runs)
+    assert [[one.run for one in board] for board in found.boards] == [["bob", "carl"]] * 2
+    assert {one.reason for one in found.refused} == {"other data of painted/a than 2 of 3 entries have"}
+
+
+def test_runs_over_other_scenes_have_a_ranking_of_their_own(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    words = ["run", "--scenes", f"{PAINTED}:Painted/a", "--no-pictures", "--jobs", "1", "--protocols", "rooms-semantic"]
+    assert main([*words, "--methods", f"{PAINTED}:Collector", "--out", str(runs / "one-scene")]) == 0
+    assert sorted(len(board) for board in leaderboard(runs, ["rooms-semantic"]).boards) == [1, 2]
+
+
+def test_the_command_prints_marks_the_best_and_says_what_is_left_out(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    edit(runs / "ann/first" / "run.json", lambda r: r["protocols"][0].update(version=7))
+    assert main(["report", "leaderboard", str(runs), "--intervals"]) == 0
+    shown = capsys.readouterr()
+    assert "| collector " in shown.out and "**" in shown.out and "Left out: ann/first" in shown.out
+    assert "3 entries in 2 rankings, 1 left out" in shown.err
+    page = tmp_path / "board.html"
+    assert main(["report", "leaderboard", str(runs), "--format", "html", "--out", str(page)]) == 0
+    assert page.read_text().startswith("<!")
+    assert main(["report", "leaderboard", str(runs), "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["boards"]) == 2
+
+
+@pytest.mark.parametrize("name", ["empty", "absent"])
+def test_a_folder_without_runs_is_one_line(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "empty").mkdir()
+    assert main(["report", "leaderboard", str(tmp_path / name)]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+def test_a_hostile_folder_name_does_no_harm(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (runs / "bob").rename(runs / "<script>=HYPERLINK(1)|$x$")
+    for form in ("html", "markdown", "latex", "csv"):
+        assert main(["report", "leaderboard", str(runs), "--format", form]) == 0
+        text = capsys.readouterr().out
+        assert form != "html" or "<script>=" not in text
+        assert form != "latex" or "$x$" not in text
