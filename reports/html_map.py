@@ -146,7 +146,9 @@ def _plane_bytes(plane: NDArray[Any]) -> bytes:
     """Column after column; of 16 bits the low bytes of a column first."""
     columns = plane.reshape(len(plane), -1).T if len(plane) else plane.reshape(1, 0)
     if plane.dtype == np.uint16:
-        return b"".join((column & 255).astype(np.uint8).tobytes() + (column >> 8).astype(np.uint8).tobytes() for column in columns)
+        return b"".join(
+            (column & 255).astype(np.uint8).tobytes() + (column >> 8).astype(np.uint8).tobytes() for column in columns
+        )
     return np.ascontiguousarray(columns, np.uint8).tobytes()
 
 

@@ -15,9 +15,7 @@ STYLE = "page.css"
 TEMPLATE = "page.html.j2"
 
 
-def page_html(
-    title: str, numbers: Mapping[str, Any], scenes: Sequence[Mapping[str, Any]], maps: Sequence[str]
-) -> str:
+def page_html(title: str, numbers: Mapping[str, Any], scenes: Sequence[Mapping[str, Any]], maps: Sequence[str]) -> str:
     """The page. ``numbers`` and ``scenes`` are plain values; ``maps`` are in base64, in the order of ``numbers``."""
     from jinja2 import Environment
 

@@ -154,7 +154,7 @@ def png_bytes(picture: UInt8Array) -> bytes:
 
     buffer = io.BytesIO()
     image = Image.fromarray(picture).quantize(PNG_COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
-    image.save(buffer, format="PNG", compress_level=9)
+    image.save(buffer, format="PNG", compress_level=6)  # 9: a twentieth smaller in four times the time
     return buffer.getvalue()
 
 

@@ -76,7 +76,11 @@ class DrawnMap:
     def paint(self, view: MapView, colours: UInt8Array) -> UInt8Array:
         """The picture of a view, instance k in ``colours[k]``."""
         palette = np.concatenate([colours.reshape(-1, 3), np.array([NO_INSTANCE], np.uint8)])
-        return colour(view.view, palette[self.owner])[view.part]
+        return self.paint_points(view, palette[self.owner])
+
+    def paint_points(self, view: MapView, colours: UInt8Array) -> UInt8Array:
+        """The picture of a view, each drawn point in a colour (N, 3) of its own."""
+        return colour(view.view, colours)[view.part]
 
 
 def drawn_map(instances: Instances) -> DrawnMap:

@@ -190,8 +190,8 @@ function confusionSection() {
         const cell = h('td', { class: truth === called ? 'same' : null,
           title: `${label(truth)} called ${label(called)}: ${percent(value)} %, ${countText(cells.get(`${truth},${called}`) || 0)} points` },
         value >= 0.005 ? (100 * value).toFixed(0) : '');
-        if (value > 0) cell.style.backgroundColor = `rgba(var(--heat), ${(0.06 + 0.64 * value).toFixed(3)})`;
-        if (value > 0.85) cell.style.color = 'var(--on-accent)';
+        if (value > 0) cell.style.backgroundColor = `rgba(var(--heat), ${(0.06 + 0.84 * value).toFixed(3)})`;
+        if (value > 0.6) cell.style.color = 'var(--on-accent)';
         return cell;
       })))));
     const wrong = one.cells.filter(([truth, called]) => truth !== called)
@@ -330,7 +330,7 @@ function anytime(section) {
 
 function compareSection() {
   if (!DATA.comparisons.length) return;
-  const section = part('compare', 'Compare', 'B less A over the scenes that both have, in points of a per cent: with the 95 % interval when both draw the same scenes, and the exact test that flips the signs of single scenes.');
+  const section = part('compare', 'Compare', 'B less A over the scenes that both have, in points of a per cent: with the 95 % interval when both draw the same scenes, and the exact test that flips the signs of single scenes, with the least p that so many scenes can give. Bold: p below 0.05.');
   const sides = [...new Set(DATA.comparisons.flatMap((one) => [one.left, one.right].map(String)))].map((text) => {
     const at = text.indexOf(',');
     return [text, sideName(Number(text.slice(0, at)), text.slice(at + 1))];
@@ -348,14 +348,14 @@ function compareSection() {
     const sign = straight ? 1 : -1, times = (value) => (isNumber(value) ? sign * value : null);
     const rows = one.protocols.flatMap((p) => Object.entries(p.metrics).map(([metric, d]) => ({ protocol: p.protocol, metric, n: p.scenes.length,
       left: straight ? d.left : d.right, right: straight ? d.right : d.left, difference: times(d.difference),
-      interval: d.interval && (straight ? d.interval : [-d.interval[1], -d.interval[0]]), p: d.p, pairs: d.n_pairs,
+      interval: d.interval && (straight ? d.interval : [-d.interval[1], -d.interval[0]]), p: d.p, least: d.smallest_p, pairs: d.n_pairs,
       scenes: Object.entries(d.per_scene).map(([scene, value]) => [scene, times(value)]) })));
     place.replaceChildren(dataTable({ caption: 'Differences, B less A', rows, columns: [
       { label: 'Protocol', value: (row) => row.protocol }, { label: 'Metric', value: (row) => row.metric },
       { label: 'A', num: true, value: (row) => row.left, show: (row) => percent(row.left) }, { label: 'B', num: true, value: (row) => row.right, show: (row) => percent(row.right) },
       { label: 'B − A', num: true, value: (row) => row.difference, show: (row) => [signed(row.difference), row.interval ? h('small', null, ` [${signed(row.interval[0])}, ${signed(row.interval[1])}]`) : null],
-        best: (row) => row.interval && (row.interval[0] > 0 || row.interval[1] < 0) },
-      { label: 'p', num: true, value: (row) => row.p, show: (row) => (isNumber(row.p) ? [row.p.toPrecision(2), h('small', null, ` (${plural(row.pairs, 'scene')})`)] : '–') },
+        best: (row) => isNumber(row.p) && row.p < 0.05 },
+      { label: 'p', num: true, value: (row) => row.p, show: (row) => (isNumber(row.p) ? [row.p.toPrecision(2), h('small', null, ` (${plural(row.pairs, 'scene')}, at least ${row.least.toPrecision(2)})`)] : '–') },
       { label: 'Scene by scene', value: (row) => row.n, show: strip }] }), h('div', null, noteList([...new Set([...one.remarks, ...one.protocols.flatMap((p) => p.remarks)])])));
   }
   function strip(row) {

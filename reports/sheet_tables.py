@@ -10,11 +10,11 @@ from su3d_bench.reports.paper_tables import percent
 from su3d_bench.reports.table_model import NOT_MEASURED, Cell, Table, TableRow
 
 SUBJECTS = {
-    "retrieval": "Retrieval by text: is the instance ranked first right?",
-    "annotation": "Labels and merging of instances",
-    "reasoning": "Spatial reasoning: is the answer right, and are the objects that it names?",
+    "retrieval": ("Retrieval by text", "is the instance ranked first right?"),
+    "annotation": ("Labels and merging of instances", "is the label right, how was the mask merged?"),
+    "reasoning": ("Spatial reasoning", "is the answer right, and are the objects that it names?"),
 }
-JUDGES = {"people": "people", "automatic": "ground truth, same items"}
+JUDGES = {"people": "people", "automatic": "ground truth"}
 SHOWN_TESTS = 60  # pairs of methods under one metric; scores.json has all
 
 
@@ -40,16 +40,18 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
             rows.append(TableRow(f"{method} ({what})", row, group=judge))
     n_scenes = len({scene for cell in cells.values() for scene in cell["per_scene"]})
     unclear = sum(c["n_cannot_tell"] for c in cells.values() if c["judge"] == "people" and c["metric"] in metrics[-1:])
+    subject, question = SUBJECTS[scores["kind"]]
     people = ", ".join(f"{name} {n}" for name, n in scores["annotators"].items())
     return Table(
         name=f"{scores['kind']}-{dataset}",
-        caption=f"{SUBJECTS[scores['kind']]} {dataset}, {n_scenes} scene{'s' if n_scenes != 1 else ''}.",
+        caption=f"{subject} on {dataset}, {n_scenes} scene{'s' if n_scenes != 1 else ''}: {question}",
         head="method",
         columns=tuple(metrics),
         rows=tuple(rows),
         notes=(
             "Per cent; in brackets the 95 % interval over resampled items, then the number of items. An item that "
-            "several people judged counts once, with the share of them that said so",
+            "several people judged counts once, with the share of them that said so. The ground truth judges the same "
+            "items, as far as it knows them",
             f"set {scores['sheet_id']} of run {scores['run']}; {scores['n_judged']} of {scores['n_items']} items "
             f"judged; judgements by {people}",
             *([f"'cannot tell' is left out: {unclear} under {metrics[-1]}"] if unclear else []),

@@ -55,7 +55,9 @@ class Chromium:
     def __enter__(self) -> Chromium:
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         try:
             self._call("Browser.close", {}, None)
             self._process.wait(timeout=20)
@@ -131,7 +133,7 @@ class Chromium:
         path.write_bytes(base64.b64decode(self.call("Page.captureScreenshot", {"format": "png"})["data"]))
 
     def faults(self) -> list[str]:
-        """What the page complained of: errors, refused resources, and every address beyond the file that it asked for."""
+        """What the page complained of: errors, what was refused, every address that it asked for."""
         self.run("0")
         found = []
         for one in self.messages:

@@ -35,7 +35,7 @@ def truth(refine: Refine | None = None) -> AnnotationTruth:
 
 def values(prediction: Instances, refine: Refine | None = None) -> dict[str, float]:
     score = score_scene(RULES, truth(refine), prediction, None)
-    return metric_values(RULES, [score.counts], pooled=True)  # type: ignore[list-item]
+    return metric_values(RULES, [score.counts], pooled=True)
 
 
 def named(names: tuple[str, ...]) -> Instances:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from tiny_models import blocks, frame_of, tiny_dino, tiny_sam, write_models
+from tiny_models import blocks, frame_of, paper_words, tiny_dino, tiny_sam, write_models
 
 from su3d_bench.cli.main import main
 from su3d_bench.errors import ConfigError, ModelMissing
@@ -221,23 +221,11 @@ def test_the_command_line_says_it_too(no_models: Path, monkeypatch: pytest.Monke
     assert "model 'clip-vit-h-14': not found; fetch" in capsys.readouterr().err
 
 
-def ask(root: Path, models: Path, scene: str, *words: str) -> int:
-    """``su3d-bench run`` on the tiny models."""
-    settings = [f"perception.models.folder={models}", "perception.models.encoder=embedded"]
-    settings += ["perception.paper.n_tags=6", "perception.paper.grounded.boxes.box_threshold=0.3"]
-    # Random masks are scattered over the image; their own boxes would be too large to count.
-    settings += ["perception.paper.grounded.region_boxes=detector"]
-    settings += ["perception.paper.automatic.points_per_side=2", "perception.paper.automatic.pred_iou_thresh=0"]
-    settings += ["perception.paper.automatic.stability_score_thresh=0", "perception.paper.automatic.box_nms_thresh=1.0"]
-    options = ["--profile", "paper", "--out", str(root / "out"), "--quiet", "--jobs", "1", *words]
-    return main(["run", "--scenes", scene, *options, "--set", *settings])
-
-
 def test_a_room_runs_end_to_end(models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
-    words = ("--methods", "opensu3d", "sam3d", "--limit", "2", "--no-pictures", "--protocols", "rooms-semantic")
-    assert ask(tmp_path, models, "rooms/living0", *words) == 0
-    for method in ("opensu3d", "sam3d"):  # named masks, and masks of everything
+    methods = ("opensu3d", "sam3d")  # named masks, and masks of everything
+    assert main(paper_words(models, tmp_path / "out", "rooms/living0", (), "--methods", *methods)) == 0
+    for method in methods:
         found = read_prediction(next((tmp_path / "out").glob(f"scenes/*/{method}/prediction.npz")))
         assert isinstance(found, Instances) and len(found) > 0
     assert "RAM++ is not here" in str(read_json(tmp_path / "out" / "metrics.json"))
@@ -258,7 +246,7 @@ def test_real_frames_run_end_to_end(models: Path, tmp_path: Path, monkeypatch: p
     (folder / "rgbd.toml").write_text(write_toml([((key,), value, "") for key, value in keys.items()]))
     monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
-    assert ask(tmp_path, models, "rgbd/chair", "--limit", "2", "--stride", "1", "--no-pictures") == 0
+    assert main(paper_words(models, tmp_path / "out", "rgbd/chair", (), "--stride", "1")) == 0
     found = read_prediction(next((tmp_path / "out").glob("scenes/*/opensu3d/prediction.npz")))
     assert isinstance(found, Instances) and len(found) > 0
 

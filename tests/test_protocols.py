@@ -87,8 +87,8 @@ def test_instance_protocols_use_the_original_thresholds_and_size(name: str) -> N
         n_points = MIN_REGION_SIZE if rules.kind == "instance" else 1
         assert (rules.thresholds, rules.min_region_size) == (THRESHOLDS, n_points)
     else:
-        n_points = MIN_REGION_SIZE if rules.kind in SHARE_KINDS else None
-        assert (rules.thresholds, rules.min_region_size, rules.confidence) == ((), n_points, None)
+        n_vertices = MIN_REGION_SIZE if rules.kind in SHARE_KINDS else None
+        assert (rules.thresholds, rules.min_region_size, rules.confidence) == ((), n_vertices, None)
 
 
 def test_the_51_classes_of_ovo_fall_into_three_thirds() -> None:

@@ -158,3 +158,19 @@ def test_the_verb_shows_a_set_without_its_control_characters(
 def test_wrong_requests_are_one_line(words: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["questions", *words, "--quiet"]) == 2
     assert line in capsys.readouterr().err
+
+
+def test_the_verb_makes_questions_from_classes_boxes_and_frames(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    scenes = f"{Path(__file__).parent}/painted.py:Painted/a"
+    words = ["questions", "make", "--scenes", scenes, "--quiet"]
+    assert main([*words, "--colours", "--out", str(tmp_path / "q.toml")]) == 0
+    assert "with known answers" in capsys.readouterr().out
+    found = {one.text: one for one in read_questions(tmp_path / "q.toml")}
+    assert found["chair"] == new_question("painted/a", "instance", "chair", (1,), "generated")
+    assert [found[text].answers for text in ("red chair", "green sofa", "blue table")] == [(1,), (2,), (3,)]
+    assert main([*words, "--per-kind", "1", "--out", str(tmp_path / "few.csv")]) == 0
+    few = read_questions(tmp_path / "few.csv")
+    assert max(Counter(one.kind for one in few).values()) == 1
+    assert {one.id for one in few} <= {one.id for one in found.values()}

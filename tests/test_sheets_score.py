@@ -27,6 +27,7 @@ from su3d_bench.sheets.score_file import read_scores, write_scores
 from su3d_bench.sheets.scores import ScoreCell, Scores, paired_p, score
 from su3d_bench.sheets.validation import check_answers, check_key
 from su3d_bench.statistics import sign_flip_test
+from su3d_bench.types import Float64Array
 
 Rows = list[AnswerRow]
 
@@ -143,15 +144,24 @@ def test_the_difference_of_two_schemes_is_tested_on_the_same_questions() -> None
 
 def test_the_paired_test_is_the_sign_flip_test_where_both_are_exact() -> None:
     rng = np.random.default_rng(0)
+
+    def general(changes: Float64Array) -> float:
+        test = sign_flip_test(changes)
+        assert test is not None and test.is_exact
+        return test.p
+
     for n in range(1, 30):
         changes = rng.integers(-1, 2, n).astype(np.float64)
-        test = sign_flip_test(changes)
-        assert test is not None
-        assert paired_p(changes)[0] == pytest.approx(test.p, rel=1e-12)
+        assert paired_p(changes)[0] == pytest.approx(general(changes), rel=1e-12)
     # 5 to 20 of 25 that differ: 2 x sum of C(25, k) for k = 0..5, over 2^25
     assert paired_p(np.repeat([1.0, -1.0, 0.0], [20, 5, 9]))[0] == pytest.approx(2 * 68406 / 2**25)
     # with halves, of two annotators, the signed sums of .5 .5 1: only +++ and --- are as far as 2
     assert paired_p(np.array([0.5, 0.5, 1.0])) == (0.25, 0.25, True)
+    thirds = rng.integers(-3, 4, 25) / 3
+    assert paired_p(thirds)[0] == pytest.approx(general(thirds), rel=1e-9)
+    # many judges: no small step, so the general test
+    odd = rng.random(12) - 0.3
+    assert paired_p(odd)[0] == general(odd)
 
 
 def test_labels_and_merging_of_the_paper_come_from_the_blinded_questions() -> None:
@@ -174,6 +184,12 @@ def test_labels_and_merging_of_the_paper_come_from_the_blinded_questions() -> No
     assert (test.left, test.right) == ("opensu3d label n", "opensu3d label n'")
     assert (test.n_items, test.n_differ, test.p) == (5, 3, 1.0)  # two better, one worse
     assert test.difference == pytest.approx(1 / 5)
+    # labels 1 and 2 are one question: 8 labels of 5 instances, of which two have the same label twice
+    assert [one.ask for one in found.agreements] == ["label", "merging"]
+    assert {one.ask: (one.n, one.n_equal, one.choices[0]) for one in found.confusions} == {
+        "label": (8, 8, "right"),
+        "merging": (5, 5, "well-merged"),
+    }
 
 
 def test_answers_and_objects_of_reasoning_are_counted_apart() -> None:
@@ -447,7 +463,7 @@ def test_the_tables_say_what_was_counted(small: tuple[Sheet, Key]) -> None:
     main_table = tables["retrieval-rooms"]
     assert main_table.columns == (*KINDS, "all")
     assert [row.label for row in main_table.rows] == [
-        f"{scheme} ({who})" for who in ("people", "ground truth, same items") for scheme in SCHEMES
+        f"{scheme} ({who})" for who in ("people", "ground truth") for scheme in SCHEMES
     ]
     truth = main_table.rows[4].cells[-1]
     assert truth.text == "50.0" and truth.beside.endswith("n=8")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -108,6 +109,20 @@ def write_models(root: Path) -> Path:
     (root / "grounding-dino" / "preprocessor_config.json").write_text("{}")
     tiny_tokenizer(root / "grounding-dino").save_pretrained(root / "grounding-dino")
     return root
+
+
+def paper_words(models: Path, out: Path, scene: str, settings: Sequence[str] = (), *words: str) -> list[str]:
+    """``su3d-bench run --profile paper`` on the models of ``write_models``, over two small images of a scene."""
+    lenient = [f"models.folder={models}", "models.encoder=embedded", "paper.n_tags=6"]
+    # Random masks are scattered over the image; their own boxes would be too large to count.
+    lenient += ["paper.grounded.boxes.box_threshold=0.3", "paper.grounded.region_boxes=detector"]
+    lenient += ["paper.automatic.points_per_side=2", "paper.automatic.pred_iou_thresh=0"]
+    lenient += ["paper.automatic.stability_score_thresh=0", "paper.automatic.box_nms_thresh=1.0"]
+    if scene.startswith("rooms/"):
+        settings = (*settings, "rooms.width=160", "rooms.height=120")
+        words = (*words, "--protocols", "rooms-semantic")
+    options = ["--scenes", scene, "--profile", "paper", "--limit", "2", "--no-pictures", "--jobs", "1", "--quiet"]
+    return ["run", *options, *words, "--out", str(out), "--set", *(f"perception.{one}" for one in lenient), *settings]
 
 
 def blocks(height: int, width: int, seed: int = 0, cell: int = 8) -> UInt8Array:

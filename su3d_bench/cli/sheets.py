@@ -6,10 +6,10 @@ import argparse
 from types import ModuleType
 from typing import Any
 
-from su3d_bench.cli import sheets_make, sheets_score
+from su3d_bench.cli import sheets_make, sheets_pictures, sheets_score
 
 # Modules with ``NAME`` and ``add_parser(actions)``, imported for --help too, so with nothing heavy at their top.
-SUB_VERBS: tuple[ModuleType, ...] = (sheets_make, sheets_score)
+SUB_VERBS: tuple[ModuleType, ...] = (sheets_make, sheets_score, sheets_pictures)
 
 
 def add_parser(verbs: Any) -> None:

@@ -17,7 +17,7 @@ MIN_SHARE = 0.6  # ours: of the pixels of an object that have the same word
 # CIELAB, all ours: below this chroma a colour is black, grey or white, by its lightness.
 GREY_CHROMA, BLACK_L, WHITE_L = 12.0, 25.0, 75.0
 HUES_DEGREES = (
-    (40.0, "red"), (75.0, "orange"), (105.0, "yellow"), (200.0, "green"), (300.0, "blue"), (345.0, "purple"),
+    (40.0, "red"), (75.0, "orange"), (105.0, "yellow"), (200.0, "green"), (310.0, "blue"), (345.0, "purple"),
 )  # fmt: skip
 BROWN_L, BROWN_CHROMA, BEIGE_CHROMA = 60.0, 45.0, 30.0  # a dull dark orange is brown, a pale orange or yellow beige
 PINK_L = 60.0  # a light red is pink

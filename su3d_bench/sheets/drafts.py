@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from su3d_bench.errors import ConfigError
-from su3d_bench.metrics.covered_objects import Covered, covered_objects
+from su3d_bench.metrics.covered_objects import Covered
 from su3d_bench.metrics.question_truths import AskedText, GivenAnswer, ReasoningTruth, TrueAnswer
 from su3d_bench.metrics.score_questions import (
     are_objects_right,
@@ -32,7 +31,7 @@ from su3d_bench.reasoning.named_objects import nearest_by
 from su3d_bench.reasoning.scene_map import map_of
 from su3d_bench.reasoning.solver import Solver
 from su3d_bench.sheets.items import RIGHT, WRONG
-from su3d_bench.sheets.run_source import RunSource
+from su3d_bench.sheets.run_source import RunSource, mask_digest
 from su3d_bench.types import Encoder, Float64Array, GroundTruth, Instances
 
 MOST_TEXT = 1000  # characters of a query, a label or an answer that a sheet shows
@@ -92,11 +91,10 @@ def questions_of(
 def retrieval_drafts(source: RunSource, scene: str, questions: Sequence[Question], encoder: Encoder) -> list[Draft]:
     """For each question one draft for every instance that some method ranks first, with all methods that do."""
     rules = source.rules(scene, "retrieval")
-    truth = source.truth(scene, rules)
     texts = [one.text for one in questions]
     maps = {method: source.instances(scene, method) for method in source.methods}
     rankings = {method: rank_all(found, texts, encoder) for method, found in maps.items() if len(found)}
-    objects = {method: _covered(rules, truth, maps[method]) for method in rankings}
+    objects = {method: source.covered(scene, rules, maps[method]) for method in rankings}
     drafts = []
     for place, question in enumerate(questions):
         groups: dict[bytes, list[str]] = {}
@@ -198,7 +196,7 @@ def _annotation_judge(
     source: RunSource, scene: str, rules: ProtocolRules | None, truth: GroundTruth | None, instances: Instances
 ) -> Judge:
     """What the truth says of an instance and its labels: ``n``, ``n'`` and ``merging``; nothing where it is silent."""
-    covered = _covered(rules, truth, instances)
+    covered = source.covered(scene, rules, instances)
     if covered is None or rules is None or truth is None or rules.merging is None:
         return lambda row, names: {}
     known: Any = question_truth(rules, source.dataset(scene), scene.partition("/")[2], truth)
@@ -245,7 +243,7 @@ def reasoning_drafts(
         refined = refined_names(source.run.folder.job(scene, method), instances)
         a_map = map_of(instances, None if refined is None else refined.names)
         solver = Solver(a_map, None, None if encoder is None else nearest_by(encoder))
-        covered = _covered(rules, truth, instances)
+        covered = source.covered(scene, rules, instances)
         row_of = {one.id: one.row for one in a_map.objects}
         names = [""] * len(instances)
         for one in a_map.objects:
@@ -310,19 +308,8 @@ def _judged_answer(
     return found
 
 
-def mask_digest(instances: Instances, rows: Sequence[int]) -> bytes:
-    """A key of where the instances lie, so that equal masks of several maps are known as one."""
-    total = hashlib.sha256()
-    for row in rows:
-        total.update(np.ascontiguousarray(instances.points[instances.mask(row)]).tobytes())
-        total.update(b"|")
-    return total.digest()
-
-
 def _also(draft: Draft, method: str, instance_id: int) -> Draft:
     """The draft, said by one more method; that of a method said twice stays as it is."""
-    from dataclasses import replace
-
     if method in draft.methods:
         return draft
     return replace(draft, methods=(*draft.methods, method), instance_ids=(*draft.instance_ids, instance_id))
@@ -334,7 +321,3 @@ def _id(instances: Instances, row: int) -> int:
 
 def _only_id(instances: Instances, rows: Sequence[int]) -> int:
     return _id(instances, rows[0]) if len(rows) == 1 else -1
-
-
-def _covered(rules: ProtocolRules | None, truth: GroundTruth | None, instances: Instances) -> Covered | None:
-    return None if rules is None or truth is None else covered_objects(rules.transfer, truth, instances)

@@ -20,9 +20,9 @@ from su3d_bench.reports.item_picture import (
 )
 from su3d_bench.reports.map_views import DrawnMap, MapView, drawn_map, pale
 from su3d_bench.reports.pictures import instance_colours
-from su3d_bench.sheets.drafts import Draft, mask_digest
+from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import SheetKind
-from su3d_bench.sheets.run_source import RunSource
+from su3d_bench.sheets.run_source import RunSource, mask_digest
 from su3d_bench.types import BoolArray, Float64Array, Frame, Instances, UInt8Array
 
 ANSWER_COLOUR, OTHER_COLOUR = (222, 74, 22), (32, 98, 196)  # those of reasoning_picture

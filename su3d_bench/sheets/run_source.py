@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Sequence
 from functools import cached_property, lru_cache
 from typing import Any
@@ -12,6 +13,7 @@ from su3d_bench import registry
 from su3d_bench.config import Setting, Settings, resolve
 from su3d_bench.errors import ConfigError, DataError, GroundTruthMissing, PredictionError, StoreError, suggest
 from su3d_bench.finished_run import FinishedRun
+from su3d_bench.metrics.covered_objects import Covered, covered_objects
 from su3d_bench.plain_text import printable
 from su3d_bench.planning import data_root, dataset_targets, why_not_fitting
 from su3d_bench.protocols import ProtocolRules, load_protocol, protocol_names
@@ -19,7 +21,7 @@ from su3d_bench.scene_run import Part, build_dataset
 from su3d_bench.store import read_prediction
 from su3d_bench.types import Frame, GroundTruth, Instances
 
-MOST_FRAMES = 48  # of a scene, among which the best view of an object is looked for
+MOST_FRAMES = 32  # of a scene, among which the best view of an object is looked for
 
 
 class RunSource:
@@ -38,6 +40,8 @@ class RunSource:
                 hint = suggest(scene, run.scenes) or f"; it has {', '.join(run.scenes)}"
                 raise ConfigError(f"{run.name}: has no scene '{printable(scene, 80)}'{hint}")
         self.instances = lru_cache(maxsize=len(self.methods))(self._instances)
+        self._covered: dict[tuple[str, str, bytes], Covered] = {}
+        self._truths = lru_cache(maxsize=2)(self._read_truth)
         self._frames_at = lru_cache(maxsize=len(self.methods))(self._read_frames)
 
     def _instances(self, scene: str, method: str) -> Instances:
@@ -99,10 +103,31 @@ class RunSource:
 
     def truth(self, scene: str, rules: ProtocolRules | None) -> GroundTruth | None:
         """The ground truth that ``rules`` ask for; None where nobody has it."""
-        if rules is None:
-            return None
+        return None if rules is None else self._truths(scene, rules.ground_truth)
+
+    def _read_truth(self, scene: str, variant: str) -> GroundTruth | None:
         try:
-            truth: GroundTruth = self.dataset(scene).ground_truth(scene.partition("/")[2], rules.ground_truth)
+            truth: GroundTruth = self.dataset(scene).ground_truth(scene.partition("/")[2], variant)
         except GroundTruthMissing:
             return None
         return truth
+
+    def covered(self, scene: str, rules: ProtocolRules | None, instances: Instances) -> Covered | None:
+        """What of the truth each instance covers, found once for equal masks; None where there is no truth."""
+        truth = self.truth(scene, rules)
+        if rules is None or truth is None:
+            return None
+        key = (scene, rules.name, mask_digest(instances, range(len(instances))))
+        if key not in self._covered:
+            self._covered = {old: one for old, one in self._covered.items() if old[0] == scene}
+            self._covered[key] = covered_objects(rules.transfer, truth, instances)
+        return self._covered[key]
+
+
+def mask_digest(instances: Instances, rows: Sequence[int]) -> bytes:
+    """A key of where the instances lie, so that equal masks of several maps are known as one."""
+    total = hashlib.sha256()
+    for row in rows:
+        total.update(np.ascontiguousarray(instances.points[instances.mask(row)]).tobytes())
+        total.update(b"|")
+    return total.digest()

@@ -16,10 +16,12 @@ from su3d_bench.sheets.agreement import Agreement, Interval, agreement, cohen_ka
 from su3d_bench.sheets.items import CANNOT_TELL, MERGES, RIGHT, Key, KeyItem, Sheet
 from su3d_bench.sheets.validation import LABELS, Judgement
 from su3d_bench.statistics import percentile_interval, resample_weights, sign_flip_test
-from su3d_bench.types import Float64Array
+from su3d_bench.types import Float64Array, Int64Array
 
 Judge = Literal["people", "automatic"]
 SCHEMA = 1
+STEPS = (1, 2, 6, 12, 60)  # of which shares of up to 1, 2, 3, 4, 6 judges, and their differences, are whole numbers
+MOST_STEPS = 50_000  # a distribution of 100,001 sums, some seconds for as many items
 WELL_MERGED, UNDER_MERGED, OVER_MERGED = MERGES[:3]
 OF_ALL_KINDS = "all"
 LABEL_METRICS = (f"label {LABELS[0]}", f"label {LABELS[1]}")
@@ -152,7 +154,7 @@ def score(sheet: Sheet, key: Key, judgements: Sequence[Judgement], silent: Seque
     truth = [
         (one, ask, choice) for one in key.items for ask, choice in one.automatic.items() if (one.id, ask) in judged
     ]
-    ratings = _ratings(judgements)
+    ratings = _ratings(told, judgements)
     return Scores(
         sheet_id=sheet.id,
         kind=sheet.kind,
@@ -165,21 +167,29 @@ def score(sheet: Sheet, key: Key, judgements: Sequence[Judgement], silent: Seque
         n_judged=len({one.item_id for one in judgements}),
         cells=(*_cells("people", key.methods, by_people), *_cells("automatic", key.methods, _values(truth))),
         tests=tuple(_label_tests(key, by_people) if sheet.kind == "annotation" else _method_tests(key, by_people)),
-        agreements=tuple(AskAgreement(ask, agreement(items)) for ask, items in ratings.items()),
-        confusions=tuple(one for ask in ratings if (one := _confusion(sheet, ask, told)) is not None),
-        second_looks=tuple(_second_looks(sheet, keys, ratings)),
+        agreements=tuple(AskAgreement(what, agreement(items)) for what, items in ratings.items()),
+        confusions=tuple(one for what in ratings if (one := _confusion(sheet, what, told)) is not None),
+        second_looks=tuple(_second_looks(sheet, keys, judgements)),
     )
 
 
-def _ratings(judgements: Iterable[Judgement]) -> dict[str, dict[str, dict[str, str]]]:
-    """Ask -> item -> annotator -> answer."""
+_Told = tuple[KeyItem, str, str]  # an item, one of its asks, the answer
+
+
+def _ratings(told: Sequence[_Told], judgements: Sequence[Judgement]) -> dict[str, dict[str, dict[str, str]]]:
+    """What is asked -> item and ask -> annotator -> answer."""
     found: dict[str, dict[str, dict[str, str]]] = {}
-    for one in judgements:
-        found.setdefault(one.ask, {}).setdefault(one.item_id, {})[one.annotator] = one.answer
+    for (key, ask, answer), one in zip(told, judgements, strict=True):
+        found.setdefault(_asked(key, ask), {}).setdefault(f"{key.id}\0{ask}", {})[one.annotator] = answer
     return found
 
 
-def _values(told: Iterable[tuple[KeyItem, str, str]]) -> list[_Value]:
+def _asked(key: KeyItem, ask: str) -> str:
+    """The name of what is asked: labels 1 and 2 change places from item to item and ask the same."""
+    return "label" if ask in key.stands_for else ask
+
+
+def _values(told: Iterable[_Told]) -> list[_Value]:
     """What items give to metrics, each metric of an item once, in the order of the sheet."""
     answers: dict[tuple[str, str], list[str]] = defaultdict(list)
     keys: dict[str, KeyItem] = {}
@@ -306,37 +316,49 @@ def _test(
 def paired_p(changes: Float64Array) -> tuple[float, float, bool]:
     """The two-sided p of the sign-flip test of ``changes``, the least that so many can give, and whether it is exact.
 
-    What does not change no sign can move. Where the others are equally large, as when each item is judged once, the
-    number of those above 0 is binomial: McNemar's exact test, whatever their number.
+    What does not change no sign can move. Shares of a few judges are multiples of one small step, so that the sums of
+    all patterns of signs can be counted, however many there are; where each item is judged once, this is McNemar's
+    exact test. Beyond ``MOST_STEPS`` it is ``sign_flip_test``.
 
     >>> paired_p(np.array([1.0, 1.0, 1.0, 0.0]))
     (0.25, 0.25, True)
     """
     differ = changes[changes != 0]
-    n = len(differ)
-    if n == 0:
+    if not len(differ):
         return 1.0, 1.0, True
-    if np.ptp(np.abs(differ)) > 0:
-        test = sign_flip_test(differ)
-        assert test is not None
-        return test.p, test.smallest_p, test.is_exact
-    from scipy.stats import binom
-
-    n_above = int(np.count_nonzero(differ > 0))
-    p = 2.0 * float(binom.sf(max(n_above, n - n_above) - 1, n, 0.5))
-    return min(1.0, p), min(1.0, 2.0 ** (1 - n)), True
+    for n_steps in STEPS:
+        steps = np.rint(differ * n_steps)
+        if np.abs(steps / n_steps - differ).max() < 1e-9 and np.abs(steps).sum() <= MOST_STEPS:
+            return _sign_flip_of_steps(steps.astype(np.int64)), min(1.0, 2.0 ** (1 - len(differ))), True
+    test = sign_flip_test(differ)
+    assert test is not None
+    return test.p, test.smallest_p, test.is_exact
 
 
-def _confusion(sheet: Sheet, ask: str, told: Sequence[tuple[KeyItem, str, str]]) -> Confusion | None:
+def _sign_flip_of_steps(steps: Int64Array) -> float:
+    """How likely a sum of ``steps`` with random signs is as far from 0 as theirs, from the distribution of the sum."""
+    sizes = np.abs(steps)
+    far = int(sizes.sum())
+    shares = np.zeros(2 * far + 1)
+    shares[far] = 1.0
+    for size in sizes:
+        # the ends are 0 until the last step, so that nothing comes round
+        shares = (np.roll(shares, size) + np.roll(shares, -size)) / 2.0
+    at_least = abs(int(steps.sum()))
+    return min(1.0, float(shares[np.abs(np.arange(-far, far + 1)) >= at_least].sum()))
+
+
+def _confusion(sheet: Sheet, what: str, told: Sequence[_Told]) -> Confusion | None:
     """None where the truth is known of no judged item."""
-    choices = sheet.ask(ask).choices
-    pairs = [(answer, key.automatic[ask]) for key, name, answer in told if name == ask and ask in key.automatic]
-    if not pairs:
+    known = [(key, ask, answer) for key, ask, answer in told if _asked(key, ask) == what and ask in key.automatic]
+    if not known:
         return None
+    choices = sheet.ask(known[0][1]).choices
+    pairs = [(answer, key.automatic[ask]) for key, ask, answer in known]
     counts = Counter(pairs)
     clear = [pair for pair in pairs if CANNOT_TELL not in pair]
     return Confusion(
-        ask=ask,
+        ask=what,
         choices=choices,
         counts=tuple(tuple(counts[row, column] for column in choices) for row in choices),
         n=len(clear),
@@ -345,21 +367,22 @@ def _confusion(sheet: Sheet, ask: str, told: Sequence[tuple[KeyItem, str, str]])
     )
 
 
-def _second_looks(
-    sheet: Sheet, keys: Mapping[str, KeyItem], ratings: Mapping[str, Mapping[str, Mapping[str, str]]]
-) -> list[SecondLook]:
+def _second_looks(sheet: Sheet, keys: Mapping[str, KeyItem], judgements: Iterable[Judgement]) -> list[SecondLook]:
     """What somebody should look at again, in the order of the sheet."""
+    given: dict[tuple[str, str], dict[str, str]] = defaultdict(dict)
+    for one in judgements:
+        given[one.item_id, one.ask][one.annotator] = one.answer
     found = []
     for item in sheet.items:
         key = keys[item.id]
         for ask in item.asks:
-            answers = ratings.get(ask, {}).get(item.id, {})
+            answers = given[item.id, ask]
             automatic = key.automatic.get(ask, "")
             reason = _reason(list(answers.values()), automatic)
             if reason is not None:
                 found.append(
                     SecondLook(
-                        item.id, ask, item.text, key.scene, key.methods, item.pictures, dict(answers), automatic, reason
+                        item.id, ask, item.text, key.scene, key.methods, item.pictures, answers, automatic, reason
                     )
                 )
     return found

@@ -1,0 +1,142 @@
+"""A figure of a paper: pictures in rows and columns, with all words as text that can be searched and edited."""
+
+from __future__ import annotations
+
+import io
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.errors import ConfigError
+from su3d_bench.plain_text import printable
+from su3d_bench.reports.item_picture import Tag
+from su3d_bench.reports.scene_picture import drawable
+from su3d_bench.store import make_folder, write_bytes
+from su3d_bench.types import UInt8Array
+
+FORMATS = ("pdf", "png", "svg")
+CELL_WIDTH_IN, TITLE_IN, ROW_IN, LEGEND_IN, GAP_IN = 2.4, 0.28, 0.26, 0.42, 0.08
+LEGEND_WIDTH_IN = 2.6
+DPI = 200  # of pictures within the figure
+MOST_ROW_TITLE, MOST_TAGS = 110, 40
+DARK, GREY = "#1a1a1a", "#606060"
+
+
+@dataclass(frozen=True)
+class Cell:
+    """A picture and the names in it."""
+
+    picture: UInt8Array
+    tags: tuple[Tag, ...] = ()
+
+
+@dataclass(frozen=True)
+class GridRow:
+    """``title`` stands above the row, ``note`` behind it in grey."""
+
+    title: str
+    note: str
+    cells: tuple[Cell, ...]
+
+
+def draw_grid(path: Path, columns: Sequence[str], rows: Sequence[GridRow], scale: UInt8Array | None) -> None:
+    """Write the figure as PDF, PNG or SVG by the name of ``path``; ``scale`` (256, 3) is the legend of similarity."""
+    suffix = path.suffix.lower().removeprefix(".")
+    if suffix not in FORMATS:
+        raise ConfigError(f"--out {printable(str(path), 200)}: unknown form; name a file {', '.join(FORMATS)}")
+    from matplotlib import rc_context
+
+    # 42: fonts as TrueType, so that text in a PDF stays text; no salt by time in an SVG
+    with rc_context(
+        {"pdf.fonttype": 42, "svg.fonttype": "none", "svg.hashsalt": "su3d-bench", "font.family": "DejaVu Sans"}
+    ):
+        content = _figure_bytes(suffix, columns, rows, scale)
+    make_folder(path.parent)
+    write_bytes(path, content)
+
+
+def _figure_bytes(suffix: str, columns: Sequence[str], rows: Sequence[GridRow], scale: UInt8Array | None) -> bytes:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    aspect = max(cell.picture.shape[0] / cell.picture.shape[1] for row in rows for cell in row.cells)
+    cell_height = CELL_WIDTH_IN * aspect
+    width = len(columns) * (CELL_WIDTH_IN + GAP_IN) + GAP_IN
+    height = TITLE_IN + len(rows) * (ROW_IN + cell_height + GAP_IN) + (LEGEND_IN if scale is not None else 0.1)
+    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
+    FigureCanvasAgg(figure)
+    page = _Page(figure, width, height)
+    for c, title in enumerate(columns):
+        left = GAP_IN + c * (CELL_WIDTH_IN + GAP_IN)
+        page.text(
+            left + CELL_WIDTH_IN / 2,
+            0.06,
+            textwrap.shorten(printable(title, 60), 34, placeholder="..."),
+            9,
+            ha="center",
+        )
+    for r, row in enumerate(rows):
+        top = TITLE_IN + r * (ROW_IN + cell_height + GAP_IN)
+        room = int(width * 13)
+        title = printable(row.title, min(MOST_ROW_TITLE, room))
+        page.text(GAP_IN, top + 0.03, title, 8.5, weight="bold")
+        if len(title) + len(row.note) < room:
+            page.text(width - GAP_IN, top + 0.04, printable(row.note, 60), 7, colour=GREY, ha="right")
+        for c, cell in enumerate(row.cells):
+            page.cell(GAP_IN + c * (CELL_WIDTH_IN + GAP_IN), top + ROW_IN, cell_height, cell)
+    if scale is not None:
+        page.scale(height - LEGEND_IN + 0.06, scale)
+    buffer = io.BytesIO()
+    metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {"Software": None}}[suffix]
+    figure.savefig(buffer, format=suffix, dpi=DPI, metadata=metadata)
+    return buffer.getvalue()
+
+
+class _Page:
+    """A figure measured in inches from its upper left corner."""
+
+    def __init__(self, figure: Any, width: float, height: float) -> None:
+        self.figure, self.width, self.height = figure, width, height
+
+    def text(self, x: float, y: float, text: str, size: float, *, colour: str = DARK, **more: Any) -> None:
+        place = (x / self.width, 1 - y / self.height)
+        self.figure.text(*place, drawable(text), fontsize=size, color=colour, va="top", parse_math=False, **more)
+
+    def axes(self, x: float, y: float, width: float, height: float) -> Any:
+        box = (x / self.width, 1 - (y + height) / self.height, width / self.width, height / self.height)
+        axes = self.figure.add_axes(box)
+        axes.set_axis_off()
+        return axes
+
+    def cell(self, x: float, y: float, cell_height: float, cell: Cell) -> None:
+        axes = self.axes(x, y, CELL_WIDTH_IN, cell_height)
+        axes.imshow(cell.picture, interpolation="nearest")
+        height, width = cell.picture.shape[:2]
+        taken: list[tuple[float, float, float]] = []
+        for tag in cell.tags[:MOST_TAGS]:
+            text = drawable(printable(tag.text, 24))
+            half, row = 0.011 * len(text) + 0.01, tag.y
+            if any(abs(row - other[1]) < 0.045 and abs(tag.x - other[0]) < half + other[2] for other in taken):
+                continue  # a name that covers another tells nothing
+            taken.append((tag.x, row, half))
+            shade = "#{:02x}{:02x}{:02x}".format(*tag.colour)
+            box = {
+                "boxstyle": "round,pad=0.12",
+                "facecolor": "white",
+                "edgecolor": shade,
+                "alpha": 0.88,
+                "linewidth": 0.5,
+            }
+            axes.text(
+                tag.x * width, row * height, text, fontsize=4.6, color=DARK, ha="center", va="center", bbox=box,
+                parse_math=False, clip_on=True,
+            )  # fmt: skip
+
+    def scale(self, y: float, scale: UInt8Array) -> None:
+        left = (self.width - LEGEND_WIDTH_IN) / 2
+        axes = self.axes(left, y, LEGEND_WIDTH_IN, 0.11)
+        axes.imshow(scale[None], aspect="auto")
+        self.text(left, y + 0.14, "least similar", 7, colour=GREY)
+        self.text(left + LEGEND_WIDTH_IN, y + 0.14, "most similar", 7, colour=GREY, ha="right")

@@ -1,0 +1,165 @@
+"""The figures of the paper from a run: similarity to texts, maps by label n and n', answers with their objects."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Literal
+
+import numpy as np
+
+from su3d_bench.metrics.score_questions import labels_n
+from su3d_bench.opensu3d.retrieval import rank_all
+from su3d_bench.plain_text import printable
+from su3d_bench.questions.refined import refined_names
+from su3d_bench.reasoning.named_objects import nearest_by
+from su3d_bench.reasoning.scene_map import map_of
+from su3d_bench.reasoning.solver import Solver
+from su3d_bench.reports.figure_grid import Cell, GridRow
+from su3d_bench.reports.frame_views import seen_in
+from su3d_bench.reports.heat_scales import Scale, similarity_colours
+from su3d_bench.reports.item_picture import Tag
+from su3d_bench.reports.map_views import DrawnMap, MapView, drawn_map, pale
+from su3d_bench.reports.pictures import ROOM_SURFACES, class_colours
+from su3d_bench.sheets.drawing import ANSWER_COLOUR, OTHER_COLOUR
+from su3d_bench.sheets.run_source import RunSource
+from su3d_bench.types import Encoder, Float64Array, Frame, Instances, UInt8Array
+
+Subject = Literal["similarity", "labels", "reasoning"]
+SUBJECTS: tuple[Subject, ...] = ("similarity", "labels", "reasoning")
+CELL_WIDTH, CELL_HEIGHT = 720, 500  # pixels of one picture
+UNSEEN = 225
+Labels = Sequence[str]
+
+
+class Figures:
+    """Rows and columns of a figure; maps and views are made once for each scene."""
+
+    def __init__(
+        self, source: RunSource, *, with_photo: bool = False, view: Literal["corner", "above"] = "corner"
+    ) -> None:
+        self._source, self._with_photo, self._view = source, with_photo, view
+
+    @property
+    def columns(self) -> list[str]:
+        """Titles of the columns of similarity and reasoning."""
+        return [*(["the scene"] if self._with_photo else []), *self._source.methods]
+
+    def similarity(self, texts: Sequence[str], encoder: Encoder, scale: Scale) -> list[GridRow]:
+        """A row a scene and text: each instance in the colour of its similarity, a column a method."""
+        rows = []
+        for scene in self._source.scenes:
+            maps = self._maps(scene)
+            ranked = [rank_all(one.instances, texts, encoder) for one in maps]
+            for k, text in enumerate(texts):
+                best = [ranking[k].order[:1].tolist() for ranking in ranked]
+                views = self._views(maps, best[0])
+                cells = [
+                    Cell(shown.paint(view, similarity_colours(ranking[k].similarity, scale)))
+                    for shown, view, ranking in zip(maps, views, ranked, strict=True)
+                ]
+                rows.append(
+                    GridRow(f'"{printable(text, 90)}"', scene, (*self._photo(scene, maps[0], views[0]), *cells))
+                )
+        return rows
+
+    def labels(self) -> tuple[list[str], list[GridRow]]:
+        """Titles of the columns, and a row a scene: the map by label n and by label n' of each method."""
+        titles = [*(["the scene"] if self._with_photo else [])]
+        titles += [f"{method}: label {what}" for method in self._source.methods for what in ("n", "n'")]
+        rows = []
+        for scene in self._source.scenes:
+            maps = self._maps(scene)
+            views = self._views(maps, [])
+            cells: list[Cell] = []
+            for method, shown, view in zip(self._source.methods, maps, views, strict=True):
+                refined = refined_names(self._source.run.folder.job(scene, method), shown.instances)
+                both: list[Labels] = [labels_n(shown.instances)]
+                both.append(both[0] if refined is None else refined.names)
+                palette = class_colours(list(dict.fromkeys(name for names in both for name in names)))
+                for names in both:
+                    colours = np.array([palette[name] for name in names], np.uint8).reshape(-1, 3)
+                    cells.append(Cell(shown.paint(view, colours), _name_tags(shown, view, names, colours)))
+            rows.append(GridRow(scene, "", (*self._photo(scene, maps[0], views[0]), *cells)))
+        return titles, rows
+
+    def reasoning(self, questions: Sequence[str], encoder: Encoder | None) -> list[GridRow]:
+        """A row a scene and question, a column a method: what its answer names, and what that was held against."""
+        rows = []
+        for scene in self._source.scenes:
+            maps = self._maps(scene)
+            for question in questions:
+                cells, told, views = [], "", self._views(maps, [])
+                for k, (method, shown) in enumerate(zip(self._source.methods, maps, strict=True)):
+                    refined = refined_names(self._source.run.folder.job(scene, method), shown.instances)
+                    a_map = map_of(shown.instances, None if refined is None else refined.names)
+                    answer = Solver(a_map, None, None if encoder is None else nearest_by(encoder)).answer(question)
+                    told = told or answer.text
+                    row_of = {one.id: one.row for one in a_map.objects}
+                    rows_of = [[row_of[one] for one in ids] for ids in (answer.object_ids, answer.reference_ids)]
+                    view = self._views([shown], [*rows_of[0], *rows_of[1]])[0]
+                    views[k] = view
+                    names = {one.row: one.shown for one in a_map.objects}
+                    cells.append(_answer_cell(shown, view, rows_of, names))
+                photo = self._photo(scene, maps[0], views[0])
+                rows.append(GridRow(f"{printable(question, 90)}  {printable(told, 160)}", scene, (*photo, *cells)))
+        return rows
+
+    def _maps(self, scene: str) -> list[DrawnMap]:
+        return [drawn_map(self._source.instances(scene, method)) for method in self._source.methods]
+
+    def _views(self, maps: Sequence[DrawnMap], wanted: Sequence[int]) -> list[MapView]:
+        """One camera for all ``maps``, chosen in the first: from above, or the corner that shows most of ``wanted``."""
+        first = maps[0]
+        above, *corners = first.views(CELL_WIDTH, CELL_HEIGHT)
+        if self._view == "above":
+            chosen = above
+        else:
+            members = first.members(wanted)
+            chosen = max(corners, key=lambda view: int(view.shows(members).sum()))
+        return [chosen, *(MapView(chosen.camera, one.view(chosen.camera).view, chosen.box) for one in maps[1:])]
+
+    def _photo(self, scene: str, shown: DrawnMap, view: MapView) -> tuple[Cell, ...]:
+        """The map in the colours that the frames saw, where it is asked for."""
+        if not self._with_photo:
+            return ()
+        frames = self._source.frames(scene, self._source.methods[0])
+        return (Cell(shown.paint_points(view, seen_colours(frames, shown.instances.points[shown.rows]))),)
+
+
+def seen_colours(frames: Sequence[Frame], points: np.ndarray[tuple[int, ...], np.dtype[np.float32]]) -> UInt8Array:
+    """The colour (N, 3) of each point in the last frame that sees it; grey where none does."""
+    colours = np.full((len(points), 3), UNSEEN, np.uint8)
+    places: Float64Array = points.astype(np.float64)
+    for frame in frames:
+        columns, rows, is_seen = seen_in(frame, places)
+        colours[is_seen] = frame.rgb[rows[is_seen].astype(np.int64), columns[is_seen].astype(np.int64)]
+    return colours
+
+
+def _answer_cell(shown: DrawnMap, view: MapView, rows_of: Sequence[Sequence[int]], names: dict[int, str]) -> Cell:
+    instances = shown.instances
+    colours = pale(np.array([(150, 150, 150)] * len(instances), np.uint8).reshape(-1, 3), 0.4)
+    tags = []
+    for rows, shade in ((rows_of[1], OTHER_COLOUR), (rows_of[0], ANSWER_COLOUR)):
+        colours[list(rows)] = shade
+        tags += _tags_of(instances, view, rows, [names[row] for row in rows], [shade] * len(rows))
+    return Cell(shown.paint(view, colours), tuple(reversed(tags)))
+
+
+def _name_tags(shown: DrawnMap, view: MapView, names: Labels, colours: UInt8Array) -> tuple[Tag, ...]:
+    """The names of the largest things; surfaces of the room go without."""
+    sizes = np.diff(shown.instances.indptr)
+    rows = [int(k) for k in np.argsort(-sizes, kind="stable") if names[k] and names[k] not in ROOM_SURFACES]
+    shades = [tuple(int(v) for v in colours[row]) for row in rows]
+    return tuple(_tags_of(shown.instances, view, rows, [names[row] for row in rows], shades))
+
+
+def _tags_of(
+    instances: Instances, view: MapView, rows: Sequence[int], names: Labels, shades: Sequence[tuple[int, ...]]
+) -> list[Tag]:
+    places = view.project(instances.centroids[list(rows)].astype(np.float64).reshape(-1, 3))
+    return [
+        Tag(name, float(x), float(y), (shade[0], shade[1], shade[2]))
+        for name, shade, (x, y) in zip(names, shades, places, strict=True)
+        if np.isfinite([x, y]).all() and 0 < x < 1 and 0 < y < 1
+    ]

@@ -1,0 +1,149 @@
+"""A run of the profile ``paper`` whose captions come from a vision model on loopback that fails in every way."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import threading
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from chat_server import Answered, Body, ChatServer, chat_server, error
+from tiny_encoders import needs_models
+from tiny_models import paper_words, write_models
+
+from su3d_bench.cli.main import main
+from su3d_bench.perception.language.prompts import DESCRIBE
+from su3d_bench.store import read_json, read_prediction
+from su3d_bench.types import Instances
+
+pytestmark = needs_models
+TOTAL_S = 3.0  # after it a hung connection is given up; long enough for good answers on a busy machine
+N_TRIES = 2
+
+
+class FailingModel:
+    """Answers each picture in its own way, in turn: well, with a refusal, in broken JSON, ...; counts the pictures."""
+
+    KINDS = ("good", "refusal", "malformed", "429", "500", "hung", "good")
+
+    def __init__(self) -> None:
+        self.asked: Counter[str] = Counter()
+        self.kinds: dict[str, str] = {}
+        self._lock = threading.Lock()
+
+    def __call__(self, body: Body) -> Answered:
+        text, picture = body["messages"][-1]["content"]
+        assert text["text"] == DESCRIBE
+        with self._lock:
+            url = picture["image_url"]["url"]
+            self.asked[url] += 1
+            kind = self.kinds.setdefault(url, self.KINDS[len(self.kinds) % len(self.KINDS)])
+            if kind == "429" and self.asked[url] > 1:
+                kind = "good"
+            number = list(self.kinds).index(url)
+        answers: dict[str, Answered] = {
+            "good": Answered(f"`thing {number}':`A thing with the number {number}.'"),
+            "refusal": Answered("I'm sorry, I can't help with that."),
+            "malformed": Answered(raw=b'{"choices": [{"message": '),
+            "429": error(429, "slow down", Retry_After="0"),
+            "500": error(500, "out of order"),
+            "hung": Answered(wait_s=60.0),
+        }
+        return answers[kind]
+
+    def n_sent(self, kind: str) -> set[int]:
+        """How often pictures of ``kind`` were sent."""
+        return {self.asked[url] for url, one in self.kinds.items() if one == kind}
+
+
+class Finished:
+    """A run that was made, and the server that it asked."""
+
+    def __init__(self, root: Path, models: Path, server: ChatServer) -> None:
+        self.root, self.server, self.model = root, server, FailingModel()
+        self._models = models
+        server.answer = self.model
+        self.code = self.run("first")
+
+    def run(self, folder: str, *words: str) -> int:
+        settings = ["perception.paper.captions=model", f"perception.language.base_url={self.server.url}"]
+        settings += [f"perception.language.total_timeout_s={TOTAL_S}", "perception.language.backoff_s=0.01"]
+        settings += [f"perception.language.max_retries={N_TRIES - 1}", "perception.language.max_failures_in_a_row=50"]
+        settings += ["perception.language.max_concurrent=8", "perception.language.key_variable=SU3D_TEST_KEY"]
+        return main(paper_words(self._models, self.root / folder, "rooms/living0", settings, *words))
+
+    def file(self, name: str, folder: str = "first") -> Path:
+        return next((self.root / folder).glob(f"scenes/*/opensu3d/{name}"))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Finished]:
+    root = tmp_path_factory.mktemp("captions")
+    models = write_models(root / "models")
+    with pytest.MonkeyPatch.context() as patch, chat_server() as server:
+        patch.setenv("SU3D_CACHE", str(root / "cache"))
+        patch.delenv("SU3D_TEST_KEY", raising=False)
+        yield Finished(root, models, server)
+
+
+def test_the_run_ends_complete_whatever_the_model_answers(made: Finished) -> None:
+    assert made.code == 0
+    assert set(made.model.kinds.values()) == set(FailingModel.KINDS), "every kind of answer was given"
+
+
+def test_captions_of_the_model_are_in_the_map_and_the_taggers_where_it_gave_none(made: Finished) -> None:
+    found = read_prediction(made.file("prediction.npz"))
+    assert isinstance(found, Instances) and found.captions is not None
+    of_model = [caption for caption in found.captions if caption.startswith("A thing with the number ")]
+    assert of_model and all(
+        name.startswith("thing ")
+        for name, caption in zip(found.names, found.captions, strict=True)
+        if caption in of_model
+    )
+    assert any(caption.endswith(" in a scene") for caption in found.captions)
+
+
+def test_fallbacks_and_their_reasons_are_in_the_log_and_in_the_record(made: Finished) -> None:
+    log, record = made.file("log.txt").read_text(), (made.root / "first" / "run.json").read_text()
+    for reason in ("the model refused", "is no chat completion", "status 500: out of order", "no whole answer within"):
+        assert reason in log, reason
+        assert reason in record, reason
+
+
+def test_every_picture_is_asked_about_once_and_again_only_where_no_answer_came(made: Finished) -> None:
+    assert made.model.n_sent("good") == made.model.n_sent("refusal") == {1}
+    assert made.model.n_sent("429") == {2}
+    for kind in ("malformed", "500", "hung"):
+        assert made.model.n_sent(kind) == {N_TRIES}
+
+
+def test_every_reply_lies_with_the_run_and_the_same_command_asks_nothing(made: Finished) -> None:
+    replies = [read_json(path) for path in (made.root / "first" / "language").glob("*.json")]
+    assert len(replies) == len(made.model.kinds)
+    assert {reply["purpose"] for reply in replies} == {"caption"}
+    n_asked = made.server.n_asked
+    assert made.run("first") == 0
+    assert made.server.n_asked == n_asked
+
+
+def test_offline_a_fresh_folder_with_the_replies_gives_the_same_numbers_and_asks_nothing(
+    made: Finished, capsys: pytest.CaptureFixture[str]
+) -> None:
+    n_asked = made.server.n_asked
+    assert made.run("again", "--offline") == 3, "without the replies the scene fails"
+    assert "holds no reply to this caption request" in capsys.readouterr().err
+    shutil.copytree(made.root / "first" / "language", made.root / "again" / "language")
+    assert made.run("again", "--offline") == 0
+    assert made.server.n_asked == n_asked
+    first, again = (results(made.root / folder / "metrics.json") for folder in ("first", "again"))
+    assert first == again
+    assert made.file("prediction.npz").read_bytes() == made.file("prediction.npz", "again").read_bytes()
+
+
+def results(path: Path) -> Any:
+    """What a run found, without what it took."""
+    return json.loads(path.read_text())

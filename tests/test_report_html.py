@@ -1,0 +1,380 @@
+"""The page of runs: what it holds, that nothing in it is markup or loaded, how maps are packed, what it says of gaps."""
+
+from __future__ import annotations
+
+import base64
+import doctest
+import hashlib
+import json
+import re
+import shutil
+import zlib
+from collections.abc import Mapping
+from html.parser import HTMLParser
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from painted import WordEncoder, colour_perception
+
+from su3d_bench import page_maps, scene_run
+from su3d_bench.cli import query
+from su3d_bench.cli.main import main
+from su3d_bench.page_maps import points_of_each
+from su3d_bench.reports import html_data, html_map, html_page
+from su3d_bench.reports.html_map import (
+    NO_TRUTH_NEAR,
+    NOT_SCORED,
+    box_in_view,
+    index_plane,
+    nearest_classes,
+    nearest_colours,
+    pack_map,
+    point_owners,
+    thinned,
+)
+from su3d_bench.reports.html_page import page_html
+from su3d_bench.store import read_prediction, write_prediction
+from su3d_bench.types import DenseFeatures, Instances
+
+PAINTED = f"{Path(__file__).parent}/painted.py"
+HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(1)>&\"'<!--"
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("page") / "run"
+    words = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--jobs", "1", "--no-pictures"]
+    words += ["--methods", f"{PAINTED}:Collector", f"{PAINTED}:Collector@noise_m=0.3", "--anytime", "0.5"]
+    words += ["--protocols", "rooms-semantic", "rooms-instance", "--out", str(folder)]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        assert main(words) == 0
+    return folder
+
+
+def made(run: Path, page: Path, *words: str) -> str:
+    """The page of a run, made with the encoder of painted scenes."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(query, "encoder_of", lambda folder, device="cpu": WordEncoder())
+        assert main(["report", "html", str(run), "--out", str(page), "--quiet", *words]) == 0
+    return page.read_text(encoding="utf-8")
+
+
+@pytest.fixture(scope="module")
+def page(run: Path, tmp_path_factory: pytest.TempPathFactory) -> str:
+    return made(run, tmp_path_factory.mktemp("page") / "page.html")
+
+
+class Elements(HTMLParser):
+    """The elements of a page and the content of its scripts by id."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.tags: list[str] = []
+        self.attributes: list[tuple[str, str | None]] = []
+        self.content: dict[str, str] = {}
+        self._open: str | None = None
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.tags.append(tag)
+        self.attributes += attrs
+        self._open = dict(attrs).get("id") or tag if tag in ("script", "style", "title") else None
+
+    def handle_endtag(self, tag: str) -> None:
+        self._open = None
+
+    def handle_data(self, data: str) -> None:
+        if self._open is not None:
+            self.content[self._open] = self.content.get(self._open, "") + data
+
+
+def elements(text: str) -> Elements:
+    found = Elements()
+    found.feed(text)
+    return found
+
+
+def data_of(text: str) -> dict[str, Any]:
+    found: dict[str, Any] = json.loads(elements(text).content["data"])
+    return found
+
+
+def unpacked(content: str) -> tuple[dict[str, Any], dict[str, Any]]:
+    """What a browser reads of a packed map: the JSON and the planes, positions in metres."""
+    data = zlib.decompress(base64.b64decode(content))
+    length = int.from_bytes(data[:4], "little")
+    about, at, planes = json.loads(data[4 : 4 + length]), 4 + length, {}
+    n = about["n"]
+    for plane in about["planes"]:
+        columns = []
+        for _ in range(plane["width"]):
+            part = np.frombuffer(data, np.uint8, n * plane["bytes"], at).reshape(plane["bytes"], n).astype(np.int64)
+            columns.append(part[0] + (256 * part[1] if plane["bytes"] == 2 else 0))
+            at += n * plane["bytes"]
+        planes[plane["name"]] = np.stack(columns, axis=1).squeeze()
+    assert at == len(data)
+    steps = np.cumsum(planes["position"].reshape(n, 3), axis=0) % (1 << 16)
+    planes["position"] = np.array(about["origin"]) + steps * about["step"]
+    return about, planes
+
+
+def test_the_page_holds_the_numbers_of_the_record(run: Path, page: str) -> None:
+    metrics = json.loads((run / "metrics.json").read_text())
+    found = data_of(page)
+    assert [(one["method"], one["protocol"]) for one in found["results"]] == [
+        (one["method"], one["protocol"]) for one in metrics["results"]
+    ]
+    for shown, stored in zip(found["results"], metrics["results"], strict=True):
+        for name in ("metrics", "intervals", "per_scene", "per_class", "coverage"):
+            assert shown["result"][name] == stored["result"][name]
+        assert shown["ceiling"] == stored["ceiling"]
+        assert [one["metrics"] for one in shown["anytime"]] == [one["metrics"] for one in stored["anytime"]]
+
+
+def test_confusions_errors_times_and_comparisons_are_there_for_every_method(page: str) -> None:
+    found = data_of(page)
+    methods = found["runs"][0]["methods"]
+    assert len(methods) == 2
+    assert [one["method"] for one in found["confusions"]] == methods
+    assert [one["method"] for one in found["timing"]] == methods
+    assert [(one["method"], one["reason"]) for one in found["errors"]] == [(name, None) for name in methods]
+    assert all(len(one["protocols"]) == 2 for one in found["errors"])
+    assert [(one["left"], one["right"], one["reason"]) for one in found["comparisons"]] == [
+        ([0, methods[0]], [0, methods[1]], None)
+    ]
+    assert set(found["timing"][0]["series"]) == {"painted/a", "painted/b"}
+
+
+def test_the_confusion_of_the_page_gives_the_mean_accuracy_of_the_record(page: str) -> None:
+    found = data_of(page)
+    cells = np.array(found["confusions"][1]["cells"])
+    recalls = [
+        cells[(cells[:, 0] == k) & (cells[:, 1] == k), 2].sum() / cells[cells[:, 0] == k, 2].sum()
+        for k in np.unique(cells[:, 0])
+    ]
+    shown = next(one for one in found["results"] if one["protocol"] == "rooms-semantic" and one["method"].endswith("3"))
+    assert np.mean(recalls) == pytest.approx(shown["result"]["metrics"]["mAcc"], abs=1e-12)
+
+
+def test_the_same_run_gives_the_same_bytes(run: Path, page: str, tmp_path: Path) -> None:
+    assert made(run, tmp_path / "again.html") == page
+
+
+def test_nothing_may_run_or_be_loaded_but_what_stands_in_the_page(page: str) -> None:
+    found = elements(page)
+    policy = next(value for name, value in found.attributes if name == "content" and value and "default-src" in value)
+    for kind, content in (("script", found.content["script"]), ("style", found.content["style"])):
+        digest = base64.b64encode(hashlib.sha256(content.encode()).digest()).decode()
+        assert f"{kind}-src 'sha256-{digest}'" in policy
+    assert policy.startswith("default-src 'none';")
+    assert "unsafe" not in policy
+    assert [value for name, value in found.attributes if name in ("src", "href")] == ["data:,", "#main"]
+    assert not [name for name, _ in found.attributes if name.startswith("on") or name == "style"]
+    used = re.sub(r"http://www\.w3\.org/2000/svg", "", found.content["script"] + found.content["style"])
+    assert not re.search(r"https?:|//[a-z]+\.|fetch\(|XMLHttpRequest|import\(|innerHTML|outerHTML|eval\(|url\(", used)
+
+
+def test_no_text_of_a_run_is_markup() -> None:
+    plain = elements(page_html("title", {"name": ""}, [{"name": ""}], ["AAAA"]))
+    found = elements(page_html(HOSTILE, {"name": HOSTILE, HOSTILE: 1}, [{"name": HOSTILE}], ["AAAA"]))
+    assert found.tags == plain.tags
+    assert json.loads(found.content["data"]) == {"name": HOSTILE, HOSTILE: 1}
+    assert json.loads(found.content["scene-0"]) == {"name": HOSTILE}
+    assert found.content["title"] == HOSTILE
+
+
+def test_control_characters_of_a_record_do_not_reach_the_page(run: Path, tmp_path: Path) -> None:
+    changed = tmp_path / "run"
+    shutil.copytree(run, changed)
+    metrics = json.loads((changed / "metrics.json").read_text())
+    metrics["results"][0]["caveat"] = f"{HOSTILE}\x1b[31m\u202e"
+    (changed / "metrics.json").write_text(json.dumps(metrics))
+    text = made(changed, tmp_path / "page.html", "--no-maps", "--no-errors")
+    assert data_of(text)["results"][0]["caveat"] == f"{HOSTILE}\\x1b[31m\\u202e"
+    assert "\x1b" not in text
+    assert "\u202e" not in text
+
+
+def test_a_map_reads_back_with_its_instances_colours_and_truth(run: Path, page: str) -> None:
+    found = elements(page)
+    listed = data_of(page)["maps"]
+    assert [(one["scene"], one["reason"]) for one in listed] == [("painted/a", None)] * 2 + [("painted/b", None)] * 2
+    about, planes = unpacked(found.content["map-0"])
+    stored = read_prediction(run / "scenes" / "painted.a" / "collector" / "prediction.npz")
+    assert isinstance(stored, Instances)
+    distance = np.linalg.norm(stored.points[None] - planes["position"][:, None], axis=2)
+    assert distance.min(axis=1).max() < about["step"]  # half a step along each axis
+    owner_of = np.full(len(stored.points), -1)
+    for k in range(len(stored)):
+        owner_of[stored.mask(k)] = k
+    assert np.array_equal(planes["owner"], owner_of[distance.argmin(axis=1)])
+    assert [one["name"] for one in about["instances"]] == list(stored.names)
+    assert [one["points"] for one in about["instances"]] == np.diff(stored.indptr).tolist()
+    assert {one["view"] for one in about["instances"]} <= {
+        int(frame) for frame in json.loads(found.content["scene-0"])["thumbnails"]
+    }
+    called = np.array([one["class"] for one in about["instances"]])[planes["owner"]]
+    is_scored = planes["truth"] < NOT_SCORED
+    assert 0.2 < is_scored.mean() < 1  # walls are not
+    assert (called == planes["truth"])[is_scored].mean() > 0.9
+    assert len(planes["colour"]) == about["n"]
+
+
+def test_similarities_are_those_of_the_asked_texts(run: Path, tmp_path: Path) -> None:
+    text = made(run, tmp_path / "page.html", "--queries", "chair", "table", "--no-errors")
+    about, _ = unpacked(elements(text).content["map-0"])
+    assert about["queries"] == ["chair", "table"]
+    stored = read_prediction(run / "scenes" / "painted.a" / "collector" / "prediction.npz")
+    assert stored.features is not None
+    features = stored.features / np.linalg.norm(stored.features, axis=1, keepdims=True)
+    expected = features.astype(np.float64) @ WordEncoder().encode_texts(["chair", "table"]).T
+    assert np.abs(np.array([one["similarity"] for one in about["instances"]]) / 1000 - expected).max() <= 0.0006
+
+
+def test_dense_features_have_a_class_a_point_and_no_instance(run: Path, tmp_path: Path) -> None:
+    changed = tmp_path / "run"
+    shutil.copytree(run, changed)
+    points = np.array([[0, 0, 1], [0, 0, 2], [5, 0, 2]], np.float32)
+    rows = WordEncoder().encode_texts(["sofa", "table", "sofa"]).astype(np.float16)
+    write_prediction(changed / "scenes" / "painted.a" / "collector" / "prediction.npz", DenseFeatures(points, rows))
+    about, planes = unpacked(elements(made(changed, tmp_path / "page.html", "--no-errors")).content["map-0"])
+    order = np.argmin(np.linalg.norm(points[None] - planes["position"][:, None], axis=2), axis=1)
+    assert [about["classes"][c] for c in planes["class"]] == [("sofa", "table", "sofa")[k] for k in order]
+    assert about["instances"] == []
+    assert planes["owner"].tolist() == [0xFFFF] * 3
+    assert planes["truth"][order.tolist().index(2)] == NO_TRUTH_NEAR
+
+
+def test_what_cannot_be_shown_is_a_reason_on_the_page(run: Path, tmp_path: Path) -> None:
+    changed = tmp_path / "run"
+    shutil.copytree(run, changed)
+    (changed / "scenes" / "painted.b" / "collector" / "prediction.npz").write_bytes(b"damaged")
+    record = json.loads((changed / "run.json").read_text())
+    record["data_digests"]["painted/a"] = "0" * 64
+    (changed / "run.json").write_text(json.dumps(record))
+    text = made(changed, tmp_path / "page.html")
+    found = data_of(text)
+    assert ["damaged" in str(one["reason"]) or "not a readable" in str(one["reason"]) for one in found["maps"]] == [
+        *(False, False),
+        *(True, False),
+    ]
+    assert all(one["reason"] for one in found["errors"])
+    scene = json.loads(elements(text).content["scene-0"])
+    assert scene["thumbnails"] == {}
+    assert any("not those of the run" in line for line in scene["remarks"])
+    _, planes = unpacked(elements(text).content["map-0"])
+    assert "colour" not in planes
+    assert "truth" not in planes
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"),
+    [
+        (["{missing}"], "holds no run.json"),
+        (["{run}", "--most-megabytes", "0"], "--most-megabytes 0: must be above 0"),
+    ],
+)
+def test_a_wrong_request_is_one_line(
+    run: Path, tmp_path: Path, words: list[str], expected: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    asked = [word.format(missing=tmp_path / "none", run=run) for word in words]
+    assert main(["report", "html", *asked, "--out", str(tmp_path / "page.html")]) != 0
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert expected in lines[-1]
+    assert not (tmp_path / "page.html").exists()
+
+
+def test_a_page_answers_in_json(run: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = made(run, tmp_path / "page.html", "--json", "--no-errors", "--title", "A <b> title")
+    told = json.loads(capsys.readouterr().out)
+    assert told["n_bytes"] == len(text.encode())
+    assert told["n_maps"] == 4
+    assert elements(text).content["title"] == "A <b> title"
+
+
+def surface(n: int, seed: int) -> Any:
+    """Random points (n, 3) on the walls of a room of 6 x 5 x 3 m."""
+    rng = np.random.default_rng(seed)
+    points = rng.random((n, 3)) * [6.0, 5.0, 3.0]
+    axis = rng.integers(0, 3, n)
+    points[np.arange(n), axis] = np.where(rng.random(n) < 0.5, 0.0, np.array([6.0, 5.0, 3.0])[axis])
+    return points.astype(np.float32)
+
+
+def test_twenty_scenes_under_eight_methods_stay_below_thirty_megabytes() -> None:
+    most = points_of_each(160, 30_000_000)
+    cloud = thinned(surface(400_000, 0), most)
+    assert 0.6 * most < len(cloud.points) <= most
+    rng = np.random.default_rng(1)
+    cells = np.floor(cloud.points / 0.4).astype(np.int64) @ [1, 20, 400]
+    planes = {
+        "owner": index_plane(cells % 150),
+        "colour": html_map.colour_plane(rng.integers(0, 256, (len(cells), 3), np.uint8)),  # noise: the worst case
+        "truth": index_plane(cells % 60),
+    }
+    assert 160 * len(pack_map(cloud, planes, {})) < 30_000_000
+
+
+def test_thinned_points_are_one_a_cell_and_keep_the_order_of_the_curve() -> None:
+    points = np.array([[0, 0, 0], [0.001, 0, 0], [1, 0, 0], [1, 1, 1], [0.02, 0, 0]], np.float32)
+    cloud = thinned(points, 10)
+    assert sorted(cloud.rows.tolist()) == [0, 2, 3, 4]
+    assert cloud.rows[0] == 0
+    assert len(thinned(points, 2).rows) <= 2
+    assert len(thinned(np.zeros((0, 3), np.float32), 5).rows) == 0
+
+
+def test_an_empty_map_packs_and_reads_back() -> None:
+    cloud = thinned(np.zeros((0, 3), np.float32), 5)
+    about, planes = unpacked(pack_map(cloud, {"owner": index_plane(np.zeros(0, np.int64))}, {"classes": []}))
+    assert about["n"] == 0
+    assert planes["owner"].size == 0
+
+
+def test_of_masks_that_overlap_the_smaller_one_is_seen() -> None:
+    prediction = Instances(
+        points=np.zeros((4, 3), np.float32),
+        indptr=np.array([0, 3, 4]),
+        indices=np.array([0, 1, 2, 1], np.int32),
+        scores=np.ones(2),
+        features=None,
+        labels=None,
+        names=("large", "small"),
+        captions=("", ""),
+        boxes=np.zeros((2, 2, 3), np.float32),
+        centroids=np.zeros((2, 3), np.float32),
+        view_indptr=np.zeros(3, np.int64),
+        views=np.zeros((0, 2), np.int32),
+    )
+    assert point_owners(prediction, np.arange(4)).tolist() == [0, 1, 0, -1]
+
+
+def test_the_truth_of_a_point_is_the_nearest_within_five_centimetres() -> None:
+    truth = np.array([[0, 0, 0], [1, 0, 0]], np.float32)
+    points = np.array([[0.04, 0, 0], [0.06, 0, 0], [1, 0, 0]], np.float32)
+    assert nearest_classes(points, truth, np.array([7, -1])).tolist() == [7, NO_TRUTH_NEAR, NOT_SCORED]
+    assert nearest_classes(points, truth[:0], np.zeros(0, np.int64)).tolist() == [NO_TRUTH_NEAR] * 3
+
+
+def test_a_point_that_no_frame_saw_is_grey() -> None:
+    seen, colours = np.zeros((1, 3), np.float32), np.array([[10, 20, 30]], np.uint8)
+    found = nearest_colours(np.array([[0.05, 0, 0], [0.07, 0, 0]], np.float32), seen, colours)
+    assert found is not None
+    assert found.tolist() == [[10, 20, 30], [128, 128, 128]]
+    assert nearest_colours(seen, seen[:0], colours[:0]) is None
+
+
+def test_a_box_in_a_view_is_where_the_points_project() -> None:
+    intrinsics = np.array([[100.0, 0, 50], [0, 100.0, 40], [0, 0, 1]])
+    points = np.array([[0, 0, 2], [0.5, 0.4, 2], [0, 0, -1], [9, 0, 2]], np.float32)
+    assert box_in_view(points, np.eye(4), intrinsics, 100, 80) == [0.5, 0.5, 0.75, 0.75]
+    assert box_in_view(points[2:], np.eye(4), intrinsics, 100, 80) is None
+
+
+@pytest.mark.parametrize("module", [html_data, html_map, html_page, page_maps], ids=lambda module: module.__name__)
+def test_the_examples_in_docstrings_hold(module: Any) -> None:
+    found: Mapping[str, int] = doctest.testmod(module)._asdict()
+    assert found["attempted"] > 0
+    assert found["failed"] == 0

@@ -1,0 +1,351 @@
+"""The page of runs in a real browser, opened as a file: every control does what it says, and nothing is complained of."""
+
+from __future__ import annotations
+
+import base64
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import chromium
+import pytest
+from chromium import Chromium, find_chromium
+from painted import WordEncoder, colour_perception
+
+from su3d_bench import scene_run
+from su3d_bench.cli import query
+from su3d_bench.cli.main import main
+
+pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
+PAINTED = f"{Path(__file__).parent}/painted.py"
+# WebGL without a graphics card.
+SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+SELECT = "[...document.querySelectorAll('#{part} select')].find((one) => one.labels[0].textContent === '{label}')"
+
+
+@pytest.fixture(scope="module")
+def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two runs: two methods on two scenes with maps midway, and one method of them on one of the scenes."""
+    folder = tmp_path_factory.mktemp("page")
+    words = ["--jobs", "1", "--no-pictures", "--protocols", "rooms-semantic", "rooms-instance"]
+    scenes = [f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b"]
+    methods = [f"{PAINTED}:Collector", f"{PAINTED}:Collector@noise_m=0.3"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        patch.setattr(query, "encoder_of", lambda folder, device="cpu": WordEncoder())
+        first = ["--scenes", *scenes, "--methods", *methods, "--anytime", "0.5", "--out", str(folder / "one")]
+        assert main(["run", *first, *words]) == 0
+        assert main(["run", "--scenes", scenes[0], "--methods", methods[0], "--out", str(folder / "two"), *words]) == 0
+        record = json.loads((folder / "one" / "metrics.json").read_text())
+        record["results"][0]["caveat"] = "<img src=x onerror=window.struck=1></script><script>window.struck=1</script>"
+        (folder / "one" / "metrics.json").write_text(json.dumps(record))
+        runs = [str(folder / "one"), str(folder / "two")]
+        texts = ["--queries", "chair", "table"]
+        assert main(["report", "html", *runs, "--out", str(folder / "page.html"), "--quiet", *texts]) == 0
+    return folder / "page.html"
+
+
+@pytest.fixture(scope="module")
+def browser(page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Chromium]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(chromium, "FLAGS", (*chromium.FLAGS, *SOFTWARE_GL))
+        with Chromium(tmp_path_factory.mktemp("profile")) as found:
+            found.open(page)
+            yield found
+
+
+@pytest.fixture(autouse=True)
+def no_complaint(browser: Chromium) -> Iterator[None]:
+    yield
+    assert browser.faults() == []
+
+
+def options(browser: Chromium, part: str, label: str) -> list[str]:
+    found: list[str] = browser.run(f"[...{SELECT.format(part=part, label=label)}.options].map((one) => one.text)")
+    return found
+
+
+def choose(browser: Chromium, part: str, label: str, text: str) -> None:
+    """Choose an option as a person does: the value and then the event."""
+    field = SELECT.format(part=part, label=label)
+    browser.run(
+        f"{{ const field = {field}; field.value = [...field.options].find((one) => one.text === {json.dumps(text)})"
+        ".value; field.dispatchEvent(new Event('change')); }"
+    )
+
+
+def text_of(browser: Chromium, selector: str) -> str:
+    return str(browser.run(f"document.querySelector({json.dumps(selector)}).innerText"))
+
+
+def column(browser: Chromium, part: str, k: int, table: int = 0) -> list[str]:
+    rows = f"document.querySelectorAll('#{part} table')[{table}].querySelectorAll('tbody tr')"
+    found: list[str] = browser.run(f"[...{rows}].map((row) => row.children[{k}].innerText.split('\\n')[0])")
+    return found
+
+
+def picture(browser: Chromium) -> bytes:
+    """What the 3D view shows, after it was drawn."""
+    browser.run("new Promise((done) => requestAnimationFrame(() => requestAnimationFrame(() => setTimeout(done, 60))))")
+    box = browser.run(
+        "(() => { const c = document.querySelector('#maps canvas').getBoundingClientRect();"
+        " return { x: c.x + scrollX, y: c.y + scrollY, width: c.width - 140, height: c.height - 60, scale: 1 }; })()"
+    )
+    shot = browser.call("Page.captureScreenshot", {"format": "png", "clip": box, "captureBeyondViewport": False})
+    return base64.b64decode(shot["data"])
+
+
+def open_maps(browser: Chromium) -> None:
+    browser.run("document.getElementById('maps').scrollIntoView()")
+    browser.until("document.querySelectorAll('#maps .side tbody tr').length > 0")
+    choose(browser, "maps", "Scene", "painted/a")
+    browser.until(
+        "document.querySelector('#maps canvas').getAttribute('aria-label').includes('painted/a by')"
+        " && document.querySelector('#maps .say').hidden"
+    )
+    browser.run("document.querySelector('#maps button[title=\"Whole map\"]').click()")
+
+
+def press(browser: Chromium, selector: str, *keys: str) -> None:
+    browser.run(f"document.querySelector({json.dumps(selector)}).focus()")
+    browser.press(*keys)
+
+
+def test_every_section_is_there_and_the_navigation_leads_to_it(browser: Chromium) -> None:
+    names = browser.run("[...document.querySelectorAll('#nav a')].map((one) => one.textContent)")
+    assert names == ["Summary", "Maps", "Scenes", "Classes", "Confusion", "Errors", "Timing", "Compare", "Provenance"]
+    browser.run("document.querySelector('#nav a[href=\"#timing\"]').click()")
+    browser.until("document.querySelector('#nav a[aria-current]')?.textContent === 'Timing'")
+    assert browser.run("Math.abs(document.getElementById('timing').getBoundingClientRect().top) < 120")
+
+
+def test_no_text_of_a_run_becomes_an_element(browser: Chromium) -> None:
+    assert "<img src=x onerror=window.struck=1>" in text_of(browser, "#summary .notes")
+    assert browser.run("window.struck === undefined && !document.querySelector('main img[src=x]')")
+
+
+def test_a_header_sorts_and_turns_by_mouse_and_keyboard(browser: Chromium) -> None:
+    browser.run("document.querySelectorAll('#summary table')[0].querySelectorAll('th button')[1].click()")
+    down = column(browser, "summary", 1)
+    assert (
+        browser.run("document.querySelectorAll('#summary th[aria-sort]')[0].getAttribute('aria-sort')") == "descending"
+    )
+    values = [float(value.split()[0]) for value in down]
+    assert values == sorted(values, reverse=True)
+    assert len(set(values)) > 1
+    press(browser, "#summary th[aria-sort] button")
+    browser.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": "Enter", "text": "\r"})
+    browser.call("Input.dispatchKeyEvent", {"type": "keyUp", "key": "Enter"})
+    assert [float(value.split()[0]) for value in column(browser, "summary", 1)] == sorted(values)
+
+
+def test_a_filter_leaves_the_rows_that_hold_its_text(browser: Chromium) -> None:
+    filling = "{{ const one = document.querySelector('#classes input'); one.value = {}; one.dispatchEvent(new Event('input')); }}"
+    everything = column(browser, "classes", 0)
+    browser.run(filling.format("'SOFA'"))
+    assert column(browser, "classes", 0) == ["sofa"]
+    assert text_of(browser, "#classes .count") == f"1 of {len(everything)} rows"
+    browser.run(filling.format("''"))
+    assert column(browser, "classes", 0) == everything
+
+
+def test_one_choice_of_protocol_and_its_metric_change_all_tables(browser: Chromium) -> None:
+    assert options(browser, "scenes", "Protocol") == ["rooms-semantic", "rooms-instance"]
+    choose(browser, "scenes", "Protocol", "rooms-instance")
+    assert options(browser, "scenes", "Metric")[:3] == ["AP", "AP50", "AP25"]
+    assert options(browser, "classes", "Column")[:3] == ["AP", "AP50", "AP25"]
+    assert "missed" in text_of(browser, "#errors tbody")
+    before = text_of(browser, "#scenes caption")
+    choose(browser, "scenes", "Metric", "AP25")
+    assert text_of(browser, "#scenes caption") != before
+    choose(browser, "errors", "Metric", "AP50")
+    assert "AP50" in text_of(browser, "#errors caption")
+    choose(browser, "scenes", "Protocol", "rooms-semantic")
+    assert "geometry" in text_of(browser, "#errors tbody")
+
+
+def test_the_confusion_is_of_the_chosen_method(browser: Chromium) -> None:
+    methods = options(browser, "confusion", "Method")
+    assert len(methods) == 3
+    choose(browser, "confusion", "Method", methods[1])
+    noisy = text_of(browser, "#confusion table")
+    choose(browser, "confusion", "Method", methods[0])
+    assert text_of(browser, "#confusion table") != noisy
+    assert text_of(browser, "#confusion .confusion .same") == "100"
+
+
+def test_the_timing_plot_follows_its_three_choices(browser: Chromium) -> None:
+    line = "document.querySelector('#timing path').getAttribute('d')"
+    seen = [browser.run(line)]
+    for label, text in (("Time of", "the whole update"), ("Against", "points of the map"), ("Scene", "painted/b")):
+        choose(browser, "timing", label, text)
+        seen.append(browser.run(line))
+    assert len(set(seen)) == 4
+    choose(browser, "timing", "Stages of", options(browser, "timing", "Stages of")[1])
+    assert "total" in text_of(browser, "#timing")
+    choose(browser, "timing", "Metric", "F-mIoU")
+    assert "F-mIoU in per cent" in text_of(browser, "#timing")
+
+
+def test_swapping_the_sides_turns_the_sign(browser: Chromium) -> None:
+    sides = options(browser, "compare", "A")
+    choose(browser, "compare", "A", next(one for one in sides if "noise" not in one and "one" in one))
+    choose(browser, "compare", "B", next(one for one in sides if "noise" in one))
+    before = column(browser, "compare", 4)[0].split()[0]
+    browser.run("[...document.querySelectorAll('#compare button')].find((one) => one.textContent === 'Swap').click()")
+    after = column(browser, "compare", 4)[0].split()[0]
+    assert before[0] == "\N{MINUS SIGN}"
+    assert after == "+" + before[1:]
+    choose(browser, "compare", "A", sides[0])
+    choose(browser, "compare", "B", sides[0])
+    assert "Choose two different sides" in text_of(browser, "#compare [role=status]")
+
+
+def test_settings_unfold_and_filter(browser: Chromium) -> None:
+    browser.run("document.querySelectorAll('#provenance details').forEach((one) => { one.open = true; })")
+    assert "rooms-semantic" in text_of(browser, "#provenance details")
+    assert "painted/a" in text_of(browser, "#provenance details")
+
+
+def test_every_colouring_draws_another_picture_and_says_what_it_means(browser: Chromium) -> None:
+    open_maps(browser)
+    kinds = options(browser, "maps", "Colour by")
+    assert kinds == ["colour", "instance", "class", "true class", "error against the truth", "similarity to a text"]
+    seen = {}
+    for kind in kinds:
+        choose(browser, "maps", "Colour by", kind)
+        seen[kind] = picture(browser)
+        assert text_of(browser, "#maps .legend").strip()
+    assert len(set(seen.values())) >= 5  # instances and classes may have the same colours where each is of one class
+    assert "right class" in (choose(browser, "maps", "Colour by", kinds[4]), text_of(browser, "#maps .legend"))[1]
+    choose(browser, "maps", "Colour by", kinds[5])
+    assert options(browser, "maps", "Text") == ["chair", "table"]
+    first = picture(browser)
+    choose(browser, "maps", "Text", "table")
+    assert picture(browser) != first
+    assert column(browser, "maps", 0)[0] == "table"
+    choose(browser, "maps", "Colour by", kinds[0])
+    assert browser.run(f"{SELECT.format(part='maps', label='Text')}.closest('.field').hidden")
+
+
+def test_keys_turn_move_zoom_and_bring_the_whole_map_back(browser: Chromium) -> None:
+    open_maps(browser)
+    press(browser, "#maps canvas", "Home")
+    whole = picture(browser)
+    seen = [whole]
+    for key in ("ArrowLeft", "ArrowUp", "+", "-", "-"):
+        press(browser, "#maps canvas", key)
+        seen.append(picture(browser))
+    browser.call("Input.dispatchKeyEvent", {"type": "keyDown", "key": "ArrowRight", "modifiers": 8})
+    seen.append(picture(browser))
+    assert len(set(seen)) >= 6  # zooming in and out again gives one picture twice
+    press(browser, "#maps canvas", "Home")
+    assert picture(browser) == whole
+
+
+def pointer(browser: Chromium, kind: str, x: float, y: float, **more: Any) -> None:
+    values = {"type": kind, "x": x, "y": y, "button": "left", "buttons": 1, "clickCount": 1, **more}
+    browser.call("Input.dispatchMouseEvent", values)
+
+
+def middle(browser: Chromium) -> tuple[float, float]:
+    box = browser.run(
+        "(() => { const c = document.querySelector('#maps canvas'); c.scrollIntoView({ block: 'center' });"
+        " const b = c.getBoundingClientRect(); return [b.x + b.width / 2, b.y + b.height / 2]; })()"
+    )
+    return box[0], box[1]
+
+
+def test_the_mouse_turns_moves_zooms_and_picks(browser: Chromium) -> None:
+    open_maps(browser)
+    x, y = middle(browser)
+    seen = [picture(browser)]
+    for more in ({}, {"modifiers": 8}, {"button": "right", "buttons": 2}):
+        pointer(browser, "mousePressed", x, y, **more)
+        pointer(browser, "mouseMoved", x + 30, y + 20, **more)
+        pointer(browser, "mouseReleased", x + 30, y + 20, **more)
+        seen.append(picture(browser))
+    browser.run("document.querySelector('#maps canvas').focus()")
+    browser.call("Input.dispatchMouseEvent", {"type": "mouseWheel", "x": x, "y": y, "deltaX": 0, "deltaY": -50})
+    seen.append(picture(browser))
+    assert len(set(seen)) == 5
+    press(browser, "#maps canvas", "Escape", "Home")
+    pointer(browser, "mousePressed", x, y)
+    pointer(browser, "mouseReleased", x, y)
+    browser.until("document.querySelector('#maps .detail h3') !== null")
+    assert browser.run("document.querySelectorAll('#maps tr[aria-selected=true]').length") == 1
+
+
+def test_an_instance_shows_its_name_class_scores_and_view(browser: Chromium) -> None:
+    open_maps(browser)
+    press(browser, "#maps canvas", "Escape", "n")
+    first = text_of(browser, "#maps .detail h3")
+    shown = text_of(browser, "#maps .detail")
+    for what in ("Class (rooms-semantic)", "Truth there", "Score", "Points", "Seen in", "Most like", "Frame"):
+        assert what in shown
+    browser.until("document.querySelector('#maps .detail img').naturalWidth > 0")
+    press(browser, "#maps canvas", "n")
+    assert text_of(browser, "#maps .detail h3") != first
+    press(browser, "#maps canvas", "p")
+    assert text_of(browser, "#maps .detail h3") == first
+    press(browser, "#maps canvas", "Escape")
+    assert browser.run("document.querySelector('#maps .detail h3') === null")
+    press(browser, "#maps .side tbody tr", "Enter")
+    assert text_of(browser, "#maps .detail h3") == column(browser, "maps", 0)[0]
+
+
+def test_the_cut_takes_points_away_and_buttons_zoom(browser: Chromium) -> None:
+    open_maps(browser)
+    press(browser, "#maps canvas", "Escape", "Home")
+    seen = [picture(browser)]
+    moving = "{{ const cut = document.querySelector('#maps input[type=range]'); cut.value = {}; cut.dispatchEvent(new Event('input')); }}"
+    browser.run(moving.format(30))
+    seen.append(picture(browser))
+    browser.run(moving.format(100))
+    for title in ("Zoom in", "Zoom out", "Zoom out"):
+        browser.run(f"document.querySelector('#maps button[title=\"{title}\"]').click()")
+        seen.append(picture(browser))
+    assert len(set(seen)) >= 4
+
+
+def test_another_map_and_scene_are_read_when_they_are_chosen(browser: Chromium) -> None:
+    open_maps(browser)
+    first = picture(browser)
+    assert len(options(browser, "maps", "Map")) == 3
+    choose(browser, "maps", "Map", next(one for one in options(browser, "maps", "Map") if "noise" in one))
+    label = "document.querySelector('#maps canvas').getAttribute('aria-label')"
+    browser.until(f"{label}.includes('noise')")
+    assert picture(browser) != first
+    choose(browser, "maps", "Scene", "painted/b")
+    browser.until(f"{label}.includes('painted/b') && {label}.includes('noise')")
+    assert len(options(browser, "maps", "Map")) == 2
+
+
+def test_every_control_has_a_name_and_the_page_no_sideways_scroll_on_a_phone(
+    browser: Chromium, page: Path, tmp_path: Path
+) -> None:
+    nameless = browser.run(
+        "[...document.querySelectorAll('select, input, button, canvas')].filter((one) => !(one.labels?.length"
+        " || one.getAttribute('aria-label') || one.textContent.trim())).length"
+    )
+    assert nameless == 0
+    with Chromium(tmp_path / "phone", width=390, height=844, is_phone=True) as phone:
+        phone.open(page)
+        assert phone.run("document.documentElement.scrollWidth <= innerWidth")
+        assert phone.run("document.querySelectorAll('section.part').length") == 9
+        assert phone.faults() == []
+
+
+def test_without_webgl_the_page_says_so_and_keeps_its_numbers(
+    page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(chromium, "FLAGS", (*chromium.FLAGS, "--disable-3d-apis"))
+    with Chromium(tmp_path / "profile") as browser:
+        browser.open(page)
+        browser.run("document.getElementById('maps').scrollIntoView()")
+        assert "no WebGL 2" in text_of(browser, "#maps .say")
+        browser.until("document.querySelectorAll('#maps .side tbody tr').length > 0")
+        browser.run("document.querySelector('#maps .side tbody tr').click()")
+        assert "Points" in text_of(browser, "#maps .detail")
+        assert browser.run("document.querySelectorAll('#summary table').length") == 2
