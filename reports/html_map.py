@@ -96,7 +96,7 @@ def point_owners(prediction: Prediction, rows: Int64Array) -> Int32Array:
 
 
 def nearest_colours(points: Float32Array, seen: Float32Array, seen_rgb: UInt8Array) -> UInt8Array | None:
-    """The colour (n, 3) of what frames saw nearest to each point, grey where they saw nothing near; None without any."""
+    """The colour (n, 3) of what frames saw nearest to each point, grey where nothing is near; None without frames."""
     if not len(seen) or not len(points):
         return None
     _, found = nearest(seen, points, COLOUR_NEAR_M)
@@ -146,17 +146,15 @@ def _plane_bytes(plane: NDArray[Any]) -> bytes:
     """Column after column; of 16 bits the low bytes of a column first."""
     columns = plane.reshape(len(plane), -1).T if len(plane) else plane.reshape(1, 0)
     if plane.dtype == np.uint16:
-        return b"".join(
-            (column & 255).astype(np.uint8).tobytes() + (column >> 8).astype(np.uint8).tobytes() for column in columns
-        )
+        halves = ((column & 255, column >> 8) for column in columns)
+        return b"".join(half.astype(np.uint8).tobytes() for pair in halves for half in pair)
     return np.ascontiguousarray(columns, np.uint8).tobytes()
 
 
 def colour_plane(colours: UInt8Array) -> UInt8Array:
     """Colours (n, 3) with ``COLOUR_BITS`` a channel, spread over 0..255 again."""
     kept = colours >> (8 - COLOUR_BITS)
-    spread: UInt8Array = (kept << (8 - COLOUR_BITS)) | (kept >> (2 * COLOUR_BITS - 8))
-    return spread
+    return ((kept << (8 - COLOUR_BITS)) | (kept >> (2 * COLOUR_BITS - 8))).astype(np.uint8)
 
 
 def index_plane(values: Int32Array | Int64Array) -> NDArray[np.uint16]:

@@ -117,7 +117,7 @@ def outlined(picture: UInt8Array, mask: BoolArray | None, size: tuple[int, int],
     import cv2
 
     is_smaller = size[0] < picture.shape[1]
-    resized = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if is_smaller else cv2.INTER_CUBIC)
+    resized: Any = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if is_smaller else cv2.INTER_CUBIC)
     if mask is not None and mask.any():
         smooth = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
         contours, _ = cv2.findContours((smooth > 0.5).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)

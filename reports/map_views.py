@@ -67,11 +67,9 @@ class DrawnMap:
         view = render(self.instances.points[self.rows], 2.6 * DRAWN_SPACING_M, camera)
         return MapView(camera, view, _filled_part(view, camera.width / camera.height))
 
-    def views(self, width: int, height: int) -> tuple[MapView, MapView, MapView]:
-        """From above and from two opposite corners, of the shape of this size and at least as large."""
-        grown = [round(RENDERED * side) for side in (width, height)]
-        above, first, second = view_cameras(room_bounds(self.instances.points), *grown)
-        return self.view(above), self.view(first), self.view(second)
+    def cameras(self, width: int, height: int) -> tuple[Camera, Camera, Camera]:
+        """From above and from two opposite corners, for views of the shape of this size and at least as large."""
+        return view_cameras(room_bounds(self.instances.points), round(RENDERED * width), round(RENDERED * height))
 
     def paint(self, view: MapView, colours: UInt8Array) -> UInt8Array:
         """The picture of a view, instance k in ``colours[k]``."""

@@ -183,19 +183,32 @@ function mapView(canvas, { onPick, onLost }) {
   function redraw() {
     if (!pending) { pending = true; requestAnimationFrame(draw); }
   }
-  function pickAt(x, y) {
+  // Reads without making the processor wait for the graphics card: into a buffer first, from it once a fence is passed.
+  async function pickAt(x, y) {
     if (!cloud || gl.isContextLost()) return;
     draw();
-    const ratio = canvas.width / canvas.clientWidth, reach = 3, side = 2 * reach + 1;
-    const pixels = new Uint8Array(side * side * 4);
+    const ratio = canvas.width / canvas.clientWidth, reach = 3, side = 2 * reach + 1, mine = cloud;
+    const pixels = new Uint8Array(side * side * 4), buffer = gl.createBuffer();
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
+    gl.bufferData(gl.PIXEL_PACK_BUFFER, pixels.length, gl.STREAM_READ);
     gl.bindFramebuffer(gl.FRAMEBUFFER, made.frame);
     gl.readBuffer(gl.COLOR_ATTACHMENT1);
-    gl.readPixels(Math.round(x * ratio) - reach, Math.round(canvas.height - y * ratio) - reach, side, side, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+    gl.readPixels(Math.round(x * ratio) - reach, Math.round(canvas.height - y * ratio) - reach, side, side, gl.RGBA, gl.UNSIGNED_BYTE, 0);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+    const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    const isPassed = () => gl.isContextLost() || gl.clientWaitSync(fence, 0, 0) !== gl.TIMEOUT_EXPIRED;
+    while (!isPassed()) await new Promise((done) => setTimeout(done, 5));
+    if (gl.isContextLost() || mine !== cloud) return;
+    gl.deleteSync(fence);
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
+    gl.getBufferSubData(gl.PIXEL_PACK_BUFFER, 0, pixels);
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+    gl.deleteBuffer(buffer);
     // The pixel itself first, then its surroundings.
-    const order = [...Array(side * side).keys()].sort((a, b) => away(a) - away(b));
-    function away(k) { return Math.hypot((k % side) - reach, Math.floor(k / side) - reach); }
-    const hit = order.find((k) => pixels[4 * k + 2]);
+    const away = (k) => Math.hypot((k % side) - reach, Math.floor(k / side) - reach);
+    const hit = [...Array(side * side).keys()].sort((a, b) => away(a) - away(b)).find((k) => pixels[4 * k + 2]);
     const owner = hit === undefined ? NO_OWNER : pixels[4 * hit] + 256 * pixels[4 * hit + 1] - 1;
     onPick(owner === NO_OWNER || owner < 0 ? -1 : owner);
   }

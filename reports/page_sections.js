@@ -72,16 +72,20 @@ function valueCell(metric, value, interval, ceiling) {
 
 // Marks the highest of what competes: what was told the truth does not.
 const competes = (one) => one.method !== 'oracle' && !(one.caveat || '').includes('a ceiling, not a result');
-function bestOf(rows, value) {
+const onSame = (rows, what) => new Set(rows.filter((one) => competes(one) && one.result).map(what)).size === 1;
+const limitOf = (one) => String(RUNS[one.run].limit);
+const scenesOf = (one) => [limitOf(one), ...one.result.scenes].join('\n');
+function bestOf(rows, value, what = scenesOf) {
+  // Rows on other scenes or other frames are not compared.
   const numbers = rows.filter(competes).map(value).filter(isNumber);
-  return numbers.length > 1 ? Math.max(...numbers) : null;
+  return numbers.length > 1 && onSame(rows, what) ? Math.max(...numbers) : null;
 }
 
 // Whether the numbers are those of all scenes together; where the two agree it does not matter.
 const isPooled = (one) => !!one.result && one.headline.every((metric) => one.result.metrics[metric] === one.result.pooled[metric]);
 
 function summarySection() {
-  const section = part('summary', 'Summary', 'Per cent with the 95 % interval over scenes. The tick on a line is the ceiling: what the truth itself scores.');
+  const section = part('summary', 'Summary', 'Per cent with the 95 % interval over scenes. The tick on a line is the ceiling: what the truth itself scores. The best is bold where all rows are of the same scenes and frames.');
   for (const [index, run] of RUNS.entries()) {
     const where = RUNS.length > 1 ? `${runNames[index]}: ` : '';
     if (run.is_partial) section.append(h('p', { class: 'note warn' }, h('strong', null, `${where}PARTIAL. `), `Only the first ${run.limit} frames of each scene were used.`));
@@ -127,7 +131,7 @@ function matrixSection({ id, title, intro, what, head, metricsOf, valuesOf, extr
     const all = resultsOf(protocols.protocol()).filter((one) => one.result), name = metric.input.value;
     const keys = [...new Set(all.flatMap((one) => Object.keys(valuesOf(one))))];
     const at = (one, key) => { const values = valuesOf(one)[key]; return values ? values[name] : null; };
-    const rows = keys.map((key) => ({ key, best: bestOf(all, (one) => at(one, key)) }))
+    const rows = keys.map((key) => ({ key, best: bestOf(all, (one) => at(one, key), head === 'Scene' ? limitOf : scenesOf) }))
       .filter((row) => all.some((one) => isNumber(at(one, row.key))));
     const pooled = (one) => one.result.metrics[name];
     place.replaceChildren(dataTable({
@@ -145,7 +149,7 @@ function matrixSection({ id, title, intro, what, head, metricsOf, valuesOf, extr
 
 function scenesSection() {
   matrixSection({ id: 'scenes', title: 'Scenes', what: 'Metric', head: 'Scene',
-    intro: 'Each scene alone. The best of a row is bold.',
+    intro: 'Each scene alone. The best of a row is bold where all methods saw the same frames.',
     metricsOf: (rows) => [...new Set(rows.flatMap((one) => [...one.headline, ...Object.keys(one.result.metrics)]))],
     valuesOf: (one) => (one.result ? one.result.per_scene : {}) });
 }

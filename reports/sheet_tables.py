@@ -23,8 +23,9 @@ def sheet_tables(scores: Mapping[str, Any]) -> list[Table]:
     datasets = dict.fromkeys(cell["dataset"] for cell in scores["cells"])
     tables = [_accuracies(scores, dataset) for dataset in datasets]
     tables += [_tests(scores["tests"])] if scores["tests"] else []
-    tables += [_agreements(scores["agreements"])] if scores["agreements"] else []
-    pairs = [(one["ask"], pair) for one in scores["agreements"] for pair in one["agreement"]["pairs"]]
+    shared = [one for one in scores["agreements"] if one["agreement"]["n_items"]]
+    tables += [_agreements(shared)] if shared else []
+    pairs = [(one["ask"], pair) for one in shared for pair in one["agreement"]["pairs"]]
     tables += [_pairs(pairs)] if pairs else []
     return [*tables, *(_confusion(one, scores["automatic_rule"]) for one in scores["confusions"])]
 
@@ -72,14 +73,15 @@ def _bracket(interval: Sequence[float] | None) -> str:
 
 def _tests(tests: Sequence[Mapping[str, Any]]) -> Table:
     rows = []
-    for one in tests[:SHOWN_TESTS]:
+    differing = [one for one in tests if one["n_differ"]]
+    for one in differing[:SHOWN_TESTS]:
         low_high = one["interval"]
         beside = "" if low_high is None else f"[{signed(low_high[0])}, {signed(low_high[1])}]"
         texts = (one["metric"], str(one["n_items"]), str(one["n_differ"]))
         p = f"{one['p']:.3g}" if one["is_exact"] else f"about {one['p']:.2g}"
         cells = (*map(Cell, texts), Cell(signed(one["difference"]), beside), Cell(p), Cell(f"{one['smallest_p']:.2g}"))
         rows.append(TableRow(f"{one['right']} - {one['left']} ({one['dataset']})", cells))
-    left_out = len(tests) - len(rows)
+    n_same, n_more = len(tests) - len(differing), len(differing) - len(rows)
     return Table(
         name="differences",
         caption="Differences between methods, as people judged them.",
@@ -89,7 +91,8 @@ def _tests(tests: Sequence[Mapping[str, Any]]) -> Table:
         notes=(
             "p: two-sided sign-flip test over what differs (McNemar's exact test where each is judged once); smallest "
             "p: the least that so many can give; not corrected for the number of tests",
-            *([f"{left_out} more differences are in scores.json"] if left_out else []),
+            *([f"{n_same} of {len(tests)} comparisons are left out: nothing differs"] if n_same else []),
+            *([f"{n_more} more differences are in scores.json"] if n_more else []),
         ),
     )
 

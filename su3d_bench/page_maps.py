@@ -290,9 +290,10 @@ def _n_instances(prediction: Prediction) -> int:
 
 
 def _frames_of(instances: Instances, k: int) -> list[int]:
-    rows = (
-        instances.views[instances.view_indptr[k] : instances.view_indptr[k + 1]] if len(instances.view_indptr) else []
-    )
+    """The frames in which an instance was seen, each once; none where the method keeps no views."""
+    if not len(instances.views):
+        return []
+    rows = instances.views[instances.view_indptr[k] : instances.view_indptr[k + 1]]
     return list(dict.fromkeys(int(frame) for frame, _ in rows))
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
@@ -170,7 +170,7 @@ def _confusions(run: FinishedRun, method: str) -> list[dict[str, Any]]:
         if not counts:
             continue
         rules = load_protocol(name)
-        one = {"method": method, "protocol": name}
+        one: dict[str, Any] = {"method": method, "protocol": name}
         if rules.digest != run.protocols[name][1] or any(len(c.is_present) != len(rules.classes) for c in counts):
             found.append(one | {"reason": f"the rules of {name} here are not those that scored the run"})
             continue

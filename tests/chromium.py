@@ -37,8 +37,8 @@ class Chromium:
         self._read, from_browser = os.pipe()
         self._rest, self._number = b"", 0
         command = [program, *FLAGS, f"--user-data-dir={folder}", "about:blank"]
-        # The protocol speaks on descriptors 3 and 4.
-        shell = ["sh", "-c", f'exec "$@" 3<&{to_browser} 4>&{from_browser}', "sh", *command]
+        # The protocol speaks on descriptors 3 and 4; a plain sh knows descriptors above 9 by their paths alone.
+        shell = ["sh", "-c", f'exec "$@" 3</dev/fd/{to_browser} 4>/dev/fd/{from_browser}', "sh", *command]
         self._process = subprocess.Popen(
             shell, pass_fds=(to_browser, from_browser), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
         )
@@ -101,8 +101,9 @@ class Chromium:
 
     def open(self, path: Path) -> None:
         """Open a file, as a person does who double-clicks on it."""
+        self.run("window.isOfThePageBefore = true")
         self.call("Page.navigate", {"url": path.resolve().as_uri()})
-        self.until("document.readyState === 'complete' && location.protocol === 'file:'")
+        self.until("!window.isOfThePageBefore && document.readyState === 'complete' && location.protocol === 'file:'")
 
     def run(self, script: str) -> Any:
         """The value of an expression in the page."""

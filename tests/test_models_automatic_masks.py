@@ -161,6 +161,24 @@ def test_every_batch_size_gives_the_same_masks_of_the_drawn_network() -> None:
     assert len({answer.masks.tobytes() for answer in answers}) == 1
 
 
+def test_points_are_halved_where_the_memory_runs_out_and_give_the_same_masks() -> None:
+    import torch
+
+    asked = []
+
+    class Short(Drawn):
+        def decode(self, embedding: Any, prompts: Prompts, is_single: bool) -> tuple[Any, Any]:
+            asked.append(len(prompts))
+            if len(prompts) > 20:
+                raise torch.OutOfMemoryError("CUDA out of memory")
+            return super().decode(embedding, prompts, is_single)
+
+    config = AutomaticMaskConfig(points_per_side=8)
+    found, plain = (AutomaticMasks(Sam(network), config).regions(blocks(64, 64)) for network in (Short(), Drawn()))
+    assert asked == [64, 32, 16, 16, 16, 16]
+    assert found.masks.tobytes() == plain.masks.tobytes() and len(found.masks) > 1
+
+
 def test_an_image_without_anything_has_no_regions() -> None:
     class Blind(Drawn):
         squares = ()

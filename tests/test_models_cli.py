@@ -67,15 +67,18 @@ def test_the_examples_of_every_action_parse() -> None:
         assert build_parser().parse_args(words.split()).verb == "models"
 
 
-@pytest.mark.parametrize("words", [["models", "--help"], ["models", "list"], ["models", "check", "--help"]])
-def test_listing_models_loads_nothing_heavy(words: list[str]) -> None:
+@pytest.mark.parametrize(
+    ("words", "code_wanted"),
+    [(["models", "list"], "0"), (["run", "--profile", "paper", "--scenes", "rooms/living0"], "2")],
+)
+def test_what_needs_no_model_or_finds_none_loads_nothing_heavy(words: list[str], code_wanted: str) -> None:
     code = (
         "import sys; from su3d_bench.cli.main import main\n"
         f"code = main({words!r})\n"
         f"print('heavy:', ' '.join(sorted(set({HEAVY!r}) & set(sys.modules))), code)"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stdout.splitlines()[-1].split() == ["heavy:", "0"], done.stderr
+    assert done.stdout.splitlines()[-1].split() == ["heavy:", code_wanted], done.stderr
 
 
 def test_the_list_names_every_model_with_size_licence_and_that_it_is_missing(

@@ -115,6 +115,33 @@ def test_the_same_batch_gives_the_same_bytes_and_another_batch_nearly_the_same_l
     assert (masks[1] != masks[2]).mean() < 1e-3
 
 
+def test_prompts_are_halved_where_the_memory_runs_out_and_stay_so(sam: Sam) -> None:
+    import torch
+
+    asked = []
+
+    class Short:
+        """SAM on a device that holds two prompts."""
+
+        image_px = SAM_PX
+
+        def embed(self, pixels: Float32Array) -> Any:
+            return sam.network.embed(pixels)
+
+        def decode(self, embedding: Any, prompts: Prompts, is_single: bool) -> tuple[Any, Any]:
+            asked.append(len(prompts))
+            if len(prompts) > 2:
+                raise torch.OutOfMemoryError("CUDA out of memory")
+            return sam.network.decode(embedding, prompts, is_single)
+
+    short, boxes = Sam(Short()), np.concatenate([BOXES, BOXES[:2]])
+    masks, scores = short.from_boxes(short.look(RGB), boxes, is_single=False)
+    theirs, predicted = Sam(sam.network, 2).from_boxes(sam.look(RGB), boxes, is_single=False)
+    assert masks.tobytes() == theirs.tobytes() and scores.tobytes() == predicted.tobytes()
+    short.from_boxes(short.look(RGB), boxes, is_single=False)
+    assert asked == [5, 2, 2, 1, 2, 2, 1]
+
+
 def test_masks_of_no_boxes_are_none(sam: Sam) -> None:
     masks, scores = sam.from_boxes(sam.look(RGB), np.zeros((0, 4), np.float32), is_single=False)
     assert masks.shape == (0, 40, 60)

@@ -9,14 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+from damage import damages, outcomes
 from perception_fakes import CountingEncoder, still_life
 from PIL import Image
 
-from su3d_bench.errors import ConfigError, DataError, PredictionError
+from su3d_bench.errors import ConfigError, DataError, PredictionError, Su3dError
 from su3d_bench.perception.gsa_files import GsaFiles
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
 from su3d_bench.timing import Timer
-from su3d_bench.types import Float32Array, PerceptionNeeds, SceneInfo
+from su3d_bench.types import Float32Array, Frame, PerceptionNeeds, SceneInfo
 
 SCENE = SceneInfo("replica", "room0", n_frames=1, stride=1, image_domain="camera")
 PATTERN = "{scene}/gsa_detections_none/frame{index}.pkl.gz"
@@ -146,6 +147,26 @@ def test_a_frame_without_a_file_and_a_folder_without_files_are_named(tmp_path: P
         GsaFiles(tmp_path, PATTERN.replace("frame", "image"), SCENE)
     with pytest.raises(ConfigError, match=r"perception\.stored\.detections: .*leads out of"):
         GsaFiles(tmp_path, "../frame{index}.pkl.gz", SCENE)
+
+
+def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path) -> None:
+    small = Frame(40, 0.0, FRAME.rgb[:6, :8], FRAME.depth_m[:6, :8], FRAME.camera_to_world, FRAME.intrinsics)
+    content = detections(mask=np.ones((3, 6, 8), bool), image_crops=[], xyxy=np.tile([0.0, 0, 8, 6], (3, 1)))
+    path = write(tmp_path, content)
+    files = GsaFiles(tmp_path, PATTERN, SCENE)
+    plain, packed = pickle.dumps(content, 4), path.read_bytes()
+
+    def read(damaged: bytes) -> object:
+        path.write_bytes(damaged)
+        return files.frame(small)
+
+    def read_inner(damaged: bytes) -> object:
+        return read(gzip.compress(damaged, 1))
+
+    for one, copies in ((read_inner, damages(plain, 400)), (read, damages(packed, 100))):
+        n_read, n_refused = outcomes(one, copies, must_name="frame000040.pkl.gz", refusal=Su3dError)
+        assert n_read + n_refused > 0 and n_refused > 10
+    assert outcomes(read_inner, iter([plain]), must_name="") == (1, 0)
 
 
 class Calling:

@@ -10,13 +10,15 @@ import numpy as np
 import pytest
 from tiny_models import blocks, frame_of, paper_words, tiny_dino, tiny_sam, write_models
 
+from su3d_bench import registry
 from su3d_bench.cli.main import main
 from su3d_bench.errors import ConfigError, ModelMissing
+from su3d_bench.perception import profile_paper
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.config import PerceptionConfig
 from su3d_bench.perception.language.captioner import CropCaption
 from su3d_bench.perception.models.tagging import WORDS_CAVEAT
-from su3d_bench.perception.profiles import Perception, build_perception, resolve_profile
+from su3d_bench.perception.profiles import Perception, build_perception, check_models, resolve_profile
 from su3d_bench.store import read_json, read_prediction
 from su3d_bench.timing import Timer
 from su3d_bench.toml_text import write_toml
@@ -108,6 +110,47 @@ def test_a_method_gets_the_settings_of_its_own_program(models: Path, tmp_path: P
     assert set(tags.names) <= known
     with pytest.raises(ConfigError, match=r"class-agnostic masks 'conceptgraph', there are none; did you mean"):
         perception.detect(FRAME, PerceptionNeeds(masks="class-agnostic", automatic="conceptgraph"), Timer())
+
+
+@pytest.mark.parametrize(
+    ("method", "asked"),
+    [
+        ("conceptfusion-sam", {"points_per_side": 8, "pred_iou_thresh": 0.92, "crop_n_layers": 1,
+                               "crop_n_points_downscale_factor": 2}),
+        ("conceptgraphs", {"points_per_side": 12, "points_per_batch": 144, "min_mask_region_area": 100}),
+        ("sam3d", {"points_per_side": 32, "pred_iou_thresh": 0.88, "stability_score_thresh": 0.95}),
+        ("conceptgraphs-detector", {"region_boxes": "detector",
+                                    "boxes": {"box_threshold": 0.2, "text_threshold": 0.2, "nms_iou": 0.5}}),
+        ("conceptfusion", {"region_boxes": "mask", "boxes": {"box_threshold": 0.25, "text_threshold": 0.25}}),
+        ("opensu3d", {"region_boxes": "mask",
+                      "boxes": {"box_threshold": 0.25, "text_threshold": 0.25, "nms_iou": 0.4}}),
+    ],
+)  # fmt: skip
+def test_each_methods_published_mask_settings_reach_the_models(
+    models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, method: str, asked: dict[str, Any]
+) -> None:
+    class Asked(Exception):
+        pass
+
+    class Telling:
+        name = digest = "telling"
+
+        def __init__(self, networks: Any, settings: Any) -> None:
+            self.settings = settings.model_dump()
+
+        def segment(self, frame: Any) -> Any:
+            raise Asked(self.settings)
+
+    for segmenter in ("GroundedSam", "AutomaticSam"):
+        monkeypatch.setattr(profile_paper, segmenter, Telling)
+    method_class = registry.load("method", method)
+    published = PerceptionConfig.model_validate({"models": {"folder": models, "encoder": "embedded"}})
+    with pytest.raises(Asked) as caught:
+        built(published, tmp_path).detect(FRAME, method_class(method_class.Config()).needs, Timer())
+    found = caught.value.args[0]
+    inner = asked.pop("boxes", {})
+    assert {key: found[key] for key in asked} == asked
+    assert {key: found["boxes"][key] for key in inner} == inner
 
 
 def config_words() -> tuple[str, ...]:
@@ -217,8 +260,22 @@ def test_without_models_one_line_says_what_to_fetch(no_models: Path) -> None:
 def test_the_command_line_says_it_too(no_models: Path, monkeypatch: pytest.MonkeyPatch, capsys: Any) -> None:
     monkeypatch.chdir(no_models)
     words = ["run", "--scenes", "rooms/living0", "--profile", "paper", "--limit", "1", "--out", "out", "--quiet"]
-    assert main(words) != 0
-    assert "model 'clip-vit-h-14': not found; fetch" in capsys.readouterr().err
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert said.startswith("su3d-bench: model 'clip-vit-h-14': not found; fetch") and len(said.splitlines()) == 1
+    assert not (no_models / "out").exists(), "no frame was read"
+    assert main([*words, "--set", "perception.models.encoder=embedded"]) == 2
+    assert "model 'sam-vit-h': not found; fetch" in capsys.readouterr().err
+
+
+def test_a_tagger_that_was_asked_for_is_looked_for_before_any_frame(models: Path, no_models: Path) -> None:
+    check_models("paper", config_of(models))
+    with pytest.raises(ModelMissing, match=r"model 'ram-plus': not found; make it: onnx/export\.py"):
+        check_models("paper", config_of(models, tagger="ram-onnx"))
+    other = PerceptionConfig.model_validate({"models": {"folder": no_models, "encoder": "clip-vit-b-32"}})
+    with pytest.raises(ModelMissing, match="model 'clip-vit-b-32': not found"):
+        check_models("embedded", other)
+    check_models("embedded", PerceptionConfig())
 
 
 def test_a_room_runs_end_to_end(models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

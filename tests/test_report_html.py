@@ -1,4 +1,4 @@
-"""The page of runs: what it holds, that nothing in it is markup or loaded, how maps are packed, what it says of gaps."""
+"""The page of runs: what it holds, that nothing of a run is markup, how maps are packed, what it says of gaps."""
 
 from __future__ import annotations
 
@@ -309,7 +309,7 @@ def test_twenty_scenes_under_eight_methods_stay_below_thirty_megabytes() -> None
     assert 0.6 * most < len(cloud.points) <= most
     rng = np.random.default_rng(1)
     cells = np.floor(cloud.points / 0.4).astype(np.int64) @ [1, 20, 400]
-    planes = {
+    planes: dict[str, Any] = {
         "owner": index_plane(cells % 150),
         "colour": html_map.colour_plane(rng.integers(0, 256, (len(cells), 3), np.uint8)),  # noise: the worst case
         "truth": index_plane(cells % 60),

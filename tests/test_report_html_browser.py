@@ -1,4 +1,4 @@
-"""The page of runs in a real browser, opened as a file: every control does what it says, and nothing is complained of."""
+"""The page of runs in a real browser, opened as a file: every control works, and nothing is complained of."""
 
 from __future__ import annotations
 
@@ -55,10 +55,15 @@ def browser(page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ch
             yield found
 
 
+def faults(browser: Chromium) -> list[str]:
+    """What the page is to blame for: a browser without a graphics card says of itself that it reads canvases slowly."""
+    return [line for line in browser.faults() if "GL Driver Message (OpenGL, Performance" not in line]
+
+
 @pytest.fixture(autouse=True)
 def no_complaint(browser: Chromium) -> Iterator[None]:
     yield
-    assert browser.faults() == []
+    assert faults(browser) == []
 
 
 def options(browser: Chromium, part: str, label: str) -> list[str]:
@@ -72,6 +77,13 @@ def choose(browser: Chromium, part: str, label: str, text: str) -> None:
     browser.run(
         f"{{ const field = {field}; field.value = [...field.options].find((one) => one.text === {json.dumps(text)})"
         ".value; field.dispatchEvent(new Event('change')); }"
+    )
+
+
+def type_into(browser: Chromium, selector: str, value: str) -> None:
+    browser.run(
+        f"{{ const one = document.querySelector({json.dumps(selector)}); one.value = {json.dumps(value)};"
+        " one.dispatchEvent(new Event('input')); }"
     )
 
 
@@ -141,12 +153,11 @@ def test_a_header_sorts_and_turns_by_mouse_and_keyboard(browser: Chromium) -> No
 
 
 def test_a_filter_leaves_the_rows_that_hold_its_text(browser: Chromium) -> None:
-    filling = "{{ const one = document.querySelector('#classes input'); one.value = {}; one.dispatchEvent(new Event('input')); }}"
     everything = column(browser, "classes", 0)
-    browser.run(filling.format("'SOFA'"))
+    type_into(browser, "#classes input", "SOFA")
     assert column(browser, "classes", 0) == ["sofa"]
     assert text_of(browser, "#classes .count") == f"1 of {len(everything)} rows"
-    browser.run(filling.format("''"))
+    type_into(browser, "#classes input", "")
     assert column(browser, "classes", 0) == everything
 
 
@@ -176,7 +187,8 @@ def test_the_confusion_is_of_the_chosen_method(browser: Chromium) -> None:
 
 
 def test_the_timing_plot_follows_its_three_choices(browser: Chromium) -> None:
-    line = "document.querySelector('#timing path').getAttribute('d')"
+    plot = "document.querySelector('#timing .wide svg')"
+    line = f"{plot}.querySelector('path').getAttribute('d') + {plot}.textContent"
     seen = [browser.run(line)]
     for label, text in (("Time of", "the whole update"), ("Against", "points of the map"), ("Scene", "painted/b")):
         choose(browser, "timing", label, text)
@@ -218,7 +230,8 @@ def test_every_colouring_draws_another_picture_and_says_what_it_means(browser: C
         seen[kind] = picture(browser)
         assert text_of(browser, "#maps .legend").strip()
     assert len(set(seen.values())) >= 5  # instances and classes may have the same colours where each is of one class
-    assert "right class" in (choose(browser, "maps", "Colour by", kinds[4]), text_of(browser, "#maps .legend"))[1]
+    choose(browser, "maps", "Colour by", kinds[4])
+    assert "right class" in text_of(browser, "#maps .legend")
     choose(browser, "maps", "Colour by", kinds[5])
     assert options(browser, "maps", "Text") == ["chair", "table"]
     first = picture(browser)
@@ -295,14 +308,39 @@ def test_an_instance_shows_its_name_class_scores_and_view(browser: Chromium) -> 
     assert text_of(browser, "#maps .detail h3") == column(browser, "maps", 0)[0]
 
 
+def test_fingers_turn_and_zoom(browser: Chromium) -> None:
+    open_maps(browser)
+    press(browser, "#maps canvas", "Home")
+    x, y = middle(browser)
+
+    def touch(kind: str, *places: tuple[float, float]) -> None:
+        points = [{"x": place[0], "y": place[1], "id": k} for k, place in enumerate(places)]
+        browser.call("Input.dispatchTouchEvent", {"type": kind, "touchPoints": points})
+
+    seen = [picture(browser)]
+    touch("touchStart", (x, y))
+    touch("touchMove", (x + 40, y + 10))
+    touch("touchEnd")
+    seen.append(picture(browser))
+    touch("touchStart", (x - 20, y), (x + 20, y))
+    touch("touchMove", (x - 60, y), (x + 60, y))
+    touch("touchEnd")
+    seen.append(picture(browser))
+    assert len(set(seen)) == 3
+
+
+def test_rows_on_other_scenes_have_no_best_and_those_of_one_scene_do(browser: Chromium) -> None:
+    assert browser.run("document.querySelectorAll('#summary td.best').length") == 0
+    assert browser.run("document.querySelectorAll('#scenes td.best').length") > 0
+
+
 def test_the_cut_takes_points_away_and_buttons_zoom(browser: Chromium) -> None:
     open_maps(browser)
     press(browser, "#maps canvas", "Escape", "Home")
     seen = [picture(browser)]
-    moving = "{{ const cut = document.querySelector('#maps input[type=range]'); cut.value = {}; cut.dispatchEvent(new Event('input')); }}"
-    browser.run(moving.format(30))
+    type_into(browser, "#maps input[type=range]", "30")
     seen.append(picture(browser))
-    browser.run(moving.format(100))
+    type_into(browser, "#maps input[type=range]", "100")
     for title in ("Zoom in", "Zoom out", "Zoom out"):
         browser.run(f"document.querySelector('#maps button[title=\"{title}\"]').click()")
         seen.append(picture(browser))
@@ -334,7 +372,7 @@ def test_every_control_has_a_name_and_the_page_no_sideways_scroll_on_a_phone(
         phone.open(page)
         assert phone.run("document.documentElement.scrollWidth <= innerWidth")
         assert phone.run("document.querySelectorAll('section.part').length") == 9
-        assert phone.faults() == []
+        assert faults(phone) == []
 
 
 def test_without_webgl_the_page_says_so_and_keeps_its_numbers(

@@ -20,6 +20,7 @@ from su3d_bench.metrics.question_truths import AskedText, GivenAnswer, Reasoning
 from su3d_bench.metrics.results import metric_values
 from su3d_bench.metrics.score_questions import are_objects_right, is_answer_right
 from su3d_bench.metrics.shares import ShareCounts
+from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
 from su3d_bench.planning import protocols_of_run
 from su3d_bench.predictions.base import VertexMasks
 from su3d_bench.protocols import load_protocol, protocols_for, read_protocol, rules_file
@@ -103,6 +104,16 @@ def test_scenes_pool_by_their_questions_and_counts_survive_the_file() -> None:
     assert result.metrics == result.pooled
     assert result.per_scene["b"]["all"] == 1.0
     assert result.intervals["all"] == (4 / 6, 1.0)
+
+
+@pytest.mark.parametrize("text", ["<script>", '=HYPERLINK("x")', "\u202e", "\U0001f600", "x" * 10_000])
+def test_hostile_texts_are_asked_as_they_are(text: str) -> None:
+    asked = RetrievalTruth(TRUTH, (AskedText("instance", text, (2,)),))
+    embedded = EmbeddedEncoder()
+    features = embedded.encode_texts(list(NAMES))
+    prediction = replace(PERFECT, features=features)
+    score = score_scene(RULES, asked, prediction, embedded)
+    assert metric_values(RULES, [score.counts], pooled=True)["n_instance"] == 1
 
 
 def test_a_map_without_features_is_told_why() -> None:

@@ -22,7 +22,7 @@ from su3d_bench.reports.second_looks import second_looks_csv, second_looks_page
 from su3d_bench.reports.sheet_tables import sheet_tables
 from su3d_bench.reports.table_formats import csv_text, html_page, markdown
 from su3d_bench.sheets.answers import AnswerRow, parse_csv, parse_workbook, read_answers
-from su3d_bench.sheets.items import ANSWER_COLUMNS, Key, Sheet, write_key, write_sheet
+from su3d_bench.sheets.items import ANSWER_COLUMNS, Key, Sheet, read_key, write_key, write_sheet
 from su3d_bench.sheets.score_file import read_scores, write_scores
 from su3d_bench.sheets.scores import ScoreCell, Scores, paired_p, score
 from su3d_bench.sheets.validation import check_answers, check_key
@@ -250,7 +250,7 @@ def both(small: tuple[Sheet, Key]) -> Rows:
     ("change", "told"),
     [
         ({"item_id": "item-00O1"}, "item 'item-00O1' is not in this set; did you mean 'item-00"),
-        ({"answer": ""}, "item 'item-0001', question 'retrieval', is not answered; choose right | wrong | cannot tell"),
+        ({"answer": ""}, "no answer (item 'item-0001', question 'retrieval'); answer, and export again"),
         ({"answer": "wrnog"}, "unknown answer 'wrnog' to 'retrieval'; did you mean 'wrong'?"),
         ({"answer": "=HYPERLINK(1)"}, "unknown answer '=HYPERLINK(1)'"),
         ({"check": "c000000000000"}, "cells of item 'item-0001' were changed ('check' does not fit)"),
@@ -287,6 +287,14 @@ def test_an_annotator_without_any_answer_is_named_but_no_fault(small: tuple[Shee
     assert (checked.faults, checked.silent) == ((), ("bob",))
 
 
+def test_rows_without_an_answer_are_one_line_a_file(small: tuple[Sheet, Key]) -> None:
+    rows = [replace(one, answer="") if one.item_id < "item-0005" else one for one in both(small)]
+    faults = check_answers(small[0], [one for one in rows if one.annotator == "ann"]).faults
+    assert faults == (
+        "ann.csv: row 2 and 4 more rows: no answer (item 'item-0000', question 'retrieval'); answer, and export again",
+    )
+
+
 def test_all_faults_are_told_at_once(small: tuple[Sheet, Key]) -> None:
     rows = both(small)
     rows[0], rows[2] = replace(rows[0], answer="yes"), replace(rows[2], check="c")
@@ -305,6 +313,24 @@ def test_capitals_and_blanks_make_no_other_answer(small: tuple[Sheet, Key]) -> N
     rows[0] = replace(rows[0], answer="Cannot  TELL")
     checked = check_answers(small[0], rows)
     assert checked.faults == () and checked.judgements[0].answer == "cannot tell"
+
+
+def test_a_damaged_key_is_refused_or_counted_but_never_breaks(tmp_path: Path) -> None:
+    sheet, key = annotation_set([("right", "wrong", "well-merged"), ("right", "right", "over-merged")])
+    checked = check_answers(sheet, answered(sheet, key, {"ann": 0.0}))
+    content, copy = write_key(tmp_path, key).read_bytes(), tmp_path / "copy.json"
+
+    def use(damaged: bytes) -> Scores:
+        copy.write_bytes(damaged)
+        found = read_key(copy)
+        try:
+            check_key(sheet, found)
+        except DataError as error:
+            raise DataError(f"copy.json: {error}") from error
+        return score(sheet, found, checked.judgements)
+
+    n_read, n_refused = outcomes(use, damages(content, 150), must_name="copy.json")
+    assert n_read and n_refused
 
 
 @pytest.mark.parametrize(
@@ -465,10 +491,20 @@ def test_the_tables_say_what_was_counted(small: tuple[Sheet, Key]) -> None:
     assert [row.label for row in main_table.rows] == [
         f"{scheme} ({who})" for who in ("people", "ground truth") for scheme in SCHEMES
     ]
+    n_different = sum(one.n_differ > 0 for one in scores.tests)
+    assert 0 < n_different < 30 == len(scores.tests)
+    assert len(tables["differences"].rows) == n_different
+    assert f"{30 - n_different} of 30 comparisons are left out: nothing differs" in tables["differences"].notes
     truth = main_table.rows[4].cells[-1]
     assert truth.text == "50.0" and truth.beside.endswith("n=8")
     n = len(small[0].items)
     assert f"{n} of {n} items judged; judgements by ann {n}, bob {n}" in main_table.notes[1]
+
+
+def test_one_annotator_agrees_with_nobody() -> None:
+    sheet, key = retrieval_set(8)
+    tables = sheet_tables(asdict(scored(sheet, key, answered(sheet, key, {"ann": 0.0}))))
+    assert [one.name for one in tables] == ["retrieval-rooms", "differences", "confusion-retrieval"]
 
 
 # The verb

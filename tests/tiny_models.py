@@ -119,7 +119,7 @@ def paper_words(models: Path, out: Path, scene: str, settings: Sequence[str] = (
     lenient += ["paper.automatic.points_per_side=2", "paper.automatic.pred_iou_thresh=0"]
     lenient += ["paper.automatic.stability_score_thresh=0", "paper.automatic.box_nms_thresh=1.0"]
     if scene.startswith("rooms/"):
-        settings = (*settings, "rooms.width=160", "rooms.height=120")
+        settings = (*settings, "rooms.width=160", "rooms.height=120", "rooms.mesh_spacing_m=0.1")
         words = (*words, "--protocols", "rooms-semantic")
     options = ["--scenes", scene, "--profile", "paper", "--limit", "2", "--no-pictures", "--jobs", "1", "--quiet"]
     return ["run", *options, *words, "--out", str(out), "--set", *(f"perception.{one}" for one in lenient), *settings]

@@ -58,6 +58,7 @@ def add_parser(actions: Any) -> None:
     )
     parser.add_argument("--seed", type=int, default=0, help="of the drawing and shuffling (default: 0)")
     parser.add_argument("--colours", choices=("paper", "cividis"), default="paper", help="of the heat maps")
+    parser.add_argument("--jobs", type=int, default=2, metavar="N", help="scenes drawn side by side (default: 2)")
     parser.add_argument("--device", default="cpu", help="of the text's encoder, if a large one (default: cpu)")
 
 
@@ -67,30 +68,39 @@ def call(arguments: argparse.Namespace) -> int:
 
     limit_threads()
     from su3d_bench.finished_run import read_run
-    from su3d_bench.sheets.drawing import Artist
-    from su3d_bench.sheets.making import Origin, make_sheets, write_sheets
+    from su3d_bench.sheets.drawing_jobs import draw_all
+    from su3d_bench.sheets.making import Origin, check_split, make_sheets, write_sheets
     from su3d_bench.sheets.run_source import RunSource
 
     if arguments.per_kind is not None and arguments.per_kind < 1:
         raise ConfigError(f"--per-kind {arguments.per_kind}: at least 1 item is needed")
+    if arguments.jobs < 1:
+        raise ConfigError(f"--jobs {arguments.jobs}: at least 1 is needed")
     if arguments.seed < 0:
         raise ConfigError(f"--seed {arguments.seed}: expected 0 or more")
     source = RunSource(read_run(arguments.run), arguments.methods, arguments.scenes)
     drafts = _drafts(source, arguments)
     rules = {rules.name for scene in source.scenes if (rules := source.rules(scene, arguments.kind)) is not None}
-    artist = Artist(source, arguments.kind, arguments.colours)
+    check_split(len(drafts), arguments.annotators, arguments.overlap)
     origin = Origin(source.run.name, source.run.code, source.methods, ", ".join(sorted(rules)))
     with progress(1, is_quiet=arguments.quiet, last_step="writing") as report:
-        made = make_sheets(
+        drawn = draw_all(
+            source,
             arguments.kind,
+            arguments.colours,
             drafts,
-            artist.draw,
-            origin,
-            seed=arguments.seed,
-            annotators=arguments.annotators,
-            overlap=arguments.overlap,
-            progress=lambda n_done, n: report(Event(source.run.name, "pictures", n_done, n)),
+            arguments.jobs,
+            lambda n_done, n: report(Event(source.run.name, "pictures", n_done, n)),
         )
+    made = make_sheets(
+        arguments.kind,
+        drafts,
+        drawn,
+        origin,
+        seed=arguments.seed,
+        annotators=arguments.annotators,
+        overlap=arguments.overlap,
+    )
     key = arguments.key or arguments.out.with_name(f"{arguments.out.name}-key")
     files = write_sheets(made, arguments.out, key)
     if arguments.json:

@@ -40,7 +40,8 @@ def score_retrieval(
     rows["all"] = is_right
     rows["reachable"] = np.array([not found.isdisjoint(one.answers) for one in truth.asked], bool)
     told = encoder_warning(rules, prediction, encoder)
-    return _scored(rules, truth.scene, prediction, _counts(rules, rows), [told] if told else [])
+    asked_for = [one for asked in truth.asked for one in asked.answers]
+    return _scored(rules, truth.scene, asked_for, prediction, _counts(rules, rows), [told] if told else [])
 
 
 def first_instances(
@@ -85,7 +86,7 @@ def score_annotation(rules: ProtocolRules, truth: AnnotationTruth, prediction: I
     }
     warnings = [f"judged are the {len(judged)} of {len(objects)} instances that stand for an object that counts"]
     warnings.append("no label n': the map keeps no names of views" if refined is None else f"n': {refined.source}")
-    return _scored(rules, truth.scene, prediction, _counts(rules, rows), warnings)
+    return _scored(rules, truth.scene, truth.object_ids, prediction, _counts(rules, rows), warnings)
 
 
 def labels_n(instances: Instances) -> tuple[str, ...]:
@@ -137,7 +138,8 @@ def score_reasoning(
     }
     n_open = sum(not told.is_settled for told in given)
     warnings = [f"the solver could not settle {n_open} of {len(given)} questions"] if n_open else []
-    return _scored(rules, truth.scene, prediction, _counts(rules, rows), warnings)
+    named = [one for asked in truth.asked for one in asked.object_ids]
+    return _scored(rules, truth.scene, named, prediction, _counts(rules, rows), warnings)
 
 
 def is_answer_right(rules: AnswerRules, true: TrueAnswer, given: GivenAnswer, main_object: Int64Array) -> bool:
@@ -172,15 +174,17 @@ def _counts(rules: ProtocolRules, rows: dict[str, BoolArray]) -> ShareCounts:
 def _scored(
     rules: ProtocolRules,
     truth: GroundTruth,
+    object_ids: Sequence[int],
     prediction: Instances | Partition,
     counts: ShareCounts,
     warnings: Sequence[str],
 ) -> SceneScore:
+    """The score, with the coverage of the objects ``object_ids``, on which the counts rest."""
     if isinstance(prediction, Instances):
         masks = transfer.masks_of(prediction)
     else:
         masks = transfer.masks_of_partition(prediction.instance, len(prediction.features))
-    wanted = truth.instance > 0
+    wanted = np.isin(truth.instance, np.array([*object_ids], np.int64))
     distance = distance_to_masks(prediction.points, masks, truth.points, wanted)
     return SceneScore(
         protocol=rules.name,

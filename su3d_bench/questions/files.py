@@ -23,7 +23,9 @@ PAPER = Path(__file__).parent / "paper_queries.toml"
 
 
 def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ...]:
-    """The questions of a file, each scene as ``<dataset>/<scene>``; ``dataset`` completes scenes that name none.
+    """The questions of a file, each scene as ``<dataset>/<scene>``.
+
+    ``dataset`` completes scenes that name none; an empty one leaves them as they are.
 
     A query without a kind is one of kind instance. The same question of the same scene may stand there once.
     """
@@ -36,7 +38,7 @@ def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ..
             raise DataError(f"{row.at}: unknown kind '{printable(kind, 40)}'; known: {', '.join(ALL_KINDS)}")
         if "/" not in row.scene and dataset is None:
             raise DataError(f"{row.at}: of which dataset is scene '{printable(row.scene, 60)}'? write dataset/scene")
-        scene = row.scene if "/" in row.scene else f"{dataset}/{row.scene}"
+        scene = f"{dataset}/{row.scene}" if dataset and "/" not in row.scene else row.scene
         source = row.source or printable(path.name, 100)
         one = new_question(scene, kind, row.text, row.objects or None, source)
         if one.id in found:

@@ -119,8 +119,9 @@ class _ShownMap:
 
         self.scene, self.instances = scene, instances
         self.drawn: DrawnMap = drawn_map(instances)
-        self.above: MapView = self.drawn.views(ZOOM_WIDTH, LOW_HEIGHT)[0]
-        self.corners: tuple[MapView, ...] = self.drawn.views(PHOTO_WIDTH, LOW_HEIGHT)[1:]
+        self.above: MapView = self.drawn.view(self.drawn.cameras(ZOOM_WIDTH, LOW_HEIGHT)[0])
+        corners = self.drawn.cameras(PHOTO_WIDTH, LOW_HEIGHT)[1:]
+        self.corners: tuple[MapView, ...] = tuple(self.drawn.view(camera) for camera in corners)
         self.colours = np.array(instance_colours(instances.names), np.uint8).reshape(-1, 3)
         self.tree: Any = KDTree(instances.points, balanced_tree=False, compact_nodes=False)
 

@@ -27,6 +27,7 @@ from su3d_bench.types import Encoder, Float64Array, Frame, Instances, UInt8Array
 Subject = Literal["similarity", "labels", "reasoning"]
 SUBJECTS: tuple[Subject, ...] = ("similarity", "labels", "reasoning")
 CELL_WIDTH, CELL_HEIGHT = 720, 500  # pixels of one picture
+SMALLER = 4  # times, of the views in which the corner is chosen
 UNSEEN = 225
 Labels = Sequence[str]
 
@@ -110,13 +111,14 @@ class Figures:
     def _views(self, maps: Sequence[DrawnMap], wanted: Sequence[int]) -> list[MapView]:
         """One camera for all ``maps``, chosen in the first: from above, or the corner that shows most of ``wanted``."""
         first = maps[0]
-        above, *corners = first.views(CELL_WIDTH, CELL_HEIGHT)
-        if self._view == "above":
-            chosen = above
-        else:
+        place = 0
+        if self._view == "corner":
             members = first.members(wanted)
-            chosen = max(corners, key=lambda view: int(view.shows(members).sum()))
-        return [chosen, *(MapView(chosen.camera, one.view(chosen.camera).view, chosen.box) for one in maps[1:])]
+            small = [first.view(one) for one in first.cameras(CELL_WIDTH // SMALLER, CELL_HEIGHT // SMALLER)[1:]]
+            place = 1 + int(np.argmax([view.shows(members).sum() for view in small]))
+        camera = first.cameras(CELL_WIDTH, CELL_HEIGHT)[place]
+        chosen = first.view(camera)
+        return [chosen, *(MapView(camera, one.view(camera).view, chosen.box) for one in maps[1:])]
 
     def _photo(self, scene: str, shown: DrawnMap, view: MapView) -> tuple[Cell, ...]:
         """The map in the colours that the frames saw, where it is asked for."""

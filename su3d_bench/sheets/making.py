@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import csv
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -43,8 +43,6 @@ TITLES = {
     "annotation": "Are the labels right, and is the mask one object?",
     "reasoning": "Is the answer right?",
 }
-Draw = Callable[[Draft], bytes]
-Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -69,29 +67,22 @@ class MadeSheets:
 def make_sheets(
     kind: SheetKind,
     drafts: Sequence[Draft],
-    draw: Draw,
+    drawn: Sequence[bytes],
     origin: Origin,
     *,
     seed: int = 0,
     annotators: int = 1,
     overlap: float = 1.0,
-    progress: Progress = lambda n_done, n: None,
 ) -> MadeSheets:
-    """The set of all ``drafts``, dealt evenly to ``annotators``; a share ``overlap`` of it goes to each of them."""
-    if not drafts:
-        raise ConfigError("there is nothing to judge: no question, or no instance, in these scenes")
-    if not 1 <= annotators <= MOST_ANNOTATORS:
-        raise ConfigError(f"--annotators {annotators}: expected 1 to {MOST_ANNOTATORS}")
-    if not 0.0 <= overlap <= 1.0:
-        raise ConfigError(f"--overlap {overlap:g}: expected a share of the items from 0 to 1")
+    """The set of all ``drafts``, dealt evenly to ``annotators``; a share ``overlap`` of it goes to each of them.
+
+    ``drawn``: the picture of each draft, a PNG.
+    """
+    check_split(len(drafts), annotators, overlap)
     random = np.random.default_rng(seed)
     number_of = random.permutation(len(drafts))
     ids = [f"item-{number + 1:04d}" for number in number_of]
-    pictures: dict[str, bytes] = {}
-    for k, draft in enumerate(drafts):  # in the order of the scenes, whose frames are read once
-        progress(k, len(drafts))
-        pictures[f"{ids[k]}.png"] = draw(draft)
-    progress(len(drafts), len(drafts))
+    pictures = {f"{one}.png": content for one, content in zip(ids, drawn, strict=True)}
     digests = {name: digest_bytes(content) for name, content in pictures.items()}
     order = np.argsort(number_of)
     contents = [[ids[k], drafts[k].text, list(drafts[k].asks), digests[f"{ids[k]}.png"]] for k in order]
@@ -105,6 +96,16 @@ def make_sheets(
     key_items = tuple(_key_item(ids[k], drafts[k]) for k in order)
     key = Key(set_id, kind, origin.run, origin.run_digest, origin.methods, origin.automatic_rule, key_items)
     return MadeSheets(sheet, key, pictures)
+
+
+def check_split(n_items: int, annotators: int, overlap: float) -> None:
+    """A ``ConfigError`` where so many items cannot be dealt so."""
+    if not n_items:
+        raise ConfigError("there is nothing to judge: no question, or no instance, in these scenes")
+    if not 1 <= annotators <= MOST_ANNOTATORS:
+        raise ConfigError(f"--annotators {annotators}: expected 1 to {MOST_ANNOTATORS}")
+    if not 0.0 <= overlap <= 1.0:
+        raise ConfigError(f"--overlap {overlap:g}: expected a share of the items from 0 to 1")
 
 
 def dealt(

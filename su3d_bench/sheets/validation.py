@@ -10,7 +10,7 @@ from su3d_bench.errors import DataError, suggest
 from su3d_bench.plain_text import printable
 from su3d_bench.questions.model import KINDS
 from su3d_bench.sheets.answers import AnswerRow
-from su3d_bench.sheets.items import Key, Sheet, SheetItem
+from su3d_bench.sheets.items import ASKS, Key, KeyItem, Sheet, SheetItem
 
 LABELS = ("n", "n'")  # as the paper calls them: the name of the best view, and that out of the names of several
 SHOWN_ITEMS = 5  # of many that are missing
@@ -49,14 +49,25 @@ def check_key(sheet: Sheet, key: Key) -> None:
     keyed = [one.id for one in key.items]
     if set(keyed) != known or len(keyed) != len(known):
         raise DataError(f"key: has {len(keyed)} items, the sheet {len(known)}; give the key that was made with it")
+    if {one.name: one.choices for one in sheet.asks} != {one.name: one.choices for one in ASKS[sheet.kind]}:
+        raise DataError(f"sheet: asks something else than '{sheet.kind}' sheets of this version do; make it again")
     asks = {one.id: one.asks for one in sheet.items}
     for one in key.items:
-        labels = {label for named in one.stands_for.values() for label in named}
-        has_kind = sheet.kind != "retrieval" or one.question_kind in KINDS
-        is_known = has_kind and set(one.methods) <= set(key.methods) and labels <= set(LABELS)
-        judged = [name in asks[one.id] and choice in sheet.ask(name).choices for name, choice in one.automatic.items()]
-        if not is_known or not all(judged):
+        if not _fits(sheet, asks[one.id], one, key.methods):
             raise DataError(f"key: item '{printable(one.id, 40)}' does not fit the sheet; make the sheets again")
+
+
+def _fits(sheet: Sheet, asks: Sequence[str], item: KeyItem, methods: Sequence[str]) -> bool:
+    """Whether what the key says of an item can be counted."""
+    labels = [label for named in item.stands_for.values() for label in named]
+    return (
+        set(item.methods) <= set(methods)
+        and (sheet.kind != "retrieval" or item.question_kind in KINDS)
+        and set(item.stands_for) == {one for one in asks if one.startswith("label ")}
+        and set(labels) <= set(LABELS)
+        and len(set(labels)) == len(labels)
+        and all(name in asks and choice in sheet.ask(name).choices for name, choice in item.automatic.items())
+    )
 
 
 def check_answers(sheet: Sheet, rows: Sequence[AnswerRow]) -> Checked:
@@ -66,6 +77,7 @@ def check_answers(sheet: Sheet, rows: Sequence[AnswerRow]) -> Checked:
     shares = {one.name: set(one.item_ids) for one in sheet.annotators}
     first: dict[tuple[str, str, str], AnswerRow] = {}
     given: dict[tuple[str, str, str], str] = {}
+    empty: dict[str, list[AnswerRow]] = defaultdict(list)
     for row in own:
         place = (row.annotator, row.item_id, row.question)
         fault = _identity_fault(row, items, shares)
@@ -73,10 +85,13 @@ def check_answers(sheet: Sheet, rows: Sequence[AnswerRow]) -> Checked:
             fault = f"is answered a second time, first at {first[place].at}; keep one of the two"
         if fault is None:
             first[place] = row
-            answer, fault = _choice(sheet, row)
-            given[place] = answer
+            if not row.answer:
+                empty[_file_of(row)].append(row)
+                continue
+            given[place], fault = _choice(sheet, row)
         if fault is not None:
             faults.append(f"{row.at}: {fault}")
+    faults += [_unanswered(found) for found in empty.values()]
     there = {(row.annotator, row.item_id, row.question) for row in own}  # with a fault of its own or without
     answered = {name for name, _, _ in there}
     for share in sheet.annotators:
@@ -98,13 +113,12 @@ def _of_other_sets(sheet: Sheet, rows: Iterable[AnswerRow]) -> tuple[list[str], 
         if row.sheet_id == sheet.id:
             own.append(row)
         else:
-            others[row.at.rpartition(": row ")[0], row.sheet_id].append(row)
+            others[_file_of(row), row.sheet_id].append(row)
     faults = []
     for (_, other), found in others.items():
-        more = f" and {len(found) - 1} more rows" if len(found) > 1 else ""
         what = f"belongs to the set '{printable(other, 60)}'" if other else "has no sheet_id"
         faults.append(
-            f"{found[0].at}{more}: {what}, not to '{sheet.id}' (another kind, seed or run, or a changed cell); "
+            f"{_places(found)}: {what}, not to '{sheet.id}' (another kind, seed or run, or a changed cell); "
             f"score each set with its own sheet and key"
         )
     return faults, own
@@ -132,13 +146,27 @@ def _identity_fault(row: AnswerRow, items: dict[str, SheetItem], shares: dict[st
 def _choice(sheet: Sheet, row: AnswerRow) -> tuple[str, str | None]:
     """The choice that was made, whatever its capitals, and what is wrong with it."""
     choices = sheet.ask(row.question).choices
-    if not row.answer:
-        return "", f"item '{row.item_id}', question '{row.question}', is not answered; choose {' | '.join(choices)}"
     for one in choices:
         if " ".join(row.answer.split()).casefold() == one.casefold():
             return one, None
     near = suggest(row.answer, choices) or f"; choose {' | '.join(choices)}"
     return "", f"unknown answer '{printable(row.answer, 40)}' to '{row.question}'{near}"
+
+
+def _unanswered(rows: Sequence[AnswerRow]) -> str:
+    """One line for all rows of a file without an answer."""
+    first = rows[0]
+    return f"{_places(rows)}: no answer (item '{first.item_id}', question '{first.question}'); answer, and export again"
+
+
+def _file_of(row: AnswerRow) -> str:
+    return row.at.rpartition(": row ")[0]
+
+
+def _places(rows: Sequence[AnswerRow]) -> str:
+    """Where rows of one file stand: the first, and how many more."""
+    n_more = len(rows) - 1
+    return f"{rows[0].at}{f' and {n_more} more row' if n_more else ''}{'s' if n_more > 1 else ''}"
 
 
 def _left_out(who: str, share: Sequence[SheetItem], there: set[tuple[str, str, str]]) -> list[str]:

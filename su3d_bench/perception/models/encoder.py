@@ -14,9 +14,10 @@ import numpy as np
 from su3d_bench.errors import DataError
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.models.devices import Batches
-from su3d_bench.perception.models.image_transform import ImageTransform
+from su3d_bench.perception.models.image_transform import LARGEST_SIZE, ImageTransform
 from su3d_bench.perception.models.onnx_session import PROVIDERS
 from su3d_bench.perception.models.text_tokens import TOKENS_VERSION, TokensKind
+from su3d_bench.plain_text import printable
 from su3d_bench.types import Float32Array, Int64Array, UInt8Array
 
 ENCODER_VERSION = "1"
@@ -34,6 +35,27 @@ class EncoderSpec:
     tokens: TokensKind
     pad_id: int | None
     transform: ImageTransform
+
+
+def check_spec(spec: EncoderSpec, where: object) -> EncoderSpec:
+    """``spec`` as a file said it; a ``DataError`` where a value is none that an encoder has."""
+    transform = spec.transform
+    for key, value, limit in (
+        ("dim", spec.dim, 2**16),
+        ("n_tokens", spec.n_tokens, 8192),
+        ("n_words", spec.n_words, 2_000_000),
+        ("size", transform.size, LARGEST_SIZE),
+    ):
+        if type(value) is not int or not 1 <= value <= limit:
+            raise DataError(f"{where}: {key} is {printable(str(value), 40)}, out of range; expected 1 to {limit}")
+    is_known = transform.fit in ("shortest", "squash") and transform.resample in range(6)
+    is_rgb = len(transform.mean) == len(transform.std) == 3 and 0 not in transform.std
+    if not is_known or not is_rgb or not np.isfinite((*transform.mean, *transform.std)).all():
+        raise DataError(f"{where}: the preparation of images is none that is known; fetch or export the folder anew")
+    pad = spec.pad_id
+    if spec.tokens not in ("clip", "siglip") or not (pad is None or (type(pad) is int and 0 <= pad < spec.n_words)):
+        raise DataError(f"{where}: the tokens are none that are known; fetch or export the folder anew")
+    return spec
 
 
 class Towers(Protocol):

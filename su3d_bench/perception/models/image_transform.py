@@ -116,8 +116,8 @@ def _size(path: Path, content: Mapping[str, Any]) -> tuple[Literal["shortest", "
         square = asked.get("height"), asked.get("width")
         if does_crop and _is_size(shortest):
             crop = content.get("crop_size", shortest)
-            crop = set(crop.values()) if isinstance(crop, Mapping) else {crop}
-            if crop == {shortest}:
+            sides = list(crop.values()) if isinstance(crop, Mapping) else [crop]
+            if sides and all(side == shortest for side in sides):
                 return "shortest", shortest
         elif not does_crop and square[0] == square[1] and _is_size(square[0]):
             return "squash", square[0]

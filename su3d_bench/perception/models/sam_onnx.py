@@ -154,7 +154,7 @@ def read_sam_manifest(path: Path) -> SamManifest:
         known = SamManifest(
             str(content["name"]), int(content["image_px"]), files, content["source"], int(content["opset"]), parity
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise DataError(f"{path}: is no manifest of a segmenter ({bounded(error, 80)}); export it anew") from error
     if any(Path(name).name != name for name in files) or not {ENCODER_FILE, DECODER_FILE} <= set(files):
         raise DataError(f"{path}: files must be names inside the folder, {ENCODER_FILE} and {DECODER_FILE} among them")

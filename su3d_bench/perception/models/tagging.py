@@ -175,7 +175,8 @@ def load_ram(files: ModelFiles, device: str) -> Any:
     except ModelMissing as error:
         raise ModelMissing(
             "tagger 'ram-plus': its package is not installed (pip install "
-            "git+https://github.com/xinyu1205/recognize-anything.git), or set perception.paper.tagger to words"
+            "git+https://github.com/xinyu1205/recognize-anything.git); export it, or "
+            "set perception.paper.tagger to words"
         ) from error
     make_deterministic(device)
     try:

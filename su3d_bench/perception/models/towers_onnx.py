@@ -19,7 +19,7 @@ from su3d_bench.digests import digest_file
 from su3d_bench.errors import CheckFailed, DataError, StoreError
 from su3d_bench.perception.models import towers_transformers
 from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
-from su3d_bench.perception.models.encoder import EncoderSpec, unit_rows
+from su3d_bench.perception.models.encoder import EncoderSpec, check_spec, unit_rows
 from su3d_bench.perception.models.files import ModelFiles, file_sha256
 from su3d_bench.perception.models.image_transform import Convention, ImageTransform
 from su3d_bench.perception.models.onnx_export import OPSET, Parity, compare_outputs, export_onnx
@@ -165,12 +165,11 @@ def read_manifest(path: Path) -> Manifest:
             int(content["opset"]),
             tuple(Parity(**one) for one in content["parity"]),
         )
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
+    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
         raise DataError(f"{path}: is no manifest of an encoder ({bounded(error, 80)}); export it anew") from error
     if any(Path(name).name != name for name in files) or not {IMAGE_FILE, TEXT_FILE} <= set(files):
         raise DataError(f"{path}: files must be names inside the folder, {IMAGE_FILE} and {TEXT_FILE} among them")
-    if not 1 <= known.spec.dim <= 2**16 or not 1 <= known.spec.transform.size <= 2048:
-        raise DataError(f"{path}: dim {known.spec.dim} or size {known.spec.transform.size} is out of range")
+    check_spec(known.spec, path)
     return known
 
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from su3d_bench.errors import DataError
 from su3d_bench.perception.models.devices import first_batch, make_deterministic, require, require_transformers
-from su3d_bench.perception.models.encoder import EncoderSpec
+from su3d_bench.perception.models.encoder import EncoderSpec, check_spec
 from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.image_transform import Convention, read_transform
 from su3d_bench.perception.models.weights import PICKLED, bounded, read_settings, read_weights
@@ -52,10 +52,11 @@ def read_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
     if kind == "clip":
         dim = config.get("projection_dim", _CLIP_DIM)
         n_tokens, n_words = text.get("max_position_embeddings", _CLIP_TOKENS), text.get("vocab_size", _CLIP_WORDS)
-        return EncoderSpec(dim, n_tokens, n_words, "clip", None, transform)
+        return check_spec(EncoderSpec(dim, n_tokens, n_words, "clip", None, transform), path)
     dim = text.get("projection_size", text.get("hidden_size", _SIGLIP_WIDTH))
     n_tokens, n_words = text.get("max_position_embeddings", _SIGLIP_TOKENS), text.get("vocab_size", _SIGLIP_WORDS)
-    return EncoderSpec(dim, n_tokens, n_words, "siglip", text.get("pad_token_id", 1), transform)
+    spec = EncoderSpec(dim, n_tokens, n_words, "siglip", text.get("pad_token_id", 1), transform)
+    return check_spec(spec, path)
 
 
 def _table(path: Any, config: Mapping[str, Any], key: str) -> Mapping[str, Any]:

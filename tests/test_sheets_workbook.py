@@ -1,0 +1,100 @@
+from __future__ import annotations
+
+import io
+import shutil
+import subprocess
+import zipfile
+from pathlib import Path
+
+import pytest
+from made_sheets import HOSTILE, made
+
+from su3d_bench.sheets.answers import read_answers
+from su3d_bench.sheets.items import ANSWER_COLUMNS
+from su3d_bench.sheets.making import MadeSheets
+from su3d_bench.sheets.workbook import COLUMNS, HEADER_ROW, HIDDEN, workbook_bytes
+
+openpyxl = pytest.importorskip("openpyxl", reason="needs the sheets extra")
+OFFICE = shutil.which("soffice") or shutil.which("libreoffice")
+
+
+def book_of(both: MadeSheets) -> bytes:
+    return workbook_bytes(both.sheet, both.sheet.annotators[0], both.pictures, "title")
+
+
+@pytest.fixture(scope="module")
+def hostile() -> tuple[MadeSheets, bytes]:
+    both = made("annotation", HOSTILE)
+    return both, book_of(both)
+
+
+def test_everything_given_is_text_and_one_cell_alone_a_formula(hostile: tuple[MadeSheets, bytes]) -> None:
+    for page in openpyxl.load_workbook(io.BytesIO(hostile[1])).worksheets:
+        formulas = [cell.coordinate for row in page.iter_rows() for cell in row if cell.data_type == "f"]
+        assert formulas == (["B2"] if page.title == "answers" else [])
+    with zipfile.ZipFile(io.BytesIO(hostile[1])) as archive:
+        texts = b"".join(archive.read(name) for name in archive.namelist() if name.endswith(".xml"))
+    assert texts.count(b"<f>") == 1 and b"<script>" not in texts and b"<hyperlink" not in texts
+
+
+def test_each_item_has_a_picture_and_a_row_for_each_question(hostile: tuple[MadeSheets, bytes]) -> None:
+    both, content = hostile
+    page = openpyxl.load_workbook(io.BytesIO(content))["answers"]
+    rows = list(page.iter_rows(min_row=HEADER_ROW, values_only=True))
+    assert rows[0] == COLUMNS and set(ANSWER_COLUMNS) <= set(COLUMNS)
+    assert len(rows) - 1 == 3 * len(HOSTILE)
+    assert [row[0] for row in rows[1::3]] == [item.id for item in both.sheet.items]
+    assert sorted(one.anchor._from.row + 1 for one in page._images) == list(range(4, 4 + 3 * len(HOSTILE), 3))
+    assert all(page.row_dimensions[row].height <= 409 for row in range(4, 4 + 3 * len(HOSTILE)))
+
+
+def test_answers_are_chosen_from_lists_and_all_else_is_locked(hostile: tuple[MadeSheets, bytes]) -> None:
+    page = openpyxl.load_workbook(io.BytesIO(hostile[1]))["answers"]
+    letter = "ABCDEFGHI"[COLUMNS.index("answer")]
+    lists = {
+        one.formula1: {str(part) for part in str(one.sqref).split()} for one in page.data_validations.dataValidation
+    }
+    assert set(lists) == {'"right,wrong,cannot tell"', '"well-merged,under-merged,over-merged,cannot tell"'}
+    assert f"{letter}6" in lists['"well-merged,under-merged,over-merged,cannot tell"']
+    assert page.protection.sheet and page.freeze_panes == "B4"
+    for row in page.iter_rows(min_row=HEADER_ROW + 1):
+        assert [cell.coordinate[0] for cell in row if not cell.protection.locked] == [letter]
+    hidden = [name for name, one in zip(COLUMNS, "ABCDEFGHI", strict=True) if page.column_dimensions[one].hidden]
+    assert tuple(hidden) == HIDDEN
+
+
+def test_the_same_sheet_is_the_same_workbook(hostile: tuple[MadeSheets, bytes]) -> None:
+    assert book_of(hostile[0]) == hostile[1]
+
+
+def test_a_workbook_filled_by_a_library_is_read_back(tmp_path: Path, hostile: tuple[MadeSheets, bytes]) -> None:
+    book = openpyxl.load_workbook(io.BytesIO(hostile[1]))
+    for row in range(HEADER_ROW + 1, HEADER_ROW + 1 + 3 * len(HOSTILE)):
+        book["answers"].cell(row, COLUMNS.index("answer") + 1).value = "wrong"
+    book.save(tmp_path / "filled.xlsx")
+    rows = read_answers(tmp_path / "filled.xlsx")
+    checks = {item.id: item.check for item in hostile[0].sheet.items}
+    assert len(rows) == 3 * len(HOSTILE)
+    assert {row.answer for row in rows} == {"wrong"}
+    assert all(row.check == checks[row.item_id] and row.sheet_id == hostile[0].sheet.id for row in rows)
+
+
+@pytest.mark.skipif(OFFICE is None, reason="no LibreOffice: install libreoffice-calc")
+def test_libreoffice_opens_the_workbook_and_keeps_what_is_in_it(
+    tmp_path: Path, hostile: tuple[MadeSheets, bytes]
+) -> None:
+    assert OFFICE is not None
+    (tmp_path / "sheet.xlsx").write_bytes(hostile[1])
+    profile = f"-env:UserInstallation={(tmp_path / 'profile').as_uri()}"
+    (tmp_path / "out").mkdir()
+    command = [OFFICE, profile, "--headless", "--convert-to", "xlsx", "--outdir", str(tmp_path / "out")]
+    done = subprocess.run([*command, str(tmp_path / "sheet.xlsx")], capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0 and "Error" not in done.stdout + done.stderr
+    kept = openpyxl.load_workbook(tmp_path / "out" / "sheet.xlsx", data_only=True)["answers"]
+    assert kept["B2"].value == f"0 of {3 * len(HOSTILE)} answered"
+    assert len(kept._images) == len(HOSTILE)
+    items = {item.text for item in hostile[0].sheet.items}
+    column = COLUMNS.index("text")
+    assert {row[column] for row in kept.iter_rows(min_row=HEADER_ROW + 1, values_only=True)} == items
+    rows = read_answers(tmp_path / "out" / "sheet.xlsx")
+    assert len(rows) == 3 * len(HOSTILE) and {row.answer for row in rows} == {""}
