@@ -24,6 +24,7 @@ from su3d_bench.metrics.labelling import (
     scored_classes,
 )
 from su3d_bench.metrics.scene_score import present
+from su3d_bench.metrics.score_semantic import has_feature
 from su3d_bench.plain_text import printable, printable_json
 from su3d_bench.planning import data_root, dataset_targets
 from su3d_bench.protocols import ProtocolRules, load_protocol
@@ -263,10 +264,13 @@ class _Scene:
         is_present = scored_classes(rules) if truth is None else present(truth, len(rules.classes))
         try:
             candidates = candidate_classes(rules, is_present & scored_classes(rules))
-            return classes_of_prediction(rules, prediction, self._encoder(run, prediction), candidates)
+            classes = classes_of_prediction(rules, prediction, self._encoder(run, prediction), candidates)
         except Su3dError as error:
             self._remarks.append(f"no classes: {error}")
             return None
+        if isinstance(prediction, DenseFeatures):
+            return np.where(has_feature(prediction), classes, -1)
+        return classes
 
     def _encoder(self, run: FinishedRun, prediction: Prediction) -> Encoder | None:
         labels = getattr(prediction, "labels", None)

@@ -84,8 +84,9 @@ def score_annotation(rules: ProtocolRules, truth: AnnotationTruth, prediction: I
         "label n'": np.zeros(0, bool) if refined is None else _are_called(truth, refined.names, objects, judged),
         **{name: merges == name for name in (WELL_MERGED, UNDER_MERGED, OVER_MERGED)},
     }
-    warnings = [f"judged are the {len(judged)} of {len(objects)} instances that stand for an object that counts"]
-    warnings.append("no label n': the map keeps no names of views" if refined is None else f"n': {refined.source}")
+    warnings = ["no label n': the map keeps no names of views" if refined is None else f"n': {refined.source}"]
+    if len(judged) < len(objects):
+        warnings.append("not judged: instances that stand for no object, a small one, or a wall, floor or ceiling")
     return _scored(rules, truth.scene, truth.object_ids, prediction, _counts(rules, rows), warnings)
 
 
@@ -137,7 +138,7 @@ def score_reasoning(
         "objects": np.array([are_objects_right(one, told, main) for one, told in pairs if one.object_ids], bool),
     }
     n_open = sum(not told.is_settled for told in given)
-    warnings = [f"the solver could not settle {n_open} of {len(given)} questions"] if n_open else []
+    warnings = ["questions that the solver could not settle count as wrong"] if n_open else []
     named = [one for asked in truth.asked for one in asked.object_ids]
     return _scored(rules, truth.scene, named, prediction, _counts(rules, rows), warnings)
 
