@@ -66,10 +66,10 @@ def _frame(content: Mapping[object, object], frame: Frame, where: str) -> GsaFra
     if not np.isfinite(scores).all():
         raise DataError(f"{where}: a confidence is not finite")
     masks = _masks(content, n, (height, width), where)
-    boxes = _numbers(content, "xyxy", where).astype(np.float64).reshape(-1, 4) if n else np.zeros((0, 4))
-    if boxes.shape != (n, 4) or not np.isfinite(boxes).all():
-        raise DataError(f"{where}: xyxy is {boxes.shape}; expected {n} boxes of finite numbers")
-    boxes = np.clip(boxes, 0, np.array([width, height, width, height])).astype(np.float32)
+    corners = _numbers(content, "xyxy", where).astype(np.float64).reshape(-1, 4) if n else np.zeros((0, 4))
+    if corners.shape != (n, 4) or not np.isfinite(corners).all():
+        raise DataError(f"{where}: xyxy is {corners.shape}; expected {n} boxes of finite numbers")
+    boxes: Float32Array = np.clip(corners, 0, np.array([width, height, width, height])).astype(np.float32)
     names = _names(content, n, where)
     features = _features(content, n, where)
     # SAM's predicted IoU may be a little above 1. A mask without pixels or a box without area is no region.
