@@ -112,7 +112,7 @@ class Drawn:
     """A network that knows two squares and says of each point: the square, a larger one, and a vague one."""
 
     image_px = 64
-    squares = ((8, 8, 24, 24), (40, 8, 56, 24))
+    squares: tuple[tuple[int, int, int, int], ...] = ((8, 8, 24, 24), (40, 8, 56, 24))
 
     def embed(self, pixels: Float32Array) -> Any:
         assert pixels.shape == (3, 64, 64)
@@ -204,7 +204,7 @@ def test_what_passes_the_filters_is_what_transformers_lets_pass() -> None:
         answer.pred_masks, inputs["original_sizes"], inputs["reshaped_input_sizes"], binarize=False
     )[0]
     # Random weights give logits below 1, so the offset is small.
-    settings = {"pred_iou_thresh": 0.75, "stability_score_thresh": 0.3, "stability_score_offset": 0.2}
+    settings: dict[str, Any] = {"pred_iou_thresh": 0.75, "stability_score_thresh": 0.3, "stability_score_offset": 0.2}
     rle, scores, boxes = processor.filter_masks(logits, answer.iou_scores[0], (40, 60), [0, 0, 60, 40], **settings)
     config = AutomaticMaskConfig(points_per_side=5, points_per_batch=25, box_nms_thresh=1.0, **settings)
     found = AutomaticMasks(Sam(TorchSam(tiny_sam())), config).regions(rgb)
@@ -218,7 +218,12 @@ def test_what_passes_the_filters_is_what_transformers_lets_pass() -> None:
 
 def test_crops_find_regions_of_their_own_on_random_weights_and_the_smaller_crop_wins() -> None:
     sam = Sam(TorchSam(tiny_sam()))
-    open_filters = {"pred_iou_thresh": 0.0, "stability_score_thresh": 0.0, "points_per_side": 2, "box_nms_thresh": 1.0}
+    open_filters: dict[str, Any] = {
+        "pred_iou_thresh": 0.0,
+        "stability_score_thresh": 0.0,
+        "points_per_side": 2,
+        "box_nms_thresh": 1.0,
+    }
     whole = AutomaticMasks(sam, AutomaticMaskConfig(**open_filters)).regions(blocks(160, 200))
     layered = AutomaticMasks(
         sam, AutomaticMaskConfig(**open_filters, crop_n_layers=1, crop_nms_thresh=1.0, crop_n_points_downscale_factor=2)
@@ -236,8 +241,10 @@ def test_crops_find_regions_of_their_own_on_random_weights_and_the_smaller_crop_
 )  # fmt: skip
 def test_presets_hold_the_published_values(name: str, values: tuple[float, ...]) -> None:
     config = AUTOMATIC_MASKS[name]
-    assert values == (
+    found: tuple[float, ...] = (
         config.points_per_side, config.points_per_batch, config.pred_iou_thresh, config.stability_score_thresh,
         config.crop_n_layers, config.crop_n_points_downscale_factor, config.min_mask_region_area,
     )  # fmt: skip
-    assert (config.box_nms_thresh, config.crop_nms_thresh, config.stability_score_offset) == (0.7, 0.7, 1.0)
+    thresholds: tuple[float, ...] = (config.box_nms_thresh, config.crop_nms_thresh, config.stability_score_offset)
+    assert found == values
+    assert thresholds == (0.7, 0.7, 1.0)
