@@ -19,11 +19,12 @@ bench: $(VENV)/test
 	$(BIN)/python benchmarks/write_performance.py build/bench.json docs/performance.md
 
 # All methods on the demo rooms, and along a corridor in which every map grows: half an hour on two cores.
-CORRIDOR_METHODS := opensu3d sam3d@incremental conceptgraphs conceptgraphs-detector conceptfusion conceptfusion-sam openmask3d
+CORRIDOR := $(BIN)/su3d-bench run --profile oracle --stride 1 --no-pictures --set perception.cache=false --scenes benchmarks/corridor.py:Corridor
 bench-methods: $(VENV)/test
 	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods all --protocols rooms-semantic rooms-instance --no-pictures --out runs/bench-rooms
-	$(BIN)/su3d-bench run --scenes benchmarks/corridor.py:Corridor/400m --profile oracle --stride 1 --methods $(CORRIDOR_METHODS) --no-pictures --out runs/bench-corridor
-	$(BIN)/python benchmarks/write_performance.py build/bench.json docs/performance.md runs/bench-rooms runs/bench-corridor
+	$(CORRIDOR)/400m --methods opensu3d sam3d@incremental conceptfusion openmask3d --out runs/bench-corridor
+	$(CORRIDOR)/100m --methods conceptgraphs conceptgraphs-detector --out runs/bench-corridor-objects
+	$(BIN)/python benchmarks/write_performance.py build/bench.json docs/performance.md runs/bench-rooms runs/bench-corridor runs/bench-corridor-objects
 
 # Learns the reference that .ci/run holds the demo run against; commit it with the change that moves the numbers. Wide
 # limits where machines differ: CI runs on whatever there is, beside whatever else runs there.

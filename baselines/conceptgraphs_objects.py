@@ -58,8 +58,17 @@ class MapObject:
 
     def share_near(self, points: Float64Array, radius_m: float) -> float:
         """The share of ``points`` nearer than ``radius_m`` to a point of the object."""
-        distances, _ = self.tree.query(points, distance_upper_bound=radius_m, workers=1)
-        return float((distances < radius_m).mean())
+        # Points beyond the object's extent by more than the radius cannot be near; the margin covers rounding.
+        low, high = self.extent
+        margin = 1.001 * radius_m
+        candidates = points[((points > low - margin) & (points < high + margin)).all(axis=1)]
+        distances, _ = self.tree.query(candidates, distance_upper_bound=radius_m, workers=1)
+        return float(np.count_nonzero(distances < radius_m) / len(points))
+
+    @cached_property
+    def extent(self) -> tuple[Float64Array, Float64Array]:
+        """The least and the largest coordinates (3,) of its points."""
+        return self.points.min(axis=0), self.points.max(axis=0)
 
 
 def unit(vector: Float64Array) -> Float64Array:

@@ -1,6 +1,6 @@
 """What ``make bench`` measured, as ``docs/performance.md``: a table a group, with ratios within it, then whole runs.
 
-``python benchmarks/write_performance.py build/bench.json docs/performance.md [ROOMS_RUN CORRIDOR_RUN]``: the runs of
+``python benchmarks/write_performance.py build/bench.json docs/performance.md [ROOMS_RUN CORRIDOR_RUN...]``: the runs of
 ``make bench-methods``, all methods on the four demo rooms and along a corridor in which every map grows.
 """
 
@@ -91,10 +91,10 @@ def rooms_section(run: Path) -> str:
     return "\n".join([head, *aligned(rows), ""])
 
 
-def corridor_section(run: Path, picture: Path) -> str:
+def corridor_section(runs: Sequence[Path], picture: Path) -> str:
     """How the cost of an update grows with each method's map, and its plot."""
     rows = [["method", "updates", "points at the end", "map ms at a tenth", "at the end", "exponent", ""]]
-    every = _times(run)
+    every = [times for run in runs for times in _times(run)]
     for times in every:
         summary = summarise(times)
         cost = times[0].ms(MAP)
@@ -107,8 +107,8 @@ def corridor_section(run: Path, picture: Path) -> str:
         rows.append([summary.method, str(len(cost)), points, f"{early:.1f}", f"{late:.1f}", fitted, words])
     picture.write_bytes(draw_update_cost(every, 3, "png"))
     head = (
-        "## An update against the map\n\n`make bench-methods`: a corridor of 400 m, 2 m a frame, perfect masks, every "
-        "frame an update. Milliseconds without reading and perception; the exponent is that of a log-log fit against "
+        "## An update against the map\n\n`make bench-methods`: corridors of 400 m (ConceptGraphs: 100 m), 2 m a frame, perfect masks, "
+        "every frame an update. Milliseconds without reading and perception; the exponent is that of a log-log fit against "
         "the points of the method's own map, with its 95 % interval.\n"
     )
     return "\n".join(
@@ -130,8 +130,8 @@ def main(arguments: Sequence[str]) -> None:
     measured = json.loads(source.read_text(encoding="utf-8"))
     page = performance_page(measured["benchmarks"], hardware_line())
     if runs:
-        rooms, corridor = runs
-        page += "\n" + rooms_section(rooms) + "\n" + corridor_section(corridor, target.with_name("update-cost.png"))
+        rooms, *corridors = runs
+        page += "\n" + rooms_section(rooms) + "\n" + corridor_section(corridors, target.with_name("update-cost.png"))
     target.write_text(page, encoding="utf-8")
 
 
