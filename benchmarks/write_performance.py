@@ -107,9 +107,9 @@ def corridor_section(runs: Sequence[Path], picture: Path) -> str:
         rows.append([summary.method, str(len(cost)), points, f"{early:.1f}", f"{late:.1f}", fitted, words])
     picture.write_bytes(draw_update_cost(every, 3, "png"))
     head = (
-        "## An update against the map\n\n`make bench-methods`: corridors of 400 m (ConceptGraphs: 100 m), 2 m a frame, perfect masks, "
-        "every frame an update. Milliseconds without reading and perception; the exponent is that of a log-log fit against "
-        "the points of the method's own map, with its 95 % interval.\n"
+        "## An update against the map\n\n`make bench-methods`: corridors of 400 m (ConceptGraphs: 100 m), 2 m a frame, "
+        "perfect masks, every frame an update. Milliseconds without reading and perception; the exponent is that of a "
+        "log-log fit against the points of the method's own map, with its 95 % interval.\n"
     )
     return "\n".join(
         [head, *aligned(rows), "", f"![Cost of an update against the points of the map]({picture.name})", ""]
