@@ -70,7 +70,8 @@ def _label(times: Sequence[UpdateTimes], several_runs: bool) -> str:
 
 
 def _several_runs(times: Sequence[Sequence[UpdateTimes]]) -> bool:
-    return len({one[0].run for one in times}) > 1
+    """Whether a method stands there more than once, so that its name alone does not tell it."""
+    return len({one[0].method for one in times}) < len(times)
 
 
 def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int) -> Figure:
