@@ -110,8 +110,8 @@ def corridor_section(runs: Sequence[Path], picture: Path) -> str:
     picture.write_bytes(draw_update_cost(every, 3, "png"))
     head = (
         "## An update against the map\n\n`make bench-methods`: corridors of 400 m (`conceptgraphs-detector`: 100 m), "
-        "2 m a frame, perfect masks, every frame an update. Milliseconds without reading and perception; the exponent is "
-        "that of a log-log fit against the points of the method's own map, with its 95 % interval. An update that "
+        "2 m a frame, perfect masks, every frame an update. Milliseconds without reading and perception; the exponent "
+        "is that of a log-log fit against the points of the method's own map, with its 95 % interval. An update that "
         "tidies the map, every 20th of ConceptGraphs', stands in the last column.\n"
     )
     return "\n".join(
