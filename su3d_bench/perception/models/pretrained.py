@@ -12,7 +12,7 @@ from su3d_bench.perception.models.devices import make_deterministic, require, re
 from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.grounding_dino import GroundingDino
 from su3d_bench.perception.models.sam_networks import TorchSam
-from su3d_bench.perception.models.weights import PICKLED, bounded, read_settings, read_weights
+from su3d_bench.perception.models.weights import bounded, load_pretrained, read_settings, read_weights
 
 # Width, layers, heads and layers with global attention of the image towers, from segment_anything/build_sam.py.
 _SAM_TOWERS = {
@@ -142,29 +142,7 @@ def _pretrained(files: ModelFiles, class_name: str) -> Any:
     if told != model_class.config_class.model_type:
         wanted = model_class.config_class.model_type
         raise DataError(f"{files.folder}: model_type is {str(told)[:40]!r}; '{files.entry.name}' is {wanted!r}")
-    if files.weights.suffix in PICKLED:
-        read_weights(files.weights, "meta")  # says in our words what is wrong with the file
-    try:
-        model, info = model_class.from_pretrained(
-            str(files.folder),
-            local_files_only=True,
-            use_safetensors=files.weights.suffix == ".safetensors",
-            weights_only=True,
-            dtype=require("torch", class_name).float32,
-            output_loading_info=True,
-        )
-    except Exception as error:
-        if type(error).__module__.startswith("safetensors") or isinstance(
-            error, OSError | ValueError | RuntimeError | KeyError
-        ):
-            raise DataError(f"{files.weights}: cannot be loaded: {bounded(error)}; fetch the folder anew") from error
-        raise
-    if missing := sorted(info["missing_keys"]):
-        raise DataError(
-            f"{files.weights}: lacks {len(missing)} tensors, such as {missing[0][:80]}; it is no "
-            f"{files.entry.name}, fetch the folder anew from {files.form.source}"
-        )
-    return model
+    return load_pretrained(files, model_class)
 
 
 def _on_device(model: Any, device: str, precision: str) -> Any:

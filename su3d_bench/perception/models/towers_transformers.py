@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.errors import DataError
-from su3d_bench.perception.models.devices import first_batch, make_deterministic, require, require_transformers
+from su3d_bench.perception.models.devices import first_batch, make_deterministic, require_transformers
 from su3d_bench.perception.models.encoder import EncoderSpec, check_spec
 from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.image_transform import Convention, read_transform
-from su3d_bench.perception.models.weights import PICKLED, bounded, read_settings, read_weights
+from su3d_bench.perception.models.weights import load_pretrained, read_settings
 from su3d_bench.types import Float32Array, Int64Array
 
 # What transformers takes for a CLIP configuration that does not say it.
@@ -80,34 +80,9 @@ def _check_limits(path: Any, table: Mapping[str, Any]) -> None:
 def load_model(files: ModelFiles) -> Any:
     """The model in evaluation mode and float32 on the CPU; weights that are missing are an error, never random."""
     transformers = require_transformers(f"encoder '{files.entry.name}'")
-    torch = require("torch", f"encoder '{files.entry.name}'")
     kind = read_settings(files.folder / "config.json").get("model_type")
     model_class = {"clip": transformers.CLIPModel, "siglip": transformers.SiglipModel}[str(kind)]
-    if files.weights.suffix in PICKLED:
-        read_weights(files.weights, "meta")  # says in our words what is wrong with the file
-    try:
-        model, info = model_class.from_pretrained(
-            str(files.folder),
-            local_files_only=True,
-            use_safetensors=files.weights.suffix == ".safetensors",
-            weights_only=True,
-            dtype=torch.float32,
-            attn_implementation="sdpa",
-            output_loading_info=True,
-        )
-    except Exception as error:
-        if type(error).__module__.startswith("safetensors") or isinstance(
-            error, OSError | ValueError | RuntimeError | KeyError | ImportError
-        ):
-            raise DataError(f"{files.weights}: cannot be loaded: {bounded(error)}; fetch the folder anew") from error
-        raise
-    if info["missing_keys"]:
-        missing = sorted(info["missing_keys"])
-        raise DataError(
-            f"{files.weights}: lacks {len(missing)} tensors, such as {missing[0][:80]}; it is no "
-            f"{files.entry.name}, fetch the folder anew from {files.form.source}"
-        )
-    return model.eval()
+    return load_pretrained(files, model_class, attn_implementation="sdpa").eval()
 
 
 class TransformersTowers:

@@ -9,6 +9,7 @@ from typing import Any
 
 from su3d_bench.errors import DataError
 from su3d_bench.perception.models.devices import require
+from su3d_bench.perception.models.files import ModelFiles
 
 LARGEST_SETTINGS = 2**24  # bytes; a tokenizer.json of 256,000 words has 2**23
 PICKLED = {".bin", ".pt", ".pth", ".ckpt"}
@@ -88,3 +89,34 @@ def bounded(error: BaseException, limit: int = 160) -> str:
     text = "".join(character if character.isprintable() else " " for character in str(error))
     text = " ".join(text.split())
     return text if len(text) <= limit else text[: limit - 3] + "..."
+
+
+def load_pretrained(files: ModelFiles, model_class: Any, **more: Any) -> Any:
+    """A transformers model in float32 on the CPU from local files; weights that are missing are an error, never random.
+
+    ``more`` goes to ``from_pretrained``.
+    """
+    if files.weights.suffix in PICKLED:
+        read_weights(files.weights, "meta")  # says in our words what is wrong with the file
+    try:
+        model, info = model_class.from_pretrained(
+            str(files.folder),
+            local_files_only=True,
+            use_safetensors=files.weights.suffix == ".safetensors",
+            weights_only=True,
+            dtype=require("torch", f"model '{files.entry.name}'").float32,
+            output_loading_info=True,
+            **more,
+        )
+    except Exception as error:
+        # safetensors has an error of its own, which cannot be named without importing it
+        known = OSError | ValueError | RuntimeError | KeyError | ImportError
+        if type(error).__module__.startswith("safetensors") or isinstance(error, known):
+            raise DataError(f"{files.weights}: cannot be loaded: {bounded(error)}; fetch the folder anew") from error
+        raise
+    if missing := sorted(info["missing_keys"]):
+        raise DataError(
+            f"{files.weights}: lacks {len(missing)} tensors, such as {missing[0][:80]}; it is no "
+            f"{files.entry.name}, fetch the folder anew from {files.form.source}"
+        )
+    return model
