@@ -27,7 +27,7 @@ MOST_COLUMNS = 1 << 16  # of a table whose width is not known; features have som
 MOST_EXPANSION = 1032  # the most that deflate can expand a byte to
 DEFLATE, SHUFFLE = 1, 2  # H5Z_FILTER_DEFLATE and H5Z_FILTER_SHUFFLE
 # What h5py raises on damaged files; it has no base class of its own.
-LIBRARY_ERRORS = (OSError, KeyError, ValueError, RuntimeError, TypeError, AttributeError, NotImplementedError)
+LIBRARY_ERRORS = (OSError, KeyError, ValueError, RuntimeError, TypeError, AttributeError)
 
 
 def read_rows(path: Path, n_columns: int, where: str) -> Float32Array:

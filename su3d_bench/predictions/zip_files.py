@@ -18,7 +18,8 @@ MOST_MEMBER = 4 << 30  # bytes; masks of a scene are some hundred MiB
 MOST_RATIO = 1032  # deflate cannot do better
 NEEDED_BY_DEFLATE = 64
 ENCRYPTED = 0x1
-DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, NotImplementedError, RuntimeError, struct.error)
+# What zipfile raises on damaged archives; an unusual compression is a NotImplementedError, which is a RuntimeError.
+DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError, struct.error)
 
 
 @contextmanager

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import csv
 import io
+import lzma
 import unicodedata
 import zipfile
 from collections.abc import Iterable, Iterator, Sequence
@@ -15,6 +16,7 @@ from pathlib import Path
 
 from su3d_bench.errors import DataError, ModelMissing
 from su3d_bench.plain_text import printable
+from su3d_bench.predictions.zip_files import DAMAGE
 from su3d_bench.reports.table_formats import FORMULA_STARTS
 from su3d_bench.sheets.items import ANSWER_COLUMNS
 
@@ -126,7 +128,7 @@ def _check_archive(content: bytes, where: str) -> None:
                     raise DataError(f"{where}: defines entities, which no workbook needs; save it as .xlsx again")
     except DataError:
         raise
-    except Exception as error:  # zipfile, too, has many kinds
+    except (*DAMAGE, OSError, OverflowError, LookupError, lzma.LZMAError) as error:
         raise DataError(f"{where}: is no whole .xlsx file; copy it again") from error
 
 
