@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.cli.flags import add_verb, add_whose_map, answer, answer_json, remark
 from su3d_bench.cli.language_flags import add_language_flags, chat_client, language_config
 from su3d_bench.cli.query import latest_run
 from su3d_bench.errors import EXIT_DONE, ConfigError, PredictionError, StoreError
@@ -37,10 +37,7 @@ def add_parser(verbs: Any) -> None:
     )
     parser.add_argument("scene", help="the scene's address, such as rooms/living0")
     parser.add_argument("question", help="the question, in English")
-    parser.add_argument(
-        "--run", type=Path, metavar="DIR", help="run folder (default: the latest in runs/ with the scene)"
-    )
-    parser.add_argument("--method", default="opensu3d", help="whose map (default: opensu3d)")
+    add_whose_map(parser)
     parser.add_argument(
         "--solver", choices=SOLVERS, default="built-in", help="who answers: geometry alone, or a language model"
     )

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.flags import add_verb, answer, answer_json
+from su3d_bench.cli.flags import add_group, add_settings, add_verb, answer, answer_json
 from su3d_bench.errors import EXIT_DONE, DataError, Su3dError
 
 LAYOUTS = ("native", "replica", "scannet", "scannet-python", "scannet-cpp", "tum")
@@ -15,15 +15,16 @@ MAX_LISTED = 40
 
 
 def add_parser(verbs: Any) -> None:
-    parser = verbs.add_parser(
+    actions = add_group(
+        verbs,
         "datasets",
-        help="list the datasets and their scenes, check or show scenes, or make rooms on disk",
-        description="List the datasets and their scenes, check or show scenes, or make rooms on disk.",
-        epilog="examples:\n  su3d-bench datasets list\n"
-        "  su3d-bench datasets make rooms --scenes rooms/living0 --layout replica --out data",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "List the datasets and their scenes, check or show scenes, or make rooms on disk.",
+        "list|check|show|make",
+        (
+            "su3d-bench datasets list",
+            "su3d-bench datasets make rooms --scenes rooms/living0 --layout replica --out data",
+        ),
     )
-    actions = parser.add_subparsers(dest="action", metavar="list|check|show|make", required=True)
     add_verb(
         actions,
         "list",
@@ -75,14 +76,7 @@ def _add_show(actions: Any) -> None:
 
 
 def _add_options(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--set",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="KEY=VALUE",
-        help="an option of a dataset, such as rooms.n_frames=40",
-    )
+    add_settings(parser, "an option of a dataset, such as rooms.n_frames=40")
 
 
 def _add_make(actions: Any) -> None:
@@ -109,14 +103,7 @@ def _add_make(actions: Any) -> None:
         "tum: the RGB-D benchmark, without ground truth (default: native)",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="the data root to make (native: default $SU3D_DATA)")
-    parser.add_argument(
-        "--set",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="KEY=VALUE",
-        help="an option of the dataset, such as n_frames=200",
-    )
+    add_settings(parser, "an option of the dataset, such as n_frames=200")
     parser.add_argument("--workers", type=int, metavar="N", help="processes side by side (default: the CPU cores)")
 
 

@@ -40,6 +40,36 @@ def add_verb(
     return parser
 
 
+def add_group(
+    verbs: Any, name: str, summary: str, actions: str, examples: tuple[str, str]
+) -> argparse._SubParsersAction[argparse.ArgumentParser]:
+    """The sub-verbs' parsers of a verb such as ``datasets``; ``actions`` names them, ``list|check``."""
+    parser = verbs.add_parser(
+        name,
+        help=summary[:1].lower() + summary[1:].rstrip("."),
+        description=summary,
+        epilog="examples:\n" + "\n".join(f"  {example}" for example in examples),
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    group: argparse._SubParsersAction[argparse.ArgumentParser] = parser.add_subparsers(
+        dest="action", metavar=actions, required=True
+    )
+    return group
+
+
+def add_settings(parser: argparse.ArgumentParser, description: str) -> None:
+    """``--set KEY=VALUE...``, which may be given several times; ``description`` says whose settings."""
+    parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help=description)
+
+
+def add_whose_map(parser: argparse.ArgumentParser) -> None:
+    """``--run`` and ``--method``: the map that is asked."""
+    parser.add_argument(
+        "--run", type=Path, metavar="DIR", help="run folder (default: the latest in runs/ with the scene)"
+    )
+    parser.add_argument("--method", default="opensu3d", help="whose map (default: opensu3d)")
+
+
 def answer(text: str) -> None:
     """Print an answer to stdout."""
     print(text.rstrip("\n"))

@@ -6,6 +6,8 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from su3d_bench.cli.flags import add_settings
+
 if TYPE_CHECKING:
     from su3d_bench.perception.language.client import ChatClient
     from su3d_bench.perception.language.config import LanguageConfig
@@ -21,14 +23,7 @@ def add_language_flags(parser: argparse.ArgumentParser) -> None:
         "--base-url", metavar="URL", help="OpenAI-compatible server (default: $OPENAI_BASE_URL, else OpenAI's)"
     )
     parser.add_argument("--config", type=Path, metavar="FILE", help="a TOML file with [perception.language]")
-    parser.add_argument(
-        "--set",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="KEY=VALUE",
-        help="such as perception.language.budget_usd=0.5",
-    )
+    add_settings(parser, "such as perception.language.budget_usd=0.5")
     parser.add_argument("--offline", action="store_true", help="stored replies only; nobody is asked")
     parser.add_argument(
         "--ask-failed-again", action="store_true", help="ask again what an earlier command asked in vain"

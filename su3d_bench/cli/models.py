@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.cli.flags import add_group, add_settings, add_verb, answer, answer_json, remark
 from su3d_bench.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
@@ -17,14 +17,16 @@ if TYPE_CHECKING:
 
 
 def add_parser(verbs: Any) -> None:
-    parser = verbs.add_parser(
+    actions = add_group(
+        verbs,
         "models",
-        help="list the foundation models, check their files, export them to ONNX, or run them once",
-        description="List the foundation models, check their files, export them to ONNX, or run them once.",
-        epilog="examples:\n  su3d-bench models list\n  su3d-bench models check clip-vit-h-14",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
+        "List the foundation models, check their files, export them to ONNX, or run them once.",
+        "list|check|export|warm",
+        (
+            "su3d-bench models list",
+            "su3d-bench models check clip-vit-h-14",
+        ),
     )
-    actions = parser.add_subparsers(dest="action", metavar="list|check|export|warm", required=True)
     listing = add_verb(
         actions,
         "list",
@@ -77,14 +79,7 @@ def _add_warm(actions: Any) -> None:
 
 
 def _add_settings(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--set",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="KEY=VALUE",
-        help="a setting of perception, such as perception.models.folder=/data/models",
-    )
+    add_settings(parser, "a setting of perception, such as perception.models.folder=/data/models")
 
 
 def _perception_config(arguments: argparse.Namespace) -> PerceptionConfig:

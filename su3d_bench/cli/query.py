@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.cli.flags import add_verb, add_whose_map, answer, answer_json, remark
 from su3d_bench.errors import ConfigError, PredictionError, StoreError
 
 if TYPE_CHECKING:
@@ -29,10 +29,7 @@ def add_parser(verbs: Any) -> None:
     )
     parser.add_argument("scene", help="the scene's address, such as rooms/living0")
     parser.add_argument("text", help="what to look for")
-    parser.add_argument(
-        "--run", type=Path, metavar="DIR", help="run folder (default: the latest in runs/ with the scene)"
-    )
-    parser.add_argument("--method", default="opensu3d", help="whose map (default: opensu3d)")
+    add_whose_map(parser)
     parser.add_argument("--top", type=int, default=10, metavar="N", help="how many instances to list (default: 10)")
     parser.add_argument(
         "--device", default="cpu", help="of the text's encoder, where it is no small one (default: cpu)"

@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-import argparse
 from types import ModuleType
 from typing import Any
 
 from su3d_bench.cli import report_html, report_leaderboard, report_tables, report_timing, report_verify
+from su3d_bench.cli.flags import add_group
 
 # Modules with ``NAME`` and ``add_parser(actions)``, imported for --help too, so with nothing heavy at their top.
 SUB_VERBS: tuple[ModuleType, ...] = (report_tables, report_timing, report_html, report_leaderboard, report_verify)
 
 
 def add_parser(verbs: Any) -> None:
-    parser = verbs.add_parser(
-        "report",
-        help="make tables and pages from finished runs, and check a paper against them",
-        description="Make tables and pages from finished runs, and check a paper against them.",
-        epilog="examples:\n  su3d-bench report tables runs/my-run --format latex --table II\n"
-        "  su3d-bench report verify paper.tex",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
     names = "|".join(module.NAME for module in SUB_VERBS)
-    actions = parser.add_subparsers(dest="action", metavar=names, required=True)
+    actions = add_group(
+        verbs,
+        "report",
+        "Make tables and pages from finished runs, and check a paper against them.",
+        names,
+        (
+            "su3d-bench report tables runs/my-run --format latex --table II",
+            "su3d-bench report verify paper.tex",
+        ),
+    )
     for module in SUB_VERBS:
         module.add_parser(actions)

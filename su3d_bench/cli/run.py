@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.cli.flags import add_settings, add_verb, answer, answer_json, remark
 from su3d_bench.errors import EXIT_DONE, EXIT_INCOMPLETE
 
 if TYPE_CHECKING:
@@ -72,9 +72,7 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--anytime", nargs="+", type=float, metavar="SHARE", help="score the map after these shares of the updates too"
     )
-    parser.add_argument(
-        "--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help="such as opensu3d.top_m=10"
-    )
+    add_settings(parser, "such as opensu3d.top_m=10")
     parser.add_argument("--config", type=Path, metavar="FILE", help="a TOML file, such as the run.toml of a run")
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="run folder (default: runs/<name made from the request>)"

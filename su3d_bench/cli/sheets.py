@@ -2,26 +2,27 @@
 
 from __future__ import annotations
 
-import argparse
 from types import ModuleType
 from typing import Any
 
 from su3d_bench.cli import sheets_make, sheets_pictures, sheets_score
+from su3d_bench.cli.flags import add_group
 
 # Modules with ``NAME`` and ``add_parser(actions)``, imported for --help too, so with nothing heavy at their top.
 SUB_VERBS: tuple[ModuleType, ...] = (sheets_make, sheets_score, sheets_pictures)
 
 
 def add_parser(verbs: Any) -> None:
-    parser = verbs.add_parser(
-        "sheets",
-        help="make sheets for people to judge a run, and score their answers",
-        description="Make sheets for people to judge a run, and score their answers.",
-        epilog="examples:\n  su3d-bench sheets make runs/my-run --kind retrieval --out sheets\n"
-        "  su3d-bench sheets score ann.csv bob.xlsx --key key/key.json",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
     names = "|".join(module.NAME for module in SUB_VERBS)
-    actions = parser.add_subparsers(dest="action", metavar=names, required=True)
+    actions = add_group(
+        verbs,
+        "sheets",
+        "Make sheets for people to judge a run, and score their answers.",
+        names,
+        (
+            "su3d-bench sheets make runs/my-run --kind retrieval --out sheets",
+            "su3d-bench sheets score ann.csv bob.xlsx --key key/key.json",
+        ),
+    )
     for module in SUB_VERBS:
         module.add_parser(actions)

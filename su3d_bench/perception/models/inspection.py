@@ -15,6 +15,7 @@ from su3d_bench.perception.models import sam_onnx, towers_onnx, towers_transform
 from su3d_bench.perception.models.catalogue import MODELS, PROFILE_MODELS, ModelEntry, model_entry
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.files import ModelFiles, locate
+from su3d_bench.perception.models.onnx_manifest import OnnxManifest, wrong_files
 from su3d_bench.perception.models.weights import PICKLED, read_settings, read_weights
 from su3d_bench.timing import Timer
 from su3d_bench.types import Encoder, Frame, PerceptionNeeds, SceneInfo
@@ -81,11 +82,12 @@ def problems_of(files: ModelFiles) -> list[str]:
 def _problems_of_export(files: ModelFiles) -> list[str]:
     if files.entry.kind == "tagger":
         return []  # the package's own export has no manifest
-    manifest: towers_onnx.Manifest | sam_onnx.SamManifest
+    manifest: OnnxManifest
     if files.entry.kind == "encoder":
-        manifest, wrong = towers_onnx.read_manifest(files.weights), towers_onnx.wrong_files(files)
+        manifest = towers_onnx.read_manifest(files.weights)
     else:
-        manifest, wrong = sam_onnx.read_sam_manifest(files.weights), sam_onnx.wrong_sam_files(files)
+        manifest = sam_onnx.read_sam_manifest(files.weights)
+    wrong = wrong_files(manifest, files.folder)
     if manifest.name != files.entry.name:
         wrong.append(f"{files.folder}: holds '{manifest.name}', not '{files.entry.name}'; mend models.paths")
     return wrong

@@ -7,21 +7,26 @@ size of the network's image, the SHA-256 of every file, the digests of the weigh
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from su3d_bench.digests import digest_file
 from su3d_bench.errors import CheckFailed, DataError
 from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
-from su3d_bench.perception.models.files import ModelFiles, file_sha256
-from su3d_bench.perception.models.onnx_export import OPSET, Parity, compare_outputs, export_onnx
+from su3d_bench.perception.models.files import ModelFiles
+from su3d_bench.perception.models.onnx_export import Parity, compare_outputs, export_onnx
+from su3d_bench.perception.models.onnx_manifest import (
+    OnnxManifest,
+    common_fields,
+    described,
+    read_common,
+    wrong_files,
+)
 from su3d_bench.perception.models.onnx_session import Provider, open_session
 from su3d_bench.perception.models.pretrained import load_sam
 from su3d_bench.perception.models.sam import Prompts
-from su3d_bench.perception.models.weights import bounded, read_settings
 from su3d_bench.store import make_folder, write_json
 from su3d_bench.types import Float32Array, Int64Array
 
@@ -34,15 +39,10 @@ LARGEST_DIFFERENCE = 1e-3
 
 
 @dataclass(frozen=True)
-class SamManifest:
-    """What ``manifest.json`` says: ``files`` name -> SHA-256, ``source`` what the export was made from."""
+class SamManifest(OnnxManifest):
+    """The manifest of an exported SAM; ``image_px`` is the side of its network's image."""
 
-    name: str
     image_px: int
-    files: Mapping[str, str]
-    source: Mapping[str, Any]
-    opset: int
-    parity: tuple[Parity, ...]
 
 
 class OnnxSam:
@@ -106,10 +106,9 @@ def export_sam(files: ModelFiles, folder: Path) -> SamManifest:
         mine = decoder(*compared.values())
     other = session.run(["logits", "iou"], {name: value.numpy() for name, value in compared.items()})
     parity += [compare_outputs(name, a.numpy(), b) for name, a, b in zip(("logits", "iou"), mine, other, strict=True)]
-    source = {"form": files.form.form, "files": files.digests(), "torch": str(torch.__version__)}
-    digests = {path.name: digest_file(path) for path in written}
-    manifest = SamManifest(files.entry.name, side, digests, source, OPSET, tuple(parity))
-    write_json(folder / ONNX_MANIFEST, {"format": FORMAT, **_plain(manifest)})
+    manifest = SamManifest(**vars(described(files, written, parity, str(torch.__version__))), image_px=side)
+    content = {"format": FORMAT, **common_fields(manifest), "image_px": side}
+    write_json(folder / ONNX_MANIFEST, content)
     for one, values in zip(parity, (embedding, *mine), strict=True):
         _check(manifest.name, one, float(values.abs().max()))
     return manifest
@@ -132,55 +131,25 @@ def _check(name: str, one: Parity, largest: float) -> None:
         )
 
 
-def _plain(manifest: SamManifest) -> dict[str, Any]:
-    return {
-        "name": manifest.name,
-        "image_px": manifest.image_px,
-        "files": dict(manifest.files),
-        "source": dict(manifest.source),
-        "opset": manifest.opset,
-        "parity": [asdict(one) for one in manifest.parity],
-    }
-
-
 def read_sam_manifest(path: Path) -> SamManifest:
     """The manifest of an exported SAM; raises ``DataError`` for anything else."""
-    content = read_settings(path)
-    if content.get("format") != FORMAT:
-        raise DataError(f"{path}: format is {str(content.get('format'))[:60]!r}; expected {FORMAT!r}; export it anew")
-    try:
-        files = {str(name): str(digest) for name, digest in content["files"].items()}
-        parity = tuple(Parity(**one) for one in content["parity"])
-        known = SamManifest(
-            str(content["name"]), int(content["image_px"]), files, content["source"], int(content["opset"]), parity
-        )
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise DataError(f"{path}: is no manifest of a segmenter ({bounded(error, 80)}); export it anew") from error
-    if any(Path(name).name != name for name in files) or not {ENCODER_FILE, DECODER_FILE} <= set(files):
-        raise DataError(f"{path}: files must be names inside the folder, {ENCODER_FILE} and {DECODER_FILE} among them")
+    known = read_common(path, FORMAT, (ENCODER_FILE, DECODER_FILE), "a segmenter", _with_size)
     if not 16 <= known.image_px <= 4096:
         raise DataError(f"{path}: image_px is {known.image_px}; expected 16 to 4096")
     return known
 
 
-def wrong_sam_files(files: ModelFiles) -> list[str]:
-    """A line for each file of an exported SAM that is missing or not the one that was written."""
-    wrong = []
-    for name, digest in read_sam_manifest(files.weights).files.items():
-        path = files.folder / name
-        if not path.is_file():
-            wrong.append(f"{path}: is missing; export it anew")
-        elif file_sha256(path) != digest:
-            wrong.append(f"{path}: is not the file that the manifest describes; export it anew")
-    return wrong
+def _with_size(known: OnnxManifest, content: Mapping[str, Any]) -> SamManifest:
+    return SamManifest(**vars(known), image_px=int(content["image_px"]))
 
 
 def load_onnx_sam(files: ModelFiles, provider: Provider = "cpu", device_index: int = 0) -> OnnxSam:
     """An exported SAM ready to run; raises ``DataError`` where a file is not the one that was written."""
-    if wrong := wrong_sam_files(files):
+    manifest = read_sam_manifest(files.weights)
+    if wrong := wrong_files(manifest, files.folder):
         raise DataError(wrong[0])
     sessions = [open_session(files.folder / name, provider, device_index) for name in (ENCODER_FILE, DECODER_FILE)]
-    return OnnxSam(sessions[0], sessions[1], read_sam_manifest(files.weights).image_px)
+    return OnnxSam(sessions[0], sessions[1], manifest.image_px)
 
 
 def modules_to_export(model: Any) -> tuple[Any, Any]:

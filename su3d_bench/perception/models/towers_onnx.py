@@ -15,17 +15,23 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.digests import digest_file
 from su3d_bench.errors import CheckFailed, DataError, StoreError
 from su3d_bench.perception.models import towers_transformers
 from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
 from su3d_bench.perception.models.encoder import EncoderSpec, check_spec, unit_rows
-from su3d_bench.perception.models.files import ModelFiles, file_sha256
+from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.image_transform import Convention, ImageTransform
-from su3d_bench.perception.models.onnx_export import OPSET, Parity, compare_outputs, export_onnx
+from su3d_bench.perception.models.onnx_export import compare_outputs, export_onnx
+from su3d_bench.perception.models.onnx_manifest import (
+    OnnxManifest,
+    common_fields,
+    described,
+    read_common,
+    wrong_files,
+)
 from su3d_bench.perception.models.onnx_session import Provider, open_session
 from su3d_bench.perception.models.text_tokens import read_tokeniser
-from su3d_bench.perception.models.weights import bounded, read_settings
+from su3d_bench.perception.models.weights import bounded
 from su3d_bench.store import make_folder, write_json
 from su3d_bench.types import Float32Array, Int64Array
 
@@ -40,15 +46,10 @@ GPU_BATCH = 32
 
 
 @dataclass(frozen=True)
-class Manifest:
-    """What ``manifest.json`` says: ``files`` name -> SHA-256, ``source`` what the export was made from."""
+class Manifest(OnnxManifest):
+    """The manifest of an exported encoder."""
 
-    name: str
     spec: EncoderSpec
-    files: Mapping[str, str]
-    source: Mapping[str, Any]
-    opset: int
-    parity: tuple[Parity, ...]
 
 
 def export_encoder(files: ModelFiles, folder: Path) -> Manifest:
@@ -76,10 +77,8 @@ def export_encoder(files: ModelFiles, folder: Path) -> Manifest:
         other = open_session(folder / name).run(["features"], {key: value.numpy() for key, value in inputs.items()})[0]
         parity.append(compare_outputs(kind, unit_rows(mine, kind), unit_rows(other, kind)))
     written += _copy_tokenizer(files.folder, folder)
-    digests = {path.name: digest_file(path) for path in written}
-    source = {"form": files.form.form, "files": files.digests(), "torch": str(torch.__version__)}
-    manifest = Manifest(files.entry.name, spec, digests, source, OPSET, tuple(parity))
-    write_json(folder / ONNX_MANIFEST, _manifest_json(manifest))
+    manifest = Manifest(**vars(described(files, written, parity, str(torch.__version__))), spec=spec)
+    write_json(folder / ONNX_MANIFEST, {"format": FORMAT, **common_fields(manifest), "spec": asdict(spec)})
     check_parity(manifest)
     return manifest
 
@@ -134,43 +133,17 @@ def _copy_tokenizer(source: Path, folder: Path) -> list[Path]:
         raise StoreError(f"{folder}: the tokenizer cannot be copied from {source}: {bounded(error)}") from error
 
 
-def _manifest_json(manifest: Manifest) -> dict[str, Any]:
-    return {
-        "format": FORMAT,
-        "name": manifest.name,
-        "spec": asdict(manifest.spec),
-        "files": dict(manifest.files),
-        "source": dict(manifest.source),
-        "opset": manifest.opset,
-        "parity": [asdict(one) for one in manifest.parity],
-    }
-
-
 def read_manifest(path: Path) -> Manifest:
     """The manifest of an exported encoder; raises ``DataError`` for anything else."""
-    content = read_settings(path)
-    if content.get("format") != FORMAT:
-        raise DataError(f"{path}: format is {str(content.get('format'))[:60]!r}; expected {FORMAT!r}; export it anew")
-    try:
-        spec = content["spec"]
-        transform = ImageTransform(
-            **{**spec["transform"], "mean": _numbers(spec, "mean"), "std": _numbers(spec, "std")}
-        )
-        files = {str(name): str(digest) for name, digest in content["files"].items()}
-        known = Manifest(
-            str(content["name"]),
-            EncoderSpec(**{**spec, "transform": transform}),
-            files,
-            content["source"],
-            int(content["opset"]),
-            tuple(Parity(**one) for one in content["parity"]),
-        )
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise DataError(f"{path}: is no manifest of an encoder ({bounded(error, 80)}); export it anew") from error
-    if any(Path(name).name != name for name in files) or not {IMAGE_FILE, TEXT_FILE} <= set(files):
-        raise DataError(f"{path}: files must be names inside the folder, {IMAGE_FILE} and {TEXT_FILE} among them")
+    known = read_common(path, FORMAT, (IMAGE_FILE, TEXT_FILE), "an encoder", _with_spec)
     check_spec(known.spec, path)
     return known
+
+
+def _with_spec(known: OnnxManifest, content: Mapping[str, Any]) -> Manifest:
+    spec = content["spec"]
+    transform = ImageTransform(**{**spec["transform"], "mean": _numbers(spec, "mean"), "std": _numbers(spec, "std")})
+    return Manifest(**vars(known), spec=EncoderSpec(**{**spec, "transform": transform}))
 
 
 def _numbers(spec: Mapping[str, Any], key: str) -> tuple[float, ...]:
@@ -183,23 +156,11 @@ def read_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
     return replace(spec, transform=replace(spec.transform, convention=convention))
 
 
-def wrong_files(files: ModelFiles) -> list[str]:
-    """A line for each file of an exported encoder that is missing or not the one that was written."""
-    wrong = []
-    for name, digest in read_manifest(files.weights).files.items():
-        path = files.folder / name
-        if not path.is_file():
-            wrong.append(f"{path}: is missing; export it anew")
-        elif file_sha256(path) != digest:
-            wrong.append(f"{path}: is not the file that the manifest describes; export it anew")
-    return wrong
-
-
 class OnnxTowers:
     """The towers of an exported encoder, each loaded at its first use."""
 
     def __init__(self, files: ModelFiles, provider: Provider, device_index: int, batch: int) -> None:
-        if wrong := wrong_files(files):
+        if wrong := wrong_files(read_manifest(files.weights), files.folder):
             raise DataError(wrong[0])
         self._folder = files.folder
         self._provider = provider
