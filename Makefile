@@ -18,13 +18,15 @@ bench: $(VENV)/test
 	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-group-by=group --benchmark-columns=min,median,rounds --benchmark-json=build/bench.json
 	$(BIN)/python benchmarks/write_performance.py build/bench.json docs/performance.md
 
-# All methods on the demo rooms, and along a corridor in which every map grows: half an hour on two cores.
-CORRIDOR := $(BIN)/su3d-bench run --profile oracle --stride 1 --no-pictures --set perception.cache=false --scenes benchmarks/corridor.py:Corridor
+# All methods on the demo rooms, and along corridors so long that every map reaches 5 million points.
+CORRIDOR_RUN := $(BIN)/su3d-bench run --profile oracle --stride 1 --no-pictures --set perception.cache=false --jobs 1
+CORRIDOR := benchmarks/corridor.py:Corridor
 bench-methods: $(VENV)/test
 	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods all --protocols rooms-semantic rooms-instance --no-pictures --out runs/bench-rooms
-	$(CORRIDOR)/400m --methods opensu3d sam3d@incremental conceptfusion openmask3d conceptgraphs --out runs/bench-corridor
-	$(CORRIDOR)/100m --methods conceptgraphs-detector --out runs/bench-corridor-objects
-	$(BIN)/python benchmarks/write_performance.py build/bench.json docs/performance.md runs/bench-rooms runs/bench-corridor runs/bench-corridor-objects
+	$(CORRIDOR_RUN) --scenes $(CORRIDOR)/930m --methods opensu3d conceptfusion conceptfusion-sam sam3d@incremental conceptgraphs --out runs/bench-corridor
+	$(CORRIDOR_RUN) --scenes $(CORRIDOR)/310m --methods conceptgraphs-detector --out runs/bench-corridor-detector
+	$(CORRIDOR_RUN) --scenes $(CORRIDOR)/10m $(CORRIDOR)/30m $(CORRIDOR)/100m $(CORRIDOR)/300m $(CORRIDOR)/1000m --limit 20 --set corridor.step_m=0.5 --methods openmask3d openmask3d-segment3d --out runs/bench-corridor-scans
+	$(BIN)/python benchmarks/write_performance.py build/bench.json docs/performance.md --rooms runs/bench-rooms --corridors runs/bench-corridor runs/bench-corridor-detector runs/bench-corridor-scans
 
 # Learns the reference that .ci/run holds the demo run against; commit it with the change that moves the numbers. Wide
 # limits where machines differ: CI runs on whatever there is, beside whatever else runs there.

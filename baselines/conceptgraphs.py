@@ -54,6 +54,10 @@ class ConceptGraphs:
         return self._map.n_points
 
     @property
+    def map_bytes(self) -> int:
+        return self._map.n_bytes
+
+    @property
     def n_instances(self) -> int:
         """Objects now, those seen too rarely included."""
         return len(self._map)

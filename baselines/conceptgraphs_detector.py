@@ -68,6 +68,10 @@ class ConceptGraphsDetector:
         return self._map.n_points
 
     @property
+    def map_bytes(self) -> int:
+        return self._map.n_bytes
+
+    @property
     def n_instances(self) -> int:
         """Objects now, background and those seen too rarely included."""
         return len(self._map)

@@ -48,8 +48,17 @@ class ObjectMap:
     @property
     def n_points(self) -> int:
         """Points of all objects, background included."""
-        everything = [*self._objects, *self._background.values()]
-        return sum(len(one.points) for one in everything if one is not None)
+        return sum(len(one.points) for one in self._everything)
+
+    @property
+    def n_bytes(self) -> int:
+        """What points and features of all objects take, their KD-trees apart."""
+        arrays = [(one.points, one.feature, one.text_feature) for one in self._everything]
+        return sum(array.nbytes for of_object in arrays for array in of_object)
+
+    @property
+    def _everything(self) -> list[MapObject]:
+        return [one for one in (*self._objects, *self._background.values()) if one is not None]
 
     def update(self, frame: Frame, detections: Detections, text_features: Float32Array, timer: StageTimer) -> None:
         """Take in one frame; ``text_features`` (K, T) are those of the detections' names."""

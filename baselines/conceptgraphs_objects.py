@@ -58,12 +58,19 @@ class MapObject:
 
     def share_near(self, points: Float64Array, radius_m: float) -> float:
         """The share of ``points`` nearer than ``radius_m`` to a point of the object."""
-        # Points beyond the object's extent by more than the radius cannot be near; the margin covers rounding.
-        low, high = self.extent
-        margin = 1.001 * radius_m
-        candidates = points[((points > low - margin) & (points < high + margin)).all(axis=1)]
+        return self.n_near(points, radius_m) / len(points)
+
+    def n_near(self, points: Float64Array, radius_m: float) -> int:
+        """How many of ``points`` are nearer than ``radius_m`` to a point of the object."""
+        low, high = self.reach(radius_m)
+        candidates = points[((points > low) & (points < high)).all(axis=1)]
         distances, _ = self.tree.query(candidates, distance_upper_bound=radius_m, workers=1)
-        return float(np.count_nonzero(distances < radius_m) / len(points))
+        return int(np.count_nonzero(distances < radius_m))
+
+    def reach(self, radius_m: float) -> tuple[Float64Array, Float64Array]:
+        """The corners (3,) of a box beyond which nothing is nearer than ``radius_m``; its margin covers rounding."""
+        low, high = self.extent
+        return low - 1.001 * radius_m, high + 1.001 * radius_m
 
     @cached_property
     def extent(self) -> tuple[Float64Array, Float64Array]:
@@ -115,10 +122,19 @@ def overlap_ratios(objects: Sequence[MapObject], radius_m: float) -> Float64Arra
     0 on the diagonal and where the axis-aligned extents of the two boxes share no volume.
     """
     extents = extents_of_boxes([one.box for one in objects])
+    has_shared_volume = shared_volume(extents, extents) > 0
+    np.fill_diagonal(has_shared_volume, False)
     ratios = np.zeros((len(objects), len(objects)))
-    for i, j in np.argwhere(shared_volume(extents, extents) > 0):
-        if i != j:
-            ratios[i, j] = objects[j].share_near(objects[i].points, radius_m)
+    for i in np.flatnonzero(has_shared_volume.any(axis=1)).tolist():
+        points = objects[i].points
+        # By the longest axis, so that a wall is not gone through from end to end for each of the things along it.
+        axis = int(np.argmax(np.ptp(points, axis=0)))
+        points = points[np.argsort(points[:, axis])]
+        along = points[:, axis].copy()
+        for j in np.flatnonzero(has_shared_volume[i]).tolist():
+            low, high = objects[j].reach(radius_m)
+            beside = points[slice(*np.searchsorted(along, (low[axis], high[axis])))]
+            ratios[i, j] = objects[j].n_near(beside, radius_m) / len(points)
     return ratios
 
 

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import tempfile
-from pathlib import Path
 from typing import IO, Any, Literal
 
 import numpy as np
@@ -12,6 +10,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.errors import StoreError
 from su3d_bench.row_blocks import release_pages
+from su3d_bench.scratch import scratch_folder
 from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 
 Place = Literal["memory", "disk"]
@@ -119,16 +118,6 @@ def has_any_channel(features: HalfArray) -> BoolArray:
     """Which rows (C,) are not all zero."""
     answer: BoolArray = (features != 0).any(axis=1)
     return answer
-
-
-def scratch_folder() -> Path:
-    """Where large temporary files go: TMPDIR, else /var/tmp, else what Python finds.
-
-    /tmp is memory on many systems; /var/tmp is not (Filesystem Hierarchy Standard 5.15).
-    """
-    if not os.environ.get("TMPDIR") and os.access("/var/tmp", os.W_OK):
-        return Path("/var/tmp")
-    return Path(tempfile.gettempdir())
 
 
 def _nameless_file() -> IO[bytes]:

@@ -68,6 +68,13 @@ class OpenMask3D:
         return len(self._started.proposals.points)
 
     @property
+    def map_bytes(self) -> int:
+        """What the proposals take: their points, masks and scores."""
+        proposals = self._started.proposals
+        arrays = (proposals.points, proposals.indptr, proposals.indices, proposals.scores)
+        return sum(array.nbytes for array in arrays)
+
+    @property
     def n_instances(self) -> int:
         return len(self._started.proposals)
 

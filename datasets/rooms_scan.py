@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import os
-import tempfile
-import zipfile
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -13,6 +10,7 @@ import numpy as np
 from su3d_bench.datasets.rooms_mesh import Grid, Patches, RoomMesh, at_rows, caster, cut, merge_equal
 from su3d_bench.datasets.rooms_render import Renderer, camera_intrinsics
 from su3d_bench.errors import DataError
+from su3d_bench.kept_files import DAMAGE, filling, read_arrays
 from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
 
 VIEW_WIDTH, VIEW_HEIGHT = 160, 120  # of the depth images that decide what is visible: 1 cm a pixel at 1 m
@@ -110,24 +108,18 @@ def surface_colours(mesh: RoomMesh, points: Float32Array) -> UInt8Array:
 def read_scan(path: Path) -> RoomScan | None:
     """The scan in a cache file; ``None`` where there is none or the file is damaged."""
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            return RoomScan(*(stored[field.name] for field in fields(RoomScan)))
-    except (FileNotFoundError, NotADirectoryError, zipfile.BadZipFile, ValueError, KeyError, EOFError):
+        stored = read_arrays(path)
+        return RoomScan(*(stored[field.name] for field in fields(RoomScan)))
+    except DAMAGE:
         return None
 
 
 def write_scan(path: Path, scan: RoomScan) -> None:
     """Puts the scan where concurrent readers see either nothing or all of it."""
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, suffix=".partial")
-        try:
-            with os.fdopen(handle, "wb") as stream:
+        with filling(path) as stream:
+            if stream is not None:
                 np.savez(stream, **{field.name: getattr(scan, field.name) for field in fields(RoomScan)})
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
     except OSError as error:
         raise DataError(
             f"rooms: cannot write the scan to {path} ({error.strerror}); set SU3D_DATA to a folder that can be written"

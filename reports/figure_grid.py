@@ -20,16 +20,19 @@ FORMATS = ("pdf", "png", "svg")
 CELL_WIDTH_IN, TITLE_IN, ROW_IN, LEGEND_IN, GAP_IN = 2.4, 0.28, 0.26, 0.42, 0.08
 LEGEND_WIDTH_IN = 2.6
 DPI = 200  # of pictures within the figure
+CAPTION_IN, CAPTION_LINE, CAPTION_LINES = 0.13, 56, 3  # height of a line, its characters, how many of them
 MOST_ROW_TITLE, MOST_TAGS = 110, 40
+FEW_TAGS, AWAY = 6, 0.11  # so few names stand beside what they name, this share of the height away
 DARK, GREY = "#1a1a1a", "#606060"
 
 
 @dataclass(frozen=True)
 class Cell:
-    """A picture and the names in it."""
+    """A picture and the names in it; ``caption`` stands below it."""
 
     picture: UInt8Array
     tags: tuple[Tag, ...] = ()
+    caption: str = ""
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,11 @@ def _figure_bytes(suffix: str, columns: Sequence[str], rows: Sequence[GridRow], 
     aspect = max(cell.picture.shape[0] / cell.picture.shape[1] for row in rows for cell in row.cells)
     cell_height = CELL_WIDTH_IN * aspect
     width = len(columns) * (CELL_WIDTH_IN + GAP_IN) + GAP_IN
-    height = TITLE_IN + len(rows) * (ROW_IN + cell_height + GAP_IN) + (LEGEND_IN if scale is not None else 0.1)
+    captions = [_caption_lines(row) for row in rows]
+    tops = [TITLE_IN]
+    for lines in captions:
+        tops.append(tops[-1] + ROW_IN + cell_height + CAPTION_IN * max(map(len, lines), default=0) + GAP_IN)
+    height = tops[-1] + (LEGEND_IN if scale is not None else 0.1)
     figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     page = _Page(figure, width, height)
@@ -78,20 +85,36 @@ def _figure_bytes(suffix: str, columns: Sequence[str], rows: Sequence[GridRow], 
             ha="center",
         )
     for r, row in enumerate(rows):
-        top = TITLE_IN + r * (ROW_IN + cell_height + GAP_IN)
+        top = tops[r]
         room = int(width * 13)
         title = printable(row.title, min(MOST_ROW_TITLE, room))
         page.text(GAP_IN, top + 0.03, title, 8.5, weight="bold")
         if len(title) + len(row.note) < room:
             page.text(width - GAP_IN, top + 0.04, printable(row.note, 60), 7, colour=GREY, ha="right")
         for c, cell in enumerate(row.cells):
-            page.cell(GAP_IN + c * (CELL_WIDTH_IN + GAP_IN), top + ROW_IN, cell_height, cell)
+            left = GAP_IN + c * (CELL_WIDTH_IN + GAP_IN)
+            page.cell(left, top + ROW_IN, cell_height, cell)
+            for k, line in enumerate(captions[r][c]):
+                page.text(left, top + ROW_IN + cell_height + 0.02 + CAPTION_IN * k, line, 6.5, colour=GREY)
     if scale is not None:
         page.scale(height - LEGEND_IN + 0.06, scale)
     buffer = io.BytesIO()
     metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {"Software": None}}[suffix]
     figure.savefig(buffer, format=suffix, dpi=DPI, metadata=metadata)
     return buffer.getvalue()
+
+
+def _caption_lines(row: GridRow) -> list[list[str]]:
+    """The lines below each picture of a row; what does not fit ends in dots."""
+    return [
+        textwrap.wrap(printable(cell.caption, 1000), CAPTION_LINE, max_lines=CAPTION_LINES, placeholder=" ...")
+        for cell in row.cells
+    ]
+
+
+def _covers(taken: Sequence[tuple[float, float, float]], x: float, row: float, half: float) -> bool:
+    """Whether a name of this half width would cover one of those that stand there."""
+    return any(abs(row - other[1]) < 0.045 and abs(x - other[0]) < half + other[2] for other in taken)
 
 
 class _Page:
@@ -115,13 +138,20 @@ class _Page:
         axes.imshow(cell.picture, interpolation="nearest")
         height, width = cell.picture.shape[:2]
         taken: list[tuple[float, float, float]] = []
+        is_beside = len(cell.tags) <= FEW_TAGS
         for tag in cell.tags[:MOST_TAGS]:
             text = drawable(printable(tag.text, 24))
-            half, row = 0.011 * len(text) + 0.01, tag.y
-            if any(abs(row - other[1]) < 0.045 and abs(tag.x - other[0]) < half + other[2] for other in taken):
+            half = 0.011 * len(text) + 0.01
+            row = tag.y + (AWAY if tag.y < 2 * AWAY else -AWAY) if is_beside else tag.y
+            while is_beside and _covers(taken, tag.x, row, half) and 0 < row < 0.95:
+                row += 0.05
+            if _covers(taken, tag.x, row, half):
                 continue  # a name that covers another tells nothing
             taken.append((tag.x, row, half))
             shade = "#{:02x}{:02x}{:02x}".format(*tag.colour)
+            if is_beside:
+                places = [tag.x * width] * 2, [tag.y * height, row * height]
+                axes.plot(*places, color=shade, linewidth=0.7, marker="o", markersize=1.4, markevery=[0])
             box = {
                 "boxstyle": "round,pad=0.12",
                 "facecolor": "white",
@@ -133,6 +163,8 @@ class _Page:
                 tag.x * width, row * height, text, fontsize=4.6, color=DARK, ha="center", va="center", bbox=box,
                 parse_math=False, clip_on=True,
             )  # fmt: skip
+        axes.set_xlim(-0.5, width - 0.5)
+        axes.set_ylim(height - 0.5, -0.5)
 
     def scale(self, y: float, scale: UInt8Array) -> None:
         left = (self.width - LEGEND_WIDTH_IN) / 2

@@ -18,7 +18,8 @@ def headline(verdict: Verdict) -> str:
     better = f", {n_better} better" if n_better else ""
     if verdict.is_passed:
         return f"passed: {verdict.n_compared} headline values are as the reference has them{better}"
-    return f"failed: {len(verdict.failures)} differences from the reference{better}"
+    n_failed = len(verdict.failures)
+    return f"failed: {n_failed} difference{'s' if n_failed != 1 else ''} from the reference{better}"
 
 
 def plain_lines(verdict: Verdict) -> list[str]:

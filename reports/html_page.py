@@ -10,7 +10,17 @@ from pathlib import Path
 from typing import Any
 
 HERE = Path(__file__).parent
-SCRIPTS = ("page_elements.js", "page_map.js", "page_sections.js", "page_scene.js", "page.js")  # in the order they run
+SCRIPTS = (  # in the order in which they run
+    "page_elements.js",
+    "page_map.js",
+    "page_sections.js",
+    "page_paint.js",
+    "page_scene.js",
+    "page_errors.js",
+    "page_timing.js",
+    "page_compare.js",
+    "page.js",
+)
 STYLE = "page.css"
 TEMPLATE = "page.html.j2"
 

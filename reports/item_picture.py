@@ -23,6 +23,7 @@ TITLE_SIZE, TITLE_LINE, MOST_TITLE_LINES = 25, 33, 3
 MOST_TAGS, MOST_TAG_TEXT, TAG_LINE = 8, 28, 19
 OUTLINE, HALO = (255, 64, 200), (255, 255, 255)  # a pink that neither heat scale has, on white
 INK, GREY, PAPER, PANEL = (26, 26, 26), (96, 96, 96), (255, 255, 255), (244, 244, 242)
+ROOM_COLUMNS, ROOM_GAP = 3, 6  # photographs of the room side by side, pixels between them
 ZOOM_GROWTH = 1.7  # sides of the part that is shown, as a multiple of those of the object
 PNG_COLOURS = 160  # of the palette; more make the file larger and the picture no clearer
 
@@ -58,7 +59,8 @@ class Panel:
 class ItemParts:
     """What stands in the picture of an item; ``heat_scale`` (256, 3) are the colours of its legend, None for none.
 
-    ``title``: lines at the top, the first one large. ``photo`` is None where no frame shows the object.
+    ``title``: lines at the top, the first one large. ``photo`` is None where there is no object to be seen, and then
+    ``room`` are photographs of the room.
     """
 
     title: tuple[str, ...]
@@ -66,6 +68,7 @@ class ItemParts:
     map_view: Panel
     place: Panel
     heat_scale: UInt8Array | None = None
+    room: tuple[UInt8Array, ...] = ()
 
 
 def compose(parts: ItemParts) -> UInt8Array:
@@ -84,14 +87,28 @@ def compose(parts: ItemParts) -> UInt8Array:
         _place(page, draw, parts.photo, (MARGIN, top), (PHOTO_WIDTH, TOP_HEIGHT))
         _place(page, draw, zoomed(parts.photo), (right, top), (ZOOM_WIDTH, TOP_HEIGHT))
     else:
-        box = (MARGIN, top + CAPTION, WIDTH - MARGIN, top + CAPTION + TOP_HEIGHT)
-        draw.rectangle(box, fill=PANEL)
-        _write(draw, (MARGIN + 20, top + CAPTION + 20), "no frame shows this object", 18, GREY)
+        _place_room(page, draw, parts.room, top)
     _place(page, draw, parts.map_view, (MARGIN, low), (PHOTO_WIDTH, LOW_HEIGHT))
     _place(page, draw, parts.place, (right, low), (ZOOM_WIDTH, LOW_HEIGHT))
     if parts.heat_scale is not None:
         _draw_scale(page, draw, parts.heat_scale, (MARGIN + 8, low + CAPTION + LOW_HEIGHT - 26))
     return np.asarray(page, np.uint8).copy()
+
+
+def _place_room(page: Any, draw: Any, photos: tuple[UInt8Array, ...], top: int) -> None:
+    """Photographs of the room where nothing can be outlined."""
+    if not photos:
+        box = (MARGIN, top + CAPTION, WIDTH - MARGIN, top + CAPTION + TOP_HEIGHT)
+        draw.rectangle(box, fill=PANEL)
+        _write(draw, (MARGIN + 20, top + CAPTION + 20), "no frame shows this object", 18, GREY)
+        return
+    wide = (WIDTH - 2 * MARGIN - (ROOM_COLUMNS - 1) * ROOM_GAP) // ROOM_COLUMNS
+    n_rows = -(-len(photos) // ROOM_COLUMNS)
+    high = (TOP_HEIGHT - (n_rows - 1) * ROOM_GAP) // n_rows
+    for k, photo in enumerate(photos):
+        row, column = divmod(k, ROOM_COLUMNS)
+        at = (MARGIN + column * (wide + ROOM_GAP), top + row * (high + ROOM_GAP))
+        _place(page, draw, Panel("nothing to outline; the room" if k == 0 else "", photo), at, (wide, high))
 
 
 def zoomed(photo: Panel) -> Panel:

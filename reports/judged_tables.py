@@ -1,4 +1,4 @@
-"""Tables IV and V of OpenSU3D's paper: retrieval by scheme, labels and merging, as people or the ground truth judge."""
+"""Tables IV and V of OpenSU3D's paper and its reasoning scores, as people or the ground truth judge."""
 
 from __future__ import annotations
 
@@ -36,18 +36,21 @@ JUDGED: Mapping[PaperTable, JudgedLayout] = {
             "refined label (n')": OWN_NAMES | {"label-accuracy": "label n'"},
         },
     ),
+    "reasoning": JudgedLayout(
+        "reasoning", "Spatial reasoning", ("reasoning-accuracy", "objects"), {"": {"reasoning-accuracy": "answer"}}
+    ),
 }
 
 
 def judged_table(number: PaperTable, found: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
-    """Table IV or V, one for each dataset: what people judged, what the ground truth judged, what the paper reports."""
+    """Such a table for each dataset: what people judged, what the ground truth judged, what the paper reports."""
     layout = JUDGED[number]
     rows = [one for one in found if one.kind == layout.kind]
     if not any(one.per_scene for one in rows):
         have = ", ".join(dict.fromkeys(one.protocol for one in found))
         raise ConfigError(
-            f"Table {number}: needs protocol rooms-{layout.kind}, replica-{layout.kind} or scannet-{layout.kind}, or "
-            f"scores of sheets of kind {layout.kind}; there are {have}"
+            f"Table {number}: needs {_protocols(layout.kind)}, or scores of sheets of kind {layout.kind}; there are "
+            f"{have}"
         )
     tables = []
     for dataset in dict.fromkeys(one.datasets for one in rows if one.per_scene):
@@ -91,6 +94,12 @@ def _dataset_table(
     )
 
 
+def _protocols(kind: str) -> str:
+    datasets = ("rooms",) if kind == "reasoning" else ("rooms", "replica", "scannet")
+    names = [f"{one}-{kind}" for one in datasets]
+    return f"protocol {' or '.join(names)}"
+
+
 def _part(row: Measured, part: str, layout: JudgedLayout) -> Measured:
     """``row`` with the metrics of one part under the names of their columns."""
     names = layout.parts[part]
@@ -117,7 +126,9 @@ def _own(cell: Cell, layout: JudgedLayout) -> Cell:
     if cell.origin is None:
         return cell
     method, _, part = cell.origin.method.rpartition(": ")
-    if part not in layout.parts or not part:
+    if "" in layout.parts:
+        method, part = cell.origin.method, ""
+    elif part not in layout.parts:
         return cell
     metric = layout.parts[part].get(cell.origin.metric, cell.origin.metric)
     return replace(cell, origin=replace(cell.origin, method=method, metric=metric))

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 import unicodedata
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from urllib.parse import quote, unquote
 
@@ -38,8 +39,12 @@ _LIGATURE = re.compile(r"--|''|,,|[?!]`")
 _SAFE = "/.-_+:@"
 REPORTED = "as reported, not measured here"
 GAP_PT, SMALLEST_GAP_PT = 4, 2
+MOST_LABEL_PT = 150  # of a label in a table that is too wide for a page; a longer one is broken
 # Widths of one column and of the page in a paper of two columns (IEEEtran: 252 pt and 516 pt), a little narrower.
 FLOATS = (("table", 238), ("table*", 480))
+# Heights of a line in each type size, of a title with rules, and of what a page takes, caption aside.
+LINES_PT = {r"\small": 11.0, r"\footnotesize": 9.5, r"\scriptsize": 8.0}
+HEAD_PT, PAGE_PT, NOTE_LETTER_PT = 34.0, 560.0, 3.7
 # Type sizes and the width of a letter: digits of Computer Modern, bold, with 10 pt as the normal size.
 SIZES = ((r"\small", 5.3), (r"\footnotesize", 4.9), (r"\scriptsize", 4.4))
 _ORIGIN = re.compile(
@@ -76,58 +81,140 @@ def _letter(character: str) -> str:
 
 
 def latex(tables: Sequence[Table]) -> str:
-    """All ``tables`` as floats of their own, notes beneath in small type."""
-    return "\n\n".join([HEADER, *(_float(table) for table in tables)]) + "\n"
+    """All ``tables`` as floats of their own, several where one would be too high; notes beneath in small type."""
+    return "\n\n".join([HEADER, *(each for table in tables for each in _floats(table))]) + "\n"
 
 
-def _float(table: Table) -> str:
-    kind, size, gap_pt = _place(table)
+@dataclass(frozen=True)
+class _Place:
+    """How a table fits a page of two columns: its float, type size and half the gap between columns.
+
+    ``label_pt``: the width at which labels are broken, None where they need not be; ``parts``: the columns of each
+    tabular, one beneath the other.
+    """
+
+    kind: str
+    size: str
+    gap_pt: int
+    label_pt: float | None
+    parts: tuple[tuple[int, ...], ...]
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """Some columns and rows of a table, which stand together."""
+
+    columns: tuple[int, ...]
+    rows: tuple[TableRow, ...]
+    height_pt: float
+
+
+def _pieces(table: Table, place: _Place) -> Iterator[_Piece]:
+    """The tabulars of a table, none higher than a page."""
+    line_pt, letter_pt = LINES_PT[place.size], dict(SIZES)[place.size]
+    for columns in place.parts:
+        rows: list[TableRow] = []
+        height = HEAD_PT
+        for row in table.rows:
+            n_lines = 1 if place.label_pt is None else math.ceil(1.2 * len(row.label) * letter_pt / place.label_pt)
+            if rows and height + n_lines * line_pt > PAGE_PT:
+                yield _Piece(columns, tuple(rows), height)
+                rows, height = [], HEAD_PT
+            rows.append(row)
+            height += n_lines * line_pt
+        yield _Piece(columns, tuple(rows), height)
+
+
+def _floats(table: Table) -> Iterator[str]:
+    place = _place(table)
+    width_pt = dict(FLOATS)[place.kind]
+    notes_pt = sum(LINES_PT[r"\scriptsize"] * math.ceil(len(note) * NOTE_LETTER_PT / width_pt) for note in table.notes)
+    pages: list[list[_Piece]] = [[]]
+    for piece in _pieces(table, place):
+        if pages[-1] and sum(one.height_pt for one in (*pages[-1], piece)) > PAGE_PT:
+            pages.append([])
+        pages[-1].append(piece)
+    if sum(one.height_pt for one in pages[-1]) + notes_pt > PAGE_PT:
+        pages.append([])
+    for k, pieces in enumerate(pages):
+        yield _float(table, place, pieces, is_first=k == 0, is_last=k == len(pages) - 1)
+
+
+def _float(table: Table, place: _Place, pieces: Sequence[_Piece], *, is_first: bool, is_last: bool) -> str:
+    label = f"  \\label{{tab:{re.sub(r'[^A-Za-z0-9]+', '-', table.name).strip('-')}}}"
     lines = [
-        f"\\begin{{{kind}}}[t]",
+        f"\\begin{{{place.kind}}}[t]",
         r"  \centering\hbadness=10000",  # a caption of few words in a narrow column
-        f"  \\caption{{{escape(table.caption)}}}",
-        f"  \\label{{tab:{re.sub(r'[^A-Za-z0-9]+', '-', table.name).strip('-')}}}",
-        f"  {size}\\setlength{{\\tabcolsep}}{{{gap_pt}pt}}",
-        f"  \\begin{{tabular}}{{@{{}}l{'r' * len(table.columns)}@{{}}}}",
-        r"    \toprule",
-        f"    {escape(table.head)} & {' & '.join(map(escape, table.columns))} \\\\",
+        f"  \\caption{{{escape(table.caption if is_first else f'{table.caption} (continued)')}}}",
+        *([label] if is_first else [r"  \addtocounter{table}{-1}"]),
+        f"  {place.size}\\setlength{{\\tabcolsep}}{{{place.gap_pt}pt}}",
     ]
-    was_reported = False
-    for block in blocks_of(table.rows):
-        lines.append(r"    \midrule")
-        if block[0].is_reported and not was_reported:
-            was_reported = True
-            lines.append(f"    \\multicolumn{{{len(table.columns) + 1}}}{{@{{}}l}}{{\\emph{{{REPORTED}}}}} \\\\")
-        lines += [line for row in block for line in _row(row)]
-    lines += [r"    \bottomrule", r"  \end{tabular}"]
-    if table.notes:
+    for k, piece in enumerate(pieces):
+        lines += [*(["", r"  \medskip"] if k else []), *_tabular(table, piece, place.label_pt)]
+    if table.notes and is_last:
         lines += ["", r"  \smallskip", r"  \begin{minipage}{\linewidth}", r"    \scriptsize\raggedright"]
         lines += [f"    {escape(note)}\\par" for note in table.notes]
         lines.append(r"  \end{minipage}")
-    return "\n".join([*lines, f"\\end{{{kind}}}"])
+    return "\n".join([*lines, f"\\end{{{place.kind}}}"])
 
 
-def _place(table: Table) -> tuple[str, str, int]:
-    """The float, the type size and half the gap between columns with which the table fits a page of two columns.
+def _tabular(table: Table, piece: _Piece, label_pt: float | None) -> list[str]:
+    columns = piece.columns
+    first = "l" if label_pt is None else f"p{{{label_pt:.0f}pt}}"
+    titles = [escape(table.columns[k]) for k in columns]
+    lines = [f"  \\begin{{tabular}}{{@{{}}{first}{'r' * len(columns)}@{{}}}}", r"    \toprule"]
+    lines.append(f"    {' & '.join([_label(table.head, label_pt), *titles])} \\\\")
+    was_reported = False
+    for block in blocks_of(piece.rows):
+        lines.append(r"    \midrule")
+        if block[0].is_reported and not was_reported:
+            was_reported = True
+            lines.append(f"    \\multicolumn{{{len(columns) + 1}}}{{@{{}}l}}{{\\emph{{{REPORTED}}}}} \\\\")
+        lines += [line for row in block for line in _row(row, columns, label_pt)]
+    return [*lines, r"    \bottomrule", r"  \end{tabular}"]
 
-    Letters are counted, not measured: what does not fit in the smallest type may be wider than the page.
-    """
-    titles = [table.head, *(f"{row.label} {row.mark}" for row in table.rows)]
+
+def _place(table: Table) -> _Place:
+    """Letters are counted, not measured."""
+    label = max(len(text) for text in (table.head, *(f"{row.label} {row.mark}" for row in table.rows)))
     columns = [
-        [name, *(row.cells[k].whole for row in table.rows if k < len(row.cells))]
+        max(len(text) for text in (name, *(row.cells[k].whole for row in table.rows if k < len(row.cells))))
         for k, name in enumerate(table.columns)
     ]
-    n_letters = sum(max(map(len, texts)) for texts in (titles, *columns))
+    everything = tuple(range(len(columns)))
     for kind, width_pt in FLOATS:
         for size, letter_pt in SIZES:
-            if n_letters * letter_pt + 2 * GAP_PT * len(table.columns) <= width_pt:
-                return kind, size, GAP_PT
-    return FLOATS[-1][0], SIZES[-1][0], SMALLEST_GAP_PT
+            if (label + sum(columns)) * letter_pt + 2 * GAP_PT * len(columns) <= width_pt:
+                return _Place(kind, size, GAP_PT, None, (everything,))
+    (kind, width_pt), (size, letter_pt) = FLOATS[-1], SIZES[-1]
+    label_pt = min(label * letter_pt, MOST_LABEL_PT)
+    parts: list[list[int]] = [[]]
+    left_pt = width_pt - label_pt
+    for k, n_letters in enumerate(columns):
+        needed_pt = n_letters * letter_pt + 2 * SMALLEST_GAP_PT
+        if parts[-1] and needed_pt > left_pt:
+            parts.append([])
+            left_pt = width_pt - label_pt
+        parts[-1].append(k)
+        left_pt -= needed_pt
+    broken = label_pt if label * letter_pt > MOST_LABEL_PT else None
+    return _Place(kind, size, SMALLEST_GAP_PT, broken, tuple(map(tuple, parts)))
 
 
-def _row(row: TableRow) -> list[str]:
-    mark = f"\\textsuperscript{{{escape(row.mark)}}}" if row.mark else ""
-    return [f"    {escape(row.label)}{mark}", *(f"      & {_cell(cell)}".rstrip() for cell in row.cells), r"      \\"]
+def _label(text: str, width_pt: float | None, mark: str = "") -> str:
+    """A label, which may be broken after a sign between its words where it has a width."""
+    raised = f"\\textsuperscript{{{escape(mark)}}}" if mark else ""
+    if width_pt is None:
+        return escape(text) + raised
+    pieces = re.split(r"(?<=[@=,/])(?=\S)", text)
+    shown = r"\allowbreak{}".join(map(escape, pieces))
+    return rf"\raggedright {shown}{raised}"
+
+
+def _row(row: TableRow, columns: Sequence[int], label_pt: float | None) -> list[str]:
+    cells = [row.cells[k] for k in columns if k < len(row.cells)]
+    lines = [f"      & {_cell(cell)}".rstrip() for cell in cells]
+    return [f"    {_label(row.label, label_pt, row.mark)}", *lines, r"      \\"]
 
 
 def _cell(cell: Cell) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -28,16 +29,18 @@ class MapView:
     view: View
     box: tuple[int, int, int, int]
 
-    @property
-    def part(self) -> tuple[slice, slice]:
-        x0, y0, x1, y1 = self.box
-        return slice(y0, y1), slice(x0, x1)
+    @cached_property
+    def shown(self) -> View:
+        """The part of ``view`` that is shown."""
+        x0, y0, x1, y1 = (OVERSAMPLING * side for side in self.box)
+        part = slice(y0, y1), slice(x0, x1)
+        return View(np.ascontiguousarray(self.view.point[part]), np.ascontiguousarray(self.view.shade[part]))
 
     def shows(self, is_member: BoolArray) -> BoolArray:
         """Where the view shows a point of those that ``is_member`` marks: (h, w) of the picture."""
-        seen = np.append(is_member, False)[self.view.point]
-        small: BoolArray = seen[::OVERSAMPLING, ::OVERSAMPLING] | seen[1::OVERSAMPLING, 1::OVERSAMPLING]
-        return small[self.part]
+        point, known = self.shown.point, np.append(is_member, False)
+        seen: BoolArray = known[point[::OVERSAMPLING, ::OVERSAMPLING]] | known[point[1::OVERSAMPLING, 1::OVERSAMPLING]]
+        return seen
 
     def project(self, points: Float64Array) -> Float64Array:
         """Columns and rows (N, 2) of world points as shares of the width and height that are shown."""
@@ -78,7 +81,7 @@ class DrawnMap:
 
     def paint_points(self, view: MapView, colours: UInt8Array) -> UInt8Array:
         """The picture of a view, each drawn point in a colour (N, 3) of its own."""
-        return colour(view.view, colours)[view.part]
+        return colour(view.shown, colours)
 
 
 def drawn_map(instances: Instances) -> DrawnMap:

@@ -2,28 +2,64 @@
 
 function headFacts() {
   const n = (values) => new Set(values).size;
-  const facts = [[n(RUNS.flatMap((run) => run.scenes)), 'scene'], [n(RUNS.flatMap((run) => run.methods)), 'method'], [PROTOCOLS.length, 'protocol']];
-  byId('main').append(h('ul', { class: 'facts' }, RUNS.length > 1 ? h('li', null, h('b', null, String(RUNS.length)), ' runs') : null,
-    facts.map(([count, what]) => h('li', null, h('b', null, String(count)), ` ${what}${count === 1 ? '' : 's'}`)),
-    RUNS.length === 1 && RUNS[0].profile ? h('li', null, 'profile ', h('b', null, RUNS[0].profile)) : null,
-    RUNS.length === 1 && RUNS[0].encoder ? h('li', null, 'encoder ', h('b', null, RUNS[0].encoder)) : null));
+  const counts = [
+    [n(RUNS.flatMap((run) => run.scenes)), 'scene'], [n(RUNS.flatMap((run) => run.methods)), 'method'],
+    [PROTOCOLS.length, 'protocol'],
+  ];
+  const [only] = RUNS.length === 1 ? RUNS : [{}];
+  const fact = (what, value) => (value ? h('li', null, `${what} `, h('b', null, value)) : null);
+  byId('main').append(h('ul', { class: 'facts' },
+    RUNS.length > 1 ? h('li', null, h('b', null, String(RUNS.length)), ' runs') : null,
+    counts.map(([count, what]) => h('li', null, h('b', null, String(count)), ` ${what}${count === 1 ? '' : 's'}`)),
+    fact('profile', only.profile), fact('encoder', only.encoder)));
 }
 
 function followSections() {
-  const links = [...byId('nav').querySelectorAll('a')], sections = [...document.querySelectorAll('section.part')];
+  const nav = byId('nav'), links = [...nav.querySelectorAll('a')];
+  const sections = [...document.querySelectorAll('section.part')];
   const mark = () => {
     const at = sections.filter((section) => section.getBoundingClientRect().top < 140).pop() || sections[0];
     links.forEach((link) => {
       const is = at && link.getAttribute('href') === `#${at.id}`;
       if (is === link.hasAttribute('aria-current')) return;
-      if (is) { link.setAttribute('aria-current', 'true'); byId('nav').scrollLeft = link.offsetLeft - byId('nav').offsetLeft - 40; } else link.removeAttribute('aria-current');
+      if (!is) { link.removeAttribute('aria-current'); return; }
+      link.setAttribute('aria-current', 'true');
+      nav.scrollLeft = link.offsetLeft - nav.offsetLeft - 40;
     });
   };
   let waiting = false;
-  document.addEventListener('scroll', () => { if (!waiting) { waiting = true; requestAnimationFrame(() => { waiting = false; mark(); }); } }, { passive: true });
+  const soon = () => {
+    if (waiting) return;
+    waiting = true;
+    requestAnimationFrame(() => { waiting = false; mark(); });
+  };
+  document.addEventListener('scroll', soon, { passive: true });
   mark();
 }
 
+// The summary at once; the rest one section after the other while nothing else is to do, or before anybody jumps there.
+function makeInTime() {
+  const idle = window.requestIdleCallback || ((work) => setTimeout(work, 1));
+  const next = () => {
+    const [section] = unmade.keys();
+    if (!section) return;
+    idle(next, { timeout: 300 });
+    makePart(section);
+  };
+  byId('main').setAttribute('aria-busy', 'true');
+  byId('nav').addEventListener('click', makeAll);
+  window.addEventListener('hashchange', makeAll);
+  window.addEventListener('beforeprint', makeAll);
+  makePart(byId('summary'));
+  if (location.hash) makeAll();
+  else idle(next, { timeout: 300 });
+}
+
 headFacts();
-for (const make of [summarySection, mapsSection, scenesSection, classesSection, confusionSection, errorsSection, timingSection, compareSection, provenanceSection]) make();
+for (const make of [
+  summarySection, mapsSection, scenesSection, classesSection, confusionSection, errorsSection, timingSection,
+  compareSection, provenanceSection,
+]) make();
+makeInTime();
 followSections();
+performance.mark('su3d-usable');

@@ -39,15 +39,22 @@ const percent = (value, digits = 1) => (isNumber(value) ? (100 * value).toFixed(
 const metricText = (metric, value) =>
   isNumber(value) && isCount(metric) ? String(Math.round(value)) : percent(value);
 const signed = (value) => (isNumber(value) ? (value >= 0 ? '+' : '−') + Math.abs(100 * value).toFixed(1) : '–');
-const msText = (value) => (!isNumber(value) ? '–' : value >= 100 ? value.toFixed(0) : value.toPrecision(3).replace(/\.?0+$/, ''));
+function msText(value) {
+  if (!isNumber(value)) return '–';
+  return value >= 100 ? value.toFixed(0) : value.toPrecision(3).replace(/\.?0+$/, '');
+}
 const countText = (value) => (isNumber(value) ? value.toLocaleString('en-US') : '–');
 const plural = (n, what) => `${n} ${what}${n === 1 ? '' : 's'}`;
 
 function compareValues(a, b) {
   const missing = (value) => value === null || value === undefined || Number.isNaN(value);
   if (missing(a) || missing(b)) return missing(a) - missing(b);
-  return typeof a === 'number' && typeof b === 'number' ? a - b : String(a).localeCompare(String(b), 'en', { numeric: true });
+  if (typeof a === 'number' && typeof b === 'number') return a - b;
+  return String(a).localeCompare(String(b), 'en', { numeric: true });
 }
+
+// Keeps its place where the table beneath it scrolls sideways.
+const captionOf = (text) => h('caption', null, h('span', null, text));
 
 // A table that sorts by its headers and, with `filter`, shows the rows whose text holds what is typed.
 // Columns: {label, value(row), show(row), num, best}; rows of `onRow` can be chosen by mouse and keyboard.
@@ -57,7 +64,8 @@ function dataTable({ caption, columns, rows, filter, tall, sortBy, descending, o
   const headers = columns.map((column, index) =>
     h('th', { scope: 'col', class: column.num ? 'num' : null },
       h('button', { type: 'button', class: 'sort', onclick: () => sort(index) }, column.label)));
-  const node = h('table', null, h('caption', null, caption), h('thead', null, h('tr', null, headers)), body, foot || null);
+  const head = h('thead', null, h('tr', null, headers));
+  const node = h('table', null, captionOf(caption), head, body, foot || null);
   const counter = h('span', { class: 'count', role: 'status' });
   const box = h('div', null);
   if (filter) {
@@ -66,7 +74,8 @@ function dataTable({ caption, columns, rows, filter, tall, sortBy, descending, o
     box.append(h('div', { class: 'toolbar' },
       h('div', { class: 'field' }, h('label', { for: input.id }, `Filter ${filter}`), input), counter));
   }
-  box.append(h('div', { class: tall ? 'wide tall' : 'wide', tabindex: '0', role: 'region', 'aria-label': caption }, node));
+  const classes = tall ? 'wide tall' : 'wide';
+  box.append(h('div', { class: classes, tabindex: '0', role: 'region', 'aria-label': caption }, node));
 
   function sort(index) {
     state.down = state.column === index ? !state.down : !!columns[index].num;
@@ -83,9 +92,10 @@ function dataTable({ caption, columns, rows, filter, tall, sortBy, descending, o
     if (state.column !== null) {
       const value = columns[state.column].value;
       const missing = (row) => { const v = value(row); return v === null || v === undefined || Number.isNaN(v); };
-      shown = [...shown].sort((a, b) => (missing(a) - missing(b)) || (state.down ? -1 : 1) * compareValues(value(a), value(b)));
+      const order = (a, b) => (state.down ? -1 : 1) * compareValues(value(a), value(b));
+      shown = [...shown].sort((a, b) => (missing(a) - missing(b)) || order(a, b));
     }
-    counter.textContent = shown.length === rows.length ? `${rows.length} rows` : `${shown.length} of ${rows.length} rows`;
+    counter.textContent = `${shown.length === rows.length ? '' : `${shown.length} of `}${rows.length} rows`;
     body.replaceChildren(...shown.map(line));
   }
   function line(row) {
@@ -94,8 +104,13 @@ function dataTable({ caption, columns, rows, filter, tall, sortBy, descending, o
       const classes = [column.num ? 'num' : '', column.best && column.best(row) ? 'best' : ''].join(' ').trim();
       return h(index ? 'td' : 'th', { class: classes || null, scope: index ? null : 'row' }, content);
     });
-    const attributes = onRow ? { tabindex: '0', 'aria-selected': String(!!row.selected), onclick: () => onRow(row),
-      onkeydown: (event) => { if (event.key === 'Enter' || event.key === ' ') { event.preventDefault(); onRow(row); } } } : null;
+    const onkeydown = (event) => {
+      if (event.key !== 'Enter' && event.key !== ' ') return;
+      event.preventDefault();
+      onRow(row);
+    };
+    const attributes = onRow
+      ? { tabindex: '0', 'aria-selected': String(!!row.selected), onclick: () => onRow(row), onkeydown } : null;
     const made = h('tr', attributes, cells);
     row.node = made;
     return made;
@@ -120,26 +135,28 @@ function niceTicks(low, high, most) {
   const raw = (high - low || 1) / most, power = 10 ** Math.floor(Math.log10(raw));
   const step = [1, 2, 5, 10].map((m) => m * power).find((s) => s >= raw);
   const ticks = [];
-  for (let value = Math.ceil(low / step) * step; value <= high + step * 1e-9; value += step) ticks.push(Number(value.toPrecision(12)));
+  for (let value = Math.ceil(low / step) * step; value <= high + step * 1e-9; value += step) {
+    ticks.push(Number(value.toPrecision(12)));
+  }
   return ticks;
 }
 
 const DASHES = [null, '6 3', '2 3', '9 3 2 3', '4 2', '1 2', '12 4', '7 2 2 2'];
 
-function linePlot({ label, lines, xLabel, yLabel, xFromZero }) {
-  // Lines: {name, style, x: [], y: [], marks}; styles differ in colour and dash.
+function linePlot({ label, lines, xLabel, yLabel }) {
+  // Lines: {name, style, x: [], y: []}; styles differ in colour and dash.
   const width = 760, height = 300, left = 62, right = 12, top = 22, bottom = 42;
   const xs = lines.flatMap((one) => one.x), ys = lines.flatMap((one) => one.y);
   const plot = svg('svg', { viewBox: `0 0 ${width} ${height}`, width, role: 'img', 'aria-label': label });
   if (!xs.length) return h('p', { class: 'intro' }, 'Nothing was timed here.');
-  const xLow = xFromZero ? 0 : Math.min(...xs), xHigh = Math.max(...xs, xLow + 1e-9), yHigh = Math.max(...ys, 1e-9) * 1.05;
-  const px = (v) => left + ((v - xLow) / (xHigh - xLow)) * (width - left - right);
+  const xHigh = Math.max(...xs, 1e-9), yHigh = Math.max(...ys, 1e-9) * 1.05;
+  const px = (v) => left + (v / xHigh) * (width - left - right);
   const py = (v) => height - bottom - (v / yHigh) * (height - top - bottom);
   for (const tick of niceTicks(0, yHigh, 5)) {
     plot.append(svg('line', { class: 'grid', x1: left, x2: width - right, y1: py(tick), y2: py(tick) }),
       svg('text', { x: left - 6, y: py(tick) + 4, 'text-anchor': 'end' }, countText(tick)));
   }
-  for (const tick of niceTicks(xLow, xHigh, 7)) {
+  for (const tick of niceTicks(0, xHigh, 7)) {
     plot.append(svg('text', { x: px(tick), y: height - bottom + 16, 'text-anchor': 'middle' }, countText(tick)));
   }
   plot.append(svg('line', { class: 'axis', x1: left, x2: width - right, y1: height - bottom, y2: height - bottom }),
@@ -149,12 +166,12 @@ function linePlot({ label, lines, xLabel, yLabel, xFromZero }) {
     const d = one.x.map((v, i) => `${i ? 'L' : 'M'}${px(v).toFixed(1)} ${py(one.y[i]).toFixed(1)}`).join('');
     plot.append(svg('path', { class: `line l${one.style % 8}`, d, 'stroke-dasharray': DASHES[one.style % 8] },
       svg('title', null, one.name)));
-    if (one.x.length < 30) one.x.forEach((v, i) => plot.append(
-      svg('circle', { class: `l${one.style % 8}`, fill: 'none', 'stroke-width': 1.6, cx: px(v), cy: py(one.y[i]), r: 2.6 },
-        svg('title', null, `${one.name}: ${countText(one.y[i])}`))));
+    const ring = { class: `l${one.style % 8}`, fill: 'none', 'stroke-width': 1.6, r: 2.6 };
+    if (one.x.length < 30) one.x.forEach((v, i) => plot.append(svg('circle', { ...ring, cx: px(v), cy: py(one.y[i]) },
+      svg('title', null, `${one.name}: ${countText(one.y[i])}`))));
   }
-  const key = h('ul', { class: 'key' }, lines.map((one) => h('li', null,
-    svg('svg', { width: 30, height: 8, 'aria-hidden': 'true' },
-      svg('line', { class: `line l${one.style % 8}`, x1: 0, x2: 30, y1: 4, y2: 4, 'stroke-dasharray': DASHES[one.style % 8] })), one.name)));
+  const dash = (style) => svg('svg', { width: 30, height: 8, 'aria-hidden': 'true' },
+    svg('line', { class: `line l${style}`, x1: 0, x2: 30, y1: 4, y2: 4, 'stroke-dasharray': DASHES[style] }));
+  const key = h('ul', { class: 'key' }, lines.map((one) => h('li', null, dash(one.style % 8), one.name)));
   return h('div', null, key, h('div', { class: 'wide' }, plot));
 }

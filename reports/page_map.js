@@ -64,23 +64,25 @@ function mapView(canvas, { onPick, onLost }) {
       gl.attachShader(linked, shader);
     }
     gl.linkProgram(linked);
-    if (!gl.getProgramParameter(linked, gl.LINK_STATUS) && !gl.isContextLost()) throw new Error(gl.getProgramInfoLog(linked));
-    return linked;
+    if (gl.getProgramParameter(linked, gl.LINK_STATUS) || gl.isContextLost()) return linked;
+    throw new Error(gl.getProgramInfoLog(linked));
   }
   function make() {
     const points = program(POINT_VERTEX, POINT_FRAGMENT), shade = program(SHADE_VERTEX, SHADE_FRAGMENT);
     const at = (name) => gl.getUniformLocation(points, name), of = (name) => gl.getUniformLocation(shade, name);
+    const all = (names, place) => Object.fromEntries(names.map((name) => [name, place(name)]));
     made = {
-      points, shade, array: gl.createVertexArray(), nothing: gl.createVertexArray(), frame: gl.createFramebuffer(), size: [0, 0],
+      points, shade, array: gl.createVertexArray(), nothing: gl.createVertexArray(), frame: gl.createFramebuffer(),
+      size: [0, 0],
       buffers: [gl.createBuffer(), gl.createBuffer(), gl.createBuffer()],
       textures: [gl.createTexture(), gl.createTexture(), gl.createTexture()],
-      uniforms: Object.fromEntries(['camera', 'origin', 'spread', 'cut', 'pixels', 'chosen'].map((name) => [name, at(name)])),
-      shades: Object.fromEntries(['shown', 'depth', 'near', 'far', 'reach', 'paper'].map((name) => [name, of(name)])),
+      uniforms: all(['camera', 'origin', 'spread', 'cut', 'pixels', 'chosen'], at),
+      shades: all(['shown', 'depth', 'near', 'far', 'reach', 'paper'], of),
     };
   }
   function resize() {
     const ratio = Math.min(2, window.devicePixelRatio || 1);
-    const size = [Math.max(1, Math.round(canvas.clientWidth * ratio)), Math.max(1, Math.round(canvas.clientHeight * ratio))];
+    const size = [canvas.clientWidth, canvas.clientHeight].map((length) => Math.max(1, Math.round(length * ratio)));
     if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
     if (made.size[0] === size[0] && made.size[1] === size[1]) return;
     made.size = size;
@@ -91,7 +93,8 @@ function mapView(canvas, { onPick, onLost }) {
     formats.forEach(([inside, format, type], k) => {
       gl.bindTexture(gl.TEXTURE_2D, made.textures[k]);
       gl.texImage2D(gl.TEXTURE_2D, 0, inside, size[0], size[1], 0, format, type, null);
-      for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(gl.TEXTURE_2D, name, gl.NEAREST);
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+      gl.texParameteri(gl.TEXTURE_2D, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
       gl.framebufferTexture2D(gl.FRAMEBUFFER, places[k], gl.TEXTURE_2D, made.textures[k], 0);
     });
     gl.drawBuffers([gl.COLOR_ATTACHMENT0, gl.COLOR_ATTACHMENT1]);
@@ -193,7 +196,8 @@ function mapView(canvas, { onPick, onLost }) {
     gl.bufferData(gl.PIXEL_PACK_BUFFER, pixels.length, gl.STREAM_READ);
     gl.bindFramebuffer(gl.FRAMEBUFFER, made.frame);
     gl.readBuffer(gl.COLOR_ATTACHMENT1);
-    gl.readPixels(Math.round(x * ratio) - reach, Math.round(canvas.height - y * ratio) - reach, side, side, gl.RGBA, gl.UNSIGNED_BYTE, 0);
+    const left = Math.round(x * ratio) - reach, bottom = Math.round(canvas.height - y * ratio) - reach;
+    gl.readPixels(left, bottom, side, side, gl.RGBA, gl.UNSIGNED_BYTE, 0);
     gl.bindFramebuffer(gl.FRAMEBUFFER, null);
     gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
     const fence = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
@@ -253,7 +257,7 @@ function mapView(canvas, { onPick, onLost }) {
     moved += Math.abs(across) + Math.abs(along);
     if (held.size === 2) {
       const other = [...held].find(([id]) => id !== event.pointerId)[1];
-      const was = Math.hypot(before[0] - other[0], before[1] - other[1]), is = Math.hypot(now[0] - other[0], now[1] - other[1]);
+      const [was, is] = [before, now].map((place) => Math.hypot(place[0] - other[0], place[1] - other[1]));
       if (was > 1 && is > 1) zoom(was / is);
       pan(across / 2 / height, along / 2 / height);
     } else if (event.buttons & 2 || event.shiftKey) pan(across / height, along / height);
@@ -315,10 +319,11 @@ async function unpackMap(text) {
   let at = 4 + length;
   const planes = {};
   for (const plane of about.planes) {
-    const { n } = about, values = plane.bytes === 2 ? new Uint16Array(n * plane.width) : new Uint8Array(n * plane.width);
-    for (let column = 0; column < plane.width; column++) {
-      for (let k = 0; k < n; k++) values[k * plane.width + column] = data[at + k] + (plane.bytes === 2 ? 256 * data[at + n + k] : 0);
-      at += n * plane.bytes;
+    const { n } = about, { bytes: size, width } = plane;
+    const values = size === 2 ? new Uint16Array(n * width) : new Uint8Array(n * width);
+    for (let column = 0; column < width; column++) {
+      for (let k = 0; k < n; k++) values[k * width + column] = data[at + k] + (size === 2 ? 256 * data[at + n + k] : 0);
+      at += n * size;
     }
     planes[plane.name] = values;
   }
@@ -328,6 +333,7 @@ async function unpackMap(text) {
     if (k > 2) positions[k] += positions[k - 3]; // modulo 2 ** 16, as the type itself has it
     most[k % 3] = Math.max(most[k % 3], positions[k]);
   }
-  return { ...about, positions, owner: planes.owner, colour: planes.colour, truth: planes.truth, classOfPoint: planes.class,
+  const { owner, colour, truth, class: classOfPoint } = planes;
+  return { ...about, positions, owner, colour, truth, classOfPoint,
     low: about.origin, high: about.origin.map((v, i) => v + most[i] * about.step) };
 }

@@ -11,7 +11,7 @@ from su3d_bench.errors import ConfigError, suggest
 from su3d_bench.plain_text import printable
 from su3d_bench.reports.measured import Measured
 from su3d_bench.reports.published import Figure, PaperTable, published
-from su3d_bench.reports.table_model import NOT_MEASURED, Cell, Origin, Table, TableRow
+from su3d_bench.reports.table_model import NOT_MEASURED, Cell, Origin, Table, TableRow, is_count
 from su3d_bench.statistics import SignFlipTest, sign_flip_test
 
 LEVEL = 0.05
@@ -72,13 +72,21 @@ def paper_table(number: PaperTable, found: Sequence[Measured], shown: Shown, *, 
 
 
 def selection_tables(found: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
-    """One table a protocol, in the order of the runs."""
+    """One table a protocol, in the order of the runs; of chosen metrics those that it has, none where it has none."""
     tables = []
+    known = {name for one in found for name in one.metrics}
     for name in dict.fromkeys(one.protocol for one in found):
         rows = [one for one in found if one.protocol == name]
-        figures = [figure for figure in published() if figure.protocol == name] if with_published else []
-        tables.append(protocol_table(rows, shown, figures))
+        metrics = shown.metrics
+        if known.issuperset(metrics):  # else the table says which is known nowhere
+            metrics = tuple(metric for metric in metrics if metric in rows[0].metrics)
+        if metrics or not shown.metrics:
+            tables.append(protocol_table(rows, replace(shown, metrics=metrics), _figures(name, with_published)))
     return tables
+
+
+def _figures(protocol: str, with_published: bool) -> list[Figure]:
+    return [figure for figure in published() if figure.protocol == protocol] if with_published else []
 
 
 def protocol_table(measured: Sequence[Measured], shown: Shown, figures: Sequence[Figure]) -> Table:
@@ -153,13 +161,13 @@ def cells_of(row: Measured, shown: Shown, best: set[str]) -> list[Cell]:
     for name in shown.metrics:
         interval = row.intervals.get(name) if shown.intervals else None
         value = row.metrics[name]
-        beside = "" if interval is None else f"[{percent(interval[0])}, {percent(interval[1])}]"
+        beside = "" if interval is None else f"[{shown_as(name, interval[0])}, {shown_as(name, interval[1])}]"
         origin = None if value is None else _origin(row, name, value, interval=interval)
-        cells.append(Cell(percent(value), beside, name in best, origin))
+        cells.append(Cell(shown_as(name, value), beside, name in best, origin))
     for name in shown.metrics if shown.ceilings else ():
         value = row.ceilings.get(name)
         origin = None if value is None else replace(_origin(row, name, value), what="ceiling")
-        cells.append(Cell(percent(value), origin=origin))
+        cells.append(Cell(shown_as(name, value), origin=origin))
     if shown.scenes_count:
         n = float(len(row.per_scene))
         cells.append(Cell(row.scenes_text, origin=replace(_origin(row, "scenes", n), what="scenes")))
@@ -168,6 +176,11 @@ def cells_of(row: Measured, shown: Shown, best: set[str]) -> list[Cell]:
 
 def _origin(row: Measured, metric: str, value: float, interval: tuple[float, float] | None = None) -> Origin:
     return Origin(row.run, row.method, row.protocol, row.version, metric, "value", value, interval)
+
+
+def shown_as(metric: str, value: float | None) -> str:
+    """``value`` as a table shows it: a share in per cent, a count as it is."""
+    return percent(value) if value is None or not is_count(metric) else f"{value:.1f}".removesuffix(".0")
 
 
 def percent(value: float | None) -> str:

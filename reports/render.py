@@ -149,10 +149,8 @@ def _shade(depth: Float64Array) -> Float32Array:
 
 def colour(view: View, colours: UInt8Array) -> UInt8Array:
     """The picture (h / 2, w / 2, 3) of a view, point i in ``colours[i]``, averaged down to size."""
+    from su3d_bench.reports.render_kernels import averaged_colours
+
     palette = np.concatenate([colours, np.array([BACKGROUND], np.uint8)]).astype(np.float32)
-    picture = palette[view.point]  # -1 is the last row, the background
-    picture *= np.where(view.point >= 0, view.shade, 1.0)[..., None]
-    steps = range(OVERSAMPLING)
-    total = sum((picture[y::OVERSAMPLING, x::OVERSAMPLING] for y in steps for x in steps), np.float32(0))
-    averaged: UInt8Array = np.rint(total / OVERSAMPLING**2).astype(np.uint8)
+    averaged: UInt8Array = averaged_colours(view.point, view.shade, palette, OVERSAMPLING)
     return averaged

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from su3d_bench.plain_text import printable
 from su3d_bench.reports.comparison_table import signed
 from su3d_bench.reports.paper_tables import percent
 from su3d_bench.reports.table_model import NOT_MEASURED, Cell, Table, TableRow
@@ -43,6 +44,8 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
     unclear = sum(c["n_cannot_tell"] for c in cells.values() if c["judge"] == "people" and c["metric"] in metrics[-1:])
     subject, question = SUBJECTS[scores["kind"]]
     people = ", ".join(f"{name} {n}" for name, n in scores["annotators"].items())
+    judged = f"{scores['n_judged']} of {scores['n_items']} items judged; judgements by {people}"
+    judged = judged if people else f"no person judged; {scores['n_items']} items"
     return Table(
         name=f"{scores['kind']}-{dataset}",
         caption=f"{subject} on {dataset}, {n_scenes} scene{'s' if n_scenes != 1 else ''}: {question}",
@@ -53,8 +56,8 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
             "Per cent; in brackets the 95 % interval over resampled items, then the number of items. An item that "
             "several people judged counts once, with the share of them that said so. The ground truth judges the same "
             "items, as far as it knows them",
-            f"set {scores['sheet_id']} of run {scores['run']}; {scores['n_judged']} of {scores['n_items']} items "
-            f"judged; judgements by {people}",
+            f"set {scores['sheet_id']} of run {scores['run']}; {judged}",
+            *([f"answers by {printable(scores['answered_by'], 100)}"] if scores["answered_by"] else []),
             *([f"'cannot tell' is left out: {unclear} under {metrics[-1]}"] if unclear else []),
             *([f"no answers from {', '.join(scores['silent'])}"] if scores["silent"] else []),
         ),

@@ -11,6 +11,11 @@ Interval = tuple[float, float]
 What = Literal["value", "ceiling", "scenes"]
 
 
+def is_count(metric: str) -> bool:
+    """Whether a metric is a number of something and no share, by its name as in ``metrics.json``."""
+    return metric.startswith("n_")
+
+
 @dataclass(frozen=True)
 class Origin:
     """Which number of which run a cell shows; ``value`` is a fraction, or the number of scored scenes."""

@@ -26,29 +26,53 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
 DASHES = ("-", "--", "-.", ":")
 HATCHES = ("", "///", "...", "xxx", "\\\\\\", "+++", "ooo", "---")
 MAX_DRAWN = 2000  # points a method; more only make the file large
+N_SIZES = 10  # markers a method along the axis of sizes
+PANELS_A_ROW = 3
+MIB = 2**20
+POINTS, UPDATES = "points of the map", "updates so far"
 
 
 def draw_timing(
     times: Sequence[Sequence[UpdateTimes]], anytime: Sequence[AnytimePoint], warm_up: int, folder: Path
 ) -> list[Path]:
-    """Write ``update-cost``, ``stages`` and, where maps were scored midway, ``anytime`` as PNG and PDF; their paths."""
-    figures = {"update-cost": _update_cost(times, warm_up), "stages": _stages(times, warm_up)}
+    """Write the plots as PNG and PDF; their paths.
+
+    ``update-cost`` against the points of the map, ``update-course`` against the updates so far, ``memory``, ``stages``
+    and, where maps were scored midway, ``anytime``.
+    """
+    figures = {
+        "update-cost": _update_cost(times, warm_up, POINTS),
+        "update-course": _update_cost(times, warm_up, UPDATES),
+        "memory": _memory(times),
+        "stages": _stages(times, warm_up),
+    }
     if anytime:
         figures["anytime"] = _anytime(anytime)
     return [_save(figure, folder / f"{name}.{kind}") for name, figure in figures.items() for kind in ("png", "pdf")]
 
 
 def _figure(width: float, height: float, n_axes: int = 1) -> tuple[Figure, list[Axes]]:
+    """A figure of ``n_axes`` panels of ``width`` x ``height`` inches, at most ``PANELS_A_ROW`` beside each other."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(width, height), layout="constrained")
-    axes = figure.subplots(1, n_axes, squeeze=False)[0]
-    return figure, list(axes)
+    columns = min(n_axes, PANELS_A_ROW)
+    rows = -(-n_axes // columns)
+    figure = Figure(figsize=(width * columns, height * rows), layout="constrained")
+    axes = list(figure.subplots(rows, columns, squeeze=False).flat)
+    for spare in axes[n_axes:]:
+        spare.remove()
+    return figure, axes[:n_axes]
+
+
+def _style(index: int) -> dict[str, Any]:
+    """Colour, marker and dash of the ``index``-th line; marker and dash together are of no other one."""
+    dash = DASHES[(index + index // len(MARKERS)) % len(DASHES)]
+    return {"color": COLOURS[index % len(COLOURS)], "marker": MARKERS[index % len(MARKERS)], "linestyle": dash}
 
 
 def draw_update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, kind: str) -> bytes:
     """The cost of an update against the points of the map, as a ``png`` or ``pdf`` file."""
-    return _rendered(_update_cost(times, warm_up), kind)
+    return _rendered(_update_cost(times, warm_up, POINTS), kind)
 
 
 def _save(figure: Figure, path: Path) -> Path:
@@ -74,13 +98,23 @@ def _several_runs(times: Sequence[Sequence[UpdateTimes]]) -> bool:
     return len({one[0].method for one in times}) < len(times)
 
 
-def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int) -> Figure:
-    """Milliseconds of the map's share of an update against the points of the map, both axes logarithmic."""
-    figure, (axes,) = _figure(7.0, 4.8)
+def _sizes(one: UpdateTimes, against: str, warm_up: int) -> Float64Array | None:
+    """The size at each update after the first ``warm_up``; None where it was not counted."""
+    if against == UPDATES:
+        return np.arange(warm_up + 1, len(one) + 1, dtype=np.float64)
+    return one.columns["n_points"][warm_up:] if "n_points" in one.columns else None
+
+
+def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: str) -> Figure:
+    """Milliseconds of the map's share of an update ``against`` the size of the map, both axes logarithmic.
+
+    Each update is a dot; a method's line runs through the medians of the updates of about one size.
+    """
+    figure, (axes,) = _figure(7.0, 4.0 + 0.16 * len(times))
     for index, of_method in enumerate(times):
-        with_points = [one for one in of_method if "n_points" in one.columns]
-        sizes = np.concatenate([one.columns["n_points"][warm_up:] for one in with_points] or [np.zeros(0)])
-        costs = pooled(with_points, MAP, warm_up)
+        sized = [(one, size) for one in of_method if (size := _sizes(one, against, warm_up)) is not None]
+        sizes = np.concatenate([size for _, size in sized] or [np.zeros(0)])
+        costs = pooled([one for one, _ in sized], MAP, warm_up)
         usable = (sizes > 0) & (costs > 0)
         if not usable.any():
             continue
@@ -88,27 +122,39 @@ def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int) -> Figure
         label = _label(of_method, _several_runs(times))
         if growth is not None:
             label += f": exponent {growth.exponent:.2f} [{growth.low:.2f}, {growth.high:.2f}], {growth.words}"
-        _scatter(axes, sizes[usable], costs[usable], index, label)
-        if growth is not None:
-            _line(axes, sizes[usable], costs[usable], growth.exponent, index)
-    axes.set(xscale="log", yscale="log", xlabel="points of the map", ylabel="ms per update, without perception")
+        _draw_cost(axes, sizes[usable], costs[usable], index, label)
+    axes.set(xscale="log", yscale="log", xlabel=against, ylabel="ms per update, without perception")
+    _number_by_1_2_5(axes)
     axes.grid(True, which="major", color="0.85", linewidth=0.6)
     if axes.get_legend_handles_labels()[0]:
-        figure.legend(loc="outside lower center", fontsize=8, frameon=False)
+        figure.legend(loc="outside lower center", fontsize=8, frameon=False, handlelength=4)
     return figure
 
 
-def _scatter(axes: Axes, x: Float64Array, y: Float64Array, index: int, label: str) -> None:
-    step = 1 + len(x) // MAX_DRAWN
-    style: dict[str, Any] = {"marker": MARKERS[index % len(MARKERS)], "color": COLOURS[index % len(COLOURS)]}
-    axes.plot(x[::step], y[::step], linestyle="", markersize=3.5, markerfacecolor="none", label=label, **style)
+def _number_by_1_2_5(axes: Axes) -> None:
+    """Numbers such as 200 k and 5 M along x: a map often grows by less than a decade, which has one number else."""
+    from matplotlib.ticker import EngFormatter, LogLocator, NullFormatter
+
+    axes.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+    axes.xaxis.set_major_formatter(EngFormatter())
+    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
-def _line(axes: Axes, x: Float64Array, y: Float64Array, exponent: float, index: int) -> None:
-    ends = np.array([x.min(), x.max()])
-    level = np.mean(np.log(y)) - exponent * np.mean(np.log(x))
-    style: dict[str, Any] = {"color": COLOURS[index % len(COLOURS)], "linestyle": DASHES[index % len(DASHES)]}
-    axes.plot(ends, np.exp(level) * ends**exponent, linewidth=1.2, **style)
+def _draw_cost(axes: Axes, sizes: Float64Array, costs: Float64Array, index: int, label: str) -> None:
+    style = _style(index)
+    step = 1 + len(sizes) // MAX_DRAWN
+    axes.plot(sizes[::step], costs[::step], ".", markersize=2, color=style["color"], alpha=0.4)
+    x, y = medians_by_size(sizes, costs)
+    axes.plot(x, y, linewidth=1.2, markersize=5.5, markerfacecolor="white", label=label, **style)
+
+
+def medians_by_size(sizes: Float64Array, costs: Float64Array) -> tuple[Float64Array, Float64Array]:
+    """The median size and cost of each of at most ``N_SIZES`` ranges of sizes, all of one width on a log axis."""
+    edges = np.geomspace(sizes.min(), sizes.max(), N_SIZES + 1)[1:-1]
+    row = np.searchsorted(edges, sizes, side="right")
+    filled = np.unique(row)
+    x, y = (np.array([np.median(values[row == k]) for k in filled]) for values in (sizes, costs))
+    return x, y
 
 
 def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int) -> Figure:
@@ -120,7 +166,8 @@ def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int) -> Figure:
     for index, stage in enumerate(stages):
         steady = [pooled(of_method, stage, warm_up) for of_method in times]
         widths = np.array([values.mean() if len(values) else 0.0 for values in steady])
-        style: dict[str, Any] = {"hatch": HATCHES[index % len(HATCHES)], "color": COLOURS[index % len(COLOURS)]}
+        hatch = HATCHES[(index + index // len(COLOURS)) % len(HATCHES)]
+        style: dict[str, Any] = {"hatch": hatch, "color": COLOURS[index % len(COLOURS)]}
         axes.barh(rows, widths, left=left, edgecolor="white", label=stage, **style)
         left += widths
     axes.set_yticks(rows, [_label(of_method, _several_runs(times)) for of_method in times])
@@ -130,10 +177,38 @@ def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int) -> Figure:
     return figure
 
 
+def _memory(times: Sequence[Sequence[UpdateTimes]]) -> Figure:
+    """Mebibytes of the map against its points, and of the process against the updates, the scenes' medians."""
+    figure, panels = _figure(4.2, 3.4 + 0.1 * len(times), 2)
+    for axes, (column, against) in zip(panels, (("map_bytes", POINTS), ("rss_bytes", UPDATES)), strict=True):
+        for index, of_method in enumerate(times):
+            sized = [(one, _sizes(one, against, 0)) for one in of_method if column in one.columns]
+            sizes = np.concatenate([size for _, size in sized if size is not None] or [np.zeros(0)])
+            values = np.concatenate([one.columns[column] for one, size in sized if size is not None] or [np.zeros(0)])
+            if not (sizes > 0).any():
+                continue
+            x, y = medians_by_size(sizes[sizes > 0], values[sizes > 0] / MIB)
+            label = _label(of_method, _several_runs(times))
+            axes.plot(x, y, linewidth=1.2, markersize=4.5, markerfacecolor="white", label=label, **_style(index))
+        what = "the map" if column == "map_bytes" else "the process"
+        axes.set(xscale="log", xlabel=against, ylabel=f"MiB of {what}", ylim=(0, None))
+        _number_by_1_2_5(axes)
+        axes.grid(True, which="major", color="0.85", linewidth=0.6)
+    _one_legend(figure, panels)
+    return figure
+
+
+def _one_legend(figure: Figure, panels: Sequence[Axes]) -> None:
+    """The lines of all ``panels``, each named once, beneath them."""
+    named = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    if named:
+        figure.legend([*named.values()], [*named], loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+
+
 def _anytime(points: Sequence[AnytimePoint]) -> Figure:
     """Each headline metric of each protocol against the seconds until the map was there."""
     panels = list(dict.fromkeys((one.protocol, name) for one in points for name in one.metrics))
-    figure, all_axes = _figure(1.0 + 3.2 * len(panels), 3.8, len(panels))
+    figure, all_axes = _figure(3.5, 3.4, len(panels))
     several = len({one.run for one in points}) > 1
     for axes, (protocol, name) in zip(all_axes, panels, strict=True):
         curves = dict.fromkeys((one.run, one.method) for one in points)
@@ -141,11 +216,8 @@ def _anytime(points: Sequence[AnytimePoint]) -> Figure:
             mine = [one for one in points if (one.run, one.method, one.protocol) == (run, method, protocol)]
             values = [100.0 * value if (value := one.metrics.get(name)) is not None else np.nan for one in mine]
             label = printable(f"{method} ({run})" if several else method, 60).replace("$", r"\$")
-            style: dict[str, Any] = {"marker": MARKERS[index % len(MARKERS)], "color": COLOURS[index % len(COLOURS)]}
-            style["linestyle"] = DASHES[index % len(DASHES)]
-            axes.plot([one.seconds for one in mine], values, markersize=4, label=label, **style)
+            axes.plot([one.seconds for one in mine], values, markersize=4, label=label, **_style(index))
         axes.set(xlabel="seconds", ylabel=f"{name} (%)", title=protocol)
         axes.grid(True, color="0.85", linewidth=0.6)
-    handles, labels = all_axes[0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    _one_legend(figure, all_axes)
     return figure

@@ -58,13 +58,27 @@ def csv_text(summaries: Sequence[MethodSummary], hardware: Mapping[str, str]) ->
     return text.getvalue()
 
 
+def methods_csv(summaries: Sequence[MethodSummary], hardware: Mapping[str, str], camera_rate: float) -> str:
+    """One row a run and method, in full precision: speed, the map, memory."""
+    text = io.StringIO()
+    writer = csv.writer(text, lineterminator="\n")
+    speeds = ("updates_per_s", "frames_per_s", "camera_rate", "real_time_factor")
+    sizes = ("finish_ms", "n_points", "map_bytes", "peak_rss_bytes", "device_bytes")
+    writer.writerow(["run", "hardware", "method", "n_scenes", "n_updates", *speeds, *sizes])
+    for one in summaries:
+        speed = [one.updates_per_s, one.frames_per_s, camera_rate, one.frames_per_s / camera_rate]
+        values = [getattr(one, name) for name in sizes]
+        writer.writerow([one.run, hardware[one.run], one.method, len(one.scenes), one.n_updates, *speed, *values])
+    return text.getvalue()
+
+
 def _growth_cells(growth: Growth | None) -> list[float | str]:
     return ["", "", "", ""] if growth is None else [growth.exponent, growth.low, growth.high, growth.words]
 
 
 def _methods_table(summaries: Sequence[MethodSummary], camera_rate: float) -> Iterator[list[str]]:
     yield [
-        *("run", "method", "updates", "update p50", "p95", "max", "first", "map update p50", "updates/s"),
+        *("run", "method", "updates", "update p50", "p95", "max", "first", "map update p50", "updates/s", "frames/s"),
         *(f"real time at {camera_rate:g}/s", "finish", "points", "map MiB", "peak MiB", "GPU MiB"),
     ]
     for one in summaries:
@@ -73,6 +87,7 @@ def _methods_table(summaries: Sequence[MethodSummary], camera_rate: float) -> It
             *(one.run, one.method, str(one.n_updates)),
             *(_ms(total.p50), _ms(total.p95), _ms(total.worst), _ms(total.first), _ms(of_map.p50)),
             f"{one.updates_per_s:.2f}",
+            f"{one.frames_per_s:.2f}",
             f"{one.frames_per_s / camera_rate:.2f}x",
             NOT_MEASURED if one.finish_ms is None else _ms(one.finish_ms),
             NOT_MEASURED if one.n_points is None else f"{one.n_points:,}",

@@ -11,7 +11,7 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -30,7 +30,9 @@ class RunConfig(BaseModel):
     ``protocols`` empty: those of each dataset; ``stride`` 0: the method's own; ``jobs`` 0: one a scene, at most one a
     CPU core; ``limit`` 0: all frames, otherwise the first ``limit`` frames of each scene, and the run is partial;
     ``offline``: no language model is asked, replies that are stored with the run are used;
-    ``anytime``: shares of the updates after which the map so far is scored too, such as 0.1 0.25 0.5.
+    ``anytime``: shares of the updates after which the map so far is scored too, such as 0.1 0.25 0.5;
+    ``executor`` auto: this process for one job, else processes; ``ray_address`` empty: that of ``RAY_ADDRESS``, or the
+    cluster on this machine; ``retries``: of a scene whose machine was lost; ``slurm``: KEY=VALUE of submitit.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
@@ -46,6 +48,11 @@ class RunConfig(BaseModel):
     pictures: bool = True
     offline: bool = False
     anytime: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = ()
+    executor: Literal["auto", "inline", "processes", "ray", "slurm"] = "auto"
+    ray_address: str = ""
+    gpus_per_job: float = Field(default=0.0, ge=0, le=64, allow_inf_nan=False)
+    retries: int = Field(default=2, ge=0)
+    slurm: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -94,6 +101,8 @@ def read_file(path: Path) -> Settings:
         reason, _, place = str(error).partition(" (at ")
         line = place.split(",")[0].removeprefix("line ") if place.startswith("line ") else str(text.count("\n") + 1)
         raise ConfigError(f"{path}:{line}: not valid TOML: {reason[:1].lower()}{reason[1:]}") from error
+    except (RecursionError, ValueError) as error:  # the depth of nested tables, integers of thousands of digits
+        raise ConfigError(f"{path}: not valid TOML: nested or numbered beyond what a setting needs") from error
     lines = key_lines(text)
     return Settings(tuple(Setting(leaf, value, f"{path}:{_line(lines, leaf)}") for leaf, value in flatten(table)))
 
@@ -162,7 +171,7 @@ def parse_value(text: str) -> Any:
     """A value in TOML, and plain text where it is not."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
+    except (ValueError, RecursionError):  # no TOML, thousands of digits, nested thousands deep
         return text.strip()
 
 

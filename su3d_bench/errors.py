@@ -9,6 +9,9 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
+from su3d_bench.plain_text import printable
+
+MOST_CHARACTERS = 1000  # of a message, which may quote a hostile file and name a deep folder
 EXIT_DONE = 0
 EXIT_CHECK_FAILED = 1
 EXIT_WRONG_INPUT = 2
@@ -17,9 +20,15 @@ EXIT_INTERNAL = 4
 
 
 class Su3dError(Exception):
-    """Base of every error that a user can cause; the command line prints its message on one line."""
+    """Base of every error that a user can cause.
+
+    Its text is one printable line of bounded length, whatever it quotes: it goes to terminals, records and pages.
+    """
 
     exit_code = EXIT_WRONG_INPUT
+
+    def __str__(self) -> str:
+        return printable(super().__str__(), MOST_CHARACTERS)
 
 
 class ConfigError(Su3dError):

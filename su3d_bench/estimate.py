@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Iterator
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -47,20 +47,23 @@ def _of_job(plan: Plan, job: SceneJob, part: Part) -> JobEstimate:
             n_updates = min(n_frames, job.limit or n_frames)
         except DataError as error:
             remark = str(error)
-    measured = _recent_update_s(plan.folder.path.parent, part.name)
+    measured = recent_update_s(plan.folder.path.parent, part.name)
     seconds = GUESSED_SCENE_S + n_updates * (GUESSED_UPDATE_S if measured is None else measured)
     return JobEstimate(job.scene, part.name, n_updates, seconds, measured is not None, is_done, remark)
 
 
-def _recent_update_s(runs: Path, method: str) -> float | None:
-    """Mean seconds an update in the latest runs below ``runs``; None where there is none."""
-    files = [path for path in runs.glob(f"*/scenes/*/{method}/updates.csv") if path.stat().st_size > 0]
+def recent_update_s(runs: Path, method: str) -> float | None:
+    """Mean seconds an update in the latest runs below ``runs``, damaged tables aside; None where there is none."""
+    files = [path for path in runs.glob(f"*/scenes/*/{method}/updates.csv") if path.is_file()]
     newest = sorted(files, key=lambda path: path.stat().st_mtime)[-N_RECENT:]
     totals = [ms for path in newest for ms in _totals(path)]
     return sum(totals) / len(totals) / 1e3 if totals else None
 
 
-def _totals(path: Path) -> Iterator[float]:
-    with path.open(newline="") as stream:
-        for row in csv.DictReader(stream):
-            yield float(row["total_ms"])
+def _totals(path: Path) -> list[float]:
+    try:
+        with path.open(newline="", encoding="utf-8") as stream:
+            totals = [float(row["total_ms"]) for row in csv.DictReader(stream)]
+    except (OSError, ValueError, KeyError, TypeError, csv.Error):
+        return []
+    return totals if all(0 <= ms < math.inf for ms in totals) else []

@@ -1,4 +1,5 @@
-"""Where units of work run: in this process, or each in a spawned process of its own.
+"""Where units of work run: in this process, or each in a spawned process of its own; see ``executors_ray`` and
+``executors_slurm`` for other machines.
 
 A unit that takes its process down (killed for memory, a crash in native code) fails alone. Numerical libraries are
 held to one thread everywhere, so that no result depends on how many units run side by side.
@@ -115,7 +116,7 @@ def run_processes(
                 one = running.pop(connection)
                 one.process.join()
                 connection.close()
-                yield lost(one.unit, _cause(one.process.exitcode)) if message is None else _unwrap(message)
+                yield lost(one.unit, _cause(one.process.exitcode)) if message is None else unwrap(message)
     finally:
         for one in running.values():
             one.process.terminate()
@@ -151,7 +152,19 @@ def _receive(connection: Connection) -> tuple[str, Any] | None:
     return message
 
 
-def _unwrap(message: tuple[str, Any]) -> Any:
+def answer_of(work: Work[Unit, Outcome], unit: Unit, report: Report) -> tuple[str, Any]:
+    """What became of ``unit`` in this process, as a message that ``unwrap`` takes elsewhere; raises nothing."""
+    try:
+        with one_thread():
+            return "outcome", work(unit, report)
+    except Su3dError as error:
+        return "user-error", error
+    except Exception:  # noqa: BLE001 - ``unwrap`` raises it again, with its traceback
+        return "internal-error", traceback.format_exc()
+
+
+def unwrap(message: tuple[str, Any]) -> Any:
+    """The outcome in a message of ``answer_of``; an error in it is raised here."""
     kind, content = message
     if kind == "user-error":
         raise content

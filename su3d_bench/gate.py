@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -82,12 +82,15 @@ class Reference(_Model):
     costs: dict[str, float]
 
 
+Number = Annotated[float, Field(allow_inf_nan=False)]  # NaN would differ from nothing, and so pass
+
+
 class _Numbers(BaseModel):
     """What is read of a result's ``result`` in ``metrics.json``."""
 
-    metrics: dict[str, float | None]
-    per_scene: dict[str, dict[str, float | None]]
-    per_class: dict[str, dict[str, float | None]]
+    metrics: dict[str, Number | None]
+    per_scene: dict[str, dict[str, Number | None]]
+    per_class: dict[str, dict[str, Number | None]]
 
 
 class _Result(BaseModel):

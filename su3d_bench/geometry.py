@@ -23,12 +23,7 @@ def back_project(
 
     Integer pixel indices, no half-pixel shift (as every Replica loader has it).
     """
-    if not np.linalg.det(intrinsics):
-        raise DataError(f"back-projection: the intrinsics {intrinsics.tolist()} cannot be inverted")
-    height, width = depth_m.shape
-    to_world = camera_to_world[:3, :3] @ np.linalg.inv(intrinsics)
-    of_column = to_world[:, :1] * np.arange(width)
-    of_row = to_world[:, 1:2] * np.arange(height) + to_world[:, 2:]
+    of_row, of_column = ray_parts(intrinsics, camera_to_world, *depth_m.shape)
     z = depth_m[pixels].astype(np.float64)
     points = np.empty((len(z), 3))
     # No matrix product over the pixels: a threaded one waits for cores that others use.
@@ -36,6 +31,16 @@ def back_project(
         ray = of_row[axis][:, None] + of_column[axis]
         points[:, axis] = ray[pixels] * z + camera_to_world[axis, 3]
     return points
+
+
+def ray_parts(
+    intrinsics: Float64Array, camera_to_world: Float64Array, height: int, width: int
+) -> tuple[Float64Array, Float64Array]:
+    """What rows (3, H) and columns (3, W) add to the rays of an image's pixels, in the world, to a depth of 1 m."""
+    if not np.linalg.det(intrinsics):
+        raise DataError(f"back-projection: the intrinsics {intrinsics.tolist()} cannot be inverted")
+    to_world = np.asarray(camera_to_world[:3, :3] @ np.linalg.inv(intrinsics), np.float64)
+    return to_world[:, 1:2] * np.arange(height) + to_world[:, 2:], to_world[:, :1] * np.arange(width)
 
 
 def voxel_coordinates(points: Float64Array | Float32Array, voxel: float) -> Int64Array:

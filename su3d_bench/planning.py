@@ -6,6 +6,7 @@ import difflib
 import fnmatch
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -13,11 +14,15 @@ from typing import Any
 from su3d_bench import registry
 from su3d_bench.config import RunConfig, Settings, check_keys, check_names, read_assignments, resolve
 from su3d_bench.digests import code_digest, digest_json
+from su3d_bench.distant_scene import CACHE_ROOT, fetch_seals, mirror_of
 from su3d_bench.errors import ConfigError, DataError, suggest
+from su3d_bench.execution import ELSEWHERE, check_execution
 from su3d_bench.method_names import NamedMethod, named_method
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
 from su3d_bench.protocols import ProtocolRules, load_protocol, protocols_for
 from su3d_bench.questions.truths import has_own_queries
+from su3d_bench.remote_data import DataPlace, RemoteData, data_place
+from su3d_bench.remote_folder import is_url
 from su3d_bench.scene_run import (
     CEILING_METHOD,
     FIELDS_KNOWN_LATER,
@@ -32,13 +37,17 @@ from su3d_bench.store import RunFolder
 from su3d_bench.types import Dataset
 
 DATA_ROOT = "~/.cache/su3d-bench/data"
-CACHE_ROOT = "~/.cache/su3d-bench/cache"
+# Where scenes run, and what is drawn of them, is no other run.
+MOVES_NO_NAME = {"jobs", "pictures", "offline", "executor", "ray_address", "gpus_per_job", "retries", "slurm"}
 NO_SYSTEMS = (CEILING_METHOD, "command")  # what `--methods all` leaves out: the truth itself, and programs of others
 
 
 @dataclass(frozen=True)
 class Plan:
-    """What a run will do: one job a scene; ``notes`` are remarks for whoever asked."""
+    """What a run will do: one job a scene; ``notes`` are remarks for whoever asked.
+
+    ``store``: URL of the run folder where it is in a store; ``folder`` then holds its small files.
+    """
 
     config: RunConfig
     settings: Settings
@@ -46,6 +55,8 @@ class Plan:
     jobs: tuple[SceneJob, ...]
     n_workers: int
     notes: tuple[str, ...]
+    store: str | None = None
+    data: RemoteData | None = None
 
     @property
     def methods(self) -> tuple[str, ...]:
@@ -59,7 +70,10 @@ class Plan:
 
 def data_root() -> Path:
     """Where datasets are: ``$SU3D_DATA``, else the user's cache."""
-    return Path(os.environ.get("SU3D_DATA") or DATA_ROOT).expanduser()
+    named = os.environ.get("SU3D_DATA") or DATA_ROOT
+    if is_url(named):
+        raise ConfigError(f"SU3D_DATA={named}: only su3d-bench run and ablate read a store; name a folder")
+    return Path(named).expanduser()
 
 
 def cache_root() -> Path:
@@ -67,14 +81,16 @@ def cache_root() -> Path:
     return Path(os.environ.get("SU3D_CACHE") or CACHE_ROOT).expanduser()
 
 
-def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | None = None) -> Plan:
+def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | str | None = None) -> Plan:
     """The plan of what was asked for; everything wrong with the request itself is found here, before any work.
 
     ``assignments`` are ``KEY=VALUE`` texts as ``read_assignments`` takes them. ``out`` None: a folder below ``runs/``
-    named after datasets, profile and a key of the request, so that the same command resumes its own run.
+    named after datasets, profile and a key of the request, so that the same command resumes its own run; a text: the
+    URL of a store.
     """
     check_keys(settings)
     config = resolve(settings, (), RunConfig)
+    check_execution(config)
     if config.profile not in PROFILES:
         hint = suggest(config.profile, PROFILES) or "; known: " + ", ".join(PROFILES)
         raise ConfigError(f"unknown profile '{config.profile}'{hint}")
@@ -92,14 +108,21 @@ def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | N
         perception.model_dump_json(),
         protocols_of_run(config.protocols, list(datasets.values())),
     )
-    chosen, notes = expand_scenes(config.scenes, parts.datasets)
-    folder = out or Path("runs") / _run_name(config, parts)
+    store = out if isinstance(out, str) else None
+    folder = _folder(out, config, parts)
+    named = os.environ.get("SU3D_DATA") or ""
+    with data_place(named) if is_url(named) else nullcontext(DataPlace(data_root())) as place:
+        chosen, notes = expand_scenes(config.scenes, parts.datasets, place.root)
+        data = place.needed({parts.datasets[target] for target, _ in chosen})
     jobs = tuple(
-        replace(_scene_job(config, parts, folder, target, scene), index=index)
+        replace(_scene_job(config, parts, folder, place.root, target, scene), index=index)
         for index, (target, scene) in enumerate(chosen)
     )
-    n_workers = min(config.jobs or os.cpu_count() or 1, len(jobs))
-    plan = Plan(config, settings, RunFolder(folder), jobs, n_workers, notes)
+    n_here = len(jobs) if config.executor in ELSEWHERE else os.cpu_count() or 1
+    n_workers = min(config.jobs or n_here, len(jobs))
+    plan = Plan(config, settings, RunFolder(folder), jobs, n_workers, notes, store, data)
+    if store is not None:
+        fetch_seals(store, folder)
     _refuse_other_runs(plan)
     return plan
 
@@ -186,18 +209,19 @@ def dataset_targets(addresses: Sequence[str]) -> list[str]:
 
 
 def expand_scenes(
-    addresses: Sequence[str], datasets: Mapping[str, Part]
+    addresses: Sequence[str], datasets: Mapping[str, Part], root: Path | None = None
 ) -> tuple[list[tuple[str, str]], tuple[str, ...]]:
     """(dataset target, scene) of every address or pattern, each once, in the order asked; and notes.
 
     Files among the addresses, which a shell put there by expanding ``replica/*``, are left out with a note when
-    other addresses match.
+    other addresses match. ``root`` None: ``data_root()``.
     """
+    root = data_root() if root is None else root
     chosen: dict[tuple[str, str], None] = {}
     strangers = []
     for address in addresses:
         target, pattern = split_address(address)
-        dataset = build_dataset(datasets[target], data_root()) if target in datasets else None
+        dataset = build_dataset(datasets[target], root) if target in datasets else None
         scenes = [] if dataset is None else _matching_scenes(dataset, pattern)
         if not scenes and os.path.exists(address):
             strangers.append(address)
@@ -283,14 +307,20 @@ def why_not_fitting(rules: ProtocolRules, dataset: Any) -> str | None:
     return None
 
 
+def _folder(out: Path | str | None, config: RunConfig, parts: _Parts) -> Path:
+    if isinstance(out, str):
+        return mirror_of(out, cache_root())
+    return out or Path("runs") / _run_name(config, parts)
+
+
 def _run_name(config: RunConfig, parts: _Parts) -> str:
-    request = config.model_dump(mode="json", exclude={"jobs", "pictures", "offline"})
+    request = config.model_dump(mode="json", exclude=MOVES_NO_NAME)
     options = [part.options for part in (*parts.methods, *parts.datasets.values())]
     key = digest_json([request, options, parts.perception, code_digest()])[:8]
     return "-".join([*(part.name for part in parts.datasets.values()), config.profile, key])
 
 
-def _scene_job(config: RunConfig, parts: _Parts, folder: Path, target: str, scene: str) -> SceneJob:
+def _scene_job(config: RunConfig, parts: _Parts, folder: Path, root: Path, target: str, scene: str) -> SceneJob:
     return SceneJob(
         scene=f"{parts.datasets[target].name}/{scene}",
         dataset=parts.datasets[target],
@@ -305,7 +335,7 @@ def _scene_job(config: RunConfig, parts: _Parts, folder: Path, target: str, scen
         pictures=config.pictures,
         anytime=tuple(sorted(set(config.anytime))),
         folder=folder,
-        data_root=data_root(),
+        data_root=root,
         cache_root=cache_root(),
         is_offline=config.offline,
     )

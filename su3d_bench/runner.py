@@ -7,17 +7,28 @@ workers and however often a run was killed and taken up again.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+import os
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 from su3d_bench.config import KeyPath, flatten
 from su3d_bench.digests import code_digest, git_state, package_versions
-from su3d_bench.executors import SCENE_DONE, Event, Report, run_inline, run_processes
+from su3d_bench.distant_scene import (
+    DistantJob,
+    failed_distant,
+    fetch_results,
+    run_distant_scene,
+    send_records,
+)
+from su3d_bench.errors import StoreError
+from su3d_bench.execution import ELSEWHERE, run_units
+from su3d_bench.executors import SCENE_DONE, Event, Report
 from su3d_bench.perception.profiles import PerceptionConfig
-from su3d_bench.planning import Plan
+from su3d_bench.planning import Plan, cache_root
 from su3d_bench.protocols import ProtocolRules, load_protocol
 from su3d_bench.scene_run import CEILING_METHOD, MethodOutcome, SceneJob, failed_outcomes, run_scene
 from su3d_bench.scoring import SceneScore, combine, unpack_scores
@@ -50,17 +61,28 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
         remove_file(metrics_file)  # what stands there may be of another plan
         write_text(plan.folder.path / "run.toml", write_toml(resolved_values(plan)))
         write_json(plan.folder.path / "run.json", _record(plan, (), "running"))
+        _publish(plan)
         try:
             outcomes = _execute(plan, report)
         except BaseException:
             write_json(plan.folder.path / "run.json", _record(plan, (), "interrupted"))
+            with suppress(StoreError):  # what ended the run says more
+                _publish(plan)
             raise
+        if plan.store is not None:
+            fetch_results(plan.store, plan.folder.path)
         failed = [(one.scene, one.method, one.error) for one in outcomes if one.error is not None]
         failures = tuple(each for each in failed if each[1] in plan.methods)
         metrics = summarise(plan, outcomes)
         write_json(metrics_file, metrics)
         write_json(plan.folder.path / "run.json", _record(plan, outcomes, "incomplete" if failures else "complete"))
+        _publish(plan)
     return RunResult(plan, metrics, outcomes, failures, _remarks(plan, outcomes))
+
+
+def _publish(plan: Plan) -> None:
+    if plan.store is not None:
+        send_records(plan.store, plan.folder.path)
 
 
 def _remarks(plan: Plan, outcomes: Sequence[MethodOutcome]) -> tuple[str, ...]:
@@ -80,15 +102,30 @@ def _remarks(plan: Plan, outcomes: Sequence[MethodOutcome]) -> tuple[str, ...]:
 
 
 def _execute(plan: Plan, report: Report) -> tuple[MethodOutcome, ...]:
-    if plan.n_workers == 1:
-        finished = run_inline(run_scene, plan.jobs, report)
+    start = partial(run_units, report=report, config=plan.config, n_workers=plan.n_workers, folder=plan.folder.path)
+    finished: Iterator[tuple[MethodOutcome, ...]]
+    if plan.config.executor in ELSEWHERE or plan.store is not None or plan.data is not None:
+        finished = start(run_distant_scene, _distant(plan), lost=failed_distant)
     else:
-        finished = run_processes(run_scene, plan.jobs, report, jobs=plan.n_workers, lost=failed_outcomes)
+        finished = start(run_scene, plan.jobs, lost=failed_outcomes)
     by_scene: dict[str, tuple[MethodOutcome, ...]] = {}
     for outcomes in finished:
         by_scene[outcomes[0].scene] = outcomes
         report(Event(outcomes[0].scene, SCENE_DONE, len(by_scene), len(plan.jobs)))
     return tuple(outcome for job in plan.jobs for outcome in by_scene[job.scene])
+
+
+def _distant(plan: Plan) -> list[DistantJob]:
+    own = DistantJob(
+        plan.jobs[0],
+        Path.cwd(),
+        plan.store,
+        None if plan.data is None else plan.data.url,
+        cache_root=cache_root() if "SU3D_CACHE" in os.environ or plan.config.executor not in ELSEWHERE else None,
+    )
+    files = {} if plan.data is None else plan.data.files
+    jobs = [replace(job, folder=job.folder.absolute()) for job in plan.jobs]
+    return [replace(own, job=job, files=files.get(job.scene, {})) for job in jobs]
 
 
 def resolved_values(plan: Plan) -> list[tuple[KeyPath, Any, str]]:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import csv
 import io
 import time
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,6 +12,7 @@ import numpy as np
 from su3d_bench.errors import DataError
 from su3d_bench.executors import Event, Report
 from su3d_bench.perception.profiles import Perception
+from su3d_bench.read_ahead import ReadAhead
 from su3d_bench.scene_tools import no_detections
 from su3d_bench.store import write_prediction
 from su3d_bench.timing import Timer, calibration_ms, memory_bytes
@@ -42,8 +42,11 @@ class Feeding:
         """The median time of the calibrating piece of work between the updates; None where there was none."""
         return round(float(np.median(self._calibrations)), 4) if self._calibrations else None
 
-    def up_to(self, n_fed: int, frames: Sequence[Frame], n_frames: int) -> None:
-        """Feed the frames that are missing to ``n_fed``; ``n_frames`` are all that will come."""
+    def up_to(self, n_fed: int, frames: ReadAhead[Frame], n_frames: int) -> None:
+        """Feed the frames that are missing to ``n_fed``; ``n_frames`` are all that will come.
+
+        Stage ``decode`` is what an update waited for its frame.
+        """
         if not self._rows and n_frames:
             self._report(Event(self._scene, self._method.name, 0, n_frames))
         for update in range(len(self._rows), n_fed):
@@ -56,11 +59,11 @@ class Feeding:
                 Event(self._scene, self._method.name, update + 1, n_frames, None if size is None else int(size))
             )
 
-    def _feed(self, update: int, frames: Sequence[Frame]) -> Row:
+    def _feed(self, update: int, frames: ReadAhead[Frame]) -> Row:
         timer, method = self._timer, self._method
         start = time.perf_counter()
         with timer.stage("decode"):
-            frame = frames[update]
+            frame = frames.next_frame()
         if not (frame.depth_m > 0).any():
             raise DataError(f"{self._scene} frame {frame.index}: depth is empty, no pixel is above 0 m")
         detections = self._detect(frame)

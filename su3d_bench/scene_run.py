@@ -25,8 +25,10 @@ from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_p
 from su3d_bench.protocols import SHARE_KINDS, ProtocolRules, load_protocol
 from su3d_bench.questions.refined import refined_digest, refined_names
 from su3d_bench.questions.truths import question_truth
+from su3d_bench.read_ahead import ReadAhead
 from su3d_bench.reports.pictures import draw_scene
 from su3d_bench.scene_feeding import Feeding
+from su3d_bench.scene_log import SceneLog
 from su3d_bench.scene_tools import FirstFrames, surface_of, true_proposals
 from su3d_bench.scoring import SceneScore, Truth, pack_scores, score_scene, why_not_scorable
 from su3d_bench.store import JobFolder, RunFolder, read_prediction, write_bytes, write_text
@@ -155,7 +157,8 @@ def failed_outcomes(job: SceneJob, reason: str) -> tuple[MethodOutcome, ...]:
     for part in job.methods:
         folder = RunFolder(job.folder).job(job.scene, part.name)
         folder.prepare()
-        write_text(folder.log, f"failed: {line}\n")
+        if "score" not in folder.seals():
+            write_text(folder.log, f"failed: {line}\n")
     return tuple(MethodOutcome(job.scene, part.name, error=line) for part in job.methods)
 
 
@@ -164,7 +167,7 @@ def _guarded(scene: _Scene, part: Part) -> MethodOutcome:
     job = scene.job
     folder = RunFolder(job.folder).job(job.scene, part.name)
     folder.prepare()
-    log = _Log()
+    log = SceneLog()
     package = logging.getLogger("su3d_bench")
     package.addHandler(log)
     try:
@@ -178,8 +181,8 @@ def _guarded(scene: _Scene, part: Part) -> MethodOutcome:
         outcome = MethodOutcome(job.scene, part.name, error=line)
     finally:
         package.removeHandler(log)
-    if not outcome.was_resumed:
-        write_text(folder.log, "\n".join([*log.lines, *([] if outcome.error else ["done"])]) + "\n")
+    if outcome.error is not None:
+        write_text(folder.log, log.text())
     return outcome
 
 
@@ -187,20 +190,6 @@ def error_line(error: Exception) -> str:
     """One line for any error; one that is not ours says its type."""
     text = " ".join(str(error).split())
     return text if isinstance(error, Su3dError) else f"{type(error).__name__}: {text}"
-
-
-class _Log(logging.Handler):
-    """Keeps what the library says while a scene runs: all ``lines`` for its log, ``warnings`` for the record too."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.lines: list[str] = []
-        self.warnings: list[str] = []
-
-    def emit(self, record: logging.LogRecord) -> None:
-        self.lines.append(f"{record.levelname.lower()}: {record.getMessage()}")
-        if record.levelno >= logging.WARNING:
-            self.warnings.append(record.getMessage())
 
 
 class _Scene:
@@ -245,7 +234,7 @@ class _Scene:
             is_offline=self.job.is_offline,
         )
 
-    def run(self, part: Part, folder: JobFolder, log: _Log) -> MethodOutcome:
+    def run(self, part: Part, folder: JobFolder, log: SceneLog) -> MethodOutcome:
         """Predict and score one method, each step only where its seal is missing or broken."""
         method = build_method(part)
         info = self.dataset.info(self.job.scene_name, stride_of(self.job.stride, part.options))
@@ -256,8 +245,10 @@ class _Scene:
             key |= {"profile": perception.profile, "perception": perception.digest}
         refuse_other_run(folder, key)
         was_resumed = folder.is_done("predict", key)
-        if not was_resumed:
-            self._predict(method, info, perception, folder, key)
+        if was_resumed:
+            log.recall(folder.remarks("predict"))
+        else:
+            self._predict(method, info, perception, folder, key, log)
         score_key = {"predict": digest_json(key), "encoder": perception.encoder.digest}
         score_key |= {"pictures": str(self.job.pictures)}
         score_key |= {f"protocol.{name}": load_protocol(name).digest for name in self.job.protocols}
@@ -280,7 +271,13 @@ class _Scene:
         )
 
     def _predict(
-        self, method: Method, info: SceneInfo, perception: Perception, folder: JobFolder, key: Mapping[str, str]
+        self,
+        method: Method,
+        info: SceneInfo,
+        perception: Perception,
+        folder: JobFolder,
+        key: Mapping[str, str],
+        log: SceneLog,
     ) -> None:
         frames: Sequence[Frame] = ()
         n = 0
@@ -294,13 +291,14 @@ class _Scene:
                 raise GroundTruthMissing(f"{self.job.scene}: {method.name} needs ground truth, the dataset has none")
             method.receive_truth(self.truth(self.dataset.variants[0]))
         start_memory_watch()
-        method.start(info)
         feeding = Feeding(self.job.scene, method, perception, self.report)
         shares = self.job.anytime if method.needs.frames else ()
-        for share in shares:
-            feeding.up_to(math.ceil(share * n), frames, n)
-            feeding.write_map(folder.anytime(share))
-        feeding.up_to(n, frames, n)
+        with ReadAhead(frames, n) as ahead:
+            method.start(info)
+            for share in shares:
+                feeding.up_to(math.ceil(share * n), ahead, n)
+                feeding.write_map(folder.anytime(share))
+            feeding.up_to(n, ahead, n)
         feeding.write_map(folder.prediction)
         if hasattr(method, "close"):
             method.close()
@@ -312,7 +310,7 @@ class _Scene:
             "peak_rss_bytes": peak_memory_bytes(),
             "device_bytes": device_memory_bytes(),
         }
-        folder.seal("predict", key, files, {"costs": costs})
+        folder.seal("predict", key, files, {"costs": costs} | log.remarks())
 
     def _tools(self, method: Method, perception: Perception, frames: Sequence[Frame], n: int) -> SceneTools:
         return SceneTools(
@@ -327,7 +325,9 @@ class _Scene:
             raise GroundTruthMissing(f"{self.job.scene}: proposals 'oracle' need ground truth, the dataset has none")
         return true_proposals(self.truth(self.dataset.variants[0]))
 
-    def _score(self, part: Part, perception: Perception, folder: JobFolder, key: Mapping[str, str], log: _Log) -> None:
+    def _score(
+        self, part: Part, perception: Perception, folder: JobFolder, key: Mapping[str, str], log: SceneLog
+    ) -> None:
         """Score under every protocol that has a truth here, draw the map, and seal; reasons for the others go along."""
         prediction = read_prediction(folder.prediction)
         scores, unscored = self._scores(part, perception, prediction, folder)
@@ -340,8 +340,10 @@ class _Scene:
         if self.job.pictures:
             truth_to_draw = next(iter(self._truths.values()), None)
             files += draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
-        remarks = {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings))}
-        folder.seal("score", key, files, remarks)
+        write_text(folder.log, log.text("done"))
+        folder.seal(
+            "score", key, [*files, folder.log], {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings))}
+        )
 
     def _scores(
         self, part: Part, perception: Perception, prediction: Prediction, refined_in: JobFolder | None

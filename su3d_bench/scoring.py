@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import io
 import json
-import zipfile
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
@@ -17,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.errors import DataError, PredictionError
+from su3d_bench.kept_files import DAMAGE, read_arrays
 from su3d_bench.metrics import instance_ap, object_means, semantic, shares, transfer
 from su3d_bench.metrics.openlex3d import OpenLexTruth
 from su3d_bench.metrics.query_ap import QueryTruth
@@ -196,11 +196,10 @@ def pack_scores(scores: Mapping[str, SceneScore]) -> bytes:
 def unpack_scores(data: bytes) -> dict[str, SceneScore]:
     """What ``pack_scores`` packed; raises ``DataError`` for anything else."""
     try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as archive:
-            arrays = {key: archive[key] for key in archive.files}
+        arrays = read_arrays(io.BytesIO(data))
         names = [key.removesuffix("/about") for key in arrays if key.endswith("/about")]
         return {name: _unpack_one(name, arrays) for name in names}
-    except (ValueError, KeyError, TypeError, EOFError, OSError, zipfile.BadZipFile) as error:
+    except DAMAGE as error:
         raise DataError(f"counts: are damaged or of another version ({error}); score the scene again") from error
 
 

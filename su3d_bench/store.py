@@ -12,9 +12,10 @@ import fcntl
 import io
 import json
 import os
+import secrets
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
@@ -24,6 +25,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.digests import digest_file
 from su3d_bench.errors import PredictionError, StoreError
+from su3d_bench.kept_files import DAMAGE, read_arrays
 from su3d_bench.row_blocks import row_blocks
 from su3d_bench.types import DenseFeatures, Instances, Partition, Prediction
 
@@ -36,9 +38,14 @@ REASONS = {
     errno.EACCES: "the folder is read-only; choose another with --out",
     errno.EPERM: "the folder is read-only; choose another with --out",
     errno.EROFS: "the folder is read-only; choose another with --out",
+    errno.EFBIG: "the file grows beyond what this disk or account allows; raise the limit or choose another with --out",
+    errno.ENOLCK: "this disk has no locks to give; choose a folder on another disk with --out",
     errno.ENOTDIR: "a file stands where a folder should be; choose another with --out",
     errno.EEXIST: "a file stands where a folder should be; choose another with --out",
 }
+# What a lock on a folder itself gets from network disks, which lock files that are open for writing only: flock(2).
+NO_FOLDER_LOCKS = (errno.EBADF, errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)
+LOCK_FILE = ".lock"
 
 
 def _store_error(path: Path, error: OSError) -> StoreError:
@@ -57,16 +64,20 @@ def make_folder(path: Path) -> None:
 @contextmanager
 def _replacing(path: Path) -> Iterator[IO[bytes]]:
     """A stream whose bytes take the place of ``path`` at the end, whole or not at all."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    # Machines that share a disk may have processes of one number.
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
     try:
         with temporary.open("wb") as stream:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
         os.replace(temporary, path)
-    except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise _store_error(path, error) from error
+    except BaseException as error:
+        with suppress(OSError):  # a read-only disk refuses even to remove what is not there
+            temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise _store_error(path, error) from error
+        raise
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -115,9 +126,8 @@ def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
 def read_npz(path: Path) -> dict[str, NDArray[Any]]:
     """The arrays of an .npz file; a damaged file is a ``StoreError``."""
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            return {name: archive[name] for name in archive.files}
-    except (OSError, ValueError, zipfile.BadZipFile, EOFError) as error:
+        return read_arrays(path)
+    except DAMAGE as error:
         raise StoreError(f"{path}: not a readable .npz file ({error}); delete it and run again") from error
 
 
@@ -189,7 +199,7 @@ def read_prediction(path: Path) -> Prediction:
     arrays = read_npz(path)
     if str(arrays.get("kind")) == DenseFeatures.__name__ and "features" not in arrays:
         arrays["features"] = _mapped_rows(features_beside(path))
-        if len(arrays["features"]) != len(arrays.get("points", ())):
+        if arrays["features"].shape[:1] != np.shape(arrays.get("points"))[:1]:
             raise StoreError(f"{features_beside(path)}: has other rows than {path.name}; delete both and run again")
     return prediction_from_arrays(arrays, str(path))
 
@@ -197,7 +207,7 @@ def read_prediction(path: Path) -> Prediction:
 def _mapped_rows(path: Path) -> NDArray[Any]:
     try:
         table: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
-    except (OSError, ValueError, OverflowError) as error:
+    except DAMAGE as error:
         raise StoreError(f"{path}: not a readable .npy file ({error}); delete it and run again") from error
     if table.ndim != 2 or table.dtype.kind != "f":
         raise StoreError(f"{path}: holds {table.dtype} {table.shape}, no rows of features; delete it and run again")
@@ -218,26 +228,40 @@ class RunFolder:
     def locked(self) -> Iterator[None]:
         """Hold the folder against a second run; the lock dies with the process and leaves no file behind."""
         make_folder(self.path)
+        handle = _lock(self.path)
         try:
-            handle = os.open(self.path, os.O_RDONLY)
-        except OSError as error:
-            raise _store_error(self.path, error) from error
-        try:
-            try:
-                fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError as error:
-                raise StoreError(
-                    f"{self.path}: another run is writing here; wait for it or choose another folder with --out"
-                ) from error
             _clear_half_written(self.path)
             yield
         finally:
             os.close(handle)
 
 
+def _lock(folder: Path) -> int:
+    """An open file that holds the lock of ``folder``; a ``StoreError`` where another process has it."""
+    handle = -1
+    try:
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError as error:
+            if error.errno not in NO_FOLDER_LOCKS:
+                raise
+            os.close(handle)
+            handle = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666)
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except OSError as error:
+        if handle >= 0:
+            os.close(handle)
+        if isinstance(error, BlockingIOError):
+            message = f"{folder}: another run is writing here; wait for it or choose another folder with --out"
+            raise StoreError(message) from error
+        raise _store_error(folder, error) from error
+    return handle
+
+
 def _clear_half_written(folder: Path) -> None:
     for leftover in folder.glob(".*.tmp"):
-        leftover.unlink(missing_ok=True)
+        remove_file(leftover)
 
 
 @dataclass(frozen=True)

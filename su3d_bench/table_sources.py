@@ -16,7 +16,7 @@ from su3d_bench.metrics.results import ProtocolResult
 from su3d_bench.plain_text import printable
 from su3d_bench.reports.latex import PrintedCell, printed_cells
 from su3d_bench.reports.measured import BY_PEOPLE, Measured
-from su3d_bench.reports.table_model import Origin
+from su3d_bench.reports.table_model import Origin, is_count
 from su3d_bench.scene_run import CEILING_METHOD
 from su3d_bench.scoring import combine
 from su3d_bench.sheets.score_file import FILE as SCORES_FILE
@@ -163,9 +163,12 @@ def _measured(run: str, limit: int, one: _Result, names: Sequence[str]) -> Measu
     )
 
 
-def choose(found: Sequence[Measured], methods: Sequence[str], protocols: Sequence[str]) -> list[Measured]:
-    """Those of ``methods`` and ``protocols``, all where none is named, methods in the order asked for."""
+def choose(
+    found: Sequence[Measured], methods: Sequence[str], protocols: Sequence[str], datasets: Sequence[str] = ()
+) -> list[Measured]:
+    """Those of ``methods``, ``protocols`` and ``datasets``, all where none is named, methods in the order asked for."""
     for wanted, known, what in (
+        (datasets, {scene.partition("/")[0] for one in found for scene in one.per_scene}, "dataset"),
         (methods, {one.method for one in found}, "method"),
         (protocols, {one.protocol for one in found}, "protocol"),
     ):
@@ -173,9 +176,20 @@ def choose(found: Sequence[Measured], methods: Sequence[str], protocols: Sequenc
             if name not in known:
                 hint = suggest(name, known) or f"; they have {', '.join(sorted(known))}"
                 raise ConfigError(f"these runs hold no scores of the {what} '{printable(name, 80)}'{hint}")
-    kept = [one for one in found if not protocols or one.protocol in protocols]
+    kept = [one for one in found if not datasets or _is_of(one, datasets)]
+    kept = [one for one in kept if not protocols or one.protocol in protocols]
     kept = [one for name in methods for one in kept if one.method == name] if methods else kept
     return [one for name in protocols for one in kept if one.protocol == name] if protocols else kept
+
+
+def _is_of(one: Measured, datasets: Sequence[str]) -> bool:
+    """Whether all its scenes are of ``datasets``; refused where only some are, for its numbers are of all together."""
+    own = {scene.partition("/")[0] for scene in (*one.per_scene, *one.failed, *one.unscored)}
+    if own & set(datasets) and not own <= set(datasets):
+        raise ConfigError(
+            f"{one.protocol}: its numbers are of {one.datasets} together; name all of these or none, or run them apart"
+        )
+    return bool(own) and own <= set(datasets)
 
 
 @dataclass(frozen=True)
@@ -292,7 +306,7 @@ def _check(cell: PrintedCell, file: str, recomputed: _Recomputed) -> CellCheck:
 
 
 def _numbers(origin: Origin, result: _Numbers) -> list[float] | None:
-    """What the cell should show: per cent, and the interval where it has one; None where the run lacks it."""
+    """What the cell should show: per cent or a count, then its interval where shown; None where the run lacks it."""
     if origin.what == "scenes":
         return [float(result.n_scenes)]
     value = result.metrics.get(origin.metric)
@@ -301,4 +315,5 @@ def _numbers(origin: Origin, result: _Numbers) -> list[float] | None:
     interval = result.intervals.get(origin.metric) if origin.interval is not None else None
     if origin.interval is not None and interval is None:
         return None
-    return [100.0 * value, *(100.0 * end for end in interval or ())]
+    scale = 1.0 if is_count(origin.metric) else 100.0
+    return [scale * value, *(scale * end for end in interval or ())]

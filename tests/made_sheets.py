@@ -41,6 +41,7 @@ def drafts_of(kind: SheetKind, texts: Sequence[str]) -> list[Draft]:
     by = itertools.cycle((("opensu3d@scheme1",), ("opensu3d@scheme1", "opensu3d@scheme4")))
     return [
         Draft(
+            kind=kind,
             scene="rooms/secret-scene",
             methods=methods,
             instance_ids=tuple(range(70 + k, 70 + k + len(methods))),

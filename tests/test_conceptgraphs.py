@@ -150,7 +150,9 @@ def test_scores_are_ones_or_what_is_configured_and_the_caveat_says_so(rule: str,
 
 def test_nothing_seen_is_an_empty_map() -> None:
     method = mapped(ConceptGraphs(), [[], []])
-    assert (len(method.finish()), method.n_points, method.n_instances) == (0, 0, 0)
+    assert (len(method.finish()), method.n_points, method.n_instances, method.map_bytes) == (0, 0, 0, 0)
+    seen = mapped(ConceptGraphs(BARE), [[LEFT]])
+    assert seen.map_bytes > seen.n_points * 3 * 8 > 0
 
 
 def test_class_agnostic_means_that_names_decide_nothing() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 from measured_rows import SCENES, measured
-from simulated_annotators import RATES, SCHEMES, annotation_set, answered, retrieval_set
+from simulated_annotators import RATES, SCHEMES, annotation_set, answered, reasoning_set, retrieval_set
 
 from su3d_bench.cli.main import main
 from su3d_bench.errors import ConfigError
@@ -106,6 +106,24 @@ def test_each_dataset_has_a_table_with_the_papers_rows_for_it() -> None:
     reported = [row for row in tables[1].rows if row.is_reported]
     assert [cell.text for cell in reported[-1].cells[:4]] == ["90", "70", "70", "70"]  # scheme 4 on ScanNet
     assert all("not the paper's" not in one.caption for one in tables)
+
+
+def test_reasoning_has_its_scores_above_the_papers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    sheet, key = reasoning_set([("right", "right"), ("right", "wrong"), ("wrong", "wrong"), ("right", "right")])
+    checked = check_answers(sheet, answered(sheet, key, {"ann": 0.0}))
+    write_scores(tmp_path, score(sheet, key, checked.judgements))
+    (table,) = told(capsys, str(tmp_path), "--table", "reasoning")
+    assert table["columns"] == ["reasoning-accuracy", "objects", "scenes"]
+    assert list(texts(table).values()) == [["75.0", "50.0", "1"]]
+    assert [row["cells"][0]["text"] for row in table["rows"] if row["is_reported"]] == ["83", "68"]
+    assert len({row["mark"] for row in table["rows"] if row["is_reported"]}) == 2
+    rows = [*measured_results([tmp_path]), by_truth("a: b", "reasoning", "rooms", answer=0.6, objects=0.5)]
+    tables = judged_table("reasoning", rows, Shown(), with_published=True)
+    assert [row.cells[0].text for row in tables[0].rows if not row.is_reported] == ["75.0", "60.0"]
+    paper = tmp_path / "paper.tex"
+    paper.write_text(latex(judged_table("reasoning", rows[:1], Shown(), with_published=True)))
+    checks = check_paper(paper)
+    assert len(checks) == 3 and [check.fault for check in checks if check.fault] == []
 
 
 def test_without_judged_rows_the_message_says_what_makes_them() -> None:

@@ -298,6 +298,7 @@ class TestMethod:
         assert found.views.tolist() == [[0, 0], [30, 0], [0, 1], [30, 1]]
         assert method.finish_costs["n_frames_again"] == 2 and method.finish_costs["n_views"] == 4
         assert (method.n_points, method.n_instances) == (len(WALL), 2)
+        assert method.map_bytes > 12 * len(WALL)
 
     def test_finish_midway_changes_nothing_and_the_same_run_gives_the_same(self) -> None:
         proposals, frames = made(WALL, LEFT + MIDDLE, RIGHT), [frame(0), frame(10, x_m=0.1)]

@@ -87,7 +87,10 @@ def test_a_percentage_stays_as_printed() -> None:
         (WHOLE.replace('"1.0"', "1.0"), "figure 1: values.AP = 1.0: input should be a valid string"),
         (WHOLE.replace('"1.0"', '"about 1"'), "figure 1: values.AP = 'about 1': string should match pattern"),
         (WHOLE.replace('{ AP = "1.0" }', "{}"), "figure 1: values = {}: dictionary should have at least 1 item"),
-        (WHOLE + 'table = "VI"\n', "figure 1: table = 'VI': input should be 'I', 'II', 'III', 'IV' or 'V'"),
+        (
+            WHOLE + 'table = "VI"\n',
+            "figure 1: table = 'VI': input should be 'I', 'II', 'III', 'IV', 'V' or 'reasoning'",
+        ),
         (WHOLE.replace('"A paper', '"A \\u001b[31m'), ""),
         ("figure = 3", "'figure' is no list; write each as [[figure]]"),
         ("figure = [", "is no TOML"),

@@ -136,6 +136,25 @@ def test_damaged_comments_are_found_as_cells_without_an_origin() -> None:
         assert cell.origin is None
 
 
+def wide_and_high(n_rows: int) -> Table:
+    """More columns than a page is wide, more rows than it is high, and labels that must be broken."""
+    columns = tuple(f"column {k}" for k in range(9))
+    label = "opensu3d@crop_ratios=[0.8,1.0,1.2,1.4,1.6]: refined label (n'), ground truth"
+    cells = tuple(Cell(f"{k}2.3", "[41.2, 61.8]") for k in range(9))
+    rows = tuple(TableRow(f"{label} {k}", cells, group=str(k // 30)) for k in range(n_rows))
+    return Table("wide", "A wide table.", "method, judge", columns, rows, ("a note of the table " * 12,))
+
+
+def test_a_table_too_large_for_a_page_is_divided_and_loses_nothing() -> None:
+    text = latex([wide_and_high(40)])
+    floats = text.split(r"\begin{table*}")[1:]
+    assert len(floats) > 2
+    assert text.count("{[}41.2, 61.8{]}") == 40 * 9
+    assert text.count(r"\label{tab:wide}") == 1
+    assert text.count("(continued)") == text.count(r"\addtocounter{table}{-1}") == len(floats) - 1
+    assert [("a note of" in one) for one in floats] == [False] * (len(floats) - 1) + [True]
+
+
 @pytest.mark.skipif(shutil.which("pdflatex") is None, reason="pdflatex is not installed (texlive-latex-base, booktabs)")
 def test_the_tables_compile_without_a_warning(tmp_path: Path) -> None:
     shown = Shown(intervals=True, ceilings=True, scenes_count=True)
@@ -147,6 +166,7 @@ def test_the_tables_compile_without_a_warning(tmp_path: Path) -> None:
         *paper_table("III", instances, shown, with_published=True),
         ablation_table([*rows, *instances], [SweepRow("m", "5", "opensu3d")], Shown(), with_published=True),
         replace(hostile_table(), columns=("=f", "<b>")),
+        wide_and_high(40),
     ]
     tables = [replace(table, name=f"{table.name} {k}") for k, table in enumerate(tables)]
     (tmp_path / "tables.tex").write_text(latex(tables))

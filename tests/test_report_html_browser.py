@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 import json
+import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -21,6 +22,8 @@ pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium"
 PAINTED = f"{Path(__file__).parent}/painted.py"
 # WebGL without a graphics card.
 SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+MIDDLE_SECTIONS = ("Scenes", "Classes", "Confusion", "Errors", "Timing", "Compare")
+WHOLE = "!document.querySelector('#main[aria-busy]')"  # sections are filled one after the other
 SELECT = "[...document.querySelectorAll('#{part} select')].find((one) => one.labels[0].textContent === '{label}')"
 
 
@@ -52,6 +55,7 @@ def browser(page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Ch
         patch.setattr(chromium, "FLAGS", (*chromium.FLAGS, *SOFTWARE_GL))
         with Chromium(tmp_path_factory.mktemp("profile")) as found:
             found.open(page)
+            found.until(WHOLE)
             yield found
 
 
@@ -370,9 +374,107 @@ def test_every_control_has_a_name_and_the_page_no_sideways_scroll_on_a_phone(
     assert nameless == 0
     with Chromium(tmp_path / "phone", width=390, height=844, is_phone=True) as phone:
         phone.open(page)
+        phone.until(WHOLE)
         assert phone.run("document.documentElement.scrollWidth <= innerWidth")
         assert phone.run("document.querySelectorAll('section.part').length") == 9
         assert faults(phone) == []
+
+
+# Every control of the page, by its section, kind and name; column headers and rows of tables apart.
+CONTROLS = {
+    *(("nav", "a", name) for name in (*MIDDLE_SECTIONS, "Summary", "Maps", "Provenance")),
+    ("skip", "a", "Skip to the numbers"),
+    *(("maps", "select", name) for name in ("Scene", "Map", "Colour by", "Text")),
+    *(("maps", "button", name) for name in ("Zoom in", "Zoom out", "Whole map")),
+    ("maps", "input", "Cut above"),
+    ("maps", "input", "Filter instances"),
+    ("maps", "canvas", "3D view"),
+    ("scenes", "select", "Protocol"),
+    ("scenes", "select", "Metric"),
+    ("scenes", "input", "Filter scenes"),
+    ("classes", "select", "Protocol"),
+    ("classes", "select", "Column"),
+    ("classes", "input", "Filter classes"),
+    ("confusion", "select", "Protocol"),
+    ("confusion", "select", "Method"),
+    ("confusion", "input", "Filter classes"),
+    ("errors", "select", "Protocol"),
+    ("errors", "select", "Metric"),
+    *(("timing", "select", name) for name in ("Scene", "Time of", "Against", "Stages of", "Protocol", "Metric")),
+    ("compare", "select", "A"),
+    ("compare", "select", "B"),
+    ("compare", "button", "Swap"),
+    ("provenance", "summary", "Rules and data"),
+    ("provenance", "summary", "Settings"),
+    ("provenance", "input", "Filter settings"),
+}
+# Operates the k-th control of a kind in a section, and says whether it could: a choice of one cannot be changed.
+OPERATE = """(part, kind, k) => {
+  const one = document.querySelectorAll(`${part} ${kind}`)[k];
+  if (kind === 'select') {
+    if (one.options.length < 2) return false;
+    one.selectedIndex = (one.selectedIndex + 1 + (k % (one.options.length - 1))) % one.options.length;
+    one.dispatchEvent(new Event('change'));
+  } else if (kind === 'input') {
+    one.value = one.type === 'range' ? '40' : 'no row has this text';
+    one.dispatchEvent(new Event('input'));
+  } else one.click();
+  return true;
+}"""
+
+
+def names_of_controls(browser: Chromium) -> set[tuple[str, str, str]]:
+    found = browser.run(
+        "[...document.querySelectorAll('a[href], button, select, input, textarea, summary, canvas')]"
+        ".filter((one) => !one.matches('button.sort')).map((one) => [one.closest('section')?.id"
+        " || one.closest('nav')?.id || one.className, one.localName,"
+        " (one.labels?.[0]?.textContent || one.getAttribute('aria-label')"
+        " || one.textContent).trim()])"
+    )
+    return {(part, kind, re.sub(r" \(\d+\)$| of .* by .*", "", name)) for part, kind, name in found}
+
+
+def test_the_list_of_controls_is_whole(browser: Chromium) -> None:
+    open_maps(browser)
+    assert names_of_controls(browser) == CONTROLS
+
+
+@pytest.mark.parametrize("part", ["summary", *(name.lower() for name in MIDDLE_SECTIONS), "provenance", "maps"])
+def test_each_control_of_a_section_changes_what_it_shows(browser: Chromium, part: str) -> None:
+    open_maps(browser)
+    browser.run("document.querySelectorAll('details').forEach((one) => { one.open = false; })")
+    shown = f"document.getElementById('{part}').outerHTML + document.querySelector('#{part} select')?.value"
+    n_operated = 0
+    if part == "confusion":  # the other methods confuse nothing
+        choose(browser, part, "Method", next(one for one in options(browser, part, "Method") if "noise" in one))
+    for kind in ("button.sort", "summary", "input", "select", "button:not(.sort)"):
+        for k in range(browser.run(f"document.querySelectorAll('#{part} {kind}').length")):
+            is_of_view = part == "maps" and kind == "button:not(.sort)"
+            if is_of_view:  # so that the whole map is another picture than this one
+                press(browser, "#maps canvas", "ArrowLeft")
+            before, seen = browser.run(shown), picture(browser) if is_of_view else b""
+            if kind == "select" and browser.run(
+                f"document.querySelectorAll('#{part} select')[{k}].closest('[hidden]')"
+            ):
+                continue
+            if not browser.run(f"({OPERATE})('#{part}', {json.dumps(kind)}, {k})"):
+                continue
+            n_operated += 1
+            if seen:
+                assert picture(browser) != seen, (kind, k)
+            else:
+                browser.until(f"{shown} !== {json.dumps(before)}")
+    assert n_operated > 0
+
+
+def test_each_link_leads_to_its_section(browser: Chromium) -> None:
+    for link in ("#nav a", "a.skip"):
+        for k in range(browser.run(f"document.querySelectorAll('{link}').length")):
+            target = browser.run(f"document.querySelectorAll('{link}')[{k}].hash")
+            browser.run(f"document.querySelectorAll('{link}')[{k}].click()")
+            browser.until(f"location.hash === {json.dumps(target)}")
+            place = f"document.querySelector({json.dumps(target)}).getBoundingClientRect()"
+            assert browser.run(f"{place}.top < innerHeight && {place}.bottom > 0"), target
 
 
 def test_without_webgl_the_page_says_so_and_keeps_its_numbers(
@@ -382,7 +484,7 @@ def test_without_webgl_the_page_says_so_and_keeps_its_numbers(
     with Chromium(tmp_path / "profile") as browser:
         browser.open(page)
         browser.run("document.getElementById('maps').scrollIntoView()")
-        assert "no WebGL 2" in text_of(browser, "#maps .say")
+        browser.until("document.querySelector('#maps .say')?.innerText.includes('no WebGL 2')")
         browser.until("document.querySelectorAll('#maps .side tbody tr').length > 0")
         browser.run("document.querySelector('#maps .side tbody tr').click()")
         assert "Points" in text_of(browser, "#maps .detail")

@@ -123,7 +123,7 @@ def test_runs_on_other_data_do_not_stand_in_one_table(sweep: Path, tmp_path: Pat
 @pytest.mark.parametrize(
     ("words", "line"),
     [
-        (["--table", "IV"], "Table IV: needs protocol rooms-retrieval, "),
+        (["--table", "IV"], "Table IV: needs protocol rooms-retrieval "),
         (["--table", "V"], "or scores of sheets of kind annotation; there are rooms-semantic"),
         (["--methods", "colector"], "hold no scores of the method 'colector'; did you mean 'collector'?"),
         (["--protocols", "rooms"], "hold no scores of the protocol 'rooms'"),

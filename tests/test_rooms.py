@@ -185,7 +185,7 @@ def test_a_damaged_cache_file_is_made_anew(rooms: Rooms, damage: str) -> None:
     path.write_bytes(damaged[damage])
     assert _same(rooms.scan(SCENE), good)
     assert path.read_bytes() == content
-    assert not list(path.parent.glob("*.partial"))
+    assert not list(path.parent.glob(".*"))
 
 
 def test_a_cache_that_cannot_be_written_is_said_so(tmp_path: Path) -> None:

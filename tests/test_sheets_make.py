@@ -25,7 +25,7 @@ from su3d_bench.questions.model import new_question
 from su3d_bench.reports.frame_views import best_view, mask_in_frame, seen_in
 from su3d_bench.reports.heat_scales import SCALES, scale_stops, similarity_colours
 from su3d_bench.reports.item_picture import ItemParts, Panel, compose, png_bytes, zoomed
-from su3d_bench.sheets.drafts import annotation_drafts, reasoning_drafts, retrieval_drafts
+from su3d_bench.sheets.drafts import annotation_drafts, retrieval_drafts
 from su3d_bench.sheets.drawing import Artist
 from su3d_bench.sheets.drawing_jobs import SceneDrafts, _lost, draw_all, draw_scene
 from su3d_bench.sheets.items import (
@@ -38,6 +38,7 @@ from su3d_bench.sheets.items import (
     write_sheet,
 )
 from su3d_bench.sheets.making import table_csv, write_sheets
+from su3d_bench.sheets.reasoning_drafts import built_in, reasoning_drafts
 from su3d_bench.sheets.run_source import RunSource
 from su3d_bench.types import Frame
 
@@ -216,7 +217,7 @@ def test_labels_are_asked_in_drawn_order_and_equal_ones_once(
 
 def test_answers_that_maps_share_are_judged_once(source: RunSource) -> None:
     question = new_question("painted/a", "reasoning", "How many chairs are there?", None, "test")
-    drafts = reasoning_drafts(source, "painted/a", [question], 1, WordEncoder())
+    drafts = reasoning_drafts(source, "painted/a", [question], 1, built_in(WordEncoder()))
     assert [one.methods for one in drafts] == [METHODS[:2], METHODS[2:]]
     assert drafts[0].text.startswith("How many chairs are there?\nAnswer: ")
     assert all(one.automatic == {} for one in drafts)
@@ -229,12 +230,12 @@ def test_the_picture_of_an_item_is_small_and_shows_the_object(source: RunSource,
         draft = replace(draft, similarity=np.array([0.1, 0.9, 0.2, 0.3]))
     if kind == "reasoning":
         draft = replace(draft, names=("chair #1", "sofa #2", "table #3", "wall #4"), others=(0,))
-    content = Artist(source, kind).draw(draft)
+    content = Artist(source).draw(draft)
     picture = np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(int)
     assert len(content) < 150_000 and picture.shape[1] == 960
     is_outline = (np.abs(picture - [255, 64, 200]).sum(axis=2) < 60).mean()
     assert is_outline > 0.001
-    assert content == Artist(source, kind).draw(draft)
+    assert content == Artist(source).draw(draft)
 
 
 @pytest.mark.parametrize("text", HOSTILE)
@@ -302,7 +303,7 @@ def test_sheets_are_made_from_the_command_line(
     monkeypatch.setattr(query, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
     words = ["sheets", "make", "run", "--kind", "retrieval", "--out", "out"]
     assert main([*words, "--questions", "queries.csv", "--annotators", "2", "--json"]) == 0
-    told = json.loads(capsys.readouterr().out)
+    (told,) = json.loads(capsys.readouterr().out)["sets"]
     sheet: Sheet = read_sheet(folder / "out" / "sheet.json")
     key = read_key(folder / "out-key" / "key.json")
     assert told["sheet_id"] == sheet.id == key.sheet_id
@@ -362,10 +363,10 @@ def test_scenes_drawn_in_processes_give_the_pictures_in_order(source: RunSource,
         for k, one in enumerate(drafts_of("retrieval", TEXTS[:3]))
     ]
     told: list[tuple[int, int]] = []
-    drawn = draw_all(source, "retrieval", "paper", drafts, 1, lambda *counts: told.append(counts))
+    drawn = draw_all(source, "paper", drafts, 1, lambda *counts: told.append(counts))
     assert told == [(1, 3), (2, 3), (3, 3)]
-    assert drawn == [Artist(source, "retrieval").draw(one) for one in drafts]
-    unit = SceneDrafts(folder / "run", METHODS, "retrieval", "paper", (0,), tuple(drafts[:1]))
+    assert drawn == [Artist(source).draw(one) for one in drafts]
+    unit = SceneDrafts(folder / "run", METHODS, "paper", (0,), tuple(drafts[:1]))
     (in_process,) = run_processes(draw_scene, [unit], lambda event: None, jobs=2, lost=_lost)
     assert in_process.pictures == (drawn[0],)
     assert "try --jobs 1" in _lost(unit, "died").lost

@@ -18,13 +18,13 @@ from chromium import Chromium, find_chromium
 
 from su3d_bench.cli.main import main
 from su3d_bench.sheets.drafts import Draft
-from su3d_bench.sheets.items import CANNOT_TELL, Key, Sheet
+from su3d_bench.sheets.items import CANNOT_TELL, Key, Sheet, SheetKind
 from su3d_bench.sheets.making import PAGE, TABLE, WORKBOOK, Origin, make_sheets, write_sheets
 
 HOSTILE = '=HYPERLINK("x") <script>alert(1)</script> \u202eabc " , ; \U0001f600'
 
 
-def drafts(kind: str, n: int) -> list[Draft]:
+def drafts(kind: SheetKind, n: int) -> list[Draft]:
     """``n`` things to judge, of which the truth says by turns all that it can say."""
     found = []
     for k in range(n):
@@ -40,7 +40,7 @@ def drafts(kind: str, n: int) -> list[Draft]:
             more = {"asks": ("answer", "objects"), "automatic": {"answer": right, "objects": other}}
             more["question_kind"] = "closer"
         more["question_id"] = "" if kind == "annotation" else f"q{k}"
-        found.append(Draft("rooms/a", ("opensu3d",), (k,), (k,), (HOSTILE,), f"{HOSTILE} {k}", **more))
+        found.append(Draft(kind, "rooms/a", ("opensu3d",), (k,), (k,), (HOSTILE,), f"{HOSTILE} {k}", **more))
     return found
 
 

@@ -121,7 +121,10 @@ def test_the_report_prints_tables_and_writes_them_with_plots(
     assert {"map", "total"} <= {row["stage"] for row in rows}
     assert all(int(row["n"]) == 10 and float(row["p50_ms"]) >= 0 for row in rows)
     assert (tmp_path / "timing.md").read_text().startswith(str(run))
-    for name in ("update-cost", "stages", "anytime"):
+    (method,) = csv.DictReader((tmp_path / "methods.csv").open())
+    assert float(method["real_time_factor"]) == pytest.approx(float(method["frames_per_s"]) / 30)
+    assert int(method["peak_rss_bytes"]) > 1e6
+    for name in ("update-cost", "update-course", "memory", "stages", "anytime"):
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert (tmp_path / f"{name}.pdf").read_bytes().startswith(b"%PDF")
 

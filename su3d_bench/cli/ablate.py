@@ -16,13 +16,20 @@ def add_parser(verbs: Any) -> None:
         "ablate",
         "Vary settings of a method, each on its own, over scenes; perception is computed once.",
         (
-            "su3d-bench ablate --vary m=1,5,10 k=1,3,5 --scenes 'rooms/*' --out runs/table1",
+            "su3d-bench ablate --vary m=1,5,10 k=1,3,5 --beside conceptgraphs --scenes 'rooms/*' --out runs/sweep",
             "su3d-bench ablate --method conceptgraphs --vary sim_threshold=1.0,1.2 stride=5,10 --grid --dry-run",
         ),
         call,
     )
     parser.add_argument("--vary", nargs="+", required=True, metavar="KEY=V1,V2", help="settings and their values")
     parser.add_argument("--method", default="opensu3d", help="name or file.py:Class (default: opensu3d)")
+    parser.add_argument(
+        "--beside",
+        nargs="+",
+        default=[],
+        metavar="METHOD",
+        help="other methods in the same run, as run --methods takes",
+    )
     parser.add_argument("--grid", action="store_true", help="every combination, instead of one setting at a time")
     add_run_flags(parser)
 
@@ -33,7 +40,8 @@ def call(arguments: argparse.Namespace) -> int:
 
     rows = ablation_rows(arguments.method, arguments.vary, is_grid=arguments.grid)
     own_name = str(registry.load("method", arguments.method).name)
-    arguments.methods = list(dict.fromkeys(arguments.method + row.method.removeprefix(own_name) for row in rows))
+    swept = [arguments.method + row.method.removeprefix(own_name) for row in rows]
+    arguments.methods = list(dict.fromkeys([*swept, *arguments.beside]))
     plan = plan_of(arguments)
     for note in plan.notes:
         remark(note, quiet=arguments.quiet)

@@ -29,6 +29,7 @@ from su3d_bench.cli import (
     sheets,
 )
 from su3d_bench.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_WRONG_INPUT, ConfigError, Su3dError, suggest
+from su3d_bench.plain_text import printable
 
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 DESCRIPTION = "Evaluate and benchmark open-vocabulary, instance-level 3D scene understanding from RGB-D."
@@ -54,11 +55,11 @@ class Parser(argparse.ArgumentParser):
 
     def _with_suggestion(self, message: str) -> str:
         if message.startswith("unrecognized arguments: "):
-            word = message.removeprefix("unrecognized arguments: ").split()[0]
+            word = [*message.removeprefix("unrecognized arguments: ").split(), ""][0]
             return f"unknown argument '{word}'{suggest(word, self._option_string_actions)}"
         if "invalid choice: " in message:
             argument, _, rest = message.partition(": invalid choice: ")
-            word = rest.split("'")[1]
+            word = rest.partition(" (choose from")[0][1:-1]  # a repr, with either kind of quotes
             known = [choice for action in self._actions for choice in (action.choices or ())]
             return f"unknown {argument.removeprefix('argument ')} '{word}'{suggest(word, map(str, known))}"
         return message
@@ -113,7 +114,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Su3dError as error:
         if is_debug:
             raise
-        print(f"su3d-bench: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"su3d-bench: {error}", file=sys.stderr)
         return error.exit_code
     except KeyboardInterrupt:
         print("su3d-bench: interrupted; the same command takes it up again", file=sys.stderr)
@@ -123,7 +124,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     except Exception as error:
         if is_debug:
             raise
-        text = " ".join(f"{type(error).__name__}: {error}".split())
+        text = printable(f"{type(error).__name__}: {error}")
         print(f"su3d-bench: internal error: {text}; run again with --debug for the traceback", file=sys.stderr)
         return EXIT_INTERNAL
     return code

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 NAME = "tables"
 FORMATS = ("markdown", "latex", "csv", "html")
-PAPER_TABLES = ("I", "II", "III", "IV", "V")
+PAPER_TABLES = ("I", "II", "III", "IV", "V", "reasoning")
 
 
 def add_parser(actions: Any) -> None:
@@ -34,11 +34,20 @@ def add_parser(actions: Any) -> None:
         "runs", nargs="+", type=Path, metavar="RUN", help="folders of finished runs, or of what sheets score wrote"
     )
     parser.add_argument("--format", choices=FORMATS, default="markdown", help="(default: markdown)")
-    parser.add_argument("--table", nargs="+", choices=PAPER_TABLES, default=[], help="of the paper (default: none)")
-    for name, what in (("methods", "these rows, in this order"), ("protocols", "under these"), ("metrics", "columns")):
-        parser.add_argument(
-            f"--{name}", nargs="+", default=[], metavar=name[:-1].upper(), help=f"{what} alone (default: all)"
-        )
+    parser.add_argument(
+        "--table",
+        nargs="+",
+        choices=PAPER_TABLES,
+        default=[],
+        help="of the paper, or its reasoning scores (default: none)",
+    )
+    for name, what in (
+        ("methods", "these rows, in this order, alone (default: all)"),
+        ("datasets", "scenes of these alone (default: all)"),
+        ("protocols", "under these alone (default: all)"),
+        ("metrics", "these columns (default: the headline ones)"),
+    ):
+        parser.add_argument(f"--{name}", nargs="+", default=[], metavar=name[:-1].upper(), help=what)
     parser.add_argument("--intervals", action="store_true", help="show the 95 %% interval over scenes")
     parser.add_argument("--ceilings", action="store_true", help="show what the truth itself scores")
     parser.add_argument(
@@ -84,7 +93,7 @@ def _tables(arguments: argparse.Namespace) -> list[Table]:
         only_significant=arguments.significant,
     )
     with_published = bool(arguments.table) if arguments.published is None else arguments.published
-    found = choose(measured_results(arguments.runs), arguments.methods, arguments.protocols)
+    found = choose(measured_results(arguments.runs), arguments.methods, arguments.protocols, arguments.datasets)
     if not arguments.table:
         return selection_tables(found, shown, with_published=with_published)
     tables = []

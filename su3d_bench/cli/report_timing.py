@@ -31,7 +31,9 @@ def add_parser(actions: Any) -> None:
     parser.add_argument(
         "--camera-rate", type=float, default=30.0, metavar="HZ", help="frames a second of the camera (default: 30)"
     )
-    parser.add_argument("--out", type=Path, metavar="DIR", help="write timing.md, timing.csv and the plots there")
+    parser.add_argument(
+        "--out", type=Path, metavar="DIR", help="write timing.md, timing.csv, methods.csv and the plots there"
+    )
 
 
 def call(arguments: argparse.Namespace) -> int:
@@ -39,7 +41,7 @@ def call(arguments: argparse.Namespace) -> int:
 
     from su3d_bench.errors import ConfigError
     from su3d_bench.finished_run import read_run
-    from su3d_bench.reports.timing_tables import csv_text, markdown
+    from su3d_bench.reports.timing_tables import csv_text, markdown, methods_csv
     from su3d_bench.update_times import summarise
 
     if arguments.warm_up < 0 or not arguments.camera_rate > 0:
@@ -57,7 +59,12 @@ def call(arguments: argparse.Namespace) -> int:
     else:
         answer(text.rstrip("\n"))
     if arguments.out is not None:
-        _write(arguments, text, csv_text(summaries, hardware), times, anytime)
+        files = {
+            "timing.md": text,
+            "timing.csv": csv_text(summaries, hardware),
+            "methods.csv": methods_csv(summaries, hardware, arguments.camera_rate),
+        }
+        _write(arguments, files, times, anytime)
     return 0
 
 
@@ -95,14 +102,14 @@ def _seconds_until(times: UpdateTimes, index: int) -> float:
 
 
 def _write(
-    arguments: argparse.Namespace, text: str, table: str, times: list[list[UpdateTimes]], anytime: list[Any]
+    arguments: argparse.Namespace, files: dict[str, str], times: list[list[UpdateTimes]], anytime: list[Any]
 ) -> None:
     from su3d_bench.reports.timing_plots import draw_timing
     from su3d_bench.store import make_folder, write_text
 
     make_folder(arguments.out)
-    write_text(arguments.out / "timing.md", text)
-    write_text(arguments.out / "timing.csv", table)
+    for name, text in files.items():
+        write_text(arguments.out / name, text)
     pictures = draw_timing(times, anytime, arguments.warm_up, arguments.out)
-    for path in (arguments.out / "timing.md", arguments.out / "timing.csv", *pictures):
+    for path in (*(arguments.out / name for name in files), *pictures):
         remark(f"wrote {path}", quiet=arguments.quiet)

@@ -27,6 +27,11 @@ FLAGS_OF_KEYS = (
     "pictures",
     "offline",
     "anytime",
+    "executor",
+    "ray_address",
+    "gpus_per_job",
+    "retries",
+    "slurm",
 )
 
 
@@ -63,6 +68,7 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
         "--limit", type=int, metavar="N", help="only the first N updates of each scene; marks it partial"
     )
     parser.add_argument("--jobs", type=int, metavar="N", help="scenes side by side (default: the CPU cores)")
+    add_executor_flags(parser)
     parser.add_argument(
         "--pictures", action=argparse.BooleanOptionalAction, help="draw the maps into the run folder (default: yes)"
     )
@@ -75,9 +81,30 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     add_settings(parser, "such as opensu3d.top_m=10")
     parser.add_argument("--config", type=Path, metavar="FILE", help="a TOML file, such as the run.toml of a run")
     parser.add_argument(
-        "--out", type=Path, metavar="DIR", help="run folder (default: runs/<name made from the request>)"
+        "--out",
+        type=run_place,
+        metavar="DIR",
+        help="run folder, or URL of one such as s3://bucket/run (default: runs/<name made from the request>)",
     )
     parser.add_argument("--dry-run", action="store_true", help="print what would be done, with a time estimate")
+
+
+def run_place(text: str) -> Path | str:
+    """A folder, or the text of a URL."""
+    return text if "://" in text else Path(text)
+
+
+def add_executor_flags(parser: argparse.ArgumentParser) -> None:
+    """The flags that say where the scenes run; docs/clusters.md has more on them."""
+    parser.add_argument(
+        "--executor", metavar="WHERE", help="inline, processes, ray or slurm (default: processes, inline for one job)"
+    )
+    parser.add_argument("--ray-address", metavar="ADDRESS", help="of the Ray cluster (default: this machine's)")
+    parser.add_argument("--gpus-per-job", type=float, metavar="N", help="that ray or slurm gives a scene, such as 0.5")
+    parser.add_argument("--retries", type=int, metavar="N", help="of a scene whose machine was lost (default: 2)")
+    parser.add_argument(
+        "--slurm", nargs="+", metavar="KEY=VALUE", help="submitit's, such as slurm_partition=gpu timeout_min=60"
+    )
 
 
 def call(arguments: argparse.Namespace) -> int:
@@ -104,7 +131,9 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
     settings = Settings() if arguments.config is None else read_file(arguments.config)
     flags: list[tuple[KeyPath, Any]] = [((name,), getattr(arguments, name)) for name in FLAGS_OF_KEYS]
     flags.append((("perception", "models", "device"), arguments.device))
-    return settings + Settings(tuple(Setting(key, value, f"--{key[-1]}") for key, value in flags if value is not None))
+    return settings + Settings(
+        tuple(Setting(key, value, f"--{key[-1].replace('_', '-')}") for key, value in flags if value is not None)
+    )
 
 
 def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
@@ -133,7 +162,9 @@ def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
         answer(markdown_table(result.metrics))
     for line in result.remarks:
         remark(line, quiet=arguments.quiet)
-    remark(f"run folder: {result.plan.folder.path}", quiet=arguments.quiet)
+    plan = result.plan
+    place = plan.folder.path if plan.store is None else f"{plan.store} (its small files: {plan.folder.path})"
+    remark(f"run folder: {place}", quiet=arguments.quiet)
 
 
 def show_plan(plan: Plan, arguments: argparse.Namespace) -> int:

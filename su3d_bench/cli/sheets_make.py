@@ -3,23 +3,29 @@
 from __future__ import annotations
 
 import argparse
+from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.cli.language_flags import add_language_flags, chat_client, language_config
 from su3d_bench.errors import EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from su3d_bench.questions.model import Question
     from su3d_bench.sheets.drafts import Draft
+    from su3d_bench.sheets.items import SheetKind
+    from su3d_bench.sheets.reasoning_drafts import AskMap
     from su3d_bench.sheets.run_source import RunSource
+    from su3d_bench.types import Encoder
 
 NAME = "make"
 KINDS = ("retrieval", "annotation", "reasoning")
 # A person judges some hundred items without a break: so many of each kind of question and scene, instances a scene,
 # or questions of each template and scene.
+LANGUAGE_FLAGS = ("model", "base_url", "config", "set", "offline", "ask_failed_again", "dry_run")
 PER_KIND = {"retrieval": 5, "annotation": 30, "reasoning": 1}
 
 
@@ -31,11 +37,14 @@ def add_parser(actions: Any) -> None:
         (
             "su3d-bench sheets make runs/my-run --kind retrieval --out sheets/my-run",
             "su3d-bench sheets make runs/my-run --kind annotation --annotators 3 --overlap 0.3 --out sheets/labels",
+            "su3d-bench sheets make runs/my-run --kind retrieval annotation reasoning --out sheets",
         ),
         call,
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a run; variants stand side by side in it")
-    parser.add_argument("--kind", choices=KINDS, required=True, help="what is judged")
+    parser.add_argument(
+        "--kind", nargs="+", choices=KINDS, required=True, help="what is judged; several give a folder each in DIR"
+    )
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="where the sheets go")
     parser.add_argument("--key", type=Path, metavar="DIR", help="where the key goes (default: DIR-key)")
     parser.add_argument(
@@ -60,91 +69,142 @@ def add_parser(actions: Any) -> None:
     parser.add_argument("--colours", choices=("paper", "cividis"), default="paper", help="of the heat maps")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="scenes drawn side by side (default: 2)")
     parser.add_argument("--device", default="cpu", help="of the text's encoder, if a large one (default: cpu)")
+    parser.add_argument(
+        "--solver",
+        choices=("built-in", "llm"),
+        default="built-in",
+        help="who answers in reasoning sheets: geometry alone (default), or a language model, as in su3d-bench ask",
+    )
+    add_language_flags(parser)
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.cli.progress import progress
-    from su3d_bench.executors import Event, limit_threads
+    from su3d_bench.executors import limit_threads
 
     limit_threads()
     from su3d_bench.finished_run import read_run
-    from su3d_bench.sheets.drawing_jobs import draw_all
-    from su3d_bench.sheets.making import Origin, check_split, make_sheets, write_sheets
     from su3d_bench.sheets.run_source import RunSource
 
+    _check(arguments)
+    kinds = tuple(dict.fromkeys(arguments.kind))
+    source = RunSource(read_run(arguments.run), arguments.methods, arguments.scenes)
+    sources: dict[SheetKind, RunSource] = {kind: _judgeable(source, kind, arguments.quiet) for kind in kinds}
+    if arguments.dry_run:
+        return _estimate(sources["reasoning"], arguments)
+    drafts, answered_by = _drafts(sources, arguments)
+    told = _write(sources, drafts, _drawn(source, drafts, arguments), answered_by, arguments)
+    if arguments.json:
+        answer_json({"sets": told})
+        return EXIT_DONE
+    for one in told:
+        answer(f"{one['sheet_id']}: {_n(one['n_items'], 'item')}, {_n(one['n_questions'], 'question')}")
+        for path in one["files"]:
+            answer(path)
+        remark(f"key, which annotators must not see: {one['key']}", quiet=arguments.quiet)
+    return EXIT_DONE
+
+
+def _n(count: int, what: str) -> str:
+    return f"{count} {what}{'' if count == 1 else 's'}"
+
+
+def _check(arguments: argparse.Namespace) -> None:
+    """Refuse what could not be done, or would be done without being asked for."""
     if arguments.per_kind is not None and arguments.per_kind < 1:
         raise ConfigError(f"--per-kind {arguments.per_kind}: at least 1 item is needed")
     if arguments.jobs < 1:
         raise ConfigError(f"--jobs {arguments.jobs}: at least 1 is needed")
     if arguments.seed < 0:
         raise ConfigError(f"--seed {arguments.seed}: expected 0 or more")
-    source = RunSource(read_run(arguments.run), arguments.methods, arguments.scenes)
-    drafts = _drafts(source, arguments)
-    rules = {rules.name for scene in source.scenes if (rules := source.rules(scene, arguments.kind)) is not None}
-    check_split(len(drafts), arguments.annotators, arguments.overlap)
-    origin = Origin(source.run.name, source.run.code, source.methods, ", ".join(sorted(rules)))
-    with progress(1, is_quiet=arguments.quiet, last_step="writing") as report:
-        drawn = draw_all(
-            source,
-            arguments.kind,
-            arguments.colours,
-            drafts,
-            arguments.jobs,
-            lambda n_done, n: report(Event(source.run.name, "pictures", n_done, n)),
-        )
-    made = make_sheets(
-        arguments.kind,
-        drafts,
-        drawn,
-        origin,
-        seed=arguments.seed,
-        annotators=arguments.annotators,
-        overlap=arguments.overlap,
-    )
-    key = arguments.key or arguments.out.with_name(f"{arguments.out.name}-key")
-    files = write_sheets(made, arguments.out, key)
-    if arguments.json:
-        answer_json(
-            {
-                "sheet_id": made.sheet.id,
-                "n_items": len(made.sheet.items),
-                "n_questions": sum(len(one.asks) for one in made.sheet.items),
-                "files": [str(path) for path in files],
-                "key": str(key),
-            }
-        )
-        return EXIT_DONE
-    answer(f"{made.sheet.id}: {len(made.sheet.items)} items, {sum(len(o.asks) for o in made.sheet.items)} questions")
-    for path in files:
-        answer(str(path))
-    remark(f"key, which annotators must not see: {key}", quiet=arguments.quiet)
-    return EXIT_DONE
+    if arguments.kind == ["annotation"] and arguments.questions != "generated":
+        raise ConfigError("--questions: annotation sheets ask about labels and masks; leave it out")
+    if arguments.solver == "llm" and "reasoning" not in arguments.kind:
+        raise ConfigError("--solver llm: answers questions of reasoning sheets; add --kind reasoning")
+    given = [f"--{name.replace('_', '-')}" for name in LANGUAGE_FLAGS if getattr(arguments, name)]
+    if given and arguments.solver != "llm":
+        raise ConfigError(f"{given[0]}: is for --solver llm alone; the built-in solver asks nobody")
 
 
-def _drafts(source: RunSource, arguments: argparse.Namespace) -> list[Draft]:
+def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
+    """The run without the methods whose maps have no features, where texts are compared with features."""
+    if kind != "retrieval":
+        return source
+    scene = source.scenes[0]
+    kept = tuple(one for one in source.methods if source.instances(scene, one).features is not None)
+    if not kept:
+        raise ConfigError(
+            f"{source.run.name}: {', '.join(source.methods)}: no map has features that a text could be compared with; "
+            "give the run a method that makes them, such as opensu3d"
+        )
+    if kept == source.methods:
+        return source
+    left_out = [one for one in source.methods if one not in kept]
+    remark(f"retrieval: left out {', '.join(left_out)}, which keeps no features to rank by", quiet=is_quiet)
+    return source.of_methods(kept)
+
+
+def _drafts(
+    sources: Mapping[SheetKind, RunSource], arguments: argparse.Namespace
+) -> tuple[dict[SheetKind, list[Draft]], str]:
+    """What is judged, and who answered the questions of reasoning sheets."""
     import numpy as np
 
     from su3d_bench.cli.query import encoder_of
-    from su3d_bench.sheets.drafts import annotation_drafts, questions_of, reasoning_drafts, retrieval_drafts
+    from su3d_bench.sheets.drafts import annotation_drafts, questions_of, retrieval_drafts
+    from su3d_bench.sheets.making import check_split
+    from su3d_bench.sheets.reasoning_drafts import reasoning_drafts
 
-    if arguments.kind == "annotation" and arguments.questions != "generated":
-        raise ConfigError("--questions: annotation sheets ask about labels and masks; leave it out")
-    n_most = arguments.per_kind or PER_KIND[arguments.kind]
+    source = next(iter(sources.values()))
     random = np.random.default_rng(arguments.seed)
     given = _given(source, arguments)
-    found: list[Draft] = []
-    encoder = None if arguments.kind == "annotation" else encoder_of(source.run.folder, arguments.device)
+    found: dict[SheetKind, list[Draft]] = {kind: [] for kind in sources}
+    needs_encoder = "retrieval" in sources or ("reasoning" in sources and arguments.solver != "llm")
+    encoder = encoder_of(source.run.folder, arguments.device) if needs_encoder else None
+    ask, answered_by = _ask_map(source, encoder, arguments) if "reasoning" in sources else (None, "")
+    for scene in source.scenes:  # all kinds of one scene together, for they share its truth
+        for kind, mine in sources.items():
+            n_most = arguments.per_kind or PER_KIND[kind]
+            if kind == "annotation":
+                found[kind] += annotation_drafts(mine, scene, n_most, random)
+            elif kind == "reasoning":
+                assert ask is not None
+                found[kind] += reasoning_drafts(mine, scene, given, n_most, ask)
+            else:
+                assert encoder is not None
+                # A file is asked as it stands, unless --per-kind limits it.
+                asked = questions_of(mine, scene, given, n_most if given is None else arguments.per_kind)
+                found[kind] += retrieval_drafts(mine, scene, asked, encoder)
+    for drafts in found.values():
+        check_split(len(drafts), arguments.annotators, arguments.overlap)
+    return found, answered_by
+
+
+def _ask_map(source: RunSource, encoder: Encoder | None, arguments: argparse.Namespace) -> tuple[AskMap, str]:
+    """Who answers the questions of reasoning sheets, and how the key calls them."""
+    from su3d_bench.sheets.reasoning_drafts import built_in, by_language_model
+
+    if arguments.solver != "llm":
+        return built_in(encoder), "the built-in solver"
+    config = language_config(arguments)
+    return by_language_model(chat_client(arguments, source.run.folder, config), config), config.text_model
+
+
+def _estimate(source: RunSource, arguments: argparse.Namespace) -> int:
+    """Tell what asking the language model would cost at the most."""
+    from su3d_bench.sheets.reasoning_drafts import reasoning_drafts, requests_into
+
+    config = language_config(arguments)
+    client = chat_client(arguments, source.run.folder, config)
+    given, requests = _given(source, arguments), []
     for scene in source.scenes:
-        if arguments.kind == "annotation":
-            found += annotation_drafts(source, scene, n_most, random)
-        elif arguments.kind == "reasoning":
-            found += reasoning_drafts(source, scene, given, n_most, encoder)
-        else:
-            assert encoder is not None
-            # A file is asked as it stands, unless --per-kind limits it.
-            limit = n_most if given is None else arguments.per_kind
-            found += retrieval_drafts(source, scene, questions_of(source, scene, given, limit), encoder)
-    return found
+        n_most = arguments.per_kind or PER_KIND["reasoning"]
+        reasoning_drafts(source, scene, given, n_most, requests_into(requests, client, config))
+    estimate = client.estimate(requests)
+    if arguments.json:
+        answer_json(estimate.to_json())
+    else:
+        answer(estimate.line())
+    return EXIT_DONE
 
 
 def _given(source: RunSource, arguments: argparse.Namespace) -> Sequence[Question] | None:
@@ -161,3 +221,65 @@ def _given(source: RunSource, arguments: argparse.Namespace) -> Sequence[Questio
     if not any(one.scene in source.scenes for one in given):
         raise ConfigError(f"--questions {arguments.questions}: asks nothing of a scene of this run")
     return given
+
+
+def _drawn(
+    source: RunSource, drafts: Mapping[SheetKind, Sequence[Draft]], arguments: argparse.Namespace
+) -> dict[SheetKind, list[bytes]]:
+    """The pictures of all drafts."""
+    from su3d_bench.cli.progress import progress
+    from su3d_bench.executors import Event
+    from su3d_bench.sheets.drawing_jobs import draw_all
+
+    flat = [one for of_kind in drafts.values() for one in of_kind]
+    name = source.run.name
+    with progress(1, is_quiet=arguments.quiet, last_step="writing") as report:
+        pictures = draw_all(
+            source,
+            arguments.colours,
+            flat,
+            arguments.jobs,
+            lambda n_done, n: report(Event(name, "pictures", n_done, n)),
+        )
+    remaining = iter(pictures)
+    return {kind: list(islice(remaining, len(of_kind))) for kind, of_kind in drafts.items()}
+
+
+def _write(
+    sources: Mapping[SheetKind, RunSource],
+    drafts: Mapping[SheetKind, Sequence[Draft]],
+    drawn: Mapping[SheetKind, Sequence[bytes]],
+    answered_by: str,
+    arguments: argparse.Namespace,
+) -> list[dict[str, Any]]:
+    """Write a set of each kind, several of them each into a folder of its name; what was written."""
+    from su3d_bench.sheets.making import Origin, make_sheets, write_sheets
+
+    apart = arguments.key or arguments.out.with_name(f"{arguments.out.name}-key")
+    told = []
+    for kind, source in sources.items():
+        rules = {rules.name for scene in source.scenes if (rules := source.rules(scene, kind)) is not None}
+        by = answered_by if kind == "reasoning" else ""
+        origin = Origin(source.run.name, source.run.code, source.methods, ", ".join(sorted(rules)), by)
+        made = make_sheets(
+            kind,
+            drafts[kind],
+            drawn[kind],
+            origin,
+            seed=arguments.seed,
+            annotators=arguments.annotators,
+            overlap=arguments.overlap,
+        )
+        folder, key = (arguments.out, apart) if len(sources) == 1 else (arguments.out / kind, apart / kind)
+        files = write_sheets(made, folder, key)
+        told.append(
+            {
+                "kind": kind,
+                "sheet_id": made.sheet.id,
+                "n_items": len(made.sheet.items),
+                "n_questions": sum(len(one.asks) for one in made.sheet.items),
+                "files": [str(path) for path in files],
+                "key": str(key),
+            }
+        )
+    return told

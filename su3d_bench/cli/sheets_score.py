@@ -25,10 +25,17 @@ def add_parser(actions: Any) -> None:
         (
             "su3d-bench sheets score ann.csv bob.xlsx --key key/key.json --out scores",
             "su3d-bench sheets score answers/*.csv --sheet sheet/sheet.json --key key/key.json --json",
+            "su3d-bench sheets score --key key",
         ),
         call,
     )
-    parser.add_argument("files", nargs="+", type=Path, metavar="FILE", help="answers: .csv or .xlsx, in any mixture")
+    parser.add_argument(
+        "files",
+        nargs="*",
+        type=Path,
+        metavar="FILE",
+        help="answers: .csv or .xlsx, in any mixture (default: none, what the ground truth alone says)",
+    )
     parser.add_argument("--key", type=Path, required=True, metavar="FILE", help="key.json of the set, or its folder")
     parser.add_argument(
         "--sheet",
@@ -66,11 +73,13 @@ def call(arguments: argparse.Namespace) -> int:
     faults += checked.faults
     if faults:
         _refuse(faults, arguments)
-    if not checked.judgements:
+    if arguments.files and not checked.judgements:
         raise DataError(f"{', '.join(map(str, arguments.files))}: no answer is in these files")
-    if checked.silent:
+    if checked.silent and arguments.files:
         remark(f"no answers from {', '.join(checked.silent)}", quiet=arguments.quiet)
     scores = score(sheet, key, checked.judgements, checked.silent)
+    if not scores.cells:
+        raise DataError(f"{key_file}: the ground truth answers none of its items; give files of people's answers")
     content = asdict(scores)
     if arguments.out is not None:
         _write(arguments.out, scores, sheet_file.parent)

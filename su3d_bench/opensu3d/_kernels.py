@@ -1,8 +1,8 @@
 """Compiled loops over points; imported only when a map is made, for numba takes its time to load.
 
-Space is cut into voxels of side ``eps``; 2x2x2 voxels are a cell, 8x8x8 cells a block. ``table`` is an open-addressing
-hash of block coordinates; ``heads[block, cell]`` starts the linked list of the cell's points, -1 where it is empty.
-Distances are float64 and summed x, y, z, as a KD-tree does.
+Space is cut into voxels of side ``eps``; 8x8x8 voxels are a block. ``table`` is an open-addressing hash of block
+coordinates; ``heads[block, voxel]`` starts the linked list of the voxel's points, the newest first, -1 where it is
+empty. Distances are float64 and summed x, y, z, as a KD-tree does.
 """
 
 from __future__ import annotations
@@ -12,8 +12,10 @@ import math
 import numpy as np
 from numba import njit
 
-CELLS = 512
+VOXELS = 512  # of a block
 ABSENT = -1
+UNKNOWN = -2
+STEPS = (0, -1, 1, -2, 2)  # from a query's own voxel, the nearest first
 
 
 @njit(cache=True, inline="always")
@@ -34,8 +36,8 @@ def _slot(table, keys, bx, by, bz):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def _local(cx, cy, cz):  # type: ignore[no-untyped-def]
-    return ((cx & 7) * 8 + (cy & 7)) * 8 + (cz & 7)
+def _local(vx, vy, vz):  # type: ignore[no-untyped-def]
+    return ((vx & 7) * 8 + (vy & 7)) * 8 + (vz & 7)
 
 
 @njit(cache=True, inline="always")
@@ -50,17 +52,6 @@ def rehash(table, keys, n_blocks):  # type: ignore[no-untyped-def]
         table[_slot(table, keys, keys[block, 0], keys[block, 1], keys[block, 2])] = block
 
 
-@njit(cache=True, inline="always")
-def _occupant(points, following, head, vx, vy, vz, eps):  # type: ignore[no-untyped-def]
-    """The first point of a cell's list that lies in the voxel, or ABSENT."""
-    j = head
-    while j != ABSENT:
-        if _voxel(points[j, 0], eps) == vx and _voxel(points[j, 1], eps) == vy and _voxel(points[j, 2], eps) == vz:
-            break
-        j = following[j]
-    return j
-
-
 @njit(cache=True)
 def insert(  # type: ignore[no-untyped-def]
     new_points, new_ids, start, eps, keep_density, refill, points, ids, following, keys, heads, table, counts, placed
@@ -70,21 +61,24 @@ def insert(  # type: ignore[no-untyped-def]
     ``counts`` holds the number of points and of blocks; ``placed`` takes the map index of each point that was added
     or took over a voxel of no instance (id 0), ABSENT for the others.
     """
+    bx, by, bz, block = np.int64(0), np.int64(0), np.int64(0), np.int32(ABSENT)
     for i in range(start, len(new_points)):
         x, y, z = new_points[i, 0], new_points[i, 1], new_points[i, 2]
         vx, vy, vz = _voxel(x, eps), _voxel(y, eps), _voxel(z, eps)
-        cx, cy, cz = vx >> 1, vy >> 1, vz >> 1
-        slot = _slot(table, keys, cx >> 3, cy >> 3, cz >> 3)
-        if table[slot] == ABSENT:
-            block = counts[1]
-            if block == len(keys):
-                return i
-            keys[block, 0], keys[block, 1], keys[block, 2] = cx >> 3, cy >> 3, cz >> 3
-            heads[block, :] = ABSENT
-            table[slot] = block
-            counts[1] += 1
-        block, local = table[slot], _local(cx, cy, cz)
-        target = _occupant(points, following, heads[block, local], vx, vy, vz, eps) if keep_density else ABSENT
+        if block == ABSENT or vx >> 3 != bx or vy >> 3 != by or vz >> 3 != bz:
+            bx, by, bz = vx >> 3, vy >> 3, vz >> 3
+            slot = _slot(table, keys, bx, by, bz)
+            if table[slot] == ABSENT:
+                new_block = counts[1]
+                if new_block == len(keys):
+                    return i
+                keys[new_block, 0], keys[new_block, 1], keys[new_block, 2] = bx, by, bz
+                heads[new_block, :] = ABSENT
+                table[slot] = new_block
+                counts[1] += 1
+            block = table[slot]
+        local = _local(vx, vy, vz)
+        target = heads[block, local] if keep_density else ABSENT
         placed[i] = ABSENT
         if target == ABSENT:
             target = counts[0]
@@ -100,50 +94,63 @@ def insert(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def _squared_gap(x, cell, side, eps):  # type: ignore[no-untyped-def]
-    """Of one axis: squared distance from ``x`` to its own cell (side 0), the one below (1), the one above (2).
+def _write_gaps(x, voxel, eps, gaps):  # type: ignore[no-untyped-def]
+    """Of one axis: squared distance from ``x`` to the voxels 2 below to 2 above its own, into ``gaps`` (5,).
 
-    Rounded down, so that no cell is passed over for rounding. A cell is 2 eps wide: none further can be within eps.
+    Rounded down, so that no voxel is passed over for rounding: the second ones can hold a point within eps where ``x``
+    lies on the border of its voxel, up to rounding.
     """
-    if side == 0:
-        return 0.0
-    gap = x - cell * 2 * eps if side == 1 else (cell + 1) * 2 * eps - x
-    gap = max(gap * (1.0 - 1e-9) - abs(x) * 1e-15, 0.0)
-    return gap * gap
+    slack = abs(x) * 1e-15
+    below, above = x - voxel * eps, (voxel + 1) * eps - x
+    for steps in range(2):
+        near = max((below + steps * eps) * (1.0 - 1e-9) - slack, 0.0)
+        far = max((above + steps * eps) * (1.0 - 1e-9) - slack, 0.0)
+        gaps[1 - steps] = near * near
+        gaps[3 + steps] = far * far
+    gaps[2] = 0.0
 
 
-@njit(cache=True)
+@njit(cache=True, nogil=True)
 def nearest(queries, eps, points, following, keys, heads, table, found):  # type: ignore[no-untyped-def]
     """Writes the nearest map point strictly within ``eps`` of each query into ``found``, ABSENT where there is none.
 
-    Of equally near points the lowest index wins. Gives the number of cells that were looked into.
+    Of equally near points the lowest index wins. Gives the number of voxels that were looked into.
     """
     visited = 0
-    bx, by, bz, block = np.int64(0), np.int64(0), np.int64(0), np.int32(ABSENT)
-    is_known = False
+    gaps_x, gaps_y, gaps_z = np.empty(5), np.empty(5), np.empty(5)
+    around = np.full((3, 3, 3), UNKNOWN, np.int32)  # the blocks about that of the last query
+    mx, my, mz = np.int64(0), np.int64(0), np.int64(0)
     for i in range(len(queries)):
         x, y, z = queries[i, 0], queries[i, 1], queries[i, 2]
-        own_x, own_y, own_z = _voxel(x, eps) >> 1, _voxel(y, eps) >> 1, _voxel(z, eps) >> 1
+        own_x, own_y, own_z = _voxel(x, eps), _voxel(y, eps), _voxel(z, eps)
+        if own_x >> 3 != mx or own_y >> 3 != my or own_z >> 3 != mz:
+            mx, my, mz = own_x >> 3, own_y >> 3, own_z >> 3
+            around[:] = UNKNOWN
+        _write_gaps(x, own_x, eps, gaps_x)
+        _write_gaps(y, own_y, eps, gaps_y)
+        _write_gaps(z, own_z, eps, gaps_z)
         best, best_squared = ABSENT, eps * eps
-        for side_x in range(3):
-            gap_x = _squared_gap(x, own_x, side_x, eps)
+        for step_x in STEPS:
+            gap_x = gaps_x[step_x + 2]
             if gap_x > best_squared:
                 continue
-            cx = own_x + (side_x == 2) - (side_x == 1)
-            for side_y in range(3):
-                gap_xy = gap_x + _squared_gap(y, own_y, side_y, eps)
+            vx = own_x + step_x
+            for step_y in STEPS:
+                gap_xy = gap_x + gaps_y[step_y + 2]
                 if gap_xy > best_squared:
                     continue
-                cy = own_y + (side_y == 2) - (side_y == 1)
-                for side_z in range(3):
-                    if gap_xy + _squared_gap(z, own_z, side_z, eps) > best_squared:
+                vy = own_y + step_y
+                for step_z in STEPS:
+                    if gap_xy + gaps_z[step_z + 2] > best_squared:
                         continue
-                    cz = own_z + (side_z == 2) - (side_z == 1)
-                    if not is_known or cx >> 3 != bx or cy >> 3 != by or cz >> 3 != bz:
-                        bx, by, bz, is_known = cx >> 3, cy >> 3, cz >> 3, True
-                        block = table[_slot(table, keys, bx, by, bz)]
+                    vz = own_z + step_z
                     visited += 1
-                    j = heads[block, _local(cx, cy, cz)] if block != ABSENT else ABSENT
+                    nx, ny, nz = (vx >> 3) - mx + 1, (vy >> 3) - my + 1, (vz >> 3) - mz + 1
+                    block = around[nx, ny, nz]
+                    if block == UNKNOWN:
+                        block = table[_slot(table, keys, vx >> 3, vy >> 3, vz >> 3)]
+                        around[nx, ny, nz] = block
+                    j = heads[block, _local(vx, vy, vz)] if block != ABSENT else ABSENT
                     while j != ABSENT:
                         dx, dy, dz = x - points[j, 0], y - points[j, 1], z - points[j, 2]
                         squared = dx * dx + dy * dy + dz * dz
@@ -156,7 +163,7 @@ def nearest(queries, eps, points, following, keys, heads, table, found):  # type
 
 @njit(cache=True)
 def _count_block(block, lower, upper, points, ids, following, heads, row_of_id, found):  # type: ignore[no-untyped-def]
-    for local in range(CELLS):
+    for local in range(VOXELS):
         j = heads[block, local]
         while j != ABSENT:
             row = row_of_id[ids[j]] if ids[j] < len(row_of_id) else ABSENT
@@ -177,7 +184,7 @@ def count_inside(  # type: ignore[no-untyped-def]
     """
     first, last = np.empty(3, np.int64), np.empty(3, np.int64)
     for a in range(3):
-        first[a], last[a] = _voxel(lower[a], eps) >> 4, _voxel(upper[a], eps) >> 4
+        first[a], last[a] = _voxel(lower[a], eps) >> 3, _voxel(upper[a], eps) >> 3
     span = last - first + 1
     if float(span[0]) * float(span[1]) * float(span[2]) > n_blocks:
         for block in range(n_blocks):
@@ -195,38 +202,3 @@ def count_inside(  # type: ignore[no-untyped-def]
                 if block != ABSENT:
                     _count_block(block, lower, upper, points, ids, following, heads, row_of_id, found)
     return span[0] * span[1] * span[2]
-
-
-@njit(cache=True)
-def first_of_voxel(points, labels, voxel, table, kept):  # type: ignore[no-untyped-def]
-    """Writes the index of the first point of each (voxel, label) into ``kept``, in order; gives their number.
-
-    ``table`` is an empty hash of a power-of-two size above the number of points.
-    """
-    size = np.uint64(len(table) - 1)
-    n = 0
-    for i in range(len(points)):
-        vx, vy, vz = _voxel(points[i, 0], voxel), _voxel(points[i, 1], voxel), _voxel(points[i, 2], voxel)
-        mixed = (
-            np.uint64(vx) * np.uint64(0x9E3779B97F4A7C15)
-            ^ np.uint64(vy) * np.uint64(0xC2B2AE3D27D4EB4F)
-            ^ np.uint64(vz) * np.uint64(0x165667B19E3779F9)
-            ^ np.uint64(labels[i]) * np.uint64(0xD6E8FEB86659FD93)
-        )
-        slot = (mixed ^ (mixed >> np.uint64(32))) & size
-        while True:
-            j = table[slot]
-            if j == ABSENT:
-                table[slot] = i
-                kept[n] = i
-                n += 1
-                break
-            if (
-                labels[j] == labels[i]
-                and _voxel(points[j, 0], voxel) == vx
-                and _voxel(points[j, 1], voxel) == vy
-                and _voxel(points[j, 2], voxel) == vz
-            ):
-                break
-            slot = (slot + np.uint64(1)) & size
-    return n

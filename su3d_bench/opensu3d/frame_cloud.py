@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from su3d_bench.errors import DataError
-from su3d_bench.geometry import back_project, valid_depth
+from su3d_bench.geometry import ray_parts, valid_depth
 from su3d_bench.opensu3d.config import OpenSU3DConfig
-from su3d_bench.opensu3d.id_image import NO_DETECTION, paint
-from su3d_bench.types import BoolArray, Float64Array, Frame, Int32Array, Int64Array
+from su3d_bench.opensu3d.id_image import IdImage, paint
+from su3d_bench.types import BoolArray, Float64Array, Frame, Int32Array
 
 
 @dataclass(frozen=True)
@@ -36,28 +37,34 @@ def frame_cloud(frame: Frame, masks: BoolArray, config: OpenSU3DConfig) -> Frame
         raise DataError(f"frame {frame.index}: masks are {columns}x{rows} and the image is {width}x{height}")
     painted = paint(masks, config.border_in(frame.depth_m.shape[1]), config.border_shape)
     pixels = valid_depth(frame.depth_m, config.depth_min, config.depth_max)
-    is_ring = (painted.owner != NO_DETECTION) & (painted.ids == NO_DETECTION)
-    if config.border_pixels == "drop":
-        pixels &= ~is_ring
-    if config.background_pixels == "drop":
-        pixels &= painted.owner != NO_DETECTION
-    points = back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, pixels)
-    owner = painted.owner[pixels]
-    if config.border_pixels == "background":
-        owner[is_ring[pixels]] = NO_DETECTION
-    # 0 inside a mask, 1 in a ring, 2 in no mask
-    rank = np.where(owner == NO_DETECTION, 2, is_ring[pixels]).astype(np.int8)
-    if config.frame_voxel > 0:
-        kept = _first_of_voxel(points, owner * 3 + rank, config.frame_voxel)
-        points, owner, rank = points[kept], owner[kept], rank[kept]
+    points, owner, rank = _cloud(frame, pixels, painted, config)
     order = np.argsort(rank, kind="stable")
     return FrameCloud(points[order], owner[order], int(np.count_nonzero(rank == 0)))
 
 
-def _first_of_voxel(points: Float64Array, labels: Int32Array, voxel: float) -> Int64Array:
-    from su3d_bench.opensu3d import _kernels
+def _cloud(
+    frame: Frame, pixels: BoolArray, painted: IdImage, config: OpenSU3DConfig
+) -> tuple[Float64Array, Int32Array, NDArray[np.int8]]:
+    """Points, owners and ranks (0 inside a mask, 1 in a ring, 2 in no mask) of ``pixels`` in row-major order."""
+    from su3d_bench.opensu3d import image_kernels as kernels
 
-    kept = np.empty(len(points), np.int64)
-    table = np.full(1 << (2 * len(points) + 1).bit_length(), -1, np.int32)
-    n = _kernels.first_of_voxel(points, labels, voxel, table, kept)
-    return kept[:n]
+    of_row, of_column = ray_parts(frame.intrinsics, frame.camera_to_world, *frame.depth_m.shape)
+    n_pixels = int(np.count_nonzero(pixels))
+    points, owner, rank = np.empty((n_pixels, 3)), np.empty(n_pixels, np.int32), np.empty(n_pixels, np.int8)
+    rings = {"owner": kernels.OWNED, "background": kernels.BACKGROUND, "drop": kernels.DROPPED}
+    n = kernels.cloud(
+        np.require(frame.depth_m, requirements=["C", "W"]),  # one kind of array: no second compilation
+        pixels,
+        of_row,
+        of_column,
+        np.ascontiguousarray(frame.camera_to_world[:3, 3], np.float64),
+        painted.ids,
+        painted.owner,
+        rings[config.border_pixels],
+        config.background_pixels == "drop",
+        config.frame_voxel,
+        points,
+        owner,
+        rank,
+    )
+    return points[:n], owner[:n], rank[:n]

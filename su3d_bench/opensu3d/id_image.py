@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import isqrt
 from typing import Literal
 
 import numpy as np
 
-from su3d_bench.types import BoolArray, Int32Array, UInt8Array
+from su3d_bench.types import BoolArray, Int32Array, Int64Array
 
 NO_DETECTION = -1
 
@@ -29,38 +30,22 @@ def paint(masks: BoolArray, border_px: int, shape: Literal["disc", "square"]) ->
     Larger masks are painted first, equal ones in order, so that where masks overlap the smaller one shows. Each mask
     takes the ring of ``border_px`` around it from what was painted before.
     """
+    from su3d_bench.opensu3d import image_kernels as kernels
+
     ids = np.full(masks.shape[1:], NO_DETECTION, np.int32)
     owner = ids.copy()
-    areas = np.count_nonzero(masks, axis=(1, 2))
-    element = _structuring_element(border_px, shape)
+    pixels = np.require(masks, np.bool_, ["C", "W"]).view(np.uint8)
+    areas, bounds = np.empty(len(masks), np.int64), np.empty((len(masks), 4), np.int64)
+    kernels.extents(pixels, areas, bounds)
+    reach = _reach(border_px, shape)
     for k in np.argsort(-areas, kind="stable"):
-        if areas[k] == 0:
-            continue
-        window = _window(masks[k], border_px)
-        mask = masks[k][window]
-        ids[window][_dilate(mask, element)] = NO_DETECTION
-        ids[window][mask] = k
-        owner[window][mask] = k
+        if areas[k]:
+            kernels.paint(pixels[k], k, bounds[k], reach, ids, owner)
     return IdImage(ids, owner)
 
 
-def _window(mask: BoolArray, margin: int) -> tuple[slice, slice]:
-    """The mask's bounding box grown by ``margin``, clipped to the image."""
-    rows, columns = np.flatnonzero(mask.any(axis=1)), np.flatnonzero(mask.any(axis=0))
-    return (
-        slice(max(int(rows[0]) - margin, 0), int(rows[-1]) + margin + 1),
-        slice(max(int(columns[0]) - margin, 0), int(columns[-1]) + margin + 1),
-    )
-
-
-def _structuring_element(radius: int, shape: Literal["disc", "square"]) -> UInt8Array:
-    offsets = np.arange(-radius, radius + 1)
-    inside = offsets[:, None] ** 2 + offsets[None, :] ** 2 <= radius * radius
-    return np.where(inside | (shape == "square"), 1, 0).astype(np.uint8)
-
-
-def _dilate(mask: BoolArray, element: UInt8Array) -> BoolArray:
-    import cv2
-
-    grown = cv2.dilate(mask.astype(np.uint8), element, borderType=cv2.BORDER_CONSTANT, borderValue=0)
-    return np.asarray(grown, np.uint8) > 0
+def _reach(radius: int, shape: Literal["disc", "square"]) -> Int64Array:
+    """How far the ring of one pixel goes along the rows 0, 1, ... ``radius`` off."""
+    rows = np.arange(radius + 1)
+    furthest = np.array([isqrt(radius * radius - int(row) ** 2) for row in rows], np.int64)
+    return np.full(radius + 1, radius, np.int64) if shape == "square" else furthest

@@ -17,6 +17,7 @@ from su3d_bench.opensu3d.id_image import NO_DETECTION
 from su3d_bench.opensu3d.postprocess import segments_of, to_instances
 from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View, record_of
 from su3d_bench.opensu3d.voxel_map import NO_INSTANCE, VoxelMap
+from su3d_bench.scratch import Scratch
 from su3d_bench.timing import Timer
 from su3d_bench.types import (
     Detections,
@@ -54,9 +55,12 @@ class OpenSU3D:
 
     def __init__(self, config: OpenSU3DConfig | None = None) -> None:
         self.config = config or OpenSU3DConfig()
+        self._scratch = Scratch()
         self._clear()
 
     def _clear(self) -> None:
+        self._scratch.close()
+        self._scratch = Scratch()
         self._map = VoxelMap(self.config.eps)
         self._table = TrackingTable()
         self._images: list[ImageRecord] = []
@@ -109,7 +113,9 @@ class OpenSU3D:
         matched_id[matched >= 0] = self._map.ids[matched[matched >= 0]]
         overlaps = count_overlaps(cloud.owner[: cloud.n_inside], matched_id)
         wanted = np.unique(overlaps.best[overlaps.best > NO_INSTANCE])
-        lower, upper = cloud.points.min(axis=0) - self.config.eps, cloud.points.max(axis=0) + self.config.eps
+        # An axis at a time: over rows of three, numpy's minimum is ten times slower.
+        lower = np.array([axis.min() for axis in cloud.points.T]) - self.config.eps
+        upper = np.array([axis.max() for axis in cloud.points.T]) + self.config.eps
         inside = np.append(self._map.count_inside(lower, upper, wanted), 0)
         n_scene = np.where(overlaps.best > NO_INSTANCE, inside[np.searchsorted(wanted, overlaps.best)], 0)
         ratios = overlap_ratios(overlaps, n_scene, self.config.overlap_rule)
@@ -127,7 +133,7 @@ class OpenSU3D:
         hit = placed.copy()
         hit[: cloud.n_inside] = np.where(placed[: cloud.n_inside] >= 0, placed[: cloud.n_inside], matched)
         hit[cloud.owner == NO_DETECTION] = -1
-        self._images.append(record_of(detections, self.config.fusion, cloud.owner, hit))
+        self._images.append(record_of(detections, self.config.fusion, cloud.owner, hit, self._scratch))
 
     def finish(self) -> Instances:
         """The instances of the map so far, and its points of no instance."""
@@ -137,6 +143,11 @@ class OpenSU3D:
         instances = to_instances(points, ids, segments, self._images, self.config)
         self._postprocess_ms = (time.perf_counter() - start) * 1e3
         return instances
+
+    def close(self) -> None:
+        """Forgets the scene, and gives memory and disk space back."""
+        self._clear()
+        self._scratch.close()
 
 
 @cache
@@ -163,3 +174,4 @@ def _warm_up(config: OpenSU3DConfig) -> None:
     for _ in range(2):
         scratch.update(frame, detections, Timer())
     scratch.finish()
+    scratch.close()

@@ -48,12 +48,13 @@ def caption_of(name: str) -> str:
 
 def cluster(points: Float64Array, config: OpenSU3DConfig) -> Int64Array:
     """DBSCAN label (N,) of each point: 0, 1, ... or NOISE."""
-    from sklearn.cluster import DBSCAN
+    from su3d_bench.opensu3d import cluster_kernels as kernels
 
-    if len(points) < config.dbscan_min_points:
-        return np.full(len(points), NOISE, np.int64)
-    labels = DBSCAN(eps=config.dbscan_eps, min_samples=config.dbscan_min_points, n_jobs=1).fit_predict(points)
-    return np.asarray(labels, np.int64)
+    labels = np.full(len(points), NOISE, np.int64)
+    if len(points) >= config.dbscan_min_points:
+        own = np.require(points, np.float64, ["C", "W"])
+        kernels.dbscan(own, config.dbscan_eps, config.dbscan_min_points, kernels.STEPS, labels)
+    return labels
 
 
 def kept_clusters(labels: Int64Array, split_fraction: float) -> list[int]:
@@ -75,15 +76,16 @@ def segments_of(
     order = np.argsort(ids, kind="stable")
     kept: list[Segment] = []
     split_off: list[Segment] = []
-    for scene_id in table.scene_ids():
-        first, last = np.searchsorted(ids, [scene_id, scene_id + 1], sorter=order)
+    scene_ids = table.scene_ids()
+    ends = [np.searchsorted(ids[order], np.array(scene_ids, np.int32), side) for side in ("left", "right")]
+    for scene_id, first, last in zip(scene_ids, *ends, strict=True):
         own = order[first:last]
         labels = cluster(points[own], config)
         clusters = kept_clusters(labels, config.split_fraction)
         views = table.views(scene_id)
         for rank, label in enumerate(clusters):
             members = own[labels == label]
-            hitting = views if len(clusters) == 1 else _views_that_hit(members, views, images, len(ids))
+            hitting = views if len(clusters) == 1 else _views_that_hit(members, views, images)
             if rank == 0:
                 kept.append(Segment(scene_id, members, hitting))
             else:
@@ -91,12 +93,15 @@ def segments_of(
     return kept + split_off
 
 
-def _views_that_hit(
-    members: Int64Array, views: tuple[View, ...], images: Sequence[ImageRecord], n_points: int
-) -> tuple[View, ...]:
-    is_member = np.zeros(n_points, np.bool_)
-    is_member[members] = True
-    return tuple(view for view in views if is_member[images[view.position].hits_of(view.detection)].any())
+def _views_that_hit(members: Int64Array, views: tuple[View, ...], images: Sequence[ImageRecord]) -> tuple[View, ...]:
+    """Those of ``views`` that hit one of ``members`` (sorted, at least one)."""
+
+    def is_hit(view: View) -> bool:
+        hits = images[view.position].hits_of(view.detection)
+        place = np.searchsorted(members, hits)
+        return bool((members[np.minimum(place, len(members) - 1)] == hits).any())
+
+    return tuple(view for view in views if is_hit(view))
 
 
 def best_views(views: tuple[View, ...], images: Sequence[ImageRecord], m: int) -> tuple[View, ...]:
@@ -129,7 +134,7 @@ def to_instances(
     boxes = [_box(points[segment.points]) for segment in segments]
     n_views = [len(segment.views) for segment in segments]
     views = [(images[view.position], view.detection) for segment in segments for view in segment.views]
-    dimension = len(images[0].global_feature) if images else 0
+    dimension = images[0].n_dimensions if images else 0
     return Instances(
         points=points[is_kept].astype(np.float32),
         indptr=_indptr(len(segment.points) for segment in segments),
@@ -163,8 +168,8 @@ def _described(segment: Segment, images: Sequence[ImageRecord], config: OpenSU3D
     name = best.names[top[0].detection]
     scores = np.array([images[view.position].scores[view.detection] for view in segment.views])
     feature = fuse_views(
-        np.stack([images[view.position].multi_scale[view.detection] for view in top]),
-        np.stack([images[view.position].global_feature for view in top]),
+        np.stack([images[view.position].feature_of(view.detection) for view in top]),
+        np.stack([images[view.position].feature_of_image() for view in top]),
         config.fusion.multi_view,
     )
     caption = best.captions[top[0].detection].strip() or caption_of(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,10 +10,11 @@ import numpy as np
 from su3d_bench.errors import DataError
 from su3d_bench.opensu3d.config import Fusion
 from su3d_bench.opensu3d.feature_fusion import fuse_scales
+from su3d_bench.scratch import Scratch, StoredRows
 from su3d_bench.types import Detections, Float64Array, Int32Array, Int64Array
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class View:
     """One mask of one image: ``position`` counts the images given so far, ``detection`` is the row in that image."""
 
@@ -20,43 +22,72 @@ class View:
     detection: int
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class ImageRecord:
     """What one image said of its detections, kept for names, captions, scores and features.
 
-    ``multi_scale`` (K, D) are the f_MS of its K detections, ``global_feature`` (D,) is f_G; the map points that
-    detection k hit are ``hits[hit_indptr[k]:hit_indptr[k + 1]]``.
+    What is large lies in a scratch file, so that memory does not grow with the images: ``multi_scale`` (K, D), the f_MS
+    of its K detections, ``global_feature`` (1, D), its f_G, and ``hits``, the map points that detections hit, those of
+    detection k in rows ``hit_indptr[k]`` to ``hit_indptr[k + 1]``.
     """
 
     frame_index: int
     scores: Float64Array
     names: tuple[str, ...]
     captions: tuple[str, ...]
-    multi_scale: Float64Array
-    global_feature: Float64Array
+    multi_scale: StoredRows
+    global_feature: StoredRows
     hit_indptr: Int64Array
-    hits: Int64Array
+    hits: StoredRows
+
+    @property
+    def n_dimensions(self) -> int:
+        """D of its features."""
+        return self.global_feature.shape[1]
+
+    def feature_of(self, detection: int) -> Float64Array:
+        """f_MS (D,) of ``detection``."""
+        feature: Float64Array = self.multi_scale.rows(detection, detection + 1)[0]
+        return feature
+
+    def feature_of_image(self) -> Float64Array:
+        """f_G (D,)."""
+        feature: Float64Array = self.global_feature.rows(0, 1)[0]
+        return feature
 
     def hits_of(self, detection: int) -> Int64Array:
-        """Map points that the mask of ``detection`` hit."""
-        return self.hits[self.hit_indptr[detection] : self.hit_indptr[detection + 1]]
+        """Map points that the mask of ``detection`` hit, ascending."""
+        first, last = (int(end) for end in self.hit_indptr[detection : detection + 2])
+        return self.hits.rows(first, last).astype(np.int64)
 
 
-def record_of(detections: Detections, fusion: Fusion, segment: Int32Array, hit: Int64Array) -> ImageRecord:
+def record_of(
+    detections: Detections, fusion: Fusion, segment: Int32Array, hit: Int64Array, scratch: Scratch
+) -> ImageRecord:
     """Keeps what one image said; ``segment`` and ``hit`` pair each detection with a map point it hit, -1 for none."""
     columns = [_column(detections, ratio) for ratio in fusion.crop_ratios]
     features = fuse_scales(detections.crop_features[:, columns], fusion.crop_ratios, fusion.multi_scale)
-    pairs = np.unique((segment[hit >= 0].astype(np.int64) << 40) | hit[hit >= 0])
+    is_hit = hit >= 0
+    pairs = _distinct((segment[is_hit].astype(np.int64) << 40) | hit[is_hit])
     return ImageRecord(
         detections.frame_index,
         detections.scores.astype(np.float64),
-        detections.names,
-        detections.captions,
-        features,
-        detections.global_feature.astype(np.float64),
+        # one text a name, not one an image
+        tuple(map(sys.intern, map(str, detections.names))),
+        tuple(map(sys.intern, map(str, detections.captions))),
+        scratch.put(features),
+        scratch.put(detections.global_feature.astype(np.float64)[None]),
         np.searchsorted(pairs, np.arange(len(detections) + 1) << 40),
-        pairs & ((1 << 40) - 1),
+        scratch.put((pairs & ((1 << 40) - 1)).astype(np.int32)),
     )
+
+
+def _distinct(values: Int64Array) -> Int64Array:
+    """The different ``values``, ascending; np.unique takes ten times as long for want of a sort."""
+    ordered = np.sort(values)
+    is_first = np.ones(len(ordered), np.bool_)
+    np.not_equal(ordered[1:], ordered[:-1], out=is_first[1:])
+    return np.asarray(ordered[is_first], np.int64)
 
 
 def _column(detections: Detections, ratio: float) -> int:

@@ -8,9 +8,6 @@ and is made anew.
 from __future__ import annotations
 
 import hashlib
-import os
-import tempfile
-import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -19,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.errors import StoreError
+from su3d_bench.kept_files import DAMAGE, filling, read_arrays
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.types import BoolArray, Float32Array, Float64Array, Frame, StageTimer, UInt8Array
 
@@ -83,9 +81,8 @@ class FrameCache:
         if path is None or not path.is_file():
             return None
         try:
-            with np.load(path, allow_pickle=False) as entry:
-                arrays = {name: entry[name] for name in entry.files}
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            arrays = read_arrays(path)
+        except DAMAGE:
             return None
         checksum = arrays.pop(_CHECKSUM, None)
         if checksum is None or not np.array_equal(checksum, _checksum(arrays)):
@@ -97,16 +94,11 @@ class FrameCache:
         path = self.path(key)
         if path is None:
             return
-        temporary = ""
         try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            with tempfile.NamedTemporaryFile(dir=path.parent, suffix=".tmp", delete=False) as file:
-                temporary = file.name
-                np.savez(file, allow_pickle=False, **{**arrays, _CHECKSUM: _checksum(arrays)})
-            os.replace(temporary, path)
+            with filling(path) as file:
+                if file is not None:  # whoever writes this entry just now writes the same
+                    np.savez(file, allow_pickle=False, **{**arrays, _CHECKSUM: _checksum(arrays)})
         except OSError as error:
-            if temporary:
-                Path(temporary).unlink(missing_ok=True)
             raise StoreError(
                 f"{path.parent}: the perception cache cannot be written ({error.strerror or error}); "
                 "free space, choose another cache folder, or set perception.cache = false"

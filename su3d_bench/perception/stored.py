@@ -14,7 +14,6 @@ Files are plain arrays: nothing in them is unpickled. ``write_stored`` writes th
 
 from __future__ import annotations
 
-import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -25,6 +24,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, model_validator
 
 from su3d_bench.errors import DataError
+from su3d_bench.kept_files import DAMAGE, read_arrays
 from su3d_bench.perception.naming import scene_caption
 from su3d_bench.types import Detections, Encoder, Float32Array, Frame, Regions
 
@@ -117,13 +117,12 @@ def read_stored(path: Path, frame: Frame, encoder: Encoder) -> StoredFrame:
 
 def _load(path: Path, where: str) -> dict[str, NDArray[Any]]:
     try:
-        with np.load(path, allow_pickle=False) as file:
-            return {key: file[key] for key in file.files}
+        return read_arrays(path)
     except FileNotFoundError:
         raise DataError(
             f"{where}: there is no file {path}; a frame without detections has a file with 0 rows"
         ) from None
-    except (OSError, ValueError, EOFError, zipfile.BadZipFile) as error:
+    except DAMAGE as error:
         raise DataError(f"{where}: {path} is not an npz file of plain arrays ({error})") from error
 
 

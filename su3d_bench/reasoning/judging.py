@@ -48,7 +48,7 @@ def is_right(question: GeneratedQuestion, answer: Answer, same: Mapping[int, int
         if question.kind.startswith(("what ", "between")):
             return set(ids) == set(question.answer.object_ids)
         return ids[:1] == list(question.answer.object_ids[:1])
-    said = _value(answer, true)
+    said = said_value(answer, true)
     if said is None:
         return False
     if isinstance(true, float):
@@ -56,7 +56,8 @@ def is_right(question: GeneratedQuestion, answer: Answer, same: Mapping[int, int
     return said == true
 
 
-def _value(answer: Answer, like: float | int | bool) -> float | int | bool | None:
+def said_value(answer: Answer, like: float | int | bool) -> float | int | bool | None:
+    """What an answer says of the kind of ``like``, read from its words where it gives no value; None for nothing."""
     if answer.value is not None:
         return answer.value
     text = answer.text.lower()

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 
 from su3d_bench.perception.language.captioner import reason_of
-from su3d_bench.perception.language.chat import ChatRequest
+from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.language.parsing import answered, is_refusal
 from su3d_bench.reasoning.answers import Answer, unsettled
-from su3d_bench.reasoning.prompting import ask_request, context_for
+from su3d_bench.reasoning.prompting import Context, ask_request, context_for
 from su3d_bench.reasoning.scene_map import SceneMap
 
 
@@ -28,8 +29,16 @@ class LanguageSolver:
 
     def answer(self, question: str) -> Answer:
         """The model's answer and the objects that it names; its failure or refusal as an unsettled one."""
-        context = context_for(self._scene, question, self._config)
-        reply = self._model.ask_all([ask_request(context, question, self._config)])[0]
+        return self.answers([question])[0]
+
+    def answers(self, questions: Sequence[str]) -> list[Answer]:
+        """The answers in the order of ``questions``, several of which may be under way at once."""
+        contexts = [context_for(self._scene, one, self._config) for one in questions]
+        requests = [ask_request(*both, self._config) for both in zip(contexts, questions, strict=True)]
+        replies = self._model.ask_all(requests)
+        return [self._answer(*both) for both in zip(contexts, replies, strict=True)]
+
+    def _answer(self, context: Context, reply: Reply) -> Answer:
         notes = tuple(note for note in (context.note, _dropped(reply.dropped)) if note)
         said = None if reply.failure else answered(reply.text, [one.id for one in context.objects])
         if said is None or (not said.object_ids and is_refusal(said.text)):

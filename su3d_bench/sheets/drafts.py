@@ -9,11 +9,8 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.errors import ConfigError
-from su3d_bench.metrics.covered_objects import Covered
-from su3d_bench.metrics.question_truths import AskedText, GivenAnswer, ReasoningTruth, TrueAnswer
+from su3d_bench.metrics.question_truths import AskedText
 from su3d_bench.metrics.score_questions import (
-    are_objects_right,
-    is_answer_right,
     judge_merging,
     judge_retrieval,
     labels_n,
@@ -23,14 +20,10 @@ from su3d_bench.plain_text import printable
 from su3d_bench.protocols import ProtocolRules
 from su3d_bench.questions.generator import chosen, generate
 from su3d_bench.questions.known_objects import known_objects
-from su3d_bench.questions.model import KINDS, REASONING, Question, question_id
+from su3d_bench.questions.model import KINDS, Question
 from su3d_bench.questions.refined import refined_names
 from su3d_bench.questions.truths import own_questions, question_truth
-from su3d_bench.reasoning.answers import Answer
-from su3d_bench.reasoning.named_objects import nearest_by
-from su3d_bench.reasoning.scene_map import map_of
-from su3d_bench.reasoning.solver import Solver
-from su3d_bench.sheets.items import RIGHT, WRONG
+from su3d_bench.sheets.items import RIGHT, WRONG, SheetKind
 from su3d_bench.sheets.run_source import RunSource, mask_digest
 from su3d_bench.types import Encoder, Float64Array, GroundTruth, Instances
 
@@ -46,6 +39,7 @@ class Draft:
     query, ``names`` (K) as the answer calls them.
     """
 
+    kind: SheetKind
     scene: str
     methods: tuple[str, ...]
     instance_ids: tuple[int, ...]
@@ -110,9 +104,10 @@ def retrieval_drafts(source: RunSource, scene: str, questions: Sequence[Question
                 automatic = {"retrieval": judged(bool(is_right[0]))}
             drafts.append(
                 Draft(
+                    kind="retrieval",
                     scene=scene,
                     methods=tuple(methods),
-                    instance_ids=tuple(_id(maps[one], int(rankings[one][place].order[0])) for one in methods),
+                    instance_ids=tuple(id_of(maps[one], int(rankings[one][place].order[0])) for one in methods),
                     rows=(row,),
                     title=(f"Is this: {question.text}?",),
                     text=printable(question.text, MOST_TEXT),
@@ -140,7 +135,7 @@ def annotation_drafts(source: RunSource, scene: str, n_most: int, random: np.ran
             names = [printable(one[row], MOST_TEXT) or NO_LABEL for one in labels if one is not None]
             key = mask_digest(instances, [row]) + "\0".join(names).encode()
             if key in found:
-                found[key] = _also(found[key], method, _id(instances, row))
+                found[key] = also(found[key], method, id_of(instances, row))
             else:
                 found[key] = _annotation_draft(scene, method, instances, row, names, judge(row, names))
     drafts = list(found.values())
@@ -152,9 +147,10 @@ def _annotation_draft(
     scene: str, method: str, instances: Instances, row: int, names: list[str], automatic: Mapping[str, str]
 ) -> Draft:
     return Draft(
+        kind="annotation",
         scene=scene,
         methods=(method,),
-        instance_ids=(_id(instances, row),),
+        instance_ids=(id_of(instances, row),),
         rows=(row,),
         title=tuple(names),
         text="",
@@ -176,17 +172,8 @@ def _with_labels_shuffled(draft: Draft, random: np.random.Generator) -> Draft:
         automatic["merging"] = draft.automatic["merging"]
     lines = tuple(f"Label {k + 1}: {name}" for k, name in enumerate(names))
     asks = (*stands_for, "merging")
-    return Draft(
-        scene=draft.scene,
-        methods=draft.methods,
-        instance_ids=draft.instance_ids,
-        rows=draft.rows,
-        title=lines,
-        text="\n".join(lines),
-        asks=asks,
-        stands_for=stands_for,
-        automatic=automatic,
-    )
+    text = "\n".join(lines)
+    return replace(draft, title=lines, text=text, asks=asks, stands_for=stands_for, automatic=automatic)
 
 
 Judge = Callable[[int, Sequence[str]], Mapping[str, str]]
@@ -213,111 +200,12 @@ def _annotation_judge(
     return judge
 
 
-def reasoning_drafts(
-    source: RunSource, scene: str, given: Sequence[Question] | None, per_kind: int, encoder: Encoder | None
-) -> list[Draft]:
-    """The built-in solver's answers about each map, one draft for all maps on which it says the same.
-
-    Asked are the questions of kind ``reasoning`` that are ``given``, else ``per_kind`` of each template, made from the
-    ground truth.
-    """
-    rules = source.rules(scene, "reasoning")
-    truth = source.truth(scene, rules)
-    known: Sequence[TrueAnswer] = ()
-    if given is None:
-        if rules is None or truth is None:
-            raise ConfigError(
-                f"{printable(scene, 100)}: has no ground truth that questions could be made from; name a file of "
-                "questions of kind reasoning with --questions FILE"
-            )
-        with_fewer = rules.model_copy(update={"per_kind": per_kind})
-        made: Any = question_truth(with_fewer, source.dataset(scene), scene.partition("/")[2], truth)
-        assert isinstance(made, ReasoningTruth)
-        known = made.asked
-        texts = [one.text for one in known]
-    else:
-        texts = [one.text for one in given if one.scene == scene and one.kind == REASONING]
-    groups: dict[bytes, Draft] = {}
-    for method in source.methods:
-        instances = source.instances(scene, method)
-        refined = refined_names(source.run.folder.job(scene, method), instances)
-        a_map = map_of(instances, None if refined is None else refined.names)
-        solver = Solver(a_map, None, None if encoder is None else nearest_by(encoder))
-        covered = source.covered(scene, rules, instances)
-        row_of = {one.id: one.row for one in a_map.objects}
-        names = [""] * len(instances)
-        for one in a_map.objects:
-            names[one.row] = one.shown
-        for place, text in enumerate(texts):
-            answer = solver.answer(text)
-            rows = tuple(row_of[one] for one in answer.object_ids)
-            others = tuple(row_of[one] for one in answer.reference_ids)
-            key = text.encode() + b"\0" + answer.text.encode() + mask_digest(instances, rows)
-            if key in groups:
-                groups[key] = _also(groups[key], method, _only_id(instances, rows))
-                continue
-            automatic = {}
-            if known and covered is not None and rules is not None:
-                automatic = _judged_answer(rules, known[place], answer, row_of, covered)
-            kind = known[place].kind if known else REASONING
-            groups[key] = _reasoning_draft(
-                scene, method, text, kind, answer, rows, others, tuple(names), automatic, _only_id(instances, rows)
-            )
-    return list(groups.values())
-
-
-def _reasoning_draft(
-    scene: str,
-    method: str,
-    text: str,
-    kind: str,
-    answer: Answer,
-    rows: tuple[int, ...],
-    others: tuple[int, ...],
-    names: tuple[str, ...],
-    automatic: Mapping[str, str],
-    instance_id: int,
-) -> Draft:
-    asks = ("answer", "objects") if rows else ("answer",)
-    return Draft(
-        scene=scene,
-        methods=(method,),
-        instance_ids=(instance_id,),
-        rows=rows,
-        title=(text, f"Answer: {answer.text}"),
-        text=f"{printable(text, MOST_TEXT)}\nAnswer: {printable(answer.text, MOST_TEXT)}",
-        asks=asks,
-        question_id=question_id(scene, REASONING, text),
-        question_kind=kind,
-        automatic={ask: value for ask, value in automatic.items() if ask in asks},
-        others=others,
-        names=names,
-    )
-
-
-def _judged_answer(
-    rules: ProtocolRules, true: TrueAnswer, answer: Answer, row_of: Mapping[int, int], covered: Covered
-) -> dict[str, str]:
-    assert rules.answers is not None
-    rows = np.array([row_of[one] for one in answer.object_ids], np.int64)
-    given = GivenAnswer(answer.value, rows, answer.is_settled)
-    main = covered.main_object
-    found = {"answer": judged(is_answer_right(rules.answers, true, given, main))}
-    if true.object_ids:
-        found["objects"] = judged(are_objects_right(true, given, main))
-    return found
-
-
-def _also(draft: Draft, method: str, instance_id: int) -> Draft:
+def also(draft: Draft, method: str, instance_id: int) -> Draft:
     """The draft, said by one more method; that of a method said twice stays as it is."""
     if method in draft.methods:
         return draft
     return replace(draft, methods=(*draft.methods, method), instance_ids=(*draft.instance_ids, instance_id))
 
 
-def _id(instances: Instances, row: int) -> int:
+def id_of(instances: Instances, row: int) -> int:
     return int(instances.ids[row]) if len(instances.ids) else row
-
-
-def _only_id(instances: Instances, rows: Sequence[int]) -> int:
-    return _id(instances, rows[0]) if len(rows) == 1 else -1

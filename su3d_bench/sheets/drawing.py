@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -27,14 +29,24 @@ from su3d_bench.types import BoolArray, Float64Array, Frame, Instances, UInt8Arr
 
 ANSWER_COLOUR, OTHER_COLOUR = (222, 74, 22), (32, 98, 196)  # those of reasoning_picture
 PALE_SHARE = 0.3
-OUTLINED = {"retrieval": "what was found", "annotation": "the mask", "reasoning": "what the answer names"}
+ROOM_PHOTOS = 6  # of the room, for answers that name nothing
+MAP_TITLES: Mapping[SheetKind, str] = {
+    "retrieval": "similarity of everything in the map to the text",
+    "annotation": "the map around it, the outlined mask in red",
+    "reasoning": "the map: red what the answer names, blue what it was held against",
+}
+OUTLINED: Mapping[SheetKind, str] = {
+    "retrieval": "what was found",
+    "annotation": "the mask",
+    "reasoning": "what the answer names",
+}
 
 
 class Artist:
     """Draws the items of a run, one scene after another; what a scene's items share is made once."""
 
-    def __init__(self, source: RunSource, kind: SheetKind, scale: Scale = "paper") -> None:
-        self._source, self._kind, self._scale = source, kind, scale
+    def __init__(self, source: RunSource, scale: Scale = "paper") -> None:
+        self._source, self._scale = source, scale
         self._maps: dict[bytes, _ShownMap] = {}
 
     def draw(self, draft: Draft) -> bytes:
@@ -48,7 +60,7 @@ class Artist:
         photo, eye = self._photo(draft, shown)
         best = max(shown.corners, key=lambda view: int(view.shows(members).sum()))
         map_view = Panel(
-            self._map_title(),
+            MAP_TITLES[draft.kind],
             shown.drawn.paint(best, self._colours(draft, shown)),
             best.shows(members),
             _tags(draft, shown.instances, best),
@@ -65,14 +77,16 @@ class Artist:
             eye=None if eye is None else _inside(shown.above.project(eye[None])[0]),
         )
         scale = scale_stops(self._scale) if draft.similarity is not None else None
-        return compose(ItemParts(draft.title, photo, map_view, place, scale))
+        room = self._room(draft) if photo is None else ()
+        return compose(ItemParts(draft.title, photo, map_view, place, scale, room))
 
-    def _map_title(self) -> str:
-        return {
-            "retrieval": "similarity of everything in the map to the text",
-            "annotation": "the map around it, the outlined mask in red",
-            "reasoning": "the map: red what the answer names, blue what it was held against",
-        }[self._kind]
+    def _room(self, draft: Draft) -> tuple[UInt8Array, ...]:
+        """Some of the frames, spread over the walk, where an answer names nothing that could be outlined."""
+        if draft.rows:
+            return ()
+        frames = self._source.frames(draft.scene, draft.methods[0])
+        chosen = np.unique(np.linspace(0, len(frames) - 1, min(ROOM_PHOTOS, len(frames))).astype(np.int64))
+        return tuple(frames[k].rgb for k in chosen)
 
     def _colours(self, draft: Draft, shown: _ShownMap) -> UInt8Array:
         if draft.similarity is not None:
@@ -87,18 +101,11 @@ class Artist:
         wanted = draft.rows or draft.others
         if not wanted:
             return None, None
-        frames = self._source.frames(draft.scene, draft.methods[0])
-        is_member = np.zeros(len(shown.instances.points), np.bool_)
-        for row in wanted:
-            is_member[shown.instances.mask(row)] = True
-        points = shown.instances.points[is_member]
-        view = best_view(frames, points)
-        if view is None:
+        photo = shown.photo(wanted, self._source.frames(draft.scene, draft.methods[0]))
+        if photo is None:
             return None, None
-        frame: Frame = frames[view.frame]
-        bounds = np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float64)
-        mask = _at_full_size(mask_in_frame(frame, shown.tree, is_member, bounds), frame)
-        return Panel(f"outlined: {OUTLINED[self._kind]}", frame.rgb, mask), frame.camera_to_world[:3, 3]
+        title = OUTLINED[draft.kind] if draft.rows else "what the answer was held against"
+        return Panel(f"outlined: {title}", photo.frame.rgb, photo.mask), photo.frame.camera_to_world[:3, 3]
 
     def _map(self, scene: str, method: str) -> _ShownMap:
         """The views of a map; those of another method where it has the same masks."""
@@ -109,6 +116,14 @@ class Artist:
                 self._maps.clear()
             self._maps[key] = _ShownMap(scene, instances)
         return self._maps[key]
+
+
+@dataclass(frozen=True)
+class _Photo:
+    """A frame and where it shows what is outlined (h, w)."""
+
+    frame: Frame
+    mask: BoolArray
 
 
 class _ShownMap:
@@ -123,7 +138,27 @@ class _ShownMap:
         corners = self.drawn.cameras(PHOTO_WIDTH, LOW_HEIGHT)[1:]
         self.corners: tuple[MapView, ...] = tuple(self.drawn.view(camera) for camera in corners)
         self.colours = np.array(instance_colours(instances.names), np.uint8).reshape(-1, 3)
-        self.tree: Any = KDTree(instances.points, balanced_tree=False, compact_nodes=False)
+        self._tree: Any = KDTree(instances.points, balanced_tree=False, compact_nodes=False)
+        self._photos: dict[tuple[tuple[int, ...], tuple[int, ...]], _Photo | None] = {}
+
+    def photo(self, rows: tuple[int, ...], frames: Sequence[Frame]) -> _Photo | None:
+        """The best of ``frames`` to see these instances in, found once; None where none shows them."""
+        key = rows, tuple(frame.index for frame in frames)
+        if key not in self._photos:
+            self._photos[key] = self._best_photo(rows, frames)
+        return self._photos[key]
+
+    def _best_photo(self, rows: tuple[int, ...], frames: Sequence[Frame]) -> _Photo | None:
+        is_member = np.zeros(len(self.instances.points), np.bool_)
+        for row in rows:
+            is_member[self.instances.mask(row)] = True
+        points = self.instances.points[is_member]
+        view = best_view(frames, points)
+        if view is None:
+            return None
+        frame = frames[view.frame]
+        bounds = np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float64)
+        return _Photo(frame, _at_full_size(mask_in_frame(frame, self._tree, is_member, bounds), frame))
 
 
 def _tags(draft: Draft, instances: Instances, view: MapView) -> tuple[Tag, ...]:

@@ -12,7 +12,6 @@ from su3d_bench.finished_run import read_run
 from su3d_bench.reports.heat_scales import Scale
 from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.drawing import Artist
-from su3d_bench.sheets.items import SheetKind
 from su3d_bench.sheets.run_source import RunSource
 
 Progress = Callable[[int, int], None]
@@ -24,7 +23,6 @@ class SceneDrafts:
 
     run: Path
     methods: tuple[str, ...]
-    kind: SheetKind
     scale: Scale
     places: tuple[int, ...]
     drafts: tuple[Draft, ...]
@@ -41,7 +39,6 @@ class DrawnScene:
 
 def draw_all(
     source: RunSource,
-    kind: SheetKind,
     scale: Scale,
     drafts: Sequence[Draft],
     jobs: int,
@@ -52,7 +49,7 @@ def draw_all(
     for scene in dict.fromkeys(one.scene for one in drafts):
         places = tuple(k for k, one in enumerate(drafts) if one.scene == scene)
         mine = tuple(drafts[k] for k in places)
-        units.append(SceneDrafts(source.run.folder.path, source.methods, kind, scale, places, mine))
+        units.append(SceneDrafts(source.run.folder.path, source.methods, scale, places, mine))
     n_done = 0
 
     def report(event: Event) -> None:
@@ -74,7 +71,7 @@ def draw_all(
 
 def draw_scene(unit: SceneDrafts, report: Report) -> DrawnScene:
     """The pictures of one scene."""
-    artist = Artist(RunSource(read_run(unit.run), unit.methods), unit.kind, unit.scale)
+    artist = Artist(RunSource(read_run(unit.run), unit.methods), unit.scale)
     pictures = []
     for k, draft in enumerate(unit.drafts):
         pictures.append(artist.draw(draft))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -89,20 +90,19 @@ class Figures:
         for scene in self._source.scenes:
             maps = self._maps(scene)
             for question in questions:
-                cells, told, views = [], "", self._views(maps, [])
+                cells, views = [], self._views(maps, [])
                 for k, (method, shown) in enumerate(zip(self._source.methods, maps, strict=True)):
                     refined = refined_names(self._source.run.folder.job(scene, method), shown.instances)
                     a_map = map_of(shown.instances, None if refined is None else refined.names)
                     answer = Solver(a_map, None, None if encoder is None else nearest_by(encoder)).answer(question)
-                    told = told or answer.text
                     row_of = {one.id: one.row for one in a_map.objects}
                     rows_of = [[row_of[one] for one in ids] for ids in (answer.object_ids, answer.reference_ids)]
                     view = self._views([shown], [*rows_of[0], *rows_of[1]])[0]
                     views[k] = view
                     names = {one.row: one.shown for one in a_map.objects}
-                    cells.append(_answer_cell(shown, view, rows_of, names))
+                    cells.append(replace(_answer_cell(shown, view, rows_of, names), caption=answer.text))
                 photo = self._photo(scene, maps[0], views[0])
-                rows.append(GridRow(f"{printable(question, 90)}  {printable(told, 160)}", scene, (*photo, *cells)))
+                rows.append(GridRow(printable(question, 160), scene, (*photo, *cells)))
         return rows
 
     def _maps(self, scene: str) -> list[DrawnMap]:

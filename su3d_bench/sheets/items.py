@@ -165,7 +165,7 @@ class KeyItem:
 @dataclass(frozen=True)
 class Key:
     """What the maintainer keeps: ``sheet_id`` ties it to its sheet, ``run`` names the run folder, ``run_digest`` its
-    code."""
+    code; ``answered_by``: who gave the answers of reasoning sheets."""
 
     __pydantic_config__ = _STRICT
     sheet_id: str
@@ -175,6 +175,7 @@ class Key:
     methods: tuple[str, ...]
     automatic_rule: str
     items: tuple[KeyItem, ...]
+    answered_by: str = ""
     schema_version: int = SCHEMA
 
 

@@ -53,6 +53,7 @@ class Origin:
     run_digest: str
     methods: tuple[str, ...]
     automatic_rule: str
+    answered_by: str = ""
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,16 @@ def make_sheets(
     shares = dealt([one.id for one in items], annotators, overlap, random)
     sheet = Sheet(set_id, kind, seed, ASKS[kind], items, shares)
     key_items = tuple(_key_item(ids[k], drafts[k]) for k in order)
-    key = Key(set_id, kind, origin.run, origin.run_digest, origin.methods, origin.automatic_rule, key_items)
+    key = Key(
+        set_id,
+        kind,
+        origin.run,
+        origin.run_digest,
+        origin.methods,
+        origin.automatic_rule,
+        key_items,
+        origin.answered_by,
+    )
     return MadeSheets(sheet, key, pictures)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from copy import copy
 from functools import cached_property, lru_cache
 from typing import Any
 
@@ -43,6 +44,13 @@ class RunSource:
         self._covered: dict[tuple[str, str, bytes], Covered] = {}
         self._truths = lru_cache(maxsize=2)(self._read_truth)
         self._frames_at = lru_cache(maxsize=len(self.methods))(self._read_frames)
+
+    def of_methods(self, methods: Sequence[str]) -> RunSource:
+        """The same run with these of its methods alone; what was read is shared."""
+        _ = self._datasets
+        other = copy(self)
+        other.methods = tuple(methods)
+        return other
 
     def _instances(self, scene: str, method: str) -> Instances:
         """The map of a scene; a ``PredictionError`` where it has no instances."""

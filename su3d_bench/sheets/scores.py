@@ -127,6 +127,7 @@ class Scores:
     agreements: tuple[AskAgreement, ...]
     confusions: tuple[Confusion, ...]
     second_looks: tuple[SecondLook, ...]
+    answered_by: str = ""
     schema_version: int = SCHEMA
 
 
@@ -146,13 +147,16 @@ class _Value:
 
 
 def score(sheet: Sheet, key: Key, judgements: Sequence[Judgement], silent: Sequence[str] = ()) -> Scores:
-    """The scores of judgements that ``check_answers`` found without fault."""
+    """The scores of judgements that ``check_answers`` found without fault; without any, what the truth says of all."""
     keys = {one.id: one for one in key.items}
     told = [(keys[one.item_id], one.ask, one.answer) for one in judgements]
     by_people = _values(told)
     judged = {(one.item_id, one.ask) for one in judgements}
     truth = [
-        (one, ask, choice) for one in key.items for ask, choice in one.automatic.items() if (one.id, ask) in judged
+        (one, ask, choice)
+        for one in key.items
+        for ask, choice in one.automatic.items()
+        if (one.id, ask) in judged or not judgements
     ]
     ratings = _ratings(told, judgements)
     return Scores(
@@ -170,6 +174,7 @@ def score(sheet: Sheet, key: Key, judgements: Sequence[Judgement], silent: Seque
         agreements=tuple(AskAgreement(what, agreement(items)) for what, items in ratings.items()),
         confusions=tuple(one for what in ratings if (one := _confusion(sheet, what, told)) is not None),
         second_looks=tuple(_second_looks(sheet, keys, judgements)),
+        answered_by=key.answered_by,
     )
 
 

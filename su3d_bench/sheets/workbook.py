@@ -22,6 +22,7 @@ HEADER_ROW = 3
 PICTURE_WIDTH = 600  # pixels as shown; the file has more
 POINTS_A_PIXEL = 0.75
 MOST_ROW_POINTS = 400.0  # a spreadsheet's rows end at 409
+FONT = "Calibri"  # that of a plain cell; without a name a bold one gets another
 HEAD_FILL, OPEN_FILL, EDGE = "FF1857B8", "FFFFF4CC", "FFD4D4CF"
 
 
@@ -112,15 +113,15 @@ def _write_head(page: Any, title: str, last: int) -> None:
     """Title, progress and the names of the columns, which stay in sight."""
     from openpyxl.styles import Alignment, Font, PatternFill
 
-    text_cell(page, 1, 2, title).font = Font(bold=True, size=15)
+    text_cell(page, 1, 2, title).font = Font(name=FONT, bold=True, size=15)
     letter = "ABCDEFGHI"[COLUMNS.index("answer")]
     cells = f"{letter}{HEADER_ROW + 1}:{letter}{last}"
     page.cell(2, 2).value = f'=COUNTA({cells})&" of "&ROWS({cells})&" answered"'
-    page.cell(2, 2).font = Font(bold=True, color=HEAD_FILL)
+    page.cell(2, 2).font = Font(name=FONT, bold=True, color=HEAD_FILL)
     text_cell(page, 2, 3, "Choose from the list in the column 'answer', save, and send the file back.")
     for column, name in enumerate(COLUMNS, 1):
         cell = text_cell(page, HEADER_ROW, column, name)
-        cell.font = Font(bold=True, color="FFFFFFFF")
+        cell.font = Font(name=FONT, bold=True, color="FFFFFFFF")
         cell.fill = PatternFill("solid", fgColor=HEAD_FILL)
         cell.alignment = Alignment(vertical="center")
     page.freeze_panes = page.cell(HEADER_ROW + 1, 2)
@@ -154,11 +155,11 @@ def _write_guide(page: Any, sheet: Sheet, title: str) -> None:
     """What each choice means."""
     from openpyxl.styles import Alignment, Font
 
-    text_cell(page, 1, 1, title).font = Font(bold=True, size=15)
+    text_cell(page, 1, 1, title).font = Font(name=FONT, bold=True, size=15)
     row = 2
     for ask in sheet.asks:
         row += 1
-        text_cell(page, row, 1, ask.text).font = Font(bold=True)
+        text_cell(page, row, 1, ask.text).font = Font(name=FONT, bold=True)
         for choice, meaning in zip(ask.choices, ask.meanings, strict=True):
             row += 1
             text_cell(page, row, 1, choice).alignment = Alignment(indent=1)

@@ -1,0 +1,347 @@
+"""Runs killed with signal 9 at random moments, their last written files spoilt as by a power cut, then taken up again.
+
+    python benchmarks/kill_at_random.py --kills 200
+    python benchmarks/kill_at_random.py --kills 20 --seed 7 --executors processes
+
+A run of three methods on four tiny painted scenes is started, killed at a moment drawn evenly from the time that a
+whole run takes, and half of the time each file of the second before the kill is cut short, emptied, filled with zeros
+or taken back. Half of the runs that take it up again are killed too. After every kill nothing that a seal vouches for
+may differ from the undisturbed run and the folder may not stay locked; in the end every file must have the bytes of
+the undisturbed run, columns of times aside, and no unfinished file may be left.
+
+Each run is a process forked from one that has its modules loaded, so that the kills strike the work, not the start.
+``group`` kills a run and all its workers, ``driver`` leaves workers behind for the next run to meet, ``worker`` kills
+one worker of a run.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import contextlib
+import csv
+import io
+import json
+import os
+import random
+import shutil
+import signal
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+TESTS = Path(__file__).resolve().parents[1] / "tests"
+METHODS = ("opensu3d", "sam3d", "conceptfusion")
+RUN = ("run", "--protocols", "rooms-semantic", "rooms-instance", "--anytime", "0.5", "--no-pictures", "--quiet")
+SUBJECTS = {
+    "light": (
+        *RUN, "--scenes", *(f"{TESTS}/painted.py:Painted/{scene}" for scene in "abc"),
+        "--methods", f"{TESTS}/painted.py:Collector", f"{TESTS}/kill_subject.py:Dense",
+        "--set", "painted.n_frames=4", "painted.frame_ms=10.0", "collector.noise_m=0.01",
+    ),
+    "opensu3d": (
+        *RUN, "--scenes", *(f"{TESTS}/painted.py:Painted/{scene}" for scene in "ab"),
+        "--methods", *METHODS, "--profile", "oracle",
+        "--set", "painted.n_frames=4", *(f"{name}.stride=1" for name in METHODS),
+    ),
+}  # fmt: skip
+EXECUTORS = {"inline": ("--jobs", "1"), "processes": ("--jobs", "2")}
+VICTIMS = {"inline": ("group",), "processes": ("group", "driver", "worker")}
+LAST_SECOND_NS = 1_000_000_000
+PAGE = 4096
+TIMES = ("_ms", "rss_bytes")
+COMPLETE, INCOMPLETE = 0, 3  # exit codes of the command
+
+
+@dataclass
+class Tally:
+    """What was done and what came of it; ``faults`` must stay empty."""
+
+    done: collections.Counter[str] = field(default_factory=collections.Counter)
+    faults: list[str] = field(default_factory=list)
+
+
+class Run:
+    """One run of the command in a process group of its own."""
+
+    def __init__(self, folder: Path, request: Sequence[str]) -> None:
+        self._log = folder.with_suffix(".log")
+        words = [*request, "--out", str(folder)]
+        self.started = time.monotonic()
+        self.pid = os.fork()
+        if self.pid == 0:
+            self._be_the_command(words)
+
+    def _be_the_command(self, words: list[str]) -> None:
+        code = 4
+        try:
+            os.setsid()
+            log = os.open(self._log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            os.dup2(log, 1)
+            os.dup2(log, 2)
+            from su3d_bench.cli.main import main
+
+            code = main(words)
+            sys.stdout.flush()
+            sys.stderr.flush()
+        finally:
+            os._exit(code)
+
+    def finish(self) -> int:
+        """The exit code; minus the signal where one ended it."""
+        _, status = os.waitpid(self.pid, 0)
+        return os.waitstatus_to_exitcode(status)
+
+    def has_ended(self) -> bool:
+        """Whether it is over; its exit code can still be had."""
+        return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+
+    def said(self) -> str:
+        return self._log.read_text(errors="replace")[-2000:]
+
+    def workers(self) -> list[int]:
+        import psutil
+
+        with contextlib.suppress(psutil.NoSuchProcess):
+            children = psutil.Process(self.pid).children(recursive=True)
+            return [one.pid for one in children if "spawn_main" in " ".join(one.cmdline())]
+        return []
+
+
+def kill(run: Run, victim: str, moments: random.Random) -> bool:
+    """Kill ``victim`` of ``run``; whether it was there."""
+    if run.has_ended():
+        return False
+    if victim == "worker":
+        workers = run.workers()
+        if not workers:
+            return False
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(moments.choice(workers), signal.SIGKILL)
+    elif victim == "driver":
+        os.kill(run.pid, signal.SIGKILL)
+    else:
+        os.killpg(run.pid, signal.SIGKILL)
+    return True
+
+
+def cut_power(roots: Sequence[Path], moments: random.Random) -> int:
+    """Spoil the files of the last second as an unlucky file system would; how many were."""
+    since = time.time_ns() - LAST_SECOND_NS
+    spoilt = 0
+    for path in sorted(path for root in roots for path in root.rglob("*") if path.is_file()):
+        if path.stat().st_mtime_ns < since:
+            continue
+        content = path.read_bytes()
+        way = moments.choice(("whole", "cut", "empty", "zeros", "tail", "undone"))
+        at = moments.randrange(len(content) + 1)
+        if way == "whole":
+            continue
+        spoilt += 1
+        if way == "undone":  # the bytes reached the disk in part, the new name did not
+            path.rename(path.with_name(f".{path.name}.tmp"))
+        elif way == "cut":
+            path.write_bytes(content[:at])
+        elif way == "tail":  # whole pages that were promised but not written
+            kept = at // PAGE * PAGE
+            path.write_bytes(content[:kept] + bytes(len(content) - kept))
+        else:
+            path.write_bytes(b"" if way == "empty" else bytes(len(content)))
+    return spoilt
+
+
+def outcome(folder: Path) -> dict[str, Any]:
+    """What every file of a run folder holds, without what a clock or a meter put there."""
+    return {
+        path.relative_to(folder).as_posix(): _timeless(path) for path in sorted(folder.rglob("*")) if path.is_file()
+    }
+
+
+def _timeless(path: Path) -> Any:
+    content = path.read_bytes()
+    if path.name == "updates.csv":
+        rows = list(csv.DictReader(io.StringIO(content.decode())))
+        return [{name: value for name, value in row.items() if not name.endswith(TIMES)} for row in rows]
+    if path.name == "done.json":
+        record = json.loads(content)
+        for step in record["steps"].values():
+            step["files"].pop("updates.csv", None)
+            step["remarks"].pop("costs", None)
+        return record
+    return content
+
+
+def false_seals(folder: Path, expected: dict[str, Any]) -> list[str]:
+    """Files that a seal vouches for, or a reader takes for a finished run, though they are not those of a whole run."""
+    from su3d_bench.digests import digest_file
+    from su3d_bench.errors import Su3dError
+    from su3d_bench.finished_run import read_run
+    from su3d_bench.store import JobFolder
+
+    wrong = []
+    for done in folder.rglob("done.json"):
+        for seal in JobFolder(done.parent).seals().values():
+            files = {done.parent / name: sha for name, sha in seal["files"].items()}
+            if all(path.is_file() and digest_file(path) == sha for path, sha in files.items()):
+                names = [path.relative_to(folder).as_posix() for path in files]
+                wrong += [name for name in names if _timeless(folder / name) != expected.get(name)]
+    with contextlib.suppress(Su3dError):
+        run = read_run(folder)
+        if run.is_incomplete:
+            return wrong
+        for method in run.methods:
+            run.scores(method)
+        present = outcome(folder)
+        wrong += [f"{name} of a run that reads as finished" for name in expected if present.get(name) != expected[name]]
+    return wrong
+
+
+class Trial:
+    """One executor: its undisturbed run, and as many killed ones as are asked for."""
+
+    def __init__(self, scratch: Path, subject: str, executor: str, moments: random.Random, tally: Tally) -> None:
+        self._request = (*SUBJECTS[subject], *EXECUTORS[executor])
+        self._scratch, self._executor, self._moments, self._tally = scratch, executor, moments, tally
+        self._cache = scratch / "cache"
+        os.environ["SU3D_CACHE"] = str(self._cache)
+        whole = scratch / f"whole-{executor}"
+        run = Run(whole, self._request)
+        if run.finish() != COMPLETE:
+            raise SystemExit(f"the undisturbed run failed: {run.said()}")
+        shutil.rmtree(self._cache, ignore_errors=True)
+        run = Run(scratch / "timed", self._request)
+        run.finish()
+        self._whole_s = time.monotonic() - run.started
+        self.expected = outcome(whole)
+        if outcome(scratch / "timed") != self.expected:
+            raise SystemExit("two undisturbed runs differ; nothing can be said of killed ones")
+        shutil.rmtree(scratch / "timed")
+
+    def kills(self, n: int) -> None:
+        """Episodes until ``n`` kills struck."""
+        struck = 0
+        while struck < n:
+            folder = self._scratch / "run"
+            shutil.rmtree(folder, ignore_errors=True)
+            shutil.rmtree(self._cache, ignore_errors=True)
+            of_episode = 0
+            while of_episode == 0 or (struck < n and self._moments.random() < 0.5):
+                of_episode += 1
+                struck += self._kill_one(folder)
+            self._take_up(folder)
+
+    def _kill_one(self, folder: Path) -> bool:
+        victim = self._moments.choice(VICTIMS[self._executor])
+        run = Run(folder, self._request)
+        time.sleep(self._moments.uniform(0, self._whole_s))
+        was_hit = kill(run, victim, self._moments)
+        if was_hit and victim == "driver":
+            run.finish()
+            return self._count("driver", spoilt=None)  # its workers may live on for a moment: the next run meets them
+        code = run.finish()
+        if not was_hit:
+            self._tally.done["was over, or had no worker, at the moment of the kill"] += 1
+            if code != COMPLETE:
+                self._fault(f"a run that nobody killed ended with {code}: {run.said()}")
+            return False
+        if victim == "worker" and code not in (COMPLETE, INCOMPLETE):
+            self._fault(f"a run whose worker was killed ended with {code}: {run.said()}")
+        if victim == "worker" and "Traceback" in run.said():
+            self._fault(f"a run whose worker was killed showed a traceback: {run.said()}")
+        spoilt = cut_power([folder, self._cache], self._moments) if self._moments.random() < 0.5 else None
+        if folder.is_dir():
+            for name in false_seals(folder, self.expected):
+                self._fault(f"taken for whole after the kill of a {victim}: {name}")
+            self._lock(folder)
+        return self._count(victim, spoilt)
+
+    def _count(self, victim: str, spoilt: int | None) -> bool:
+        self._tally.done[f"{self._executor}: kills of a {victim}"] += 1
+        if spoilt is not None:
+            self._tally.done[f"{self._executor}: power cuts"] += 1
+            self._tally.done[f"{self._executor}: files spoilt"] += spoilt
+        return True
+
+    def _lock(self, folder: Path) -> None:
+        from su3d_bench.errors import StoreError
+        from su3d_bench.store import RunFolder
+
+        try:
+            with RunFolder(folder).locked():
+                pass
+        except StoreError as error:
+            self._fault(f"a lock stayed: {error}")
+
+    def _take_up(self, folder: Path) -> None:
+        run = Run(folder, self._request)
+        code = run.finish()
+        self._tally.done[f"{self._executor}: runs taken up again and compared"] += 1
+        if code != COMPLETE:
+            self._fault(f"taken up again it ended with {code}: {run.said()}")
+            return
+        found = outcome(folder)
+        for name in sorted(found.keys() | self.expected.keys()):
+            if found.get(name) != self.expected.get(name):
+                state = (
+                    "is missing" if name not in found else "is left over" if name not in self.expected else "differs"
+                )
+                self._fault(f"taken up again: {name} {state}")
+        for path in self._cache.rglob("*"):
+            if path.is_file() and path.suffix != ".npz":
+                self._fault(f"left in the cache: {path.name}")
+
+    def _fault(self, line: str) -> None:
+        self._tally.faults.append(f"{self._executor}: {line}")
+        print(f"FAULT {self._tally.faults[-1]}", flush=True)
+
+
+def load_modules(subject: str) -> None:
+    """What a run imports, in this one process, which must stay without threads of its own."""
+    from su3d_bench.executors import limit_threads
+
+    limit_threads()
+    import su3d_bench.cli.main
+    import su3d_bench.planning
+    import su3d_bench.reports.tables
+    import su3d_bench.runner
+
+    if subject == "opensu3d":
+        import sklearn.cluster  # noqa: F401
+
+        import su3d_bench.baselines.conceptfusion
+        import su3d_bench.baselines.sam3d
+        import su3d_bench.opensu3d.pipeline  # noqa: F401
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=200, help="in all, shared evenly by the executors (default: 200)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--executors", nargs="+", choices=list(EXECUTORS), default=list(EXECUTORS))
+    parser.add_argument("--subject", choices=list(SUBJECTS), default="light", help="what runs (default: light)")
+    given = parser.parse_args(arguments)
+    load_modules(given.subject)
+    tally = Tally()
+    started = time.monotonic()
+    with tempfile.TemporaryDirectory(prefix="su3d-kills-") as scratch:
+        for k, executor in enumerate(given.executors):
+            own = Path(scratch) / executor
+            own.mkdir()
+            n = given.kills // len(given.executors) + (k < given.kills % len(given.executors))
+            Trial(own, given.subject, executor, random.Random(f"{given.seed} {executor}"), tally).kills(n)
+    for what, n in sorted(tally.done.items()):
+        print(f"{n:6} {what}")
+    print(f"{len(tally.faults):6} faults, in {time.monotonic() - started:.0f} s")
+    return 1 if tally.faults else 0
+
+
+if "light" in sys.argv or "--subject" not in sys.argv:  # at import: spawned workers import this file with its arguments
+    sys.path.insert(0, str(TESTS))
+    import kill_subject  # noqa: F401
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,151 @@
+// The colours of a map's points, and what is said of them beneath the view.
+
+const COLOURINGS = [
+  ['colour', 'colour'], ['instance', 'instance'], ['class', 'class'], ['truth', 'true class'],
+  ['error', 'error against the truth'], ['similarity', 'similarity to a text'],
+];
+const PALE = { wall: [226, 222, 214], floor: [208, 203, 196], ceiling: [236, 236, 232] };
+const NOTHING = [150, 154, 160];
+const HEAT = [[0, 0, 128], [0, 80, 255], [90, 215, 190], [250, 190, 40], [230, 50, 10], [128, 0, 0]];
+const ERRORS = [
+  ['right class', [59, 140, 226]], ['wrong class', [224, 72, 58]], ['truth not scored', [176, 180, 186]],
+  ['no truth within 5 cm', [120, 124, 132]], ['no class', [240, 176, 64]],
+];
+const NEAR_NONE = 0xffff, NOT_SCORED = 0xfffe;
+
+function distinct(k) {
+  const [s, v] = [[0.72, 0.86], [0.55, 0.95], [0.85, 0.62]][Math.floor(k / 8) % 3];
+  const hue = ((0.58 + k * 0.61803398875) % 1) * 6;
+  return [5, 3, 1].map((n) => {
+    const t = (n + hue) % 6;
+    return Math.round(255 * (v - v * s * Math.max(0, Math.min(t, 4 - t, 1))));
+  });
+}
+function heat(t) {
+  const at = Math.max(0, Math.min(1, t)) * (HEAT.length - 1), k = Math.min(HEAT.length - 2, Math.floor(at));
+  return HEAT[k].map((value, c) => Math.round(value + (HEAT[k + 1][c] - value) * (at - k)));
+}
+
+// The kinds of colours that a map has.
+function colouringsOf(map) {
+  const hasClass = map.classOfPoint || map.instances.some((one) => one.class !== undefined);
+  const has = {
+    colour: !!map.colour, instance: map.instances.length > 0, truth: !!map.truth, error: !!map.truth && hasClass,
+    class: map.classOfPoint || map.instances.some((one) => one.class >= 0), similarity: map.queries.length > 0,
+  };
+  return COLOURINGS.filter(([kind]) => has[kind]);
+}
+
+function classAt(map, k) {
+  if (map.classOfPoint) return map.classOfPoint[k] === NEAR_NONE ? -1 : map.classOfPoint[k];
+  const own = map.instances[map.owner[k]];
+  return own && own.class !== undefined ? own.class : -1;
+}
+const truthAt = (map, k) => (map.truth[k] >= NOT_SCORED ? -1 : map.truth[k]);
+function errorAt(map, k) {
+  if (map.truth[k] === NEAR_NONE) return 3;
+  if (map.truth[k] === NOT_SCORED) return 2;
+  const called = classAt(map, k);
+  if (called === map.truth[k]) return 0;
+  return called < 0 ? 4 : 1;
+}
+
+// The classes of the truth, else of the map, by their points: the first ones get the most distinct colours.
+function classOrder(map) {
+  if (map.order) return map.order;
+  const counts = new Map();
+  for (let k = 0; k < map.n; k++) {
+    const c = map.truth && map.truth[k] < NOT_SCORED ? map.truth[k] : classAt(map, k);
+    counts.set(c, (counts.get(c) || 0) + 1);
+  }
+  const coloured = [...counts].filter(([c]) => c >= 0 && !PALE[map.classes[c]]).sort((a, b) => b[1] - a[1]);
+  map.order = new Map(coloured.map(([c], place) => [c, place]));
+  return map.order;
+}
+
+// The colours of all points in one way, and the legend as pairs of a colour (null where there is none) and a text.
+function painted(map, kind, query) {
+  const colours = new Uint8Array(3 * map.n), counts = new Map(), order = classOrder(map);
+  const count = (what) => { counts.set(what, (counts.get(what) || 0) + 1); return what; };
+  const share = (n) => `${((100 * n) / Math.max(1, map.n)).toFixed(0)} %`;
+  const tint = (c) =>
+    (c < 0 || c >= map.classes.length ? NOTHING : PALE[map.classes[c]] || distinct(order.get(c) ?? c));
+  const values = kind === 'similarity' ? map.instances.map((one) => one.similarity[query]) : [];
+  const low = Math.min(...values), high = Math.max(...values);
+  const owned = (k, rgb) => (map.owner[k] === NEAR_NONE ? NOTHING : rgb(map.owner[k]));
+  const nameOfInstance = (own) => (map.instances[own] ? map.instances[own].name : undefined);
+  const warmth = (own) => heat(high > low ? (values[own] - low) / (high - low) : 0.5);
+  const paintOf = {
+    colour: (k) => map.colour.subarray(3 * k, 3 * k + 3),
+    instance: (k) => owned(k, (own) => PALE[nameOfInstance(own)] || distinct(own)),
+    class: (k) => tint(count(classAt(map, k))),
+    truth: (k) => tint(count(truthAt(map, k))),
+    error: (k) => ERRORS[count(errorAt(map, k))][1],
+    similarity: (k) => owned(k, warmth),
+  }[kind];
+  if (paintOf) for (let k = 0; k < map.n; k++) colours.set(paintOf(k), 3 * k);
+  const classes = (none) => [...counts].sort((a, b) => b[1] - a[1])
+    .map(([c, n]) => [tint(c), `${c < 0 ? none : map.classes[c]} ${share(n)}`]);
+  const legendOf = {
+    colour: () => [[null, 'as the frames saw it']],
+    instance: () => [[null, plural(map.instances.length, 'instance')]],
+    class: () => classes('none'),
+    truth: () => classes('not scored or nothing near'),
+    error: () => ERRORS.map(([text, rgb], e) => [rgb, `${text} ${share(counts.get(e) || 0)}`])
+      .filter((_, e) => counts.get(e)),
+    similarity: () => [0, 0.25, 0.5, 0.75, 1].map((t) => [heat(t), ((low + t * (high - low)) / 1000).toFixed(3)]),
+  }[kind];
+  return { colours, legend: legendOf ? legendOf() : [] };
+}
+
+function legendEntry([rgb, text]) {
+  if (!rgb) return h('li', null, text);
+  const swatch = h('span', { class: 'swatch' });
+  swatch.style.backgroundColor = `rgb(${rgb.join(',')})`;
+  return h('li', null, swatch, text);
+}
+
+const titleOf = (map, one) => one.name || (one.class >= 0 ? map.classes[one.class] : '') || `instance ${one.id}`;
+
+// The true class that most scored points of an instance have, and their share of them.
+function truthOfInstance(map, index) {
+  const counts = new Map();
+  for (let k = 0; k < map.n; k++) {
+    if (map.owner[k] === index && truthAt(map, k) >= 0) counts.set(map.truth[k], (counts.get(map.truth[k]) || 0) + 1);
+  }
+  const [most] = [...counts].sort((a, b) => b[1] - a[1]);
+  return most ? [map.classes[most[0]], most[1] / [...counts.values()].reduce((a, b) => a + b, 0)] : null;
+}
+
+// What is known of an instance, as pairs of a name and a text.
+function factsOfInstance(map, index) {
+  const one = map.instances[index], facts = [];
+  const metres = (values, between) => values.map((v) => v.toFixed(2)).join(between);
+  if (one.class !== undefined) facts.push([`Class (${map.protocol})`, one.class < 0 ? 'none' : map.classes[one.class]]);
+  const truth = map.truth ? truthOfInstance(map, index) : null;
+  if (map.truth) facts.push(['Truth there', truth ? `${truth[0]} (${percent(truth[1], 0)} % of its points)` : 'none']);
+  if (isNumber(one.score)) facts.push(['Score', one.score.toFixed(3)]);
+  facts.push(['Points', countText(one.points)]);
+  if (one.size) facts.push(['Size', `${metres(one.size, ' × ')} m`], ['Centre', `${metres(one.centre, ', ')} m`]);
+  if (one.views) {
+    const named = `${plural(one.n_views, 'frame')}: ${one.views.join(', ')}`;
+    facts.push(['Seen in', one.n_views ? named + (one.n_views > one.views.length ? ', …' : '') : 'not recorded']);
+  }
+  if (one.similarity && one.similarity.length) {
+    const k = one.similarity.indexOf(Math.max(...one.similarity));
+    facts.push(['Most like', `“${map.queries[k]}” ${(one.similarity[k] / 1000).toFixed(3)}`]);
+  }
+  return facts;
+}
+
+// A frame in which the instance is seen, with a box around it; null where the page holds none.
+function viewOfInstance(map, one, thumbnails) {
+  const image = one.view !== undefined && thumbnails[one.view];
+  if (!image) return null;
+  const frame = h('i', { 'aria-hidden': 'true' }), [x0, y0, x1, y1] = one.box.map((v) => 100 * v);
+  Object.assign(frame.style, { left: `${x0}%`, top: `${y0}%`, width: `${x1 - x0}%`, height: `${y1 - y0}%` });
+  const alt = `Frame ${one.view} with ${titleOf(map, one)}`;
+  return h('figure', { class: 'thumb' },
+    h('div', { class: 'thumb' }, h('img', { alt, src: `data:image/jpeg;base64,${image}` }), frame),
+    h('figcaption', null, `Frame ${one.view}: where its points are`));
+}

@@ -1,0 +1,108 @@
+// The section of times: the course of the updates, methods beside each other, stages, maps midway.
+
+function timingSection() {
+  if (!DATA.timing.length) return;
+  part('timing', 'Timing', 'What each update costs. Perception is read from its cache where the stage “cache” '
+    + 'stands; “map” is everything but reading the frame and perception.', (section) => {
+    section.append(h('ul', { class: 'facts' }, RUNS.map((run, k) =>
+      h('li', null, RUNS.length > 1 ? `${runNames[k]}: ` : '', h('b', null, run.hardware)))));
+    coursePlot(section);
+    section.append(h('h3', null, 'Methods'), methodTimes());
+    const below = h('div');
+    const side = select('Stages of', DATA.timing.map((one, k) => [k, nameOf(one)]), 0, draw);
+    section.append(h('div', { class: 'toolbar' }, side), below);
+    function draw() { below.replaceChildren(stageTimes(DATA.timing[side.input.value])); }
+    draw();
+    anytime(section);
+  });
+}
+
+function coursePlot(section) {
+  const scenes = [...new Set(DATA.timing.flatMap((one) => Object.keys(one.series)))], place = h('div');
+  const scene = select('Scene', scenes.map((name) => [name, name]), scenes[0], plot);
+  const what = select('Time of', [['map', 'the map alone'], ['total', 'the whole update']], 'map', plot);
+  const axes = [['updates', 'updates so far'], ['points', 'points of the map']];
+  const against = select('Against', axes, 'updates', plot);
+  section.append(h('div', { class: 'toolbar' }, scene, what, against), place);
+  function plot() {
+    const name = scene.input.value, byPoints = against.input.value === 'points';
+    const usable = DATA.timing.filter((one) => one.series[name]);
+    const lines = usable.map((one) => {
+      const series = one.series[name];
+      const updates = series.total.map((_, k) => Math.min(series.n, (k + 1) * series.per));
+      const x = byPoints ? series.points || [] : updates;
+      const y = x.length ? series[what.input.value] : [];
+      return { name: nameOf(one), style: styleOf(one.run, one.method), x, y };
+    }).filter((line) => line.x.length);
+    const per = Math.max(1, ...usable.map((one) => one.series[name].per));
+    const yLabel = `ms an update${per > 1 ? ` (means of up to ${per})` : ''}`, [, xLabel] = axes[byPoints ? 1 : 0];
+    place.replaceChildren(linePlot({ label: `Milliseconds an update in ${name}`, lines, xLabel, yLabel }));
+  }
+  plot();
+}
+
+const growthWords = (one) => (one.by_points || one.by_updates || { words: 'too few updates to tell' }).words;
+
+function methodTimes() {
+  const stage = (one, name) => one.stages.find((each) => each.name === name) || {};
+  const mib = (bytes) => (isNumber(bytes) ? (bytes / 2 ** 20).toFixed(0) : '–');
+  const ms = (label, value) => ({ label, num: true, value, show: (one) => msText(value(one)) });
+  const bytes = (label, key) => ({ label, num: true, value: (one) => one[key], show: (one) => mib(one[key]) });
+  return dataTable({
+    caption: 'All scenes; milliseconds an update, the first three of a scene apart', rows: DATA.timing,
+    columns: [
+      { label: 'Method', value: nameOf }, { label: 'Updates', num: true, value: (one) => one.n_updates },
+      ...['p50', 'p95', 'max', 'first'].map((key) => ms(key, (one) => stage(one, 'total')[key])),
+      ms('map p50', (one) => stage(one, 'map').p50),
+      { label: 'With a larger map', value: (one) => growthWords(stage(one, 'map')) },
+      ms('Finish', (one) => one.finish_ms),
+      { label: 'Points', num: true, value: (one) => one.n_points, show: (one) => countText(one.n_points) },
+      bytes('Map MiB', 'map_bytes'), bytes('Peak MiB', 'peak_rss_bytes'), bytes('GPU MiB', 'device_bytes'),
+    ],
+  });
+}
+
+function stageTimes(one) {
+  const growth = (g) => (g ? `${g.exponent.toFixed(2)} [${g.low.toFixed(2)}, ${g.high.toFixed(2)}]` : '–');
+  const exponent = (label, key) => ({
+    label, num: true, value: (row) => row[key] && row[key].exponent, show: (row) => growth(row[key]) });
+  return dataTable({
+    caption: `${nameOf(one)}: milliseconds an update, stage by stage`, rows: one.stages,
+    columns: [
+      { label: 'Stage', value: (row) => row.name },
+      ...['p50', 'p95', 'max', 'first'].map((key) => ({
+        label: key, num: true, value: (row) => row[key], show: (row) => msText(row[key]) })),
+      { label: 'Share', num: true, value: (row) => row.share, show: (row) => `${percent(row.share)} %` },
+      exponent('Exponent by map points', 'by_points'), exponent('Exponent by updates', 'by_updates'),
+      { label: 'With a larger map', value: growthWords },
+    ],
+  });
+}
+
+function anytime(section) {
+  const midway = DATA.results.filter((one) => one.anytime.length && one.result);
+  if (!midway.length) return;
+  const place = h('div'), names = [...new Set(midway.map((one) => one.protocol))];
+  const protocols = protocolField(names), metric = select('Metric', [], null, draw);
+  section.append(h('h3', null, 'Maps midway'), h('div', { class: 'toolbar' }, protocols, metric), place);
+  chosen.listeners.push(refresh);
+  function refresh() {
+    const first = midway.find((one) => one.protocol === protocols.protocol());
+    if (!first) return;
+    metric.setOptions(first.headline.map((name) => [name, name]), metric.input.value);
+    draw();
+  }
+  function draw() {
+    const name = metric.input.value;
+    const lines = midway.filter((one) => one.protocol === protocols.protocol()).map((one) => {
+      const shares = one.anytime.map((each) => [each.share, each.metrics[name]]);
+      const points = [...shares, [1, one.result.metrics[name]]].filter(([, value]) => isNumber(value))
+        .sort((a, b) => a[0] - b[0]);
+      return { name: nameOf(one), style: styleOf(one.run, one.method), x: points.map(([share]) => 100 * share),
+        y: points.map(([, value]) => (isCount(name) ? value : 100 * value)) };
+    });
+    place.replaceChildren(linePlot({ label: `${name} of maps midway`, lines,
+      xLabel: 'per cent of the frames', yLabel: isCount(name) ? name : `${name} in per cent` }));
+  }
+  refresh();
+}

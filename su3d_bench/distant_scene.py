@@ -1,0 +1,143 @@
+"""One scene of a run whose worker, data or run folder is elsewhere: fetch, run as everywhere, send back.
+
+A store has no rename and no lock. So ``done.json``, which vouches for a job's other files by their SHA-256, is sent
+after them: a job that was sent in part has no seal, or one that its files do not match, and is run again.
+"""
+
+from __future__ import annotations
+
+import os
+import tempfile
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from su3d_bench.digests import digest_bytes
+from su3d_bench.errors import StoreError
+from su3d_bench.executors import Report
+from su3d_bench.remote_folder import RemoteFolder
+from su3d_bench.scene_run import MethodOutcome, SceneJob, failed_outcomes, run_scene
+from su3d_bench.store import RunFolder, make_folder, write_bytes
+
+CACHE_ROOT = "~/.cache/su3d-bench/cache"
+SEAL = "done.json"
+REPLIES = "language"  # of language models, which the scenes of a run share
+OF_THE_RUN = ("run.toml", "run.json", "metrics.json", "ablation.json")
+LARGE = ("prediction.npz", ".features.npy", ".png")  # ends of names that no table or comparison reads
+
+
+@dataclass(frozen=True)
+class DistantJob:
+    """A job for a worker that shares a disk or nothing with whoever asked; it runs in ``folder`` where that exists.
+
+    ``store`` and ``data`` are URLs, None where the job's own folders are on a shared disk; ``files`` are those of the
+    scene in ``data`` with their sizes; ``cache_root`` None: the worker's own.
+    """
+
+    job: SceneJob
+    here: Path
+    store: str | None = None
+    data: str | None = None
+    files: Mapping[str, int] = field(default_factory=dict)
+    cache_root: Path | None = None
+
+
+def run_distant_scene(distant: DistantJob, report: Report) -> tuple[MethodOutcome, ...]:
+    """What ``run_scene`` gives, its files sent to the store."""
+    if distant.here.is_dir():
+        os.chdir(distant.here)  # relative paths in the configuration are meant from there
+    cache_root = distant.cache_root or Path(os.environ.get("SU3D_CACHE") or CACHE_ROOT).expanduser()
+    with tempfile.TemporaryDirectory(prefix="su3d-scene-") as scratch:
+        job = replace(distant.job, cache_root=cache_root)
+        if distant.data is not None:
+            job = replace(job, data_root=Path(scratch) / "data")
+            make_folder(job.data_root)
+            RemoteFolder(distant.data).fetch(distant.files, job.data_root)
+        if distant.store is None:
+            return run_scene(job, report)
+        job = replace(job, folder=Path(scratch) / "run")
+        with _stored(RemoteFolder(distant.store), job):
+            return run_scene(job, report)
+
+
+class _stored:  # noqa: N801 - reads as the statement that it is
+    """The files of a job, from the store at the start of the block and back to it at its end."""
+
+    def __init__(self, store: RemoteFolder, job: SceneJob) -> None:
+        self._store, self._folder = store, job.folder
+        self._below = _scene_folder(job)
+        self._before: dict[str, tuple[int, int]] = {}
+
+    def __enter__(self) -> None:
+        make_folder(self._folder)
+        self._store.fetch(self._store.files(self._below) | self._store.files(REPLIES), self._folder)
+        self._before = self._files()
+
+    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
+        if isinstance(error, StoreError):
+            raise StoreError(str(error).replace(str(self._folder), self._store.url)) from error
+        if error is None:
+            after = self._files()
+            changed = [name for name, stamp in after.items() if self._before.get(name) != stamp]
+            self._store.remove(name for name in self._before if name not in after)
+            self._store.send(self._folder, sorted(changed, key=lambda name: (name.endswith(f"/{SEAL}"), name)))
+
+    def _files(self) -> dict[str, tuple[int, int]]:
+        """Inode and time of every file, which a file that is written again does not keep."""
+        found = [path for path in sorted(self._folder.rglob("*")) if path.is_file() and not path.name.endswith(".tmp")]
+        stats = {path.relative_to(self._folder).as_posix(): path.stat() for path in found}
+        return {name: (about.st_ino, about.st_mtime_ns) for name, about in stats.items()}
+
+
+def _scene_folder(job: SceneJob) -> str:
+    return RunFolder(job.folder).job(job.scene, "any").path.parent.relative_to(job.folder).as_posix()
+
+
+def failed_distant(distant: DistantJob, reason: str) -> tuple[MethodOutcome, ...]:
+    """The outcome of a scene whose worker was lost; its logs say so, in the store too."""
+    outcomes = failed_outcomes(distant.job, reason)
+    if distant.store is not None:
+        logs = [RunFolder(distant.job.folder).job(one.scene, one.method).log for one in outcomes]
+        names = [log.relative_to(distant.job.folder).as_posix() for log in logs if log.is_file()]
+        RemoteFolder(distant.store).send(distant.job.folder, names)
+    return outcomes
+
+
+def mirror_of(url: str, cache_root: Path) -> Path:
+    """Where this machine keeps the small files of the run folder at ``url``."""
+    return cache_root / "runs" / f"{url.rstrip('/').rpartition('/')[2]}-{digest_bytes(url.rstrip('/').encode())[:8]}"
+
+
+def fetch_seals(url: str, mirror: Path) -> None:
+    """Make ``mirror`` hold the seals of the store and no others, so that a plan meets what was sealed there."""
+    with RunFolder(mirror).locked():
+        store = RemoteFolder(url)
+        seals = [name for name in store.files("scenes") if name.endswith(f"/{SEAL}")]
+        for path in mirror.glob(f"scenes/*/*/{SEAL}"):
+            path.unlink()
+        _write(mirror, store, seals)
+
+
+def fetch_results(url: str, mirror: Path) -> None:
+    """Bring every file of the run's jobs that aggregation, tables and comparisons read."""
+    store = RemoteFolder(url)
+    _write(mirror, store, [name for name in store.files("scenes") if not _is_large(name)])
+
+
+def _is_large(name: str) -> bool:
+    file = name.rpartition("/")[2]
+    is_early_map = file.startswith("anytime-") and not file.endswith("-counts.npz")
+    return is_early_map or file.endswith(LARGE)
+
+
+def _write(mirror: Path, store: RemoteFolder, names: Sequence[str]) -> None:
+    for name, content in store.read(names):
+        make_folder((mirror / name).parent)
+        write_bytes(mirror / name, content)
+
+
+def send_records(url: str, mirror: Path) -> None:
+    """Bring the run's own records in the store up to those of ``mirror``."""
+    store = RemoteFolder(url)
+    store.remove(name for name in OF_THE_RUN if not (mirror / name).is_file())
+    store.send(mirror, [name for name in OF_THE_RUN if (mirror / name).is_file()])

@@ -1,0 +1,83 @@
+"""Files of caches that several processes fill at once: whole or absent, and nothing piles up beside them.
+
+And arrays out of files that may be damaged, of which no more is believed than they hold.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import math
+import os
+import struct
+import tokenize
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+# What reading a damaged .npz raises; a compression that there is none of is a NotImplementedError, a RuntimeError.
+DAMAGE = (
+    OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, RuntimeError,
+    SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error, struct.error,
+)  # fmt: skip
+
+
+def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
+    """The plain arrays of an .npz file; raises one of ``DAMAGE`` for anything else.
+
+    As ``numpy.load``, but a header that promises more than its member holds is damage, and no terabyte to allocate.
+    """
+    with zipfile.ZipFile(source) as archive:
+        return {info.filename.removesuffix(".npy"): _array(archive, info) for info in archive.infolist()}
+
+
+def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
+    with archive.open(info) as member:
+        version = np.lib.format.read_magic(member)
+        if version not in ((1, 0), (2, 0)):
+            raise ValueError(f"{info.filename}: .npy of version {version}")
+        header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = header(member)
+        if math.prod(shape) * dtype.itemsize != info.file_size - member.tell():
+            raise ValueError(f"{info.filename}: holds other than the {shape} that it promises")
+        member.seek(0)
+        array: NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
+        return array
+
+
+@contextmanager
+def filling(path: Path) -> Iterator[IO[bytes] | None]:
+    """A stream whose bytes become ``path`` at the end; None where another process is writing that file just now.
+
+    The unfinished file has one name, and its writer holds a lock that dies with it: what a killed process leaves is
+    taken over by the next that writes the same file. Raises ``OSError`` where the disk refuses.
+    """
+    unfinished = path.with_name(f".{path.name}.tmp")
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with os.fdopen(os.open(unfinished, os.O_RDWR | os.O_CREAT, 0o666), "r+b") as stream:
+        if not _is_ours(stream, unfinished):
+            yield None
+            return
+        try:
+            stream.truncate(0)
+            yield stream
+            stream.flush()
+            os.replace(unfinished, path)
+        except BaseException:
+            with suppress(OSError):
+                unfinished.unlink(missing_ok=True)
+            raise
+
+
+def _is_ours(stream: IO[bytes], unfinished: Path) -> bool:
+    """Whether the lock is ours and the file is still unfinished: its last writer may have renamed it meanwhile."""
+    try:
+        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        return os.path.samestat(os.fstat(stream.fileno()), unfinished.stat())
+    except (BlockingIOError, FileNotFoundError):
+        return False

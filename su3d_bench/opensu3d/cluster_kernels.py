@@ -1,0 +1,194 @@
+"""DBSCAN on a grid, compiled: the labels of scikit-learn's, which takes far longer and keeps every neighbour.
+
+Cells are a little smaller than eps / sqrt(3), so that points of one cell are always within eps of each other: the core
+points of a cell are one cluster, and clusters grow from cell to cell. What comes out does not depend on the order of
+the work: a cluster is a component of core points, clusters are numbered by their first core point, and a border point
+belongs to the first cluster that has a core point within eps of it.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numba import njit
+
+NOISE = -1
+ABSENT = -1
+# Of 5x5x5 cells around one, the nearest first; a point within eps lies in one of them.
+_STEPS = np.array(
+    sorted(np.ndindex(5, 5, 5), key=lambda step: sum(max(abs(axis - 2) - 1, 0) ** 2 for axis in step)), np.int64
+)
+STEPS = _STEPS[np.argsort((_STEPS != 2).any(axis=1), kind="stable")] - 2
+
+
+@njit(cache=True, inline="always")
+def _slot(table, keys, cx, cy, cz):  # type: ignore[no-untyped-def]
+    """Where the cell is in ``table``, or the free slot where it belongs."""
+    size = np.uint64(len(table) - 1)
+    mixed = (
+        np.uint64(cx) * np.uint64(0x9E3779B97F4A7C15)
+        ^ np.uint64(cy) * np.uint64(0xC2B2AE3D27D4EB4F)
+        ^ np.uint64(cz) * np.uint64(0x165667B19E3779F9)
+    )
+    slot = (mixed ^ (mixed >> np.uint64(32))) & size
+    while True:
+        cell = table[slot]
+        if cell == ABSENT or (keys[cell, 0] == cx and keys[cell, 1] == cy and keys[cell, 2] == cz):
+            return slot
+        slot = (slot + np.uint64(1)) & size
+
+
+@njit(cache=True)
+def _fill_cells(points, eps, table, keys, cell_of):  # type: ignore[no-untyped-def]
+    """Writes the cell of each point and each cell's coordinates; gives the number of cells."""
+    side = eps / math.sqrt(3.0) * (1.0 - 1e-6)
+    lowest = np.array([points[:, 0].min(), points[:, 1].min(), points[:, 2].min()])
+    n_cells = 0
+    for i in range(len(points)):
+        cx = np.int64((points[i, 0] - lowest[0]) / side)
+        cy = np.int64((points[i, 1] - lowest[1]) / side)
+        cz = np.int64((points[i, 2] - lowest[2]) / side)
+        slot = _slot(table, keys, cx, cy, cz)
+        if table[slot] == ABSENT:
+            keys[n_cells, 0], keys[n_cells, 1], keys[n_cells, 2] = cx, cy, cz
+            table[slot] = n_cells
+            n_cells += 1
+        cell_of[i] = table[slot]
+    return n_cells
+
+
+@njit(cache=True)
+def _by_cell(points, cell_of, n_cells):  # type: ignore[no-untyped-def]
+    """Where each cell's points begin, the points cell by cell, and the index of each of those."""
+    starts = np.zeros(n_cells + 1, np.int64)
+    for cell in cell_of:
+        starts[cell + 1] += 1
+    starts = np.cumsum(starts)
+    free, order, ordered = starts[:-1].copy(), np.empty(len(points), np.int64), np.empty_like(points)
+    for i in range(len(points)):
+        place = free[cell_of[i]]
+        free[cell_of[i]] += 1
+        order[place] = i
+        for axis in range(3):
+            ordered[place, axis] = points[i, axis]
+    return starts, ordered, order
+
+
+@njit(cache=True, inline="always")
+def _is_near(points, i, j, eps):  # type: ignore[no-untyped-def]
+    dx, dy, dz = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
+    return dx * dx + dy * dy + dz * dz <= eps * eps
+
+
+@njit(cache=True)
+def _neighbours(cell, table, keys, steps, around):  # type: ignore[no-untyped-def]
+    """Writes the cells around ``cell`` that hold points, itself first; gives their number."""
+    n = 0
+    for s in range(len(steps)):
+        cx, cy, cz = keys[cell, 0] + steps[s, 0], keys[cell, 1] + steps[s, 1], keys[cell, 2] + steps[s, 2]
+        other = table[_slot(table, keys, cx, cy, cz)]
+        if other != ABSENT:
+            around[n] = other
+            n += 1
+    return n
+
+
+@njit(cache=True)
+def _has_neighbours(i, points, starts, around, n_around, eps, min_points):  # type: ignore[no-untyped-def]
+    """Whether at least ``min_points`` points, itself included, are within eps of point ``i`` of ``around[0]``."""
+    n = starts[around[0] + 1] - starts[around[0]]
+    for a in range(1, n_around):
+        if n >= min_points:
+            return True
+        for j in range(starts[around[a]], starts[around[a] + 1]):
+            n += _is_near(points, i, j, eps)
+    return n >= min_points
+
+
+@njit(cache=True)
+def _root(parents, cell):  # type: ignore[no-untyped-def]
+    while parents[cell] != cell:
+        parents[cell] = parents[parents[cell]]
+        cell = parents[cell]
+    return cell
+
+
+@njit(cache=True)
+def _touch(points, is_core, first, second, starts, eps):  # type: ignore[no-untyped-def]
+    """Whether a core point of one cell is within eps of one of the other."""
+    for i in range(starts[first], starts[first + 1]):
+        if is_core[i]:
+            for j in range(starts[second], starts[second + 1]):
+                if is_core[j] and _is_near(points, i, j, eps):
+                    return True
+    return False
+
+
+@njit(cache=True)
+def _first_cluster(i, points, is_core, starts, around, n_around, number_of, eps):  # type: ignore[no-untyped-def]
+    """The lowest cluster with a core point within eps of point ``i``, or NOISE."""
+    first = NOISE
+    for a in range(n_around):
+        number = number_of[around[a]]
+        if number == NOISE or (first != NOISE and number >= first):
+            continue
+        for j in range(starts[around[a]], starts[around[a] + 1]):
+            if is_core[j] and _is_near(points, i, j, eps):
+                first = number
+                break
+    return first
+
+
+@njit(cache=True, nogil=True)
+def dbscan(points, eps, min_points, steps, labels):  # type: ignore[no-untyped-def]
+    """Writes the cluster of each of at least one points (N, 3), 0, 1, ... or NOISE, into ``labels``."""
+    n_slots = 4
+    while n_slots < 2 * len(points):
+        n_slots *= 2
+    table, keys = np.full(n_slots, ABSENT, np.int32), np.empty((len(points), 3), np.int64)
+    cell_of = np.empty(len(points), np.int32)
+    n_cells = _fill_cells(points, eps, table, keys, cell_of)
+    starts, ordered, order = _by_cell(points, cell_of, n_cells)
+    is_core = np.zeros(len(points), np.bool_)
+    around = np.empty(len(steps), np.int32)
+    for cell in range(n_cells):
+        n_around = _neighbours(cell, table, keys, steps, around)
+        for i in range(starts[cell], starts[cell + 1]):
+            is_core[i] = _has_neighbours(i, ordered, starts, around, n_around, eps, min_points)
+    parents = np.arange(n_cells)
+    for cell in range(n_cells):
+        n_around = _neighbours(cell, table, keys, steps, around)
+        for a in range(1, n_around):
+            own, other = _root(parents, cell), _root(parents, around[a])
+            if around[a] > cell and own != other and _touch(ordered, is_core, cell, around[a], starts, eps):
+                parents[max(own, other)] = min(own, other)
+    number_of = _numbered(order, cell_of, is_core, starts, parents, n_cells)
+    for cell in range(n_cells):
+        n_around = _neighbours(cell, table, keys, steps, around)
+        for i in range(starts[cell], starts[cell + 1]):
+            if is_core[i]:
+                labels[order[i]] = number_of[cell]
+            else:
+                labels[order[i]] = _first_cluster(i, ordered, is_core, starts, around, n_around, number_of, eps)
+
+
+@njit(cache=True)
+def _numbered(order, cell_of, is_core, starts, parents, n_cells):  # type: ignore[no-untyped-def]
+    """The cluster of each cell's core points, NOISE where it has none; numbered by the first core point of each."""
+    core_in_order = np.zeros(len(order), np.bool_)
+    for i in range(len(order)):
+        core_in_order[order[i]] = is_core[i]
+    number_of_root = np.full(n_cells, NOISE, np.int64)
+    n = 0
+    for i in range(len(order)):
+        if core_in_order[i]:
+            root = _root(parents, cell_of[i])
+            if number_of_root[root] == NOISE:
+                number_of_root[root] = n
+                n += 1
+    number_of = np.full(n_cells, NOISE, np.int64)
+    for cell in range(n_cells):
+        if is_core[starts[cell] : starts[cell + 1]].any():
+            number_of[cell] = number_of_root[_root(parents, cell)]
+    return number_of

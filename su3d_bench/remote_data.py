@@ -1,0 +1,107 @@
+"""The data root in a store: which scenes are there, and which files each of them needs.
+
+Datasets look for scenes by the names of files. So a plan is made over an *outline*: the tree of the store as empty
+files. A job gets the real files of its scene alone.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from su3d_bench.errors import ConfigError
+from su3d_bench.remote_folder import RemoteFolder
+from su3d_bench.scene_run import Part, build_dataset
+from su3d_bench.store import make_folder
+
+MOST_SHARED_BYTES = 1 << 26  # label tables and camera files; ScanNet's largest has 1 MB
+
+
+@dataclass(frozen=True)
+class RemoteData:
+    """The data root in a store, and by scene (``<dataset>/<scene>``) the files that a job needs, with their sizes."""
+
+    url: str
+    files: Mapping[str, Mapping[str, int]]
+
+
+@dataclass(frozen=True)
+class DataPlace:
+    """Where a plan looks for scenes: the data root, or the outline of the one at ``url``, with the sizes there."""
+
+    root: Path
+    url: str | None = None
+    sizes: Mapping[str, int] = field(default_factory=dict)
+
+    def needed(self, datasets: Iterable[Part]) -> RemoteData | None:
+        """What the scenes of ``datasets`` need; None where the data root is here."""
+        if self.url is None:
+            return None
+        files: dict[str, Mapping[str, int]] = {}
+        for part in datasets:
+            of_scenes = files_of_scenes(self.sizes, build_dataset(part, self.root).scenes())
+            files |= {f"{part.name}/{scene}": found for scene, found in of_scenes.items()}
+        return RemoteData(self.url, files)
+
+
+@contextmanager
+def data_place(url: str) -> Iterator[DataPlace]:
+    """The outline of the store at ``url``, for the time of the block."""
+    sizes = RemoteFolder(url).files()
+    if not sizes:
+        raise ConfigError(f"SU3D_DATA={url}: holds no file; name the folder that holds the datasets")
+    with tempfile.TemporaryDirectory(prefix="su3d-outline-") as folder:
+        for below in {str(Path(name).parent) for name in sizes}:
+            make_folder(Path(folder, below))
+        for name in sizes:
+            Path(folder, name).touch()
+        yield DataPlace(Path(folder), url, sizes)
+
+
+def files_of_scenes(sizes: Mapping[str, int], scenes: Sequence[str]) -> dict[str, dict[str, int]]:
+    """Files and sizes by scene of one dataset: those named after it or in a folder so named, and those of no scene.
+
+    A folder or file is named after a scene whatever stands around the name between separators and however the name
+    itself is separated: ``room0_mesh.ply`` and ``room_0/`` are of ``room0``. Files of no scene count where they are
+    beside scenes, in the same folder of the root, and are small.
+    """
+    of_key = {_key(scene): scene for scene in scenes}
+    owners = {name: _owner(name, of_key) for name in sizes}
+    tops = {_top(name) for name, owner in owners.items() if owner is not None}
+    shared = {
+        name: sizes[name]
+        for name, owner in owners.items()
+        if owner is None and _top(name) in tops and sizes[name] <= MOST_SHARED_BYTES
+    }
+    found: dict[str, dict[str, int]] = {scene: dict(shared) for scene in scenes}
+    for name, owner in owners.items():
+        if owner is not None:
+            found[owner][name] = sizes[name]
+    return found
+
+
+def _top(name: str) -> str:
+    return name.partition("/")[0] if "/" in name else ""
+
+
+def _owner(name: str, of_key: Mapping[str, str]) -> str | None:
+    for part in name.split("/"):
+        for key in _keys(part):
+            if key in of_key:
+                return of_key[key]
+    return None
+
+
+def _keys(part: str) -> Iterable[str]:
+    """What ``part`` may be named after, the longest first."""
+    words = [word for word in re.split(r"[._-]+", part) if word]
+    for n in range(len(words), 0, -1):
+        yield from ("".join(words[k : k + n]) for k in range(len(words) - n + 1))
+
+
+def _key(scene: str) -> str:
+    return "".join(re.split(r"[._-]+", scene))

@@ -1,0 +1,12 @@
+"""The inventory of what reads files and texts of others: tests and ``benchmarks/fuzz.py`` damage every row."""
+
+from __future__ import annotations
+
+import fuzz_targets_datasets
+import fuzz_targets_predictions
+import fuzz_targets_runs
+
+TARGETS = {
+    one.name: one
+    for one in (*fuzz_targets_datasets.TARGETS, *fuzz_targets_predictions.TARGETS, *fuzz_targets_runs.TARGETS)
+}

@@ -1,0 +1,295 @@
+"""What reads the files of datasets: a small valid sample of each and the call that reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from fuzzing import Make, Read, Target, every_one_of
+
+
+def _whole_dataset(make: Callable[[], Any], scene: str) -> Read:
+    """All that is ever asked of a dataset, each question whatever became of the one before."""
+
+    def asked() -> Iterator[Read]:
+        dataset = make()
+        yield dataset.scenes
+        yield lambda: dataset.files(scene)
+        yield lambda: dataset.info(scene, 1)
+        yield lambda: dataset.digest(scene)
+        yield lambda: list(dataset.frames(scene, 1))
+        for variant in dataset.variants:
+            yield partial(dataset.ground_truth, scene, variant)
+        yield lambda: dataset.instance_mesh(scene)
+        for name in ("surface", "problems", "queries", "object_boxes", "status"):
+            if hasattr(dataset, name):
+                yield lambda name=name: _used_up(getattr(dataset, name)(scene))
+
+    return lambda: every_one_of(asked())
+
+
+def _used_up(found: Any) -> object:
+    return list(found) if isinstance(found, Iterator) else found
+
+
+def _replica(folder: Path) -> Read:
+    from replica_scene import CHAIR, QUADS, TABLE, TWO_OBJECTS, WALL, write_original, write_render
+    from scannet_scan import grid, write_mesh
+    from test_replica_problems import box
+    from test_replica_truths import write_clouds, write_labels
+
+    from su3d_bench.datasets.replica import Replica
+
+    write_render(folder, n_frames=2)
+    habitat = write_original(folder, QUADS, [0, 0, 5, 5], TWO_OBJECTS)
+    table = habitat / "info_semantic.json"
+    boxes = f', "oriented_bbox": {box()}'.replace("'", '"').replace("(", "[").replace(")", "]")
+    table.write_text(table.read_text().replace(f'"class_id": {CHAIR}}}', f'"class_id": {CHAIR}{boxes}}}'))
+    points = np.random.default_rng(0).random((5, 3))
+    write_clouds(folder, points, np.array([CHAIR, 0, WALL, 101, TABLE]), np.array([[1.0, 2, 3], [4, 5, 6]]))
+    write_mesh(folder / "Replica/room0_mesh.ply", *grid(4, 2))
+    write_labels(folder, "Replica/ground_truth/room0.txt", [20066, 80066, 30, 256003, 20000, 0, 20066, 0])
+    write_labels(folder, "Replica/semantic_gt/room0.txt", [CHAIR, WALL, TABLE, CHAIR, CHAIR, WALL, WALL, TABLE])
+    (folder / "Replica/rooms.json").write_text('{"scenes": {"room0": "abc", "other": "def"}}')
+    return _whole_dataset(lambda: Replica(folder), "room0")
+
+
+def _scannet(folder: Path) -> Read:
+    from scannet_scan import write_floor_truth
+    from test_scannet import write_scan
+
+    from su3d_bench.datasets.scannet import ScanNet, ScannetOptions
+
+    write_floor_truth(write_scan(folder, n_frames=2), spacing_m=0.5)
+    return _whole_dataset(lambda: ScanNet(folder, ScannetOptions()), "scene0000_00")
+
+
+def _aligned_scannet(folder: Path) -> Read:
+    from scannet_scan import write_floor_truth
+    from test_scannet import write_scan
+
+    from su3d_bench.datasets.scannet import ScanNet, ScannetOptions
+
+    write_floor_truth(write_scan(folder, n_frames=2, lost=[1]), spacing_m=0.5)
+    return _whole_dataset(lambda: ScanNet(folder, ScannetOptions(axis_align=True)), "scene0000_00")
+
+
+def _sens(name: str) -> Make:
+    def make(folder: Path) -> Read:
+        from test_sens import WHERE, read_whole
+
+        from su3d_bench.datasets.sens import SensFile
+
+        path = folder / "a.sens"
+        path.write_bytes((Path(__file__).parent / "cases" / name).read_bytes())
+        return lambda: read_whole(SensFile(path, WHERE))
+
+    return make
+
+
+def _scannet_export(form: str) -> Make:
+    def make(folder: Path) -> Read:
+        from scannet_scan import table_text, write_floor_truth
+        from test_scannet_exports import write_cpp_export, write_python_export
+
+        from su3d_bench.datasets.scannet import ScanNet, ScannetOptions
+
+        scan = folder / "scans" / "scene0000_00"
+        (write_python_export if form == "python" else write_cpp_export)(scan)
+        write_floor_truth(scan, spacing_m=0.5)
+        (folder / "scannetv2-labels.combined.tsv").write_text(table_text())
+        return _whole_dataset(lambda: ScanNet(folder, ScannetOptions()), "scene0000_00")
+
+    return make
+
+
+def _rgbd(**changes: Any) -> Make:
+    def make(folder: Path) -> Read:
+        from scannet_scan import grid, write_mesh
+        from test_rgbd import write_scene
+
+        from su3d_bench.datasets.rgbd import Rgbd
+
+        write_mesh(write_scene(folder, n_frames=2, mesh="mesh.ply", **changes) / "data/mesh.ply", *grid(3, 2))
+        return _whole_dataset(lambda: Rgbd(folder), "desk")
+
+    return make
+
+
+def _tum(folder: Path) -> Read:
+    from test_tum import SCENE, write_sequence
+
+    from su3d_bench.datasets.tum import Tum
+
+    sequence = write_sequence(folder, n_frames=2)
+    pairs = [f"100.{k} rgb/100.{k}00000.png 100.{k} depth/100.{k}04000.png\n" for k in range(2)]
+    (sequence / "associate.txt").write_text("".join(pairs))
+    return _whole_dataset(lambda: Tum(folder), SCENE)
+
+
+def _rooms(folder: Path) -> Read:
+    from su3d_bench.datasets.rooms_scan import RoomScan, read_scan, write_scan
+
+    points = np.zeros((5, 3), np.float32)
+    faces = np.array([[0, 1, 2]], np.int32)
+    write_scan(folder / "a.npz", RoomScan(points, points, np.zeros((5, 3), np.uint8), faces, np.zeros(5, np.int32)))
+    return lambda: read_scan(folder / "a.npz")
+
+
+def _openlex3d(folder: Path) -> Read:
+    from test_openlex3d_files import corners, write_visible, written
+
+    from su3d_bench.datasets.openlex3d import categories_truth, queries_truth
+
+    files, mesh = written(folder), corners()
+    write_visible(folder, mesh.points[::5])
+    return lambda: every_one_of(
+        iter((files.prompts, lambda: categories_truth(files, mesh), lambda: queries_truth(files, mesh, "all")))
+    )
+
+
+def _ply(form: str) -> Make:
+    def make(folder: Path) -> Read:
+        from test_ply import MIXED, mesh_bytes
+
+        from su3d_bench.datasets.ply import read_ply
+
+        (folder / "made").mkdir()
+        (folder / "a.ply").write_bytes(mesh_bytes(folder / "made", form, MIXED))
+        return lambda: read_ply(folder / "a.ply")
+
+    return make
+
+
+def _pcd(form: str) -> Make:
+    def make(folder: Path) -> Read:
+        from test_pcd import forms
+
+        from su3d_bench.datasets.pcd import read_pcd_points
+
+        (folder / "a.pcd").write_bytes(forms()[form])
+        return lambda: read_pcd_points(folder / "a.pcd", "map: a.pcd")
+
+    return make
+
+
+def _hdf5(**options: Any) -> Make:
+    def make(folder: Path) -> Read:
+        from test_hdf5 import write
+
+        from su3d_bench.datasets.hdf5 import largest_column, n_columns_of, read_rows
+
+        path = write(folder, **options)
+        asked = (lambda: n_columns_of(path, "a"), lambda: read_rows(path, 3, "a"), lambda: largest_column(path, 3, "a"))
+        return lambda: every_one_of(iter(asked))
+
+    return make
+
+
+def _image(suffix: str) -> Make:
+    def make(folder: Path) -> Read:
+        import cv2
+
+        from su3d_bench.datasets.image_files import decode_colour, decode_depth, image_size, read_bytes
+
+        values = np.arange(24 * 32, dtype=np.uint16).reshape(24, 32) * 80
+        path, is_depth = folder / f"a{suffix}", suffix in (".depth.png", ".pgm")
+        if suffix == ".pgm":
+            path.write_bytes(b"P5\n# made\n32 24\n65535\n" + values.astype(">u2").tobytes())
+        else:
+            cv2.imwrite(str(path), values if is_depth else np.repeat((values >> 8).astype(np.uint8)[..., None], 3, 2))
+        decode = decode_depth if is_depth else decode_colour
+
+        def asked() -> Iterator[Read]:
+            content = read_bytes(path, "a")
+            yield lambda: image_size(content)
+            yield lambda: decode(content, "a")
+
+        return lambda: every_one_of(asked())
+
+    return make
+
+
+def _queries(suffix: str) -> Make:
+    def make(folder: Path) -> Read:
+        from test_query_files import CSV, TOML
+
+        from su3d_bench.datasets.query_files import read_query_file
+
+        path = folder / f"q{suffix}"
+        path.write_text(CSV if suffix == ".csv" else TOML)
+        return lambda: read_query_file(path)
+
+    return make
+
+
+def _questions(name: str, text_of: Callable[[Any], str]) -> Make:
+    def make(folder: Path) -> Read:
+        import test_question_files
+
+        from su3d_bench.questions.files import read_questions
+
+        path = folder / name
+        path.write_text(text_of(test_question_files))
+        if name.startswith("v1"):
+            answers = folder / "v1_balanced_sqa_annotations_val_scannetv2.json"
+            answers.write_text(test_question_files.SQA3D_ANSWERS)
+        return lambda: read_questions(path)
+
+    return make
+
+
+SCAN = "scans/scene0000_00"
+LOGGED: dict[str, Any] = {"pose": None, "trajectory": "trajectory.log"}
+FILED: dict[str, Any] = {"intrinsics": None, "intrinsics_file": "camera.json"}
+LISTED: dict[str, Any] = {"intrinsics": None, "intrinsics_file": "intrinsics.txt"}
+TARGETS = (
+    Target("replica camera", _replica, ("Replica/cam_params.json",), 0.15),
+    Target("replica trajectory", _replica, ("Replica/room0/traj.txt",), 0.15),
+    Target("replica images", _replica, ("Replica/room0/results/*",), 0.15),
+    Target("replica marker", _replica, ("Replica/rooms.json",), 0.15),
+    Target("replica mesh", _replica, ("replica_v1/room_0/habitat/*.ply", "Replica/room0_mesh.ply"), 0.15),
+    Target("replica objects", _replica, ("replica_v1/room_0/habitat/*.json",), 0.15),
+    Target("replica clouds", _replica, ("Replica-semantic/**/*.h5", "Replica/**/*.h5"), 0.15),
+    Target("replica first pose", _replica, ("Replica-semantic/**/traj_w_c.txt",), 0.15),
+    Target("replica labels", _replica, ("Replica/ground_truth/*.txt", "Replica/semantic_gt/*.txt"), 0.15),
+    Target("scannet recording", _scannet, (f"{SCAN}/*.sens",), 0.15),
+    Target("scannet meshes", _scannet, (f"{SCAN}/*.ply",), 0.15),
+    Target("scannet segments", _scannet, (f"{SCAN}/*.segs.json",), 0.15),
+    Target("scannet aggregation", _scannet, (f"{SCAN}/*.aggregation.json",), 0.15),
+    Target("scannet table", _scannet, ("*.tsv",), 0.15),
+    Target("scannet facts", _aligned_scannet, (f"{SCAN}/scene0000_00.txt",), 0.15),
+    Target("sens", _sens("sens01_toy.sens"), ("a.sens",)),
+    Target("sens raw", _sens("sens02_toy_raw.sens"), ("a.sens",)),
+    Target("scannet python export", _scannet_export("python"), (f"{SCAN}/*/*",), 0.15),
+    Target("scannet c++ export", _scannet_export("c++"), (f"{SCAN}/frame*", f"{SCAN}/_info.txt"), 0.15),
+    Target("rgbd description", _rgbd(camera_axes="opengl", depth_invalid=[3]), ("rgbd/desk/rgbd.toml",)),
+    Target("rgbd frames", _rgbd(), ("rgbd/desk/data/colour/*", "rgbd/desk/data/depth/*")),
+    Target("rgbd poses", _rgbd(), ("rgbd/desk/data/*.pose.txt",)),
+    Target("rgbd log", _rgbd(**LOGGED), ("rgbd/desk/data/trajectory.log",)),
+    Target("rgbd camera", _rgbd(**FILED), ("rgbd/desk/data/camera.json",)),
+    Target("rgbd intrinsics", _rgbd(**LISTED), ("rgbd/desk/data/intrinsics.txt",)),
+    Target("rgbd mesh", _rgbd(), ("rgbd/desk/data/mesh.ply",)),
+    Target("tum lists", _tum, ("*/rgb.txt", "*/depth.txt", "*/associate.txt")),
+    Target("tum trajectory", _tum, ("*/groundtruth.txt",)),
+    Target("tum camera", _tum, ("*/camera.txt",)),
+    Target("tum images", _tum, ("*/rgb/*", "*/depth/*")),
+    Target("rooms cache", _rooms, ("a.npz",)),
+    Target("openlex3d labels", _openlex3d, ("replica/room0/gt_categories.json",)),
+    Target("openlex3d queries", _openlex3d, ("replica/room0/*_all.json",)),
+    Target("openlex3d prompts", _openlex3d, ("replica/prompt_list.txt",)),
+    Target("openlex3d cloud", _openlex3d, ("replica/room0/*.pcd",)),
+    *(Target(f"ply {form}", _ply(form), ("a.ply",)) for form in ("ascii", "binary_little_endian", "binary_big_endian")),
+    *(Target(f"pcd {form}", _pcd(form), ("a.pcd",)) for form in ("ascii", "binary", "binary_compressed")),
+    Target("hdf5 contiguous", _hdf5(), ("*.h5",)),
+    Target("hdf5 chunked", _hdf5(chunks=(16, 3), compression="gzip", shuffle=True), ("*.h5",)),
+    *(Target(f"image{suffix}", _image(suffix), ("a*",)) for suffix in (".jpg", ".png", ".depth.png", ".pgm", ".ppm")),
+    *(Target(f"queries{suffix}", _queries(suffix), ("q.*",)) for suffix in (".toml", ".csv")),
+    Target("questions own", _questions("q.toml", lambda test: test.toml_text(test.SET[:2])), ("q.toml",)),
+    Target("questions scanrefer", _questions("q.json", lambda test: test.SCANREFER), ("q.json",)),
+    Target("questions nr3d", _questions("q.csv", lambda test: test.NR3D), ("q.csv",)),
+    Target("questions sqa3d", _questions("v1_balanced_questions_val_scannetv2.json", lambda test: test.SQA3D), ("*",)),
+)

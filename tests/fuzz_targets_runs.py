@@ -1,0 +1,349 @@
+"""What reads run folders, references, sheets, papers, configurations, caches and the words of language models."""
+
+from __future__ import annotations
+
+import atexit
+import functools
+import itertools
+import json
+import shutil
+import tempfile
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from cli_calls import called
+from fuzzing import Make, Read, Target, every_one_of
+
+HERE = Path(__file__).parent
+COLLECTOR = f"{HERE}/painted.py:Collector"
+
+
+@functools.cache
+def _made_run() -> Path:
+    """A folder with a finished run of two painted scenes, with maps midway; made once a process."""
+    import pytest
+    from painted import colour_perception
+
+    from su3d_bench import scene_run
+
+    folder = Path(tempfile.mkdtemp(prefix="fuzzrun")).resolve()
+    atexit.register(shutil.rmtree, folder, ignore_errors=True)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        patch.setenv("SU3D_DATA", str(folder / "data"))
+        called(_command(folder / "a"))
+    return folder / "a"
+
+
+def _command(out: Path) -> list[str]:
+    words = ["run", "--scenes", f"{HERE}/painted.py:Painted/a", f"{HERE}/painted.py:Painted/b", "--methods", COLLECTOR]
+    words += [f"{COLLECTOR}@drop=1", "--protocols", "rooms-semantic", "rooms-instance", "--no-pictures", "--jobs", "1"]
+    return [*words, "--anytime", "0.5", "--out", str(out), "--quiet"]
+
+
+def _copied_run(folder: Path) -> Path:
+    shutil.copytree(_made_run(), folder / "runs/a")
+    return folder / "runs/a"
+
+
+def _run(folder: Path) -> Read:
+    """Everything that is read of a finished run."""
+    from su3d_bench.comparison_sides import Side, check_shapes, rules_of
+    from su3d_bench.estimate import recent_update_s
+    from su3d_bench.finished_run import read_run
+    from su3d_bench.finished_updates import read_update_times
+    from su3d_bench.gate import check, learn, read_reference
+    from su3d_bench.leaderboard import leaderboard
+    from su3d_bench.table_sources import measured_results
+
+    path, reference = _copied_run(folder), folder / "reference.json"
+    reference.write_text(json.dumps(learn([read_run(path)]).model_dump(mode="json")))
+    is_scored_again = itertools.cycle([True, False, False, False])  # the leaderboard draws intervals, which is slow
+
+    def asked() -> Iterator[Read]:
+        yield lambda: recent_update_s(path.parent, "collector")
+        yield lambda: read_reference(reference)
+        if next(is_scored_again):
+            yield lambda: leaderboard(path.parent)
+        yield lambda: measured_results([path])
+        run = read_run(path)
+        yield lambda: check(run, read_reference(reference))
+        for method in (*run.methods[:3], "collector"):
+            yield lambda method=method: read_update_times(run, method)
+            side = Side(run, method)
+            scores: dict[str, Any] = {}
+            yield lambda method=method, scores=scores: scores.update(run.scores(method))
+            for protocol in (*list(run.protocols)[:3], "rooms-semantic"):
+                yield lambda side=side, protocol=protocol: rules_of(side, protocol)
+                yield lambda side=side, protocol=protocol, scores=scores: check_shapes(
+                    rules_of(side, protocol), side, scores.get(protocol, {})
+                )
+
+    return lambda: every_one_of(asked())
+
+
+def _verbs(folder: Path) -> Read:
+    """The verbs that read a run folder, from the command line, in turn."""
+    run = _copied_run(folder)
+    called(["check", "--learn", str(run), "--out", str(folder / "reference.json")])
+    commands = itertools.cycle(
+        [
+            ["report", "tables", str(run), "--json"],
+            ["report", "timing", str(run)],
+            ["report", "leaderboard", str(folder / "runs")],
+            ["compare", f"{run}:collector", f"{run}:collector@drop=1", "--per-class"],
+            ["check", str(run), "--against", str(folder / "reference.json")],
+            ["attribute", str(run), "--method", "collector"],
+            ["report", "html", str(run), "--out", str(folder / "page.html")],
+            ["export", str(run), "--to", "openlex3d", "--method", "collector", "--out", str(folder / "out")],
+            [*_command(run), "--dry-run"],
+            ["refine", str(run), "--method", "collector"],
+            ["datasets", "check", f"{HERE}/painted.py:Painted/a"],
+        ]
+    )
+
+    def read() -> None:
+        shutil.rmtree(folder / "out", ignore_errors=True)
+        called(next(commands))
+
+    return read
+
+
+def _resumed(folder: Path) -> Read:
+    """The same command again on a run folder of which a file was hurt: it mends what it can."""
+    import pytest
+    from painted import colour_perception
+
+    from su3d_bench import scene_run
+
+    words = _command(_copied_run(folder))
+
+    def read() -> None:
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(scene_run, "build_perception", colour_perception)
+            called(words)
+
+    return read
+
+
+def _counts(folder: Path) -> Read:
+    from su3d_bench.scoring import unpack_scores
+
+    file = next(_made_run().glob("scenes/*.a/collector/counts.npz"))
+    (folder / "counts.npz").write_bytes(file.read_bytes())
+    return lambda: unpack_scores((folder / "counts.npz").read_bytes())
+
+
+def _paper(folder: Path) -> Read:
+    run, paper = _copied_run(folder), folder / "paper.tex"
+    called(["report", "tables", str(run), "--format", "latex", "--out", str(paper)])
+    return lambda: called(["report", "verify", str(paper), "--root", str(folder)])
+
+
+def _answers(name: str) -> Make:
+    def make(folder: Path) -> Read:
+        from simulated_annotators import answered, as_csv, retrieval_set
+        from test_sheets_score import workbook
+
+        from su3d_bench.sheets.answers import read_answers
+        from su3d_bench.sheets.validation import check_answers
+
+        sheet, key = retrieval_set(4)
+        rows = answered(sheet, key, {"ann": 0.0})
+        (folder / name).write_bytes(as_csv(rows).encode() if name.endswith("csv") else workbook(rows))
+        return lambda: check_answers(sheet, read_answers(folder / name))
+
+    return make
+
+
+def _sheet_files(folder: Path) -> Read:
+    """The set, its key and its scores, through the verb that reads them."""
+    from simulated_annotators import answered, as_csv, retrieval_set
+
+    from su3d_bench.sheets.items import write_key, write_sheet
+
+    sheet, key = retrieval_set(4)
+    for name in ("sheet", "key"):
+        (folder / name).mkdir()
+    write_sheet(folder / "sheet", sheet)
+    write_key(folder / "key", key)
+    (folder / "ann.csv").write_text(as_csv(answered(sheet, key, {"ann": 0.0})))
+    words = ["sheets", "score", str(folder / "ann.csv"), "--key", str(folder / "key"), "--json"]
+    scores = ["sheets", "score", str(folder / "ann.csv"), "--key", str(folder / "key"), "--out", str(folder / "scores")]
+    called(scores)
+
+    def asked() -> Iterator[Read]:
+        from su3d_bench.sheets.items import KEY_FILE, SHEET_FILE, read_key, read_sheet
+        from su3d_bench.sheets.score_file import read_scores
+
+        yield lambda: called(words)
+        yield lambda: read_sheet(folder / "sheet" / SHEET_FILE)
+        yield lambda: read_key(folder / "key" / KEY_FILE)
+        yield lambda: read_scores(folder / "scores")
+        yield lambda: called(["report", "tables", str(folder / "scores")])
+
+    return lambda: every_one_of(asked())
+
+
+def _config(name: str, *more: str) -> Make:
+    """A configuration from another run, which is planned but not done."""
+
+    def make(folder: Path) -> Read:
+        (folder / name).write_bytes((_made_run() / "run.toml").read_bytes())
+        words = [*_command(folder / "b"), "--dry-run", "--config", str(folder / name)]
+        return lambda: called([*words, *more])
+
+    return make
+
+
+def _method_config(folder: Path) -> Read:
+    """The settings of all methods of our own in one file."""
+    from su3d_bench.config import check_keys, read_file, resolve
+    from su3d_bench.perception.config import PerceptionConfig
+    from su3d_bench.registry import METHODS, load
+    from su3d_bench.toml_text import write_toml
+
+    classes = {name: load("method", name).Config for name in METHODS}
+    leaves: list[Any] = []
+    for name, model in classes.items():
+        from su3d_bench.config import flatten
+
+        try:
+            values = model().model_dump(mode="json")
+        except ValueError:  # it has settings without defaults
+            continue
+        leaves += [(("method", name, *path), value, "here") for path, value in flatten(values)]
+    (folder / "a.toml").write_text(write_toml(leaves))
+
+    def asked() -> Iterator[Read]:
+        settings = read_file(folder / "a.toml")
+        yield lambda: check_keys(settings)
+        yield lambda: resolve(settings, ("perception",), PerceptionConfig)
+        for name, model in classes.items():
+            yield lambda name=name, model=model: resolve(settings, ("method", name), model)
+
+    return lambda: every_one_of(asked())
+
+
+def _protocol(folder: Path) -> Read:
+    from su3d_bench.protocols import read_protocol, rules_file
+
+    for name in ("rooms-semantic", "openlex3d-topn", "rooms-instance"):
+        (folder / f"{name}.toml").write_bytes(rules_file(name).read_bytes())
+    files = sorted(folder.glob("*.toml"))
+    return lambda: every_one_of(iter([lambda file=file: read_protocol(file) for file in files]))
+
+
+def _published(folder: Path) -> Read:
+    from su3d_bench.reports.published import FILE, read_published
+
+    text = FILE.read_text(encoding="utf-8")
+    (folder / "published.toml").write_text("[[figure]]".join(text.split("[[figure]]")[:4]))
+    return lambda: read_published(folder / "published.toml")
+
+
+def _ablation(folder: Path) -> Read:
+    from su3d_bench.ablation import ablation_rows, read_rows, write_rows
+
+    write_rows(folder, ablation_rows(COLLECTOR, ["noise_m=0.0,0.3", "drop=1"], is_grid=False))
+    return lambda: read_rows(folder)
+
+
+def _assignments(folder: Path) -> Read:
+    """Words of ``--set``, of variants and of ``--vary``, one a line of a file."""
+    from su3d_bench.ablation import ablation_rows
+    from su3d_bench.config import parse_value, read_assignments
+    from su3d_bench.method_names import named_method
+
+    lines = ("opensu3d.top_m=10", "top_m=10,5", "perception.cache=false", "rooms.width=64", "opensu3d.a='x'")
+    (folder / "words.txt").write_text("\n".join(lines))
+
+    def asked() -> Iterator[Read]:
+        path = folder / "words.txt"
+        text = path.read_bytes().decode("utf-8", "surrogateescape") if path.is_file() else ""
+        for word in [line for k, line in enumerate(text.split("\n")[:20]) if k != 1]:
+            yield lambda word=word: read_assignments([word], ["opensu3d"], ["rooms"])
+            yield lambda word=word: parse_value(word)
+        assigned, varied = [*text.split("\n"), ""][:2]
+        yield lambda: named_method(f"opensu3d@{assigned.removeprefix('opensu3d.')}")
+        yield lambda: ablation_rows("opensu3d", [varied], is_grid=True)
+
+    return lambda: every_one_of(asked())
+
+
+REPLIES: Sequence[str] = (
+    '["chair", "a red chair by the wall"]',
+    'Sure! ```json\n{"name": "chair", "caption": "a red chair"}\n```',
+    "Label: chair\nCaption: a red chair in a scene",
+    '{"answer": "the lamp", "ids": [3, 4], "reason": "it is closer"}',
+    "The object that is closer is the lamp (id 3), because it stands at 1.2 m.",
+    "{'chair': 0.7, 'sofa': 0.3}",
+    "I'm sorry, I can't help with that.",
+)
+
+
+def _replies(folder: Path) -> Read:
+    """What language models write: read as a description, a name, an answer, whatever they wrote."""
+    from su3d_bench.perception.language import parsing
+
+    (folder / "replies.json").write_text(json.dumps(REPLIES))
+
+    def asked() -> Iterator[Read]:
+        path = folder / "replies.json"
+        content = path.read_bytes() if path.is_file() else b""
+        try:
+            texts = [one for one in json.loads(content) if isinstance(one, str)]
+        except (ValueError, RecursionError, TypeError):
+            texts = []
+        for text in [*texts[:10], content.decode("utf-8", "replace")]:
+            yield lambda text=text: parsing.is_refusal(text)
+            yield lambda text=text: parsing.described(text)
+            yield lambda text=text: parsing.chosen_name(text, ["chair", "sofa", "armchair"])
+            yield lambda text=text: parsing.answered(text, [3, 4, 70])
+            yield lambda text=text: parsing.clean_name(text)
+
+    return lambda: every_one_of(asked())
+
+
+def _cached_frame(folder: Path) -> Read:
+    from su3d_bench.perception.cache import FrameCache, content_key, pack_masks, unpack_masks
+
+    cache, key = FrameCache(folder / "cache"), content_key("a")
+    cache.save(key, {**pack_masks(np.eye(5, dtype=bool)[None]), "names": np.array(["cup"])})
+
+    def read() -> None:
+        entry = cache.load(key)
+        if entry is not None:
+            unpack_masks(entry)
+
+    return read
+
+
+RUN = "runs/a"
+JOB = "runs/a/scenes/*/collector"
+TARGETS = (
+    Target("run record", _run, (f"{RUN}/run.json",), 0.15),
+    Target("run metrics", _run, (f"{RUN}/metrics.json",), 0.15),
+    Target("run settings", _run, (f"{RUN}/run.toml",), 0.15),
+    Target("run seals", _run, (f"{JOB}/done.json",), 0.15),
+    Target("run updates", _run, (f"{JOB}/updates.csv",), 0.15),
+    Target("run counts", _run, (f"{JOB}/counts.npz",), 0.15),
+    Target("reference", _run, ("reference.json",), 0.15),
+    Target("run verbs", _verbs, (f"{RUN}/*.json", f"{RUN}/run.toml", f"{JOB}/*", "reference.json"), 0.05),
+    Target("run resumed", _resumed, (f"{RUN}/**/*",), 0.02),
+    Target("run packed counts", _counts, ("counts.npz",)),
+    Target("paper", _paper, ("paper.tex",), 0.15),
+    Target("answers.csv", _answers("ann.csv"), ("ann.csv",)),
+    Target("answers.xlsx", _answers("bob.xlsx"), ("bob.xlsx",), 0.3),
+    Target("sheet files", _sheet_files, ("sheet/*.json", "key/*.json", "scores/scores.json"), 0.05),
+    Target("config of a run", _config("a.toml"), ("a.toml",), 0.05),
+    Target("config of methods", _method_config, ("a.toml",)),
+    Target("protocol", _protocol, ("*.toml",)),
+    Target("published", _published, ("published.toml",)),
+    Target("ablation", _ablation, ("ablation.json",)),
+    Target("assignments", _assignments, ("words.txt",)),
+    Target("replies", _replies, ("replies.json",)),
+    Target("cached frame", _cached_frame, ("cache/**/*",)),
+)

@@ -1,0 +1,62 @@
+"""What runs that are killed on purpose are made of: light parts that write every kind of file that a run has.
+
+Importing this puts ``KeptPerception`` in the place of perception, in spawned workers too.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+from painted import Collector, ColourPerception
+
+from su3d_bench import scene_run
+from su3d_bench.perception.cache import FrameCache, content_key, frame_digest
+from su3d_bench.types import DenseFeatures, Detections, Frame, PerceptionNeeds, Prediction, StageTimer
+
+logger = logging.getLogger("su3d_bench.kill_subject")
+
+
+class Dense(Collector):
+    """Every point with the feature of its colour, and a warning that the run's record must keep."""
+
+    name = "dense"
+
+    def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
+        if not self._points:
+            logger.warning("the first frame is %d", frame.index)
+        super().update(frame, detections, timer)
+
+    def finish(self) -> Prediction:
+        clouds = [np.concatenate(self._points[name]) for name in sorted(self._points)]
+        features = [self._features[name] for name in sorted(self._points)]
+        rows = [np.tile(feature, (len(cloud), 1)) for feature, cloud in zip(features, clouds, strict=True)]
+        return DenseFeatures(np.concatenate(clouds).astype(np.float32), np.concatenate(rows).astype(np.float16))
+
+
+class KeptPerception(ColourPerception):
+    """Masks that are kept in the perception cache."""
+
+    def __init__(self, cache_root: Path) -> None:
+        super().__init__()
+        self._cache = FrameCache(cache_root)
+
+    def detect(self, frame: Frame, needs: PerceptionNeeds, timer: StageTimer) -> Detections:
+        key = content_key(self.digest, frame_digest(frame, with_pose=False))
+        found = super().detect(frame, needs, timer)
+        kept = self._cache.load(key)
+        if kept is None:
+            self._cache.save(key, {"masks": found.masks})
+        elif not np.array_equal(kept["masks"], found.masks):
+            raise AssertionError("the perception cache answered with masks of another frame")
+        return found
+
+
+def kept_perception(*_: Any, cache_root: Path, **__: Any) -> KeptPerception:
+    return KeptPerception(cache_root)
+
+
+patch.object(scene_run, "build_perception", kept_perception).start()

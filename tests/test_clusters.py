@@ -1,0 +1,174 @@
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import psutil
+import pytest
+from painted import colour_perception
+
+from su3d_bench import scene_run
+from su3d_bench.cli.main import main
+
+pytest.importorskip("ray", reason="the ray extra is not installed")
+pytest.importorskip("submitit", reason="the slurm extra is not installed")
+
+HERE = Path(__file__).parent
+PAINTED = f"{HERE}/painted_anywhere.py:Painted"
+COLLECTOR = f"{HERE}/painted_anywhere.py:Collector"
+NOISE = ("--set", "collector.noise_m=0.02", "painted.frame_ms=50")
+WHILE_LOADED_S = 300
+
+
+@pytest.fixture(scope="module")
+def cluster() -> Iterator[Any]:
+    """Three machines of one core: the driver's, which takes no job, one with a GPU in name, and one to be killed."""
+    from ray.cluster_utils import Cluster
+
+    small = {"object_store_memory": 80_000_000, "include_dashboard": False}
+    made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, **small})
+    made.add_node(num_cpus=1, num_gpus=1, **small)
+    made.doomed = made.add_node(num_cpus=1, **small)
+    yield made
+    made.shutdown()
+
+
+@pytest.fixture(autouse=True)
+def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+
+
+def words(*more: str, out: str) -> list[str]:
+    base = ["run", "--scenes", f"{PAINTED}/*", "--methods", COLLECTOR, "--protocols", "rooms-semantic"]
+    return [*base, "--no-pictures", "--quiet", "--out", out, *NOISE, *more]
+
+
+def run(*more: str, out: str) -> int:
+    return main(words(*more, out=out))
+
+
+def deterministic_files(out: Path) -> dict[str, Any]:
+    """Everything of a run that holds no time and no machine, by name: files, and the keys that jobs are sealed with."""
+    paths = [path for path in out.rglob("*") if path.is_file()]
+    kept = [path for path in paths if path.name not in ("run.json", "run.toml", "updates.csv", "done.json")]
+    found: dict[str, Any] = {path.relative_to(out).as_posix(): path.read_bytes() for path in kept}
+    for path in out.rglob("done.json"):
+        steps = json.loads(path.read_text())["steps"]
+        found[path.relative_to(out).as_posix()] = {name: one["key"] for name, one in steps.items()}
+    return found
+
+
+def assert_equal_runs(one: Path | str, other: Path | str) -> None:
+    first, second = deterministic_files(Path(one)), deterministic_files(Path(other))
+    assert sorted(first) == sorted(second)
+    assert {"metrics.json", "scenes/painted.d/collector/prediction.npz"} <= set(first)
+    assert [name for name in first if first[name] != second[name]] == []
+
+
+def workers_of(node: Any) -> list[psutil.Process]:
+    """Processes of ``node`` that carry out a job, as soon as there are some."""
+    raylet = psutil.Process(node.all_processes["raylet"][0].process.pid)
+    end = time.monotonic() + WHILE_LOADED_S
+    while time.monotonic() < end:
+        found = [child for child in raylet.children(recursive=True) if "ray::_on_node" in " ".join(child.cmdline())]
+        if found:
+            return found
+        time.sleep(0.02)
+    raise AssertionError("no job came to the machine")
+
+
+def test_a_machine_that_dies_in_mid_run_costs_no_scene_and_no_byte(cluster: Any) -> None:
+    assert run("--jobs", "1", out="inline") == 0
+    command = [sys.executable, str(HERE / "painted_cli.py"), *words("--executor", "ray", out="ray")]
+    driver = subprocess.Popen([*command, "--ray-address", cluster.address], stdout=subprocess.DEVNULL)
+    at_work = workers_of(cluster.doomed)
+    os.kill(cluster.doomed.all_processes["raylet"][0].process.pid, signal.SIGKILL)
+    assert driver.wait(timeout=WHILE_LOADED_S) == 0
+    assert not any(process.is_running() for process in at_work)
+    assert_equal_runs("inline", "ray")
+
+
+def test_a_share_of_a_gpu_is_taken_where_there_is_one_and_more_than_there_is_refused(
+    cluster: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = ("--executor", "ray", "--ray-address", cluster.address, "--scenes", f"{PAINTED}/a")
+    assert run(*where, "--gpus-per-job", "0.5", out="half") == 0
+    capsys.readouterr()
+    assert run(*where, "--gpus-per-job", "2", out="two") == 2
+    error = capsys.readouterr().err
+    assert error == "su3d-bench: --gpus-per-job 2: no machine of the Ray cluster has more than 1; lower it\n"
+
+
+def test_a_scene_that_takes_every_worker_down_fails_alone_after_its_retries(
+    cluster: Any, capsys: pytest.CaptureFixture[str]
+) -> None:
+    where = ("--executor", "ray", "--ray-address", cluster.address, "--scenes", f"{PAINTED}/[ab]")
+    assert run(*where, "--retries", "1", "--set", "painted.fault=kill", out="killed") == 3
+    error = capsys.readouterr().err
+    assert "painted/b: the worker or its machine was lost, 2 times; see the cluster's logs, or raise --retries" in error
+    assert json.loads(Path("killed/metrics.json").read_text())["results"][0]["result"]["scenes"] == ["painted/a"]
+
+
+def test_an_address_without_a_cluster_is_one_line_within_seconds(capsys: pytest.CaptureFixture[str]) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        address = f"127.0.0.1:{taken.getsockname()[1]}"
+        assert run("--executor", "ray", "--ray-address", address, out="nowhere") == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"su3d-bench: no Ray cluster answers at '{address}' (connection refused); start one with")
+    assert error.count("\n") == 1
+
+
+def test_submitit_gives_the_same_bytes_as_inline() -> None:
+    scenes = ("--scenes", f"{PAINTED}/[ad]")
+    assert run(*scenes, "--jobs", "1", out="inline") == 0
+    assert run(*scenes, "--executor", "slurm", "--slurm", "cluster=local", "timeout_min=20", out="slurm") == 0
+    assert_equal_runs("inline", "slurm")
+
+
+@pytest.mark.parametrize(
+    ("more", "line"),
+    [
+        (
+            ["--retries", "3"],
+            "--retries 3: means nothing to the executor 'auto'; add --executor ray or --executor slurm",
+        ),
+        (
+            ["--slurm", "x=1", "--executor", "ray"],
+            "--slurm x=1: means nothing to the executor 'ray'; add --executor slurm",
+        ),
+        (
+            ["--executor", "inline", "--jobs", "3"],
+            "--jobs 3: the executor 'inline' runs one; choose --executor processes",
+        ),
+        (["--executor", "slurm", "--gpus-per-job", "0.5"], "--gpus-per-job 0.5: Slurm gives whole GPUs"),
+        (["--executor", "ray", "--gpus-per-job", "1.5"], "--gpus-per-job 1.5: a share is below 1, more come whole"),
+        (
+            ["--executor", "slurm", "--slurm", "x"],
+            "--slurm x: expected KEY=VALUE, such as slurm_partition=gpu timeout_min=60",
+        ),
+        (["--executor", "slurm", "--slurm", "cluster=x"], "--slurm cluster=x: expected slurm or local"),
+        (["--executor", "slurm", "--slurm", "cluster=local", "timeout_mni=1"], "--slurm: submitit refuses it: Unknown"),
+        (
+            ["--executor", "foo"],
+            "--executor: executor = 'foo': input should be 'auto', 'inline', 'processes', 'ray' or",
+        ),
+    ],
+)
+def test_an_option_that_means_nothing_is_one_line(
+    more: list[str], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert run(*more, out="out") == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"su3d-bench: {line}")
+    assert error.count("\n") == 1

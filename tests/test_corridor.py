@@ -1,0 +1,140 @@
+"""The corridor that ``make bench-methods`` walks along, and the table that is made of the walks."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from su3d_bench.registry import load
+from su3d_bench.reports.timing_plots import medians_by_size
+from su3d_bench.types import Float64Array, Int32Array
+from su3d_bench.update_times import UpdateTimes
+
+BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+
+
+def corridor(**options: float) -> Any:
+    dataset = load("dataset", f"{BENCHMARKS / 'corridor.py'}:Corridor")
+    return dataset(Path(), dataset.Options(**options))
+
+
+@pytest.fixture(scope="module")
+def write_performance() -> Any:
+    spec = importlib.util.spec_from_file_location("write_performance", BENCHMARKS / "write_performance.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def corners_of(vertices: Any, triangles: Int32Array) -> Float64Array:
+    result: Float64Array = vertices.astype(np.float64)[triangles]
+    return result
+
+
+def normals_m2(mesh: Any) -> Float64Array:
+    """The normal (T, 3) of each triangle, twice as long as its area."""
+    a, b, c = corners_of(mesh.vertices, mesh.triangles).transpose(1, 0, 2)
+    result: Float64Array = np.cross(b - a, c - a)
+    return result
+
+
+def volume_m3(mesh: Any) -> float:
+    """What its boxes hold together; negative where the triangles face inwards."""
+    a, b, c = corners_of(mesh.vertices, mesh.triangles).transpose(1, 0, 2)
+    return float((a * np.cross(b, c)).sum() / 6)
+
+
+def test_the_scan_covers_what_is_cast_and_faces_the_same_way() -> None:
+    dataset = corridor(surface_edge_m=0.5)
+    scan, cast = dataset.surface("3m"), dataset.instance_mesh("3m")
+    fine, coarse = normals_m2(scan), normals_m2(cast)
+    assert np.linalg.norm(fine, axis=1).sum() == pytest.approx(np.linalg.norm(coarse, axis=1).sum(), rel=1e-6)
+    np.testing.assert_allclose(volume_m3(scan), volume_m3(cast), rtol=1e-6)
+    np.testing.assert_allclose(scan.vertices.min(axis=0), cast.vertices.min(axis=0), atol=1e-6)
+    np.testing.assert_allclose(scan.vertices.max(axis=0), cast.vertices.max(axis=0), atol=1e-6)
+    assert set(scan.triangles.reshape(-1)) == set(range(len(scan.vertices)))
+
+
+def test_no_side_of_a_square_of_the_scan_exceeds_the_option() -> None:
+    scan = corridor(surface_edge_m=0.3).surface("2m")
+    a, b, c = corners_of(scan.vertices, scan.triangles[::2]).transpose(1, 0, 2)
+    sides = np.linalg.norm([b - a, c - b], axis=2)
+    assert 0.25 < sides.max() <= 0.3 + 1e-5
+
+
+def test_a_metre_of_the_scan_has_about_five_thousand_vertices() -> None:
+    dataset = corridor()
+    shorter, longer = (len(dataset.surface(scene).vertices) for scene in ("20m", "120m"))
+    assert 4500 < (longer - shorter) / 100 < 6000
+
+
+def walk(scene: str, n_points: Float64Array, **stages_ms: Float64Array) -> UpdateTimes:
+    columns = {"n_points": n_points, **stages_ms, "total_ms": np.sum(list(stages_ms.values()), axis=0)}
+    return UpdateTimes("r", scene, "m", columns, (), None, None)
+
+
+def test_the_table_tells_what_the_smallest_and_the_largest_maps_cost(write_performance: Any) -> None:
+    points = np.linspace(1e5, 5e6, 103)
+    one = walk("corridor/9m", points, decode_ms=points, match_ms=points / 1e5, insert_ms=np.full(103, 1e-3))
+    head, row = write_performance.growth_table([[one]])
+    told = dict(zip(head, row, strict=True))
+    steady = points[3:] / 1e5 + 1e-3
+    assert (told["m"], told["updates"]) == ("9", "103")
+    assert (told["points, from"], told["to"]) == (f"{points[3]:,.0f}", "5,000,000")
+    assert told["ms, smallest tenth"] == f"{np.median(steady[:10]):.1f}"
+    assert (told["largest"], told["worst"]) == (f"{np.median(steady[-10:]):.1f}", "50")
+    assert told["exponent"].startswith("1.00 [")
+    assert told["stages that grow"] == "match 1.00"
+
+
+def test_walks_of_several_lengths_make_one_row(write_performance: Any) -> None:
+    sizes = {10: 1e5, 100: 6e5, 1000: 5e6}
+    walks = [walk(f"corridor/{m}m", np.full(20, n), project_ms=np.full(20, n / 3e4)) for m, n in sizes.items()]
+    head, row = write_performance.growth_table([walks])
+    told = dict(zip(head, row, strict=True))
+    assert (told["m"], told["updates"], told["to"]) == ("10, 100, 1000", "60", "5,000,000")
+    assert (told["ms, smallest tenth"], told["largest"]) == ("3.3", "166.7")
+    assert told["stages that grow"] == "project 1.00"
+
+
+def test_a_map_that_does_not_grow_has_no_exponent(write_performance: Any) -> None:
+    head, row = write_performance.growth_table([[walk("corridor/9m", np.full(20, 7.0), match_ms=np.ones(20))]])
+    assert dict(zip(head, row, strict=True))["exponent"] == "-"
+
+
+def test_medians_by_size_are_those_of_ranges_of_one_width_on_a_log_axis() -> None:
+    sizes = np.array([1.0, 1.1, 1.2, 500.0, 1024.0, 1024.0])
+    x, y = medians_by_size(sizes, np.array([3.0, 9.0, 4.0, 7.0, 10.0, 30.0]))
+    np.testing.assert_allclose(x, [1.1, 500.0, 1024.0])
+    np.testing.assert_allclose(y, [4.0, 7.0, 20.0])
+
+
+def test_maps_of_one_size_are_one_marker() -> None:
+    x, y = medians_by_size(np.full(5, 8.0), np.arange(5.0))
+    assert (x.tolist(), y.tolist()) == ([8.0], [2.0])
+
+
+def test_what_a_script_measured_becomes_a_section(write_performance: Any, tmp_path: Path) -> None:
+    table = {"columns": ["what", "s"], "rows": [["start", "0.2"]]}
+    for name, title, notes in (("b", "Second", []), ("a", "First", ["One machine.", "Cold."])):
+        told = {"title": title, "command": "python x.py", "notes": notes, **table}
+        (tmp_path / f"{name}.json").write_text(json.dumps(told))
+    first, second = write_performance.measured_sections(tmp_path)
+    assert first.splitlines() == [
+        *("## First", "", "`python x.py`", "", "| what  | s   |", "|-------|-----|", "| start | 0.2 |", ""),
+        "One machine. Cold.",
+    ]
+    assert second.startswith("## Second\n") and second.endswith("| start | 0.2 |\n")
+
+
+def test_a_section_is_found_whole_and_without_its_neighbours(write_performance: Any) -> None:
+    page = "# Page\n\n## A\n\none\n\n## AB\n\n| x |\n\n![p](p.png)\n\n## C\n\nthree\n"
+    assert write_performance.section_of(page, "## AB") == "## AB\n\n| x |\n\n![p](p.png)\n"
+    assert write_performance.section_of(page, "## C") == "## C\n\nthree\n"
+    assert write_performance.section_of(page, "## B") == ""

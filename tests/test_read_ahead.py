@@ -1,0 +1,118 @@
+from __future__ import annotations
+
+import threading
+import time
+from collections.abc import Callable, Sequence
+
+import numpy as np
+import pytest
+
+from su3d_bench.errors import DataError
+from su3d_bench.read_ahead import ReadAhead
+from su3d_bench.types import Frame
+
+N_FRAMES = 40
+
+
+class Watched(Sequence[Frame]):
+    """Frames whose reading is noted; ``read`` is called with the position before the frame is given."""
+
+    def __init__(self, read: Callable[[int], None] = lambda _: None) -> None:
+        self.begun: list[int] = []
+        self._read = read
+
+    def __len__(self) -> int:
+        return N_FRAMES
+
+    def __getitem__(self, position: int) -> Frame:  # type: ignore[override]
+        self.begun.append(position)
+        self._read(position)
+        rgb, depth_m = np.zeros((2, 3, 3), np.uint8), np.ones((2, 3), np.float32)
+        return Frame(position, 0.0, rgb, depth_m, np.eye(4), np.eye(3))
+
+
+def threads() -> int:
+    return sum(one.name.startswith("read-ahead") for one in threading.enumerate())
+
+
+def wait_until(is_so: Callable[[], bool]) -> None:
+    until = time.monotonic() + 10
+    while not is_so():
+        assert time.monotonic() < until, "it never became so"
+        time.sleep(0.002)
+
+
+def test_frames_come_in_their_order_however_long_each_takes() -> None:
+    delays = np.random.default_rng(0).uniform(0, 0.004, N_FRAMES)
+    with ReadAhead(Watched(lambda i: time.sleep(delays[i])), N_FRAMES, n_threads=4, n_ahead=8) as ahead:
+        assert [ahead.next_frame().index for _ in range(N_FRAMES)] == list(range(N_FRAMES))
+
+
+def test_no_more_frames_are_read_than_may_wait() -> None:
+    frames = Watched()
+    with ReadAhead(frames, N_FRAMES, n_ahead=3) as ahead:
+        for n_taken in range(1, 10):
+            ahead.next_frame()
+            wait_until(lambda n=n_taken: len(frames.begun) == n + 3)  # type: ignore[misc]
+            time.sleep(0.002)
+            assert len(frames.begun) == n_taken + 3
+
+
+def test_the_first_frame_is_read_before_any_other_begins() -> None:
+    frames, is_over = Watched(lambda _: is_over.wait(10) and None), threading.Event()
+    with ReadAhead(frames, N_FRAMES) as ahead:
+        wait_until(lambda: frames.begun == [0])
+        time.sleep(0.02)
+        assert frames.begun == [0]
+        is_over.set()
+        ahead.next_frame()
+        wait_until(lambda: sorted(frames.begun) == [0, 1, 2])
+
+
+def test_frames_are_read_side_by_side_while_one_is_in_use() -> None:
+    both = threading.Barrier(2)
+    with ReadAhead(Watched(lambda i: i and both.wait(10) and None), 5) as ahead:
+        assert [ahead.next_frame().index for _ in range(5)] == [0, 1, 2, 3, 4]
+
+
+def test_a_broken_frame_fails_when_it_is_asked_for_and_not_before() -> None:
+    def read(position: int) -> None:
+        if position == 2:
+            raise DataError("frame 2: broken")
+
+    with ReadAhead(Watched(read), N_FRAMES) as ahead:
+        assert [ahead.next_frame().index for _ in range(2)] == [0, 1]
+        with pytest.raises(DataError, match="frame 2: broken"):
+            ahead.next_frame()
+        assert ahead.next_frame().index == 3
+
+
+@pytest.mark.parametrize("n_taken", [0, 1, 7, N_FRAMES])
+def test_leaving_early_ends_the_threads_and_reads_nothing_more(n_taken: int) -> None:
+    frames = Watched()
+    with ReadAhead(frames, N_FRAMES) as ahead:
+        for _ in range(n_taken):
+            ahead.next_frame()
+    assert threads() == 0
+    n_begun = len(frames.begun)
+    assert n_begun <= min(n_taken + 2, N_FRAMES)
+    time.sleep(0.01)
+    assert len(frames.begun) == n_begun
+
+
+def test_an_error_of_who_uses_the_frames_ends_the_threads_too() -> None:
+    def use() -> None:
+        with ReadAhead(Watched(), N_FRAMES) as ahead:
+            ahead.next_frame()
+            raise RuntimeError("the method failed")
+
+    with pytest.raises(RuntimeError, match="the method failed"):
+        use()
+    assert threads() == 0
+
+
+def test_no_frames_start_no_thread() -> None:
+    frames = Watched()
+    with ReadAhead(frames, 0):
+        assert threads() == 0
+    assert frames.begun == []

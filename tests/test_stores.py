@@ -1,0 +1,176 @@
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import fsspec
+import pytest
+from painted import colour_perception
+from replica_scene import CHAIR, TABLE, write_original, write_render
+from test_clusters import COLLECTOR, PAINTED, assert_equal_runs, deterministic_files, run
+
+from su3d_bench import scene_feeding, scene_run
+from su3d_bench.cli.main import main
+from su3d_bench.errors import ConfigError, StoreError
+from su3d_bench.planning import data_root
+from su3d_bench.remote_data import files_of_scenes
+from su3d_bench.remote_folder import RemoteFolder
+
+URL = "memory://bucket/runs/one"
+TWO = ("--scenes", f"{PAINTED}/[ad]", "--jobs", "1")
+
+
+@pytest.fixture(autouse=True)
+def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+
+
+@pytest.fixture
+def store() -> Any:
+    """The memory of this process as a store, empty."""
+    driver = fsspec.filesystem("memory")
+    driver.store.clear()
+    driver.pseudo_dirs[:] = [""]
+    return driver
+
+
+def brought(url: str, to: Path) -> Path:
+    """A copy of all that is in the store."""
+    folder = RemoteFolder(url)
+    folder.fetch(folder.files(), to)
+    return to
+
+
+def test_a_run_in_a_store_has_the_bytes_of_a_run_in_a_folder(store: Any, tmp_path: Path) -> None:
+    assert run(*TWO, out="local") == 0
+    assert run(*TWO, out=URL) == 0
+    assert_equal_runs("local", brought(URL, tmp_path / "came"))
+    (mirror,) = (tmp_path / "cache" / "runs").iterdir()
+    small = {name for name in deterministic_files(mirror) if not name.endswith("prediction.npz")}
+    assert small == {name for name in deterministic_files(Path("local")) if not name.endswith("prediction.npz")}
+    assert main(["report", "tables", str(mirror)]) == 0
+
+
+def test_a_run_in_a_store_is_taken_up_again_without_the_folder_here(
+    store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run(*TWO, out=URL) == 0
+    before = brought(URL, tmp_path / "before")
+    shutil.rmtree(tmp_path / "cache")
+    monkeypatch.setattr(scene_feeding, "write_prediction", None)
+    monkeypatch.setattr(scene_run, "pack_scores", None)
+    assert run(*TWO, out=URL) == 0
+    assert_equal_runs(before, brought(URL, tmp_path / "after"))
+
+
+def test_a_job_that_was_sent_in_part_is_run_again(store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run(*TWO, out="local") == 0
+
+    def stop_at_the_seal(self: RemoteFolder, folder: Path, names: list[str]) -> None:
+        send(self, folder, [name for name in names if not name.endswith("d/collector/done.json")])
+        if any("painted.d" in name for name in names):
+            raise KeyboardInterrupt
+
+    send = RemoteFolder.send
+    with monkeypatch.context() as patch:
+        patch.setattr(RemoteFolder, "send", stop_at_the_seal)
+        assert run(*TWO, out=URL) == 130
+    assert "scenes/painted.d/collector/prediction.npz" in RemoteFolder(URL).files()
+    assert run(*TWO, out=URL) == 0
+    assert_equal_runs("local", brought(URL, tmp_path / "came"))
+
+
+def test_a_file_that_arrived_cut_short_is_not_taken_for_whole(store: Any, tmp_path: Path) -> None:
+    assert run(*TWO, out="local") == 0
+    assert run(*TWO, out=URL) == 0
+    cut = "/bucket/runs/one/scenes/painted.a/collector/prediction.npz"
+    store.pipe_file(cut, store.cat_file(cut)[:-100])
+    assert run(*TWO, out=URL) == 0
+    assert_equal_runs("local", brought(URL, tmp_path / "came"))
+
+
+def test_another_run_in_the_store_is_refused_by_name(store: Any, capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(*TWO, out=URL) == 0
+    capsys.readouterr()
+    assert run(*TWO, "--seed", "5", out=URL) == 2
+    assert "holds another run (seed was 0, now 5); choose another folder with --out" in capsys.readouterr().err
+
+
+def test_workers_of_their_own_reach_a_store_too(tmp_path: Path) -> None:
+    url = (tmp_path / "shared").as_uri()
+    base = ["run", "--scenes", f"{PAINTED}/[ad]", "--methods", COLLECTOR, "--protocols", "rooms-semantic", "--quiet"]
+    common = [*base, "--no-pictures", "--set", "collector.noise_m=0.02", "painted.frame_ms=50"]
+    assert main([*common, "--jobs", "1", "--out", "local"]) == 0
+    assert main([*common, "--executor", "processes", "--jobs", "2", "--out", url]) == 0
+    assert_equal_runs("local", tmp_path / "shared")
+
+
+def test_scenes_of_a_data_root_in_a_store_are_fetched_one_by_one(
+    store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    data = tmp_path / "data"
+    for scene in ("room0", "room1"):
+        write_render(data, scene)
+        faces = [[0, 1, 4, 3], [1, 2, 5, 4], [3, 4, 7, 6], [4, 5, 8, 7]]
+        write_original(data, faces, [1, 1, 2, 2], [(1, CHAIR), (2, TABLE)], folder=f"replica_v1/room_{scene[-1]}")
+    RemoteFolder("memory://lake/data").send(
+        data, [p.relative_to(data).as_posix() for p in data.rglob("*") if p.is_file()]
+    )
+    words = ["run", "--scenes", "replica/*", "--methods", "oracle", "--no-pictures", "--jobs", "1", "--quiet"]
+    monkeypatch.setenv("SU3D_DATA", str(data))
+    assert main([*words, "--out", "local"]) == 0
+    shutil.rmtree(data)
+    fetched: list[set[str]] = []
+    fetch = RemoteFolder.fetch
+
+    def noting(self: RemoteFolder, sizes: dict[str, int], into: Path) -> None:
+        fetched.append(set(sizes))
+        fetch(self, sizes, into)
+
+    monkeypatch.setenv("SU3D_DATA", "memory://lake/data")
+    monkeypatch.setattr(RemoteFolder, "fetch", noting)
+    with pytest.raises(ConfigError, match="only su3d-bench run and ablate read a store"):
+        data_root()
+    assert main([*words, "--out", "far"]) == 0
+    assert Path("far/metrics.json").read_bytes() == Path("local/metrics.json").read_bytes()
+    first, second = fetched
+    assert first & second == {"Replica/cam_params.json"}
+    assert {"Replica/room0/traj.txt", "replica_v1/room_0/habitat/mesh_semantic.ply"} <= first
+
+
+def test_files_are_told_apart_by_the_scene_that_they_are_named_after() -> None:
+    names = [
+        "scannet/scans/scene0000_00/scene0000_00.sens",
+        "scannet/scans/scene0000_01/scene0000_01.sens",
+        "scannet/scans/scene0000_00/scene0000_00_vh_clean_2.ply",
+        "scannet/scannetv2-labels.combined.tsv",
+        "tum/rgbd_dataset_freiburg1_desk/rgb.txt",
+        "tum/rgbd_dataset_freiburg1_desk2/rgb.txt",
+        "Replica/room0_mesh.ply",
+        "replica_v1/room_0/habitat/mesh_semantic.ply",
+        "Replica/cam_params.json",
+    ]
+    sizes = dict.fromkeys(names, 1)
+    scans = files_of_scenes(sizes, ["scene0000_00", "scene0000_01"])
+    assert list(scans["scene0000_00"]) == [names[3], names[0], names[2]]
+    assert list(scans["scene0000_01"]) == [names[3], names[1]]
+    assert list(files_of_scenes(sizes, ["freiburg1_desk"])["freiburg1_desk"]) == [names[5], names[4]]
+    assert list(files_of_scenes(sizes, ["room0"])["room0"]) == [names[8], names[6], names[7]]
+
+
+@pytest.mark.parametrize("name", ["scenes/../../evil", "scenes/a\\b", "scenes/a\x1b[2J", "scenes//x"])
+def test_a_name_that_leads_out_of_the_store_is_refused(
+    name: str, store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(type(store), "find", lambda *_, **__: {f"/bucket/runs/one/{name}": {"size": 1}})
+    with pytest.raises(StoreError, match="which is no name of a file; remove it"):
+        RemoteFolder(URL).files()
+
+
+def test_a_store_of_an_unknown_kind_is_one_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run(*TWO, out="zz://x/y") == 2
+    error = capsys.readouterr().err
+    assert error == "su3d-bench: zz://x/y: Protocol not known: zz; such as s3://bucket/folder\n"
