@@ -18,7 +18,8 @@ bench: $(VENV)/test
 	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-group-by=group --benchmark-columns=min,median,rounds --benchmark-json=build/bench.json
 	$(BIN)/python benchmarks/write_performance.py build/bench.json docs/performance.md
 
-# All methods on the demo rooms, and along corridors so long that every map reaches 5 million points.
+# All methods on the demo rooms, and along corridors so long that every map reaches 5 million points: on two cores three
+# quarters of an hour for the rooms and half an hour for the corridors.
 CORRIDOR_RUN := $(BIN)/su3d-bench run --profile oracle --stride 1 --no-pictures --set perception.cache=false --jobs 1
 CORRIDOR := benchmarks/corridor.py:Corridor
 bench-methods: $(VENV)/test
@@ -45,11 +46,11 @@ $(VENV)/core: pyproject.toml constraints.txt
 	@touch $@
 
 $(VENV)/test: $(VENV)/core
-	$(PIP) -e '.[models,sheets,test]'
+	$(PIP) -e '.[models,sheets,ray,slurm,stores,test]'
 	@touch $@
 
 $(VENV)/dev: $(VENV)/test
-	$(PIP) -e '.[models,sheets,test,dev]'
+	$(PIP) -e '.[models,sheets,ray,slurm,stores,test,dev]'
 	@touch $@
 
 clean:

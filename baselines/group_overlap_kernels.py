@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from su3d_bench.kernels import njit
 
 # A cell is looked into although it lies this much beyond what was found: float32 distances are rounded.
 SLACK = 1.0 + 1e-5

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import numba
 import numpy as np
 
+from su3d_bench.kernels import njit
 
-@numba.njit(cache=True)
+
+@njit(cache=True)
 def project(points, projection, depth_m, tolerance_m):  # type: ignore[no-untyped-def]
     """The pixel of each visible point, -1 for the others; ``projection`` (3, 4) maps the world to the image."""
     height, width = depth_m.shape
@@ -26,7 +27,7 @@ def project(points, projection, depth_m, tolerance_m):  # type: ignore[no-untype
     return pixels
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def count_distinct(pixels, indptr, indices, n_image):  # type: ignore[no-untyped-def]
     """Distinct pixels of each mask, in whichever order its members come."""
     last_mask = np.full(n_image, -1, np.int32)

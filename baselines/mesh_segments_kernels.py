@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import math
 
-import numba
 import numpy as np
+
+from su3d_bench.kernels import njit
 
 ONE = np.float32(1.0)
 ZERO = np.float32(0.0)
 SHORT = 16  # runs up to this length are left to the insertion sort, as _S_threshold of GNU's std::sort
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def vertex_normals(vertices, triangles):  # type: ignore[no-untyped-def]
     """Running means (V, 3) of the unit normals of the triangles around each vertex, in the order of the triangles."""
     normals = np.zeros((len(vertices), 3), np.float32)
@@ -43,7 +44,7 @@ def vertex_normals(vertices, triangles):  # type: ignore[no-untyped-def]
     return normals
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def edges_of(vertices, triangles):  # type: ignore[no-untyped-def]
     """Three edges (3 T, 2) a triangle, those of two triangles twice, and their weights (3 T,).
 
@@ -74,7 +75,7 @@ def edges_of(vertices, triangles):  # type: ignore[no-untyped-def]
     return edges, weights
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def joined(n_vertices, edges, weights, threshold, min_vertices):  # type: ignore[no-untyped-def]
     """The root (V,) of each vertex after the edges in the given order, and then small segments, were joined."""
     parent = np.arange(n_vertices).astype(np.int32)
@@ -96,7 +97,7 @@ def joined(n_vertices, edges, weights, threshold, min_vertices):  # type: ignore
     return segments
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _root(parent, vertex):  # type: ignore[no-untyped-def]
     found = vertex
     while found != parent[found]:
@@ -105,7 +106,7 @@ def _root(parent, vertex):  # type: ignore[no-untyped-def]
     return found
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _join(parent, rank, size, a, b):  # type: ignore[no-untyped-def]
     """Hang the root of the lower rank below the other, ``a`` below ``b`` where they are equal; the root that stays."""
     if rank[a] > rank[b]:
@@ -119,7 +120,7 @@ def _join(parent, rank, size, a, b):  # type: ignore[no-untyped-def]
     return b
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def sort_as_gnu(weights, edges):  # type: ignore[no-untyped-def]
     """Sorts both by ``weights`` in place, equal ones in the order in which GNU's ``std::sort`` leaves them.
 
@@ -148,14 +149,14 @@ def sort_as_gnu(weights, edges):  # type: ignore[no-untyped-def]
         _insert(weights, edges, k)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _swap(weights, edges, i, j):  # type: ignore[no-untyped-def]
     weights[i], weights[j] = weights[j], weights[i]
     edges[i, 0], edges[j, 0] = edges[j, 0], edges[i, 0]
     edges[i, 1], edges[j, 1] = edges[j, 1], edges[i, 1]
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _partition(weights, edges, first, last):  # type: ignore[no-untyped-def]
     middle = first + (last - first) // 2
     _swap(weights, edges, first, _median(weights, first + 1, middle, last - 1))
@@ -173,7 +174,7 @@ def _partition(weights, edges, first, last):  # type: ignore[no-untyped-def]
         low += 1
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _median(weights, a, b, c):  # type: ignore[no-untyped-def]
     if weights[a] < weights[b]:
         if weights[b] < weights[c]:
@@ -184,7 +185,7 @@ def _median(weights, a, b, c):  # type: ignore[no-untyped-def]
     return c if weights[b] < weights[c] else b
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _insert(weights, edges, k):  # type: ignore[no-untyped-def]
     weight, a, b = weights[k], edges[k, 0], edges[k, 1]
     while k > 0 and weight < weights[k - 1]:
@@ -193,7 +194,7 @@ def _insert(weights, edges, k):  # type: ignore[no-untyped-def]
     weights[k], edges[k, 0], edges[k, 1] = weight, a, b
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _heap_sort(weights, edges, first, last):  # type: ignore[no-untyped-def]
     n = last - first
     for parent in range((n - 2) // 2, -1, -1):
@@ -206,7 +207,7 @@ def _heap_sort(weights, edges, first, last):  # type: ignore[no-untyped-def]
         _sift(weights, edges, first, 0, end, weight, a, b)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _sift(weights, edges, first, hole, n, weight, a, b):  # type: ignore[no-untyped-def]
     """Lets the hole sink to a leaf along the larger children, then its new content rise, as GNU's __adjust_heap."""
     top, child = hole, hole
@@ -228,6 +229,6 @@ def _sift(weights, edges, first, hole, n, weight, a, b):  # type: ignore[no-unty
     weights[first + hole], edges[first + hole, 0], edges[first + hole, 1] = weight, a, b
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _move(weights, edges, source, target):  # type: ignore[no-untyped-def]
     weights[target], edges[target, 0], edges[target, 1] = weights[source], edges[source, 0], edges[source, 1]

@@ -9,7 +9,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from su3d_bench.kernels import njit
 
 ABSENT = -1
 NOISE = -1

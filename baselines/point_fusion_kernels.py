@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
+
+from su3d_bench.kernels import njit
 
 ABSENT = -1
 # find_active_map_points: a projection may lie this far out of the outermost pixel centres.

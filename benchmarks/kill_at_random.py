@@ -3,15 +3,16 @@
     python benchmarks/kill_at_random.py --kills 200
     python benchmarks/kill_at_random.py --kills 20 --seed 7 --executors processes
 
-A run of three methods on four tiny painted scenes is started, killed at a moment drawn evenly from the time that a
-whole run takes, and half of the time each file of the second before the kill is cut short, emptied, filled with zeros
-or taken back. Half of the runs that take it up again are killed too. After every kill nothing that a seal vouches for
-may differ from the undisturbed run and the folder may not stay locked; in the end every file must have the bytes of
-the undisturbed run, columns of times aside, and no unfinished file may be left.
+A run of two methods on three tiny painted scenes (``--subject opensu3d``: OpenSU3D and two baselines) is started,
+killed at a moment drawn evenly from the time that a whole run takes, and half of the time each file of the second
+before the kill is cut short, emptied, filled with zeros or taken back. Half of the runs that take it up again are
+killed too. After every kill nothing that a seal vouches for may differ from the undisturbed run and the folder may not
+stay locked; in the end every file must have the bytes of the undisturbed run, columns of times aside, and no
+unfinished file may be left.
 
 Each run is a process forked from one that has its modules loaded, so that the kills strike the work, not the start.
 ``group`` kills a run and all its workers, ``driver`` leaves workers behind for the next run to meet, ``worker`` kills
-one worker of a run.
+one worker of a run. With ray, the workers are those of a cluster that is started here and outlives the runs.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ import os
 import random
 import shutil
 import signal
+import subprocess
 import sys
 import tempfile
 import time
@@ -34,12 +36,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from measured import write_measured
+
 TESTS = Path(__file__).resolve().parents[1] / "tests"
 METHODS = ("opensu3d", "sam3d", "conceptfusion")
 RUN = ("run", "--protocols", "rooms-semantic", "rooms-instance", "--anytime", "0.5", "--no-pictures", "--quiet")
 SUBJECTS = {
     "light": (
-        *RUN, "--scenes", *(f"{TESTS}/painted.py:Painted/{scene}" for scene in "abc"),
+        *RUN, "--scenes", *(f"{TESTS}/kill_subject.py:Painted/{scene}" for scene in "abc"),
         "--methods", f"{TESTS}/painted.py:Collector", f"{TESTS}/kill_subject.py:Dense",
         "--set", "painted.n_frames=4", "painted.frame_ms=10.0", "collector.noise_m=0.01",
     ),
@@ -49,11 +53,22 @@ SUBJECTS = {
         "--set", "painted.n_frames=4", *(f"{name}.stride=1" for name in METHODS),
     ),
 }  # fmt: skip
-EXECUTORS = {"inline": ("--jobs", "1"), "processes": ("--jobs", "2")}
-VICTIMS = {"inline": ("group",), "processes": ("group", "driver", "worker")}
+EXECUTORS = {
+    "inline": ("--jobs", "1"),
+    "processes": ("--jobs", "2"),
+    "ray": ("--executor", "ray", "--jobs", "2"),
+}
+VICTIMS = {"inline": ("group",), "processes": ("group", "driver", "worker"), "ray": ("driver", "worker")}
+SHARES = {"inline": 12, "processes": 5, "ray": 3}  # of the kills: a run in workers takes many times as long
+A_WORKER = ("spawn_main", "ray::_on_node")  # in the command lines of workers
 LAST_SECOND_NS = 1_000_000_000
 PAGE = 4096
 TIMES = ("_ms", "rss_bytes")
+COLUMNS = ("kills", "of a group", "of a driver", "of a worker", "power cuts", "files spoilt", "compared")
+NOTE = (
+    "compared: runs that were taken up again to their end, whose files had the bytes of the undisturbed run; a fault is "
+    "a file that differs, a half-written one taken for whole, a lock that stayed, a traceback, or a file left over."
+)
 COMPLETE, INCOMPLETE = 0, 3  # exit codes of the command
 
 
@@ -103,21 +118,21 @@ class Run:
     def said(self) -> str:
         return self._log.read_text(errors="replace")[-2000:]
 
-    def workers(self) -> list[int]:
-        import psutil
 
-        with contextlib.suppress(psutil.NoSuchProcess):
-            children = psutil.Process(self.pid).children(recursive=True)
-            return [one.pid for one in children if "spawn_main" in " ".join(one.cmdline())]
-        return []
+def workers_below(pid: int) -> list[int]:
+    import psutil
+
+    with contextlib.suppress(psutil.NoSuchProcess):
+        children = psutil.Process(pid).children(recursive=True)
+        return [one.pid for one in children if any(mark in " ".join(one.cmdline()) for mark in A_WORKER)]
+    return []
 
 
-def kill(run: Run, victim: str, moments: random.Random) -> bool:
+def kill(run: Run, victim: str, workers: Sequence[int], moments: random.Random) -> bool:
     """Kill ``victim`` of ``run``; whether it was there."""
     if run.has_ended():
         return False
     if victim == "worker":
-        workers = run.workers()
         if not workers:
             return False
         with contextlib.suppress(ProcessLookupError):
@@ -200,11 +215,39 @@ def false_seals(folder: Path, expected: dict[str, Any]) -> list[str]:
     return wrong
 
 
+class Cluster:
+    """A Ray cluster of two machines on this one, the second of which takes jobs; a process of its own holds it."""
+
+    CODE = (
+        "import sys; from ray.cluster_utils import Cluster\n"
+        "small = {'object_store_memory': 80_000_000, 'include_dashboard': False}\n"
+        "made = Cluster(initialize_head=True, head_node_args={'num_cpus': 0, **small})\n"
+        "made.add_node(num_cpus=2, **small); print(made.address, flush=True); sys.stdin.read(); made.shutdown()"
+    )
+
+    def __init__(self) -> None:
+        words = [sys.executable, "-c", self.CODE]
+        self._process = subprocess.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+        assert self._process.stdout is not None
+        said = iter(self._process.stdout.readline, "")
+        self.address = next(line.strip() for line in said if line.startswith("127.") or line[:1].isdigit())
+        self.pid = self._process.pid
+
+    def close(self) -> None:
+        self._process.communicate("")
+
+
 class Trial:
     """One executor: its undisturbed run, and as many killed ones as are asked for."""
 
-    def __init__(self, scratch: Path, subject: str, executor: str, moments: random.Random, tally: Tally) -> None:
+    def __init__(
+        self, scratch: Path, subject: str, executor: str, cluster: Cluster | None, seed: str, tally: Tally
+    ) -> None:
         self._request = (*SUBJECTS[subject], *EXECUTORS[executor])
+        if cluster is not None:
+            self._request += ("--ray-address", cluster.address)
+        self._cluster = cluster
+        moments = random.Random(f"{seed} {executor}")
         self._scratch, self._executor, self._moments, self._tally = scratch, executor, moments, tally
         self._cache = scratch / "cache"
         os.environ["SU3D_CACHE"] = str(self._cache)
@@ -238,13 +281,14 @@ class Trial:
         victim = self._moments.choice(VICTIMS[self._executor])
         run = Run(folder, self._request)
         time.sleep(self._moments.uniform(0, self._whole_s))
-        was_hit = kill(run, victim, self._moments)
+        above = run.pid if self._cluster is None else self._cluster.pid
+        was_hit = kill(run, victim, workers_below(above) if victim == "worker" else (), self._moments)
         if was_hit and victim == "driver":
             run.finish()
             return self._count("driver", spoilt=None)  # its workers may live on for a moment: the next run meets them
         code = run.finish()
         if not was_hit:
-            self._tally.done["was over, or had no worker, at the moment of the kill"] += 1
+            self._tally.done["nobody there"] += 1
             if code != COMPLETE:
                 self._fault(f"a run that nobody killed ended with {code}: {run.said()}")
             return False
@@ -260,10 +304,13 @@ class Trial:
         return self._count(victim, spoilt)
 
     def _count(self, victim: str, spoilt: int | None) -> bool:
-        self._tally.done[f"{self._executor}: kills of a {victim}"] += 1
+        self._tally.done["kills"] += 1
+        self._tally.done[f"of a {victim}"] += 1
         if spoilt is not None:
-            self._tally.done[f"{self._executor}: power cuts"] += 1
-            self._tally.done[f"{self._executor}: files spoilt"] += spoilt
+            self._tally.done["power cuts"] += 1
+            self._tally.done["files spoilt"] += spoilt
+        if self._tally.done["kills"] % 10 == 0:
+            print(f"{self._executor}: {dict(self._tally.done)}", flush=True)
         return True
 
     def _lock(self, folder: Path) -> None:
@@ -279,7 +326,7 @@ class Trial:
     def _take_up(self, folder: Path) -> None:
         run = Run(folder, self._request)
         code = run.finish()
-        self._tally.done[f"{self._executor}: runs taken up again and compared"] += 1
+        self._tally.done["compared"] += 1
         if code != COMPLETE:
             self._fault(f"taken up again it ended with {code}: {run.said()}")
             return
@@ -319,29 +366,41 @@ def load_modules(subject: str) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--kills", type=int, default=200, help="in all, shared evenly by the executors (default: 200)")
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--kills", type=int, default=200, help="in all; most are of runs inline (default: 200)")
+    parser.add_argument("--seed", default="0")
     parser.add_argument("--executors", nargs="+", choices=list(EXECUTORS), default=list(EXECUTORS))
     parser.add_argument("--subject", choices=list(SUBJECTS), default="light", help="what runs (default: light)")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the table there too")
     given = parser.parse_args(arguments)
     load_modules(given.subject)
-    tally = Tally()
     started = time.monotonic()
+    tallies = {}
     with tempfile.TemporaryDirectory(prefix="su3d-kills-") as scratch:
-        for k, executor in enumerate(given.executors):
-            own = Path(scratch) / executor
-            own.mkdir()
-            n = given.kills // len(given.executors) + (k < given.kills % len(given.executors))
-            Trial(own, given.subject, executor, random.Random(f"{given.seed} {executor}"), tally).kills(n)
-    for what, n in sorted(tally.done.items()):
-        print(f"{n:6} {what}")
-    print(f"{len(tally.faults):6} faults, in {time.monotonic() - started:.0f} s")
-    return 1 if tally.faults else 0
+        for executor in given.executors:
+            n = round(given.kills * SHARES[executor] / sum(SHARES[one] for one in given.executors))
+            tallies[executor] = Tally()
+            try_executor(Path(scratch) / executor, given.subject, executor, max(n, 1), given.seed, tallies[executor])
+            print(f"{executor}: {dict(tallies[executor].done)}, {len(tallies[executor].faults)} faults", flush=True)
+    rows = [
+        [name, *(str(tally.done[what]) for what in COLUMNS), str(len(tally.faults))] for name, tally in tallies.items()
+    ]
+    n_faults = sum(len(tally.faults) for tally in tallies.values())
+    print(f"{n_faults} faults in {time.monotonic() - started:.0f} s")
+    if given.json is not None:
+        command = f"python benchmarks/kill_at_random.py --kills {given.kills} --seed {given.seed}"
+        write_measured(given.json, "Runs killed at random", command, ["executor", *COLUMNS, "faults"], rows, [NOTE])
+    return 1 if n_faults else 0
 
 
-if "light" in sys.argv or "--subject" not in sys.argv:  # at import: spawned workers import this file with its arguments
-    sys.path.insert(0, str(TESTS))
-    import kill_subject  # noqa: F401
+def try_executor(scratch: Path, subject: str, executor: str, n: int, seed: str, tally: Tally) -> None:
+    scratch.mkdir()
+    cluster = Cluster() if executor == "ray" else None
+    try:
+        Trial(scratch, subject, executor, cluster, seed, tally).kills(n)
+    finally:
+        if cluster is not None:
+            cluster.close()
+
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from numba import njit
+from su3d_bench.kernels import njit
 
 compiled: Any = njit(cache=True)
 

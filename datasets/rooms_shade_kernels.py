@@ -11,7 +11,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import njit
+
+from su3d_bench.kernels import njit
 
 compiled: Any = njit(cache=True)
 inlined: Any = njit(cache=True, inline="never")

@@ -44,7 +44,7 @@ MOST_LABEL_PT = 150  # of a label in a table that is too wide for a page; a long
 FLOATS = (("table", 238), ("table*", 480))
 # Heights of a line in each type size, of a title with rules, and of what a page takes, caption aside.
 LINES_PT = {r"\small": 11.0, r"\footnotesize": 9.5, r"\scriptsize": 8.0}
-HEAD_PT, PAGE_PT, NOTE_LETTER_PT = 34.0, 560.0, 3.7
+HEAD_PT, PAGE_PT, NOTE_LETTER_PT = 34.0, 600.0, 3.7
 # Type sizes and the width of a letter: digits of Computer Modern, bold, with 10 pt as the normal size.
 SIZES = ((r"\small", 5.3), (r"\footnotesize", 4.9), (r"\scriptsize", 4.4))
 _ORIGIN = re.compile(
@@ -145,8 +145,9 @@ def _float(table: Table, place: _Place, pieces: Sequence[_Piece], *, is_first: b
     lines = [
         f"\\begin{{{place.kind}}}[t]",
         r"  \centering\hbadness=10000",  # a caption of few words in a narrow column
+        *([] if is_first else [r"  \addtocounter{table}{-1}"]),
         f"  \\caption{{{escape(table.caption if is_first else f'{table.caption} (continued)')}}}",
-        *([label] if is_first else [r"  \addtocounter{table}{-1}"]),
+        *([label] if is_first else []),
         f"  {place.size}\\setlength{{\\tabcolsep}}{{{place.gap_pt}pt}}",
     ]
     for k, piece in enumerate(pieces):

@@ -17,8 +17,13 @@ function headFacts() {
 function followSections() {
   const nav = byId('nav'), links = [...nav.querySelectorAll('a')];
   const sections = [...document.querySelectorAll('section.part')];
+  const top = (section) => section.getBoundingClientRect().top;
+  // At the end of the page several short sections may stand on the screen: the one asked for, else the last.
+  const atEnd = () => sections.find((one) => `#${one.id}` === location.hash && top(one) > 0 && top(one) < innerHeight)
+    || sections[sections.length - 1];
   const mark = () => {
-    const at = sections.filter((section) => section.getBoundingClientRect().top < 140).pop() || sections[0];
+    const isEnd = scrollY > 0 && innerHeight + scrollY >= document.documentElement.scrollHeight - 2;
+    const at = isEnd ? atEnd() : sections.filter((section) => top(section) < 140).pop() || sections[0];
     links.forEach((link) => {
       const is = at && link.getAttribute('href') === `#${at.id}`;
       if (is === link.hasAttribute('aria-current')) return;

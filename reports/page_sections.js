@@ -100,9 +100,9 @@ const onSame = (rows, what) => new Set(rows.filter((one) => competes(one) && one
 const limitOf = (one) => String(RUNS[one.run].limit);
 const scenesOf = (one) => [limitOf(one), ...one.result.scenes].join('\n');
 function bestOf(rows, value, what = scenesOf) {
-  // Rows on other scenes or other frames are not compared.
-  const numbers = rows.filter(competes).map(value).filter(isNumber);
-  return numbers.length > 1 && onSame(rows, what) ? Math.max(...numbers) : null;
+  // Rows on other scenes or other frames are not compared, and where all are equal none is the best.
+  const numbers = rows.filter(competes).map(value).filter(isNumber), most = Math.max(...numbers);
+  return numbers.some((one) => one < most) && onSame(rows, what) ? most : null;
 }
 
 // Whether the numbers are those of all scenes together; where the two agree it does not matter.

@@ -15,6 +15,7 @@ from su3d_bench.reports.table_model import NOT_MEASURED, Cell, Origin, Table, Ta
 from su3d_bench.statistics import SignFlipTest, sign_flip_test
 
 LEVEL = 0.05
+PAPER_DATA = "replica"  # of Tables II and III
 
 
 @dataclass(frozen=True)
@@ -64,8 +65,9 @@ def paper_table(number: PaperTable, found: Sequence[Measured], shown: Shown, *, 
     for name in names:
         rows = [one for one in fitting if one.protocol == name]
         one = protocol_table(rows, replace(shown, metrics=metrics), figures)
-        setup = "" if name == layout.protocol else ", not the paper's set-up"
         where = next((row.datasets for row in rows if row.per_scene), "no scene")
+        setup = "" if name == layout.protocol else ", not the paper's set-up"
+        setup += " and data" if setup and where != PAPER_DATA else ""
         caption = f"{layout.subject} on {where}, {name}{setup}."
         tables.append(replace(one, name=f"{number}-{name}", caption=caption))
     return tables

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba
 import numpy as np
 
+from su3d_bench.kernels import njit
 
-@numba.njit(cache=True)
+
+@njit(cache=True)
 def averaged_colours(point: Any, shade: Any, palette: Any, steps: int) -> Any:
     """The mean colour (h / steps, w / steps, 3) of blocks of pixels, in the order in which numpy would add them.
 

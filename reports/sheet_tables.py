@@ -41,7 +41,8 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
             row = tuple(_accuracy(cells.get((judge, method, metric))) for metric in metrics)
             rows.append(TableRow(f"{method} ({what})", row, group=judge))
     n_scenes = len({scene for cell in cells.values() for scene in cell["per_scene"]})
-    unclear = sum(c["n_cannot_tell"] for c in cells.values() if c["judge"] == "people" and c["metric"] in metrics[-1:])
+    # methods share items, so that their sum would count a judgement several times
+    unclear = max((c["n_cannot_tell"] for c in cells.values() if c["judge"] == "people"), default=0)
     subject, question = SUBJECTS[scores["kind"]]
     people = ", ".join(f"{name} {n}" for name, n in scores["annotators"].items())
     judged = f"{scores['n_judged']} of {scores['n_items']} items judged; judgements by {people}"
@@ -58,7 +59,7 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
             "items, as far as it knows them",
             f"set {scores['sheet_id']} of run {scores['run']}; {judged}",
             *([f"answers by {printable(scores['answered_by'], 100)}"] if scores["answered_by"] else []),
-            *([f"'cannot tell' is left out: {unclear} under {metrics[-1]}"] if unclear else []),
+            *([f"'cannot tell' is left out: at most {unclear} judgements of a number"] if unclear else []),
             *([f"no answers from {', '.join(scores['silent'])}"] if scores["silent"] else []),
         ),
     )

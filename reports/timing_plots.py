@@ -27,7 +27,8 @@ DASHES = ("-", "--", "-.", ":")
 HATCHES = ("", "///", "...", "xxx", "\\\\\\", "+++", "ooo", "---")
 MAX_DRAWN = 2000  # points a method; more only make the file large
 N_SIZES = 10  # markers a method along the axis of sizes
-PANELS_A_ROW = 3
+PANELS_A_ROW, LEGEND_COLUMNS = 3, 3
+LETTERS_AN_INCH = 15  # of a legend's type
 MIB = 2**20
 POINTS, UPDATES = "points of the map", "updates so far"
 
@@ -179,7 +180,7 @@ def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int) -> Figure:
 
 def _memory(times: Sequence[Sequence[UpdateTimes]]) -> Figure:
     """Mebibytes of the map against its points, and of the process against the updates, the scenes' medians."""
-    figure, panels = _figure(4.2, 3.4 + 0.1 * len(times), 2)
+    figure, panels = _figure(4.8, 3.2 + 0.16 * len(times), 2)
     for axes, (column, against) in zip(panels, (("map_bytes", POINTS), ("rss_bytes", UPDATES)), strict=True):
         for index, of_method in enumerate(times):
             sized = [(one, _sizes(one, against, 0)) for one in of_method if column in one.columns]
@@ -193,6 +194,7 @@ def _memory(times: Sequence[Sequence[UpdateTimes]]) -> Figure:
         what = "the map" if column == "map_bytes" else "the process"
         axes.set(xscale="log", xlabel=against, ylabel=f"MiB of {what}", ylim=(0, None))
         _number_by_1_2_5(axes)
+        axes.tick_params(axis="x", labelsize=8)
         axes.grid(True, which="major", color="0.85", linewidth=0.6)
     _one_legend(figure, panels)
     return figure
@@ -201,8 +203,11 @@ def _memory(times: Sequence[Sequence[UpdateTimes]]) -> Figure:
 def _one_legend(figure: Figure, panels: Sequence[Axes]) -> None:
     """The lines of all ``panels``, each named once, beneath them."""
     named = {label: line for axes in panels for line, label in zip(*axes.get_legend_handles_labels(), strict=True)}
-    if named:
-        figure.legend([*named.values()], [*named], loc="outside lower center", ncols=3, fontsize=8, frameon=False)
+    if not named:
+        return
+    letters = figure.get_figwidth() * LETTERS_AN_INCH - 10 * LEGEND_COLUMNS
+    ncols = max(1, min(LEGEND_COLUMNS, int(letters / max(map(len, named)))))
+    figure.legend([*named.values()], [*named], loc="outside lower center", ncols=ncols, fontsize=8, frameon=False)
 
 
 def _anytime(points: Sequence[AnytimePoint]) -> Figure:

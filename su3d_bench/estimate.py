@@ -6,6 +6,7 @@ import csv
 import math
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from su3d_bench.errors import DataError
 from su3d_bench.planning import Plan
@@ -33,21 +34,29 @@ class JobEstimate:
 
 def estimate(plan: Plan) -> list[JobEstimate]:
     """One estimate a scene and method, in the order of the plan; reads no frame."""
-    return [_of_job(plan, job, part) for job in plan.jobs for part in job.methods]
+    runs = plan.folder.path.parent
+    update_s = {part.name: recent_update_s(runs, part.name) for part in plan.jobs[0].methods}
+    roots = {job.dataset: job.data_root for job in plan.jobs}
+    datasets = {part: build_dataset(part, root) for part, root in roots.items()}
+    needs_frames = {part: bool(build_method(part).needs.frames) for part in plan.jobs[0].methods}
+    return [
+        _of_job(plan, job, part, update_s[part.name], datasets[job.dataset] if needs_frames[part] else None)
+        for job in plan.jobs
+        for part in job.methods
+    ]
 
 
-def _of_job(plan: Plan, job: SceneJob, part: Part) -> JobEstimate:
+def _of_job(plan: Plan, job: SceneJob, part: Part, measured: float | None, dataset: Any) -> JobEstimate:
+    """``measured``: seconds an update; ``dataset`` None where the method looks at no frame."""
     folder = plan.folder.job(job.scene, part.name)
     is_done = {"predict", "score"} <= set(folder.seals())
     n_updates, remark = 0, None
-    if build_method(part).needs.frames:
+    if dataset is not None:
         try:
-            dataset = build_dataset(job.dataset, job.data_root)
             n_frames = len(dataset.frames(job.scene_name, stride_of(job.stride, part.options)))
             n_updates = min(n_frames, job.limit or n_frames)
         except DataError as error:
             remark = str(error)
-    measured = recent_update_s(plan.folder.path.parent, part.name)
     seconds = GUESSED_SCENE_S + n_updates * (GUESSED_UPDATE_S if measured is None else measured)
     return JobEstimate(job.scene, part.name, n_updates, seconds, measured is not None, is_done, remark)
 

@@ -342,7 +342,9 @@ def _scene_job(config: RunConfig, parts: _Parts, folder: Path, root: Path, targe
 
 
 def _refuse_other_runs(plan: Plan) -> None:
+    keys: dict[tuple[Part, Part], dict[str, str]] = {}  # the same for all scenes of a dataset
     for job in plan.jobs:
         for part in job.methods:
-            key = config_key(job, part, build_method(part))
-            refuse_other_run(plan.folder.job(job.scene, part.name), key, FIELDS_KNOWN_LATER)
+            if (job.dataset, part) not in keys:
+                keys[job.dataset, part] = config_key(job, part, build_method(part))
+            refuse_other_run(plan.folder.job(job.scene, part.name), keys[job.dataset, part], FIELDS_KNOWN_LATER)

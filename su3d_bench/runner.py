@@ -60,14 +60,14 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
         metrics_file = plan.folder.path / "metrics.json"
         remove_file(metrics_file)  # what stands there may be of another plan
         write_text(plan.folder.path / "run.toml", write_toml(resolved_values(plan)))
-        write_json(plan.folder.path / "run.json", _record(plan, (), "running"))
-        _publish(plan)
+        write_json(plan.folder.path / "run.json", record(plan, (), "running"))
+        publish(plan)
         try:
             outcomes = _execute(plan, report)
         except BaseException:
-            write_json(plan.folder.path / "run.json", _record(plan, (), "interrupted"))
+            write_json(plan.folder.path / "run.json", record(plan, (), "interrupted"))
             with suppress(StoreError):  # what ended the run says more
-                _publish(plan)
+                publish(plan)
             raise
         if plan.store is not None:
             fetch_results(plan.store, plan.folder.path)
@@ -75,12 +75,13 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
         failures = tuple(each for each in failed if each[1] in plan.methods)
         metrics = summarise(plan, outcomes)
         write_json(metrics_file, metrics)
-        write_json(plan.folder.path / "run.json", _record(plan, outcomes, "incomplete" if failures else "complete"))
-        _publish(plan)
+        write_json(plan.folder.path / "run.json", record(plan, outcomes, "incomplete" if failures else "complete"))
+        publish(plan)
     return RunResult(plan, metrics, outcomes, failures, _remarks(plan, outcomes))
 
 
-def _publish(plan: Plan) -> None:
+def publish(plan: Plan) -> None:
+    """Bring the records of a run in a store up to those of its folder here; nothing to do for a run in a folder."""
     if plan.store is not None:
         send_records(plan.store, plan.folder.path)
 
@@ -237,7 +238,7 @@ def _model_files(plan: Plan, outcomes: Sequence[MethodOutcome]) -> dict[str, dic
     return models_record(names, PerceptionConfig.model_validate_json(plan.jobs[0].perception).models) if names else {}
 
 
-def _record(plan: Plan, outcomes: Sequence[MethodOutcome], status: str) -> dict[str, Any]:
+def record(plan: Plan, outcomes: Sequence[MethodOutcome], status: str) -> dict[str, Any]:
     """What ``run.json`` holds: where the numbers come from."""
     rules = [load_protocol(name) for name in dict.fromkeys(name for job in plan.jobs for name in job.protocols)]
     return {

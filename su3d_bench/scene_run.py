@@ -47,6 +47,7 @@ from su3d_bench.types import (
 CEILING_METHOD = "oracle"
 # Settings of perception that move no number, or whose part that does is in perception's digest.
 MOVES_NO_NUMBER = ("perception.cache", "perception.models.folder", "perception.models.paths", "perception.language.")
+LAYOUTS_OF_ROOMS = ("replica", "scannet", "tum")  # in which `datasets make rooms` writes files
 TRUE_PROPOSALS_CAVEAT = "proposals from the ground truth; a ceiling, not a result"
 NAMED_KINDS = ("annotation", "reasoning")  # labels n' of a file beside the map move their numbers
 FIELDS_KNOWN_LATER = ("data", "profile", "perception")
@@ -109,11 +110,13 @@ class MethodOutcome:
     warnings: tuple[str, ...] = ()
 
 
-def caveat_of(method: Method, perception: Perception) -> str | None:
-    """What must be said beside every number: where the masks, or the method's own proposals, come from."""
+def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str | None:
+    """What must be said beside every number: where the scenes, the masks, or the method's own proposals come from."""
     own = TRUE_PROPOSALS_CAVEAT if method.needs.true_proposals else getattr(method, "caveat", None)
     is_seen_by_profile = method.needs.frames and not getattr(method, "has_own_perception", False)
-    parts = [perception.caveat if is_seen_by_profile else None, own]
+    is_made = scene.image_domain == "rendered-rooms" and scene.dataset in LAYOUTS_OF_ROOMS
+    made = f"made rooms in the layout of {scene.dataset}, not its scenes" if is_made else None
+    parts = [made, perception.caveat if is_seen_by_profile else None, own]
     return "; ".join(part for part in parts if part) or None
 
 
@@ -189,6 +192,8 @@ def _guarded(scene: _Scene, part: Part) -> MethodOutcome:
 def error_line(error: Exception) -> str:
     """One line for any error; one that is not ours says its type."""
     text = " ".join(str(error).split())
+    if isinstance(error, MemoryError):
+        return f"out of memory ({text or 'no details'}); try fewer --jobs, or a machine with more"
     return text if isinstance(error, Su3dError) else f"{type(error).__name__}: {text}"
 
 
@@ -261,7 +266,7 @@ class _Scene:
             self.job.scene,
             part.name,
             profile=perception.profile if method.needs.frames else None,
-            caveat=caveat_of(method, perception),
+            caveat=caveat_of(method, perception, info),
             encoder=perception.encoder.name,
             encoder_digest=perception.encoder.digest,
             data_digest=self.data_digest,
@@ -341,9 +346,8 @@ class _Scene:
             truth_to_draw = next(iter(self._truths.values()), None)
             files += draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
         write_text(folder.log, log.text("done"))
-        folder.seal(
-            "score", key, [*files, folder.log], {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings))}
-        )
+        remarks = {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings))}
+        folder.seal("score", key, [*files, folder.log], remarks)
 
     def _scores(
         self, part: Part, perception: Perception, prediction: Prediction, refined_in: JobFolder | None

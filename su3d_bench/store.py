@@ -46,6 +46,7 @@ REASONS = {
 # What a lock on a folder itself gets from network disks, which lock files that are open for writing only: flock(2).
 NO_FOLDER_LOCKS = (errno.EBADF, errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)
 LOCK_FILE = ".lock"
+WRITTEN_BY_ALL = ("language", "language/images")  # where all jobs of a run write; a job clears its own folders
 
 
 def _store_error(path: Path, error: OSError) -> StoreError:
@@ -230,7 +231,8 @@ class RunFolder:
         make_folder(self.path)
         handle = _lock(self.path)
         try:
-            _clear_half_written(self.path)
+            for folder in (self.path, *(self.path / name for name in WRITTEN_BY_ALL)):
+                _clear_half_written(folder)
             yield
         finally:
             os.close(handle)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -25,7 +26,9 @@ from su3d_bench.sheets.scores import ScoreCell, Scores
 from su3d_bench.store import read_json
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
-MOST_SOURCE_BYTES = 1 << 24  # of a paper's LaTeX
+MOST_SOURCE_BYTES, MOST_SOURCES = 1 << 24, 500  # of a paper's LaTeX
+_READ_SOURCE = re.compile(r"\\(?:input|include)\s*\{([^{}\0]{1,200})\}")
+_COMMENT = re.compile(r"(?<!\\)%.*")
 
 
 class _Values(BaseModel):
@@ -266,9 +269,46 @@ class _Recomputed:
 def check_paper(file: Path, root: Path | None = None) -> list[CellCheck]:
     """Every cell of a LaTeX source that names its run, held against what the run's counts give now.
 
-    Runs are looked for from ``root``, else from here and then from the folder of ``file``. Raises ``ConfigError`` where
-    no cell names a run.
+    What the source reads by ``\\input`` or ``\\include`` from its own folder is part of it. Runs are looked for from
+    ``root``, else from here and then from the folder of ``file``. Raises ``ConfigError`` where no cell names a run.
     """
+    recomputed = _Recomputed([root] if root is not None else [Path(), file.parent])
+    checks = []
+    for source, text in _sources(file):
+        shown = printable(str(source), 200)
+        checks += [_check(cell, shown, recomputed) for cell in printed_cells(text)]
+    if not checks:
+        shown = printable(str(file), 200)
+        raise ConfigError(f"{shown}: no cell names its run; make the tables with: su3d-bench report tables")
+    return checks
+
+
+def _sources(file: Path) -> Iterator[tuple[Path, str]]:
+    """The source itself, then what it reads, each file once."""
+    waiting, known = [file], {file.resolve()}
+    while waiting:
+        source = waiting.pop(0)
+        text = _source_text(source)
+        yield source, text
+        for name in _READ_SOURCE.findall(_COMMENT.sub("", text)):
+            path = _read_from(file.parent, name)
+            if path is not None and path.resolve() not in known and len(known) < MOST_SOURCES:
+                known.add(path.resolve())
+                waiting.append(path)
+
+
+def _read_from(folder: Path, name: str) -> Path | None:
+    """The file in ``folder`` that LaTeX takes for ``name``; None where it is none, or lies elsewhere."""
+    try:
+        for path in (folder / name, folder / f"{name}.tex"):
+            if path.is_file() and path.resolve().is_relative_to(folder.resolve()):
+                return path
+    except (OSError, ValueError):  # no name that this system can have
+        return None
+    return None
+
+
+def _source_text(file: Path) -> str:
     shown = printable(str(file), 200)
     try:
         content = file.read_bytes()
@@ -276,11 +316,7 @@ def check_paper(file: Path, root: Path | None = None) -> list[CellCheck]:
         raise ConfigError(f"{shown}: cannot be read: {error.strerror}") from error
     if len(content) > MOST_SOURCE_BYTES:
         raise ConfigError(f"{shown}: has {len(content)} bytes; a paper's source has at most {MOST_SOURCE_BYTES}")
-    cells = printed_cells(content.decode("utf-8", "replace"))
-    if not cells:
-        raise ConfigError(f"{shown}: no cell names its run; make the tables with: su3d-bench report tables")
-    recomputed = _Recomputed([root] if root is not None else [Path(), file.parent])
-    return [_check(cell, shown, recomputed) for cell in cells]
+    return content.decode("utf-8", "replace")
 
 
 def _check(cell: PrintedCell, file: str, recomputed: _Recomputed) -> CellCheck:

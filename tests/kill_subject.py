@@ -1,17 +1,21 @@
 """What runs that are killed on purpose are made of: light parts that write every kind of file that a run has.
 
-Importing this puts ``KeptPerception`` in the place of perception, in spawned workers too.
+Importing this puts ``KeptPerception`` in the place of perception, in workers that nobody else can reach too.
 """
 
 from __future__ import annotations
 
 import logging
+import sys
 from pathlib import Path
 from typing import Any
-from unittest.mock import patch
 
 import numpy as np
-from painted import Collector, ColourPerception
+
+if str(Path(__file__).parent) not in sys.path:
+    sys.path.insert(0, str(Path(__file__).parent))
+
+from painted import Collector, ColourPerception, Painted
 
 from su3d_bench import scene_run
 from su3d_bench.perception.cache import FrameCache, content_key, frame_digest
@@ -59,4 +63,6 @@ def kept_perception(*_: Any, cache_root: Path, **__: Any) -> KeptPerception:
     return KeptPerception(cache_root)
 
 
-patch.object(scene_run, "build_perception", kept_perception).start()
+scene_run.build_perception = kept_perception  # type: ignore[assignment]
+
+__all__ = ["Dense", "Painted"]

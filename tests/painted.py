@@ -95,6 +95,8 @@ class Painted:
             depth_m = np.zeros_like(depth_m)
         if fault == "crash":
             raise ZeroDivisionError("a mistake in a plug-in")
+        if fault == "memory":
+            np.zeros(1 << 56)
         if fault == "kill":
             os.kill(os.getpid(), signal.SIGKILL)
         return Frame(index, index / 30, COLOURS[objects], depth_m, pose, INTRINSICS)

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import sys
 from pathlib import Path
+from unittest.mock import patch
 
 HERE = Path(__file__).parent
 if str(HERE) not in sys.path:
@@ -14,7 +14,7 @@ from painted import Collector, Painted, colour_perception  # noqa: E402
 
 from su3d_bench import scene_run  # noqa: E402
 
-if "PYTEST_VERSION" not in os.environ or "pytest" not in sys.modules:
-    scene_run.build_perception = colour_perception  # type: ignore[assignment]
+if "pytest" not in sys.modules:  # a test patches, and unpatches, its own process
+    patch.object(scene_run, "build_perception", colour_perception).start()
 
 __all__ = ["Collector", "Painted"]

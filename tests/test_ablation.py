@@ -76,6 +76,17 @@ def test_a_sweep_is_one_run_with_its_rows_beside_it(tmp_path: Path, monkeypatch:
     assert [one["method"] for one in results] == ["collector", "collector@stride=2", "collector@drop=1"]
 
 
+def test_other_methods_stand_beside_a_sweep_in_one_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    words = ["ablate", "--method", f"{PAINTED}:Collector", "--vary", "drop=0,1", "--no-pictures", "--jobs", "1"]
+    words += ["--beside", f"{PAINTED}:Collector", f"{PAINTED}:Collector@noise_m=0.1"]
+    words += ["--scenes", f"{PAINTED}:Painted/a", "--protocols", "rooms-semantic"]
+    assert main([*words, "--out", str(tmp_path / "out")]) == 0
+    assert [row.method for row in read_rows(tmp_path / "out")] == ["collector", "collector@drop=1"]
+    results = json.loads((tmp_path / "out" / "metrics.json").read_text())["results"]
+    assert [one["method"] for one in results] == ["collector", "collector@drop=1", "collector@noise_m=0.1"]
+
+
 def test_a_run_that_is_no_sweep_says_so(tmp_path: Path) -> None:
     with pytest.raises(StoreError, match="ablate --vary"):
         read_rows(tmp_path)

@@ -27,6 +27,7 @@ LAYERS = (
     {"geometry", "statistics", "timing"},
     {"update_times", "gate_findings"},
     {"digests", "toml_text", "row_blocks", "kept_files", "scratch"},
+    {"kernels"},
     {"config", "protocols", "rules"},
     {"metrics"},
     {"registry", "store", "scoring"},

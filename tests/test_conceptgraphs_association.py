@@ -255,6 +255,17 @@ def part(low_z: float, number: int, **more) -> MapObject:  # type: ignore[no-unt
     return an_object(block((0, 0, low_z)), number, **more)
 
 
+def test_a_wall_and_the_things_along_it_have_the_ratios_of_all_pairs_of_points() -> None:
+    rng = np.random.default_rng(0)
+    wall = an_object(rng.uniform((0, 0, 0), (5, 0.1, 1), (1500, 3)))
+    things = [an_object(rng.uniform((x, 0, 0), (x + 0.6, 0.4, 0.5), (200, 3))) for x in np.arange(0, 5, 0.5)]
+    ratios = overlap_ratios([wall, *things], 0.05)
+    for k, thing in enumerate(things, start=1):
+        is_near = np.linalg.norm(wall.points[:, None] - thing.points, axis=2) < 0.05
+        assert ratios[0, k] == is_near.any(axis=1).mean() > 0
+        assert ratios[k, 0] == is_near.any(axis=0).mean() > 0
+
+
 def test_overlap_ratios_are_shares_of_the_first_object() -> None:
     whole, piece = an_object(block((0, 0, 0), (0.3, 0.3, 0.6))), part(0.45, 2)
     far = part(0.75, 3)

@@ -96,6 +96,20 @@ def test_verify_finds_every_cell_that_was_changed_by_hand(
     assert main(["report", "verify", str(paper), "--root", str(sweep.parent.parent)]) == 0
 
 
+def test_what_a_paper_reads_from_its_own_folder_is_checked_too(
+    sweep: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paper, outside = tmp_path / "paper", tmp_path / "outside.tex"
+    assert main(["report", "tables", str(sweep), "--format", "latex", "--out", str(paper / "tables" / "all.tex")]) == 0
+    outside.write_text((paper / "tables" / "all.tex").read_text())
+    names = ("tables/all", "tables/all.tex", "main", "../outside", "gone", "/", "é" * 200)
+    (paper / "main.tex").write_text("% \\input{none}\n" + "\n".join(f"\\input{{{name}}}" for name in names))
+    capsys.readouterr()
+    assert main(["report", "verify", str(paper / "main.tex")]) == 0
+    n_cells = (paper / "tables" / "all.tex").read_text().count("% run=")
+    assert capsys.readouterr().out == f"{n_cells} cells checked, 0 differ\n"
+
+
 def test_numbers_come_from_the_counts_not_from_the_record(sweep: Path, tmp_path: Path) -> None:
     copy = tmp_path / "run"
     shutil.copytree(sweep, copy)

@@ -49,6 +49,9 @@ def call(arguments: argparse.Namespace) -> int:
         return show_plan(plan, arguments)
     code = carry_out(plan, arguments)
     if code == EXIT_DONE:
+        from su3d_bench.runner import publish
+
         write_rows(plan.folder.path, rows)
+        publish(plan)
         remark(f"table: su3d-bench report tables {plan.folder.path} --table I", quiet=arguments.quiet or arguments.json)
     return code

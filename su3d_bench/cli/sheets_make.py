@@ -14,6 +14,7 @@ from su3d_bench.errors import EXIT_DONE, ConfigError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from su3d_bench.perception.language.chat import ChatRequest
     from su3d_bench.questions.model import Question
     from su3d_bench.sheets.drafts import Draft
     from su3d_bench.sheets.items import SheetKind
@@ -36,8 +37,7 @@ def add_parser(actions: Any) -> None:
         "Make sheets on which people judge a run: an offline page, a workbook and a table with pictures.",
         (
             "su3d-bench sheets make runs/my-run --kind retrieval --out sheets/my-run",
-            "su3d-bench sheets make runs/my-run --kind annotation --annotators 3 --overlap 0.3 --out sheets/labels",
-            "su3d-bench sheets make runs/my-run --kind retrieval annotation reasoning --out sheets",
+            "su3d-bench sheets make runs/my-run --kind retrieval annotation reasoning --annotators 3 --out sheets",
         ),
         call,
     )
@@ -195,7 +195,8 @@ def _estimate(source: RunSource, arguments: argparse.Namespace) -> int:
 
     config = language_config(arguments)
     client = chat_client(arguments, source.run.folder, config)
-    given, requests = _given(source, arguments), []
+    given = _given(source, arguments)
+    requests: list[ChatRequest] = []
     for scene in source.scenes:
         n_most = arguments.per_kind or PER_KIND["reasoning"]
         reasoning_drafts(source, scene, given, n_most, requests_into(requests, client, config))

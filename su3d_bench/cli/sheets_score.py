@@ -24,7 +24,6 @@ def add_parser(actions: Any) -> None:
         "Check the answers of all annotators and add them up: accuracies, tests, agreement, people beside the truth.",
         (
             "su3d-bench sheets score ann.csv bob.xlsx --key key/key.json --out scores",
-            "su3d-bench sheets score answers/*.csv --sheet sheet/sheet.json --key key/key.json --json",
             "su3d-bench sheets score --key key",
         ),
         call,
@@ -98,7 +97,9 @@ def _sheet_file(arguments: argparse.Namespace, key_file: Path, sheet_id: str) ->
     if arguments.sheet is not None:
         given: Path = arguments.sheet
         return given / SHEET_FILE if given.is_dir() else given
-    folders = [key_file.parent, *sorted(key_file.resolve().parent.parent.glob("*/"))]
+    own = key_file.resolve().parent
+    # sets of several kinds lie deeper: sheets/annotation and sheets-key/annotation
+    folders = [key_file.parent, *sorted(own.parent.glob("*/")), *sorted(own.parent.parent.glob(f"*/{own.name}/"))]
     folders += [folder for file in arguments.files for folder in (file.parent, file.resolve().parent.parent)]
     for folder in dict.fromkeys(folders):
         file: Path = folder / SHEET_FILE

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -252,6 +253,9 @@ def concatenate(counts: Sequence[InstanceCounts]) -> InstanceCounts:
     )
 
 
+MOST_REMEMBERED_ROWS = 12  # small curves repeat from scene to scene, longer ones hardly ever
+
+
 def average_precision(scores: Float64Array, is_true: BoolArray, n_missed: int) -> float:
     """Area under the raw precision-recall polyline, one vertex a distinct score and the vertex (recall 0, precision 1).
 
@@ -262,6 +266,19 @@ def average_precision(scores: Float64Array, is_true: BoolArray, n_missed: int) -
     """
     if not len(scores):
         return 0.0
+    if len(scores) <= MOST_REMEMBERED_ROWS:
+        values = scores.tolist()
+        rank_of = {value: rank for rank, value in enumerate(sorted(set(values)))}  # the curve depends on order alone
+        return _remembered(tuple(rank_of[value] for value in values), tuple(is_true.tolist()), n_missed)
+    return _area(scores, is_true, n_missed)
+
+
+@lru_cache(maxsize=1 << 16)
+def _remembered(ranks: tuple[int, ...], is_true: tuple[bool, ...], n_missed: int) -> float:
+    return _area(np.array(ranks, np.float64), np.array(is_true, bool), n_missed)
+
+
+def _area(scores: Float64Array, is_true: BoolArray, n_missed: int) -> float:
     order = np.argsort(scores, kind="stable")
     n_true_up_to = np.cumsum(is_true[order])
     _, first = np.unique(scores[order], return_index=True)

@@ -10,7 +10,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from su3d_bench.kernels import njit
 
 VOXELS = 512  # of a block
 ABSENT = -1

@@ -11,7 +11,8 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numba import njit
+
+from su3d_bench.kernels import njit
 
 NOISE = -1
 ABSENT = -1

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
+from su3d_bench.kernels import njit
 from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int32Array
 
 

@@ -60,7 +60,7 @@ class Artist:
         photo, eye = self._photo(draft, shown)
         best = max(shown.corners, key=lambda view: int(view.shows(members).sum()))
         map_view = Panel(
-            MAP_TITLES[draft.kind],
+            MAP_TITLES[draft.kind] if draft.rows or draft.others else "the map",
             shown.drawn.paint(best, self._colours(draft, shown)),
             best.shows(members),
             _tags(draft, shown.instances, best),
@@ -70,7 +70,8 @@ class Artist:
         place_colours[list(draft.others)] = OTHER_COLOUR
         place_colours[list(draft.rows)] = ANSWER_COLOUR
         place = Panel(
-            "its place, from above" + (" (arrow: from the camera)" if eye is not None else ""),
+            ("its place, from above" if draft.rows else "from above")
+            + (" (arrow: from the camera)" if eye is not None and draft.rows else ""),
             shown.drawn.paint(shown.above, place_colours),
             tags=_tags(draft, shown.instances, shown.above),
             ring=_ring(draft, shown),

@@ -195,7 +195,7 @@ def file_sha256(path: Path) -> str:
         return known
     digest = digest_file(path)
     make_folder(note.parent)
-    write_json(note, {"of": key, "sha256": digest})
+    write_json(note, {"of": key, "sha256": digest, "check": _check(key, digest)})
     return digest
 
 
@@ -215,4 +215,9 @@ def _noted(note: Path, key: str) -> str | None:
     if not isinstance(content, dict) or content.get("of") != key:
         return None
     digest = content.get("sha256")
-    return digest if isinstance(digest, str) and len(digest) == 64 else None
+    return digest if isinstance(digest, str) and content.get("check") == _check(key, digest) else None
+
+
+def _check(key: str, digest: str) -> str:
+    """A digest of a note, so that a damaged one counts as absent."""
+    return digest_bytes(f"{key}\n{digest}".encode())

@@ -1,0 +1,170 @@
+"""How long 10,000 jobs in one run folder take to list, to aggregate and to report.
+
+    python benchmarks/many_jobs.py --json build/measured/many_jobs.json
+
+The folder is simulated: one real job (opensu3d on 20 frames of rooms/bathroom0) stands in it 10,000 times, as 1,250
+scenes under 8 methods, each with the counts, timings, log and seal of a real one, without its map. What is timed is
+what a user types, each command in a process of its own; to aggregate is what a run does after its last job.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, ClassVar
+
+from pydantic import BaseModel, ConfigDict
+
+from su3d_bench.cli.main import main as su3d_bench
+from su3d_bench.config import Setting, Settings
+from su3d_bench.digests import digest_bytes
+from su3d_bench.planning import Plan, make_plan
+from su3d_bench.runner import record, resolved_values, summarise
+from su3d_bench.scene_run import MethodOutcome, build_method, config_key
+from su3d_bench.store import RunFolder, make_folder, write_json
+from su3d_bench.toml_text import write_toml
+from su3d_bench.types import SceneInfo
+
+N_FRAMES = 20
+METHODS = (
+    "opensu3d",
+    "conceptfusion",
+    "conceptfusion-sam",
+    "conceptgraphs",
+    "conceptgraphs-detector",
+    "openmask3d",
+    "sam3d",
+    "oracle",
+)
+SOURCE = "rooms/bathroom0"
+PROTOCOLS = ("rooms-semantic", "rooms-instance")
+ENCODER = {"encoder": "simulated", "encoder_digest": "simulated", "profile": "embedded"}
+
+
+class Many:
+    """As many scenes as one likes, of which only the names and the number of frames are there."""
+
+    name = "many"
+    label_space = "replica"
+    variants: ClassVar[tuple[str, ...]] = ("mesh-vertices",)
+    image_domain = "rendered-rooms"
+
+    class Options(BaseModel):
+        """How many scenes there are."""
+
+        model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+        n_scenes: int = 1250
+
+    def __init__(self, root: Path, options: Options) -> None:
+        self.options = options
+
+    def scenes(self) -> Sequence[str]:
+        return [f"s{index:05d}" for index in range(self.options.n_scenes)]
+
+    def frames(self, scene: str, stride: int) -> Sequence[Any]:
+        return [None] * len(range(0, N_FRAMES, stride))
+
+    def info(self, scene: str, stride: int) -> SceneInfo:
+        return SceneInfo(self.name, scene, len(self.frames(scene, stride)), stride, self.image_domain)
+
+
+def plan_of(n_scenes: int, out: Path) -> Plan:
+    """The plan that the commands make too, see ``words``."""
+    values = {
+        ("scenes",): [f"{Path(__file__)}:Many/*"],
+        ("methods",): list(METHODS),
+        ("protocols",): list(PROTOCOLS),
+        ("pictures",): False,
+        ("dataset", "many", "n_scenes"): n_scenes,
+    }
+    return make_plan(Settings(tuple(Setting(key, value, "many_jobs") for key, value in values.items())), (), out)
+
+
+def words(n_scenes: int, out: Path) -> list[str]:
+    wanted = ["--scenes", f"{Path(__file__)}:Many/*", "--methods", *METHODS, "--protocols", *PROTOCOLS]
+    return ["run", *wanted, "--no-pictures", "--set", f"many.n_scenes={n_scenes}", "--out", str(out), "--dry-run"]
+
+
+def simulate(plan: Plan, source: RunFolder) -> list[MethodOutcome]:
+    """Write every job of ``plan`` as a copy of that of ``source``; their outcomes."""
+    real = source.job(SOURCE, "opensu3d")
+    contents = {path.name: path.read_bytes() for path in (real.counts, real.updates, real.log)}
+    steps = json.loads(real.done.read_text())["steps"]
+    for step in steps.values():
+        step["files"] = {name: digest_bytes(content) for name, content in contents.items() if name in step["files"]}
+    keys = {part.name: config_key(plan.jobs[0], part, build_method(part)) for part in plan.jobs[0].methods}
+    outcomes = []
+    for job in plan.jobs:
+        for part in job.methods:
+            folder = plan.folder.job(job.scene, part.name)
+            make_folder(folder.path)
+            for name, content in contents.items():
+                (folder.path / name).write_bytes(content)
+            steps["predict"]["key"] = keys[part.name] | {"data": "simulated", "profile": "embedded", "perception": "-"}
+            folder.done.write_text(json.dumps({"schema": 1, "steps": steps}, indent=2))
+            outcomes.append(MethodOutcome(job.scene, part.name, data_digest="simulated", was_resumed=True, **ENCODER))
+    return outcomes
+
+
+def seconds_of(command: Sequence[str]) -> float:
+    """How long ``su3d-bench`` takes in a process of its own."""
+    start = time.perf_counter()
+    done = subprocess.run([sys.executable, "-m", "su3d_bench", *command], stdout=subprocess.PIPE, text=True)
+    assert done.returncode == 0, command
+    return time.perf_counter() - start
+
+
+def measure(n_scenes: int, folder: Path) -> list[tuple[str, float]]:
+    out = folder / "run"
+    limited = ["--limit", str(N_FRAMES), "--no-pictures", "--jobs", "1", "--quiet", "--stride", "1"]
+    asked = ["run", "--scenes", SOURCE, "--methods", "opensu3d", "--protocols", *PROTOCOLS, *limited]
+    assert su3d_bench([*asked, "--out", str(folder / "real")]) == 0
+    plan = plan_of(n_scenes, out)
+    outcomes = simulate(plan, RunFolder(folder / "real"))
+    start = time.perf_counter()
+    metrics = summarise(plan, outcomes)
+    aggregate_s = time.perf_counter() - start
+    write_json(out / "metrics.json", metrics)
+    write_json(out / "run.json", record(plan, outcomes, "complete"))
+    (out / "run.toml").write_text(write_toml(resolved_values(plan)))
+    rows = [("list: run --dry-run", seconds_of(words(n_scenes, out))), ("aggregate: metrics.json anew", aggregate_s)]
+    commands = {
+        "report: report tables": ["report", "tables", str(out)],
+        "report: report timing": ["report", "timing", str(out)],
+        "compare two methods": ["compare", f"{out}:opensu3d", f"{out}:sam3d"],
+    }
+    return rows + [(name, seconds_of(command)) for name, command in commands.items()]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--scenes", type=int, default=1250, help="under 8 methods each")
+    parser.add_argument("--json", type=Path, help="write the table there")
+    arguments = parser.parse_args()
+    with tempfile.TemporaryDirectory(prefix="su3d-many-") as folder:
+        rows = measure(arguments.scenes, Path(folder))
+    for name, seconds in rows:
+        print(f"{name:<32} {seconds:6.1f} s")
+    if arguments.json is not None:
+        from measured import write_measured  # beside this file, which the commands read as a plug-in too
+
+        n_jobs = arguments.scenes * len(METHODS)
+        write_measured(
+            arguments.json,
+            f"{n_jobs:,} jobs in one run folder",
+            "python benchmarks/many_jobs.py --json build/measured/many_jobs.json",
+            ["what", "seconds"],
+            [[name, f"{seconds:.1f}"] for name, seconds in rows],
+            ["The jobs are copies of one real job without its map; each command is a process of its own."],
+        )
+
+
+if __name__ == "__main__":
+    main()

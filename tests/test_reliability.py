@@ -1,0 +1,312 @@
+"""What a run does when it is killed, when a disk is full or closed, when memory ends, when a clock jumps."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import json
+import os
+import random
+import resource
+import shutil
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from painted import colour_perception
+
+from su3d_bench import scene_run
+from su3d_bench.cli.main import main
+from su3d_bench.errors import StoreError
+from su3d_bench.kept_files import filling
+from su3d_bench.perception.cache import FrameCache
+from su3d_bench.store import RunFolder, npz_bytes, read_npz
+
+HERE = Path(__file__).parent
+KILLS = HERE.parent / "benchmarks" / "kill_at_random.py"
+SUBJECT = f"{HERE}/kill_subject.py"
+SETTINGS = ("--set", "painted.n_frames=3", "--protocols", "rooms-semantic", "--no-pictures", "--jobs", "1", "--quiet")
+
+
+@pytest.fixture(autouse=True)
+def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+    monkeypatch.chdir(tmp_path)
+
+
+def run(*more: str, scenes: str = "[ab]", out: str = "out") -> int:
+    words = ["run", "--scenes", f"{HERE}/painted.py:Painted/{scenes}", "--methods", f"{SUBJECT}:Dense"]
+    return main([*words, *SETTINGS, "--out", out, *more])
+
+
+def job(scene: str = "a", out: str = "out") -> Path:
+    return Path(out, "scenes", f"painted.{scene}", "dense")
+
+
+def results(out: str = "out") -> dict[str, bytes]:
+    """Every file of a run that holds no time."""
+    paths = [path for path in Path(out).rglob("*") if path.is_file() and path.name not in ("updates.csv", "done.json")]
+    return {path.relative_to(out).as_posix(): path.read_bytes() for path in paths}
+
+
+def test_runs_killed_at_random_and_after_power_cuts_end_in_the_bytes_of_an_undisturbed_one() -> None:
+    words = [sys.executable, str(KILLS), "--kills", "5", "--seed", "3", "--executors", "inline", "--json", "found.json"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stdout + done.stderr
+    found = json.loads(Path("found.json").read_text())
+    row = dict(zip(found["columns"], found["rows"][0], strict=True))
+    assert (row["kills"], row["faults"]) == ("5", "0")
+    assert int(row["compared"]) > 0
+    assert int(row["files spoilt"]) > 0
+
+
+@pytest.mark.parametrize("lost", ["log", "score and log"])
+def test_what_was_said_before_a_kill_is_in_the_log_and_the_record_of_the_run_that_goes_on(lost: str) -> None:
+    assert run() == 0
+    before = results()
+    assert b"warning: the first frame is 0" in before["scenes/painted.a/dense/log.txt"]
+    assert "the first frame is 0" in json.loads(before["run.json"])["warnings"]
+    (job() / "log.txt").unlink()
+    if lost == "score and log":
+        record = json.loads((job() / "done.json").read_text())
+        del record["steps"]["score"]
+        (job() / "done.json").write_text(json.dumps(record))
+    assert run() == 0
+    assert results() == before
+
+
+def test_the_log_of_a_finished_job_outlives_the_loss_of_a_later_worker() -> None:
+    assert run(scenes="a") == 0
+    before = (job() / "log.txt").read_bytes()
+    planned = scene_run.SceneJob(
+        "painted/a", scene_run.Part("", "painted", "{}"), (scene_run.Part("", "dense", "{}"),), None,
+        (), "embedded", "{}", 0, 0, 0, False, (), Path("out"), Path(), Path(),
+    )  # fmt: skip
+    (outcome,) = scene_run.failed_outcomes(planned, "the worker was killed")
+    assert outcome.error == "painted/a: the worker was killed"
+    assert (job() / "log.txt").read_bytes() == before
+
+
+@contextmanager
+def files_of_at_most(n_bytes: int) -> Iterator[None]:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (n_bytes, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
+
+
+def test_a_file_beyond_what_the_account_allows_is_one_line_and_the_run_resumes(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    assert run(out="whole") == 0
+    capfd.readouterr()
+    with files_of_at_most(20_000):
+        assert run() == 2
+    error = capfd.readouterr().err
+    assert error.count("\n") == 1
+    assert "prediction" in error
+    assert ": the file grows beyond what this disk or account allows; raise the limit" in error
+    assert not list(Path("out").rglob(".*"))
+    assert run() == 0
+    assert results() == results("whole")
+
+
+def test_a_disk_that_is_full_at_any_write_is_one_line_and_the_run_resumes(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert run(out="whole", scenes="a") == 0
+    write = os.fsync
+    for n_that_fit in range(100):
+        left = n_that_fit
+
+        def full_after(descriptor: int) -> None:
+            nonlocal left
+            left -= 1
+            if left < 0:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            write(descriptor)
+
+        shutil.rmtree("out", ignore_errors=True)
+        capsys.readouterr()
+        with monkeypatch.context() as patch:
+            patch.setattr(os, "fsync", full_after)
+            code = run(scenes="a")
+        if code == 0:
+            break
+        error = capsys.readouterr().err
+        assert (code, error.count("\n")) == (2, 1), error
+        assert ": the disk is full; free some space and run the same command again" in error
+        assert not list(Path("out").rglob(".*"))
+        assert run(scenes="a") == 0
+        assert results() == results("whole")
+    assert n_that_fit > 8
+
+
+def test_memory_that_ends_fails_its_scene_alone_and_says_so(capsys: pytest.CaptureFixture[str]) -> None:
+    assert run("--set", "painted.fault=memory") == 3
+    line = "painted/b: out of memory (Unable to allocate 512. PiB for an array with shape (72057594037927936,) and data"
+    assert f"{line} type float64); try fewer --jobs, or a machine with more\n" in capsys.readouterr().err
+    assert "score" in json.loads((job("a") / "done.json").read_text())["steps"]
+
+
+def test_a_clock_that_jumps_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert run() == 0
+    before = results()
+    (job() / "counts.npz").unlink()
+    jumps = random.Random(0)
+    for path in Path("out").rglob("*"):
+        when = jumps.choice((0, 4_000_000_000))
+        os.utime(path, (when, when))
+    monkeypatch.setattr(time, "time", lambda: jumps.choice((0.0, 4e9)))
+    n_scored = []
+    score = scene_run.score_scene
+    monkeypatch.setattr(scene_run, "score_scene", lambda *a: n_scored.append(1) or score(*a))
+    assert run() == 0
+    assert results() == before
+    assert len(n_scored) == 1, "the step that lacks a file is done again, and no other"
+    rows = [line.split(",") for line in (job() / "updates.csv").read_text().splitlines()]
+    assert all(float(row[rows[0].index("total_ms")]) >= 0 for row in rows[1:])
+
+
+def test_of_many_runs_that_start_at_once_one_has_the_folder_and_the_others_a_line(tmp_path: Path) -> None:
+    inside, most_inside, refused = 0, 0, []
+    start = threading.Barrier(8)
+
+    def hold() -> None:
+        nonlocal inside, most_inside
+        start.wait()
+        for _ in range(50):
+            try:
+                with RunFolder(tmp_path).locked():
+                    inside += 1
+                    most_inside = max(most_inside, inside)
+                    time.sleep(0)
+                    inside -= 1
+            except StoreError as error:
+                refused.append(str(error))
+
+    threads = [threading.Thread(target=hold) for _ in range(8)]
+    for thread in threads:
+        thread.start()
+    for thread in threads:
+        thread.join()
+    assert most_inside == 1
+    assert set(refused) <= {f"{tmp_path}: another run is writing here; wait for it or choose another folder with --out"}
+    assert refused
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_disk_whose_folders_cannot_be_locked_has_a_lock_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lock = fcntl.flock
+
+    def as_on_a_network_disk(handle: int, operation: int) -> None:
+        if os.path.isdir(f"/proc/self/fd/{handle}"):
+            raise OSError(errno.EBADF, "Bad file descriptor")
+        lock(handle, operation)
+
+    monkeypatch.setattr(fcntl, "flock", as_on_a_network_disk)
+    for _ in range(2):
+        with (
+            RunFolder(tmp_path).locked(),
+            pytest.raises(StoreError, match="another run is writing here; wait for it"),
+            RunFolder(tmp_path).locked(),
+        ):
+            pass
+
+    def without_locks(handle: int, operation: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", without_locks)
+    with pytest.raises(StoreError, match="this disk has no locks to give"), RunFolder(tmp_path).locked():
+        pass
+
+
+def test_any_damage_to_an_entry_of_the_cache_counts_as_absent(tmp_path: Path) -> None:
+    cache = FrameCache(tmp_path)
+    key = "ab" * 32
+    arrays: dict[str, Any] = {"rows": np.arange(12, dtype=np.float32), "names": np.array(["chair"])}
+    cache.save(key, arrays)
+    path = cache.path(key)
+    assert path is not None
+    whole = path.read_bytes()
+    draw = random.Random(0)
+    n_absent = 0
+    for k in range(600):
+        damaged = bytearray(whole if k % 3 else whole[: draw.randrange(len(whole))])
+        for _ in range(draw.choice((1, 4))):
+            if damaged:
+                damaged[draw.randrange(len(damaged))] = draw.randrange(256)
+        path.write_bytes(damaged)
+        found = cache.load(key)
+        n_absent += found is None
+        assert found is None or all(np.array_equal(found[name], arrays[name]) for name in arrays)
+    assert n_absent > 400
+
+
+def test_any_damage_to_a_stored_array_is_a_typed_error(tmp_path: Path) -> None:
+    whole = npz_bytes({"points": np.zeros((5, 3), np.float32)})
+    path = tmp_path / "prediction.npz"
+    draw = random.Random(1)
+    for _ in range(600):
+        damaged = bytearray(whole)
+        damaged[draw.randrange(len(damaged))] = draw.randrange(256)
+        path.write_bytes(damaged)
+        with suppress(StoreError):  # and nothing else
+            read_npz(path)
+
+
+def test_a_cache_file_is_whole_or_absent_and_a_killed_writer_leaves_nothing_to_pile_up(tmp_path: Path) -> None:
+    path = tmp_path / "entry.npz"
+    (tmp_path / ".entry.npz.tmp").write_bytes(b"left by a killed process, and longer")
+    with filling(path) as stream:
+        assert stream is not None
+        stream.write(b"whole")
+        with filling(path) as second:
+            assert second is None, "somebody is writing it"
+        assert not path.exists()
+    assert path.read_bytes() == b"whole"
+    with suppress(KeyboardInterrupt), filling(path) as stream:
+        assert stream is not None
+        stream.write(b"half")
+        raise KeyboardInterrupt
+    assert path.read_bytes() == b"whole"
+    assert [child.name for child in tmp_path.iterdir()] == ["entry.npz"]
+
+
+KERNEL = """
+import sys
+from pathlib import Path
+from su3d_bench.kernels import njit
+
+@njit(cache=True)
+def double(x):
+    return 2 * x
+
+print(double(21), sum(double.stats.cache_hits.values()))
+"""
+
+
+def test_a_compiled_kernel_whose_kept_form_is_damaged_is_compiled_again(tmp_path: Path) -> None:
+    (tmp_path / "kernel.py").write_text(KERNEL)
+
+    def imported() -> str:
+        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "numba")}
+        words = [sys.executable, "-c", "import kernel"]
+        return subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
+
+    assert imported() == "42 0\n"
+    for suffix in ("nbi", "nbc"):
+        (kept,) = (tmp_path / "numba").rglob(f"*.{suffix}")
+        kept.write_bytes(bytes(kept.stat().st_size))
+        assert imported() == "42 0\n"
+    assert imported() == "42 1\n"
