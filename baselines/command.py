@@ -7,7 +7,6 @@ import os
 import re
 import shlex
 import shutil
-import tempfile
 import uuid
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,6 +21,7 @@ from su3d_bench.digests import digest_file
 from su3d_bench.errors import ConfigError, DataError, PredictionError, Su3dError
 from su3d_bench.plain_text import printable
 from su3d_bench.predictions.formats import READERS
+from su3d_bench.temporary_folders import TemporaryFolder
 from su3d_bench.types import (
     Detections,
     Frame,
@@ -131,6 +131,7 @@ class Command:
         self._scene: SceneInfo | None = None
         self._frames: FrameFolder | None = None
         self._surface: Surface | None = None
+        self._scratch: TemporaryFolder | None = None
         self._root: Path | None = None
         self._costs: dict[str, float | int] = {}
 
@@ -164,7 +165,8 @@ class Command:
                 self._surface = self._tools.surface()
             except DataError as error:
                 logger.info("no mesh.ply for the program: %s", error)
-        self._root = Path(tempfile.mkdtemp(prefix="su3d-command-"))
+        self._scratch = TemporaryFolder("su3d-command-")
+        self._root = self._scratch.path
         self._frames = FrameFolder(self._root / "frames", scene, self.config.colour, self._surface)
         self._frames.open()
 
@@ -199,12 +201,12 @@ class Command:
 
     def close(self) -> None:
         """Remove the folders that the program worked in."""
-        if self._root is not None:
-            shutil.rmtree(self._root, ignore_errors=True)
-        self._root = self._frames = None
+        if self._scratch is not None:
+            self._scratch.close()
+        self._scratch = self._root = self._frames = None
 
     def __del__(self) -> None:
-        if getattr(self, "_root", None) is not None:
+        if getattr(self, "_scratch", None) is not None:
             self.close()
 
     def _run(self, folders: Mapping[str, Path]) -> None:

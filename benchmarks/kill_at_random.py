@@ -66,8 +66,8 @@ PAGE = 4096
 TIMES = ("_ms", "rss_bytes")
 COLUMNS = ("kills", "of a group", "of a driver", "of a worker", "power cuts", "files spoilt", "compared")
 NOTE = (
-    "compared: runs that were taken up again to their end, whose files had the bytes of the undisturbed run; a fault is "
-    "a file that differs, a half-written one taken for whole, a lock that stayed, a traceback, or a file left over."
+    "compared: runs that were taken up again to their end, whose files had the bytes of the undisturbed run; a fault "
+    "is a file that differs, a half-written one taken for whole, a lock that stayed, a traceback, or a file left over."
 )
 COMPLETE, INCOMPLETE = 0, 3  # exit codes of the command
 
@@ -83,8 +83,8 @@ class Tally:
 class Run:
     """One run of the command in a process group of its own."""
 
-    def __init__(self, folder: Path, request: Sequence[str]) -> None:
-        self._log = folder.with_suffix(".log")
+    def __init__(self, folder: Path, request: Sequence[str], log: Path | None = None) -> None:
+        self._log = log or folder.with_suffix(".log")
         words = [*request, "--out", str(folder)]
         self.started = time.monotonic()
         self.pid = os.fork()

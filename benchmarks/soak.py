@@ -28,11 +28,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measured import write_measured
 
 METHODS = ("opensu3d", "sam3d", "conceptgraphs")
 SCENES = ("rooms/living0", "rooms/office0")
 RUN = ("run", "--methods", *METHODS, "--protocols", "rooms-semantic", "rooms-instance", "--limit", "3", "--quiet")
 FRESH_CACHE_EVERY, PAGE_EVERY, WORKERS_EVERY, COMMAND_EVERY = 4, 6, 8, 10
+COLUMNS = ("quantity", "median", "range", "slope an hour with 95 % interval", "verdict")
 N_SPANS = 12
 T_95 = 2.228  # Student's t, 97.5 %, of the 10 degrees of freedom that 12 spans leave a line
 # What counts as growth over the whole time, beside an interval above zero: a share of the level, or things.
@@ -132,31 +134,38 @@ def soak(scratch: Path, hours: float, table: Path) -> None:
             number += 1
 
 
-def summarise(table: Path) -> bool:
-    """Print how each quantity went after the first tenth of the time; whether none grows."""
+def summarise(table: Path, json_file: Path | None) -> bool:
+    """Print how each quantity went after the first tenth of the time, and write it down; whether none grows."""
     with table.open(newline="") as stream:
         rows = [{name: float(value) for name, value in row.items()} for row in csv.DictReader(stream)]
     hours = np.array([row["hours"] for row in rows])
     # A tenth, but all kinds of rounds at least once.
-    is_warm = (hours > 0.1 * hours[-1]) & (np.arange(len(rows)) > 2 * COMMAND_EVERY)
+    is_warm = (hours > 0.1 * hours[-1]) & (np.arange(len(rows)) >= COMMAND_EVERY)
     if is_warm.sum() < 2 * N_SPANS:
         raise SystemExit(f"{table}: {len(rows)} rounds are too few; let it run longer")
     span = hours[-1] - hours[is_warm][0]
     print(f"{len(rows)} rounds in {hours[-1]:.2f} h; after the warm-up {int(is_warm.sum())} in {span:.2f} h")
-    grows = False
+    lines: list[list[str]] = []
     for name in list(rows[0])[3:]:
         values = np.array([row[name] for row in rows])[is_warm]
         slope, half = line(hours[is_warm], values)
         level = float(np.median(values))
         allowed = TOLERANCE.get(name, lambda _: ONE_THING)(level)
         is_growing = slope - half > 0 and slope * span > allowed
-        grows |= is_growing
-        verdict = "GROWS" if is_growing else "does not grow"
-        print(
-            f"{name:17} {level:10.1f}  [{values.min():.1f}, {values.max():.1f}]  "
-            f"{slope:+.3f} an hour [{slope - half:+.3f}, {slope + half:+.3f}]  {verdict}"
+        lines.append(
+            [
+                name,
+                f"{level:.1f}",
+                f"{values.min():.1f} to {values.max():.1f}",
+                f"{slope:+.3f} [{slope - half:+.3f}, {slope + half:+.3f}]",
+                "GROWS" if is_growing else "does not grow",
+            ]
         )
-    return not grows
+        print("  ".join(lines[-1]))
+    if json_file is not None:
+        note = f"{len(rows)} rounds in {hours[-1]:.2f} hours; from the {len(rows) - int(is_warm.sum()) + 1}th on."
+        write_measured(json_file, "Long soak", "python benchmarks/soak.py --hours 3", COLUMNS, lines, [note])
+    return not any(line[-1] == "GROWS" for line in lines)
 
 
 def line(hours: Any, values: Any) -> tuple[float, float]:
@@ -176,12 +185,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--hours", type=float, default=3.0)
     parser.add_argument("--out", type=Path, default=Path("soak.csv"), help="a line a round (default: soak.csv)")
     parser.add_argument("--summarise", type=Path, metavar="CSV", help="only read such a table")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the table of the answer there too")
     given = parser.parse_args(arguments)
     if given.summarise is not None:
-        return 0 if summarise(given.summarise) else 1
+        return 0 if summarise(given.summarise, given.json) else 1
     with tempfile.TemporaryDirectory(prefix="su3d-soak-") as scratch:
         soak(Path(scratch), given.hours, given.out)
-    return 0 if summarise(given.out) else 1
+    return 0 if summarise(given.out, given.json) else 1
 
 
 if __name__ == "__main__":

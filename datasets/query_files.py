@@ -92,7 +92,7 @@ def query_truth(truth: GroundTruth, queries: tuple[TextQuery, ...], where: str) 
 def _toml_rows(text: str, where: str) -> Iterator[QueryRow]:
     try:
         content = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
+    except (ValueError, RecursionError) as error:  # no TOML, or an integer of thousands of digits
         raise DataError(f"{where}: not TOML ({printable(str(error), 120)})") from error
     tables = content.get("query")
     if set(content) != {"query"} or not isinstance(tables, list):

@@ -9,19 +9,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.datasets.rooms_classes import CLASSES
-from su3d_bench.datasets.rooms_kinds import KINDS, furnish
-from su3d_bench.datasets.rooms_layout import Plan
-from su3d_bench.datasets.rooms_mesh import Patches, RoomMesh, build_mesh, gather_patches
 from su3d_bench.datasets.rooms_noise import LEVELS, add_noise
-from su3d_bench.datasets.rooms_render import RenderedFrame, Renderer, camera_intrinsics
-from su3d_bench.datasets.rooms_scan import RoomScan, read_scan, scan_room, write_scan
-from su3d_bench.datasets.rooms_trajectory import walk
-from su3d_bench.datasets.rooms_truth import Query, RoomObject, RoomTruth, queries, truth_of
 from su3d_bench.errors import DataError, GroundTruthMissing, suggest
 from su3d_bench.types import (
     Float64Array,
@@ -35,8 +29,16 @@ from su3d_bench.types import (
     Surface,
 )
 
+if TYPE_CHECKING:  # what makes a room is imported where one is made: a list of scenes needs none of it
+    from su3d_bench.datasets.rooms_layout import Plan
+    from su3d_bench.datasets.rooms_mesh import Patches, RoomMesh
+    from su3d_bench.datasets.rooms_render import RenderedFrame, Renderer
+    from su3d_bench.datasets.rooms_scan import RoomScan
+    from su3d_bench.datasets.rooms_truth import Query, RoomObject, RoomTruth
+
 GENERATOR_VERSION = 3  # raise it whenever a scene of the same name comes out different
 DEFAULT_SCENES = ("living0", "bedroom0", "kitchen0", "office0", "bathroom0", "studio0", "living1", "office1")
+KIND_NAMES = ("living", "bedroom", "kitchen", "office", "bathroom", "studio")  # the keys of rooms_kinds.KINDS
 TRAINING_FROM = 10_000  # numbers from here on are kept for training the embedded encoder; no benchmark uses them
 FRAMES_PER_SECOND = 30.0
 N_STRUCTURE = 6  # floor, ceiling and four walls have the ids 1..6
@@ -60,8 +62,8 @@ class RoomOptions(BaseModel):
 def scene_name_parts(scene: str) -> tuple[str, int]:
     """Kind and number of a scene name; raises ``DataError`` for what is no scene."""
     match = re.fullmatch(r"([a-z]+)(0|[1-9]\d{0,5})", scene)
-    if match is None or match[1] not in KINDS:
-        hint = suggest(scene, DEFAULT_SCENES) or f"; kinds: {', '.join(KINDS)}"
+    if match is None or match[1] not in KIND_NAMES:
+        hint = suggest(scene, DEFAULT_SCENES) or f"; kinds: {', '.join(KIND_NAMES)}"
         raise DataError(f"rooms: no scene '{scene}'; a scene is a kind and a number such as office3{hint}")
     return match[1], int(match[2])
 
@@ -83,19 +85,27 @@ class BuiltRoom:
 
     @cached_property
     def patches(self) -> Patches:
+        from su3d_bench.datasets.rooms_mesh import gather_patches
+
         return gather_patches(self.plan.placed)
 
     @cached_property
     def mesh(self) -> RoomMesh:
+        from su3d_bench.datasets.rooms_mesh import build_mesh
+
         exposure = float(_generator("exposure", self.scene, self.options.seed_offset).uniform(0.58, 0.72))
         return build_mesh(self.patches, self.plan.lights, exposure)
 
     @cached_property
     def renderer(self) -> Renderer:
+        from su3d_bench.datasets.rooms_render import Renderer
+
         return Renderer(self.mesh, self.options.width, self.options.height)
 
     @cached_property
     def trajectory(self) -> Float64Array:
+        from su3d_bench.datasets.rooms_trajectory import walk
+
         plan = self.plan
         size = plan.width, plan.depth, plan.height
         rng = _generator("walk", self.scene, self.options.seed_offset)
@@ -118,6 +128,8 @@ class Rooms:
 
     @property
     def intrinsics(self) -> Float64Array:
+        from su3d_bench.datasets.rooms_render import camera_intrinsics
+
         return camera_intrinsics(self.options.width, self.options.height)
 
     def scenes(self) -> Sequence[str]:
@@ -145,6 +157,8 @@ class Rooms:
 
     def queries(self, scene: str) -> tuple[Query, ...]:
         """Texts of four kinds with all right answers, on what the walk sees."""
+        from su3d_bench.datasets.rooms_truth import queries
+
         return queries(self.truth(scene), self.visible_vertices(scene))
 
     def trajectory(self, scene: str) -> Float64Array:
@@ -172,6 +186,8 @@ class Rooms:
 
     def scan(self, scene: str) -> RoomScan:
         """The ground-truth surface; made once, then read from the cache."""
+        from su3d_bench.datasets.rooms_scan import read_scan, scan_room, write_scan
+
         path = self.root / "rooms" / self._scan_key(scene) / f"{scene}.npz"
         found = read_scan(path)
         if found is None:
@@ -224,6 +240,9 @@ class Rooms:
         return Surface(scan.vertices, scan.faces[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
 
     def _room(self, scene: str) -> BuiltRoom:
+        from su3d_bench.datasets.rooms_kinds import furnish
+        from su3d_bench.datasets.rooms_truth import truth_of
+
         if scene not in self._rooms:
             kind, _ = scene_name_parts(scene)
             plan = furnish(kind, _generator("room", scene, self.options.seed_offset))

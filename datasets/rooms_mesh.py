@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from su3d_bench.compiled_open3d import compiled_open3d
 from su3d_bench.datasets.rooms_items import Item
 from su3d_bench.datasets.rooms_materials import Material
 from su3d_bench.datasets.rooms_shapes import Shape, rotation
@@ -161,8 +162,7 @@ def build_mesh(patches: Patches, lights: Sequence[Light], exposure: float) -> Ro
 
 def caster(vertices: Float32Array, triangles: Int32Array) -> object:
     """An Open3D ray-casting scene of one mesh; ``primitive_ids`` are rows of ``triangles``."""
-    import open3d as o3d
-
+    o3d = compiled_open3d()
     scene = o3d.t.geometry.RaycastingScene()
     scene.add_triangles(
         o3d.core.Tensor(np.ascontiguousarray(vertices)),
@@ -252,7 +252,6 @@ def _open_sky(scene: object, start: Float64Array, facing: Float64Array) -> Float
 
 
 def _blocked(scene: object, rays: Float32Array, far: float) -> NDArray[np.bool_]:
-    import open3d as o3d
-
+    o3d = compiled_open3d()
     hit = scene.test_occlusions(o3d.core.Tensor(rays), tnear=0.0, tfar=far)  # type: ignore[attr-defined]
     return np.asarray(hit.numpy(), bool)

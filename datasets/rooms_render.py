@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from su3d_bench.compiled_open3d import compiled_open3d
 from su3d_bench.datasets.rooms_mesh import RoomMesh, caster
 from su3d_bench.types import Float32Array, Float64Array, Int32Array, UInt8Array
 
@@ -60,9 +61,9 @@ class Renderer:
         return np.where(hit, t_hit, np.float32(0)).reshape(shape), np.where(hit, ids, np.int32(0)).reshape(shape)
 
     def _cast(self, pose: Float64Array) -> tuple[Float32Array, Float32Array, Int32Array, Float32Array]:
-        import open3d as o3d
-
         from su3d_bench.datasets.rooms_shade_kernels import aim
+
+        o3d = compiled_open3d()
 
         rays = np.empty((self.width * self.height, 6), np.float32)
         aim(self._directions, pose, rays)

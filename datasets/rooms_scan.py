@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from su3d_bench.compiled_open3d import compiled_open3d
 from su3d_bench.datasets.rooms_mesh import Grid, Patches, RoomMesh, at_rows, caster, cut, merge_equal
 from su3d_bench.datasets.rooms_render import Renderer, camera_intrinsics
 from su3d_bench.errors import DataError
@@ -90,9 +91,9 @@ def _welded(
 
 def surface_colours(mesh: RoomMesh, points: Float32Array) -> UInt8Array:
     """The lit colour (N, 3) of the surface nearest to each point, without highlights."""
-    import open3d as o3d
-
     from su3d_bench.datasets.rooms_shade_kernels import shade
+
+    o3d = compiled_open3d()
 
     nearest = caster(mesh.vertices, mesh.triangles).compute_closest_points(o3d.core.Tensor(points))  # type: ignore[attr-defined]
     n = len(points)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from su3d_bench.compiled_open3d import compiled_open3d
 from su3d_bench.datasets.rooms_layout import Box
 from su3d_bench.datasets.rooms_mesh import RoomMesh, caster
 from su3d_bench.types import BoolArray, Float64Array
@@ -220,8 +221,7 @@ def _visible_shares(
     n_structure: int,
 ) -> tuple[Float64Array, Float64Array]:  # fmt: skip
     """How well each candidate view of each station shows each object (0..1), and how much of it is too near."""
-    import open3d as o3d
-
+    o3d = compiled_open3d()
     rays = np.empty((len(stations), len(directions), 6), np.float32)
     rays[..., :3], rays[..., 3:] = stations[:, None], directions
     answer = caster(mesh.vertices, mesh.triangles).cast_rays(o3d.core.Tensor(rays.reshape(-1, 6)))  # type: ignore[attr-defined]

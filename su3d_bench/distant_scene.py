@@ -7,7 +7,6 @@ after them: a job that was sent in part has no seal, or one that its files do no
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -18,6 +17,7 @@ from su3d_bench.executors import Report
 from su3d_bench.remote_folder import RemoteFolder
 from su3d_bench.scene_run import MethodOutcome, SceneJob, failed_outcomes, run_scene
 from su3d_bench.store import RunFolder, make_folder, write_bytes
+from su3d_bench.temporary_folders import TemporaryFolder
 
 CACHE_ROOT = "~/.cache/su3d-bench/cache"
 SEAL = "done.json"
@@ -47,15 +47,15 @@ def run_distant_scene(distant: DistantJob, report: Report) -> tuple[MethodOutcom
     if distant.here.is_dir():
         os.chdir(distant.here)  # relative paths in the configuration are meant from there
     cache_root = distant.cache_root or Path(os.environ.get("SU3D_CACHE") or CACHE_ROOT).expanduser()
-    with tempfile.TemporaryDirectory(prefix="su3d-scene-") as scratch:
+    with TemporaryFolder("su3d-scene-") as scratch:
         job = replace(distant.job, cache_root=cache_root)
         if distant.data is not None:
-            job = replace(job, data_root=Path(scratch) / "data")
+            job = replace(job, data_root=scratch / "data")
             make_folder(job.data_root)
             RemoteFolder(distant.data).fetch(distant.files, job.data_root)
         if distant.store is None:
             return run_scene(job, report)
-        job = replace(job, folder=Path(scratch) / "run")
+        job = replace(job, folder=scratch / "run")
         with _stored(RemoteFolder(distant.store), job):
             return run_scene(job, report)
 

@@ -14,7 +14,7 @@ from su3d_bench.errors import ConfigError, DataError, StoreError, suggest
 from su3d_bench.plain_text import printable
 from su3d_bench.scene_run import CEILING_METHOD
 from su3d_bench.scoring import SceneScore, unpack_scores
-from su3d_bench.store import RunFolder, read_json
+from su3d_bench.store import RunFolder, is_file, read_json
 
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -119,14 +119,14 @@ class FinishedRun:
     def has_scores(self, method: str) -> bool:
         """Whether any scene was scored for ``method``; those of the ceiling stand in no table."""
         is_name = "/" not in method
-        return is_name and any(self.folder.job(scene, method).counts.is_file() for scene in self.scenes)
+        return is_name and any(is_file(self.folder.job(scene, method).counts) for scene in self.scenes)
 
     def scores(self, method: str) -> dict[str, dict[str, SceneScore]]:
         """Protocol -> scene -> counts, of every scene that was scored."""
         found: dict[str, dict[str, SceneScore]] = {name: {} for name in self.protocols}
         for scene in self.scenes:
             file = self.folder.job(scene, method).counts
-            if not file.is_file():
+            if not is_file(file):
                 continue
             try:
                 of_scene = unpack_scores(file.read_bytes())
@@ -140,9 +140,9 @@ class FinishedRun:
 def read_run(path: Path) -> FinishedRun:
     """The run in the folder ``path``; a ``StoreError`` where it holds none, or one that is not finished."""
     shown = printable(str(path), 200)
-    if not (path / "run.json").is_file():
+    if not is_file(path / "run.json"):
         raise StoreError(f"{shown}: holds no run.json; name the folder of a run, such as runs/my-run")
-    if not (path / "metrics.json").is_file():
+    if not is_file(path / "metrics.json"):
         raise StoreError(f"{shown}: holds no metrics.json, so the run is not finished; run its command again")
     record = _checked(_Record, path / "run.json", shown)
     metrics = _checked(_Metrics, path / "metrics.json", shown)

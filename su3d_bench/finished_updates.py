@@ -11,6 +11,7 @@ import numpy as np
 from su3d_bench.errors import DataError
 from su3d_bench.finished_run import FinishedRun
 from su3d_bench.plain_text import printable
+from su3d_bench.store import is_file
 from su3d_bench.types import Float64Array
 from su3d_bench.update_times import MapCost, UpdateTimes
 
@@ -23,7 +24,7 @@ def read_update_times(run: FinishedRun, method: str) -> list[UpdateTimes]:
     found = []
     for scene in run.scenes:
         job = run.folder.job(scene, method)
-        if not job.updates.is_file():
+        if not is_file(job.updates):
             continue
         where = f"{printable(scene, 120)}: {job.updates.name}"
         columns = _columns(job.updates, where)

@@ -24,6 +24,8 @@ from su3d_bench.update_times import MAP, WARM_UP, pooled
 
 SPREADS = 2.0  # a value may leave the taught ones by this many times their range: 2 of 50 unchanged repeats would at 1
 ACROSS_MACHINES = 0.02  # 2 points: what ONNX Runtime's and BLAS's kernels of other processors may move a headline value
+# Where the calibrating work itself takes so many times the reference's on the same kind of processor, others used it.
+BUSY = 1.5
 COST_LIMIT = 1.4  # an update may cost so many times the reference's; single runs scatter by a tenth to a fifth
 # Settings that name what was asked for or move no number; scenes, methods and protocols are compared one by one.
 NOT_COMPARED = ("scenes", "methods", "protocols", "jobs", "pictures", "offline", "perception.cache")
@@ -65,7 +67,8 @@ class MethodResult(_Model):
 class Reference(_Model):
     """What a run is held against; ``costs``: a method's update over the calibrating piece of work.
 
-    ``processor``: a digest of the processor's kind; byte-equality is promised on one kind alone.
+    ``processor``: a digest of the processor's kind; byte-equality is promised on one kind alone. ``calibration_ms``:
+    of that piece of work, None in references that older versions wrote.
     """
 
     schema_version: Literal[1] = 1
@@ -80,6 +83,7 @@ class Reference(_Model):
     protocols: dict[str, ProtocolKey]
     results: tuple[MethodResult, ...] = Field(min_length=1)
     costs: dict[str, float]
+    calibration_ms: float | None = Field(default=None, gt=0, allow_inf_nan=False)
 
 
 Number = Annotated[float, Field(allow_inf_nan=False)]  # NaN would differ from nothing, and so pass
@@ -149,7 +153,12 @@ def learn(
         protocols={name: ProtocolKey(version=one[0], digest=one[1]) for name, one in first.protocols.items()},
         results=tuple(_learn_result([table[key] for table in tables]) for key in tables[0]),
         costs={name: float(np.median([cost[name] for cost in costs if name in cost])) for name in costs[0]},
+        calibration_ms=_median([one for run in runs if (one := calibration_of(run)) is not None]),
     )
+
+
+def _median(values: Sequence[float]) -> float | None:
+    return float(np.median(values)) if values else None
 
 
 def _learn_result(repeats: Sequence[_Result]) -> MethodResult:
@@ -205,8 +214,9 @@ def check(run: FinishedRun, reference: Reference) -> Verdict:
             findings.append(_changed(where, "encoder digest", expected.encoder_digest, found.encoder_digest))
         findings += _numbers(where, expected, found.result, None if is_same_machine else reference.across_machines)
         n_compared += len(expected.metrics)
-    findings += _costs(run, reference, is_same_machine)
-    remarks = [] if is_same_machine else [_other_machine(run, reference)]
+    busy = _busy(run, reference) if is_same_machine else None
+    findings += _costs(run, reference, is_judged=is_same_machine and busy is None)
+    remarks = [busy] if busy else [] if is_same_machine else [_other_machine(run, reference)]
     return Verdict(run.name, tuple(findings), n_compared, tuple(remarks))
 
 
@@ -214,6 +224,17 @@ def _other_machine(run: FinishedRun, reference: Reference) -> str:
     return (
         f"another processor ({run.hardware}) than the reference's ({reference.hardware}): headline values are compared "
         f"within {100 * reference.across_machines:g} points, scenes and classes by presence, costs are not judged"
+    )
+
+
+def _busy(run: FinishedRun, reference: Reference) -> str | None:
+    """Why costs say nothing of the code, where something else used the processor; None where they do."""
+    now, before = calibration_of(run), reference.calibration_ms
+    if now is None or before is None or now <= BUSY * before:
+        return None
+    return (
+        f"the machine was busy: the calibrating work took {now:.3g} ms, {now / before:.1f} times the reference's, so "
+        "costs are not judged; run it again alone"
     )
 
 
@@ -285,13 +306,13 @@ def _compare(
             yield Finding(kind, f"{where} / {name}", text, one.value, measured, tolerance)
 
 
-def _costs(run: FinishedRun, reference: Reference, is_same_machine: bool) -> Iterator[Finding]:
+def _costs(run: FinishedRun, reference: Reference, *, is_judged: bool) -> Iterator[Finding]:
     measured = update_costs(run) if reference.costs else {}
     for method, before in reference.costs.items():
         now = measured.get(method)
         if now is None:
             yield Finding("missing", f"{method} / cost of an update", "the run did not measure it", before)
-        elif is_same_machine and now > reference.cost_limit * before:
+        elif is_judged and now > reference.cost_limit * before:
             text = f"costs {now / before:.2f} times the reference; {reference.cost_limit:g} times are allowed"
             yield Finding("cost", f"{method} / cost of an update", text, before, now)
 
@@ -309,6 +330,12 @@ def update_costs(run: FinishedRun) -> dict[str, float]:
         if ratios:
             costs[method] = float(np.median(ratios))
     return costs
+
+
+def calibration_of(run: FinishedRun) -> float | None:
+    """Median milliseconds of the calibrating work over scenes and methods; None where nothing was updated."""
+    times = (one.calibration_ms for method in run.methods for one in read_update_times(run, method))
+    return _median([one for one in times if one])
 
 
 def _settings(run: FinishedRun) -> dict[str, str]:

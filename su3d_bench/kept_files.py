@@ -6,20 +6,25 @@ And arrays out of files that may be damaged, of which no more is believed than t
 from __future__ import annotations
 
 import fcntl
+import io
 import math
 import os
 import struct
+import sys
 import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from functools import lru_cache
 from pathlib import Path
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+MAGIC_1_0 = b"\x93NUMPY\x01\x00"
+SMALL_BYTES = 1 << 16  # of an array that is read whole before its header is looked at
 # What reading a damaged .npz raises; a compression that there is none of is a NotImplementedError, a RuntimeError.
 DAMAGE = (
     OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, RuntimeError,
@@ -33,21 +38,60 @@ def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
     As ``numpy.load``, but a header that promises more than its member holds is damage, and no terabyte to allocate.
     """
     with zipfile.ZipFile(source) as archive:
-        return {info.filename.removesuffix(".npy"): _array(archive, info) for info in archive.infolist()}
+        arrays = {info.filename.removesuffix(".npy"): _array(archive, info) for info in archive.infolist()}
+    for name, array in arrays.items():
+        if (
+            array.dtype.kind == "U"
+            and array.size
+            and array.reshape(-1).view(_codes(array.dtype)).max() > sys.maxunicode
+        ):
+            raise ValueError(f"{name}: holds what is no text")
+    return arrays
+
+
+def _codes(texts: np.dtype[Any]) -> np.dtype[Any]:
+    """The type of the characters in an array of ``texts``."""
+    return np.dtype(np.uint32).newbyteorder(texts.byteorder)
 
 
 def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
+    if info.file_size <= SMALL_BYTES and (content := archive.read(info)).startswith(MAGIC_1_0):
+        return _small_array(content, info.filename)
     with archive.open(info) as member:
         version = np.lib.format.read_magic(member)
         if version not in ((1, 0), (2, 0)):
             raise ValueError(f"{info.filename}: .npy of version {version}")
         header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, _, dtype = header(member)
-        if math.prod(shape) * dtype.itemsize != info.file_size - member.tell():
+        if math.prod(shape) * _item_bytes(dtype) != info.file_size - member.tell():
             raise ValueError(f"{info.filename}: holds other than the {shape} that it promises")
         member.seek(0)
         array: NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
         return array
+
+
+def _item_bytes(dtype: np.dtype[Any]) -> int:
+    """How long one item is; NumPy makes texts of no length one character long."""
+    return dtype.itemsize or 1
+
+
+def _small_array(content: bytes, name: str) -> NDArray[Any]:
+    """The array of a .npy file in memory; a run has thousands of files with few and equal headers."""
+    start = 10 + int.from_bytes(content[8:10], "little")
+    shape, is_fortran, dtype = _header_1_0(content[:start])
+    if dtype.hasobject or math.prod(shape) * _item_bytes(dtype) != len(content) - start:
+        raise ValueError(f"{name}: holds other than the {shape} of {dtype} that it promises")
+    if start == len(content):
+        return np.empty(shape, dtype)
+    return np.frombuffer(content, dtype, offset=start).reshape(shape, order="F" if is_fortran else "C").copy("K")
+
+
+@lru_cache(maxsize=1024)
+def _header_1_0(content: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
+    stream = io.BytesIO(content)
+    np.lib.format.read_magic(stream)
+    found: tuple[tuple[int, ...], bool, np.dtype[Any]] = np.lib.format.read_array_header_1_0(stream)
+    return found
 
 
 @contextmanager

@@ -13,7 +13,7 @@ from numba.core.caching import FunctionCache
 from su3d_bench.kept_files import DAMAGE
 
 
-class MendingCache(FunctionCache):  # type: ignore[misc]  # numba has no types
+class MendingCache(FunctionCache):
     """Numba's own store of one function; what cannot be read is compiled again, what cannot be kept is used once.
 
     Numba renames what it writes, but does not wait for the disk: after a power cut its files may hold anything.
@@ -21,18 +21,18 @@ class MendingCache(FunctionCache):  # type: ignore[misc]  # numba has no types
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
-            return super().load_overload(sig, target_context)
+            return super().load_overload(sig, target_context)  # type: ignore[no-untyped-call]
         except (*DAMAGE, LookupError, AttributeError, ImportError, pickle.UnpicklingError):
             self._forget()
             return None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         with suppress(OSError):
-            super().save_overload(sig, data)
+            super().save_overload(sig, data)  # type: ignore[no-untyped-call]
 
     def _forget(self) -> None:
         with suppress(OSError):
-            self.flush()
+            self.flush()  # type: ignore[no-untyped-call]
 
 
 def njit(*, cache: bool, **options: Any) -> Callable[[Callable[..., Any]], Any]:
@@ -42,7 +42,7 @@ def njit(*, cache: bool, **options: Any) -> Callable[[Callable[..., Any]], Any]:
         dispatcher = numba.njit(**options)(function)
         if cache:
             with suppress(RuntimeError):  # no place for it: neither beside the module nor in the user's cache
-                dispatcher._cache = MendingCache(function)
+                dispatcher._cache = MendingCache(function)  # type: ignore[no-untyped-call]
         return dispatcher
 
     return compiled

@@ -20,6 +20,7 @@ from su3d_bench.reports.table_model import NOT_MEASURED, Cell, Origin, Table, Ta
 from su3d_bench.scoring import combine
 
 MOST_RUNS = 10_000
+MOST_NAMED = 4  # methods of what is left out
 MOST_FOLDERS = 1_000_000  # a folder that holds more was not meant
 
 
@@ -170,12 +171,23 @@ def _rank(entry: Entry) -> tuple[bool, float, str, str]:
 def tables(found: Leaderboard, *, intervals: bool) -> list[Table]:
     """One table a ranking; what was refused stands beneath the last one."""
     made = [_table(board, index, intervals) for index, board in enumerate(found.boards)]
-    notes = tuple(f"Left out: {one.run}, {one.what}: {one.reason}" for one in found.refused)
+    notes = tuple(_left_out(found.refused))
     if not made:
         return [Table("leaderboard", "Leaderboard: no run may stand in a ranking.", "method", (), (), notes)]
     last = made[-1]
     made[-1] = Table(last.name, last.caption, last.head, last.columns, last.rows, (*last.notes, *notes))
     return made
+
+
+def _left_out(refused: Sequence[Refused]) -> Iterator[str]:
+    """One line for what is refused of one run under one protocol for one reason."""
+    groups: dict[tuple[str, str, str], list[str]] = {}
+    for one in refused:
+        method, slash, protocol = one.what.rpartition(" / ")
+        groups.setdefault((one.run, slash + protocol, one.reason), []).append(method)
+    for (run, where, reason), methods in groups.items():
+        more = f" and {len(methods) - MOST_NAMED} more" if len(methods) > MOST_NAMED else ""
+        yield f"Left out: {run}, {', '.join(methods[:MOST_NAMED])}{more}{where}: {reason}"
 
 
 def _table(board: Sequence[Entry], index: int, intervals: bool) -> Table:

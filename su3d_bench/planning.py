@@ -15,7 +15,7 @@ from su3d_bench import registry
 from su3d_bench.config import RunConfig, Settings, check_keys, check_names, read_assignments, resolve
 from su3d_bench.digests import code_digest, digest_json
 from su3d_bench.distant_scene import CACHE_ROOT, fetch_seals, mirror_of
-from su3d_bench.errors import ConfigError, DataError, suggest
+from su3d_bench.errors import ConfigError, DataError, StoreError, suggest
 from su3d_bench.execution import ELSEWHERE, check_execution
 from su3d_bench.method_names import NamedMethod, named_method
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
@@ -123,7 +123,10 @@ def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | s
     plan = Plan(config, settings, RunFolder(folder), jobs, n_workers, notes, store, data)
     if store is not None:
         fetch_seals(store, folder)
-    _refuse_other_runs(plan)
+    try:
+        _refuse_other_runs(plan)
+    except StoreError as error:
+        raise StoreError(str(error).replace(str(folder), str(store or folder))) from error
     return plan
 
 

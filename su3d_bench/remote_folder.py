@@ -17,6 +17,7 @@ from su3d_bench.plain_text import printable
 from su3d_bench.store import make_folder
 
 AT_ONCE = 256  # small files that one request to the driver asks for; it fetches them side by side
+BUCKETS = ("s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "oss")  # have no folders, and to make one makes a bucket
 MOST_NAME_CHARACTERS = 1024  # the longest key of an S3 object
 
 
@@ -42,6 +43,7 @@ class RemoteFolder:
         except ValueError as error:
             raise ConfigError(f"{url}: {' '.join(str(error).split())[:200]}; such as s3://bucket/folder") from error
         self._root = str(root).rstrip("/")
+        self._has_buckets = self.url.partition(":")[0] in BUCKETS
 
     def files(self, below: str = "") -> dict[str, int]:
         """Size in bytes of every file in the folder ``below``, by name; empty where there is none."""
@@ -94,7 +96,8 @@ class RemoteFolder:
         for name in names:
             with self._telling(f"{name} cannot be written"):
                 path = f"{self._root}/{name}"
-                self._driver.makedirs(path.rpartition("/")[0], exist_ok=True)
+                if not self._has_buckets:
+                    self._driver.makedirs(path.rpartition("/")[0], exist_ok=True)
                 self._driver.put_file(str(folder / name), path)
 
     def remove(self, names: Iterable[str]) -> None:

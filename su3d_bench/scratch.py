@@ -27,18 +27,18 @@ def scratch_folder() -> Path:
 
 
 class Scratch:
-    """A file without a name that arrays are put into; it is gone with the process, however that ends."""
+    """A file without a name that takes arrays, ``n_bytes`` in all; it is gone with the process, however that ends."""
 
     def __init__(self, most_in_memory_bytes: int = MOST_IN_MEMORY_BYTES) -> None:
         self._file = tempfile.SpooledTemporaryFile(most_in_memory_bytes, dir=scratch_folder())  # noqa: SIM115
-        self._n_bytes = 0
+        self.n_bytes = 0
 
     def put(self, array: NDArray[Any]) -> StoredRows:
         """Keeps a copy of ``array`` until ``close``."""
-        stored = StoredRows(self, self._n_bytes, array.dtype, array.shape)
+        stored = StoredRows(self, self.n_bytes, array.dtype, array.shape)
         content = np.ascontiguousarray(array).tobytes()
         try:
-            self._file.seek(self._n_bytes)
+            self._file.seek(self.n_bytes)
             self._file.write(content)
             self._file.flush()
         except OSError as error:
@@ -46,7 +46,7 @@ class Scratch:
                 f"cannot write temporary data to {scratch_folder()}: {error.strerror or error}; set TMPDIR to a larger "
                 "disk"
             ) from error
-        self._n_bytes += len(content)
+        self.n_bytes += len(content)
         return stored
 
     def read(self, offset: int, n_bytes: int) -> bytes:

@@ -132,13 +132,21 @@ def read_npz(path: Path) -> dict[str, NDArray[Any]]:
         raise StoreError(f"{path}: not a readable .npz file ({error}); delete it and run again") from error
 
 
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; none has a name that no system could give, as a hostile record may say."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
 def read_json(path: Path) -> Any:
     """The value of a JSON file; a missing or damaged file is a ``StoreError``."""
     try:
         return json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise StoreError(f"{path}: cannot be read: {error.strerror}") from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise StoreError(f"{path}: not readable as JSON; run the same command again to mend it") from error
 
 
@@ -200,7 +208,7 @@ def read_prediction(path: Path) -> Prediction:
     arrays = read_npz(path)
     if str(arrays.get("kind")) == DenseFeatures.__name__ and "features" not in arrays:
         arrays["features"] = _mapped_rows(features_beside(path))
-        if arrays["features"].shape[:1] != np.shape(arrays.get("points"))[:1]:
+        if "points" not in arrays or arrays["features"].shape[:1] != arrays["points"].shape[:1]:
             raise StoreError(f"{features_beside(path)}: has other rows than {path.name}; delete both and run again")
     return prediction_from_arrays(arrays, str(path))
 

@@ -23,7 +23,7 @@ from su3d_bench.scoring import combine
 from su3d_bench.sheets.score_file import FILE as SCORES_FILE
 from su3d_bench.sheets.score_file import read_scores
 from su3d_bench.sheets.scores import ScoreCell, Scores
-from su3d_bench.store import read_json
+from su3d_bench.store import is_file, read_json
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 MOST_SOURCE_BYTES, MOST_SOURCES = 1 << 24, 500  # of a paper's LaTeX
@@ -84,7 +84,7 @@ def measured_results(folders: Sequence[Path]) -> list[Measured]:
 
 def is_scores(path: Path) -> bool:
     """Whether ``path`` is what ``sheets score`` writes, rather than a run."""
-    return path.suffix == ".json" or ((path / SCORES_FILE).is_file() and not (path / "run.json").exists())
+    return path.suffix == ".json" or (is_file(path / SCORES_FILE) and not is_file(path / "run.json"))
 
 
 def _judged_by_people(path: Path) -> list[Measured]:
@@ -227,7 +227,7 @@ class _Recomputed:
     def _run(self, name: str) -> FinishedRun:
         if name not in self._runs:
             places = [root / name for root in self._roots]
-            path = next((place for place in places if (place / "run.json").is_file()), places[0])
+            path = next((place for place in places if is_file(place / "run.json")), places[0])
             self._runs[name] = read_run(path)
         return self._runs[name]
 
@@ -244,7 +244,7 @@ class _Recomputed:
 
     def _of_people(self, origin: Origin) -> _Numbers:
         places = [root / origin.run for root in self._roots]
-        path = next((place for place in places if place.exists()), places[0])
+        path = next((place for place in places if is_file(place) or is_file(place / SCORES_FILE)), places[0])
         for one in _judged_by_people(path):
             if (one.protocol, one.method) == (origin.protocol, origin.method):
                 return _Numbers(one.version, len(one.scenes), one.metrics, one.intervals)

@@ -3,10 +3,16 @@
 from __future__ import annotations
 
 import fuzz_targets_datasets
+import fuzz_targets_perception
 import fuzz_targets_predictions
 import fuzz_targets_runs
 
 TARGETS = {
     one.name: one
-    for one in (*fuzz_targets_datasets.TARGETS, *fuzz_targets_predictions.TARGETS, *fuzz_targets_runs.TARGETS)
+    for one in (
+        *fuzz_targets_datasets.TARGETS,
+        *fuzz_targets_perception.TARGETS,
+        *fuzz_targets_predictions.TARGETS,
+        *fuzz_targets_runs.TARGETS,
+    )
 }

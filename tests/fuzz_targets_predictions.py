@@ -62,12 +62,14 @@ def _scannetpp(folder: Path) -> Read:
 
 def _pickle(kind: str) -> Make:
     def make(folder: Path) -> Read:
-        from test_predictions_pickles import reader, written
+        from test_predictions_pickles import written
 
-        content = written(folder, kind)
-        (folder / kind).write_bytes(content)
-        read = reader(folder, kind)
-        return lambda: read((folder / kind).read_bytes())
+        from su3d_bench.plain_pickles.pickles import read_pickle_file
+        from su3d_bench.predictions.numpy_files import read_npy_value
+
+        path = folder / kind
+        path.write_bytes(written(folder, kind))
+        return lambda: read_npy_value(path) if kind.endswith(".npy") else read_pickle_file(path)
 
     return make
 

@@ -133,7 +133,8 @@ def _counts(folder: Path) -> Read:
 
     file = next(_made_run().glob("scenes/*.a/collector/counts.npz"))
     (folder / "counts.npz").write_bytes(file.read_bytes())
-    return lambda: unpack_scores((folder / "counts.npz").read_bytes())
+    path = folder / "counts.npz"
+    return lambda: unpack_scores(path.read_bytes() if path.is_file() else b"")
 
 
 def _paper(folder: Path) -> Read:

@@ -51,4 +51,4 @@ def fill(desktop: Any, source: str, target: str, first: int) -> None:
         desktop.terminate()
 
 
-fill(connected(sys.argv[1]), *sys.argv[2:4], int(sys.argv[4]))
+fill(connected(sys.argv[1]), sys.argv[2], sys.argv[3], int(sys.argv[4]))

@@ -206,6 +206,25 @@ def test_the_tolerance_is_twice_the_spread_of_the_taught_runs(run: Path, made: P
     assert not check(read_run(tmp_path / "third"), taught).is_passed
 
 
+def busier(costs: Any, factor: float) -> None:
+    if costs["calibration_ms"] is not None:
+        costs["calibration_ms"] *= factor
+
+
+def test_on_a_busy_machine_costs_are_not_judged_and_it_says_so(
+    run: Path, learnt: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    slower(3.0)(run)
+    assert main(["check", str(run), "--against", str(learnt)]) == 1
+    for done in run.rglob("collector/done.json"):
+        edit(done, lambda value: busier(value["steps"]["predict"]["remarks"]["costs"], 2.0))
+    capsys.readouterr()
+    assert main(["check", str(run), "--against", str(learnt)]) == 0
+    assert "the machine was busy: the calibrating work took" in capsys.readouterr().err
+    lowered("metrics", "mAcc")(run)
+    assert main(["check", str(run), "--against", str(learnt)]) == 1
+
+
 def test_on_another_processor_headline_values_have_a_stated_tolerance(run: Path, reference: Reference) -> None:
     edit(run / "run.json", lambda r: r.update(processor="other"))
     lowered("metrics", "mAcc", by=0.019)(run)

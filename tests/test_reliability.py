@@ -27,7 +27,9 @@ from su3d_bench.cli.main import main
 from su3d_bench.errors import StoreError
 from su3d_bench.kept_files import filling
 from su3d_bench.perception.cache import FrameCache
+from su3d_bench.scoring import score_scene
 from su3d_bench.store import RunFolder, npz_bytes, read_npz
+from su3d_bench.temporary_folders import TemporaryFolder
 
 HERE = Path(__file__).parent
 KILLS = HERE.parent / "benchmarks" / "kill_at_random.py"
@@ -168,12 +170,17 @@ def test_a_clock_that_jumps_changes_nothing(monkeypatch: pytest.MonkeyPatch) -> 
         when = jumps.choice((0, 4_000_000_000))
         os.utime(path, (when, when))
     monkeypatch.setattr(time, "time", lambda: jumps.choice((0.0, 4e9)))
-    n_scored = []
-    score = scene_run.score_scene
-    monkeypatch.setattr(scene_run, "score_scene", lambda *a: n_scored.append(1) or score(*a))
+    n_scored = 0
+
+    def counted(*arguments: Any) -> Any:
+        nonlocal n_scored
+        n_scored += 1
+        return score_scene(*arguments)
+
+    monkeypatch.setattr(scene_run, "score_scene", counted)
     assert run() == 0
     assert results() == before
-    assert len(n_scored) == 1, "the step that lacks a file is done again, and no other"
+    assert n_scored == 1, "the step that lacks a file is done again, and no other"
     rows = [line.split(",") for line in (job() / "updates.csv").read_text().splitlines()]
     assert all(float(row[rows[0].index("total_ms")]) >= 0 for row in rows[1:])
 
@@ -283,6 +290,24 @@ def test_a_cache_file_is_whole_or_absent_and_a_killed_writer_leaves_nothing_to_p
     assert [child.name for child in tmp_path.iterdir()] == ["entry.npz"]
 
 
+def test_the_temporary_folder_of_a_killed_process_goes_when_the_next_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    code = (
+        "import os, signal; from su3d_bench.temporary_folders import TemporaryFolder\n"
+        "folder = TemporaryFolder('su3d-test-'); (folder.path / 'large').write_text('x')\n"
+        "os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    subprocess.run([sys.executable, "-c", code], env=os.environ | {"TMPDIR": str(tmp_path)}, check=False)
+    (left,) = tmp_path.glob("su3d-test-*/large")
+    (tmp_path / "su3d-test-of-another-kind").mkdir()
+    with TemporaryFolder("su3d-test-") as first, TemporaryFolder("su3d-test-") as second:
+        assert first.is_dir() and second.is_dir()
+        assert not left.parent.exists()
+    assert [path.name for path in tmp_path.iterdir()] == ["su3d-test-of-another-kind"]
+
+
 KERNEL = """
 import sys
 from pathlib import Path
@@ -310,3 +335,11 @@ def test_a_compiled_kernel_whose_kept_form_is_damaged_is_compiled_again(tmp_path
         kept.write_bytes(bytes(kept.stat().st_size))
         assert imported() == "42 0\n"
     assert imported() == "42 1\n"
+
+
+def test_a_temporary_folder_that_cannot_be_made_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "not there"))
+    with pytest.raises(
+        StoreError, match="cannot make a temporary folder below .*not there: No such file or directory;"
+    ):
+        TemporaryFolder("su3d-test-")

@@ -1,8 +1,12 @@
 from __future__ import annotations
 
+from dataclasses import replace
+from types import SimpleNamespace
 from typing import Any
 
 from su3d_bench.reports.tables import headline, markdown_table
+from su3d_bench.scene_run import caveat_of
+from su3d_bench.types import PerceptionNeeds, SceneInfo
 
 
 def result(method: str = "opensu3d", **more: Any) -> dict[str, Any]:
@@ -78,3 +82,13 @@ def test_what_was_not_measured_is_a_dash() -> None:
 
 def test_no_protocol_is_said() -> None:
     assert table() == "no protocol scores these scenes\n"
+
+
+def test_made_rooms_in_anothers_layout_are_said_to_be_such() -> None:
+    method: Any = SimpleNamespace(needs=PerceptionNeeds(masks="grounded"), caveat=None)
+    perception: Any = SimpleNamespace(caveat=None)
+    scene = SceneInfo("replica", "office0", 1, 1, "rendered-rooms")
+    said = caveat_of(method, perception, scene)
+    assert said == "made rooms in the layout of replica, not its scenes"
+    assert caveat_of(method, perception, replace(scene, image_domain="camera")) is None
+    assert caveat_of(method, perception, replace(scene, dataset="rooms")) is None

@@ -104,8 +104,10 @@ def test_methods_without_features_are_left_out_of_retrieval_alone(
         write_prediction(job.prediction, replace(found, features=None))
 
     strip(METHODS[0])
+    Path("chairs.csv").write_text("scene,text,objects,kind\npainted/a,chair,1,instance\n")
     words = ["sheets", "make", "run", "--kind", "retrieval", "annotation", "--per-kind", "1", "--out", "out"]
-    assert main([*words, "--jobs", "1"]) == 0
+    words += ["--questions", "chairs.csv", "--jobs", "1"]
+    assert main(words) == 0
     assert f"retrieval: left out {METHODS[0]}, which" in capsys.readouterr().err
     assert read_key(folder / "out-key" / "retrieval" / "key.json").methods == METHODS[1:]
     assert read_key(folder / "out-key" / "annotation" / "key.json").methods == METHODS

@@ -3,6 +3,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import zipfile
 from collections import Counter
 from dataclasses import replace
 from pathlib import Path
@@ -78,6 +79,11 @@ def test_what_annotators_get_names_no_method_no_scene_and_no_truth(tmp_path: Pat
     for path in shown:
         assert not [word for word in secret if word in path.read_text()], path
     assert "opensu3d@scheme4" in (tmp_path / "key" / "key.json").read_text()
+    with zipfile.ZipFile(tmp_path / "out" / "annotator-1" / "sheet.xlsx") as book:
+        for name in book.namelist():
+            assert not [word for word in secret if word.encode() in book.read(name) or word in name], name
+    assert not [path for path in (tmp_path / "out").rglob("*") if any(word in str(path) for word in secret[:-1])]
+    assert {tuple(Image.open(path).info) for path in (tmp_path / "out").rglob("*.png")} == {()}
 
 
 def test_the_key_may_not_lie_among_the_sheets(tmp_path: Path) -> None:

@@ -96,7 +96,8 @@ def test_another_run_in_the_store_is_refused_by_name(store: Any, capsys: pytest.
     assert run(*TWO, out=URL) == 0
     capsys.readouterr()
     assert run(*TWO, "--seed", "5", out=URL) == 2
-    assert "holds another run (seed was 0, now 5); choose another folder with --out" in capsys.readouterr().err
+    line = f"su3d-bench: {URL}/scenes/painted.a/collector: holds another run (seed was 0, now 5); choose another folder"
+    assert capsys.readouterr().err.startswith(line)
 
 
 def test_workers_of_their_own_reach_a_store_too(tmp_path: Path) -> None:

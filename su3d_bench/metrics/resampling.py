@@ -54,17 +54,17 @@ def _weighted_areas(
     """
     if not len(score):
         return np.zeros(len(weights))
-    from su3d_bench.metrics.resampling_kernels import vertex_counts
-
     last_of_score = np.flatnonzero(np.append(np.diff(score) != 0, True))
     areas = np.empty(len(weights))
-    step = max(1, _MAX_CELLS // len(last_of_score))
+    step = max(1, _MAX_CELLS // len(score))
     for start in range(0, len(weights), step):
-        n_counted, n_hit = vertex_counts(weights[start : start + step], scene, is_true, last_of_score)
+        drawn = weights[start : start + step][:, scene]
+        n_counted = np.cumsum(drawn, axis=1)[:, last_of_score].astype(np.float64)
+        n_hit = np.cumsum(drawn * is_true, axis=1)[:, last_of_score].astype(np.float64)
         precision = np.divide(n_hit, n_counted, out=np.ones_like(n_hit), where=n_counted > 0)
         recall = n_hit / np.maximum(n_truth[start : start + step, None], 1)
-        precision = np.concatenate([np.ones((len(n_hit), 1)), precision], axis=1)
-        recall = np.concatenate([np.zeros((len(n_hit), 1)), recall], axis=1)
+        precision = np.concatenate([np.ones((len(drawn), 1)), precision], axis=1)
+        recall = np.concatenate([np.zeros((len(drawn), 1)), recall], axis=1)
         areas[start : start + step] = (np.diff(recall, axis=1) * (precision[:, 1:] + precision[:, :-1]) / 2).sum(axis=1)
     return areas
 

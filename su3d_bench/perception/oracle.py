@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from su3d_bench.compiled_open3d import compiled_open3d
 from su3d_bench.perception.cache import array_digest, content_key, source_digest
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.oracle_noise import OracleNoise, disturb
@@ -54,8 +55,7 @@ class MeshProjector:
         return self._fill(instance, depth_m, measured & ~agrees, agrees)
 
     def _cast(self, frame: Frame) -> tuple[Float32Array, Int32Array]:
-        import open3d as o3d
-
+        o3d = compiled_open3d()
         if self._scene is None:
             self._scene = o3d.t.geometry.RaycastingScene(nthreads=1)
             self._scene.add_triangles(

@@ -24,7 +24,9 @@ MAGIC = b"\x93NUMPY"
 MOST_HEADER = 10_000  # NumPy's own limit
 DESCR = re.compile(rb"'descr':\s*'([^']{1,16})'")
 ORDER = re.compile(rb"'fortran_order':\s*(True|False)")
-SHAPE = re.compile(rb"'shape':\s*\(((?:\d{1,18}L?,?\s?){0,9})\)")
+SHAPE = re.compile(rb"'shape':\s*\(([0-9L,\s]{0,250})\)")
+SIZE = re.compile(rb"\d+")
+MOST_DIGITS = 18  # of a size
 
 
 @dataclass(frozen=True)
@@ -52,10 +54,11 @@ def npy_header(content: bytes) -> NpyHeader | None:
     if start > min(len(content), MOST_HEADER) or found[0] is None or found[1] is None or found[2] is None:
         return None
     code = found[0][1].decode("latin1")
-    shape = tuple(int(size) for size in re.findall(rb"\d+", found[2][1]))
-    if SIMPLE_TYPE.fullmatch(code) is None or len(shape) > MOST_DIMENSIONS:
+    sizes = SIZE.findall(found[2][1])
+    is_odd = len(sizes) > MOST_DIMENSIONS or any(len(size) > MOST_DIGITS for size in sizes)
+    if SIMPLE_TYPE.fullmatch(code) is None or is_odd:
         return None
-    return NpyHeader(code, found[1][1] == b"True", shape, start)
+    return NpyHeader(code, found[1][1] == b"True", tuple(map(int, sizes)), start)
 
 
 def npy_header_of(path: Path) -> NpyHeader | None:

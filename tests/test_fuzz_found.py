@@ -1,0 +1,153 @@
+"""What fuzzing found readers and the command line to stumble over: each is one clear line now."""
+
+from __future__ import annotations
+
+import io
+import json
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from su3d_bench.cli.main import main
+from su3d_bench.config import parse_value, read_file
+from su3d_bench.datasets.query_files import read_query_file
+from su3d_bench.errors import MOST_CHARACTERS, ConfigError, DataError, PredictionError, StoreError, Su3dError
+from su3d_bench.estimate import recent_update_s
+from su3d_bench.finished_run import read_run
+from su3d_bench.kept_files import DAMAGE, read_arrays
+from su3d_bench.predictions.numpy_files import read_npy
+from su3d_bench.protocols import read_protocol
+from su3d_bench.store import is_file, read_json, read_prediction
+
+DEEP, LONG = "[" * 100_000, "1" * 5000
+NO_TEXT = np.array([0x3F800000], np.uint32).tobytes()  # a float's bits where a character should be
+
+
+def npz(folder: Path, header: str, body: bytes = b"") -> Path:
+    """An archive of one array, which says of itself what ``header`` says."""
+    text = header.encode().ljust(117) + b"\n"
+    member = b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text + body
+    with zipfile.ZipFile(folder / "a.npz", "w") as archive:
+        archive.writestr("a.npy", member)
+    return folder / "a.npz"
+
+
+@pytest.mark.parametrize(
+    ("header", "body"),
+    [
+        ("{'descr': '<f4', 'fortran_order': False, 'shape': (3,", b""),  # no end: tokenize's own error
+        ("{'descr': '<f4', 'fortran_order': False, 'shape': (1099511627776,)}", b""),
+        ("{'descr': '<f4', 'fortran_order': False, 'shape': (0, -4)}", b""),
+        ("{'descr': '<U0', 'fortran_order': False, 'shape': (1099511627776,)}", b""),  # of no bytes, says NumPy
+        ("{'descr': '<U1', 'fortran_order': False, 'shape': (1,)}", NO_TEXT),
+        ("{'descr': '|O', 'fortran_order': False, 'shape': (1,)}", b"\x80\x04N."),
+    ],
+)
+def test_no_header_of_an_array_is_believed(tmp_path: Path, header: str, body: bytes) -> None:
+    path = npz(tmp_path, header, body)
+    with pytest.raises(DAMAGE):
+        read_arrays(path)
+    with pytest.raises(StoreError, match=r"a\.npz: not a readable \.npz file"):
+        read_prediction(path)
+
+
+def test_a_member_that_is_no_array_is_damage() -> None:
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as archive:
+        archive.writestr("a.npy", b"no array")
+    with pytest.raises(DAMAGE):
+        read_arrays(content)
+
+
+@pytest.mark.parametrize("dtype", ["<f4", ">f8", "<i8", "|b1", "<U5", ">U2", "|S3", "<c8"])
+@pytest.mark.parametrize("shape", [(), (0,), (3,), (2, 0, 3), (2, 3, 4)])
+@pytest.mark.parametrize("order", ["C", "F"])
+def test_arrays_are_read_as_numpy_reads_them(tmp_path: Path, dtype: str, shape: tuple[int, ...], order: str) -> None:
+    array = np.asarray(np.arange(int(np.prod(shape))).reshape(shape).astype(dtype), order=order)  # type: ignore[call-overload]
+    np.savez(tmp_path / "a.npz", a=array)
+    ours = read_arrays(tmp_path / "a.npz")["a"]
+    with np.load(tmp_path / "a.npz") as theirs:
+        np.testing.assert_array_equal(ours, theirs["a"])
+        assert (ours.dtype, ours.shape, ours.flags.writeable) == (theirs["a"].dtype, array.shape, True)
+
+
+def test_a_shape_of_hundreds_of_digits_is_refused_at_once(tmp_path: Path) -> None:
+    header = f"{{'descr': '<f4', 'fortran_order': False, 'shape': ({'1' * 400},), }}".encode() + b"\n"
+    (tmp_path / "a.npy").write_bytes(b"\x93NUMPY\x01\x00" + len(header).to_bytes(2, "little") + header)
+    started = time.monotonic()
+    with pytest.raises(PredictionError, match=r"a\.npy"):
+        read_npy(tmp_path / "a.npy")
+    assert time.monotonic() - started < 5
+
+
+@pytest.mark.parametrize(
+    ("read", "error"), [(read_file, ConfigError), (read_protocol, ConfigError), (read_query_file, DataError)]
+)
+@pytest.mark.parametrize("text", [f"a = {DEEP}", f"a = {LONG}", f"[[query]]\nobjects = [{LONG}]\n"])
+def test_toml_nested_or_numbered_beyond_reason_is_refused(
+    tmp_path: Path, read: Callable[[Path], object], error: type[Su3dError], text: str
+) -> None:
+    (tmp_path / "a.toml").write_text(text)
+    with pytest.raises(error, match=r"a\.toml"):
+        read(tmp_path / "a.toml")
+
+
+@pytest.mark.parametrize("text", [DEEP, LONG])
+def test_an_assignment_beyond_reason_is_text(text: str) -> None:
+    assert parse_value(text) == text
+
+
+@pytest.mark.parametrize("text", [DEEP, '{"a":' * 50_000, f'{{"a": {LONG}}}'])
+def test_a_record_nested_or_numbered_beyond_reason_is_refused(tmp_path: Path, text: str) -> None:
+    (tmp_path / "run.json").write_text(text)
+    with pytest.raises(StoreError, match=r"run\.json: not readable as JSON"):
+        read_json(tmp_path / "run.json")
+
+
+def test_a_name_that_no_file_can_have_is_no_file(tmp_path: Path) -> None:
+    assert not is_file(tmp_path / ("a" * 20_000))
+    with pytest.raises(StoreError, match=r"holds no run\.json"):
+        read_run(tmp_path / ("a" * 20_000))
+
+
+@pytest.mark.parametrize(
+    "content", [b"total_ms\n0b1\n", b"total_ms\n\xff\n", b"other\n1\n", b"a,total_ms\n1\n", b"total_ms\nnan\n", b""]
+)
+def test_a_damaged_table_of_times_is_left_out_of_the_estimate(tmp_path: Path, content: bytes) -> None:
+    for name, table in (("a", b"total_ms\n4\n8\n"), ("b", content)):
+        job = tmp_path / name / "scenes/rooms.x/opensu3d"
+        job.mkdir(parents=True)
+        (job / "updates.csv").write_bytes(table)
+    assert recent_update_s(tmp_path, "opensu3d") == pytest.approx(0.006)
+
+
+def test_what_an_error_quotes_can_be_shown_on_a_terminal() -> None:
+    text = str(DataError("a.ply:\x1b[31m 'propert\0' \u202e\n is not PLY" + "x" * 5000))
+    assert text.startswith(r"a.ply:\x1b[31m 'propert\x00' \u202e is not PLYxxx") and text.isprintable()
+    assert len(text) == MOST_CHARACTERS
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["methods", "opensu3d", ""], "su3d-bench: methods: unknown argument ''"),
+        (["report", "a\"b'c"], "su3d-bench: report: unknown"),
+        (["sheets", "make", "--kind", "'", "--out", "x", "y"], "su3d-bench: sheets make: unknown --kind"),
+        (["\x1b[31m"], r"su3d-bench: unknown VERB '\x1b[31m'"),
+    ],
+)
+def test_odd_words_are_answered_in_one_line(words: list[str], line: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(words) == 2
+    said = capsys.readouterr().err
+    assert said.startswith(line) and said.count("\n") == 1 and said.rstrip("\n").isprintable()
+
+
+def test_a_list_of_scenes_that_are_no_names_is_refused(tmp_path: Path) -> None:
+    (tmp_path / "run.json").write_text(json.dumps({"scenes": [1]}))
+    (tmp_path / "metrics.json").write_text("{}")
+    with pytest.raises(StoreError, match=r"run\.json"):
+        read_run(tmp_path)
