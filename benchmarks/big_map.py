@@ -154,8 +154,8 @@ def main() -> None:
     if arguments.json:
         title = f"A map of {arguments.points / 1e6:g} million points and {arguments.instances:,} instances"
         notes = [
-            "Memory is the resident set at its highest in each step. The score is that of rooms-semantic, for the truth of "
-            "instance AP may hold 999 instances at most."
+            "Memory is the resident set at its highest in each step. The score is that of rooms-semantic; for instance "
+            "AP the truth of a scene may hold 999 instances at most."
         ]
         columns = ["step", "time", "peak memory, MiB", "what came out"]
         write_measured(arguments.json, title, "python benchmarks/big_map.py", columns, rows, notes)

@@ -33,7 +33,10 @@ def compiled_open3d() -> Any:
         spec = spec_from_file_location(NAME, file)
         assert spec is not None and spec.loader is not None
         module = module_from_spec(spec)
-        spec.loader.exec_module(module)
+        try:
+            spec.loader.exec_module(module)
+        except ImportError:  # a library that the package loads first; its own message is the better one
+            return importlib.import_module("open3d")
         sys.modules[NAME] = module
         return module
 

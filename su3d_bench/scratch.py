@@ -30,7 +30,7 @@ class Scratch:
     """A file without a name that takes arrays, ``n_bytes`` in all; it is gone with the process, however that ends."""
 
     def __init__(self, most_in_memory_bytes: int = MOST_IN_MEMORY_BYTES) -> None:
-        self._file = tempfile.SpooledTemporaryFile(most_in_memory_bytes, dir=scratch_folder())  # noqa: SIM115
+        self._file = tempfile.SpooledTemporaryFile(most_in_memory_bytes, dir=str(scratch_folder()))  # noqa: SIM115
         self.n_bytes = 0
 
     def put(self, array: NDArray[Any]) -> StoredRows:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -285,15 +286,15 @@ def check_paper(file: Path, root: Path | None = None) -> list[CellCheck]:
 
 def _sources(file: Path) -> Iterator[tuple[Path, str]]:
     """The source itself, then what it reads, each file once."""
-    waiting, known = [file], {file.resolve()}
+    waiting, known = [file], {os.path.realpath(file)}
     while waiting:
         source = waiting.pop(0)
         text = _source_text(source)
         yield source, text
         for name in _READ_SOURCE.findall(_COMMENT.sub("", text)):
             path = _read_from(file.parent, name)
-            if path is not None and path.resolve() not in known and len(known) < MOST_SOURCES:
-                known.add(path.resolve())
+            if path is not None and os.path.realpath(path) not in known and len(known) < MOST_SOURCES:
+                known.add(os.path.realpath(path))
                 waiting.append(path)
 
 

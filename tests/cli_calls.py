@@ -35,6 +35,6 @@ def called(words: Sequence[str]) -> None:
         return
     if not lines or len(lines) > MOST_LINES or not lines[-1].startswith("su3d-bench: "):
         raise BadMessage(f"exit code {code} and {len(lines)} lines: {said[-300:]!r}")
-    if (fault := fault_of_message(lines[-1])) is not None:
+    if (fault := fault_of_message(lines[-1].removeprefix("su3d-bench: "))) is not None:
         raise BadMessage(f"exit code {code}: {fault}")
     raise Declined(lines[-1])

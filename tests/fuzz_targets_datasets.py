@@ -26,12 +26,13 @@ def _whole_dataset(make: Callable[[], Any], scene: str) -> Read:
         yield lambda: dataset.instance_mesh(scene)
         for name in ("surface", "problems", "queries", "object_boxes", "status"):
             if hasattr(dataset, name):
-                yield lambda name=name: _used_up(getattr(dataset, name)(scene))
+                yield partial(_used_up, getattr(dataset, name), scene)
 
     return lambda: every_one_of(asked())
 
 
-def _used_up(found: Any) -> object:
+def _used_up(ask: Callable[[str], Any], scene: str) -> object:
+    found = ask(scene)
     return list(found) if isinstance(found, Iterator) else found
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -103,16 +104,16 @@ def _own_prediction(kind: str) -> Make:
         from prediction_files import own_instances
 
         from su3d_bench.store import read_prediction, write_prediction
-        from su3d_bench.types import DenseFeatures, Partition
+        from su3d_bench.types import DenseFeatures, Partition, Prediction
 
         points = np.zeros((3, 3), np.float32)
-        predictions = {
-            "instances": own_instances,
-            "partition": lambda: Partition(points, np.array([0, -1, 0], np.int32), np.ones((1, 4), np.float32)),
-            "dense": lambda: DenseFeatures(points, np.ones((3, 4), np.float16)),
+        predictions: dict[str, Prediction] = {
+            "instances": own_instances(),
+            "partition": Partition(points, np.array([0, -1, 0], np.int32), np.ones((1, 4), np.float32)),
+            "dense": DenseFeatures(points, np.ones((3, 4), np.float16)),
         }
         path = folder / "prediction.npz"
-        write_prediction(path, predictions[kind]())
+        write_prediction(path, predictions[kind])
         return lambda: read_prediction(path)
 
     return make
@@ -147,8 +148,8 @@ def _proposals(folder: Path) -> Read:
 
     def asked() -> Iterator[Read]:
         for name in ("text", "torch"):
-            yield lambda name=name: digest_of_folder(folder / name)
-            yield lambda name=name: read_proposals(folder / name, "room0", flat())
+            yield partial(digest_of_folder, folder / name)
+            yield partial(read_proposals, folder / name, "room0", flat())
 
     return lambda: every_one_of(asked())
 

@@ -9,6 +9,7 @@ import json
 import shutil
 import tempfile
 from collections.abc import Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -48,9 +49,15 @@ def _copied_run(folder: Path) -> Path:
     return folder / "runs/a"
 
 
+def _checked_counts(side: Any, protocol: str) -> None:
+    from su3d_bench.comparison_sides import check_shapes, rules_of
+
+    check_shapes(rules_of(side, protocol), side, side.run.scores(side.method).get(protocol, {}))
+
+
 def _run(folder: Path) -> Read:
     """Everything that is read of a finished run."""
-    from su3d_bench.comparison_sides import Side, check_shapes, rules_of
+    from su3d_bench.comparison_sides import Side
     from su3d_bench.estimate import recent_update_s
     from su3d_bench.finished_run import read_run
     from su3d_bench.finished_updates import read_update_times
@@ -71,15 +78,11 @@ def _run(folder: Path) -> Read:
         run = read_run(path)
         yield lambda: check(run, read_reference(reference))
         for method in (*run.methods[:3], "collector"):
-            yield lambda method=method: read_update_times(run, method)
+            yield partial(read_update_times, run, method)
             side = Side(run, method)
-            scores: dict[str, Any] = {}
-            yield lambda method=method, scores=scores: scores.update(run.scores(method))
+            yield partial(run.scores, method)
             for protocol in (*list(run.protocols)[:3], "rooms-semantic"):
-                yield lambda side=side, protocol=protocol: rules_of(side, protocol)
-                yield lambda side=side, protocol=protocol, scores=scores: check_shapes(
-                    rules_of(side, protocol), side, scores.get(protocol, {})
-                )
+                yield partial(_checked_counts, side, protocol)
 
     return lambda: every_one_of(asked())
 
@@ -223,7 +226,7 @@ def _method_config(folder: Path) -> Read:
         yield lambda: check_keys(settings)
         yield lambda: resolve(settings, ("perception",), PerceptionConfig)
         for name, model in classes.items():
-            yield lambda name=name, model=model: resolve(settings, ("method", name), model)
+            yield partial(resolve, settings, ("method", name), model)
 
     return lambda: every_one_of(asked())
 
@@ -234,7 +237,7 @@ def _protocol(folder: Path) -> Read:
     for name in ("rooms-semantic", "openlex3d-topn", "rooms-instance"):
         (folder / f"{name}.toml").write_bytes(rules_file(name).read_bytes())
     files = sorted(folder.glob("*.toml"))
-    return lambda: every_one_of(iter([lambda file=file: read_protocol(file) for file in files]))
+    return lambda: every_one_of(iter([partial(read_protocol, file) for file in files]))
 
 
 def _published(folder: Path) -> Read:
@@ -265,8 +268,8 @@ def _assignments(folder: Path) -> Read:
         path = folder / "words.txt"
         text = path.read_bytes().decode("utf-8", "surrogateescape") if path.is_file() else ""
         for word in [line for k, line in enumerate(text.split("\n")[:20]) if k != 1]:
-            yield lambda word=word: read_assignments([word], ["opensu3d"], ["rooms"])
-            yield lambda word=word: parse_value(word)
+            yield partial(read_assignments, [word], ["opensu3d"], ["rooms"])
+            yield partial(parse_value, word)
         assigned, varied = [*text.split("\n"), ""][:2]
         yield lambda: named_method(f"opensu3d@{assigned.removeprefix('opensu3d.')}")
         yield lambda: ablation_rows("opensu3d", [varied], is_grid=True)
@@ -299,11 +302,11 @@ def _replies(folder: Path) -> Read:
         except (ValueError, RecursionError, TypeError):
             texts = []
         for text in [*texts[:10], content.decode("utf-8", "replace")]:
-            yield lambda text=text: parsing.is_refusal(text)
-            yield lambda text=text: parsing.described(text)
-            yield lambda text=text: parsing.chosen_name(text, ["chair", "sofa", "armchair"])
-            yield lambda text=text: parsing.answered(text, [3, 4, 70])
-            yield lambda text=text: parsing.clean_name(text)
+            yield partial(parsing.is_refusal, text)
+            yield partial(parsing.described, text)
+            yield partial(parsing.chosen_name, text, ["chair", "sofa", "armchair"])
+            yield partial(parsing.answered, text, [3, 4, 70])
+            yield partial(parsing.clean_name, text)
 
     return lambda: every_one_of(asked())
 

@@ -31,6 +31,7 @@ WHILE_LOADED_S = 300
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Any]:
     """Three machines of one core: the driver's, which takes no job, one with a GPU in name, and one to be killed."""
+    os.environ["RAY_USAGE_STATS_ENABLED"] = "0"  # no test asks the network for anything
     from ray.cluster_utils import Cluster
 
     small = {"object_store_memory": 80_000_000, "include_dashboard": False}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import random
+from functools import partial
 from pathlib import Path
 
 import pytest
@@ -92,7 +93,7 @@ def test_the_first_refusal_of_several_questions_is_raised_and_all_are_asked() ->
         raise DataError(f"refusal {k}")
 
     with pytest.raises(DataError, match="refusal 0"):
-        every_one_of(iter([lambda k=k: refusing(k) for k in range(3)]))
+        every_one_of(iter([partial(refusing, k) for k in range(3)]))
     assert asked == [0, 1, 2]
 
 

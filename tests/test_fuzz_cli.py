@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Iterator
 
 import pytest
 from cli_calls import Declined, called
@@ -24,7 +25,7 @@ QUIET = settings(
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _empty_place(tmp_path_factory: pytest.TempPathFactory) -> None:
+def _empty_place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
     """A folder with a few files of the right names and no data."""
     folder = tmp_path_factory.mktemp("cli")
     (folder / "folder").mkdir()

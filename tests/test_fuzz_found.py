@@ -22,6 +22,7 @@ from su3d_bench.kept_files import DAMAGE, read_arrays
 from su3d_bench.predictions.numpy_files import read_npy
 from su3d_bench.protocols import read_protocol
 from su3d_bench.store import is_file, read_json, read_prediction
+from su3d_bench.table_sources import check_paper
 
 DEEP, LONG = "[" * 100_000, "1" * 5000
 NO_TEXT = np.array([0x3F800000], np.uint32).tobytes()  # a float's bits where a character should be
@@ -144,6 +145,12 @@ def test_odd_words_are_answered_in_one_line(words: list[str], line: str, capsys:
     assert main(words) == 2
     said = capsys.readouterr().err
     assert said.startswith(line) and said.count("\n") == 1 and said.rstrip("\n").isprintable()
+
+
+def test_a_paper_that_links_to_itself_cannot_be_read(tmp_path: Path) -> None:
+    (tmp_path / "paper.tex").symlink_to("paper.tex")
+    with pytest.raises(ConfigError, match=r"paper\.tex: cannot be read"):
+        check_paper(tmp_path / "paper.tex")
 
 
 def test_a_list_of_scenes_that_are_no_names_is_refused(tmp_path: Path) -> None:

@@ -339,7 +339,5 @@ def test_a_compiled_kernel_whose_kept_form_is_damaged_is_compiled_again(tmp_path
 
 def test_a_temporary_folder_that_cannot_be_made_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "not there"))
-    with pytest.raises(
-        StoreError, match="cannot make a temporary folder below .*not there: No such file or directory;"
-    ):
+    with pytest.raises(StoreError, match=r"cannot make a temporary folder below .*not there: No such file"):
         TemporaryFolder("su3d-test-")
