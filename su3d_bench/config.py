@@ -24,6 +24,12 @@ SECTIONS = ("method", "dataset", "perception")
 DEFAULT_SOURCE = "default"
 
 
+# Where scenes run and what is drawn of them: neither moves a number.
+MOVES_NO_NUMBER = frozenset(
+    {"jobs", "pictures", "offline", "executor", "ray_address", "gpus_per_job", "retries", "slurm"}
+)
+
+
 class RunConfig(BaseModel):
     """The part of a run that belongs to no dataset, method or perception profile.
 

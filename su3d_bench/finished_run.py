@@ -137,6 +137,17 @@ class FinishedRun:
         return found
 
 
+class _Rules(dict[str, tuple[int, str]]):
+    """Version and digest of protocols; one that the run's record does not name is a ``StoreError``."""
+
+    def __init__(self, rules: Mapping[str, tuple[int, str]], shown: str) -> None:
+        super().__init__(rules)
+        self._shown = shown
+
+    def __missing__(self, protocol: str) -> tuple[int, str]:
+        raise StoreError(f"{self._shown}: run.json does not name the protocol '{protocol}'; run its command again")
+
+
 def read_run(path: Path) -> FinishedRun:
     """The run in the folder ``path``; a ``StoreError`` where it holds none, or one that is not finished."""
     shown = printable(str(path), 200)
@@ -150,7 +161,7 @@ def read_run(path: Path) -> FinishedRun:
         folder=RunFolder(path),
         scenes=record.scenes,
         methods=record.methods,
-        protocols={one.name: (one.version, one.digest) for one in record.protocols},
+        protocols=_Rules({one.name: (one.version, one.digest) for one in record.protocols}, shown),
         data_digests=record.data_digests,
         results={(one.method, one.protocol): _result_record(one) for one in metrics.results},
         is_partial=record.is_partial,

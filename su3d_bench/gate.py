@@ -14,6 +14,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from su3d_bench.config import MOVES_NO_NUMBER
 from su3d_bench.errors import ConfigError, StoreError
 from su3d_bench.finished_run import FinishedRun
 from su3d_bench.finished_updates import read_update_times
@@ -28,7 +29,7 @@ ACROSS_MACHINES = 0.02  # 2 points: what ONNX Runtime's and BLAS's kernels of ot
 BUSY = 1.5
 COST_LIMIT = 1.4  # an update may cost so many times the reference's; single runs scatter by a tenth to a fifth
 # Settings that name what was asked for or move no number; scenes, methods and protocols are compared one by one.
-NOT_COMPARED = ("scenes", "methods", "protocols", "jobs", "pictures", "offline", "perception.cache")
+NOT_COMPARED = frozenset({"scenes", "methods", "protocols", "perception.cache"}) | MOVES_NO_NUMBER
 _SHARES = ("recall", "precision", "IoU", "F1", "F1-conceptgraphs", "mPrecision", "mF1", "mF1-conceptgraphs", "pAcc")
 HIGHER_IS_BETTER = frozenset({"AP", "AP50", "AP25", "mAcc", "mIoU", "F-mIoU", "synonyms", "overall", *_SHARES})
 

@@ -144,6 +144,8 @@ def _why_not(run: FinishedRun, protocol: str, failed: Sequence[str]) -> str | No
         return f"is incomplete: {len(failed)} scenes failed"
     if protocol not in protocol_names():
         return "its protocol is none of those installed here"
+    if protocol not in run.protocols:
+        return "its protocol is none of those that run.json names"
     here, (version, digest) = load_protocol(protocol), run.protocols[protocol]
     if version != here.version:
         return f"was scored under version {version} of the protocol, here it is {here.version}"

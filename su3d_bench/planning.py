@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench import registry
-from su3d_bench.config import RunConfig, Settings, check_keys, check_names, read_assignments, resolve
+from su3d_bench.config import MOVES_NO_NUMBER, RunConfig, Settings, check_keys, check_names, read_assignments, resolve
 from su3d_bench.digests import code_digest, digest_json
 from su3d_bench.distant_scene import CACHE_ROOT, fetch_seals, mirror_of
 from su3d_bench.errors import ConfigError, DataError, StoreError, suggest
@@ -37,8 +37,6 @@ from su3d_bench.store import RunFolder
 from su3d_bench.types import Dataset
 
 DATA_ROOT = "~/.cache/su3d-bench/data"
-# Where scenes run, and what is drawn of them, is no other run.
-MOVES_NO_NAME = {"jobs", "pictures", "offline", "executor", "ray_address", "gpus_per_job", "retries", "slurm"}
 NO_SYSTEMS = (CEILING_METHOD, "command")  # what `--methods all` leaves out: the truth itself, and programs of others
 
 
@@ -317,7 +315,7 @@ def _folder(out: Path | str | None, config: RunConfig, parts: _Parts) -> Path:
 
 
 def _run_name(config: RunConfig, parts: _Parts) -> str:
-    request = config.model_dump(mode="json", exclude=MOVES_NO_NAME)
+    request = config.model_dump(mode="json", exclude=set(MOVES_NO_NUMBER))
     options = [part.options for part in (*parts.methods, *parts.datasets.values())]
     key = digest_json([request, options, parts.perception, code_digest()])[:8]
     return "-".join([*(part.name for part in parts.datasets.values()), config.profile, key])

@@ -44,7 +44,7 @@ def _command(out: Path) -> list[str]:
     return [*words, "--anytime", "0.5", "--out", str(out), "--quiet"]
 
 
-def _copied_run(folder: Path) -> Path:
+def copied_run(folder: Path) -> Path:
     shutil.copytree(_made_run(), folder / "runs/a")
     return folder / "runs/a"
 
@@ -65,7 +65,7 @@ def _run(folder: Path) -> Read:
     from su3d_bench.leaderboard import leaderboard
     from su3d_bench.table_sources import measured_results
 
-    path, reference = _copied_run(folder), folder / "reference.json"
+    path, reference = copied_run(folder), folder / "reference.json"
     reference.write_text(json.dumps(learn([read_run(path)]).model_dump(mode="json")))
     is_scored_again = itertools.cycle([True, False, False, False])  # the leaderboard draws intervals, which is slow
 
@@ -89,7 +89,7 @@ def _run(folder: Path) -> Read:
 
 def _verbs(folder: Path) -> Read:
     """The verbs that read a run folder, from the command line, in turn."""
-    run = _copied_run(folder)
+    run = copied_run(folder)
     called(["check", "--learn", str(run), "--out", str(folder / "reference.json")])
     commands = itertools.cycle(
         [
@@ -121,7 +121,7 @@ def _resumed(folder: Path) -> Read:
 
     from su3d_bench import scene_run
 
-    words = _command(_copied_run(folder))
+    words = _command(copied_run(folder))
 
     def read() -> None:
         with pytest.MonkeyPatch.context() as patch:
@@ -141,7 +141,7 @@ def _counts(folder: Path) -> Read:
 
 
 def _paper(folder: Path) -> Read:
-    run, paper = _copied_run(folder), folder / "paper.tex"
+    run, paper = copied_run(folder), folder / "paper.tex"
     called(["report", "tables", str(run), "--format", "latex", "--out", str(paper)])
     return lambda: called(["report", "verify", str(paper), "--root", str(folder)])
 

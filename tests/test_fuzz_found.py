@@ -11,14 +11,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from fuzz_targets_runs import copied_run
 
 from su3d_bench.cli.main import main
+from su3d_bench.comparison_sides import Side, rules_of
 from su3d_bench.config import parse_value, read_file
 from su3d_bench.datasets.query_files import read_query_file
 from su3d_bench.errors import MOST_CHARACTERS, ConfigError, DataError, PredictionError, StoreError, Su3dError
 from su3d_bench.estimate import recent_update_s
 from su3d_bench.finished_run import read_run
 from su3d_bench.kept_files import DAMAGE, read_arrays
+from su3d_bench.leaderboard import leaderboard
 from su3d_bench.predictions.numpy_files import read_npy
 from su3d_bench.protocols import read_protocol
 from su3d_bench.store import is_file, read_json, read_prediction
@@ -151,6 +154,16 @@ def test_a_paper_that_links_to_itself_cannot_be_read(tmp_path: Path) -> None:
     (tmp_path / "paper.tex").symlink_to("paper.tex")
     with pytest.raises(ConfigError, match=r"paper\.tex: cannot be read"):
         check_paper(tmp_path / "paper.tex")
+
+
+def test_results_under_a_protocol_that_the_record_does_not_name_stand_in_no_ranking(tmp_path: Path) -> None:
+    run = copied_run(tmp_path)
+    record = json.loads((run / "run.json").read_text())
+    (run / "run.json").write_text(json.dumps({**record, "protocols": record["protocols"][:1]}))
+    missing = record["protocols"][1]["name"]
+    assert any("none of those that run.json names" in one.reason for one in leaderboard(run.parent).refused)
+    with pytest.raises(StoreError, match=f"run\\.json does not name the protocol '{missing}'"):
+        rules_of(Side(read_run(run), "collector"), missing)
 
 
 def test_a_list_of_scenes_that_are_no_names_is_refused(tmp_path: Path) -> None:
