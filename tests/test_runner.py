@@ -317,7 +317,7 @@ def test_a_killed_worker_fails_its_scene_alone() -> None:
 
 
 def test_an_interrupt_ends_cleanly_and_the_run_resumes() -> None:
-    command = in_process("--jobs", "2", "--set", "painted.frame_ms=100")
+    command = in_process("--jobs", "2", "--set", "painted.frame_ms=500")
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
     for _ in wait_for(job("a")):
         pass
