@@ -47,6 +47,7 @@ class Corridor:
 
     name = "corridor"
     label_space = "corridor"
+    renders_frames = True
     variants: ClassVar[tuple[str, ...]] = ()
 
     class Options(BaseModel):

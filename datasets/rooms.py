@@ -117,6 +117,7 @@ class Rooms:
 
     name = "rooms"
     label_space = "replica"
+    renders_frames = True
     variants: tuple[str, ...] = ("mesh-vertices", "face-corners")
     image_domain: ImageDomain = "rendered-rooms"
     Options = RoomOptions

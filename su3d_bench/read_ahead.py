@@ -18,7 +18,7 @@ class ReadAhead(Generic[Read]):
 
     What reading a frame raises is raised when that frame is asked for, not before. The first frame is read alone: what
     a dataset makes at its first use is made once. Leaving the block, at whatever frame, ends the threads; reads that
-    have begun are waited for.
+    have begun are waited for. ``n_ahead`` 0: each frame is read when it is asked for.
     """
 
     def __init__(self, frames: Sequence[Read], n: int, *, n_threads: int = N_THREADS, n_ahead: int = N_AHEAD) -> None:
@@ -29,7 +29,7 @@ class ReadAhead(Generic[Read]):
         self._threads = ThreadPoolExecutor(n_threads, thread_name_prefix="read-ahead")
 
     def __enter__(self) -> Self:
-        self._begin_up_to(1)
+        self._begin_up_to(min(1, self._n_ahead))
         return self
 
     def __exit__(
@@ -40,6 +40,7 @@ class ReadAhead(Generic[Read]):
 
     def next_frame(self) -> Read:
         """The frame after the one that was taken last."""
+        self._begin_up_to(1)
         frame = self._reading.popleft().result()
         self._begin_up_to(self._n_ahead)
         return frame

@@ -25,7 +25,7 @@ from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_p
 from su3d_bench.protocols import SHARE_KINDS, ProtocolRules, load_protocol
 from su3d_bench.questions.refined import refined_digest, refined_names
 from su3d_bench.questions.truths import question_truth
-from su3d_bench.read_ahead import ReadAhead
+from su3d_bench.read_ahead import N_AHEAD, ReadAhead
 from su3d_bench.reports.pictures import draw_scene
 from su3d_bench.scene_feeding import Feeding
 from su3d_bench.scene_log import SceneLog
@@ -298,7 +298,7 @@ class _Scene:
         start_memory_watch()
         feeding = Feeding(self.job.scene, method, perception, self.report)
         shares = self.job.anytime if method.needs.frames else ()
-        with ReadAhead(frames, n) as ahead:
+        with ReadAhead(frames, n, n_ahead=0 if getattr(self.dataset, "renders_frames", False) else N_AHEAD) as ahead:
             method.start(info)
             for share in shares:
                 feeding.up_to(math.ceil(share * n), ahead, n)

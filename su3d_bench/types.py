@@ -367,7 +367,8 @@ class Dataset(Protocol):
     It may have: ``places()``, the folders that it searches; ``status(scene)``, a word on a scene from a quick look;
     ``groups()``, names for sets of scenes such as ``val``; ``problems(scene)``, every fault of its files, a line each;
     ``surface(scene)``, the scan's mesh without labels; ``queries(scene)``, texts with ``kind`` and ``answers``, the
-    ids of all objects that answer them.
+    ids of all objects that answer them; ``renders_frames = True``, where frames are computed and not read: they are
+    not made ahead then, since the pipeline's timed stages would wait for the interpreter.
     """
 
     name: str

@@ -58,6 +58,15 @@ def test_no_more_frames_are_read_than_may_wait() -> None:
             assert len(frames.begun) == n_taken + 3
 
 
+def test_without_any_ahead_each_frame_is_read_when_it_is_asked_for() -> None:
+    frames = Watched()
+    with ReadAhead(frames, N_FRAMES, n_ahead=0) as ahead:
+        for n_taken in range(3):
+            time.sleep(0.002)
+            assert len(frames.begun) == n_taken
+            assert ahead.next_frame().index == n_taken
+
+
 def test_the_first_frame_is_read_before_any_other_begins() -> None:
     frames, is_over = Watched(lambda _: is_over.wait(10) and None), threading.Event()
     with ReadAhead(frames, N_FRAMES) as ahead:
