@@ -2,8 +2,8 @@
 
 ``python benchmarks/gate_repeats.py [--repeats 50] [--json build/measured/gate_repeats.json]``: the same small run again
 and again, OpenSU3D with perfect masks on the first twelve updates of a room; the first three teach the reference, the
-others are checked against it. Then one of them with the stages of the map slower by half, which must fail. Some
-seconds a run. Exit code 1 where a repeat fails or the slower run passes.
+others are checked against it, and each once more with the stages of the map slower by half, which must fail. Some
+seconds a run. Exit code 1 where a repeat fails or a slower one passes.
 """
 
 from __future__ import annotations
@@ -67,24 +67,24 @@ def main() -> int:
         folder = Path(name)
         taught = [read_run(made(arguments.scene, folder / f"taught{k}")) for k in range(TAUGHT)]
         reference = learn(taught)
-        ratios, failed = [], []
+        ratios, failed, n_caught = [], [], 0
         for k in range(arguments.repeats):
             run = made(arguments.scene, folder / f"repeat{k}")
             ratios.append(update_costs(read_run(run))["opensu3d"] / reference.costs["opensu3d"])
             failed += verdict_of(run, reference)
-        slower = verdict_of(slowed(folder / "repeat0"), reference)
+            n_caught += bool(verdict_of(slowed(run), reference))
     low, high = min(ratios), max(ratios)
     print("\n".join([*failed, f"{arguments.repeats} repeats, {len(failed) // 2} failed; cost {low:.2f} to {high:.2f}"]))
-    print("\n".join(slower) or "the slower run passed")
+    print(f"{n_caught} of them are caught when made slower by half")
     if arguments.json is not None:
         rows = [["unchanged", str(arguments.repeats), str(len(failed) // 2), f"{low:.2f} to {high:.2f}"]]
-        rows.append([f"the map's stages {SLOWER:g} times slower", "1", str(bool(slower) + 0), "-"])
+        rows.append([f"the map's stages {SLOWER:g} times slower", str(arguments.repeats), str(n_caught), "-"])
         notes = [f"The first {TAUGHT} of the runs taught the reference; a cost up to 1.4 times its own passes."]
         write_measured(
             arguments.json, "The gate and repeats of one run", "python benchmarks/gate_repeats.py",
             ["runs", "number", "failed", "cost of an update, times the reference's"], rows, notes,
         )  # fmt: skip
-    return int(bool(failed) or not slower)
+    return int(bool(failed) or n_caught < arguments.repeats)
 
 
 if __name__ == "__main__":

@@ -11,6 +11,7 @@ import sys
 import time
 import tomllib
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -318,7 +319,9 @@ def test_a_killed_worker_fails_its_scene_alone() -> None:
 
 def test_an_interrupt_ends_cleanly_and_the_run_resumes() -> None:
     command = in_process("--jobs", "2", "--set", "painted.frame_ms=500")
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True)
+    # a shell ignores interrupts for what it runs in the background, and children inherit that
+    heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=heard)
     for _ in wait_for(job("a")):
         pass
     os.killpg(process.pid, signal.SIGINT)
