@@ -111,6 +111,6 @@ class RemoteFolder:
     def _telling(self, what: str) -> Iterator[Any]:
         try:
             yield
-        except Exception as error:
+        except Exception as error:  # each driver has errors of its own (botocore's, gcsfs's), with no class in common
             reason = printable(" ".join(str(error).split()) or type(error).__name__, 200)
             raise StoreError(f"{self.url}: {what}: {reason}") from error
