@@ -87,9 +87,10 @@ class _Grid:
 
 def _grid(points: Float64Array, origin: Float64Array, side_m: float) -> _Grid:
     from su3d_bench.baselines import object_clouds_kernels as kernels
+    from su3d_bench.cell_kernels import ABSENT
 
     n = len(points)
-    table = np.full(1 << (2 * n).bit_length(), kernels.ABSENT, np.int32)
+    table = np.full(1 << (2 * n).bit_length(), ABSENT, np.int32)
     cells, cell_of_point = np.empty((n, 3), np.int64), np.empty(n, np.int64)
     n_cells = kernels.cells_of(points, origin, side_m, table, cells, cell_of_point)
     return _Grid(table, cells, cell_of_point, n_cells)

@@ -10,27 +10,10 @@ import math
 
 import numpy as np
 
+from su3d_bench.cell_kernels import ABSENT, slot_of
 from su3d_bench.kernels import njit
 
-ABSENT = -1
 NOISE = -1
-
-
-@njit(cache=True, inline="always")
-def _slot(table, cells, x, y, z):  # type: ignore[no-untyped-def]
-    """Where the cell is in ``table``, or the free slot where it belongs."""
-    size = np.uint64(len(table) - 1)
-    mixed = (
-        np.uint64(x) * np.uint64(0x9E3779B97F4A7C15)
-        ^ np.uint64(y) * np.uint64(0xC2B2AE3D27D4EB4F)
-        ^ np.uint64(z) * np.uint64(0x165667B19E3779F9)
-    )
-    slot = (mixed ^ (mixed >> np.uint64(32))) & size
-    while True:
-        row = table[slot]
-        if row == ABSENT or (cells[row, 0] == x and cells[row, 1] == y and cells[row, 2] == z):
-            return slot
-        slot = (slot + np.uint64(1)) & size
 
 
 @njit(cache=True)
@@ -41,7 +24,7 @@ def cells_of(points, origin, side, table, cells, cell_of_point):  # type: ignore
         x = np.int64(math.floor((points[i, 0] - origin[0]) / side))
         y = np.int64(math.floor((points[i, 1] - origin[1]) / side))
         z = np.int64(math.floor((points[i, 2] - origin[2]) / side))
-        slot = _slot(table, cells, x, y, z)
+        slot = slot_of(table, cells, x, y, z)
         if table[slot] == ABSENT:
             table[slot] = n
             cells[n, 0], cells[n, 1], cells[n, 2] = x, y, z
@@ -72,7 +55,7 @@ def _cells_around(table, cells, n_cells):  # type: ignore[no-untyped-def]
     for cell in range(n_cells):
         for k in range(27):
             x, y, z = cells[cell, 0] + k // 9 - 1, cells[cell, 1] + k // 3 % 3 - 1, cells[cell, 2] + k % 3 - 1
-            around[cell, k] = table[_slot(table, cells, x, y, z)]
+            around[cell, k] = table[slot_of(table, cells, x, y, z)]
     return around
 
 

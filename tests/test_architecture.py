@@ -28,6 +28,7 @@ LAYERS = (
     {"update_times", "gate_findings"},
     {"digests", "toml_text", "row_blocks", "kept_files", "scratch", "temporary_folders"},
     {"kernels"},
+    {"cell_kernels"},
     {"config", "protocols", "rules"},
     {"metrics"},
     {"registry", "store", "scoring"},

@@ -11,29 +11,12 @@ import math
 
 import numpy as np
 
+from su3d_bench.cell_kernels import ABSENT, slot_of
 from su3d_bench.kernels import njit
 
 VOXELS = 512  # of a block
-ABSENT = -1
 UNKNOWN = -2
 STEPS = (0, -1, 1, -2, 2)  # from a query's own voxel, the nearest first
-
-
-@njit(cache=True, inline="always")
-def _slot(table, keys, bx, by, bz):  # type: ignore[no-untyped-def]
-    """Where the block is in ``table``, or the free slot where it belongs."""
-    size = np.uint64(len(table) - 1)
-    mixed = (
-        np.uint64(bx) * np.uint64(0x9E3779B97F4A7C15)
-        ^ np.uint64(by) * np.uint64(0xC2B2AE3D27D4EB4F)
-        ^ np.uint64(bz) * np.uint64(0x165667B19E3779F9)
-    )
-    slot = (mixed ^ (mixed >> np.uint64(32))) & size
-    while True:
-        block = table[slot]
-        if block == ABSENT or (keys[block, 0] == bx and keys[block, 1] == by and keys[block, 2] == bz):
-            return slot
-        slot = (slot + np.uint64(1)) & size
 
 
 @njit(cache=True, inline="always")
@@ -50,7 +33,7 @@ def _voxel(x, eps):  # type: ignore[no-untyped-def]
 def rehash(table, keys, n_blocks):  # type: ignore[no-untyped-def]
     """Enters the first ``n_blocks`` blocks into an empty ``table``."""
     for block in range(n_blocks):
-        table[_slot(table, keys, keys[block, 0], keys[block, 1], keys[block, 2])] = block
+        table[slot_of(table, keys, keys[block, 0], keys[block, 1], keys[block, 2])] = block
 
 
 @njit(cache=True)
@@ -68,7 +51,7 @@ def insert(  # type: ignore[no-untyped-def]
         vx, vy, vz = _voxel(x, eps), _voxel(y, eps), _voxel(z, eps)
         if block == ABSENT or vx >> 3 != bx or vy >> 3 != by or vz >> 3 != bz:
             bx, by, bz = vx >> 3, vy >> 3, vz >> 3
-            slot = _slot(table, keys, bx, by, bz)
+            slot = slot_of(table, keys, bx, by, bz)
             if table[slot] == ABSENT:
                 new_block = counts[1]
                 if new_block == len(keys):
@@ -149,7 +132,7 @@ def nearest(queries, eps, points, following, keys, heads, table, found):  # type
                     nx, ny, nz = (vx >> 3) - mx + 1, (vy >> 3) - my + 1, (vz >> 3) - mz + 1
                     block = around[nx, ny, nz]
                     if block == UNKNOWN:
-                        block = table[_slot(table, keys, vx >> 3, vy >> 3, vz >> 3)]
+                        block = table[slot_of(table, keys, vx >> 3, vy >> 3, vz >> 3)]
                         around[nx, ny, nz] = block
                     j = heads[block, _local(vx, vy, vz)] if block != ABSENT else ABSENT
                     while j != ABSENT:
@@ -199,7 +182,7 @@ def count_inside(  # type: ignore[no-untyped-def]
     for bx in range(first[0], last[0] + 1):
         for by in range(first[1], last[1] + 1):
             for bz in range(first[2], last[2] + 1):
-                block = table[_slot(table, keys, bx, by, bz)]
+                block = table[slot_of(table, keys, bx, by, bz)]
                 if block != ABSENT:
                     _count_block(block, lower, upper, points, ids, following, heads, row_of_id, found)
     return span[0] * span[1] * span[2]

@@ -12,32 +12,15 @@ import math
 
 import numpy as np
 
+from su3d_bench.cell_kernels import ABSENT, slot_of
 from su3d_bench.kernels import njit
 
 NOISE = -1
-ABSENT = -1
 # Of 5x5x5 cells around one, the nearest first; a point within eps lies in one of them.
 _STEPS = np.array(
     sorted(np.ndindex(5, 5, 5), key=lambda step: sum(max(abs(axis - 2) - 1, 0) ** 2 for axis in step)), np.int64
 )
 STEPS = _STEPS[np.argsort((_STEPS != 2).any(axis=1), kind="stable")] - 2
-
-
-@njit(cache=True, inline="always")
-def _slot(table, keys, cx, cy, cz):  # type: ignore[no-untyped-def]
-    """Where the cell is in ``table``, or the free slot where it belongs."""
-    size = np.uint64(len(table) - 1)
-    mixed = (
-        np.uint64(cx) * np.uint64(0x9E3779B97F4A7C15)
-        ^ np.uint64(cy) * np.uint64(0xC2B2AE3D27D4EB4F)
-        ^ np.uint64(cz) * np.uint64(0x165667B19E3779F9)
-    )
-    slot = (mixed ^ (mixed >> np.uint64(32))) & size
-    while True:
-        cell = table[slot]
-        if cell == ABSENT or (keys[cell, 0] == cx and keys[cell, 1] == cy and keys[cell, 2] == cz):
-            return slot
-        slot = (slot + np.uint64(1)) & size
 
 
 @njit(cache=True)
@@ -50,7 +33,7 @@ def _fill_cells(points, eps, table, keys, cell_of):  # type: ignore[no-untyped-d
         cx = np.int64((points[i, 0] - lowest[0]) / side)
         cy = np.int64((points[i, 1] - lowest[1]) / side)
         cz = np.int64((points[i, 2] - lowest[2]) / side)
-        slot = _slot(table, keys, cx, cy, cz)
+        slot = slot_of(table, keys, cx, cy, cz)
         if table[slot] == ABSENT:
             keys[n_cells, 0], keys[n_cells, 1], keys[n_cells, 2] = cx, cy, cz
             table[slot] = n_cells
@@ -88,7 +71,7 @@ def _neighbours(cell, table, keys, steps, around):  # type: ignore[no-untyped-de
     n = 0
     for s in range(len(steps)):
         cx, cy, cz = keys[cell, 0] + steps[s, 0], keys[cell, 1] + steps[s, 1], keys[cell, 2] + steps[s, 2]
-        other = table[_slot(table, keys, cx, cy, cz)]
+        other = table[slot_of(table, keys, cx, cy, cz)]
         if other != ABSENT:
             around[n] = other
             n += 1
