@@ -19,20 +19,10 @@ from su3d_bench.baselines.command_prediction import as_prediction, class_names, 
 from su3d_bench.baselines.command_process import ContainerWatch, Finished, TreeWatch, Watch, run_program
 from su3d_bench.digests import digest_file
 from su3d_bench.errors import ConfigError, DataError, PredictionError, Su3dError
+from su3d_bench.interfaces import MethodAbout, SceneTools, StageTimer
 from su3d_bench.plain_text import printable
-from su3d_bench.predictions.formats import READERS
 from su3d_bench.temporary_folders import TemporaryFolder
-from su3d_bench.types import (
-    Detections,
-    Frame,
-    MethodAbout,
-    PerceptionNeeds,
-    Prediction,
-    SceneInfo,
-    SceneTools,
-    StageTimer,
-    Surface,
-)
+from su3d_bench.types import Detections, Frame, PerceptionNeeds, Prediction, SceneInfo, Surface
 
 logger = logging.getLogger(__name__)
 logger.setLevel(logging.INFO)  # what a program prints goes to the log of its scene
@@ -95,8 +85,11 @@ class CommandConfig(BaseModel):
         for mount in self.mounts:
             if not MOUNT.fullmatch(mount):
                 raise ValueError(f"mount '{mount}' is not HERE:THERE with two absolute paths")
-        if self.format is not None and self.format not in READERS:
-            raise ValueError(f"unknown format '{self.format}'; known: {', '.join(READERS)}")
+        if self.format is not None:
+            from su3d_bench.predictions.formats import READERS  # not for a list of methods
+
+            if self.format not in READERS:
+                raise ValueError(f"unknown format '{self.format}'; known: {', '.join(READERS)}")
         return self
 
     @property

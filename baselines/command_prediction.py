@@ -12,13 +12,14 @@ from su3d_bench.errors import PredictionError
 from su3d_bench.metrics.transfer import masks_of_partition
 from su3d_bench.plain_text import printable
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
-from su3d_bench.predictions.formats import recognise
 from su3d_bench.protocols import load_protocol, protocols_for
 from su3d_bench.types import Instances, Prediction, Surface
 
 
 def read_output(folder: Path, scene: str, format: str | None) -> ScenePrediction:
     """The only prediction in ``folder``, or the one of ``scene`` where there are several."""
+    from su3d_bench.predictions.formats import recognise  # every format there is: not for a list of methods
+
     files = [one for one in folder.iterdir() if not one.name.startswith(".")]
     if not files:
         raise PredictionError("it ended without an error and left nothing in {output}")

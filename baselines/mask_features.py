@@ -9,7 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.types import BoolArray, Float64Array, Frame, Int64Array, RegionPerception
+from su3d_bench.interfaces import RegionPerception
+from su3d_bench.types import BoolArray, Float64Array, Frame, Int64Array
 
 
 @dataclass(frozen=True)

@@ -19,7 +19,8 @@ from su3d_bench.baselines.mask_views import (
 )
 from su3d_bench.baselines.proposals import ProposalConfig, make_proposals
 from su3d_bench.errors import DataError
-from su3d_bench.types import Float32Array, Float64Array, Frame, Instances, Int64Array, SceneInfo, SceneTools, StageTimer
+from su3d_bench.interfaces import SceneTools, StageTimer
+from su3d_bench.types import Float32Array, Float64Array, Frame, Instances, Int64Array, SceneInfo
 
 Pixels = Annotated[int, Field(ge=2, le=65536)]
 

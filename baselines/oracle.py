@@ -5,18 +5,9 @@ from __future__ import annotations
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
+from su3d_bench.interfaces import MethodAbout, StageTimer
 from su3d_bench.perception.naming import scene_caption
-from su3d_bench.types import (
-    Detections,
-    Frame,
-    GroundTruth,
-    Instances,
-    Int32Array,
-    MethodAbout,
-    PerceptionNeeds,
-    SceneInfo,
-    StageTimer,
-)
+from su3d_bench.types import Detections, Frame, GroundTruth, Instances, Int32Array, PerceptionNeeds, SceneInfo
 
 
 class Oracle:

@@ -9,7 +9,6 @@ from pathlib import Path
 from su3d_bench.digests import digest_file, digest_json
 from su3d_bench.errors import PredictionError
 from su3d_bench.predictions.base import VertexMasks, shown
-from su3d_bench.predictions.formats import recognise
 from su3d_bench.types import Proposals, Surface
 
 
@@ -18,6 +17,8 @@ def read_proposals(folder: Path, scene: str, surface: Surface) -> Proposals:
 
     Raises ``PredictionError`` where the files hold no masks, cannot be used, or are of another mesh.
     """
+    from su3d_bench.predictions.formats import recognise  # every format there is: not for a list of methods
+
     reader = recognise(folder)
     prediction = reader.read(folder, scene)
     masks, where = prediction.content, shown(prediction.path)

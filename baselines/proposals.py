@@ -13,8 +13,9 @@ from su3d_bench.baselines.proposal_components import PartRules, split_into_parts
 from su3d_bench.baselines.proposal_files import digest_of_folder, read_proposals
 from su3d_bench.baselines.surface_proposals import SOURCE, NodeChoice, segments_of, surface_proposals
 from su3d_bench.errors import DataError
+from su3d_bench.interfaces import SceneTools
 from su3d_bench.metrics.transfer import Masks, transfer_masks
-from su3d_bench.types import Int64Array, Proposals, SceneTools, Surface
+from su3d_bench.types import Int64Array, Proposals, Surface
 
 Kind = Literal["auto", "files", "surface", "oracle"]
 Metres = Annotated[float, Field(gt=0, allow_inf_nan=False)]

@@ -32,6 +32,7 @@ from su3d_bench.baselines.group_overlap import (
 )
 from su3d_bench.errors import DataError
 from su3d_bench.geometry import back_project, valid_depth
+from su3d_bench.interfaces import MethodAbout, SceneTools, StageTimer
 from su3d_bench.timing import Timer
 from su3d_bench.types import (
     BoolArray,
@@ -42,11 +43,8 @@ from su3d_bench.types import (
     Instances,
     Int32Array,
     Int64Array,
-    MethodAbout,
     PerceptionNeeds,
     SceneInfo,
-    SceneTools,
-    StageTimer,
     Surface,
 )
 

@@ -1,7 +1,7 @@
 """What the embedded profile takes for a frame of 640x480, and its encoder in batches beside one image at a time.
 
-``python -m pytest benchmarks/bench_perception.py --benchmark-only --benchmark-group-by=group``, half a minute. Nothing
-comes from the perception cache; numerical libraries run on one thread, as in a run.
+``python -m pytest benchmarks/bench_perception.py --benchmark-only --benchmark-group-by=group``, one minute. Numerical
+libraries run on one thread, as in a run.
 """
 
 from __future__ import annotations
@@ -12,7 +12,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
+from replica_files import write_replica
 
+from su3d_bench.datasets.replica_frames import ReplicaFrames
 from su3d_bench.datasets.rooms import RoomOptions, Rooms
 from su3d_bench.executors import one_thread
 from su3d_bench.opensu3d.pipeline import OpenSU3D
@@ -50,6 +52,11 @@ def _one_thread() -> Iterator[None]:
         yield
 
 
+@pytest.fixture(scope="module")
+def files(tmp_path_factory: pytest.TempPathFactory, frames: list[Frame]) -> ReplicaFrames:
+    return write_replica(tmp_path_factory.mktemp("files"), frames, N_FRAMES)
+
+
 def note_rate(benchmark: BenchmarkFixture) -> None:
     benchmark.extra_info["frames_a_second"] = round(N_FRAMES / benchmark.stats["median"], 2)
     benchmark.extra_info["at_best"] = round(N_FRAMES / benchmark.stats["min"], 2)
@@ -68,17 +75,44 @@ def test_perception_of_frames_in_memory(
     note_rate(benchmark)
 
 
-def test_perception_of_rendered_frames_read_ahead(
-    benchmark: BenchmarkFixture, room: Rooms, perception: Perception
+def test_perception_of_files_read_ahead(
+    benchmark: BenchmarkFixture, files: ReplicaFrames, perception: Perception
 ) -> None:
-    """As in a run: two threads render the next frames meanwhile."""
+    """As in a run on recordings: two threads read the next frames meanwhile, here JPEG and 16-bit PNG."""
+    benchmark.group = f"Embedded profile, {N_FRAMES} frames of 640x480"
+
+    def perceive() -> None:
+        with ReadAhead(files, N_FRAMES) as ahead:
+            for _ in range(N_FRAMES):
+                perception.detect(ahead.next_frame(), NEEDS, Timer())
+
+    benchmark.pedantic(perceive, rounds=5, warmup_rounds=1)
+    note_rate(benchmark)
+
+
+def test_rendering_and_perception_of_a_room(benchmark: BenchmarkFixture, room: Rooms, perception: Perception) -> None:
+    """As in a run on rooms: each frame is rendered when it is asked for."""
     benchmark.group = f"Embedded profile, {N_FRAMES} frames of 640x480"
     rendered = room.frames("living0", 1600 // N_FRAMES)
 
     def perceive() -> None:
-        with ReadAhead(rendered, N_FRAMES) as ahead:
-            for _ in range(N_FRAMES):
-                perception.detect(ahead.next_frame(), NEEDS, Timer())
+        for i in range(N_FRAMES):
+            perception.detect(rendered[i], NEEDS, Timer())
+
+    benchmark.pedantic(perceive, rounds=5, warmup_rounds=1)
+    note_rate(benchmark)
+
+
+def test_perception_from_the_cache(
+    benchmark: BenchmarkFixture, tmp_path: Path, room: Rooms, frames: list[Frame]
+) -> None:
+    benchmark.group = f"Embedded profile, {N_FRAMES} frames of 640x480"
+    scene = room.info("living0", 1)
+    cached = build_perception("embedded", PerceptionConfig(), scene=scene, cache_root=tmp_path, mesh=None)
+
+    def perceive() -> None:
+        for frame in frames:
+            cached.detect(frame, NEEDS, Timer())
 
     benchmark.pedantic(perceive, rounds=5, warmup_rounds=1)
     note_rate(benchmark)

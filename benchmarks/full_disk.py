@@ -21,7 +21,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
-from kill_at_random import COMPLETE, EXECUTORS, SUBJECTS, Run, false_seals, load_modules, outcome
+from forked_runs import COMPLETE, EXECUTORS, SUBJECTS, Run, false_seals, load_modules, outcome
 from measured import write_measured
 
 REQUEST = (*SUBJECTS["light"], *EXECUTORS["inline"])

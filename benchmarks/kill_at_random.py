@@ -20,9 +20,6 @@ from __future__ import annotations
 import argparse
 import collections
 import contextlib
-import csv
-import io
-import json
 import os
 import random
 import shutil
@@ -34,42 +31,20 @@ import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
+from forked_runs import COMPLETE, EXECUTORS, INCOMPLETE, SUBJECTS, Run, false_seals, load_modules, outcome
 from measured import write_measured
 
-TESTS = Path(__file__).resolve().parents[1] / "tests"
-METHODS = ("opensu3d", "sam3d", "conceptfusion")
-RUN = ("run", "--protocols", "rooms-semantic", "rooms-instance", "--anytime", "0.5", "--no-pictures", "--quiet")
-SUBJECTS = {
-    "light": (
-        *RUN, "--scenes", *(f"{TESTS}/kill_subject.py:Painted/{scene}" for scene in "abc"),
-        "--methods", f"{TESTS}/painted.py:Collector", f"{TESTS}/kill_subject.py:Dense",
-        "--set", "painted.n_frames=4", "painted.frame_ms=10.0", "collector.noise_m=0.01",
-    ),
-    "opensu3d": (
-        *RUN, "--scenes", *(f"{TESTS}/painted.py:Painted/{scene}" for scene in "ab"),
-        "--methods", *METHODS, "--profile", "oracle",
-        "--set", "painted.n_frames=4", *(f"{name}.stride=1" for name in METHODS),
-    ),
-}  # fmt: skip
-EXECUTORS = {
-    "inline": ("--jobs", "1"),
-    "processes": ("--jobs", "2"),
-    "ray": ("--executor", "ray", "--jobs", "2"),
-}
 VICTIMS = {"inline": ("group",), "processes": ("group", "driver", "worker"), "ray": ("driver", "worker")}
 SHARES = {"inline": 12, "processes": 5, "ray": 3}  # of the kills: a run in workers takes many times as long
 A_WORKER = ("spawn_main", "ray::_on_node")  # in the command lines of workers
 LAST_SECOND_NS = 1_000_000_000
 PAGE = 4096
-TIMES = ("_ms", "rss_bytes")
 COLUMNS = ("kills", "of a group", "of a driver", "of a worker", "power cuts", "files spoilt", "compared")
 NOTE = (
     "compared: runs that were taken up again to their end, whose files had the bytes of the undisturbed run; a fault "
     "is a file that differs, a half-written one taken for whole, a lock that stayed, a traceback, or a file left over."
 )
-COMPLETE, INCOMPLETE = 0, 3  # exit codes of the command
 
 
 @dataclass
@@ -78,45 +53,6 @@ class Tally:
 
     done: collections.Counter[str] = field(default_factory=collections.Counter)
     faults: list[str] = field(default_factory=list)
-
-
-class Run:
-    """One run of the command in a process group of its own."""
-
-    def __init__(self, folder: Path, request: Sequence[str], log: Path | None = None) -> None:
-        self._log = log or folder.with_suffix(".log")
-        words = [*request, "--out", str(folder)]
-        self.started = time.monotonic()
-        self.pid = os.fork()
-        if self.pid == 0:
-            self._be_the_command(words)
-
-    def _be_the_command(self, words: list[str]) -> None:
-        code = 4
-        try:
-            os.setsid()
-            log = os.open(self._log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
-            os.dup2(log, 1)
-            os.dup2(log, 2)
-            from su3d_bench.cli.main import main
-
-            code = main(words)
-            sys.stdout.flush()
-            sys.stderr.flush()
-        finally:
-            os._exit(code)
-
-    def finish(self) -> int:
-        """The exit code; minus the signal where one ended it."""
-        _, status = os.waitpid(self.pid, 0)
-        return os.waitstatus_to_exitcode(status)
-
-    def has_ended(self) -> bool:
-        """Whether it is over; its exit code can still be had."""
-        return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
-
-    def said(self) -> str:
-        return self._log.read_text(errors="replace")[-2000:]
 
 
 def workers_below(pid: int) -> list[int]:
@@ -167,52 +103,6 @@ def cut_power(roots: Sequence[Path], moments: random.Random) -> int:
         else:
             path.write_bytes(b"" if way == "empty" else bytes(len(content)))
     return spoilt
-
-
-def outcome(folder: Path) -> dict[str, Any]:
-    """What every file of a run folder holds, without what a clock or a meter put there."""
-    return {
-        path.relative_to(folder).as_posix(): _timeless(path) for path in sorted(folder.rglob("*")) if path.is_file()
-    }
-
-
-def _timeless(path: Path) -> Any:
-    content = path.read_bytes()
-    if path.name == "updates.csv":
-        rows = list(csv.DictReader(io.StringIO(content.decode())))
-        return [{name: value for name, value in row.items() if not name.endswith(TIMES)} for row in rows]
-    if path.name == "done.json":
-        record = json.loads(content)
-        for step in record["steps"].values():
-            step["files"].pop("updates.csv", None)
-            step["remarks"].pop("costs", None)
-        return record
-    return content
-
-
-def false_seals(folder: Path, expected: dict[str, Any]) -> list[str]:
-    """Files that a seal vouches for, or a reader takes for a finished run, though they are not those of a whole run."""
-    from su3d_bench.digests import digest_file
-    from su3d_bench.errors import Su3dError
-    from su3d_bench.finished_run import read_run
-    from su3d_bench.store import JobFolder
-
-    wrong = []
-    for done in folder.rglob("done.json"):
-        for seal in JobFolder(done.parent).seals().values():
-            files = {done.parent / name: sha for name, sha in seal["files"].items()}
-            if all(path.is_file() and digest_file(path) == sha for path, sha in files.items()):
-                names = [path.relative_to(folder).as_posix() for path in files]
-                wrong += [name for name in names if _timeless(folder / name) != expected.get(name)]
-    with contextlib.suppress(Su3dError):
-        run = read_run(folder)
-        if run.is_incomplete:
-            return wrong
-        for method in run.methods:
-            run.scores(method)
-        present = outcome(folder)
-        wrong += [f"{name} of a run that reads as finished" for name in expected if present.get(name) != expected[name]]
-    return wrong
 
 
 class Cluster:
@@ -346,24 +236,6 @@ class Trial:
         print(f"FAULT {self._tally.faults[-1]}", flush=True)
 
 
-def load_modules(subject: str) -> None:
-    """What a run imports, in this one process, which must stay without threads of its own."""
-    from su3d_bench.executors import limit_threads
-
-    limit_threads()
-    import su3d_bench.cli.main
-    import su3d_bench.planning
-    import su3d_bench.reports.tables
-    import su3d_bench.runner
-
-    if subject == "opensu3d":
-        import sklearn.cluster  # noqa: F401
-
-        import su3d_bench.baselines.conceptfusion
-        import su3d_bench.baselines.sam3d
-        import su3d_bench.opensu3d.pipeline  # noqa: F401
-
-
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=200, help="in all; most are of runs inline (default: 200)")
@@ -388,6 +260,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print(f"{n_faults} faults in {time.monotonic() - started:.0f} s")
     if given.json is not None:
         command = f"python benchmarks/kill_at_random.py --kills {given.kills} --seed {given.seed}"
+        command += f" --executors {' '.join(given.executors)} --subject {given.subject}"
         write_measured(given.json, "Runs killed at random", command, ["executor", *COLUMNS, "faults"], rows, [NOTE])
     return 1 if n_faults else 0
 

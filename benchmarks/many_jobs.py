@@ -28,7 +28,7 @@ from su3d_bench.config import Setting, Settings
 from su3d_bench.digests import digest_bytes
 from su3d_bench.planning import Plan, make_plan
 from su3d_bench.runner import record, resolved_values, summarise
-from su3d_bench.scene_run import MethodOutcome, build_method, config_key
+from su3d_bench.scene_job import MethodOutcome, build_method, config_key
 from su3d_bench.store import RunFolder, make_folder, write_json
 from su3d_bench.toml_text import write_toml
 from su3d_bench.types import SceneInfo
@@ -94,25 +94,39 @@ def words(n_scenes: int, out: Path) -> list[str]:
     return ["run", *wanted, "--no-pictures", "--set", f"many.n_scenes={n_scenes}", "--out", str(out), "--dry-run"]
 
 
-def simulate(plan: Plan, source: RunFolder) -> list[MethodOutcome]:
-    """Write every job of ``plan`` as a copy of that of ``source``; their outcomes."""
+def simulate(plan: Plan, source: RunFolder) -> None:
+    """Write every job of ``plan`` after that of ``source``, with numbers of its own."""
     real = source.job(SOURCE, "opensu3d")
-    contents = {path.name: path.read_bytes() for path in (real.counts, real.updates, real.log)}
+    scores = unpack_scores(real.counts.read_bytes())
+    contents = {path.name: path.read_bytes() for path in (real.updates, real.log)}
     steps = json.loads(real.done.read_text())["steps"]
     for step in steps.values():
-        step["files"] = {name: digest_bytes(content) for name, content in contents.items() if name in step["files"]}
-    keys = {part.name: config_key(plan.jobs[0], part, build_method(part)) for part in plan.jobs[0].methods}
-    outcomes = []
+        step["files"].pop(real.prediction.name, None)
+    scenes = FinishedScenes()
+    generator = np.random.default_rng(0)
     for job in plan.jobs:
         for part in job.methods:
             folder = plan.folder.job(job.scene, part.name)
             make_folder(folder.path)
+            contents[real.counts.name] = pack_scores({name: varied(one, generator) for name, one in scores.items()})
             for name, content in contents.items():
                 (folder.path / name).write_bytes(content)
-            steps["predict"]["key"] = keys[part.name] | {"data": "simulated", "profile": "embedded", "perception": "-"}
+            inputs = scenes.inputs(job, part)
+            assert inputs is not None
+            steps["predict"]["key"] = inputs.predict_key()
+            steps["score"]["key"] = inputs.score_key(steps["predict"]["key"], folder)
+            for step in steps.values():
+                step["files"] = {name: digest_bytes(contents[name]) for name in step["files"]}
             folder.done.write_text(json.dumps({"schema": 1, "steps": steps}, indent=2))
-            outcomes.append(MethodOutcome(job.scene, part.name, data_digest="simulated", was_resumed=True, **ENCODER))
-    return outcomes
+
+
+def varied(score: SceneScore, generator: np.random.Generator) -> SceneScore:
+    """``score`` with other confidences, or with confusions drawn anew."""
+    counts = score.counts
+    if isinstance(counts, InstanceCounts):
+        return replace(score, counts=replace(counts, score=generator.random(len(counts.score))))
+    assert isinstance(counts, SemanticCounts)
+    return replace(score, counts=replace(counts, confusion=generator.poisson(counts.confusion)))
 
 
 def seconds_of(command: Sequence[str]) -> float:

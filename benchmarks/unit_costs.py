@@ -29,8 +29,8 @@ SCENES = ("rooms/living0", "rooms/office0")
 STRIDE = 40  # opensu3d's own
 N_CORES = 2  # of the machine that the plan counts in, one job each
 SCANS = 1513
-SCANNET_FRAMES = 2_492_518  # in 1,513 scans (Dai et al. 2017, table 1: 2.5 M frames)
-SCANNET_BYTES = 1.3e12  # of all files (the download page)
+SCANNET_FRAMES = 2_492_518  # in 1,513 scans (Dai et al., CVPR 2017, table 2)
+SCANNET_BYTES = 1.3e12  # "the entire ScanNet release (1.3TB)" in the instructions that come with download-scannet.py
 NETWORK_BYTES_S = 1.25e9  # 10 Gbit/s out of the store, shared by all machines: assumed
 MACHINES = (1, 10, 100)
 GB, TB = 1e9, 1e12
@@ -152,8 +152,9 @@ def main() -> None:
             plan_rows(costs),
             [
                 f"Unit costs, measured here: {units}.",
-                "Not measured: the scans (1,513 with 2,492,518 frames and 1.3 TB, as ScanNet states; every 40th frame "
-                "is an update; a room stands for a scan) and the store's network (10 Gbit/s assumed).",
+                "Not measured: the scans (1,513 with 2,492,518 frames: Dai et al., CVPR 2017, table 2; 1.3 TB: the "
+                "instructions with ScanNet's download-scannet.py; every 40th frame is an update; a room stands for a "
+                "scan) and the store's network (10 Gbit/s assumed).",
             ],
         )
 

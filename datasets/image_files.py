@@ -65,11 +65,10 @@ def decode_colour(content: bytes, where: str) -> UInt8Array:
     size = image_size(content)
     image = None
     if is_whole and size is not None and 0 < size[0] * size[1] <= MAX_PIXELS:
-        image = _decode(content, cv2.IMREAD_COLOR | cv2.IMREAD_IGNORE_ORIENTATION)
+        image = _decode(content, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None or image.dtype != np.uint8:
         raise DataError(f"{where}: not a readable {kind} image; copy the file again")
-    rgb: UInt8Array = cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-    return rgb
+    return np.asarray(image)
 
 
 def decode_depth(content: bytes, where: str) -> UInt16Array:

@@ -141,7 +141,7 @@ class RecordedFrames(Sequence[Frame]):
         frame, recording = self._frames[position], self._recording
         rgb = self._read_colour(frame)
         values = self._read_depth(frame, rgb)
-        depth_m = recording.depth_m_of_value[values]
+        depth_m = recording.depth_m_of_value.take(values)  # half the time of an index
         return Frame(frame.index, frame.timestamp_s, rgb, depth_m, frame.pose, recording.intrinsics)
 
     def _read_colour(self, frame: RecordedFrame) -> UInt8Array:

@@ -186,7 +186,7 @@ class ReplicaFrames(Sequence[Frame]):
             )
         if not values.any():
             raise DataError(f"{where}: empty depth, no pixel is above 0; copy the file again or leave the scene out")
-        depth_m: Float32Array = self._depth_m_of_value[values]
+        depth_m: Float32Array = self._depth_m_of_value.take(values)  # half the time of an index
         return depth_m
 
     def _read(self, name: str) -> tuple[str, bytes]:

@@ -76,12 +76,23 @@ def _generator(*words: object) -> np.random.Generator:
 
 @dataclass
 class BuiltRoom:
-    """A furnished room; what is costly is made when first asked for."""
+    """A furnished room; what is costly is made when first asked for, and kept in ``folder`` if there is one."""
 
     scene: str
     options: RoomOptions
-    plan: Plan
-    truth: RoomTruth
+    folder: Path | None
+
+    @cached_property
+    def plan(self) -> Plan:
+        from su3d_bench.datasets.rooms_kinds import furnish
+
+        return furnish(scene_name_parts(self.scene)[0], _generator("room", self.scene, self.options.seed_offset))
+
+    @cached_property
+    def truth(self) -> RoomTruth:
+        from su3d_bench.datasets.rooms_truth import truth_of
+
+        return truth_of(self.scene, scene_name_parts(self.scene)[0], self.plan)
 
     @cached_property
     def patches(self) -> Patches:
@@ -91,6 +102,11 @@ class BuiltRoom:
 
     @cached_property
     def mesh(self) -> RoomMesh:
+        from su3d_bench.datasets.rooms_kept import kept_mesh
+
+        return kept_mesh(self._kept_in("mesh"), self._bake)
+
+    def _bake(self) -> RoomMesh:
         from su3d_bench.datasets.rooms_mesh import build_mesh
 
         exposure = float(_generator("exposure", self.scene, self.options.seed_offset).uniform(0.58, 0.72))
@@ -104,6 +120,14 @@ class BuiltRoom:
 
     @cached_property
     def trajectory(self) -> Float64Array:
+        from su3d_bench.datasets.rooms_kept import kept_walk
+
+        return kept_walk(self._kept_in("walk"), self.options.n_frames, self._walk)
+
+    def _kept_in(self, what: str) -> Path | None:
+        return None if self.folder is None else self.folder / f"{self.scene}.{what}.npz"
+
+    def _walk(self) -> Float64Array:
         from su3d_bench.datasets.rooms_trajectory import walk
 
         plan = self.plan
@@ -204,6 +228,17 @@ class Rooms:
         words = GENERATOR_VERSION, options.n_frames, options.mesh_spacing_m, options.seed_offset
         return hashlib.sha256("/".join(str(word) for word in words).encode()).hexdigest()[:16]
 
+    def _baked_folder(self, scene: str) -> Path | None:
+        """Where mesh and walk are kept; None for the thousands of training, and where no data root was made yet."""
+        from su3d_bench.digests import NUMERIC_PACKAGES, digest_json, package_versions
+
+        _, number = scene_name_parts(scene)
+        if number >= TRAINING_FROM or not self.root.is_dir():
+            return None
+        packages = package_versions(NUMERIC_PACKAGES)  # another Open3D may bake another last bit
+        words = GENERATOR_VERSION, self.options.n_frames, self.options.seed_offset, sorted(packages.items())
+        return self.root / "rooms" / digest_json(words)[:16]
+
     def visible_vertices(self, scene: str) -> dict[int, int]:
         """Scan vertices of each object id; objects that the walk never sees have none."""
         counts = np.bincount(self.scan(scene).object_of_vertex(), minlength=len(self.objects(scene)) + 1)
@@ -241,13 +276,8 @@ class Rooms:
         return Surface(scan.vertices, scan.faces[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
 
     def _room(self, scene: str) -> BuiltRoom:
-        from su3d_bench.datasets.rooms_kinds import furnish
-        from su3d_bench.datasets.rooms_truth import truth_of
-
         if scene not in self._rooms:
-            kind, _ = scene_name_parts(scene)
-            plan = furnish(kind, _generator("room", scene, self.options.seed_offset))
-            self._rooms[scene] = BuiltRoom(scene, self.options, plan, truth_of(scene, kind, plan))
+            self._rooms[scene] = BuiltRoom(scene, self.options, self._baked_folder(scene))
             while len(self._rooms) > ROOMS_IN_MEMORY:
                 self._rooms.popitem(last=False)
         self._rooms.move_to_end(scene)

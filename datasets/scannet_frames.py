@@ -91,7 +91,8 @@ class ScannetFrames(Sequence[Frame]):
     def __getitem__(self, position: int) -> Frame:  # type: ignore[override]
         i = int(self._records[position])
         pose = self._registration.camera_to_world(self._walk.poses[i])
-        rgb, depth_m = self._registration.images(self._source.colour(i), self._depth_m_of_value[self._source.depth(i)])
+        depth_m = self._depth_m_of_value.take(self._source.depth(i))  # half the time of an index
+        rgb, depth_m = self._registration.images(self._source.colour(i), depth_m)
         return Frame(
             index=int(self._walk.numbers[i]),
             timestamp_s=self._source.timestamp_s(i),

@@ -6,7 +6,7 @@ the test flips the signs of the differences of single scenes.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from typing import Any
 
@@ -21,6 +21,7 @@ from su3d_bench.comparison_sides import (
     refuse_unlike,
     rules_of,
 )
+from su3d_bench.config import MOVES_NO_NUMBER
 from su3d_bench.errors import ConfigError
 from su3d_bench.finished_run import FinishedRun
 from su3d_bench.metrics.resampled_values import resampled_classes, resampled_metrics
@@ -32,7 +33,8 @@ from su3d_bench.statistics import SignFlipTest, percentile_interval, resample_we
 from su3d_bench.types import Float64Array
 
 SCHEMA = 1
-_SETTINGS_ASIDE = ("jobs", "pictures", "scenes", "methods", "protocols")  # they move no number of a common scene
+# They move no number of a common scene.
+_SETTINGS_ASIDE = frozenset({"scenes", "methods", "protocols"}) | MOVES_NO_NUMBER
 Interval = tuple[float, float]
 
 
@@ -101,7 +103,9 @@ def compare(
     compared: list[ProtocolComparison] = []
     for one, other in pairs:
         compared += _compare_methods(one, other, protocols, per_class)
-    remarks = [*_remarks(first.run, second.run), *(line for pair in pairs for side in pair for line in _caveats(side))]
+    sides = [side for pair in pairs for side in pair]
+    remarks = _remarks(first.run, second.run, {side.method for side in sides})
+    remarks += [line for side in sides for line in _caveats(side)]
     return Comparison(first.run.name, second.run.name, tuple(compared), tuple(dict.fromkeys(remarks)))
 
 
@@ -242,7 +246,8 @@ def _caveats(side: Side) -> list[str]:
     return [f"{side.name}: {printable(caveat)}" for caveat in caveats if caveat]
 
 
-def _remarks(left: FinishedRun, right: FinishedRun) -> list[str]:
+def _remarks(left: FinishedRun, right: FinishedRun, methods: Set[str]) -> list[str]:
+    """What must be said of two runs of which ``methods`` are compared."""
     lines = []
     for run in dict.fromkeys((left.name, right.name)):
         one = left if run == left.name else right
@@ -253,7 +258,8 @@ def _remarks(left: FinishedRun, right: FinishedRun) -> list[str]:
     changed = []
     for path in dict.fromkeys([*left.settings, *right.settings]):
         pair = (left.settings.get(path, "not set"), right.settings.get(path, "not set"))
-        if path[0] not in _SETTINGS_ASIDE and pair[0] != pair[1]:
+        is_aside = path[0] in _SETTINGS_ASIDE or (path[0] == "method" and path[1] not in methods)
+        if not is_aside and pair[0] != pair[1]:
             changed.append(printable(f"{'.'.join(path)} {pair[0]} and {pair[1]}", 120))
     if changed:
         lines.append("settings that differ: " + "; ".join(changed[:6]) + _more(len(changed) - 6))

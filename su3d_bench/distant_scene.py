@@ -7,7 +7,8 @@ after them: a job that was sent in part has no seal, or one that its files do no
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -15,7 +16,8 @@ from su3d_bench.digests import digest_bytes
 from su3d_bench.errors import StoreError
 from su3d_bench.executors import Report
 from su3d_bench.remote_folder import RemoteFolder
-from su3d_bench.scene_run import MethodOutcome, SceneJob, failed_outcomes, run_scene
+from su3d_bench.scene_job import MethodOutcome, SceneJob
+from su3d_bench.scene_run import failed_outcomes, run_scene
 from su3d_bench.store import RunFolder, make_folder, write_bytes
 from su3d_bench.temporary_folders import TemporaryFolder
 
@@ -60,33 +62,27 @@ def run_distant_scene(distant: DistantJob, report: Report) -> tuple[MethodOutcom
             return run_scene(job, report)
 
 
-class _stored:  # noqa: N801 - reads as the statement that it is
+@contextmanager
+def _stored(store: RemoteFolder, job: SceneJob) -> Iterator[None]:
     """The files of a job, from the store at the start of the block and back to it at its end."""
+    make_folder(job.folder)
+    store.fetch(store.files(_scene_folder(job)) | store.files(REPLIES), job.folder)
+    before = _stamps(job.folder)
+    try:
+        yield
+    except StoreError as error:
+        raise StoreError(str(error).replace(str(job.folder), store.url)) from error
+    after = _stamps(job.folder)
+    store.remove(name for name in before if name not in after)
+    changed = [name for name, stamp in after.items() if before.get(name) != stamp]
+    store.send(job.folder, sorted(changed, key=lambda name: (name.endswith(f"/{SEAL}"), name)))
 
-    def __init__(self, store: RemoteFolder, job: SceneJob) -> None:
-        self._store, self._folder = store, job.folder
-        self._below = _scene_folder(job)
-        self._before: dict[str, tuple[int, int]] = {}
 
-    def __enter__(self) -> None:
-        make_folder(self._folder)
-        self._store.fetch(self._store.files(self._below) | self._store.files(REPLIES), self._folder)
-        self._before = self._files()
-
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, StoreError):
-            raise StoreError(str(error).replace(str(self._folder), self._store.url)) from error
-        if error is None:
-            after = self._files()
-            changed = [name for name, stamp in after.items() if self._before.get(name) != stamp]
-            self._store.remove(name for name in self._before if name not in after)
-            self._store.send(self._folder, sorted(changed, key=lambda name: (name.endswith(f"/{SEAL}"), name)))
-
-    def _files(self) -> dict[str, tuple[int, int]]:
-        """Inode and time of every file, which a file that is written again does not keep."""
-        found = [path for path in sorted(self._folder.rglob("*")) if path.is_file() and not path.name.endswith(".tmp")]
-        stats = {path.relative_to(self._folder).as_posix(): path.stat() for path in found}
-        return {name: (about.st_ino, about.st_mtime_ns) for name, about in stats.items()}
+def _stamps(folder: Path) -> dict[str, tuple[int, int]]:
+    """Inode and time of every file, which a file that is written again does not keep."""
+    found = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.endswith(".tmp")]
+    stats = {path.relative_to(folder).as_posix(): path.stat() for path in found}
+    return {name: (about.st_ino, about.st_mtime_ns) for name, about in stats.items()}
 
 
 def _scene_folder(job: SceneJob) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import glob
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Any
 
 from su3d_bench.errors import DataError
 from su3d_bench.planning import Plan
-from su3d_bench.scene_run import Part, SceneJob, build_dataset, build_method, stride_of
+from su3d_bench.scene_job import Part, SceneJob, build_dataset, build_method, stride_of
 
 # Where no earlier run says better: an update of opensu3d under the embedded profile at 640x480, and reading, scoring
 # and drawing one room under two protocols, both on two cores of a 2020s server.
@@ -63,7 +64,7 @@ def _of_job(plan: Plan, job: SceneJob, part: Part, measured: float | None, datas
 
 def recent_update_s(runs: Path, method: str) -> float | None:
     """Mean seconds an update in the latest runs below ``runs``, damaged tables aside; None where there is none."""
-    files = [path for path in runs.glob(f"*/scenes/*/{method}/updates.csv") if path.is_file()]
+    files = [path for path in runs.glob(f"*/scenes/*/{glob.escape(method)}/updates.csv") if path.is_file()]
     newest = sorted(files, key=lambda path: path.stat().st_mtime)[-N_RECENT:]
     totals = [ms for path in newest for ms in _totals(path)]
     return sum(totals) / len(totals) / 1e3 if totals else None

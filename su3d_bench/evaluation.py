@@ -46,12 +46,13 @@ from su3d_bench.evaluation_truth import (
     text_scenes,
     text_variant,
 )
+from su3d_bench.interfaces import Encoder
 from su3d_bench.metrics.query_ap import QueryTruth, TextQuery
 from su3d_bench.planning import data_root, why_not_fitting
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexMasks, shown
 from su3d_bench.predictions.scannet_text import ScannetText
 from su3d_bench.protocols import SHARE_KINDS, ProtocolRules, load_protocol, protocol_names
-from su3d_bench.types import Encoder, GroundTruth, Instances
+from su3d_bench.types import GroundTruth, Instances
 
 __all__ = ["Evaluation", "ProtocolEvaluation", "Request", "evaluate"]
 

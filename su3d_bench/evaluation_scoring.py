@@ -19,6 +19,7 @@ from su3d_bench.evaluation_checks import (
     mask_facts,
 )
 from su3d_bench.evaluation_truth import MAX_NYU40_ID, TextTruth
+from su3d_bench.interfaces import Encoder
 from su3d_bench.metrics import instance_ap, semantic, transfer
 from su3d_bench.metrics.labelling import (
     candidate_classes,
@@ -33,16 +34,7 @@ from su3d_bench.metrics.score_instances import OBJECT, encode_without_classes
 from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
 from su3d_bench.protocols import ProtocolRules
 from su3d_bench.scoring import score_scene, why_not_scorable
-from su3d_bench.types import (
-    DenseFeatures,
-    Encoder,
-    Float32Array,
-    GroundTruth,
-    Instances,
-    Int64Array,
-    Partition,
-    Prediction,
-)
+from su3d_bench.types import DenseFeatures, Float32Array, GroundTruth, Instances, Int64Array, Partition, Prediction
 
 NAMED_KINDS = ("annotation", "reasoning")  # go by names alone
 # Ground truths of ScanNet and whose class ids they hold.

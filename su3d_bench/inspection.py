@@ -30,8 +30,9 @@ from su3d_bench.inspection_checks import (
     check_truth,
     facts_of,
 )
+from su3d_bench.interfaces import Dataset
 from su3d_bench.plain_text import printable
-from su3d_bench.types import Dataset, Float32Array, Frame, InstanceMesh
+from su3d_bench.types import Float32Array, Frame, InstanceMesh
 
 SAMPLED_FRAMES = 20
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".ppm", ".pgm"}

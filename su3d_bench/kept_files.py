@@ -37,8 +37,9 @@ def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
 
     As ``numpy.load``, but a header that promises more than its member holds is damage, and no terabyte to allocate.
     """
+    held = source.getvalue() if isinstance(source, io.BytesIO) else None
     with zipfile.ZipFile(source) as archive:
-        arrays = {info.filename.removesuffix(".npy"): _array(archive, info) for info in archive.infolist()}
+        arrays = {info.filename.removesuffix(".npy"): _array(archive, info, held) for info in archive.infolist()}
     for name, array in arrays.items():
         if (
             array.dtype.kind == "U"
@@ -54,9 +55,12 @@ def _codes(texts: np.dtype[Any]) -> np.dtype[Any]:
     return np.dtype(np.uint32).newbyteorder(texts.byteorder)
 
 
-def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
-    if info.file_size <= SMALL_BYTES and (content := archive.read(info)).startswith(MAGIC_1_0):
-        return _small_array(content, info.filename)
+def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, held: bytes | None) -> NDArray[Any]:
+    """``held``: the bytes of the archive where they are in memory."""
+    if info.file_size <= SMALL_BYTES:
+        content = archive.read(info) if held is None else _small_member(held, info)
+        if content.startswith(MAGIC_1_0):
+            return _small_array(content, info.filename)
     with archive.open(info) as member:
         version = np.lib.format.read_magic(member)
         if version not in ((1, 0), (2, 0)):
@@ -68,6 +72,23 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo) -> NDArray[Any]:
         member.seek(0)
         array: NDArray[Any] = np.lib.format.read_array(member, allow_pickle=False)
         return array
+
+
+def _small_member(held: bytes, info: zipfile.ZipInfo) -> bytes:
+    """What ``ZipFile.read`` gives, without the five objects that it makes for each member."""
+    start = info.header_offset
+    signature, flags, method, n_name, n_extra = struct.unpack_from("<4s2xHH16xHH", held, start)
+    if signature != b"PK\x03\x04" or flags & 1 or method != info.compress_type:
+        raise zipfile.BadZipFile(f"{info.filename}: its two headers differ, or it is encrypted")
+    start += 30 + n_name + n_extra
+    packed = held[start : start + info.compress_size]
+    if method == zipfile.ZIP_DEFLATED:
+        packed = zlib.decompressobj(-15).decompress(packed, SMALL_BYTES + 1)
+    elif method != zipfile.ZIP_STORED:
+        raise zipfile.BadZipFile(f"{info.filename}: packed by the method {method}")
+    if len(packed) != info.file_size or zlib.crc32(packed) != info.CRC:
+        raise zipfile.BadZipFile(f"{info.filename}: is not whole")
+    return packed
 
 
 def _item_bytes(dtype: np.dtype[Any]) -> int:

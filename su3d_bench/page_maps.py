@@ -16,6 +16,7 @@ from su3d_bench.attribution import EncoderOf
 from su3d_bench.config import Setting, Settings, resolve
 from su3d_bench.errors import Su3dError
 from su3d_bench.finished_run import FinishedRun
+from su3d_bench.interfaces import Encoder
 from su3d_bench.metrics.labelling import (
     candidate_classes,
     class_index_of_ids,
@@ -41,9 +42,9 @@ from su3d_bench.reports.html_map import (
     thinned,
 )
 from su3d_bench.reports.scene_look import SceneLook, look_at
-from su3d_bench.scene_run import Part, build_dataset
+from su3d_bench.scene_job import Part, build_dataset
 from su3d_bench.store import read_prediction
-from su3d_bench.types import DenseFeatures, Encoder, Frame, GroundTruth, Instances, Int64Array, Prediction
+from su3d_bench.types import DenseFeatures, Frame, GroundTruth, Instances, Int64Array, Prediction
 
 QUERIES = (
     "somewhere to sit",

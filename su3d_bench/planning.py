@@ -17,13 +17,15 @@ from su3d_bench.digests import code_digest, digest_json
 from su3d_bench.distant_scene import CACHE_ROOT, fetch_seals, mirror_of
 from su3d_bench.errors import ConfigError, DataError, StoreError, suggest
 from su3d_bench.execution import ELSEWHERE, check_execution
+from su3d_bench.interfaces import Dataset
 from su3d_bench.method_names import NamedMethod, named_method
+from su3d_bench.perception.models.devices import device_for
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
 from su3d_bench.protocols import ProtocolRules, load_protocol, protocols_for
 from su3d_bench.questions.truths import has_own_queries
 from su3d_bench.remote_data import DataPlace, RemoteData, data_place
 from su3d_bench.remote_folder import is_url
-from su3d_bench.scene_run import (
+from su3d_bench.scene_job import (
     CEILING_METHOD,
     FIELDS_KNOWN_LATER,
     Part,
@@ -34,7 +36,6 @@ from su3d_bench.scene_run import (
     refuse_other_run,
 )
 from su3d_bench.store import RunFolder
-from su3d_bench.types import Dataset
 
 DATA_ROOT = "~/.cache/su3d-bench/data"
 NO_SYSTEMS = (CEILING_METHOD, "command")  # what `--methods all` leaves out: the truth itself, and programs of others
@@ -99,6 +100,8 @@ def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | s
     _check_sections("dataset", settings, datasets)
     perception = resolve(settings, ("perception",), PerceptionConfig)
     check_models(config.profile, perception)
+    if config.executor not in ELSEWHERE:
+        device_for(perception.models.device, 0)  # raises where there is no such GPU
     parts = _Parts(
         tuple(_method_part(one, settings) for one in methods.values()),
         {target: _part("dataset", target, settings) for target in datasets.values()},

@@ -11,7 +11,7 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -27,16 +27,19 @@ from su3d_bench.distant_scene import (
 from su3d_bench.errors import StoreError
 from su3d_bench.execution import ELSEWHERE, run_units
 from su3d_bench.executors import SCENE_DONE, Event, Report
+from su3d_bench.finished_scenes import FinishedScenes
+from su3d_bench.metrics.results import plain_json
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.planning import Plan, cache_root
 from su3d_bench.protocols import ProtocolRules, load_protocol
-from su3d_bench.scene_run import CEILING_METHOD, MethodOutcome, SceneJob, failed_outcomes, run_scene
-from su3d_bench.scoring import SceneScore, combine, unpack_scores
-from su3d_bench.store import SCHEMA, remove_file, write_json, write_text
+from su3d_bench.scene_job import CEILING_METHOD, MethodOutcome, SceneJob
+from su3d_bench.scene_run import failed_outcomes, run_scene
+from su3d_bench.scoring import SceneScore, combine, combined_metrics, unpack_scores
+from su3d_bench.store import SCHEMA, JobFolder, remove_file, write_json, write_text
 from su3d_bench.timing import hardware_line, processor_digest
 from su3d_bench.toml_text import write_toml
 
-Scores = Mapping[tuple[str, str, str], SceneScore]
+Scores = Mapping[tuple[str, str], SceneScore]
 
 
 @dataclass(frozen=True)
@@ -104,15 +107,24 @@ def _remarks(plan: Plan, outcomes: Sequence[MethodOutcome]) -> tuple[str, ...]:
 
 def _execute(plan: Plan, report: Report) -> tuple[MethodOutcome, ...]:
     start = partial(run_units, report=report, config=plan.config, n_workers=plan.n_workers, folder=plan.folder.path)
+    by_scene: dict[str, tuple[MethodOutcome, ...]] = {}
+
+    def note(outcomes: tuple[MethodOutcome, ...]) -> None:
+        by_scene[outcomes[0].scene] = outcomes
+        report(Event(outcomes[0].scene, SCENE_DONE, len(by_scene), len(plan.jobs)))
+
     finished: Iterator[tuple[MethodOutcome, ...]]
     if plan.config.executor in ELSEWHERE or plan.store is not None or plan.data is not None:
         finished = start(run_distant_scene, _distant(plan), lost=failed_distant)
     else:
-        finished = start(run_scene, plan.jobs, lost=failed_outcomes)
-    by_scene: dict[str, tuple[MethodOutcome, ...]] = {}
+        known = FinishedScenes()
+        for job in plan.jobs:
+            if (outcomes := known.outcomes(job)) is not None:
+                note(outcomes)
+        left = [job for job in plan.jobs if job.scene not in by_scene]
+        finished = start(run_scene, left, lost=failed_outcomes)
     for outcomes in finished:
-        by_scene[outcomes[0].scene] = outcomes
-        report(Event(outcomes[0].scene, SCENE_DONE, len(by_scene), len(plan.jobs)))
+        note(outcomes)
     return tuple(outcome for job in plan.jobs for outcome in by_scene[job.scene])
 
 
@@ -142,65 +154,78 @@ def resolved_values(plan: Plan) -> list[tuple[KeyPath, Any, str]]:
 
 
 def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> dict[str, Any]:
-    """What ``metrics.json`` holds: one result a method and protocol, with ceiling and the scenes that are missing."""
-    scores = _read_scores(outcomes, lambda one: plan.folder.job(one.scene, one.method).counts)
-    early = {
-        share: _read_scores(outcomes, partial(_early_counts, plan, share)) for share in sorted(set(plan.config.anytime))
-    }
-    protocols = dict.fromkeys(name for job in plan.jobs for name in job.protocols)
-    rules = [load_protocol(name) for name in protocols]
+    """What ``metrics.json`` holds: one result a method and protocol, with ceiling and the scenes that are missing.
+
+    The counts of one method and of the ceiling are in memory at a time.
+    """
+    by_method: dict[str, list[MethodOutcome]] = {}
+    for one in outcomes:
+        by_method.setdefault(one.method, []).append(one)
+    perfect = _read_scores(plan, by_method.get(CEILING_METHOD, ()), _final_counts)
+    rules = [load_protocol(name) for name in dict.fromkeys(name for job in plan.jobs for name in job.protocols)]
+
+    @cache
+    def ceiling(protocol: str, scenes: tuple[str, ...]) -> Any:
+        found = {scene: perfect[protocol, scene] for scene in scenes if (protocol, scene) in perfect}
+        is_whole = scenes and len(found) == len(scenes)
+        return plain_json(combined_metrics(load_protocol(protocol), found)) if is_whole else None
+
+    results = {}
+    for method in plan.methods:
+        mine = by_method.get(method, ())
+        scores = perfect if method == CEILING_METHOD else _read_scores(plan, mine, _final_counts)
+        early = {
+            share: _read_scores(plan, mine, partial(JobFolder.anytime_counts, share=share))
+            for share in sorted(set(plan.config.anytime))
+        }
+        for rule in rules:
+            found = _result(plan, method, rule, mine, scores)
+            scored = tuple(found["result"]["scenes"]) if found["result"] else ()
+            results[rule.name, method] = found | {"ceiling": ceiling(rule.name, scored)} | _anytime(rule, scores, early)
     return {
         "schema": SCHEMA,
         "is_partial": plan.is_partial,
         "limit": plan.config.limit,
         "seed": plan.config.seed,
         "scenes": [job.scene for job in plan.jobs],
-        "results": [
-            _result(plan, method, one, outcomes, scores) | _anytime(method, one, scores, early)
-            for one in rules
-            for method in plan.methods
-        ],
+        "results": [results[rule.name, method] for rule in rules for method in plan.methods],
     }
 
 
-def _early_counts(plan: Plan, share: float, outcome: MethodOutcome) -> Path:
-    return plan.folder.job(outcome.scene, outcome.method).anytime_counts(share)
+def _final_counts(job: JobFolder) -> Path:
+    return job.counts
 
 
-def _read_scores(outcomes: Sequence[MethodOutcome], file_of: Callable[[MethodOutcome], Path]) -> Scores:
-    """(method, protocol, scene) -> counts, from the files of the outcomes that did not fail and have one."""
-    scores: dict[tuple[str, str, str], SceneScore] = {}
+def _read_scores(plan: Plan, outcomes: Sequence[MethodOutcome], file_of: Callable[[JobFolder], Path]) -> Scores:
+    """(protocol, scene) -> counts, from the files of the outcomes that did not fail and have one."""
+    scores: dict[tuple[str, str], SceneScore] = {}
     for one in outcomes:
-        file = file_of(one)
+        file = file_of(plan.folder.job(one.scene, one.method))
         if one.error is None and file.is_file():
-            scores |= {(one.method, name, one.scene): score for name, score in unpack_scores(file.read_bytes()).items()}
+            scores |= {(name, one.scene): score for name, score in unpack_scores(file.read_bytes()).items()}
     return scores
 
 
-def _anytime(method: str, rules: ProtocolRules, scores: Scores, early: Mapping[float, Scores]) -> dict[str, Any]:
+def _anytime(rules: ProtocolRules, scores: Scores, early: Mapping[float, Scores]) -> dict[str, Any]:
     """The metrics of the maps midway, over the scenes that the final one is scored on."""
     if not early:
         return {}
-    scenes = [scene for one, protocol, scene in scores if (one, protocol) == (method, rules.name)]
+    scenes = [scene for protocol, scene in scores if protocol == rules.name]
     midway = []
     for share, counts in early.items():
-        found = {scene: counts[key] for scene in scenes if (key := (method, rules.name, scene)) in counts}
+        found = {scene: counts[key] for scene in scenes if (key := (rules.name, scene)) in counts}
         if found and len(found) == len(scenes):
-            midway.append({"share": share, "metrics": combine(rules, found).to_json()["metrics"]})
+            midway.append({"share": share, "metrics": plain_json(combined_metrics(rules, found))})
     return {"anytime": midway}
 
 
 def _result(
     plan: Plan, method: str, rules: ProtocolRules, outcomes: Sequence[MethodOutcome], scores: Scores
 ) -> dict[str, Any]:
-    planned = [job.scene for job in plan.jobs if rules.name in _protocol_names(job)]
-    mine = {one.scene: one for one in outcomes if one.method == method and one.scene in planned}
-    scored = {scene: scores[method, rules.name, scene] for scene in planned if (method, rules.name, scene) in scores}
-    failed = [scene for scene in planned if mine[scene].error is not None]
-    ceilings = {scene: scores.get((CEILING_METHOD, rules.name, scene)) for scene in scored}
-    perfect = {scene: score for scene, score in ceilings.items() if score is not None}
-    result = combine(rules, scored).to_json() if scored else None
-    encoder = _join(one.encoder for one in mine.values() if one.profile is not None)
+    planned = {job.scene: None for job in plan.jobs if rules.name in _protocol_names(job)}
+    mine = {one.scene: one for one in outcomes if one.scene in planned}
+    scored = {scene: scores[rules.name, scene] for scene in planned if (rules.name, scene) in scores}
+    failed = {scene: None for scene in planned if mine[scene].error is not None}
     return {
         "method": method,
         "protocol": rules.name,
@@ -209,13 +234,13 @@ def _result(
         "headline": list(rules.headline),
         "profile": _join(one.profile for one in mine.values()),
         "caveat": _join((one.caveat for one in mine.values()), "; "),
-        "encoder": encoder,
+        "encoder": _join(one.encoder for one in mine.values() if one.profile is not None),
         "encoder_digest": _join(one.encoder_digest for one in mine.values()),
         "n_planned": len(planned),
-        "failed": failed,
+        "failed": list(failed),
         "unscored": [scene for scene in planned if scene not in scored and scene not in failed],
-        "ceiling": combine(rules, perfect).to_json()["metrics"] if scored and len(perfect) == len(scored) else None,
-        "result": result,
+        "ceiling": None,
+        "result": combine(rules, scored).to_json() if scored else None,
     }
 
 

@@ -6,145 +6,42 @@ having ``receive_truth`` (the oracle, from which ceilings come).
 
 from __future__ import annotations
 
-import json
 import logging
 import math
 import traceback
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cached_property, partial
-from pathlib import Path
 from typing import Any
 
-from su3d_bench import registry
-from su3d_bench.config import flatten
-from su3d_bench.digests import NUMERIC_PACKAGES, code_digest, digest_json, package_versions
 from su3d_bench.errors import GroundTruthMissing, StoreError, Su3dError
 from su3d_bench.executors import Report
+from su3d_bench.interfaces import Method, SceneTools
+from su3d_bench.job_inputs import JobInputs
+from su3d_bench.perception.models.devices import device_for
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
 from su3d_bench.protocols import SHARE_KINDS, ProtocolRules, load_protocol
-from su3d_bench.questions.refined import refined_digest, refined_names
+from su3d_bench.questions.refined import refined_names
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.read_ahead import N_AHEAD, ReadAhead
 from su3d_bench.reports.pictures import draw_scene
 from su3d_bench.scene_feeding import Feeding
+from su3d_bench.scene_job import (
+    MethodOutcome,
+    Part,
+    SceneJob,
+    build_dataset,
+    build_method,
+    config_key,
+    refuse_other_run,
+    stride_of,
+)
 from su3d_bench.scene_log import SceneLog
 from su3d_bench.scene_tools import FirstFrames, surface_of, true_proposals
 from su3d_bench.scoring import SceneScore, Truth, pack_scores, score_scene, why_not_scorable
 from su3d_bench.store import JobFolder, RunFolder, read_prediction, write_bytes, write_text
 from su3d_bench.timing import device_memory_bytes, peak_memory_bytes, start_memory_watch
-from su3d_bench.types import (
-    Frame,
-    GroundTruth,
-    InstanceMesh,
-    Method,
-    Prediction,
-    Proposals,
-    SceneInfo,
-    SceneTools,
-)
-
-CEILING_METHOD = "oracle"
-# Settings of perception that move no number, or whose part that does is in perception's digest.
-MOVES_NO_NUMBER = ("perception.cache", "perception.models.folder", "perception.models.paths", "perception.language.")
-LAYOUTS_OF_ROOMS = ("replica", "scannet", "tum")  # in which `datasets make rooms` writes files
-TRUE_PROPOSALS_CAVEAT = "proposals from the ground truth; a ceiling, not a result"
-NAMED_KINDS = ("annotation", "reasoning")  # labels n' of a file beside the map move their numbers
-FIELDS_KNOWN_LATER = ("data", "profile", "perception")
-
-
-@dataclass(frozen=True)
-class Part:
-    """A dataset or method of the run: its registry target, its own name, its resolved options as JSON."""
-
-    target: str
-    name: str
-    options: str
-
-
-@dataclass(frozen=True)
-class SceneJob:
-    """Everything that a worker needs to know of one scene; ``index`` counts the scenes of the run."""
-
-    scene: str
-    dataset: Part
-    methods: tuple[Part, ...]
-    ceiling: Part | None
-    protocols: tuple[str, ...]
-    profile: str
-    perception: str
-    stride: int
-    seed: int
-    limit: int
-    pictures: bool
-    anytime: tuple[float, ...]
-    folder: Path
-    data_root: Path
-    cache_root: Path
-    index: int = 0
-    is_offline: bool = False
-
-    @property
-    def scene_name(self) -> str:
-        """The scene as its dataset calls it."""
-        return self.scene.removeprefix(f"{self.dataset.name}/")
-
-
-@dataclass(frozen=True)
-class MethodOutcome:
-    """What became of one scene under one method; ``error`` is a line, ``unscored`` pairs a protocol and a reason.
-
-    ``warnings`` are what the library said of the data on the way.
-    """
-
-    scene: str
-    method: str
-    error: str | None = None
-    profile: str | None = None
-    caveat: str | None = None
-    encoder: str | None = None
-    encoder_digest: str | None = None
-    data_digest: str | None = None
-    was_resumed: bool = False
-    unscored: tuple[tuple[str, str], ...] = ()
-    warnings: tuple[str, ...] = ()
-
-
-def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str | None:
-    """What must be said beside every number: where the scenes, the masks, or the method's own proposals come from."""
-    own = TRUE_PROPOSALS_CAVEAT if method.needs.true_proposals else getattr(method, "caveat", None)
-    is_seen_by_profile = method.needs.frames and not getattr(method, "has_own_perception", False)
-    is_made = scene.image_domain == "rendered-rooms" and scene.dataset in LAYOUTS_OF_ROOMS
-    made = f"made rooms in the layout of {scene.dataset}, not its scenes" if is_made else None
-    parts = [made, perception.caveat if is_seen_by_profile else None, own]
-    return "; ".join(part for part in parts if part) or None
-
-
-def stride_of(job_stride: int, options: str) -> int:
-    """Frames between updates: the run's where it is set, else the method's own, else 1."""
-    return job_stride or int(json.loads(options).get("stride", 1))
-
-
-def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
-    """What of a prediction's key is known before any data is read, the most telling fields first."""
-    key = {"dataset": job.dataset.name, "method": part.name, "seed": str(job.seed)}
-    sections = [(f"method.{part.name}", part.options), (f"dataset.{job.dataset.name}", job.dataset.options)]
-    if method.needs.frames:
-        key |= {"stride": str(stride_of(job.stride, part.options)), "limit": str(job.limit or "none")}
-        if job.anytime:
-            key["anytime"] = str(job.anytime)
-        sections.append(("perception", job.perception))
-    for prefix, options in sections:
-        for path, value in flatten(json.loads(options)):
-            key[".".join((prefix, *path))] = json.dumps(value, ensure_ascii=False)
-    key = {name: text for name, text in key.items() if not name.startswith(MOVES_NO_NUMBER)}
-    if hasattr(method, "inputs"):
-        key |= {f"input.{name}": digest for name, digest in method.inputs.items()}
-    return (
-        key
-        | {f"packages.{name}": text for name, text in package_versions(NUMERIC_PACKAGES).items()}
-        | {"code": code_digest()}
-    )
+from su3d_bench.types import Frame, GroundTruth, InstanceMesh, Prediction, Proposals, SceneInfo
 
 
 def run_scene(job: SceneJob, report: Report) -> tuple[MethodOutcome, ...]:
@@ -224,8 +121,13 @@ class _Scene:
             self._truths[variant] = self.dataset.ground_truth(self.job.scene_name, variant)
         return self._truths[variant]
 
-    def perception(self, info: SceneInfo) -> Perception:
+    @cached_property
+    def perception_config(self) -> PerceptionConfig:
         config: PerceptionConfig = PerceptionConfig.model_validate_json(self.job.perception)
+        return config
+
+    def perception(self, info: SceneInfo) -> Perception:
+        config = self.perception_config
         profile = resolve_profile(self.job.profile, info.image_domain, config)
         mesh = self.mesh if profile == "oracle" else None
         return build_perception(
@@ -245,35 +147,20 @@ class _Scene:
         info = self.dataset.info(self.job.scene_name, stride_of(self.job.stride, part.options))
         info = replace(info, seed=self.job.seed)
         perception = self.perception(info)
-        key = config_key(self.job, part, method) | {"data": self.data_digest}
-        if method.needs.frames:
-            key |= {"profile": perception.profile, "perception": perception.digest}
+        config = config_key(self.job, part, method)
+        inputs = JobInputs(self.job, part.name, config, method, info, perception, self.data_digest)
+        key = inputs.predict_key()
         refuse_other_run(folder, key)
         was_resumed = folder.is_done("predict", key)
         if was_resumed:
             log.recall(folder.remarks("predict"))
         else:
             self._predict(method, info, perception, folder, key, log)
-        score_key = {"predict": digest_json(key), "encoder": perception.encoder.digest}
-        score_key |= {"pictures": str(self.job.pictures)}
-        score_key |= {f"protocol.{name}": load_protocol(name).digest for name in self.job.protocols}
-        if any(load_protocol(name).kind in NAMED_KINDS for name in self.job.protocols):
-            score_key |= refined_digest(folder)
+        score_key = inputs.score_key(key, folder)
         if not folder.is_done("score", score_key):
             self._score(part, perception, folder, score_key, log)
             was_resumed = False
-        return MethodOutcome(
-            self.job.scene,
-            part.name,
-            profile=perception.profile if method.needs.frames else None,
-            caveat=caveat_of(method, perception, info),
-            encoder=perception.encoder.name,
-            encoder_digest=perception.encoder.digest,
-            data_digest=self.data_digest,
-            was_resumed=was_resumed,
-            unscored=tuple(folder.remarks("score")["unscored"].items()),
-            warnings=tuple(folder.remarks("score")["warnings"]),
-        )
+        return inputs.outcome(folder.remarks("score"), was_resumed=was_resumed)
 
     def _predict(
         self,
@@ -289,6 +176,8 @@ class _Scene:
         if method.needs.frames:
             frames = self.dataset.frames(self.job.scene_name, info.stride)
             n = min(len(frames), self.job.limit or len(frames))
+        if hasattr(method, "receive_device"):
+            method.receive_device(device_for(self.perception_config.models.device, self.job.index))
         if hasattr(method, "receive_tools"):
             method.receive_tools(self._tools(method, perception, frames, n))
         if hasattr(method, "receive_truth"):
@@ -384,23 +273,3 @@ class _Scene:
         method.receive_truth(truth)
         told: Prediction = method.finish()
         return told
-
-
-def refuse_other_run(folder: JobFolder, key: Mapping[str, str], known_later: Sequence[str] = ()) -> None:
-    """A ``StoreError`` where ``folder`` was sealed under another key, fields in ``known_later`` aside."""
-    if changed := folder.changed_field("predict", key, known_later=known_later):
-        raise StoreError(
-            f"{folder.path}: holds another run ({changed}); choose another folder with --out or delete this one"
-        )
-
-
-def build_dataset(part: Part, data_root: Path) -> Any:
-    """The dataset of ``part``, reading below ``data_root``."""
-    dataset_class = registry.load("dataset", part.target)
-    return dataset_class(data_root, dataset_class.Options.model_validate_json(part.options))
-
-
-def build_method(part: Part) -> Any:
-    """A fresh method of ``part``."""
-    method_class = registry.load("method", part.target)
-    return method_class(method_class.Config.model_validate_json(part.options))

@@ -16,19 +16,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.errors import DataError, PredictionError
+from su3d_bench.interfaces import Encoder
 from su3d_bench.kept_files import DAMAGE, read_arrays
 from su3d_bench.metrics import instance_ap, object_means, semantic, shares, transfer
 from su3d_bench.metrics.openlex3d import OpenLexTruth
 from su3d_bench.metrics.query_ap import QueryTruth
 from su3d_bench.metrics.question_truths import AnnotationTruth, ReasoningTruth, RetrievalTruth
-from su3d_bench.metrics.results import Counts, ProtocolResult, form_result
+from su3d_bench.metrics.results import Counts, ProtocolResult, form_result, reported_values
 from su3d_bench.metrics.scene_score import SceneScore
 from su3d_bench.metrics.score_instances import score_instances
 from su3d_bench.metrics.score_open_vocabulary import NEEDS_FEATURES, score_categories, score_queries
 from su3d_bench.metrics.score_questions import labels_n, score_annotation, score_reasoning, score_retrieval
 from su3d_bench.metrics.score_semantic import score_semantic
 from su3d_bench.protocols import ProtocolRules
-from su3d_bench.types import DenseFeatures, Encoder, GroundTruth, Instances, Partition, Prediction
+from su3d_bench.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
 
 __all__ = ["SceneScore", "Truth", "combine", "pack_scores", "score_scene", "unpack_scores", "why_not_scorable"]
 
@@ -128,15 +129,7 @@ def _check_points(rules: ProtocolRules, prediction: Prediction) -> None:
 
 def combine(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> ProtocolResult:
     """The protocol's numbers over the scenes of ``scores``, whose order does not matter."""
-    if not scores:
-        raise DataError(f"{rules.name}: no scene was scored; nothing to combine")
-    for scene, score in scores.items():
-        if (score.protocol, score.version) != (rules.name, rules.version):
-            raise DataError(
-                f"{scene}: was scored under {score.protocol} version {score.version}, not {rules.name} version "
-                f"{rules.version}; score it again"
-            )
-    ordered = [(scene, scores[scene]) for scene in sorted(scores)]
+    ordered = _ordered(rules, scores)
     n_scored = sum(score.n_scored for _, score in ordered)
     n_beyond = np.sum([score.n_farther for _, score in ordered], axis=0)
     return form_result(
@@ -150,6 +143,24 @@ def combine(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> ProtocolR
         n_predictions={scene: score.n_predictions for scene, score in ordered},
         warnings=_gathered({scene: score.warnings for scene, score in ordered}),
     )
+
+
+def combined_metrics(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> Mapping[str, float]:
+    """The ``metrics`` of ``combine`` alone, without intervals, classes and scenes."""
+    return reported_values(rules, [score.counts for _, score in _ordered(rules, scores)])
+
+
+def _ordered(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> list[tuple[str, SceneScore]]:
+    """The scenes by name; a ``DataError`` where there is none, or one that was scored by other rules."""
+    if not scores:
+        raise DataError(f"{rules.name}: no scene was scored; nothing to combine")
+    for scene, score in scores.items():
+        if (score.protocol, score.version) != (rules.name, rules.version):
+            raise DataError(
+                f"{scene}: was scored under {score.protocol} version {score.version}, not {rules.name} version "
+                f"{rules.version}; score it again"
+            )
+    return [(scene, scores[scene]) for scene in sorted(scores)]
 
 
 def _gathered(warnings: Mapping[str, tuple[str, ...]]) -> list[str]:

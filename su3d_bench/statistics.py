@@ -16,6 +16,7 @@ MAX_EXACT_PAIRS = 40  # two halves of 2^20 sums, 8 MB each
 N_FLIPS = 100_000  # patterns drawn where there are more pairs
 FLAT_EXPONENT = 0.1  # at most 7 % more for a size twice as large: what a reader of a plot calls flat
 MIN_FIT = 8
+LEAST_SPREAD = 1e-9  # of a resample's sizes, over that of all: below it a slope would be made of rounding
 
 
 def resample_weights(n_scenes: int, n_resamples: int = N_RESAMPLES, seed: int = SEED) -> Int64Array:
@@ -148,16 +149,29 @@ def growth_exponent(sizes: Float64Array, costs: Float64Array, n_resamples: int =
     n = len(x)
     length = max(1, round(np.sqrt(n)))
     starts = np.random.default_rng(SEED).integers(0, n - length + 1, (n_resamples, -(-n // length)))
-    rows = (starts[:, :, None] + np.arange(length)).reshape(n_resamples, -1)[:, :n]
-    slopes = _slopes(x[rows], y[rows])
+    lengths = np.full(starts.shape[1], length)
+    lengths[-1] = n - length * (len(lengths) - 1)
+    slopes = _slopes_of_blocks(x, y, starts, lengths)
     low, high = np.nanpercentile(slopes, [2.5, 97.5])
-    return Growth(float(_slopes(x[None], y[None])[0]), float(low), float(high))
+    return Growth(float(_slopes_of_blocks(x, y, np.zeros((1, 1), np.int64), np.array([n]))[0]), float(low), float(high))
 
 
-def _slopes(x: Float64Array, y: Float64Array) -> Float64Array:
-    """The least-squares slope of each row of ``y`` on that of ``x``; NaN where ``x`` does not vary."""
-    dx = x - x.mean(axis=1, keepdims=True)
-    spread = (dx**2).sum(axis=1)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        slopes: Float64Array = np.where(spread > 0, (dx * y).sum(axis=1) / spread, np.nan)
+def _slopes_of_blocks(x: Float64Array, y: Float64Array, starts: Int64Array, lengths: Int64Array) -> Float64Array:
+    """The least-squares slope of ``y`` on ``x`` over each row's blocks of neighbours; NaN where ``x`` hardly varies.
+
+    Row r takes the ``lengths[b]`` neighbours from ``starts[r, b]`` on. Sums of a block are differences of running sums.
+    """
+    x, y = x - x.mean(), y - y.mean()
+    n = lengths.sum()
+    sum_x, sum_y, sum_xx, sum_xy = (_block_sums(values, starts, lengths) for values in (x, y, x * x, x * y))
+    spread = sum_xx - sum_x * sum_x / n
+    varies = spread > LEAST_SPREAD * (x @ x)
+    slopes: Float64Array = np.full(len(starts), np.nan)
+    np.divide(sum_xy - sum_x * sum_y / n, spread, out=slopes, where=varies)
     return slopes
+
+
+def _block_sums(values: Float64Array, starts: Int64Array, lengths: Int64Array) -> Float64Array:
+    running = np.concatenate([[0.0], np.cumsum(values)])
+    total: Float64Array = (running[starts + lengths] - running[starts]).sum(axis=1)
+    return total

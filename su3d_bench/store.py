@@ -46,6 +46,25 @@ REASONS = {
 # What a lock on a folder itself gets from network disks, which lock files that are open for writing only: flock(2).
 NO_FOLDER_LOCKS = (errno.EBADF, errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)
 LOCK_FILE = ".lock"
+# Dimensions and kinds of values of each field of a stored prediction; see Instances, Partition and DenseFeatures.
+FIELDS = {
+    "points": (2, "f"),
+    "indptr": (1, "i"),
+    "indices": (1, "i"),
+    "scores": (1, "f"),
+    "features": (2, "f"),
+    "labels": (1, "U"),
+    "names": (1, "U"),
+    "captions": (1, "U"),
+    "boxes": (3, "f"),
+    "centroids": (2, "f"),
+    "view_indptr": (1, "i"),
+    "views": (2, "i"),
+    "view_names": (1, "U"),
+    "view_scores": (1, "f"),
+    "ids": (1, "i"),
+    "instance": (1, "i"),
+}
 WRITTEN_BY_ALL = ("language", "language/images")  # where all jobs of a run write; a job clears its own folders
 
 
@@ -166,6 +185,11 @@ def prediction_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Pr
     kind = kinds.get(str(arrays.get("kind")))
     if kind is None:
         raise PredictionError(f"{where}: holds no 'kind' out of {', '.join(kinds)}; it is not a prediction")
+    for name in (name for name in FIELDS if name in arrays):
+        array, (n_dimensions, value_kind) = arrays[name], FIELDS[name]
+        if array.ndim != n_dimensions or array.dtype.kind != value_kind or (name == "indptr" and not array.size):
+            shape = f"of shape {array.shape} {array.dtype.name}"
+            raise PredictionError(f"{where}: '{name}' is an array {shape}; run the scene again")
     values: dict[str, Any] = {}
     for name in kind.__dataclass_fields__:
         value = arrays.get(name)
@@ -364,7 +388,11 @@ class JobFolder:
 
     def is_done(self, step: str, key: Mapping[str, str]) -> bool:
         """Whether ``step`` is sealed under exactly ``key`` and every file that it vouches for is whole."""
-        files = self._part(step, "files")
-        if not files or self._part(step, "key") != dict(key):
+        return self.is_whole(self.seals().get(step), key)
+
+    def is_whole(self, seal: Any, key: Mapping[str, str]) -> bool:
+        """Whether ``seal``, one of ``seals``, is of exactly ``key`` and every file that it vouches for is whole."""
+        files = seal.get("files") if isinstance(seal, dict) else None
+        if not isinstance(files, dict) or not files or seal.get("key") != dict(key):
             return False
         return all((self.path / name).is_file() and digest_file(self.path / name) == sha for name, sha in files.items())

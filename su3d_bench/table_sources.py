@@ -19,7 +19,7 @@ from su3d_bench.plain_text import printable
 from su3d_bench.reports.latex import PrintedCell, printed_cells
 from su3d_bench.reports.measured import BY_PEOPLE, Measured
 from su3d_bench.reports.table_model import Origin, is_count
-from su3d_bench.scene_run import CEILING_METHOD
+from su3d_bench.scene_job import CEILING_METHOD
 from su3d_bench.scoring import combine
 from su3d_bench.sheets.score_file import FILE as SCORES_FILE
 from su3d_bench.sheets.score_file import read_scores

@@ -107,9 +107,10 @@ class MethodSummary:
 
 def summarise(times: Sequence[UpdateTimes], warm_up: int = WARM_UP) -> MethodSummary:
     """The costs of one method over ``times``, at least one scene; ``warm_up`` updates of each scene stand apart."""
+    pool = _Pool(times, warm_up)
     stages = tuple(dict.fromkeys(stage for one in times for stage in one.stages))
-    seconds = sum(float(one.ms("total").sum()) for one in times) / 1e3
-    n_updates = sum(map(len, times))
+    seconds = float(pool.total_ms.sum()) / 1e3
+    n_updates = len(pool.total_ms)
     n_frames = sum(_frames_covered(one) for one in times)
     last = [one.maps[-1].finish_ms for one in times if one.maps]
     return MethodSummary(
@@ -117,7 +118,7 @@ def summarise(times: Sequence[UpdateTimes], warm_up: int = WARM_UP) -> MethodSum
         method=times[0].method,
         scenes=tuple(one.scene for one in times),
         n_updates=n_updates,
-        stages=tuple(_summarise_stage(times, name, warm_up) for name in (*stages, MAP, TOTAL)),
+        stages=tuple(pool.stage(name) for name in (*stages, MAP, TOTAL)),
         updates_per_s=n_updates / seconds if seconds else float("nan"),
         frames_per_s=n_frames / seconds if seconds else float("nan"),
         finish_ms=max(last) if last else None,
@@ -126,6 +127,37 @@ def summarise(times: Sequence[UpdateTimes], warm_up: int = WARM_UP) -> MethodSum
         peak_rss_bytes=_largest([one.peak_rss_bytes for one in times if one.peak_rss_bytes is not None]),
         device_bytes=_largest([one.device_bytes for one in times if one.device_bytes is not None]),
     )
+
+
+class _Pool:
+    """The updates of several scenes one after another; ``number`` counts those of each scene from 1."""
+
+    def __init__(self, times: Sequence[UpdateTimes], warm_up: int) -> None:
+        self._times = times
+        self.total_ms = self._ms(TOTAL)
+        self._number = np.concatenate([np.arange(1.0, len(one) + 1) for one in times])
+        self._points = np.concatenate([one.columns.get("n_points", np.zeros(len(one))) for one in times])
+        self._is_steady = self._number > warm_up
+
+    def _ms(self, stage: str) -> Float64Array:
+        return np.concatenate([one.ms(stage) for one in self._times])
+
+    def stage(self, name: str) -> StageSummary:
+        ms = self._ms(name)
+        first, steady = ms[~self._is_steady], ms[self._is_steady]
+        total = float(self.total_ms.sum())
+        middle, high, worst = np.percentile(steady, [50, 95, 100]) if len(steady) else (float("nan"),) * 3
+        return StageSummary(
+            name=name,
+            n=len(steady),
+            first=float(first.mean()) if len(first) else float("nan"),
+            p50=float(middle),
+            p95=float(high),
+            worst=float(worst),
+            share=float(ms.sum()) / total if total else float("nan"),
+            against_points=growth_exponent(self._points[self._is_steady], steady),
+            against_frames=growth_exponent(self._number[self._is_steady], steady),
+        )
 
 
 def _largest(values: Sequence[float]) -> int | None:
@@ -137,24 +169,3 @@ def _frames_covered(times: UpdateTimes) -> float:
     frames = times.columns.get("frame", np.arange(len(times), dtype=np.float64))
     spacing = float(np.median(np.diff(frames))) if len(frames) > 1 else 1.0
     return float(frames[-1] - frames[0]) + spacing
-
-
-def _summarise_stage(times: Sequence[UpdateTimes], stage: str, warm_up: int) -> StageSummary:
-    steady = pooled(times, stage, warm_up)
-    first = np.concatenate([one.ms(stage)[:warm_up] for one in times])
-    everything = float(sum(one.ms(stage).sum() for one in times))
-    total = float(sum(one.ms(TOTAL).sum() for one in times))
-    points = [one.columns.get("n_points", np.zeros(len(one)))[warm_up:] for one in times]
-    counts = [np.arange(warm_up + 1, len(one) + 1, dtype=np.float64) for one in times]
-    middle, high, worst = np.percentile(steady, [50, 95, 100]) if len(steady) else (float("nan"),) * 3
-    return StageSummary(
-        name=stage,
-        n=len(steady),
-        first=float(first.mean()) if len(first) else float("nan"),
-        p50=float(middle),
-        p95=float(high),
-        worst=float(worst),
-        share=everything / total if total else float("nan"),
-        against_points=growth_exponent(np.concatenate(points), steady),
-        against_frames=growth_exponent(np.concatenate(counts), steady),
-    )

@@ -124,7 +124,7 @@ def _text(content: bytes, rng: random.Random) -> bytes:
         if kind == 4:
             lines[at], lines[other] = lines[other], lines[at]
         elif kind == 5:
-            lines[at:at] = [lines[other]] * rng.choice((1, 1, 500))
+            lines[at:at] = [lines[other]] * _times(rng.choice((1, 1, 500)), len(lines[other]))
         else:
             del lines[at : at + rng.choice((1, 1, 5))]
         text = "".join(lines)
@@ -149,9 +149,14 @@ def _json(content: bytes, rng: random.Random) -> bytes:
     elif kind == 4 and isinstance(holder, dict):
         holder[rng.choice(TEXTS)] = holder.pop(key)
     else:
-        holder[key] = [holder[key]] * rng.choice((1, 2, 300))
+        holder[key] = [holder[key]] * _times(rng.choice((1, 2, 300)), len(content))
     text = json.dumps(root[0] if root else None, ensure_ascii=rng.random() < 0.5)
     return text.encode("utf-8", "surrogatepass")
+
+
+def _times(times: int, size: int) -> int:
+    """``times``, or fewer where ``size`` bytes so many times are far more than a damaged copy may have."""
+    return min(times, 1 + 2 * MOST_BYTES // max(size, 1))
 
 
 def _places(tree: Any) -> list[tuple[Any, Any]]:

@@ -140,6 +140,16 @@ def _rooms(folder: Path) -> Read:
     return lambda: read_scan(folder / "a.npz")
 
 
+def _rooms_mesh(folder: Path) -> Read:
+    from test_rooms import made_mesh
+
+    from su3d_bench.datasets.rooms_kept import kept_mesh
+
+    whole = made_mesh()
+    kept_mesh(folder / "a.npz", lambda: whole)
+    return lambda: kept_mesh(folder / "a.npz", lambda: whole)
+
+
 def _openlex3d(folder: Path) -> Read:
     from test_openlex3d_files import corners, write_visible, written
 
@@ -279,6 +289,7 @@ TARGETS = (
     Target("tum camera", _tum, ("*/camera.txt",)),
     Target("tum images", _tum, ("*/rgb/*", "*/depth/*")),
     Target("rooms cache", _rooms, ("a.npz",)),
+    Target("rooms mesh", _rooms_mesh, ("a.npz",)),
     Target("openlex3d labels", _openlex3d, ("replica/room0/gt_categories.json",)),
     Target("openlex3d queries", _openlex3d, ("replica/room0/*_all.json",)),
     Target("openlex3d prompts", _openlex3d, ("replica/prompt_list.txt",)),

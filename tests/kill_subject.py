@@ -18,8 +18,9 @@ if str(Path(__file__).parent) not in sys.path:
 from painted import Collector, ColourPerception, Painted
 
 from su3d_bench import scene_run
-from su3d_bench.perception.cache import FrameCache, content_key, frame_digest
-from su3d_bench.types import DenseFeatures, Detections, Frame, PerceptionNeeds, Prediction, StageTimer
+from su3d_bench.interfaces import StageTimer
+from su3d_bench.perception.cache import FrameCache, content_key
+from su3d_bench.types import DenseFeatures, Detections, Frame, PerceptionNeeds, Prediction
 
 logger = logging.getLogger("su3d_bench.kill_subject")
 
@@ -49,7 +50,7 @@ class KeptPerception(ColourPerception):
         self._cache = FrameCache(cache_root)
 
     def detect(self, frame: Frame, needs: PerceptionNeeds, timer: StageTimer) -> Detections:
-        key = content_key(self.digest, frame_digest(frame, with_pose=False))
+        key = content_key(self.digest, self._cache.frame_digest(frame, with_pose=False))
         found = super().detect(frame, needs, timer)
         kept = self._cache.load(key)
         if kept is None:

@@ -13,9 +13,10 @@ from painted import Painted
 
 from su3d_bench.baselines.command import Command, CommandConfig
 from su3d_bench.errors import DataError, PredictionError
+from su3d_bench.interfaces import SceneTools
 from su3d_bench.scene_tools import no_detections
 from su3d_bench.timing import Timer
-from su3d_bench.types import Frame, SceneInfo, SceneTools, Surface
+from su3d_bench.types import Frame, SceneInfo, Surface
 
 SCENE = SceneInfo("rooms", "a b", 6, 1, "rendered-rooms", seed=7)
 SURFACE = Surface(

@@ -19,6 +19,7 @@ from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.errors import DataError, GroundTruthMissing
 from su3d_bench.geometry import back_project
+from su3d_bench.interfaces import StageTimer
 from su3d_bench.types import (
     Detections,
     Float32Array,
@@ -30,7 +31,6 @@ from su3d_bench.types import (
     PerceptionNeeds,
     Prediction,
     SceneInfo,
-    StageTimer,
     UInt8Array,
 )
 

@@ -133,7 +133,7 @@ def test_recall_and_iou_of_a_class_over_drawn_scenes() -> None:
 
 @pytest.fixture(scope="module")
 def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """``a``: everything found; ``b``: one object dropped; ``few``: as ``b``, two scenes; both methods in ``both``."""
+    """``a``: everything found; ``b``: one object dropped; ``few``: as ``b``, two scenes; ``truth``: the oracle."""
     folder = tmp_path_factory.mktemp("runs")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene_run, "build_perception", colour_perception)
@@ -144,6 +144,7 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
             ("few", "[bd]", ["--set", "collector.drop=1"]),
             ("partial", "[ab]", ["--limit", "2"]),
             ("failed", "[abc]", ["--set", "painted.fault=crash"]),
+            ("variants", "[abc]", ["--methods", COLLECTOR, f"{COLLECTOR}@drop=2"]),
             ("other-data", "[abc]", ["--set", "painted.n_frames=5"]),
         ):
             words = ["run", "--scenes", f"{PAINTED}/{scenes}", "--methods", COLLECTOR, "--no-pictures", "--jobs", "1"]
@@ -236,6 +237,7 @@ def test_partial_and_incomplete_runs_are_marked() -> None:
 def test_settings_that_differ_are_named() -> None:
     assert "settings that differ: method.collector.drop 0 and 1" in compare("a", "b").remarks
     assert compare("b", "few").remarks == ()
+    assert compare("a", "variants").remarks == ()  # of the variant, which is not compared, nothing is said
 
 
 def test_two_methods_of_one_run_are_compared() -> None:

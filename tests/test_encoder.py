@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from su3d_bench.errors import DataError, ModelMissing
+from su3d_bench.interfaces import Encoder
 from su3d_bench.perception import embedded_encoder
 from su3d_bench.perception.embedded_encoder import (
     DIM,
@@ -21,7 +25,7 @@ from su3d_bench.perception.embedded_encoder import (
     log_size,
     shrink,
 )
-from su3d_bench.types import Encoder, UInt8Array
+from su3d_bench.types import UInt8Array
 
 FOLDER = Path(embedded_encoder.__file__).parent
 TEXTS = ("an image of a chair", "plant on table", "table on plant", "a green towel", "place to sit")
@@ -134,3 +138,18 @@ def test_weights_need_nothing_but_standard_operators() -> None:
         model = onnx.load(FOLDER / name)
         onnx.checker.check_model(model)
         assert [(entry.domain, entry.version) for entry in model.opset_import] == [("", 17)]
+
+
+def test_the_encoder_leaves_no_file_behind_not_even_for_its_makers(tmp_path: Path) -> None:
+    """ONNX Runtime tells its makers of every session, and for that keeps files in $TMPDIR and the user's cache."""
+    code = (
+        "from su3d_bench.perception.embedded_encoder import EmbeddedEncoder\n"
+        "print(EmbeddedEncoder().encode_texts(['chair']).shape)"
+    )
+    here = {"HOME": str(tmp_path), "TMPDIR": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}
+    environment = here | {"PATH": os.environ["PATH"], "PYTHONDONTWRITEBYTECODE": "1"}  # no CI: it is silent there
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=tmp_path, env=environment, capture_output=True, text=True, check=True
+    )
+    assert done.stdout == "(1, 128)\n"
+    assert list(tmp_path.rglob("*")) == []

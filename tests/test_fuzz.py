@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
 import pytest
-from fuzz_mutations import mutated
+from fuzz_mutations import MOST_BYTES, _json, _text, mutated
 from fuzz_targets import TARGETS
 from fuzzing import BadMessage, Input, Read, Sample, Target, bounded_addresses, every_one_of
 
@@ -112,3 +113,10 @@ def test_damage_reaches_inside_archives_texts_and_numbers() -> None:
     copies = [mutated(b'{"a": [1, 2, {"b": "text"}]}', rng) for _ in range(400)]
     assert any(b"NaN" in one for one in copies) and any(b"null" in one for one in copies)
     assert any(one.startswith(b"[[[[") for one in copies) and b"" in copies
+
+
+@pytest.mark.parametrize("change", [_text, _json])
+def test_a_large_text_is_not_repeated_beyond_memory(change: Callable[[bytes, random.Random], bytes]) -> None:
+    one_line = b'"' + b"x" * (MOST_BYTES // 2) + b'"'
+    lengths = [len(change(one_line, random.Random(k))) for k in range(60)]
+    assert 2 * MOST_BYTES < max(lengths) < 8 * MOST_BYTES

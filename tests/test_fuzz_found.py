@@ -8,10 +8,12 @@ import time
 import zipfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from fuzz_targets_runs import copied_run
+from numpy.typing import NDArray
 
 from su3d_bench.cli.main import main
 from su3d_bench.comparison_sides import Side, rules_of
@@ -171,3 +173,20 @@ def test_a_list_of_scenes_that_are_no_names_is_refused(tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text("{}")
     with pytest.raises(StoreError, match=r"run\.json"):
         read_run(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "array"),
+    [
+        ("indices", np.zeros(3, "S4")),
+        ("points", np.zeros(9, np.float32)),
+        ("indptr", np.zeros(0, np.int64)),
+        ("scores", np.zeros(1, np.complex64)),
+    ],
+)
+def test_a_prediction_with_a_field_of_another_kind_is_refused(tmp_path: Path, name: str, array: NDArray[Any]) -> None:
+    file = tmp_path / "prediction.npz"
+    arrays = {"kind": np.array("Instances"), "points": np.zeros((3, 3), np.float32), name: array}
+    np.savez(file, **arrays)  # type: ignore[arg-type]
+    with pytest.raises(PredictionError, match=rf"prediction.npz: '{name}' is an array of shape"):
+        read_prediction(file)

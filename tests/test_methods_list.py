@@ -10,9 +10,9 @@ import pytest
 from su3d_bench import registry
 from su3d_bench.cli.main import main
 from su3d_bench.config import Setting, Settings
+from su3d_bench.interfaces import MethodAbout
 from su3d_bench.planning import make_plan
 from su3d_bench.reports.published import figures_of
-from su3d_bench.types import MethodAbout
 
 SYSTEMS = (
     "opensu3d",

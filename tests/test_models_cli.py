@@ -17,12 +17,12 @@ from su3d_bench.cli.main import build_parser, main
 from su3d_bench.cli.query import encoder_of
 from su3d_bench.errors import ModelMissing, PredictionError
 from su3d_bench.evaluation_texts import encoder_for
+from su3d_bench.interfaces import Encoder
 from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.loading import load_encoder
 from su3d_bench.protocols import load_protocol
 from su3d_bench.store import RunFolder
-from su3d_bench.types import Encoder
 
 needs_models = pytest.mark.skipif(
     any(find_spec(name) is None for name in ("torch", "transformers", "onnx")),

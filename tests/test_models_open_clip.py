@@ -13,10 +13,10 @@ import pytest
 from tiny_encoders import noise_images
 
 from su3d_bench.errors import DataError, ModelMissing
+from su3d_bench.interfaces import Encoder
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.image_transform import ImageTransform
 from su3d_bench.perception.models.loading import load_encoder
-from su3d_bench.types import Encoder
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'su3d-bench[models]'")
 pytest.importorskip("safetensors", reason="safetensors is not installed: pip install 'su3d-bench[models]'")

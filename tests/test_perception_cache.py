@@ -10,7 +10,8 @@ import pytest
 from perception_fakes import CountingEncoder, still_life
 
 from su3d_bench.errors import StoreError
-from su3d_bench.perception.cache import FrameCache, content_key, frame_digest, pack_masks, unpack_masks
+from su3d_bench.kept_files import read_arrays
+from su3d_bench.perception.cache import FrameCache, content_key, pack_masks, unpack_masks
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
 from su3d_bench.timing import Timer
 from su3d_bench.types import Detections, PerceptionNeeds, SceneInfo
@@ -72,12 +73,16 @@ def test_parts_of_a_key_do_not_run_together() -> None:
 
 
 def test_the_frame_digest_moves_with_pixels_and_with_the_pose_only_on_request() -> None:
-    frame, other = still_life(), still_life()
+    cache = FrameCache(None)
+    frame, other, painted = still_life(), still_life(), still_life()
     other.camera_to_world[0, 3] = 1
-    assert frame_digest(frame, False) == frame_digest(other, False)
-    assert frame_digest(frame, True) != frame_digest(other, True)
+    painted.rgb[0, 0] += 1
+    assert cache.frame_digest(frame, False) == cache.frame_digest(other, False)
+    assert cache.frame_digest(frame, True) != cache.frame_digest(other, True)
     other.depth_m[0, 0] += 1
-    assert frame_digest(frame, False) != frame_digest(other, False)
+    assert cache.frame_digest(frame, False) != cache.frame_digest(other, False)
+    assert cache.frame_digest(frame, False) != cache.frame_digest(painted, False)
+    assert cache.frame_digest(frame, False) == FrameCache(None).frame_digest(frame, False)
 
 
 def test_answers_with_without_and_from_the_cache_are_equal_to_the_bit(tmp_path: Path) -> None:
@@ -108,6 +113,24 @@ def test_a_second_run_encodes_nothing_and_a_new_ratio_only_its_own_crops(tmp_pat
     third = CountingEncoder()
     perception(tmp_path, third).detect(still_life(), PerceptionNeeds(crop_ratios=(1.0, 2.0)), Timer())
     assert third.n_images == n
+
+
+def test_a_feature_is_written_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each image that was encoded has one row in one table, and no table is written a second time."""
+    written, save = [], FrameCache.save
+
+    def counted(cache: FrameCache, key: str, arrays: dict[str, np.ndarray]) -> None:
+        written.append(key)
+        save(cache, key, arrays)
+
+    monkeypatch.setattr(FrameCache, "save", counted)
+    encoder, needs = CountingEncoder(), PerceptionNeeds(crop_ratios=(0.8, 1.0, 1.2))
+    for _ in range(2):
+        perception(tmp_path, encoder).detect(still_life(), needs, Timer())
+    entries = [read_arrays(path) for path in tmp_path.rglob("*.npz")]
+    rows = np.concatenate([entry["rows"][entry["known"]] for entry in entries if "rows" in entry])
+    assert len(rows) == encoder.n_images > 0
+    assert len(written) == len(set(written)) == len(entries)
 
 
 def test_excluded_regions_cost_one_crop_and_are_encoded_when_asked_for_later(tmp_path: Path) -> None:

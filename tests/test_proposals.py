@@ -25,7 +25,8 @@ from su3d_bench.baselines.proposals import ProposalConfig, make_proposals
 from su3d_bench.baselines.segment_tree import SegmentTree, contacts_of, is_within, merge_cost, merge_tree
 from su3d_bench.baselines.surface_proposals import NodeChoice, chosen_nodes, contrast, segments_of, surface_proposals
 from su3d_bench.errors import DataError, PredictionError
-from su3d_bench.types import Proposals, SceneTools, Surface
+from su3d_bench.interfaces import SceneTools
+from su3d_bench.types import Proposals, Surface
 
 MASKS = np.array([[1, 1, 0, 0, 0, 0], [0, 1, 1, 1, 0, 0], [0, 0, 0, 0, 0, 0]], bool)  # two overlap, one is empty
 SCENE: dict[str, Any] = {

@@ -22,7 +22,7 @@ import numpy as np
 import pytest
 from painted import colour_perception
 
-from su3d_bench import scene_run
+from su3d_bench import scene_job, scene_run
 from su3d_bench.cli.main import main
 from su3d_bench.errors import StoreError
 from su3d_bench.kept_files import filling
@@ -88,8 +88,8 @@ def test_what_was_said_before_a_kill_is_in_the_log_and_the_record_of_the_run_tha
 def test_the_log_of_a_finished_job_outlives_the_loss_of_a_later_worker() -> None:
     assert run(scenes="a") == 0
     before = (job() / "log.txt").read_bytes()
-    planned = scene_run.SceneJob(
-        "painted/a", scene_run.Part("", "painted", "{}"), (scene_run.Part("", "dense", "{}"),), None,
+    planned = scene_job.SceneJob(
+        "painted/a", scene_job.Part("", "painted", "{}"), (scene_job.Part("", "dense", "{}"),), None,
         (), "embedded", "{}", 0, 0, 0, False, (), Path("out"), Path(), Path(),
     )  # fmt: skip
     (outcome,) = scene_run.failed_outcomes(planned, "the worker was killed")

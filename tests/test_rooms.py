@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import fields
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,6 +13,8 @@ from pydantic import ValidationError
 from scipy.spatial import cKDTree
 
 from su3d_bench.datasets.rooms import DEFAULT_SCENES, N_STRUCTURE, Rooms
+from su3d_bench.datasets.rooms_kept import MESH_ARRAYS, kept_mesh, kept_walk
+from su3d_bench.datasets.rooms_mesh import RoomMesh
 from su3d_bench.datasets.rooms_scan import RoomScan
 from su3d_bench.errors import DataError, GroundTruthMissing
 from su3d_bench.geometry import back_project
@@ -186,6 +190,74 @@ def test_a_damaged_cache_file_is_made_anew(rooms: Rooms, damage: str) -> None:
     assert _same(rooms.scan(SCENE), good)
     assert path.read_bytes() == content
     assert not list(path.parent.glob(".*"))
+
+
+def test_a_mesh_and_a_walk_that_were_kept_are_those_made_anew(tmp_path: Path) -> None:
+    first, second = Rooms(tmp_path, SMALL), Rooms(tmp_path, SMALL)
+    nowhere = Rooms(tmp_path / "no-folder", SMALL)
+    for rooms in (first, second, nowhere):
+        rooms.frame(SCENE, 0)
+    made, read, again = (one._room(SCENE) for one in (first, second, nowhere))
+    assert "patches" not in read.__dict__, "the second room was furnished and baked although both files were there"
+    for other in (read, again):
+        for field in fields(RoomMesh):
+            one, two = getattr(made.mesh, field.name), getattr(other.mesh, field.name)
+            assert one.dtype == two.dtype and one.tobytes() == two.tobytes(), field.name
+        assert made.trajectory.tobytes() == other.trajectory.tobytes()
+    assert not (tmp_path / "no-folder").exists(), "a dataset that is only looked at makes no data root"
+
+
+def made_mesh() -> RoomMesh:
+    """Of four vertices and two triangles, every number of it 0."""
+    n: dict[str | int, int] = {"vertices": 4, "triangles": 2, "materials": 3, "lights": 1, 3: 3, 4: 4, 16: 16}
+    arrays: dict[str, Any] = {
+        key: np.zeros([n[word] for word in shape], dtype) for key, (dtype, shape) in MESH_ARRAYS.items()
+    }
+    return RoomMesh(**arrays)
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("triangles", lambda array: array + 4),
+        ("triangles", lambda array: array - 4),
+        ("triangles", lambda array: array[:0]),
+        ("material_of_triangle", lambda array: array + 3),
+        ("instance_of_triangle", lambda array: array - 9),
+        ("light", lambda array: array[:-1]),
+        ("vertices", lambda array: array.astype(np.float64)),
+        ("materials", lambda array: array[:, :-1]),
+    ],
+)
+def test_a_kept_mesh_of_other_arrays_is_made_anew(tmp_path: Path, name: str, change: Callable[[Any], Any]) -> None:
+    arrays: dict[str, Any] = {field.name: getattr(made_mesh(), field.name) for field in fields(RoomMesh)}
+    path = tmp_path / "a.mesh.npz"
+    for content, n_made in ((arrays, 0), (arrays | {name: change(arrays[name])}, 1), ({"other": np.zeros(3)}, 1)):
+        np.savez(path, **content)
+        made: list[RoomMesh] = []
+
+        def make(made: list[RoomMesh] = made) -> RoomMesh:
+            made.append(RoomMesh(**arrays))
+            return made[-1]
+
+        mesh = kept_mesh(path, make)
+        assert len(made) == n_made
+        assert all(np.array_equal(getattr(mesh, key), array) for key, array in arrays.items())
+        kept_mesh(path, lambda: pytest.fail("what was made is kept"))
+
+
+def test_a_kept_walk_of_another_length_is_made_anew(tmp_path: Path) -> None:
+    path, walk = tmp_path / "a.walk.npz", np.tile(np.eye(4), (5, 1, 1))
+    for content in (walk[:4], walk.astype(np.float32)):
+        np.savez(path, poses=content)
+        assert kept_walk(path, 5, lambda: walk).tobytes() == walk.tobytes()
+        assert kept_walk(path, 5, lambda: pytest.fail("what was made is kept")).tobytes() == walk.tobytes()
+
+
+def test_rooms_for_training_are_not_kept(tmp_path: Path) -> None:
+    tiny = Rooms.Options(width=16, height=16, n_frames=1)
+    assert Rooms(tmp_path, tiny)._room("office9999").folder is not None
+    assert Rooms(tmp_path, tiny)._room("office10000").folder is None
 
 
 def test_a_cache_that_cannot_be_written_is_said_so(tmp_path: Path) -> None:

@@ -4,8 +4,8 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
+from su3d_bench.job_inputs import caveat_of
 from su3d_bench.reports.tables import headline, markdown_table
-from su3d_bench.scene_run import caveat_of
 from su3d_bench.types import PerceptionNeeds, SceneInfo
 
 

@@ -13,8 +13,9 @@ from pydantic import ValidationError
 
 from su3d_bench.baselines.sam3d import SAM3D, SAM3DConfig, paint
 from su3d_bench.errors import DataError
+from su3d_bench.interfaces import SceneTools
 from su3d_bench.timing import Timer
-from su3d_bench.types import Detections, Frame, Instances, Proposals, SceneInfo, SceneTools, Surface
+from su3d_bench.types import Detections, Frame, Instances, Proposals, SceneInfo, Surface
 
 SCENE = SceneInfo("made", "plates", 4, 1, "rendered-rooms")
 TREE, INCREMENTAL = SAM3DConfig(), SAM3DConfig(schedule="incremental")

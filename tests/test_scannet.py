@@ -40,7 +40,7 @@ from su3d_bench.datasets.scannet_frames import read_walk
 from su3d_bench.datasets.scannet_labels import TABLE_NAME
 from su3d_bench.errors import ConfigError, DataError, GroundTruthMissing
 from su3d_bench.planning import expand_scenes
-from su3d_bench.scene_run import Part
+from su3d_bench.scene_job import Part
 from su3d_bench.types import Float64Array, UInt8Array
 
 WHERE = f"scannet/{SCAN}"

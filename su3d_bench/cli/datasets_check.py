@@ -19,7 +19,7 @@ from su3d_bench.inspection import Inspection, TruthVariant, inspect
 from su3d_bench.inspection_checks import Finding
 from su3d_bench.plain_text import printable, printable_json
 from su3d_bench.planning import data_root, dataset_targets, expand_scenes
-from su3d_bench.scene_run import Part, build_dataset
+from su3d_bench.scene_job import Part, build_dataset
 
 MOST_OF_A_KIND = 10  # findings of one kind that are printed; --json has all
 

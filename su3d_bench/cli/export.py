@@ -15,10 +15,10 @@ from su3d_bench.errors import EXIT_DONE, ConfigError, PredictionError, suggest
 from su3d_bench.plain_text import printable
 
 if TYPE_CHECKING:
+    from su3d_bench.interfaces import Encoder
     from su3d_bench.predictions.base import Content, Reader
     from su3d_bench.predictions.export import LabelledMasks
     from su3d_bench.protocols import ProtocolRules
-    from su3d_bench.types import Encoder
 
 TARGETS = ("openlex3d", "scannet")
 
@@ -150,7 +150,7 @@ def sources_of(path: Path, format: str | None, method: str | None) -> list[Sourc
 def _only_method(found: Mapping[str, Sequence[Path]]) -> str | None:
     """The one method that a run was asked for; the ceiling that comes with it is not meant."""
     from su3d_bench.config import RunConfig, read_file, resolve
-    from su3d_bench.scene_run import CEILING_METHOD
+    from su3d_bench.scene_job import CEILING_METHOD
 
     run = _run_of(next(iter(found.values()))[0])
     is_single = run is not None and len(resolve(read_file(run / "run.toml"), (), RunConfig).methods) == 1
@@ -233,7 +233,7 @@ def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
     from su3d_bench.cli.datasets_check import chosen_scenes
     from su3d_bench.config import RunConfig, read_file, resolve
     from su3d_bench.planning import data_root, dataset_targets
-    from su3d_bench.scene_run import Part, build_dataset
+    from su3d_bench.scene_job import Part, build_dataset
 
     if source.run is None:
         return chosen_scenes([source.address], [], is_quiet=is_quiet)[0]

@@ -11,9 +11,10 @@ from su3d_bench.cli.flags import add_verb, add_whose_map, answer, answer_json, r
 from su3d_bench.errors import ConfigError, PredictionError, StoreError
 
 if TYPE_CHECKING:
+    from su3d_bench.interfaces import Encoder
     from su3d_bench.opensu3d.retrieval import Ranking
     from su3d_bench.store import RunFolder
-    from su3d_bench.types import Encoder, Instances
+    from su3d_bench.types import Instances
 
 
 def add_parser(verbs: Any) -> None:
@@ -31,9 +32,7 @@ def add_parser(verbs: Any) -> None:
     parser.add_argument("text", help="what to look for")
     add_whose_map(parser)
     parser.add_argument("--top", type=int, default=10, metavar="N", help="how many instances to list (default: 10)")
-    parser.add_argument(
-        "--device", default="cpu", help="of the text's encoder, where it is no small one (default: cpu)"
-    )
+    parser.add_argument("--device", default="cpu", help="of the text's encoder (default: cpu)")
     parser.add_argument("--out", type=Path, metavar="FILE", help="where the picture goes (default: beside the map)")
 
 
@@ -110,6 +109,7 @@ def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
     from su3d_bench.config import read_file, resolve
     from su3d_bench.perception.cache import FrameCache
     from su3d_bench.perception.config import PerceptionConfig
+    from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
     from su3d_bench.perception.models.catalogue import encoder_known_as
     from su3d_bench.perception.models.encoder import FoundationEncoder
     from su3d_bench.perception.models.loading import load_encoder
@@ -128,7 +128,7 @@ def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
     encoder = load_encoder(models, cache=FrameCache(cache_root() if config.cache else None))
     if made_with in (None, encoder.digest):
         return encoder
-    if isinstance(encoder, FoundationEncoder) and encoder.is_same_space(made_with):
+    if isinstance(encoder, FoundationEncoder | EmbeddedEncoder) and encoder.is_same_space(made_with):
         return encoder
     raise PredictionError(
         f"{run.path}: its features were made by encoder {made_by} ({made_with[:12]}), here is "

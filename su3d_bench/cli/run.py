@@ -58,7 +58,10 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--profile", help="who supplies perception: auto, embedded, oracle, stored, paper (default: auto)"
     )
-    parser.add_argument("--device", help="of foundation models: cpu, cuda (all GPUs, by job) or cuda:1 (default: cpu)")
+    parser.add_argument(
+        "--device",
+        help="of models, similarities and opensu3d's matching: cpu, cuda (all GPUs, by job) or cuda:1 (default: cpu)",
+    )
     parser.add_argument(
         "--protocols", nargs="+", metavar="PROTOCOL", help="evaluations (default: those of the dataset)"
     )

@@ -14,13 +14,13 @@ from su3d_bench.errors import EXIT_DONE, ConfigError
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
+    from su3d_bench.interfaces import Encoder
     from su3d_bench.perception.language.chat import ChatRequest
     from su3d_bench.questions.model import Question
     from su3d_bench.sheets.drafts import Draft
     from su3d_bench.sheets.items import SheetKind
     from su3d_bench.sheets.reasoning_drafts import AskMap
     from su3d_bench.sheets.run_source import RunSource
-    from su3d_bench.types import Encoder
 
 NAME = "make"
 KINDS = ("retrieval", "annotation", "reasoning")
@@ -68,7 +68,7 @@ def add_parser(actions: Any) -> None:
     parser.add_argument("--seed", type=int, default=0, help="of the drawing and shuffling (default: 0)")
     parser.add_argument("--colours", choices=("paper", "cividis"), default="paper", help="of the heat maps")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="scenes drawn side by side (default: 2)")
-    parser.add_argument("--device", default="cpu", help="of the text's encoder, if a large one (default: cpu)")
+    parser.add_argument("--device", default="cpu", help="of the text's encoder (default: cpu)")
     parser.add_argument(
         "--solver",
         choices=("built-in", "llm"),

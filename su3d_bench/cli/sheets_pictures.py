@@ -34,7 +34,7 @@ def add_parser(actions: Any) -> None:
     parser.add_argument("--photo", action="store_true", help="a first column with the colours that the frames saw")
     parser.add_argument("--view", choices=("corner", "above"), default="corner", help="from where (default: a corner)")
     parser.add_argument("--colours", choices=("paper", "cividis"), default="paper", help="of similarity")
-    parser.add_argument("--device", default="cpu", help="of the text's encoder, if a large one (default: cpu)")
+    parser.add_argument("--device", default="cpu", help="of the text's encoder (default: cpu)")
 
 
 def call(arguments: argparse.Namespace) -> int:

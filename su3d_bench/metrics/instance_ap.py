@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.errors import DataError, PredictionError
-from su3d_bench.metrics.dot_product import dot
+from su3d_bench.metrics.precision_recall import average_precisions
 from su3d_bench.types import BoolArray, Float64Array, Int32Array, Int64Array
 
 # arange(0.5, 0.95, 0.05) excludes its end: nine thresholds up to 0.90, as these doubles; then 0.25
@@ -253,47 +252,6 @@ def concatenate(counts: Sequence[InstanceCounts]) -> InstanceCounts:
     )
 
 
-MOST_REMEMBERED_ROWS = 12  # small curves repeat from scene to scene, longer ones hardly ever
-
-
-def average_precision(scores: Float64Array, is_true: BoolArray, n_missed: int) -> float:
-    """Area under the raw precision-recall polyline, one vertex a distinct score and the vertex (recall 0, precision 1).
-
-    Rows are the counted predictions of one class; 0 where there is none (pull request 26).
-
-    >>> average_precision(np.array([1.0, 1.0, 1.0]), np.array([True, True, False]), 2)  # recall (1 + precision) / 2
-    0.41666666666666663
-    """
-    if not len(scores):
-        return 0.0
-    if len(scores) <= MOST_REMEMBERED_ROWS:
-        values = scores.tolist()
-        rank_of = {value: rank for rank, value in enumerate(sorted(set(values)))}  # the curve depends on order alone
-        return _remembered(tuple(rank_of[value] for value in values), tuple(is_true.tolist()), n_missed)
-    return _area(scores, is_true, n_missed)
-
-
-@lru_cache(maxsize=1 << 16)
-def _remembered(ranks: tuple[int, ...], is_true: tuple[bool, ...], n_missed: int) -> float:
-    return _area(np.array(ranks, np.float64), np.array(is_true, bool), n_missed)
-
-
-def _area(scores: Float64Array, is_true: BoolArray, n_missed: int) -> float:
-    order = np.argsort(scores, kind="stable")
-    n_true_up_to = np.cumsum(is_true[order])
-    _, first = np.unique(scores[order], return_index=True)
-    n_true_below = np.where(first > 0, n_true_up_to[first - 1], 0)
-    true_positives = n_true_up_to[-1] - n_true_below
-    precision = true_positives / (len(scores) - first)
-    # every instance is either a true positive at some score or missed, so the denominator is one constant
-    recall = true_positives / (true_positives + n_true_below + n_missed)
-    precision = np.append(precision, 1.0)
-    padded = np.concatenate([recall[:1], recall, [0.0, 0.0]])
-    # convolution with (-1/2, 0, 1/2): halving is exact, so this equals numpy.convolve in every bit
-    width = 0.5 * (padded[:-2] - padded[2:])
-    return dot(precision, width)
-
-
 def combine(counts: Sequence[InstanceCounts], thresholds: Sequence[float] = THRESHOLDS) -> InstanceAP:
     """AP of the scenes together: their predictions share one curve a class, and classes are averaged.
 
@@ -306,17 +264,28 @@ def combine(counts: Sequence[InstanceCounts], thresholds: Sequence[float] = THRE
     """
     if not counts:
         raise ValueError("combine needs the counts of at least one scene")
-    whole = concatenate(counts)
-    n_classes, n_thresholds = whole.n_missed.shape
-    table = np.full((1, n_classes, n_thresholds), np.nan)
-    group = whole.class_index.astype(np.int64) * n_thresholds + whole.threshold_index
-    order = np.argsort(group, kind="stable")
-    bounds = np.searchsorted(group[order], np.arange(n_classes * n_thresholds + 1))
-    for c in np.flatnonzero(whole.n_truth > 0):
-        for t in range(n_thresholds):
-            cell = c * n_thresholds + t
-            rows = order[bounds[cell] : bounds[cell + 1]]
-            table[0, c, t] = average_precision(whole.score[rows], whole.is_true[rows], int(whole.n_missed[c, t]))
+    return combine_each([concatenate(counts)], thresholds)[0]
+
+
+def combine_each(counts: Sequence[InstanceCounts], thresholds: Sequence[float] = THRESHOLDS) -> list[InstanceAP]:
+    """AP of each scene alone, or of each group of scenes whose counts are one."""
+    n_classes, n_thresholds = counts[0].n_missed.shape
+    n_cells = n_classes * n_thresholds
+    cell = [
+        i * n_cells + c.class_index.astype(np.int64) * n_thresholds + c.threshold_index for i, c in enumerate(counts)
+    ]
+    areas = average_precisions(
+        np.concatenate(cell),
+        np.concatenate([c.score for c in counts]),
+        np.concatenate([c.is_true for c in counts]),
+        np.concatenate([c.n_missed.ravel() for c in counts]),
+        np.repeat(np.concatenate([c.n_truth > 0 for c in counts]), n_thresholds),
+    )
+    return [_averaged(table, thresholds) for table in areas.reshape(-1, 1, n_classes, n_thresholds)]
+
+
+def _averaged(table: Float64Array, thresholds: Sequence[float]) -> InstanceAP:
+    """The means of a table (1, C, T)."""
     # the order in which numpy sums follows the layout that this mixed indexing yields; the last bit depends on it
     averaged = table[np.zeros((1, 1), int), :, ap_columns(thresholds)[None, :]]
     at_50, at_25 = tuple(thresholds).index(0.5), tuple(thresholds).index(0.25)

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 
 import numpy as np
 
 from su3d_bench.metrics.instance_ap import THRESHOLDS, InstanceCounts, ap_columns
+from su3d_bench.metrics.precision_recall import MANY_ROWS
 from su3d_bench.metrics.semantic import SemanticCounts
 from su3d_bench.types import BoolArray, Float64Array, Int64Array
 
@@ -30,14 +34,12 @@ def resampled_ap(
     is_true = np.concatenate([c.is_true for c in counts])
     cell = np.concatenate([c.class_index.astype(np.int64) * n_thresholds + c.threshold_index for c in counts])
     order = np.lexsort((-score, cell))
+    rows = _Rows(scene[order], score[order], is_true[order])
     bounds = np.searchsorted(cell[order], np.arange(n_classes * n_thresholds + 1))
     n_truth = weights @ np.stack([c.n_truth for c in counts])
-    table = np.full((len(weights), n_classes, n_thresholds), np.nan)
-    for c in np.flatnonzero(n_truth.any(axis=0)):
-        for t in range(n_thresholds):
-            rows = order[bounds[c * n_thresholds + t] : bounds[c * n_thresholds + t + 1]]
-            area = _weighted_areas(score[rows], is_true[rows], scene[rows], n_truth[:, c], weights)
-            table[:, c, t] = np.where(n_truth[:, c] > 0, area, np.nan)
+    resampled_areas = _compiled_areas if len(score) >= MANY_ROWS else _areas
+    table = resampled_areas(rows, bounds, n_truth, weights).reshape(len(weights), n_classes, n_thresholds)
+    table[n_truth == 0] = np.nan
     return {
         "AP": _row_means(table[:, :, ap_columns(thresholds)].reshape(len(weights), -1)),
         "AP50": _row_means(table[:, :, tuple(thresholds).index(0.5)]),
@@ -45,8 +47,52 @@ def resampled_ap(
     }
 
 
+@dataclass(frozen=True)
+class _Rows:
+    """The counted predictions of one class and threshold after another, with falling score in each."""
+
+    scene: Int64Array
+    score: Float64Array
+    is_true: BoolArray
+
+
+def _areas(rows: _Rows, bounds: Int64Array, n_truth: Int64Array, weights: Int64Array) -> Float64Array:
+    """Area (R, cells) under each resample's polylines; ``bounds`` of the cells' rows, ``n_truth`` (R, C)."""
+    areas = np.zeros((len(weights), len(bounds) - 1))
+    n_thresholds = areas.shape[1] // n_truth.shape[1]
+    for c in np.flatnonzero(n_truth.any(axis=0)):
+        for cell in range(c * n_thresholds, (c + 1) * n_thresholds):
+            own = slice(bounds[cell], bounds[cell + 1])
+            areas[:, cell] = _weighted_areas(
+                rows.score[own], rows.is_true[own], rows.scene[own], n_truth[:, c], weights
+            )
+    return areas
+
+
+def _compiled_areas(rows: _Rows, bounds: Int64Array, n_truth: Int64Array, weights: Int64Array) -> Float64Array:
+    """``_areas`` of many rows, up to rounding, by compiled loops on all cores."""
+    from su3d_bench.metrics.precision_recall_kernels import resampled_areas
+
+    areas = np.zeros((len(weights), len(bounds) - 1))
+    class_of_cell = np.repeat(np.arange(n_truth.shape[1]), areas.shape[1] // n_truth.shape[1])
+    is_last = np.append(np.diff(rows.score) != 0, True)
+    is_last[bounds[1:][bounds[1:] > 0] - 1] = True
+    scene, drawn = rows.scene.astype(np.int32), weights.astype(np.int32)
+
+    def fill(part: Int64Array) -> None:
+        found = areas[part[0] : part[-1] + 1]
+        own = slice(part[0], part[-1] + 1)
+        resampled_areas(scene, rows.is_true, is_last, bounds, class_of_cell, n_truth[own], drawn[own], found)
+
+    n_threads = os.cpu_count() or 1
+    with ThreadPoolExecutor(n_threads) as threads:
+        parts = np.array_split(np.arange(len(weights)), min(len(weights), 4 * n_threads))
+        list(threads.map(fill, parts))  # raises what a thread raised
+    return areas
+
+
 def _weighted_areas(
-    score: Float64Array, is_true: Int64Array, scene: Int64Array, n_truth: Int64Array, weights: Int64Array
+    score: Float64Array, is_true: BoolArray, scene: Int64Array, n_truth: Int64Array, weights: Int64Array
 ) -> Float64Array:
     """Area under each resample's precision-recall polyline; rows come with falling score.
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, cast
 
@@ -54,14 +54,15 @@ class ProtocolResult:
             "protocol version headline n_scenes scenes metrics intervals pooled scene_mean per_scene per_class groups "
             "coverage n_predictions warnings"
         )
-        return {name: _plain(getattr(self, name)) for name in names.split()}
+        return {name: plain_json(getattr(self, name)) for name in names.split()}
 
 
-def _plain(value: Any) -> Any:
+def plain_json(value: Any) -> Any:
+    """``value`` with NaN as None and tuples as lists."""
     if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
+        return {key: plain_json(item) for key, item in value.items()}
     if isinstance(value, tuple | list):
-        return [_plain(item) for item in value]
+        return [plain_json(item) for item in value]
     return None if isinstance(value, float) and math.isnan(value) else value
 
 
@@ -76,10 +77,8 @@ def form_result(
 ) -> ProtocolResult:
     """The result of ``scenes`` from their counts, in that order."""
     pooled = metric_values(rules, counts, pooled=True)
-    per_scene = {
-        scene: metric_values(rules, [count], pooled=False) for scene, count in zip(scenes, counts, strict=True)
-    }
-    scene_mean = {key: semantic.nan_mean(np.array([row[key] for row in per_scene.values()])) for key in pooled}
+    per_scene = dict(zip(scenes, _scene_values(rules, counts), strict=True))
+    scene_mean = _scene_mean(per_scene.values())
     per_class = _class_values(rules, counts)
     weights = resample_weights(len(scenes))
     if rules.aggregate == "pooled":
@@ -105,6 +104,29 @@ def form_result(
     )
 
 
+def reported_values(rules: ProtocolRules, counts: Sequence[Counts]) -> Mapping[str, float]:
+    """``ProtocolResult.metrics`` alone."""
+    if rules.aggregate == "pooled":
+        return metric_values(rules, counts, pooled=True)
+    return _scene_mean(_scene_values(rules, counts))
+
+
+def _scene_mean(rows: Collection[Mapping[str, float]]) -> dict[str, float]:
+    return {key: semantic.nan_mean(np.array([row[key] for row in rows])) for key in next(iter(rows))}
+
+
+def _scene_values(rules: ProtocolRules, counts: Sequence[Counts]) -> list[dict[str, float]]:
+    """The metrics of each scene alone."""
+    if rules.kind in CURVE_KINDS:
+        each = instance_ap.combine_each(cast("Sequence[instance_ap.InstanceCounts]", counts), rules.thresholds)
+        return [_ap_values(ap) for ap in each]
+    return [metric_values(rules, [count], pooled=False) for count in counts]
+
+
+def _ap_values(ap: instance_ap.InstanceAP) -> dict[str, float]:
+    return {"AP": ap.ap, "AP50": ap.ap50, "AP25": ap.ap25}
+
+
 def metric_values(rules: ProtocolRules, counts: Sequence[Counts], *, pooled: bool) -> dict[str, float]:
     """The protocol's metrics of the scenes together.
 
@@ -112,8 +134,7 @@ def metric_values(rules: ProtocolRules, counts: Sequence[Counts], *, pooled: boo
     the classes that its ground truth contains.
     """
     if rules.kind in CURVE_KINDS:
-        ap = instance_ap.combine(cast("Sequence[instance_ap.InstanceCounts]", counts), rules.thresholds)
-        return {"AP": ap.ap, "AP50": ap.ap50, "AP25": ap.ap25}
+        return _ap_values(instance_ap.combine(cast("Sequence[instance_ap.InstanceCounts]", counts), rules.thresholds))
     if rules.kind == "categories":
         means = object_means.combine(cast("Sequence[object_means.ObjectCounts]", counts))
         return dict(zip(VALUES_OF_METRIC[rules.metric], means.tolist(), strict=True))

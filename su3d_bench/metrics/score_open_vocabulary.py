@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 
 from su3d_bench.errors import PredictionError
 from su3d_bench.geometry import voxel_coordinates
+from su3d_bench.interfaces import Encoder
 from su3d_bench.metrics import object_means, openlex3d, query_ap, transfer
-from su3d_bench.metrics.labelling import cosines, encoder_warning, has_every_label, text_features
+from su3d_bench.metrics.labelling import cosines, device_of, encoder_warning, has_every_label, text_features
 from su3d_bench.metrics.neighbours import transfer_each_mask
 from su3d_bench.metrics.openlex3d import OpenLexTruth
 from su3d_bench.metrics.query_ap import QueryTruth
@@ -20,16 +21,7 @@ from su3d_bench.metrics.score_instances import distance_to_masks
 from su3d_bench.metrics.score_semantic import has_feature
 from su3d_bench.protocols import ProtocolRules
 from su3d_bench.row_blocks import release_pages
-from su3d_bench.types import (
-    DenseFeatures,
-    Encoder,
-    Float32Array,
-    Float64Array,
-    Instances,
-    Int64Array,
-    Partition,
-    Prediction,
-)
+from su3d_bench.types import DenseFeatures, Float32Array, Float64Array, Instances, Int64Array, Partition, Prediction
 
 NEEDS_FEATURES = "needs features to compare with texts, and the prediction has none"
 _BLOCK_UNITS = 2048  # 2048 units x 3407 prompts of float64 are 56 MB
@@ -181,7 +173,7 @@ def _similarity_blocks(
     features, known = _features(rules, prediction, encoder)
     text = text_features(rules, truth.prompts, features, known)
     for start in range(0, len(used), _BLOCK_UNITS):
-        yield cosines(features[used[start : start + _BLOCK_UNITS]], text)
+        yield cosines(features[used[start : start + _BLOCK_UNITS]], text, device_of(known))
         release_pages(features)
 
 
@@ -216,7 +208,7 @@ def score_queries(
     if len(masks) and truth.queries:
         features, known = _features(rules, prediction, encoder)
         text = text_features(rules, [query.text for query in truth.queries], features, known)
-        similarity = cosines(features, text)
+        similarity = cosines(features, text, device_of(known))
     moved = _moved(rules, prediction.points, masks, truth.points)
     counts = query_ap.per_scene(
         truth.object_of_point,

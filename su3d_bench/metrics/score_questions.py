@@ -7,9 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 
 from su3d_bench.errors import PredictionError
+from su3d_bench.interfaces import Encoder
 from su3d_bench.metrics import transfer
 from su3d_bench.metrics.covered_objects import NO_OBJECT, Covered, covered_objects
-from su3d_bench.metrics.labelling import cosines, encoder_warning, text_features
+from su3d_bench.metrics.labelling import cosines, device_of, encoder_warning, text_features
 from su3d_bench.metrics.question_truths import (
     AnnotationTruth,
     AskedText,
@@ -22,7 +23,7 @@ from su3d_bench.metrics.scene_score import SceneScore, n_predictions
 from su3d_bench.metrics.score_instances import distance_to_masks
 from su3d_bench.metrics.shares import ShareCounts
 from su3d_bench.protocols import VALUES_OF_METRIC, AnswerRules, MergeRules, ProtocolRules
-from su3d_bench.types import BoolArray, Encoder, GroundTruth, Instances, Int64Array, Partition
+from su3d_bench.types import BoolArray, GroundTruth, Instances, Int64Array, Partition
 
 WELL_MERGED, UNDER_MERGED, OVER_MERGED = "well-merged", "under-merged", "over-merged"
 
@@ -53,7 +54,7 @@ def first_instances(
     if prediction.features is None or encoder is None:
         raise PredictionError(f"{rules.name}: needs features and an encoder to compare texts with them")
     text = text_features(rules, list(texts), prediction.features, encoder)
-    first: Int64Array = cosines(prediction.features, text).argmax(axis=0)
+    first: Int64Array = cosines(prediction.features, text, device_of(encoder)).argmax(axis=0)
     return first
 
 

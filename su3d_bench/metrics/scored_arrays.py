@@ -9,6 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from su3d_bench.interfaces import Encoder
 from su3d_bench.metrics import neighbours, transfer
 from su3d_bench.metrics.attribution_semantic import LabelledPoints
 from su3d_bench.metrics.labelling import (
@@ -25,7 +26,6 @@ from su3d_bench.protocols import ProtocolRules
 from su3d_bench.types import (
     BoolArray,
     DenseFeatures,
-    Encoder,
     Float64Array,
     GroundTruth,
     Instances,

@@ -211,4 +211,6 @@ def nan_mean(values: Float64Array) -> float:
     >>> nan_mean(np.array([1.0, np.nan, 0.0]))
     0.5
     """
-    return float(np.nanmean(values)) if len(values) and not np.isnan(values).all() else float("nan")
+    is_nan = np.isnan(values)
+    n = len(values) - np.count_nonzero(is_nan)
+    return float(np.where(is_nan, 0.0, values).sum() / n) if n else float("nan")  # np.nanmean, which takes its time

@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from su3d_bench.errors import DataError
+from su3d_bench.interfaces import MethodAbout, StageTimer
 from su3d_bench.opensu3d.association import assign_ids, count_overlaps, overlap_ratios
 from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig, crop_levels
 from su3d_bench.opensu3d.frame_cloud import FrameCloud, frame_cloud
@@ -17,19 +18,13 @@ from su3d_bench.opensu3d.id_image import NO_DETECTION
 from su3d_bench.opensu3d.postprocess import segments_of, to_instances
 from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View, record_of
 from su3d_bench.opensu3d.voxel_map import NO_INSTANCE, VoxelMap
+from su3d_bench.perception.models.devices import CPU
 from su3d_bench.scratch import Scratch
 from su3d_bench.timing import Timer
-from su3d_bench.types import (
-    Detections,
-    Frame,
-    Instances,
-    Int32Array,
-    Int64Array,
-    MethodAbout,
-    PerceptionNeeds,
-    SceneInfo,
-    StageTimer,
-)
+from su3d_bench.types import Detections, Frame, Instances, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
+
+if TYPE_CHECKING:
+    from su3d_bench.opensu3d.device_kernels import DeviceVoxelMap
 
 
 class OpenSU3D:
@@ -56,12 +51,13 @@ class OpenSU3D:
     def __init__(self, config: OpenSU3DConfig | None = None) -> None:
         self.config = config or OpenSU3DConfig()
         self._scratch = Scratch()
+        self._device = CPU
         self._clear()
 
     def _clear(self) -> None:
         self._scratch.close()
         self._scratch = Scratch()
-        self._map = VoxelMap(self.config.eps)
+        self._map = _empty_map(self.config.eps, self._device)
         self._table = TrackingTable()
         self._images: list[ImageRecord] = []
         self._next_id = NO_INSTANCE + 1
@@ -86,10 +82,15 @@ class OpenSU3D:
         """Milliseconds that the last ``finish`` took; None before the first."""
         return self._postprocess_ms
 
+    def receive_device(self, device: str) -> None:
+        """Has the map held and matched by torch on ``device`` (``cuda:0``), unless that is ``cpu``."""
+        self._device = device
+        self._clear()
+
     def start(self, scene: SceneInfo) -> None:
         """Forgets the scene before; of the new one nothing needs to be known."""
         self._clear()
-        _warm_up(self.config)
+        _warm_up(self.config, self._device)
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
         """Fuses one image into the map; costs what the view costs, however large the map is."""
@@ -109,9 +110,7 @@ class OpenSU3D:
         scene_id_of = np.full(n_detections, NO_INSTANCE, np.int32)
         if cloud.n_inside == 0:
             return scene_id_of
-        matched_id = np.zeros(cloud.n_inside, np.int32)
-        matched_id[matched >= 0] = self._map.ids[matched[matched >= 0]]
-        overlaps = count_overlaps(cloud.owner[: cloud.n_inside], matched_id)
+        overlaps = count_overlaps(cloud.owner[: cloud.n_inside], self._map.ids_of(matched))
         wanted = np.unique(overlaps.best[overlaps.best > NO_INSTANCE])
         # An axis at a time: over rows of three, numpy's minimum is ten times slower.
         lower = np.array([axis.min() for axis in cloud.points.T]) - self.config.eps
@@ -150,8 +149,16 @@ class OpenSU3D:
         self._scratch.close()
 
 
+def _empty_map(eps: float, device: str) -> VoxelMap | DeviceVoxelMap:
+    if device == CPU:
+        return VoxelMap(eps)
+    from su3d_bench.opensu3d.device_kernels import DeviceVoxelMap
+
+    return DeviceVoxelMap(eps, device)
+
+
 @cache
-def _warm_up(config: OpenSU3DConfig) -> None:
+def _warm_up(config: OpenSU3DConfig, device: str) -> None:
     """Fuses a made-up image twice, so that no timed step waits for a compiler or an import."""
     size = 16
     depth_m = np.linspace(0.6, 1.0, size * size, dtype=np.float32).reshape(size, size)
@@ -171,6 +178,7 @@ def _warm_up(config: OpenSU3DConfig) -> None:
         global_feature=np.ones(1, np.float32),
     )
     scratch = OpenSU3D(config)
+    scratch.receive_device(device)
     for _ in range(2):
         scratch.update(frame, detections, Timer())
     scratch.finish()

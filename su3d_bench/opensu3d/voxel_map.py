@@ -58,6 +58,13 @@ class VoxelMap:
         """Instance id of each point, NO_INSTANCE for none; a view."""
         return self._ids[: len(self)]
 
+    def ids_of(self, indices: Int64Array) -> Int32Array:
+        """Instance id of each point (N,) of the map, NO_INSTANCE for index -1."""
+        found = np.full(len(indices), NO_INSTANCE, np.int32)
+        is_there = indices >= 0
+        found[is_there] = self._ids[indices[is_there]]
+        return found
+
     def nearest(self, queries: Float64Array) -> Int64Array:
         """Index of the nearest point strictly within eps of each query, -1 where there is none; ties: the lowest."""
         return self.nearest_counted(queries)[0]
@@ -66,7 +73,7 @@ class VoxelMap:
         """As ``nearest``, with the number of voxels that were looked into."""
         from su3d_bench.opensu3d import _kernels
 
-        queries = _checked(queries)
+        queries = checked_points(queries)
         found = np.empty(len(queries), np.int64)
 
         def look_up(part: slice) -> int:
@@ -115,7 +122,7 @@ class VoxelMap:
         """
         from su3d_bench.opensu3d import _kernels
 
-        points = _checked(points)
+        points = checked_points(points)
         self._reserve_points(len(self) + len(points))
         placed = np.empty(len(points), np.int64)
         done = 0
@@ -183,7 +190,8 @@ def _grown(array: NDArray[Any], capacity: int, used: int) -> NDArray[Any]:
     return larger
 
 
-def _checked(points: Float64Array) -> Float64Array:
+def checked_points(points: Float64Array) -> Float64Array:
+    """``points`` (N, 3) as the maps take them; a ``DataError`` where one is not finite or lies beyond FARTHEST_M."""
     points = np.ascontiguousarray(points, np.float64)
     # min and max are nan or infinite where any coordinate is
     if len(points) and not (points.min() >= -FARTHEST_M and points.max() <= FARTHEST_M):

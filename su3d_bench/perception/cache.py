@@ -16,9 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.errors import StoreError
+from su3d_bench.interfaces import StageTimer
 from su3d_bench.kept_files import DAMAGE, filling, read_arrays
 from su3d_bench.perception.crops import mask_boxes
-from su3d_bench.types import BoolArray, Float32Array, Float64Array, Frame, StageTimer, UInt8Array
+from su3d_bench.types import BoolArray, Float32Array, Float64Array, Frame, UInt8Array
 
 Arrays = dict[str, NDArray[Any]]
 
@@ -54,22 +55,28 @@ def array_digest(*arrays: NDArray[Any]) -> str:
     return hasher.hexdigest()
 
 
-def frame_digest(frame: Frame, with_pose: bool) -> str:
-    """A digest of colour, depth and intrinsics, and of the pose where the answer depends on it."""
-    pose: tuple[Float64Array, ...] = (frame.camera_to_world,) if with_pose else ()
-    return array_digest(frame.rgb, frame.depth_m, frame.intrinsics, *pose)
-
-
 class FrameCache:
     """Entries of named arrays below ``root``; with ``root`` None nothing is read or written."""
 
     def __init__(self, root: Path | None) -> None:
         self._root = None if root is None else root / "perception"
+        self._last_image: tuple[UInt8Array, str] | None = None
 
     @property
     def is_on(self) -> bool:
         """Whether entries are kept at all; where not, keys need not be made."""
         return self._root is not None
+
+    def image_digest(self, rgb: UInt8Array) -> str:
+        """A digest of an image, which is taken once while one image is asked for: it is in the key of many entries."""
+        if self._last_image is None or self._last_image[0] is not rgb:
+            self._last_image = rgb, array_digest(rgb)
+        return self._last_image[1]
+
+    def frame_digest(self, frame: Frame, with_pose: bool) -> str:
+        """A digest of colour, depth and intrinsics, and of the pose where the answer depends on it."""
+        pose: tuple[Float64Array, ...] = (frame.camera_to_world,) if with_pose else ()
+        return self.image_digest(frame.rgb) + array_digest(frame.depth_m, frame.intrinsics, *pose)
 
     def path(self, key: str) -> Path | None:
         """Where the entry of ``key`` lies, whether or not it is there."""

@@ -1,4 +1,4 @@
-"""The encoder that the project trained itself, run by ONNX Runtime: no download, no GPU, no torch.
+"""The encoder that the project trained itself, run by ONNX Runtime: no download, no GPU, no torch; on a GPU by torch.
 
 Its training and its measured accuracy are in ``model_card.md`` beside the weights.
 """
@@ -52,19 +52,29 @@ class EmbeddedEncoder:
 
     Every text runs through the network alone and all on one thread, so that a feature never depends on what else is in
     the batch or on the machine's number of cores. Images run in batches where these give the bits that each image gives
-    alone, which is tried at the first use, and else alone too.
+    alone, which is tried at the first use, and else alone too. On a ``device`` other than ``cpu`` torch runs both in
+    batches, and features differ from those of the CPU by rounding.
     """
 
     name = "su3d-embedded"
     dim = DIM
 
-    def __init__(self, folder: Path | None = None) -> None:
+    def __init__(self, folder: Path | None = None, device: str = "cpu") -> None:
         self._folder = Path(__file__).parent if folder is None else folder
+        self.device = device
 
     @cached_property
     def digest(self) -> str:
-        """Moves with the weights of either tower, with the preprocessing and with the tokenizer."""
+        """Moves with the weights of either tower, with the preprocessing, the tokenizer and the kind of device."""
+        return self._digest_on(self.device.partition(":")[0])
+
+    def is_same_space(self, digest: str) -> bool:
+        """Whether ``digest`` is of these weights and this preparation, be it on another device."""
+        return digest in (self._digest_on("cpu"), self._digest_on("cuda"))
+
+    def _digest_on(self, kind: str) -> str:
         versions = f"{PREPROCESSING_VERSION}/{TOKENIZER_VERSION}/{IMAGE_SIZE}/{DIM}"
+        versions += "" if kind == "cpu" else f"/torch on {kind}"
         content = hashlib.sha256(versions.encode())
         for name in (IMAGE_FILE, TEXT_FILE):
             content.update(hashlib.sha256(self._path(name).read_bytes()).digest())
@@ -98,6 +108,8 @@ class EmbeddedEncoder:
     @cached_property
     def _batch(self) -> int:
         """How many images run together: 1 where the kernels chosen on this machine round otherwise in a batch."""
+        if self.device != "cpu":
+            return BATCH
         noise = np.random.default_rng(0)
         pixels = noise.integers(0, 256, (N_TRIED, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
         log_sizes = noise.uniform(-1, 1, (N_TRIED, 2)).astype(np.float32)
@@ -113,11 +125,18 @@ class EmbeddedEncoder:
 
     @cached_property
     def _image_tower(self) -> Any:
-        return _session(self._path(IMAGE_FILE))
+        return self._tower(self._path(IMAGE_FILE), is_image=True)
 
     @cached_property
     def _text_tower(self) -> Any:
-        return _session(self._path(TEXT_FILE))
+        return self._tower(self._path(TEXT_FILE), is_image=False)
+
+    def _tower(self, path: Path, *, is_image: bool) -> Any:
+        if self.device == "cpu":
+            return _session(path)
+        from su3d_bench.perception.embedded_torch import TorchTower
+
+        return TorchTower(path, is_image=is_image, device=self.device)
 
     def _path(self, name: str) -> Path:
         path = self._folder / name

@@ -7,9 +7,10 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from su3d_bench.interfaces import Encoder, StageTimer
 from su3d_bench.perception.cache import CachedRows, FrameCache, array_digest, content_key, source_digest
 from su3d_bench.perception.crops import crop_images
-from su3d_bench.types import Encoder, Float32Array, Frame, PerceptionNeeds, StageTimer
+from su3d_bench.types import Float32Array, Frame, PerceptionNeeds
 
 
 def regions_to_keep(
@@ -50,7 +51,7 @@ class CropEncoder:
 
     def __init__(self, encoder: Encoder, cache: FrameCache) -> None:
         self._encoder = encoder
-        self._is_cached = cache.is_on
+        self._cache = cache
         self._source = source_digest("crops")
         self._rows = CachedRows(cache, encoder.dim)
 
@@ -68,7 +69,7 @@ class CropEncoder:
         Ratios whose features (K, D) of all K boxes are ``known`` are taken from there.
         """
         with timer.stage("cache"):
-            image = array_digest(frame.rgb, boxes) if self._is_cached else ""
+            image = self._cache.image_digest(frame.rgb) + array_digest(boxes) if self._cache.is_on else ""
         features = np.zeros((len(wanted), len(ratios), self._encoder.dim), np.float32)
         for column, ratio in enumerate(ratios):
             if known is not None and ratio in known:
@@ -91,7 +92,7 @@ class CropEncoder:
                 return self._encoder.encode_images([frame.rgb])
 
         with timer.stage("cache"):
-            image = array_digest(frame.rgb) if self._is_cached else ""
+            image = self._cache.image_digest(frame.rgb) if self._cache.is_on else ""
             key = content_key("image", image, self._encoder.digest)
         row: Float32Array = self._rows.rows(key, 1, np.zeros(1, np.intp), compute, timer)[0]
         return row

@@ -8,8 +8,9 @@ from importlib.resources import files
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from su3d_bench.interfaces import Encoder
 from su3d_bench.perception.cache import content_key
-from su3d_bench.types import BoolArray, Encoder, Float32Array, Float64Array, UInt8Array
+from su3d_bench.types import BoolArray, Float32Array, Float64Array, UInt8Array
 
 # Colour words with the sRGB value that each stands for; chosen to be far apart in CIELAB.
 COLOURS: tuple[tuple[str, tuple[int, int, int]], ...] = (
@@ -78,10 +79,10 @@ def colour_word(rgb: UInt8Array, mask: BoolArray) -> str | None:
     """
     import cv2
 
-    pixels = rgb[mask]
-    if not len(pixels):
+    inside = np.flatnonzero(mask)
+    if not len(inside):
         return None
-    pixels = pixels[:: 1 + len(pixels) // 1000]
+    pixels = rgb.reshape(-1, 3)[inside[:: 1 + len(inside) // 1000]]
     table = np.array([value for _, value in COLOURS], np.float32)
     samples = np.concatenate([np.median(pixels, axis=0)[None].astype(np.float32), table]) / np.float32(255)
     lab = cv2.cvtColor(samples[None], cv2.COLOR_RGB2LAB)[0]

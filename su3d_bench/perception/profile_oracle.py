@@ -6,6 +6,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from su3d_bench.interfaces import Encoder, RegionPerception, StageTimer
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.config import PerceptionConfig
 from su3d_bench.perception.features import NameEncoder, regions_to_keep
@@ -15,15 +16,12 @@ from su3d_bench.perception.regions import cached_regions, region_under
 from su3d_bench.types import (
     BoolArray,
     Detections,
-    Encoder,
     Float32Array,
     Frame,
     InstanceMesh,
     Int64Array,
     PerceptionNeeds,
-    RegionPerception,
     Regions,
-    StageTimer,
 )
 
 ORACLE_CAVEAT = "oracle perception: masks and names come from the ground truth; a ceiling, not a result"

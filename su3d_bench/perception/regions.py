@@ -4,18 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.perception.cache import FrameCache, content_key, frame_digest, pack_masks, unpack_masks
+from su3d_bench.interfaces import Encoder, Segmenter, StageTimer
+from su3d_bench.perception.cache import FrameCache, content_key, pack_masks, unpack_masks
 from su3d_bench.timing import Timer
-from su3d_bench.types import (
-    BoolArray,
-    Encoder,
-    Float32Array,
-    Frame,
-    Int64Array,
-    Regions,
-    Segmenter,
-    StageTimer,
-)
+from su3d_bench.types import BoolArray, Float32Array, Frame, Int64Array, Regions
 
 
 def cached_regions(
@@ -30,7 +22,7 @@ def cached_regions(
             return segmenter.segment(frame)
     with timer.stage("cache"):
         index = str(frame.index) if with_pose else ""
-        key = content_key("regions", segmenter.digest, frame_digest(frame, with_pose), index)
+        key = content_key("regions", segmenter.digest, cache.frame_digest(frame, with_pose), index)
         entry = cache.load(key)
         if entry is not None:
             names = tuple(str(name) for name in entry["names"]) if "names" in entry else None

@@ -45,7 +45,7 @@ class RgbdSegmenter:
         self, frame: Frame, superpixel: Int32Array, graph: Graph, is_structure: BoolArray, is_left_out: BoolArray
     ) -> Regions:
         height, width = frame.depth_m.shape
-        labels = graph.piece_of_superpixel[superpixel]
+        labels = graph.piece_of_superpixel.astype(np.int32).take(superpixel)
         factor = -(-width // self._config.max_width)
         labels = np.repeat(np.repeat(labels, factor, axis=0), factor, axis=1)
         labels = np.pad(labels, ((0, max(0, height - len(labels))), (0, max(0, width - labels.shape[1]))), mode="edge")
@@ -53,7 +53,9 @@ class RgbdSegmenter:
         sizes = np.bincount(labels.ravel(), minlength=len(graph.pieces))
         order = np.argsort(-sizes, kind="stable")
         chosen = [k for k in order if not is_left_out[k] and sizes[k] >= self._config.min_region_px]
-        masks = np.array([labels == k for k in chosen], bool).reshape(len(chosen), height, width)
+        masks = np.empty((len(chosen), height, width), np.bool_)
+        for mask, k in zip(masks, chosen, strict=True):
+            np.equal(labels, k, out=mask)
         quality = region_quality(graph, is_structure, _pixels_at_image_border(graph, superpixel), self._config)
         return Regions(masks, mask_boxes(masks), quality[np.array(chosen, np.intp)].astype(np.float32))
 

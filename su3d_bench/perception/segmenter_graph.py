@@ -123,20 +123,19 @@ class Graph:
 
 
 def _sum_by(label: IndexArray, values: Float64Array, n: int) -> Float64Array:
+    from su3d_bench.perception.segmenter_graph_kernels import sum_rows
+
     if values.ndim == 1:
-        return np.bincount(label, values, n).astype(np.float64)
-    return np.stack([np.bincount(label, column, n) for column in values.T], axis=1).astype(np.float64)
+        return np.bincount(label, values, n)
+    sums: Float64Array = sum_rows(label, np.ascontiguousarray(values), n)
+    return sums
 
 
 def contract(graph: Graph, pairs: tuple[IndexArray, IndexArray]) -> Graph:
     """The graph with the two pieces of each pair joined, chains included."""
-    from scipy.sparse import coo_matrix
-    from scipy.sparse.csgraph import connected_components
+    from su3d_bench.perception.segmenter_graph_kernels import connected
 
-    n = len(graph.pieces)
-    links = coo_matrix((np.ones(len(pairs[0]), np.int8), pairs), shape=(n, n))
-    n_joined, labels = connected_components(links, directed=False)
-    label = labels.astype(np.intp)
+    label, n_joined = connected(*pairs, len(graph.pieces))
     pieces, borders = graph.pieces.joined(label, n_joined), graph.borders
     inside = label[borders.a] == label[borders.b]
     owner = label[borders.a[inside]]
@@ -187,20 +186,12 @@ def measure_borders(
 
     Depth differences are relative, in units of ``depth_unit``, from which on they are jumps; -1 where unknown.
     """
+    from su3d_bench.perception.segmenter_graph_kernels import border_pairs
+
     n = len(pieces)
-    keys, contrasts, depths = [], [], []
-    for axis, (first, second) in enumerate(
-        ((np.s_[:, :-1], np.s_[:, 1:]), (np.s_[:-1, :], np.s_[1:, :])),
-    ):
-        a, b = labels[first], labels[second]
-        differs = a != b
-        low, high = np.minimum(a, b)[differs].astype(np.int64), np.maximum(a, b)[differs].astype(np.int64)
-        keys.append(low * n + high)
-        contrasts.append(contrast[axis][first][differs])
-        depths.append(depth_cost[axis][first][differs])
-    key, inverse = np.unique(np.concatenate(keys), return_inverse=True)
+    low, high, contrasts, depth = border_pairs(labels, contrast, depth_cost)
+    key, inverse = np.unique(low * n + high, return_inverse=True)
     low_of, high_of = (key // max(n, 1)).astype(np.intp), (key % max(n, 1)).astype(np.intp)
-    depth = np.concatenate(depths)
     deep = (depth >= 0).astype(np.float64)
     gap = (depth >= 1).astype(np.float64)
     n_deep, n_gap = _sum_by(inverse, deep, len(key)), _sum_by(inverse, gap, len(key))
@@ -208,7 +199,7 @@ def measure_borders(
         low_of,
         high_of,
         _sum_by(inverse, np.ones(len(depth)), len(key)),
-        _sum_by(inverse, np.concatenate(contrasts).astype(np.float64), len(key)),
+        _sum_by(inverse, contrasts.astype(np.float64), len(key)),
         n_deep,
         n_gap,
         _sum_by(inverse, np.where(gap > 0, depth.astype(np.float64) * depth_unit, 0.0), len(key)),

@@ -1,4 +1,4 @@
-"""The two towers in torch; only training imports this module.
+"""The two towers in torch; only training and ``embedded_torch.py`` import this module.
 
 While training, convolutions run in bfloat16 (twice as fast on a CPU that has it), the heads in float32.
 """

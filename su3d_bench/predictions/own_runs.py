@@ -15,28 +15,10 @@ from su3d_bench.predictions.base import ScenePrediction, shown
 from su3d_bench.predictions.mask_arrays import kind_of, scene_file
 from su3d_bench.predictions.numpy_files import npy_header_of, npz_names, read_npz
 from su3d_bench.store import features_beside, prediction_from_arrays
-from su3d_bench.types import DenseFeatures, Partition, Prediction
+from su3d_bench.types import DenseFeatures, Instances, Partition, Prediction
 
 FILE = "prediction.npz"
 FLOATS = ("f2", "f4", "f8")
-# Dimensions and kinds of values of each field; see Instances, Partition and DenseFeatures.
-FIELDS = {
-    "kind": (0, "U"),
-    "points": (2, "f"),
-    "indptr": (1, "i"),
-    "indices": (1, "i"),
-    "scores": (1, "f"),
-    "features": (2, "f"),
-    "labels": (1, "U"),
-    "names": (1, "U"),
-    "captions": (1, "U"),
-    "boxes": (3, "f"),
-    "centroids": (2, "f"),
-    "view_indptr": (1, "i"),
-    "views": (2, "i"),
-    "ids": (1, "i"),
-    "instance": (1, "i"),
-}
 
 
 class OwnRuns:
@@ -61,13 +43,6 @@ class OwnRuns:
         arrays = read_npz(file)
         if str(arrays.get("kind")) == DenseFeatures.__name__ and "features" not in arrays:
             arrays["features"] = _mapped_features(features_beside(file))
-        for name, array in arrays.items():
-            _check_field(shown(file), name, array)
-        points, indptr = arrays.get("points"), arrays.get("indptr")
-        if points is not None and points.shape[1] != 3:
-            raise PredictionError(f"{shown(file)}: 'points' is {kind_of(points)}; expected three coordinates a point")
-        if indptr is not None and len(indptr) == 0:
-            raise PredictionError(f"{shown(file)}: 'indptr' is empty; run the scene again")
         try:
             content = prediction_from_arrays(arrays, shown(file))
         except PredictionError as error:
@@ -93,17 +68,15 @@ def _mapped_features(file: Path) -> NDArray[Any]:
     return np.memmap(file, np.dtype(header.code), "r", header.start, (n_rows, n_columns))
 
 
-def _check_field(where: str, name: str, array: NDArray[Any]) -> None:
-    n_dimensions, kinds = FIELDS.get(name, (array.ndim, array.dtype.kind))
-    if array.ndim != n_dimensions or array.dtype.kind not in kinds:
-        raise PredictionError(f"{where}: '{printable(name, 60)}' is {kind_of(array)}; run the scene again")
-    if name in {"points", "scores"} and not np.isfinite(array).all():
-        raise PredictionError(f"{where}: '{name}' has values that are NaN or infinite; run the scene again")
-
-
 def _check_points(where: str, content: Prediction) -> None:
-    """Refuses a partition or features that do not go with their points; instances check themselves."""
+    """Refuses what is no point, and a partition or features that do not go with their points."""
     n = len(content.points)
+    if content.points.shape[1] != 3:
+        raise PredictionError(f"{where}: 'points' is {kind_of(content.points)}; expected three coordinates a point")
+    scores = content.scores if isinstance(content, Instances) else np.zeros(0)
+    for name, values in (("points", content.points), ("scores", scores)):
+        if not np.isfinite(values).all():
+            raise PredictionError(f"{where}: '{name}' has values that are NaN or infinite; run the scene again")
     if isinstance(content, DenseFeatures) and len(content.features) != n:
         raise PredictionError(f"{where}: {n} points and {len(content.features)} features; run the scene again")
     if isinstance(content, Partition):

@@ -11,12 +11,12 @@ from functools import cache
 
 import numpy as np
 
+from su3d_bench.interfaces import Encoder
 from su3d_bench.perception.captions_lexicon import GROUPS, SYNONYMS
 from su3d_bench.perception.embedded_text import words
 from su3d_bench.perception.naming import vocabulary
 from su3d_bench.reasoning.relations import is_room_surface
 from su3d_bench.reasoning.scene_map import MapObject, SceneMap
-from su3d_bench.types import Encoder
 
 Words = tuple[str, ...]
 # A name, and how near it is by the encoder (cosine).

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.errors import ConfigError
+from su3d_bench.interfaces import Encoder
 from su3d_bench.metrics.question_truths import AskedText
 from su3d_bench.metrics.score_questions import (
     judge_merging,
@@ -25,7 +26,7 @@ from su3d_bench.questions.refined import refined_names
 from su3d_bench.questions.truths import own_questions, question_truth
 from su3d_bench.sheets.items import RIGHT, WRONG, SheetKind
 from su3d_bench.sheets.run_source import RunSource, mask_digest
-from su3d_bench.types import Encoder, Float64Array, GroundTruth, Instances
+from su3d_bench.types import Float64Array, GroundTruth, Instances
 
 MOST_TEXT = 1000  # characters of a query, a label or an answer that a sheet shows
 NO_LABEL = "(no label)"

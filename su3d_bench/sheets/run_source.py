@@ -18,7 +18,7 @@ from su3d_bench.metrics.covered_objects import Covered, covered_objects
 from su3d_bench.plain_text import printable
 from su3d_bench.planning import data_root, dataset_targets, why_not_fitting
 from su3d_bench.protocols import ProtocolRules, load_protocol, protocol_names
-from su3d_bench.scene_run import Part, build_dataset
+from su3d_bench.scene_job import Part, build_dataset
 from su3d_bench.store import read_prediction
 from su3d_bench.types import Frame, GroundTruth, Instances
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from su3d_bench.errors import DataError
 from su3d_bench.perception.cache import FrameCache, content_key
-from su3d_bench.perception.models.devices import Batches
+from su3d_bench.perception.models.devices import CPU, Batches
 from su3d_bench.perception.models.image_transform import LARGEST_SIZE, ImageTransform
 from su3d_bench.perception.models.onnx_session import PROVIDERS
 from su3d_bench.perception.models.text_tokens import TOKENS_VERSION, TokensKind
@@ -82,9 +82,11 @@ class FoundationEncoder:
         load_tokeniser: Callable[[], Callable[[Sequence[str]], Int64Array]],
         identity: Callable[[], Mapping[str, Any]],
         cache: FrameCache | None = None,
+        device: str = CPU,
     ) -> None:
         self.name = name
         self.dim = spec.dim
+        self.device = device
         self._spec = spec
         self._load_towers = load_towers
         self._load_tokeniser = load_tokeniser

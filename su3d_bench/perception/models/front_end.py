@@ -7,6 +7,7 @@ from functools import partial
 from importlib.util import find_spec
 
 from su3d_bench.errors import ConfigError, ModelMissing
+from su3d_bench.interfaces import Encoder
 from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.models.catalogue import FormName
 from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig
@@ -29,7 +30,6 @@ from su3d_bench.perception.models.tagging import (
     load_ram,
     read_word_list,
 )
-from su3d_bench.types import Encoder
 
 PAPER_ENCODER, DETECTOR, TAGGER = "clip-vit-h-14", "grounding-dino", "ram-plus"
 PACKAGES = ("torch", "transformers")

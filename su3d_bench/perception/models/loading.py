@@ -7,16 +7,16 @@ from functools import lru_cache, partial
 from typing import Any
 
 from su3d_bench.errors import ConfigError
+from su3d_bench.interfaces import Encoder
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.models import towers_onnx, towers_open_clip, towers_transformers
 from su3d_bench.perception.models.catalogue import FormName, model_entry
 from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, Runtime
-from su3d_bench.perception.models.devices import device_for, precision_for, require, require_installed
+from su3d_bench.perception.models.devices import CPU, device_for, precision_for, require, require_installed
 from su3d_bench.perception.models.encoder import EncoderSpec, FoundationEncoder, Towers
 from su3d_bench.perception.models.files import ModelFiles, locate
 from su3d_bench.perception.models.onnx_session import Provider
 from su3d_bench.perception.models.text_tokens import Tokeniser, read_tokeniser
-from su3d_bench.types import Encoder
 
 FORM_OF_RUNTIME: Mapping[Runtime, FormName] = {"torch": "transformers", "open_clip": "open_clip", "onnx": "onnx"}
 PACKAGES_OF_RUNTIME: Mapping[Runtime, tuple[str, ...]] = {
@@ -38,8 +38,8 @@ def load_encoder(
     if name == EMBEDDED:
         from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
 
-        _refuse_idle_settings(config, is_alone=default == EMBEDDED)
-        return EmbeddedEncoder()
+        _refuse_idle_settings(config)
+        return EmbeddedEncoder(device=device_for(config.device, job_index))
     files = encoder_files(config, name)
     for package in PACKAGES_OF_RUNTIME[config.runtime]:
         require(package, f"encoder '{name}'")
@@ -61,13 +61,11 @@ def encoder_files(config: ModelsConfig, name: str) -> ModelFiles:
     return locate(name, (FORM_OF_RUNTIME[config.runtime],), path=config.path_of(name), folder=config.folder)
 
 
-def _refuse_idle_settings(config: ModelsConfig, *, is_alone: bool) -> None:
-    """The embedded encoder has a runtime of its own; ``is_alone``: no other model of the profile uses the device."""
+def _refuse_idle_settings(config: ModelsConfig) -> None:
+    """The embedded encoder has a runtime of its own."""
     advice = "choose perception.models.encoder or --profile paper"
     if config.runtime != "torch":
         raise ConfigError(f"perception.models.runtime '{config.runtime}': the embedded encoder has its own; {advice}")
-    if is_alone and config.device != "cpu":
-        raise ConfigError(f"device '{config.device}': the embedded encoder runs on the CPU alone; {advice}")
 
 
 def _torch_encoder(
@@ -87,7 +85,7 @@ def _torch_encoder(
     else:
         spec = towers_transformers.read_spec(files, config.transform)
         tokeniser = _tokeniser_of(files, spec)
-    return FoundationEncoder(files.entry.known_as, spec, load_towers, tokeniser, identity, cache)
+    return FoundationEncoder(files.entry.known_as, spec, load_towers, tokeniser, identity, cache, device)
 
 
 def _onnx_encoder(
@@ -104,7 +102,10 @@ def _onnx_encoder(
         return {"runtime": "onnx", "files": dict(manifest.files), "provider": provider}
 
     load_towers = partial(_onnx_towers, files, provider, device_index, config.batch)
-    return FoundationEncoder(files.entry.known_as, spec, load_towers, _tokeniser_of(files, spec), identity, cache)
+    device = CPU if provider == "cpu" else f"cuda:{device_index}"
+    return FoundationEncoder(
+        files.entry.known_as, spec, load_towers, _tokeniser_of(files, spec), identity, cache, device
+    )
 
 
 # A worker makes a new encoder for each method and scene; the towers, gigabytes of them, are kept.

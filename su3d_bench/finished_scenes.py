@@ -1,0 +1,100 @@
+"""Scenes of a run that need no worker any more: every step sealed under today's key, every sealed file whole."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping
+from typing import Any
+
+from su3d_bench.job_inputs import JobInputs
+from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
+from su3d_bench.scene_job import MethodOutcome, Part, SceneJob, build_dataset, build_method, config_key, stride_of
+from su3d_bench.store import JobFolder, RunFolder
+from su3d_bench.types import SceneInfo
+
+SAME_EVERYWHERE = ("embedded", "paper")  # profiles whose digest does not depend on the scene
+
+
+class FinishedScenes:
+    """Tells the finished scenes of one run by the checks that a worker makes, each of which reads a file once.
+
+    What all scenes share (methods, datasets, perception, their keys) is made once. A scene whose perception has a
+    digest of its own (profiles ``stored`` and ``oracle``) is left to a worker.
+    """
+
+    def __init__(self) -> None:
+        self._datasets: dict[Part, Any] = {}
+        self._methods: dict[tuple[Part, Part], tuple[Any, dict[str, str]]] = {}
+        self._perceptions: dict[tuple[str, str], Perception] = {}
+        self._last_digest = ("", "")  # a scene and that of its data
+
+    def outcomes(self, job: SceneJob) -> tuple[MethodOutcome, ...] | None:
+        """The outcomes of a scene, that of the ceiling last; None where a worker is needed, be it to say an error."""
+        parts = job.methods if job.ceiling is None else (*job.methods, job.ceiling)
+        folders = [RunFolder(job.folder).job(job.scene, part.name) for part in parts]
+        seals = [folder.seals() for folder in folders]
+        if any("predict" not in one or "score" not in one for one in seals):
+            return None
+        package = logging.getLogger("su3d_bench")
+        package.addHandler(unheard := logging.NullHandler())  # what is said of a scene's data was said in its first run
+        try:
+            found = [self._outcome(job, *each) for each in zip(parts, folders, seals, strict=True)]
+        except Exception:  # noqa: BLE001 - a plug-in may raise anything; a worker tells it as ever
+            return None
+        finally:
+            package.removeHandler(unheard)
+        return None if None in found else tuple(one for one in found if one is not None)
+
+    def _outcome(self, job: SceneJob, part: Part, folder: JobFolder, seals: Mapping[str, Any]) -> MethodOutcome | None:
+        inputs = self.inputs(job, part)
+        if inputs is None:
+            return None
+        key = inputs.predict_key()
+        is_done = folder.is_whole(seals["predict"], key)
+        if not is_done or not folder.is_whole(seals["score"], inputs.score_key(key, folder)):
+            return None
+        return inputs.outcome(seals["score"]["remarks"], was_resumed=True)
+
+    def inputs(self, job: SceneJob, part: Part) -> JobInputs | None:
+        """What decides the numbers of a job; None where only a worker can tell."""
+        method, config = self._method(job, part)
+        info = self._dataset(job).info(job.scene_name, stride_of(job.stride, part.options))
+        perception = self._perception(job, info)
+        if perception is None:
+            return None
+        return JobInputs(job, part.name, config, method, info, perception, self._data_digest(job))
+
+    def _data_digest(self, job: SceneJob) -> str:
+        scene, digest = self._last_digest
+        if scene != job.scene:
+            digest = str(self._dataset(job).digest(job.scene_name))
+            self._last_digest = job.scene, digest
+        return digest
+
+    def _dataset(self, job: SceneJob) -> Any:
+        if job.dataset not in self._datasets:
+            self._datasets[job.dataset] = build_dataset(job.dataset, job.data_root)
+        return self._datasets[job.dataset]
+
+    def _method(self, job: SceneJob, part: Part) -> tuple[Any, dict[str, str]]:
+        if (job.dataset, part) not in self._methods:
+            method = build_method(part)
+            self._methods[job.dataset, part] = method, config_key(job, part, method)
+        return self._methods[job.dataset, part]
+
+    def _perception(self, job: SceneJob, info: SceneInfo) -> Perception | None:
+        config: PerceptionConfig = PerceptionConfig.model_validate_json(job.perception)
+        profile = resolve_profile(job.profile, info.image_domain, config)
+        if profile not in SAME_EVERYWHERE:
+            return None
+        if (profile, info.image_domain) not in self._perceptions:
+            self._perceptions[profile, info.image_domain] = build_perception(
+                profile,
+                config,
+                scene=info,
+                cache_root=job.cache_root,
+                mesh=None,
+                replies=job.folder / "language",
+                is_offline=job.is_offline,
+            )
+        return self._perceptions[profile, info.image_domain]

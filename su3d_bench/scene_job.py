@@ -1,0 +1,125 @@
+"""What a run asks of a worker and gets back: one scene's job, its outcomes, and the keys under which they are kept."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from su3d_bench import registry
+from su3d_bench.config import flatten
+from su3d_bench.digests import NUMERIC_PACKAGES, code_digest, package_versions
+from su3d_bench.errors import StoreError
+from su3d_bench.interfaces import Method
+from su3d_bench.store import JobFolder
+
+CEILING_METHOD = "oracle"
+# Settings of perception that move no number, or whose part that does is in perception's digest.
+MOVES_NO_NUMBER = ("perception.cache", "perception.models.folder", "perception.models.paths", "perception.language.")
+FIELDS_KNOWN_LATER = ("data", "profile", "perception")
+
+
+@dataclass(frozen=True)
+class Part:
+    """A dataset or method of the run: its registry target, its own name, its resolved options as JSON."""
+
+    target: str
+    name: str
+    options: str
+
+
+@dataclass(frozen=True)
+class SceneJob:
+    """Everything that a worker needs to know of one scene; ``index`` counts the scenes of the run."""
+
+    scene: str
+    dataset: Part
+    methods: tuple[Part, ...]
+    ceiling: Part | None
+    protocols: tuple[str, ...]
+    profile: str
+    perception: str
+    stride: int
+    seed: int
+    limit: int
+    pictures: bool
+    anytime: tuple[float, ...]
+    folder: Path
+    data_root: Path
+    cache_root: Path
+    index: int = 0
+    is_offline: bool = False
+
+    @property
+    def scene_name(self) -> str:
+        """The scene as its dataset calls it."""
+        return self.scene.removeprefix(f"{self.dataset.name}/")
+
+
+@dataclass(frozen=True)
+class MethodOutcome:
+    """What became of one scene under one method; ``error`` is a line, ``unscored`` pairs a protocol and a reason.
+
+    ``warnings`` are what the library said of the data on the way.
+    """
+
+    scene: str
+    method: str
+    error: str | None = None
+    profile: str | None = None
+    caveat: str | None = None
+    encoder: str | None = None
+    encoder_digest: str | None = None
+    data_digest: str | None = None
+    was_resumed: bool = False
+    unscored: tuple[tuple[str, str], ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def stride_of(job_stride: int, options: str) -> int:
+    """Frames between updates: the run's where it is set, else the method's own, else 1."""
+    return job_stride or int(json.loads(options).get("stride", 1))
+
+
+def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
+    """What of a prediction's key is known before any data is read, the most telling fields first."""
+    key = {"dataset": job.dataset.name, "method": part.name, "seed": str(job.seed)}
+    sections = [(f"method.{part.name}", part.options), (f"dataset.{job.dataset.name}", job.dataset.options)]
+    if method.needs.frames:
+        key |= {"stride": str(stride_of(job.stride, part.options)), "limit": str(job.limit or "none")}
+        if job.anytime:
+            key["anytime"] = str(job.anytime)
+        sections.append(("perception", job.perception))
+    for prefix, options in sections:
+        for path, value in flatten(json.loads(options)):
+            key[".".join((prefix, *path))] = json.dumps(value, ensure_ascii=False)
+    key = {name: text for name, text in key.items() if not name.startswith(MOVES_NO_NUMBER)}
+    if hasattr(method, "inputs"):
+        key |= {f"input.{name}": digest for name, digest in method.inputs.items()}
+    return (
+        key
+        | {f"packages.{name}": text for name, text in package_versions(NUMERIC_PACKAGES).items()}
+        | {"code": code_digest()}
+    )
+
+
+def refuse_other_run(folder: JobFolder, key: Mapping[str, str], known_later: Sequence[str] = ()) -> None:
+    """A ``StoreError`` where ``folder`` was sealed under another key, fields in ``known_later`` aside."""
+    if changed := folder.changed_field("predict", key, known_later=known_later):
+        raise StoreError(
+            f"{folder.path}: holds another run ({changed}); choose another folder with --out or delete this one"
+        )
+
+
+def build_dataset(part: Part, data_root: Path) -> Any:
+    """The dataset of ``part``, reading below ``data_root``."""
+    dataset_class = registry.load("dataset", part.target)
+    return dataset_class(data_root, dataset_class.Options.model_validate_json(part.options))
+
+
+def build_method(part: Part) -> Any:
+    """A fresh method of ``part``."""
+    method_class = registry.load("method", part.target)
+    return method_class(method_class.Config.model_validate_json(part.options))

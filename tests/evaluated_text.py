@@ -1,0 +1,61 @@
+"""A small scene of labelled vertices with its masks in ScanNet's text, and what ``evaluate`` says of it."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.evaluation import Request, evaluate
+
+N = 600
+CHAIR, TABLE = np.arange(200), np.arange(200, 400)  # the objects of the small scene; the other points are void
+TRUTH = np.repeat([5001, 7002, 1003], 200)
+
+
+def write_truth(folder: Path, name: str = "scene0001_00", values: Any = TRUTH) -> None:
+    folder.mkdir(exist_ok=True)
+    (folder / f"{name}.txt").write_text("".join(f"{value}\n" for value in values))
+
+
+def scene(
+    masks: list[Any], labels: list[int], scores: list[float] | None = None, name: str = "scene0001_00", n: int = N
+) -> dict[str, Any]:
+    full = np.zeros((len(masks), n), bool)
+    for row, members in zip(full, masks, strict=True):
+        row[members] = True
+    return {
+        "name": name,
+        "masks": full,
+        "labels": np.array(labels),
+        "scores": np.array(scores or [1.0] * len(masks)),
+        "files": [f"masks/{name}_{k}.txt" for k in range(len(masks))],
+    }
+
+
+def document(folder: Path, protocol: str | None = "scannet-instance", **more: Any) -> dict[str, Any]:
+    """The JSON value of ``pred`` against ``gt`` in ``folder``."""
+    protocols = () if protocol is None else (protocol,)
+    request = Request((folder / "pred",), ground_truth=folder / "gt", protocols=protocols, **more)
+    value: dict[str, Any] = json.loads(json.dumps(evaluate(request).to_json(), allow_nan=False))
+    return value
+
+
+def numbers(folder: Path, protocol: str = "scannet-instance", **more: Any) -> dict[str, Any]:
+    found: dict[str, Any] = document(folder, protocol, **more)["protocols"][protocol]
+    return found
+
+
+def said(found: dict[str, Any], beginning: str) -> str:
+    """The only warning that begins so."""
+    (line,) = [line for line in found["warnings"] if line.startswith(beginning)]
+    return str(line)
+
+
+def write_texts(path: Path, names: list[str], of: dict[str, int], **more: Any) -> None:
+    features = np.full((len(names), 16), 0.01, np.float32)
+    for name, column in of.items():
+        features[names.index(name), column] = 1.0
+    np.savez(path, names=np.array(names), features=features, **more)

@@ -1,0 +1,107 @@
+"""What a run computes on a torch device, beside the CPU: whole maps, labels and cosines, the embedded encoder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from test_opensu3d_pipeline import SCENE, TWINS, contents, look
+from torch_devices import TORCH_ON_CPU, needs_torch, on_each_device
+
+from su3d_bench.cli.main import main
+from su3d_bench.metrics.labelling import cosines, most_similar
+from su3d_bench.opensu3d.config import OpenSU3DConfig
+from su3d_bench.opensu3d.pipeline import OpenSU3D
+from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
+from su3d_bench.timing import Timer
+
+
+@on_each_device
+@pytest.mark.parametrize("keep_density", [True, False])
+def test_a_map_fused_on_a_device_is_that_of_the_cpu_byte_for_byte(device: str, keep_density: bool) -> None:
+    config = OpenSU3DConfig(border_px=1, border_reference_width=0, keep_density=keep_density)
+    views = [look(TWINS, index, x) for index, x in enumerate([0.0, 0.5, -0.5, 0.2])]
+    maps = []
+    for where in ("cpu", device):
+        method = OpenSU3D(config)
+        method.receive_device(where)
+        method.start(SCENE)
+        for frame, detections in views:
+            method.update(frame, detections, Timer())
+        maps.append(method.finish())
+        method.close()
+    assert len(maps[0].ids) == 2
+    assert contents(maps[0]) == contents(maps[1])
+
+
+@on_each_device
+def test_a_device_chooses_the_labels_of_the_cpu_where_classes_are_equally_near_too(device: str) -> None:
+    rng = np.random.default_rng(0)
+    text = rng.normal(size=(40, 96)).astype(np.float32)
+    text[7] = text[3]  # two classes of one feature: the first wins
+    features = rng.normal(size=(20_000, 96)).astype(np.float32)
+    features[:50] = text[7] + rng.normal(0, 1e-8, (50, 96))
+    features[9000:9100], features[9100] = 0, np.nan
+    chosen = most_similar(features, text)
+    np.testing.assert_array_equal(most_similar(features, text, device), chosen)
+    assert (chosen[:50] == 3).all() and (chosen[9000:9101] == 0).all()
+    one = text[:1]
+    np.testing.assert_array_equal(most_similar(features, one, device), np.zeros(len(features)))
+
+
+@needs_torch
+def test_a_block_in_which_every_choice_is_clear_is_not_computed_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_: object) -> None:
+        raise AssertionError
+
+    text, features = np.eye(4), np.eye(4)[[2, 0, 3]]
+    expected = most_similar(features, text)
+    monkeypatch.setattr(
+        "su3d_bench.metrics.labelling._normalised", lambda rows: rows if len(rows) == 4 else refuse(rows)
+    )
+    assert most_similar(features, text, TORCH_ON_CPU).tolist() == expected.tolist() == [2, 0, 3]
+    with pytest.raises(AssertionError):  # a tie is
+        most_similar(np.ones((3, 4)), text, TORCH_ON_CPU)
+
+
+@on_each_device
+def test_cosines_of_a_device_are_those_of_the_cpu(device: str) -> None:
+    rng = np.random.default_rng(1)
+    features, text = rng.normal(size=(300, 512)).astype(np.float16), rng.normal(size=(70, 512))
+    features[5], features[6, 3] = 0, np.inf
+    found = cosines(features, text, device)
+    np.testing.assert_allclose(found, cosines(features, text), rtol=0, atol=1e-12)
+    assert (found[5:7] == 0).all()
+
+
+@on_each_device
+def test_the_embedded_encoder_gives_the_features_of_the_cpu_on_a_device(device: str) -> None:
+    pytest.importorskip("onnx", reason="needs onnx: pip install 'su3d-bench[models]'")
+    rng = np.random.default_rng(2)
+    images = [rng.integers(0, 256, (*size, 3), np.uint8) for size in ((12, 40), (64, 64), (200, 90))] * 13
+    texts = ["chair", "a plant on the shelf", "the", ""]
+    here, there = EmbeddedEncoder(), EmbeddedEncoder(device=device)
+    np.testing.assert_allclose(there.encode_images(images), here.encode_images(images), rtol=0, atol=1e-5)
+    np.testing.assert_allclose(there.encode_texts(texts), here.encode_texts(texts), rtol=0, atol=1e-5)
+
+
+def test_features_made_on_a_gpu_have_a_digest_of_their_own_and_the_space_of_the_cpu() -> None:
+    here, there = EmbeddedEncoder(), EmbeddedEncoder(device="cuda:1")
+    assert here.digest != there.digest == EmbeddedEncoder(device="cuda:0").digest
+    assert here.is_same_space(there.digest) and there.is_same_space(here.digest)
+    assert not here.is_same_space("0" * 64)
+
+
+@needs_torch
+def test_a_run_on_a_gpu_that_is_not_here_ends_before_any_work_in_one_line(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    import torch
+
+    if torch.cuda.is_available():
+        pytest.skip("this machine has a GPU")
+    assert main(["run", "--device", "cuda", "--scenes", "rooms/living0", "--out", str(tmp_path / "run")]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "device 'cuda': torch sees no GPU here; use --device cpu" in error
+    assert not (tmp_path / "run").exists()

@@ -1,0 +1,135 @@
+"""What ``evaluate`` refuses and warns of: masks, clouds, truths and texts that do not fit or are damaged."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from damage import damages, outcomes, truncations
+from evaluated_text import CHAIR, TABLE, document, numbers, said, scene, write_texts, write_truth
+from prediction_files import (
+    write_scannet_text,
+)
+
+from su3d_bench.errors import DataError, PredictionError
+from su3d_bench.evaluation_checks import check_cloud, mask_facts
+from su3d_bench.evaluation_texts import read_text_features
+from su3d_bench.evaluation_truth import read_text_truth
+from su3d_bench.metrics.transfer import Masks
+
+# ---- checks
+
+
+def test_masks_of_another_length_are_refused_with_both_lengths(tmp_path: Path) -> None:
+    write_truth(tmp_path / "gt")
+    write_scannet_text(tmp_path / "pred", scene([CHAIR], [5], n=500))
+    with pytest.raises(PredictionError, match="scene0001_00: the masks are of 500 points, the ground truth has 600"):
+        numbers(tmp_path)
+
+
+def test_empty_double_and_foreign_masks_are_warned_of_with_their_index(tmp_path: Path) -> None:
+    write_truth(tmp_path / "gt")
+    masks = [CHAIR, [], CHAIR, CHAIR[:195], TABLE]
+    write_scannet_text(tmp_path / "pred", scene(masks, [5, 5, 5, 5, 1]))
+    found = numbers(tmp_path)
+    where = "scene0001_00: "
+    assert said(found, f"{where}1 empty mask, the first is mask 1 (masks/scene0001_00_1.txt)")
+    assert said(found, f"{where}1 pair of identical masks, the first is 0 (masks/scene0001_00_0.txt) and 2 (")
+    assert said(found, f"{where}2 pairs of near-duplicates, the first is 0 (masks/scene0001_00_0.txt) and 3 (")
+    assert "1 of class 1 (wall); the first is mask 4" in said(
+        found, f"{where}1 of 5 masks has a class that is not scored"
+    )
+    assert said(found, "every confidence is 1")
+    assert found["duplicates"] == {"near": 3, "identical": 1}
+
+
+def test_two_lines_that_name_one_mask_file_are_told(tmp_path: Path) -> None:
+    write_truth(tmp_path / "gt")
+    write_scannet_text(tmp_path / "pred", scene([CHAIR], [5]) | {"files": ["masks/m.txt"]})
+    listed = tmp_path / "pred/scene0001_00.txt"
+    listed.write_text(listed.read_text() + "masks/m.txt 7 0.5\n")
+    remarks = document(tmp_path)["remarks"]
+    assert any(line.startswith("scene0001_00: 1 lines name a mask file again") for line in remarks)
+
+
+def test_facts_of_masks_are_exact() -> None:
+    masks = Masks(np.array([0, 3, 6, 8]), np.array([0, 1, 2, 0, 1, 2, 2, 5], np.int32))
+    facts = mask_facts(masks, np.array([0.5, 1.0, 0.25]), 8)
+    assert (facts.near, facts.identical) == (((0, 1),), ((0, 1),))
+    assert (facts.n_covered, facts.n_contested) == (4, 3)
+    assert (facts.lowest_score, facts.highest_score) == (0.25, 1.0)
+
+
+BOX = np.array([[0.0, 0, 0], [6.4, 5, 2.5], [1, 1, 1]], np.float32)
+
+
+@pytest.mark.parametrize(
+    ("points", "line"),
+    [
+        (BOX * 500, "a: the cloud spans 3200, the scene 6.4 m: millimetres\\?"),
+        (BOX * 100, "a: the cloud spans 640, the scene 6.4 m: centimetres\\?"),
+        (BOX * 1e-3, "a: the cloud spans 0.0064, the scene 6.4 m: kilometres\\?"),
+        (BOX + 50, "a: no point of the cloud lies in the box of the scene"),
+        (BOX * np.nan, "a: point 0 is at"),
+    ],
+)
+def test_a_cloud_in_other_units_or_elsewhere_is_refused(points: Any, line: str) -> None:
+    with pytest.raises(PredictionError, match=line):
+        check_cloud("a", points.astype(np.float32), BOX)
+
+
+def test_a_cloud_half_outside_is_doubted_and_one_that_fits_is_not() -> None:
+    assert check_cloud("a", BOX, BOX) == []
+    assert check_cloud("a", BOX[:0], BOX) == []
+    moved = BOX + np.array([6, 4.5, 0], np.float32)
+    assert check_cloud("a", moved, BOX)[0].startswith("a: only 33 % of the cloud lies in the box of the scene")
+
+
+# ---- hostile files
+
+
+def test_every_damage_to_a_truth_file_is_one_error_with_its_name(tmp_path: Path) -> None:
+    file = tmp_path / "scene0001_00.txt"
+    content = "".join(f"{value}\n" for value in [0, 5001, 1163002, 39001, 7]).encode()
+
+    def read(damaged: bytes) -> object:
+        file.write_bytes(damaged)
+        return read_text_truth({"scene0001_00": file})
+
+    for copies in (truncations(content), damages(content)):
+        n_read, n_refused = outcomes(read, copies, must_name=file.name)
+        assert n_refused > 0
+        assert n_read > 0
+
+
+def test_every_damage_to_a_file_of_texts_is_one_error_with_its_name(tmp_path: Path) -> None:
+    file = tmp_path / "texts.npz"
+    write_texts(file, ["chair", "table"], {"chair": 1})
+    content = file.read_bytes()
+
+    def read(damaged: bytes) -> object:
+        file.write_bytes(damaged)
+        return read_text_features(file)
+
+    for copies in (truncations(content), damages(content)):
+        _, n_refused = outcomes(read, copies, must_name=file.name)
+        assert n_refused > 0
+
+
+@pytest.mark.parametrize(
+    ("arrays", "line"),
+    [
+        ({"names": np.array(["a"])}, "has no 'names' and 'features'"),
+        ({"names": np.array([1]), "features": np.ones((1, 2))}, "expected texts"),
+        ({"names": np.array(["a", "b"]), "features": np.ones((1, 2))}, "one finite row of features a name"),
+        ({"names": np.array(["a"]), "features": np.full((1, 2), np.nan)}, "one finite row of features a name"),
+        ({"names": np.array(["a", "a"]), "features": np.ones((2, 2))}, "'a' stands there twice"),
+        ({"names": np.array(["a"]), "features": np.ones((1, 2)), "encoder": np.array([1])}, "expected one text"),
+    ],
+)
+def test_a_file_of_texts_that_does_not_fit_is_refused(arrays: dict[str, Any], line: str, tmp_path: Path) -> None:
+    np.savez(tmp_path / "texts.npz", **arrays)
+    with pytest.raises(DataError, match=line):
+        read_text_features(tmp_path / "texts.npz")

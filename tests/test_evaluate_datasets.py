@@ -1,0 +1,151 @@
+"""``evaluate`` against the ground truth of datasets: our own runs, maps of their own points, OpenLex3D's release."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from evaluated_text import said, scene, write_texts, write_truth
+from prediction_files import (
+    write_scannet_text,
+)
+
+from su3d_bench.cli.main import main
+from su3d_bench.datasets.openlex3d import VISIBLE_NAME
+from su3d_bench.errors import PredictionError
+from su3d_bench.evaluation import Request, evaluate
+
+HERE = Path(__file__).parent
+PAINTED = f"{HERE}/painted.py:Painted"
+
+
+# ---- datasets
+
+
+def run_oracle(folder: Path, monkeypatch: pytest.MonkeyPatch, scenes: str, capsys: Any) -> Path:
+    from painted import colour_perception
+
+    from su3d_bench import scene_run
+
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    words = ["run", "--scenes", f"{PAINTED}/{scenes}", "--methods", "oracle", "--protocols", "rooms-instance"]
+    assert main([*words, "--no-pictures", "--jobs", "1", "--out", str(folder / "run"), "--quiet"]) == 0
+    capsys.readouterr()
+    return folder / "run"
+
+
+BOTH = ("rooms-instance", "rooms-semantic")
+
+
+def test_the_oracle_of_a_dataset_scores_exactly_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = run_oracle(tmp_path, monkeypatch, "[ab]", capsys)
+    found = evaluate(Request((run,), dataset=PAINTED, protocols=BOTH)).to_json()["protocols"]
+    assert found["rooms-instance"]["metrics"] == {"ap": 1.0, "ap50": 1.0, "ap25": 1.0}
+    assert found["rooms-semantic"]["metrics"] == {"macc": 1.0, "miou": 1.0, "fmiou": 1.0}
+    assert found["rooms-instance"]["coverage"] == {"0.025": 1.0, "0.05": 1.0, "0.1": 1.0}
+    assert list(found["rooms-instance"]["per_scene"]) == ["a", "b"]  # those of the run, not all of the dataset
+
+
+def test_scenes_that_a_run_lost_count_as_missed_under_our_own_protocols(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = run_oracle(tmp_path, monkeypatch, "[ab]", capsys)
+    (run / "scenes/painted.b/oracle/prediction.npz").unlink()
+    found = evaluate(Request((run,), dataset=PAINTED, protocols=BOTH)).to_json()["protocols"]
+    assert found["rooms-instance"]["metrics"]["ap"] == 0.5  # half of the recall, precision 1
+    assert found["rooms-instance"]["missed_scenes"] == ["b"]
+    assert found["rooms-semantic"]["metrics"]["macc"] < 1
+    assert said(found["rooms-instance"], "1 of 2 scenes have no prediction and count as missed: b")
+    for name in ("prediction.npz", "."):
+        alone = run / "scenes/painted.a/oracle" / name
+        found = evaluate(Request((alone,), dataset=PAINTED, protocols=BOTH)).to_json()["protocols"]
+        assert found["rooms-instance"]["metrics"]["ap"] == 1.0  # each stands for its scene, a folder of scenes for all
+
+
+def test_masks_on_the_points_of_a_dataset_make_a_map_too(tmp_path: Path) -> None:
+    from painted import Painted
+
+    truth = Painted(tmp_path, Painted.Options()).ground_truth("a", "mesh-vertices")
+    masks = [np.flatnonzero(truth.instance == k) for k in (1, 2, 3)]
+    write_scannet_text(tmp_path / "pred", scene(masks, [20, 76, 80], name="a", n=len(truth.points)))
+    found = evaluate(Request((tmp_path / "pred",), dataset=PAINTED, protocols=BOTH, scenes=("a",))).to_json()
+    assert found["protocols"]["rooms-instance"]["metrics"]["ap"] == 1.0
+    assert found["protocols"]["rooms-semantic"]["metrics"]["macc"] == 1.0
+    assert found["protocols"]["rooms-instance"]["coverage"]["0.025"] == 1.0
+    (tmp_path / "labels").mkdir()
+    (tmp_path / "labels/a.txt").write_text("".join(f"{one}\n" for one in truth.semantic))
+    request = Request((tmp_path / "labels",), dataset=PAINTED, protocols=("rooms-semantic",), scenes=("a",))
+    assert evaluate(request).to_json()["protocols"]["rooms-semantic"]["metrics"]["miou"] == 1.0
+
+
+def test_a_map_of_its_own_points_needs_a_dataset(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = run_oracle(tmp_path, monkeypatch, "a", capsys)
+    write_truth(tmp_path / "gt", "a")
+    with pytest.raises(PredictionError, match="has points of its own, the ground truth has no coordinates"):
+        evaluate(Request((run,), dataset=PAINTED, ground_truth=tmp_path / "gt", protocols=("rooms-instance",)))
+
+
+# ---- OpenLex3D
+
+
+def write_release(folder: Path) -> None:
+    """OpenLex3D's files of a room with a chair at the left and a table at the right."""
+    from replica_scene import QUADS, TWO_OBJECTS, write_original
+
+    write_original(folder / "data", QUADS, [0, 0, 5, 5], TWO_OBJECTS)
+    room = folder / "lex/replica/room0"
+    room.mkdir(parents=True)
+    (room.parent / "prompt_list.txt").write_text("chair\nseat\ntable\nlamp\n")
+    samples = [
+        {
+            "object_id": one,
+            "labels": {"image_attributes": {"synonyms": words, "depictions": [], "vis_sim": [], "clutter": []}},
+        }
+        for one, words in ((0, ["chair", "seat"]), (5, ["table"]))
+    ]
+    (room / "gt_categories.json").write_text(json.dumps({"dataset": {"samples": samples}}))
+    queries = {"level0": {"chair": [0], "table": [5]}}
+    (room / "gt_categories_query_to_object_mapping_l0.json").write_text(json.dumps(queries))
+
+
+def test_openlex3ds_queries_are_scored_against_its_release(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from replica_scene import write_render
+
+    write_release(tmp_path)
+    write_render(tmp_path / "data")
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
+    map_folder = tmp_path / "maps/room0"
+    map_folder.mkdir(parents=True)
+    left, right = (np.array([(x, y, 0) for x in xs for y in range(3)], np.float64) for xs in ((0.0, 0.97), (1.03, 2.0)))
+    points = np.concatenate([left, right])
+    header = f"VERSION .7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH {len(points)}\nHEIGHT 1\n"
+    body = "".join(f"{x} {y} {z}\n" for x, y, z in points)
+    tail = f"VIEWPOINT 0 0 0 1 0 0 0\nPOINTS {len(points)}\nDATA ascii\n{body}"
+    (map_folder / "point_cloud.pcd").write_text(header + tail)
+    np.save(map_folder / "index.npy", np.repeat([0, 1], [len(left), len(right)]))
+    np.save(map_folder / "embeddings.npy", np.eye(16, dtype=np.float32)[[3, 9]])
+    write_texts(tmp_path / "texts.npz", ["chair", "seat", "table", "lamp"], {"chair": 3, "seat": 3, "table": 9})
+    request = Request((tmp_path / "maps",), ground_truth=tmp_path / "lex", text_features=tmp_path / "texts.npz")
+    found = evaluate(request).to_json()
+    one = found["protocols"]["openlex3d-queries"]
+    assert one["per_scene"]["room0"]["ap25"] > 0
+    assert one["ceiling"] is None
+    assert said(one, "no ceiling is known: masks grow by the threshold")
+    assert found["not_scored"]["replica-openmask3d"] == "is not meant for the labels of OpenLex3D"
+    assert "visible" in found["not_scored"]["openlex3d-topn"]  # the cloud of visible points is not in this folder
+    (tmp_path / "lex/replica/room0" / VISIBLE_NAME).write_text(header + tail)
+    found = evaluate(request).to_json()["protocols"]
+    assert found["openlex3d-topn"]["metrics"]["synonyms"] == 1.0
+    assert found["openlex3d-topn"]["coverage"]["0.025"] == 1.0
+    assert found["openlex3d-ranking"]["metrics"]["overall"] > 0.5
+    with pytest.raises(
+        PredictionError, match=r"room0: none of 3 protocols can score it: .*needs the encoder 'ViT-H-14"
+    ):
+        evaluate(Request((tmp_path / "maps",), ground_truth=tmp_path / "lex"))

@@ -1,0 +1,223 @@
+"""Replica's ground truth as ConceptGraphs' clouds, scored end to end."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from replica_clouds import CLOUDS, REFERENCE, SEQUENCE, first_pose, write_clouds, write_table
+from replica_scene import CHAIR, TABLE, WALL, write_render
+from scored_room import instances
+
+from su3d_bench.datasets.replica import Replica
+from su3d_bench.datasets.replica_clouds import N_EMBEDDING, read_first_pose
+from su3d_bench.errors import DataError, GroundTruthMissing
+from su3d_bench.protocols import load_protocol
+from su3d_bench.scoring import combine, score_scene
+from su3d_bench.types import Float32Array, Instances
+
+Change = Callable[[Path], object]
+RUG, FLOOR, DOOR, PICTURE = 98, 40, 37, 59
+
+
+def test_the_labelled_cloud_is_moved_by_the_first_pose_and_the_reference_cloud_is_not(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    points = np.random.default_rng(0).random((5, 3))
+    reference = np.array([[1.0, 2, 3], [4, 5, 6]])
+    write_clouds(tmp_path, points, np.array([CHAIR, 0, WALL, 101, CHAIR]), reference)
+    truth = Replica(tmp_path).ground_truth("room0", "conceptgraphs")
+    expected = points @ first_pose()[:3, :3].T + first_pose()[:3, 3]
+    np.testing.assert_allclose(truth.points, expected, atol=1e-6)
+    assert truth.points.dtype == np.float32
+    assert truth.semantic.tolist() == [CHAIR, 0, WALL, 101, CHAIR]
+    assert truth.instance.tolist() == [0] * 5
+    assert truth.evaluation_points is not None
+    np.testing.assert_array_equal(truth.evaluation_points, reference)
+    assert "Sequence_1/saved-maps-gt/pointclouds, moved by the first pose of traj_w_c.txt" in truth.source
+    assert "room0/rgb_cloud/pointclouds/pc_points.h5" in truth.source
+
+
+def test_labels_are_the_first_maximum_and_a_row_of_zeros_is_other(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    write_clouds(tmp_path, np.zeros((3, 3)), np.zeros(3, int), np.zeros((1, 3)))
+    table = np.zeros((3, N_EMBEDDING), np.float32)
+    table[1, [TABLE, WALL]] = 0.5
+    table[2, CHAIR] = 1
+    write_table(tmp_path / CLOUDS / "pc_embeddings.h5", table)
+    assert Replica(tmp_path).ground_truth("room0", "conceptgraphs").semantic.tolist() == [0, TABLE, CHAIR]
+
+
+@pytest.mark.parametrize("folder", ["Replica_semantic", "replica_semantic", "Replica_Dataset", "Replica", "."])
+def test_the_clouds_are_found_in_the_usual_places(tmp_path: Path, folder: str) -> None:
+    write_render(tmp_path)
+    write_clouds(tmp_path, np.zeros((3, 3)), np.zeros(3, int), np.zeros((1, 3)))
+    target = tmp_path / folder / "room_0"
+    target.parent.mkdir(exist_ok=True)
+    (tmp_path / "Replica-semantic/room_0").rename(target)
+    assert len(Replica(tmp_path).ground_truth("room0", "conceptgraphs").points) == 3
+
+
+def test_without_clouds_one_line_says_what_is_needed_and_how_to_get_it(tmp_path: Path) -> None:
+    write_render(tmp_path)
+    with pytest.raises(
+        GroundTruthMissing, match=r"expected room_0/Sequence_1/saved-maps-gt/pointclouds of its authors"
+    ):
+        Replica(tmp_path).ground_truth("room0", "conceptgraphs")
+    write_clouds(tmp_path, np.zeros((3, 3)), np.zeros(3, int), np.zeros((1, 3)))
+    (tmp_path / REFERENCE).unlink()
+    with pytest.raises(GroundTruthMissing, match=r"rgb_cloud/pointclouds/pc_points\.h5, are missing in .*run_slam_rgb"):
+        Replica(tmp_path).ground_truth("room0", "conceptgraphs")
+
+
+def with_table(name: str, table: np.ndarray) -> Change:
+    return lambda root: write_table(root / name, table)
+
+
+def with_text(name: str, text: str | bytes) -> Change:
+    return lambda root: (root / name).write_bytes(text if isinstance(text, bytes) else text.encode())
+
+
+NAN_POINT = np.array([[0, 0, 0], [0, np.nan, 0], [0, 0, 0]], np.float32)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (with_table(f"{CLOUDS}/pc_points.h5", NAN_POINT), "pointclouds/pc_points.h5: point 1 is at [0.0, nan, 0.0]"),
+        (with_table(f"{CLOUDS}/pc_points.h5", np.full((3, 3), 1e300)), "pc_points.h5: point 0 is at [inf, inf, inf]"),
+        (with_table(f"{CLOUDS}/pc_points.h5", np.zeros((0, 3))), "pointclouds/pc_points.h5: holds no point; make"),
+        (with_table(f"{CLOUDS}/pc_points.h5", np.zeros((2, 3))), "pc_embeddings.h5: has 3 rows, pc_points.h5 has 2"),
+        (with_table(f"{CLOUDS}/pc_embeddings.h5", np.zeros((3, 101))), "has the shape (3, 101); expected (N, 102)"),
+        (with_table(REFERENCE, NAN_POINT), "rgb_cloud/pointclouds/pc_points.h5: point 1 is at"),
+        (with_table(REFERENCE, np.zeros((0, 3))), "rgb_cloud/pointclouds/pc_points.h5: holds no point"),
+        (lambda root: (root / SEQUENCE / "traj_w_c.txt").unlink(), "Sequence_1/traj_w_c.txt cannot be read: No such"),
+        (with_text(f"{SEQUENCE}/traj_w_c.txt", ""), "Sequence_1/traj_w_c.txt line 1 has 0 values; expected 16"),
+        (with_text(f"{SEQUENCE}/traj_w_c.txt", "1 " * 10**6), "traj_w_c.txt line 1 has 2048 values; expected 16"),
+        (with_text(f"{SEQUENCE}/traj_w_c.txt", "2 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"), "traj_w_c.txt line 1: not a rigid"),
+        (with_text(f"{SEQUENCE}/traj_w_c.txt", "nan 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"), "line 1: the pose holds 'nan'"),
+        (with_text(f"{SEQUENCE}/traj_w_c.txt", b"\xff\xfe" * 99), "Sequence_1/traj_w_c.txt: is not a text file"),
+    ],
+)  # fmt: skip
+def test_each_fault_of_the_clouds_is_one_clear_line(tmp_path: Path, change: Change, message: str) -> None:
+    write_render(tmp_path)
+    write_clouds(tmp_path, np.zeros((3, 3)), np.zeros(3, int), np.zeros((1, 3)))
+    change(tmp_path)
+    with pytest.raises(DataError) as caught:
+        Replica(tmp_path).ground_truth("room0", "conceptgraphs")
+    assert str(caught.value).startswith("replica/room0: ")
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@dataclass
+class TextDirections:
+    """An encoder that gives each text a direction of its own, the same in every process."""
+
+    name: str = "directions"
+    digest: str = "directions"
+    dim: int = 24
+
+    def encode_images(self, images: Any) -> Float32Array:
+        raise AssertionError("scoring looks at no image")
+
+    def encode_texts(self, texts: Any) -> Float32Array:
+        rows = [np.random.default_rng(list(text.encode())).normal(size=self.dim) for text in texts]
+        return np.stack([row / np.linalg.norm(row) for row in rows]).astype(np.float32)
+
+
+# Classes in the labelled cloud of each scene: 'other', classes that every exclusion drops, and classes that stay.
+SCENE_CLASSES = {"room0": [0, WALL, FLOOR, DOOR, CHAIR, TABLE, RUG], "office1": [0, WALL, 97, TABLE, 47, 95]}
+
+
+@dataclass
+class CloudScene:
+    """What one scene's evaluation takes: the labelled cloud in its camera, the reference cloud, and a map."""
+
+    points: Float32Array
+    labels: np.ndarray
+    reference: Float32Array
+    prediction: Instances
+
+
+def cloud_scene(scene: str) -> CloudScene:
+    rng = np.random.default_rng(list(scene.encode()))
+    labels = rng.choice(SCENE_CLASSES[scene], 90)
+    labels[-1] = PICTURE  # in a far corner, where no reference point is nearest: a class of the clouds without points
+    world = rng.random((90, 3)) * 2
+    world[-1] = 30
+    pose = first_pose()
+    points = ((world - pose[:3, 3]) @ pose[:3, :3]).astype(np.float32)
+    map_points = (rng.random((120, 3)) * 2).astype(np.float32)
+    masks = [np.sort(rng.choice(120, rng.integers(5, 25), replace=False)) for _ in range(9)]
+    features = rng.normal(size=(9, TextDirections.dim)).astype(np.float32)
+    prediction = instances(map_points, [mask.astype(np.int32) for mask in masks], None, features)
+    return CloudScene(points, labels, (rng.random((200, 3)) * 2).astype(np.float32), prediction)
+
+
+def nearest_brute(candidates: np.ndarray, query: np.ndarray) -> int:
+    return int(((candidates.astype(np.float64) - query.astype(np.float64)) ** 2).sum(axis=1).argmin())
+
+
+def brute_confusion(scene: CloudScene, names: dict[int, str], excluded: set[str]) -> np.ndarray:
+    """Steps 2 to 9 of the original evaluation, one reference point after another; rows are truth, by native id."""
+    pose = first_pose().astype(np.float32)
+    truth_points = scene.points @ pose[:3, :3].T + pose[:3, 3]
+    vocabulary = [one for one in names if one in scene.labels and names[one] not in excluded]
+    text = TextDirections().encode_texts([f"an image of {names[one]}" for one in vocabulary]).astype(np.float64)
+    features = np.asarray(scene.prediction.features, np.float64)
+    features /= np.linalg.norm(features, axis=1, keepdims=True)
+    class_of_object = [vocabulary[int((text @ feature).argmax())] for feature in features]
+    object_points = np.concatenate([scene.prediction.points[scene.prediction.mask(k)] for k in range(len(features))])
+    object_classes = [class_of_object[k] for k in range(len(features)) for _ in range(len(scene.prediction.mask(k)))]
+    confusion = np.zeros((102, 102), np.int64)
+    for query in scene.reference:
+        true = int(scene.labels[nearest_brute(truth_points, query)])
+        if true in vocabulary:
+            confusion[true, object_classes[nearest_brute(object_points, query)]] += 1
+    return confusion
+
+
+def brute_metrics(confusion: np.ndarray) -> dict[str, float]:
+    """The row `all`: classes with a reference point, rows and columns cut together."""
+    keep = np.flatnonzero(confusion.sum(axis=1))
+    cut = confusion[np.ix_(keep, keep)].astype(float)
+    hits, rows, columns = np.diag(cut), cut.sum(axis=1), cut.sum(axis=0)
+    iou = hits / np.maximum(1, rows + columns - hits)
+    return {
+        "mAcc": float(np.mean(hits / np.maximum(1, rows))),
+        "mIoU": float(iou.mean()),
+        "F-mIoU": float((rows / rows.sum() * iou).sum()),
+    }
+
+
+@pytest.mark.parametrize("n_exclude", [1, 4, 6])
+def test_scores_from_files_are_those_of_the_original_steps_done_by_brute_force(tmp_path: Path, n_exclude: int) -> None:
+    rules = load_protocol(f"replica-conceptgraphs-ex{n_exclude}")
+    excluded = set(["other", "floor", "wall", "ceiling", "door", "window"][:n_exclude])
+    names = {entry.id: entry.name for entry in rules.classes}
+    scores, confusion = {}, np.zeros((102, 102), np.int64)
+    for name in SCENE_CLASSES:
+        scene = cloud_scene(name)
+        write_render(tmp_path, name, 1)
+        write_clouds(tmp_path, scene.points, scene.labels, scene.reference, name)
+        truth = Replica(tmp_path).ground_truth(name, "conceptgraphs")
+        scores[name] = score_scene(rules, truth, scene.prediction, TextDirections())
+        of_scene = brute_confusion(scene, names, excluded)
+        assert scores[name].n_scored == of_scene.sum() > 50
+        confusion += of_scene
+    expected = brute_metrics(confusion)
+    found = combine(rules, scores).metrics
+    assert {key: found[key] for key in expected} == pytest.approx(expected, rel=1e-12)
+    assert 0.02 < expected["mAcc"] < 0.9
+
+
+def test_the_first_pose_is_read_in_single_precision(tmp_path: Path) -> None:
+    path = tmp_path / "traj_w_c.txt"
+    path.write_text(f"1 0 0 {1 / 3!r} 0 1 0 0 0 0 1 0 0 0 0 1\nno pose\n")
+    pose = read_first_pose(path, "here")
+    assert pose.dtype == np.float32
+    assert pose[0, 3] == np.float32(1 / 3)
