@@ -35,14 +35,13 @@ def density_clusters(points: Float64Array, eps_m: float, min_points: int) -> Int
 
     A point is a neighbour of itself.
     """
-    if not len(points):
-        return np.zeros(0, np.int64)
-    from su3d_bench.baselines import object_clouds_kernels as kernels
+    from su3d_bench.opensu3d import cluster_kernels as kernels
 
-    grid = _grid(points, points.min(axis=0), eps_m)
-    labels: Int64Array = kernels.density_labels(
-        points, eps_m, min_points, grid.table, grid.cells, grid.cell_of_point, grid.n_cells
-    )
+    labels = np.full(len(points), kernels.NOISE, np.int64)
+    if len(points):
+        nearer = float(np.nextafter(eps_m * eps_m, 0.0))  # a point at eps itself is no neighbour to Open3D
+        own = np.require(points, np.float64, ["C", "W"])
+        kernels.dbscan(own, eps_m, nearer, min_points, kernels.STEPS, labels)
     return labels
 
 

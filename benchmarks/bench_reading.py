@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import io
 import struct
+import time
 import tracemalloc
 import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -30,10 +31,12 @@ from su3d_bench.datasets.sens import FRAME_RECORD, SensFile
 from su3d_bench.datasets.sens_header import SensHeader, header_bytes
 from su3d_bench.datasets.sens_write import SensFrame, colour_content, depth_content, write_sens
 from su3d_bench.read_ahead import ReadAhead
+from su3d_bench.timing import calibration_ms
 from su3d_bench.types import Float32Array, Frame, UInt8Array
 
 Images = tuple[UInt8Array, np.ndarray]  # colour (H, W, 3) and depth (H, W) of a frame
 N_REPLICA, N_SENS, N_DIFFERENT = 24, 48, 6  # frames that are read; images that they repeat
+UPDATE_S = 0.06  # of a map
 N_LONG = 5_578  # frames of scene0000_00
 LONG_STRIDE = 100
 COLOUR, DEPTH = (1296, 968), (640, 480)  # ScanNet's sizes
@@ -91,6 +94,26 @@ def test_replica_frames(benchmark: BenchmarkFixture, replica: ReplicaFrames, how
     benchmark.pedantic(work[how], rounds=7, warmup_rounds=1)
     benchmark.extra_info["ms_a_frame"] = round(benchmark.stats["median"] / N_REPLICA * 1e3, 2)
     benchmark.extra_info["best_ms"] = round(benchmark.stats["min"] / N_REPLICA * 1e3, 2)
+
+
+def test_what_an_update_waits_for_its_frame(benchmark: BenchmarkFixture, replica: ReplicaFrames) -> None:
+    """Between two frames the calling thread sorts and sums, as long as a slow update of a map takes."""
+    benchmark.group = f"{N_REPLICA} Replica frames of 1200x680 read ahead of a pipeline"
+    benchmark.name = "frames and updates"
+    waits_ms: list[float] = []
+
+    def run() -> None:
+        with ReadAhead(replica, N_REPLICA) as ahead:
+            for _ in range(N_REPLICA):
+                started = time.perf_counter()
+                ahead.next_frame()
+                waits_ms.append((time.perf_counter() - started) * 1e3)
+                while time.perf_counter() - started < waits_ms[-1] / 1e3 + UPDATE_S:
+                    calibration_ms()
+
+    benchmark.pedantic(run, rounds=3, warmup_rounds=1)
+    benchmark.extra_info["update_ms"] = UPDATE_S * 1e3
+    benchmark.extra_info["median_wait_ms"] = round(float(np.median(waits_ms)), 2)
 
 
 @dataclass(frozen=True)

@@ -3,9 +3,10 @@
 ``python benchmarks/busy_cores.py --json build/measured/busy_cores.json``, five minutes: the four demo rooms under
 opensu3d through the command line, with as many workers as cores and without the perception cache; before that one frame
 of each room alone, so that what a data root keeps of a room is there. Processor time of the whole process tree is
-sampled every 50 ms. *While jobs wait*: until the first update of the last room begins. *Wanted* is what was used and
-what was waited for because something else had the core: on a machine that does nothing else the two are the same. Work
-starts with the first stage of the first update; the best of ``--starts`` runs of one frame of the first room.
+sampled every 50 ms. *While jobs wait*: until the first update of the last room begins. A core is *idle* where nothing
+of the run even waits for it: on a machine that does nothing else, all time is used or idle; on a busy one the share of
+the two that was used stays a fair guess of it. Work starts with the first stage of the first update; the best of
+``--starts`` runs of one frame of the first room.
 """
 
 from __future__ import annotations
@@ -137,9 +138,10 @@ def idle_s(samples: Sequence[Sample]) -> list[float]:
 
 
 def shares(samples: Sequence[Sample]) -> tuple[float, float]:
-    """Of the cores' time over ``samples``: what was used, and what was wanted."""
+    """What was used of the cores' time over ``samples``, and of the time that they were used or idle."""
+    used_s = samples[-1].used_s - samples[0].used_s
     available_s = (os.cpu_count() or 1) * (samples[-1].at_s - samples[0].at_s)
-    return (samples[-1].used_s - samples[0].used_s) / available_s, 1 - sum(idle_s(samples)) / available_s
+    return used_s / available_s, used_s / (used_s + sum(idle_s(samples)))
 
 
 def rates(samples: Sequence[Sample], n_scenes: int) -> Iterator[tuple[str, str]]:
@@ -151,8 +153,8 @@ def rates(samples: Sequence[Sample], n_scenes: int) -> Iterator[tuple[str, str]]
         spans["from the first update until no job waits"] = samples[fed : last + 1]
     spans["to the end of the last job"] = samples
     for name, span in spans.items():
-        used, wanted = shares(span)
-        yield name, f"{used:.0%} used, {wanted:.0%} wanted"
+        of_all, of_ours = shares(span)
+        yield name, f"{of_all:.0%} used; {of_ours:.0%} of what was used or idle"
     for name, one in (("begins", samples[begun]), ("is done", samples[fed])):
         yield f"the first update of all {name}", f"{one.at_s:.2f} s"
 
@@ -205,8 +207,8 @@ def main() -> None:
         command = "python benchmarks/busy_cores.py --json build/measured/busy_cores.json"
         notes = (
             f"{n} rooms under opensu3d, embedded profile, no perception cache, {os.cpu_count()} workers; processor "
-            "time of the whole process tree over cores times wall time. Wanted: used, and waited for while ready to "
-            "run. The marks: 85 % while jobs wait, and work that starts in 2 s.",
+            "time of the whole process tree over cores times wall time. Idle: nothing of the run waited for the core. "
+            "The marks: 85 % while jobs wait, and work that starts in 2 s.",
         )
         write_measured(arguments.json, "A run keeps the cores busy", command, ("what", "value"), rows, notes)
 

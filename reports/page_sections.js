@@ -123,6 +123,7 @@ function summarySection() {
           noteList(run.failed, 3));
       }
     }
+    if (DATA.left_out) warn(h('strong', null, 'LARGE. '), `${DATA.left_out}.`);
     for (const protocol of PROTOCOLS) {
       const rows = resultsOf(protocol);
       fill(section, null, [h('h3', null, protocol), summaryTable(rows), noteList(notesOf(rows))]);

@@ -139,7 +139,7 @@ def _compare_protocol(
     remarks: Sequence[str],
     per_class: bool,
 ) -> ProtocolComparison:
-    results = [combine(rules, scores) for scores in (left_scores, right_scores)]
+    results = [combine(rules, scores, with_intervals=False) for scores in (left_scores, right_scores)]
     scenes = results[0].scenes
     counts = [[scores[scene].counts for scene in scenes] for scores in (left_scores, right_scores)]
     weights = resample_weights(len(scenes))

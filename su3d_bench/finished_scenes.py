@@ -25,7 +25,7 @@ class FinishedScenes:
     def __init__(self) -> None:
         self._datasets: dict[Part, Any] = {}
         self._methods: dict[tuple[Part, Part], tuple[Any, dict[str, str]]] = {}
-        self._perceptions: dict[tuple[str, str], Perception] = {}
+        self._perceptions: dict[str, Perception | None] = {}  # by the domain of the images
         self._last_digest = ("", "")  # a scene and that of its data
 
     def outcomes(self, job: SceneJob) -> tuple[MethodOutcome, ...] | None:
@@ -83,18 +83,20 @@ class FinishedScenes:
         return self._methods[job.dataset, part]
 
     def _perception(self, job: SceneJob, info: SceneInfo) -> Perception | None:
-        config: PerceptionConfig = PerceptionConfig.model_validate_json(job.perception)
-        profile = resolve_profile(job.profile, info.image_domain, config)
-        if profile not in SAME_EVERYWHERE:
-            return None
-        if (profile, info.image_domain) not in self._perceptions:
-            self._perceptions[profile, info.image_domain] = build_perception(
-                profile,
-                config,
-                scene=info,
-                cache_root=job.cache_root,
-                mesh=None,
-                replies=job.folder / "language",
-                is_offline=job.is_offline,
+        if info.image_domain not in self._perceptions:
+            config: PerceptionConfig = PerceptionConfig.model_validate_json(job.perception)
+            profile = resolve_profile(job.profile, info.image_domain, config)
+            self._perceptions[info.image_domain] = (
+                build_perception(
+                    profile,
+                    config,
+                    scene=info,
+                    cache_root=job.cache_root,
+                    mesh=None,
+                    replies=job.folder / "language",
+                    is_offline=job.is_offline,
+                )
+                if profile in SAME_EVERYWHERE
+                else None
             )
-        return self._perceptions[profile, info.image_domain]
+        return self._perceptions[info.image_domain]

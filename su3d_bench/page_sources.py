@@ -23,6 +23,14 @@ from su3d_bench.store import read_json
 from su3d_bench.update_times import summarise
 
 MOST_PAIRS = 40  # pairs of methods that are compared: all of nine methods, and a few seconds
+# Jobs (a scene under a method) up to which each is read. The courses and comparisons of more take minutes to make and
+# are no more to be looked at one by one.
+MOST_JOBS = 500
+MOST_MAPS = 16  # of a page of more jobs: two scenes under eight methods
+LEFT_OUT = (
+    "what each job's own files say is left out: errors (su3d-bench attribute), confusions, times (report timing), "
+    f"comparisons (compare) and all maps but those of the first scenes, at most {MOST_MAPS}"
+)
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Values = dict[str, Number | None]
 Model = TypeVar("Model", bound=BaseModel)
@@ -90,9 +98,11 @@ def page_numbers(
     """Plain values for the page of the runs in ``folders``, every text in them on one line and printable.
 
     ``with_errors``: predictions are scored again with each kind of error mended, which takes as long as scoring them.
+    Of more than ``MOST_JOBS`` jobs the page shows what the runs' own records say, and ``left_out`` says what it lacks.
     Raises a ``StoreError`` where a folder holds no finished run; what cannot be had of one is a reason on the page.
     """
     runs = [read_run(folder) for folder in dict.fromkeys(folders)]
+    n_jobs = _n_jobs(runs)
     results: list[dict[str, Any]] = []
     confusions: list[dict[str, Any]] = []
     timing: list[dict[str, Any]] = []
@@ -100,6 +110,8 @@ def page_numbers(
     for index, run in enumerate(runs):
         progress(f"{run.name}: numbers")
         results += [{"run": index, **one.model_dump()} for one in _results(run)]
+        if n_jobs > MOST_JOBS:
+            continue
         timing += [{"run": index, **one} for method in run.methods if (one := _times(run, method)) is not None]
         for method in run.methods:
             confusions += [{"run": index, **one} for one in _confusions(run, method)]
@@ -108,12 +120,13 @@ def page_numbers(
                 errors.append({"run": index, **_errors(run, method, encoder_of)})
     progress("comparisons")
     found = {
+        "left_out": f"{n_jobs} jobs, more than {MOST_JOBS}: {LEFT_OUT}" if n_jobs > MOST_JOBS else None,
         "runs": [_about(run) for run in runs],
         "results": results,
         "confusions": confusions,
         "errors": errors,
         "timing": timing,
-        "comparisons": _comparisons(runs),
+        "comparisons": _comparisons(runs) if n_jobs <= MOST_JOBS else [],
     }
     plain: dict[str, Any] = printable_json(found)
     return plain
@@ -217,13 +230,21 @@ def _compared(
     return {**sides, "protocols": found["protocols"], "remarks": found["remarks"], "reason": None}
 
 
+def _n_jobs(runs: Sequence[FinishedRun]) -> int:
+    return sum(len(run.scenes) * len(run.methods) for run in runs)
+
+
 def scored_maps(folders: Sequence[Path]) -> list[tuple[int, FinishedRun, str, str]]:
-    """Index of the run, run, scene and method of every map there is, all methods of a scene together."""
+    """Index of the run, run, scene and method of every map there is, all methods of a scene together.
+
+    Of more than ``MOST_JOBS`` jobs only the maps of the first scenes, at most ``MOST_MAPS``.
+    """
     runs = [read_run(folder) for folder in dict.fromkeys(folders)]
-    return [
+    found = (
         (index, run, scene, method)
         for index, run in enumerate(runs)
         for scene in run.scenes
         for method in run.methods
         if run.folder.job(scene, method).prediction.is_file()
-    ]
+    )
+    return list(itertools.islice(found, MOST_MAPS) if _n_jobs(runs) > MOST_JOBS else found)

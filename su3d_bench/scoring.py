@@ -127,7 +127,7 @@ def _check_points(rules: ProtocolRules, prediction: Prediction) -> None:
         )
 
 
-def combine(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> ProtocolResult:
+def combine(rules: ProtocolRules, scores: Mapping[str, SceneScore], *, with_intervals: bool = True) -> ProtocolResult:
     """The protocol's numbers over the scenes of ``scores``, whose order does not matter."""
     ordered = _ordered(rules, scores)
     n_scored = sum(score.n_scored for _, score in ordered)
@@ -142,6 +142,7 @@ def combine(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> ProtocolR
         },
         n_predictions={scene: score.n_predictions for scene, score in ordered},
         warnings=_gathered({scene: score.warnings for scene, score in ordered}),
+        with_intervals=with_intervals,
     )
 
 

@@ -99,8 +99,8 @@ def sign_flip_test(differences: Float64Array) -> SignFlipTest | None:
     generator = np.random.default_rng(SEED)
     n_as_far = 0
     for _ in range(N_FLIPS // 1000):
-        signs = generator.integers(0, 2, (1000, n)) * 2 - 1
-        n_as_far += int((np.abs(signs @ pairs) >= observed).sum())
+        is_plus = generator.integers(0, 2, (1000, n)).astype(np.float64)
+        n_as_far += int((np.abs(2.0 * (is_plus @ pairs) - pairs.sum()) >= observed).sum())
     return SignFlipTest((1 + n_as_far) / (1 + N_FLIPS), 1 / (1 + N_FLIPS), n, False)
 
 

@@ -1,4 +1,4 @@
-"""A small scene of labelled vertices with its masks in ScanNet's text, and what ``evaluate`` says of it."""
+"""A small scene of labelled vertices, its masks and texts as files, and what ``evaluate`` says of them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from prediction_files import write_openmask3d
 
 from su3d_bench.evaluation import Request, evaluate
 
@@ -52,6 +53,14 @@ def said(found: dict[str, Any], beginning: str) -> str:
     """The only warning that begins so."""
     (line,) = [line for line in found["warnings"] if line.startswith(beginning)]
     return str(line)
+
+
+def feature_scene(folder: Path) -> None:
+    """OpenMask3D's files of two masks, the first like a chair, the second like a table; no feature for the third."""
+    write_truth(folder / "gt")
+    features = np.zeros((3, 16))
+    features[0, 3], features[1, 9] = 2.0, 5.0
+    write_openmask3d(folder / "pred", scene([CHAIR, TABLE, np.arange(150)], [0, 0, 0]), features)
 
 
 def write_texts(path: Path, names: list[str], of: dict[str, int], **more: Any) -> None:

@@ -37,10 +37,11 @@ def _used_up(ask: Callable[[str], Any], scene: str) -> object:
 
 
 def _replica(folder: Path) -> Read:
+    from replica_clouds import write_clouds
     from replica_scene import CHAIR, QUADS, TABLE, TWO_OBJECTS, WALL, write_original, write_render
     from scannet_scan import grid, write_mesh
     from test_replica_problems import box
-    from test_replica_truths import write_clouds, write_labels
+    from test_replica_truths import write_labels
 
     from su3d_bench.datasets.replica import Replica
 

@@ -120,7 +120,7 @@ def _own_prediction(kind: str) -> Make:
 
 
 def _truth(folder: Path) -> Read:
-    from test_evaluate import write_truth
+    from evaluated_text import write_truth
 
     from su3d_bench.evaluation_truth import read_text_truth
 
@@ -129,7 +129,7 @@ def _truth(folder: Path) -> Read:
 
 
 def _texts(folder: Path) -> Read:
-    from test_evaluate import write_texts
+    from evaluated_text import write_texts
 
     from su3d_bench.evaluation_texts import read_text_features
 
@@ -169,7 +169,7 @@ def _command_output(folder: Path) -> Read:
 def _evaluated(folder: Path) -> Read:
     """Predictions, truth and texts from the command line to a score."""
     from cli_calls import called
-    from test_evaluate import feature_scene, write_texts
+    from evaluated_text import feature_scene, write_texts
 
     from su3d_bench.protocols import load_protocol
 

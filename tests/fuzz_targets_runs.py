@@ -148,8 +148,8 @@ def _paper(folder: Path) -> Read:
 
 def _answers(name: str) -> Make:
     def make(folder: Path) -> Read:
+        from counted_sheets import workbook
         from simulated_annotators import answered, as_csv, retrieval_set
-        from test_sheets_score import workbook
 
         from su3d_bench.sheets.answers import read_answers
         from su3d_bench.sheets.validation import check_answers

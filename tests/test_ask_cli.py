@@ -61,7 +61,7 @@ def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> JobFolder:
     job = RunFolder(Path("runs/made")).job(SCENE, "opensu3d")
     job.prepare()
     write_prediction(job.prediction, made_map())
-    write_json(Path("runs/made/run.json"), {"scenes": [SCENE]})
+    write_json(Path("runs/made/run.json"), {"scenes": [SCENE], "methods": ["opensu3d"]})
     return job
 
 
@@ -176,7 +176,10 @@ def test_prices_and_budget_come_from_a_file(
     [
         (["ask", SCENE, " "], "the question is empty"),
         (["ask", "rooms/none", "x"], "no run in runs/ holds rooms/none by opensu3d"),
-        (["ask", SCENE, "x", "--run", "runs/none"], "runs/none: holds no map of rooms/made by opensu3d"),
+        (["ask", SCENE, "x", "--run", "runs/none"], "runs/none: holds no map of rooms/made by opensu3d; run: su3d-be"),
+        (["ask", "rooms/mode", "x", "--run", "runs/made"], "of rooms/mode by opensu3d; did you mean 'rooms/made'?"),
+        (["query", SCENE, "x", "--run", "runs/made", "--method", "opensud"], "by opensud; did you mean 'opensu3d'?"),
+        (["query", SCENE, "x", "--run", "runs/made", "--method", "sam3d"], "by sam3d; it has opensu3d"),
         (["ask", SCENE, "x", "--names", "refined"], "has no labels n'; make them with su3d-bench refine"),
         (["ask", SCENE, "x", "--solver", "lm"], "unknown --solver 'lm'; did you mean 'llm'?"),
         (["ask", SCENE, "x", "--eye", "nan", "0", "0"], "expected three finite numbers of metres"),

@@ -52,8 +52,8 @@ def test_a_device_gives_the_same_map_and_pairs_on_lattices(
     for lattice_points, keep_density, refill in added:
         points = np.array(lattice_points, np.float64) * eps / 2 + offset
         ids = rng.integers(0, 4, len(points)).astype(np.int32)
-        placed = [each.insert(points, ids, keep_density=keep_density, refill=refill) for each in (one, other)]
-        np.testing.assert_array_equal(*placed)
+        here, there = (each.insert(points, ids, keep_density=keep_density, refill=refill) for each in (one, other))
+        np.testing.assert_array_equal(there, here)
     assert_equal_maps(one, other, np.array(asked, np.float64) * eps / 2 + offset)
 
 
@@ -68,8 +68,8 @@ def test_a_device_gives_the_same_map_and_pairs_on_surfaces_that_are_seen_again(
     for _ in range(4):
         points = rng.uniform(-0.8, 0.8, (9000, 3)) * [1, 1, 0.02] + offset + rng.uniform(-0.5, 0.5, 3) * [1, 1, 0]
         ids = rng.integers(0, 4, len(points)).astype(np.int32)
-        placed = [each.insert(points, ids, keep_density=keep_density, refill=True) for each in (one, other)]
-        np.testing.assert_array_equal(*placed)
+        here, there = (each.insert(points, ids, keep_density=keep_density, refill=True) for each in (one, other))
+        np.testing.assert_array_equal(there, here)
     queries = rng.uniform(-0.9, 0.9, (20_000, 3)) * [1, 1, 0.03] + offset
     assert_equal_maps(one, other, queries)
     assert 0 < np.count_nonzero(one.nearest(queries) < 0) < len(queries)

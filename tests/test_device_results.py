@@ -82,8 +82,9 @@ def test_the_embedded_encoder_gives_the_features_of_the_cpu_on_a_device(device: 
     images = [rng.integers(0, 256, (*size, 3), np.uint8) for size in ((12, 40), (64, 64), (200, 90))] * 13
     texts = ["chair", "a plant on the shelf", "the", ""]
     here, there = EmbeddedEncoder(), EmbeddedEncoder(device=device)
-    np.testing.assert_allclose(there.encode_images(images), here.encode_images(images), rtol=0, atol=1e-5)
-    np.testing.assert_allclose(there.encode_texts(texts), here.encode_texts(texts), rtol=0, atol=1e-5)
+    tolerance = 1e-5 if device == TORCH_ON_CPU else 1e-4  # a GPU's convolutions are by other algorithms
+    np.testing.assert_allclose(there.encode_images(images), here.encode_images(images), rtol=0, atol=tolerance)
+    np.testing.assert_allclose(there.encode_texts(texts), here.encode_texts(texts), rtol=0, atol=tolerance)
 
 
 def test_features_made_on_a_gpu_have_a_digest_of_their_own_and_the_space_of_the_cpu() -> None:

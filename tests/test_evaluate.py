@@ -6,11 +6,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from evaluated_text import CHAIR, TABLE, TRUTH, N, document, numbers, said, scene, write_texts, write_truth
+from evaluated_text import (
+    CHAIR,
+    TABLE,
+    TRUTH,
+    N,
+    document,
+    feature_scene,
+    numbers,
+    said,
+    scene,
+    write_texts,
+    write_truth,
+)
 from prediction_files import (
     write_maskclustering,
     write_open3dis,
-    write_openmask3d,
     write_sam3d,
     write_scannet_text,
 )
@@ -148,14 +159,6 @@ def test_masks_of_class_0_alone_are_class_agnostic(tmp_path: Path) -> None:
     write_maskclustering(tmp_path / "pred", scene([CHAIR], [0]))
     with pytest.raises(PredictionError, match="needs classes, every mask has class 0"):
         numbers(tmp_path)
-
-
-def feature_scene(folder: Path) -> None:
-    """OpenMask3D's files of two masks, the first like a chair, the second like a table; no feature for the third."""
-    write_truth(folder / "gt")
-    features = np.zeros((3, 16))
-    features[0, 3], features[1, 9] = 2.0, 5.0
-    write_openmask3d(folder / "pred", scene([CHAIR, TABLE, np.arange(150)], [0, 0, 0]), features)
 
 
 def test_features_need_the_protocols_encoder_or_a_file_of_texts(tmp_path: Path) -> None:

@@ -15,6 +15,7 @@ from open_scene import ENCODER, OBJECTS, WordEncoder, instances_with, nothing_at
 
 from su3d_bench.errors import DataError, PredictionError
 from su3d_bench.metrics import instance_ap
+from su3d_bench.metrics.precision_recall import average_precision
 from su3d_bench.metrics.query_ap import QueryTruth, TextQuery, confidences, per_scene
 from su3d_bench.metrics.transfer import Masks
 from su3d_bench.protocols import ProtocolRules, load_protocol
@@ -254,7 +255,7 @@ def plain_ap(truth: QueryTruth, prediction: Instances) -> list[float]:
             unmet = [k for k in ranked if not any(iou(masks[k], one) > threshold for one in objects)]
             rows += [(float(confidence[k]), False) for k in unmet]
         scores, is_true = np.array([row[0] for row in rows]), np.array([row[1] for row in rows])
-        values.append(instance_ap.average_precision(scores, is_true, n_missed))
+        values.append(average_precision(scores, is_true, n_missed))
     return [float(np.mean(values[:-1])), values[0], values[-1]]
 
 

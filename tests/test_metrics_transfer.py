@@ -14,6 +14,7 @@ from su3d_bench.metrics import (
     dot_product,
     instance_ap,
     labelling,
+    precision_recall,
     resampling,
     results,
     semantic,
@@ -25,7 +26,7 @@ from su3d_bench.metrics.transfer import Masks, duplicate_pairs, nearest, reduce_
 
 @pytest.mark.parametrize(
     "module",
-    [dot_product, instance_ap, labelling, resampling, results, scoring, semantic, transfer],
+    [dot_product, instance_ap, labelling, precision_recall, resampling, results, scoring, semantic, transfer],
     ids=lambda m: m.__name__,
 )
 def test_the_examples_in_the_docstrings_run(module: object) -> None:

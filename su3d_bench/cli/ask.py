@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.flags import add_verb, add_whose_map, answer, answer_json, remark
 from su3d_bench.cli.language_flags import add_language_flags, chat_client, language_config
-from su3d_bench.cli.query import latest_run
+from su3d_bench.cli.query import latest_run, no_map
 from su3d_bench.errors import EXIT_DONE, ConfigError, PredictionError, StoreError
 
 if TYPE_CHECKING:
@@ -70,7 +70,7 @@ def call(arguments: argparse.Namespace) -> int:
         )
     run = _run_of(arguments)
     job = run.job(arguments.scene, arguments.method)
-    instances = _map(job, arguments)
+    instances = _map(run, arguments)
     refined, note = _refined(job, arguments.names)
     scene = map_of(instances, refined)
     if arguments.dry_run:
@@ -98,15 +98,13 @@ def _run_of(arguments: argparse.Namespace) -> RunFolder:
     return latest_run(arguments.scene, arguments.method) if arguments.run is None else RunFolder(arguments.run)
 
 
-def _map(job: JobFolder, arguments: argparse.Namespace) -> Instances:
+def _map(run: RunFolder, arguments: argparse.Namespace) -> Instances:
     from su3d_bench.store import read_prediction
     from su3d_bench.types import Instances
 
+    job = run.job(arguments.scene, arguments.method)
     if not job.prediction.is_file():
-        raise StoreError(
-            f"{arguments.run}: holds no map of {arguments.scene} by {arguments.method}; run: su3d-bench run --scenes "
-            f"{arguments.scene} --methods {arguments.method} --out {arguments.run}"
-        )
+        raise no_map(run, arguments.scene, arguments.method)
     prediction = read_prediction(job.prediction)
     if not isinstance(prediction, Instances):
         raise PredictionError(f"{job.prediction}: holds no instances, so there is nothing to ask about")

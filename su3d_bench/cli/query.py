@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import argparse
 import re
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.flags import add_verb, add_whose_map, answer, answer_json, remark
-from su3d_bench.errors import ConfigError, PredictionError, StoreError
+from su3d_bench.errors import ConfigError, PredictionError, StoreError, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.interfaces import Encoder
@@ -50,7 +51,7 @@ def call(arguments: argparse.Namespace) -> int:
     run = RunFolder(arguments.run) if arguments.run is not None else latest_run(arguments.scene, arguments.method)
     job = run.job(arguments.scene, arguments.method)
     if not job.prediction.is_file():
-        raise StoreError(f"{run.path}: holds no map of {arguments.scene} by {arguments.method}; {_advice(arguments)}")
+        raise no_map(run, arguments.scene, arguments.method)
     prediction = read_prediction(job.prediction)
     if not isinstance(prediction, Instances):
         what = "one feature a point and no instances" if isinstance(prediction, DenseFeatures) else "no instances"
@@ -100,8 +101,21 @@ def latest_run(scene: str, method: str) -> RunFolder:
     return max(made, key=lambda pair: pair[0].stat().st_mtime)[1]
 
 
-def _advice(arguments: argparse.Namespace) -> str:
-    return f"run: su3d-bench run --scenes {arguments.scene} --methods {arguments.method} --out {arguments.run}"
+def no_map(run: RunFolder, scene: str, method: str) -> StoreError:
+    """The error of a run without such a map: the names that it has instead, else the command that would make it."""
+    from su3d_bench.store import read_json
+
+    record: Any = None
+    with suppress(StoreError):
+        record = read_json(run.path / "run.json")
+    told = record if isinstance(record, dict) else {}
+    lists = (told.get(key) for key in ("scenes", "methods"))
+    scenes, methods = ([str(name) for name in names] if isinstance(names, list) else [] for names in lists)
+    hint = suggest(scene, scenes) if scene not in scenes else ""
+    if scene in scenes and method not in methods:
+        hint = suggest(method, methods) or f"; it has {', '.join(methods)}"
+    hint = hint or f"; run: su3d-bench run --scenes {scene} --methods {method} --out {run.path}"
+    return StoreError(f"{run.path}: holds no map of {scene} by {method}{hint}")
 
 
 def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:

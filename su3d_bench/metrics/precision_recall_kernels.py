@@ -75,31 +75,39 @@ def areas(score, is_true, bounds, n_missed, is_wanted, found):  # type: ignore[n
         found[cell] = _dot(precision, width, n_vertices + 1)
 
 
-@njit(cache=True, nogil=True)
-def resampled_areas(scene, is_true, is_last, bounds, class_of_cell, n_truth, weights, found):  # type: ignore[no-untyped-def]
-    """Writes the area (R, cells) of each resample; rows of a cell come with falling score.
+@njit(cache=True, nogil=True, error_model="numpy")
+def resampled_areas(scene, is_true, is_last, bounds, class_of_cell, n_truth, drawn, found):  # type: ignore[no-untyped-def]
+    """Writes the area (cells, R) of each resample; rows of a cell come with falling score.
 
-    ``is_last`` marks the last row of a score, ``n_truth`` (R, C) counts the instances of the drawn scenes. The curve
-    rises only where a true positive was drawn, so nothing is added elsewhere.
+    ``is_last`` marks the last row of a score, ``n_truth`` (C, R) counts the instances of the drawn scenes, ``drawn``
+    (S, R) says how often each scene was drawn. Resamples go side by side, so that the inner loops are vectors. The
+    curve rises only where a true positive was drawn, so nothing is added elsewhere.
     """
-    for r in range(len(weights)):
-        drawn = weights[r]
-        for cell in range(len(class_of_cell)):
-            n_instances = n_truth[r, class_of_cell[cell]]
-            if n_instances == 0:
+    n_resamples = drawn.shape[1]
+    n_counted, n_hit = np.empty(n_resamples, np.int32), np.empty(n_resamples, np.int32)
+    n_counted_before, n_hit_before = np.empty(n_resamples, np.int32), np.empty(n_resamples, np.int32)
+    recall_before = np.empty(n_resamples)
+    for cell in range(len(class_of_cell)):
+        area, n_instances = found[cell], n_truth[class_of_cell[cell]]
+        area[:] = n_counted[:] = n_hit[:] = n_counted_before[:] = n_hit_before[:] = recall_before[:] = 0
+        has_hit = False
+        for row in range(bounds[cell], bounds[cell + 1]):
+            n = drawn[scene[row]]
+            for r in range(n_resamples):
+                n_counted[r] += n[r]
+            if is_true[row]:
+                has_hit = True
+                for r in range(n_resamples):
+                    n_hit[r] += n[r]
+            if not is_last[row]:
                 continue
-            n_counted, n_hit, n_counted_before, n_hit_before = 0, 0, 0, 0
-            area, recall_before = 0.0, 0.0
-            for row in range(bounds[cell], bounds[cell + 1]):
-                n = drawn[scene[row]]
-                n_counted += n
-                n_hit += n * is_true[row]
-                if not is_last[row]:
-                    continue
-                if n_hit > n_hit_before:
-                    before = n_hit_before / n_counted_before if n_counted_before else 1.0
-                    recall = n_hit / n_instances
-                    area += (recall - recall_before) * (n_hit / n_counted + before) / 2
-                    n_hit_before, recall_before = n_hit, recall
-                n_counted_before = n_counted
-            found[r, cell] = area
+            if has_hit:
+                for r in range(n_resamples):
+                    before = n_hit_before[r] / n_counted_before[r] if n_counted_before[r] > 0 else 1.0
+                    recall = n_hit[r] / n_instances[r]
+                    step = (recall - recall_before[r]) * (n_hit[r] / n_counted[r] + before) / 2
+                    area[r] += step if n_hit[r] > n_hit_before[r] else 0.0
+                    recall_before[r] = recall
+                has_hit = False
+            n_counted_before[:] = n_counted
+            n_hit_before[:] = n_hit

@@ -74,30 +74,31 @@ def form_result(
     coverage: Mapping[str, float],
     n_predictions: Mapping[str, int],
     warnings: Sequence[str],
+    with_intervals: bool = True,
 ) -> ProtocolResult:
-    """The result of ``scenes`` from their counts, in that order."""
-    pooled = metric_values(rules, counts, pooled=True)
+    """The result of ``scenes`` from their counts, in that order; ``intervals`` are None where they are not wanted."""
+    curve = _curve(rules, counts) if rules.kind in CURVE_KINDS else None
+    pooled = metric_values(rules, counts, pooled=True) if curve is None else _ap_values(curve)
     per_scene = dict(zip(scenes, _scene_values(rules, counts), strict=True))
     scene_mean = _scene_mean(per_scene.values())
-    per_class = _class_values(rules, counts)
-    weights = resample_weights(len(scenes))
-    if rules.aggregate == "pooled":
-        metrics, resampled = pooled, _resampled(rules, counts, weights)
-    else:
-        table = {key: np.array([row[key] for row in per_scene.values()]) for key in rules.headline}
-        metrics, resampled = scene_mean, {key: _weighted_mean(row, weights) for key, row in table.items()}
+    per_class = _class_values(rules, counts, curve)
+    rows = list(per_scene.values())
+    intervals: dict[str, tuple[float, float] | None] = dict.fromkeys(rules.headline)
+    if with_intervals and len(scenes) > 1:
+        resampled = _resampled(rules, counts, rows, resample_weights(len(scenes)))
+        intervals = {key: percentile_interval(resampled[key]) for key in rules.headline}
     return ProtocolResult(
         protocol=rules.name,
         version=rules.version,
         headline=rules.headline,
         scenes=tuple(scenes),
-        metrics=metrics,
+        metrics=pooled if rules.aggregate == "pooled" else scene_mean,
         pooled=pooled,
         scene_mean=scene_mean,
-        intervals={key: percentile_interval(resampled[key]) if len(scenes) > 1 else None for key in rules.headline},
+        intervals=intervals,
         per_scene=per_scene,
         per_class=per_class,
-        groups=_group_values(rules, counts, per_class),
+        groups=_group_values(rules, curve, per_class),
         coverage=coverage,
         n_predictions=n_predictions,
         warnings=(*warnings, *_warnings(rules, counts)),
@@ -123,6 +124,10 @@ def _scene_values(rules: ProtocolRules, counts: Sequence[Counts]) -> list[dict[s
     return [metric_values(rules, [count], pooled=False) for count in counts]
 
 
+def _curve(rules: ProtocolRules, counts: Sequence[Counts]) -> instance_ap.InstanceAP:
+    return instance_ap.combine(cast("Sequence[instance_ap.InstanceCounts]", counts), rules.thresholds)
+
+
 def _ap_values(ap: instance_ap.InstanceAP) -> dict[str, float]:
     return {"AP": ap.ap, "AP50": ap.ap50, "AP25": ap.ap25}
 
@@ -134,7 +139,7 @@ def metric_values(rules: ProtocolRules, counts: Sequence[Counts], *, pooled: boo
     the classes that its ground truth contains.
     """
     if rules.kind in CURVE_KINDS:
-        return _ap_values(instance_ap.combine(cast("Sequence[instance_ap.InstanceCounts]", counts), rules.thresholds))
+        return _ap_values(_curve(rules, counts))
     if rules.kind == "categories":
         means = object_means.combine(cast("Sequence[object_means.ObjectCounts]", counts))
         return dict(zip(VALUES_OF_METRIC[rules.metric], means.tolist(), strict=True))
@@ -185,14 +190,14 @@ def _keep_columns(confusion: Int64Array, keep: Int64Array) -> Int64Array:
     return np.concatenate([confusion[:, keep], n_elsewhere[:, None]], axis=1)
 
 
-def _class_values(rules: ProtocolRules, counts: Sequence[Counts]) -> dict[str, dict[str, float]]:
+def _class_values(
+    rules: ProtocolRules, counts: Sequence[Counts], curve: instance_ap.InstanceAP | None
+) -> dict[str, dict[str, float]]:
     if rules.kind == "categories" or rules.kind in SHARE_KINDS:
         return {}
-    if rules.kind in CURVE_KINDS:
-        ap = instance_ap.combine(cast("Sequence[instance_ap.InstanceCounts]", counts), rules.thresholds)
-        return {
-            name: dict(zip(AP_NAMES, ap.of_class(index), strict=True)) for index, name in enumerate(rules.curve_names)
-        }
+    if curve is not None:
+        of_class = [dict(zip(AP_NAMES, curve.of_class(index), strict=True)) for index in range(len(rules.curve_names))]
+        return dict(zip(rules.curve_names, of_class, strict=True))
     metrics = _semantic_metrics(rules, counts, pooled=True)
     names = rules.scored if rules.metric == "scannet" else rules.classes
     return {
@@ -208,16 +213,15 @@ def _class_values(rules: ProtocolRules, counts: Sequence[Counts]) -> dict[str, d
 
 
 def _group_values(
-    rules: ProtocolRules, counts: Sequence[Counts], per_class: Mapping[str, Mapping[str, float]]
+    rules: ProtocolRules, curve: instance_ap.InstanceAP | None, per_class: Mapping[str, Mapping[str, float]]
 ) -> dict[str, dict[str, float]]:
     """The mean of each group over those of its classes that have a value, all scenes pooled."""
     names = list(dict.fromkeys(entry.group for entry in rules.scored if entry.group))
     if rules.class_agnostic is not None or not names:
         return {}
-    if rules.kind == "instance":
-        ap = instance_ap.combine(cast("Sequence[instance_ap.InstanceCounts]", counts), rules.thresholds)
+    if rules.kind == "instance" and curve is not None:
         members = {name: [i for i, entry in enumerate(rules.scored) if entry.group == name] for name in names}
-        return {name: dict(zip(AP_NAMES, ap.of_group(members[name]), strict=True)) for name in names}
+        return {name: dict(zip(AP_NAMES, curve.of_group(members[name]), strict=True)) for name in names}
     rows = {name: [per_class.get(entry.name, {}) for entry in rules.scored if entry.group == name] for name in names}
     return {
         name: {
@@ -228,7 +232,12 @@ def _group_values(
     }
 
 
-def _resampled(rules: ProtocolRules, counts: Sequence[Counts], weights: Int64Array) -> dict[str, Float64Array]:
+def _resampled(
+    rules: ProtocolRules, counts: Sequence[Counts], rows: Sequence[Mapping[str, float]], weights: Int64Array
+) -> dict[str, Float64Array]:
+    """The headline metrics of resampled scenes; ``rows`` are those of each scene alone."""
+    if rules.aggregate == "scene-mean":
+        return {key: _weighted_mean(np.array([row[key] for row in rows]), weights) for key in rules.headline}
     if rules.kind in CURVE_KINDS:
         instances = cast("Sequence[instance_ap.InstanceCounts]", counts)
         return resampling.resampled_ap(instances, weights, rules.thresholds)

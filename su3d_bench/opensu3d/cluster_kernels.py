@@ -1,4 +1,4 @@
-"""DBSCAN on a grid, compiled: the labels of scikit-learn's, which takes far longer and keeps every neighbour.
+"""DBSCAN on a grid, compiled: the labels of scikit-learn's or Open3D's, which take longer and keep every neighbour.
 
 Cells are a little smaller than eps / sqrt(3), so that points of one cell are always within eps of each other: the core
 points of a cell are one cluster, and clusters grow from cell to cell. What comes out does not depend on the order of
@@ -60,9 +60,9 @@ def _by_cell(points, cell_of, n_cells):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, inline="always")
-def _is_near(points, i, j, eps):  # type: ignore[no-untyped-def]
+def _is_near(points, i, j, most_squared):  # type: ignore[no-untyped-def]
     dx, dy, dz = points[i, 0] - points[j, 0], points[i, 1] - points[j, 1], points[i, 2] - points[j, 2]
-    return dx * dx + dy * dy + dz * dz <= eps * eps
+    return dx * dx + dy * dy + dz * dz <= most_squared
 
 
 @njit(cache=True)
@@ -79,14 +79,14 @@ def _neighbours(cell, table, keys, steps, around):  # type: ignore[no-untyped-de
 
 
 @njit(cache=True)
-def _has_neighbours(i, points, starts, around, n_around, eps, min_points):  # type: ignore[no-untyped-def]
-    """Whether at least ``min_points`` points, itself included, are within eps of point ``i`` of ``around[0]``."""
+def _has_neighbours(i, points, starts, around, n_around, most_squared, min_points):  # type: ignore[no-untyped-def]
+    """Whether at least ``min_points`` points, itself included, are near to point ``i`` of ``around[0]``."""
     n = starts[around[0] + 1] - starts[around[0]]
     for a in range(1, n_around):
         if n >= min_points:
             return True
         for j in range(starts[around[a]], starts[around[a] + 1]):
-            n += _is_near(points, i, j, eps)
+            n += _is_near(points, i, j, most_squared)
     return n >= min_points
 
 
@@ -99,34 +99,38 @@ def _root(parents, cell):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _touch(points, is_core, first, second, starts, eps):  # type: ignore[no-untyped-def]
-    """Whether a core point of one cell is within eps of one of the other."""
+def _touch(points, is_core, first, second, starts, most_squared):  # type: ignore[no-untyped-def]
+    """Whether a core point of one cell is near to one of the other."""
     for i in range(starts[first], starts[first + 1]):
         if is_core[i]:
             for j in range(starts[second], starts[second + 1]):
-                if is_core[j] and _is_near(points, i, j, eps):
+                if is_core[j] and _is_near(points, i, j, most_squared):
                     return True
     return False
 
 
 @njit(cache=True)
-def _first_cluster(i, points, is_core, starts, around, n_around, number_of, eps):  # type: ignore[no-untyped-def]
-    """The lowest cluster with a core point within eps of point ``i``, or NOISE."""
+def _first_cluster(i, points, is_core, starts, around, n_around, number_of, most_squared):  # type: ignore[no-untyped-def]
+    """The lowest cluster with a core point near to point ``i``, or NOISE."""
     first = NOISE
     for a in range(n_around):
         number = number_of[around[a]]
         if number == NOISE or (first != NOISE and number >= first):
             continue
         for j in range(starts[around[a]], starts[around[a] + 1]):
-            if is_core[j] and _is_near(points, i, j, eps):
+            if is_core[j] and _is_near(points, i, j, most_squared):
                 first = number
                 break
     return first
 
 
 @njit(cache=True, nogil=True)
-def dbscan(points, eps, min_points, steps, labels):  # type: ignore[no-untyped-def]
-    """Writes the cluster of each of at least one points (N, 3), 0, 1, ... or NOISE, into ``labels``."""
+def dbscan(points, eps, most_squared, min_points, steps, labels):  # type: ignore[no-untyped-def]
+    """Writes the cluster of each of at least one points (N, 3), 0, 1, ... or NOISE, into ``labels``.
+
+    Points are near up to the squared distance ``most_squared``: eps * eps, or the number before it where a point at eps
+    itself is too far.
+    """
     n_slots = 4
     while n_slots < 2 * len(points):
         n_slots *= 2
@@ -139,13 +143,13 @@ def dbscan(points, eps, min_points, steps, labels):  # type: ignore[no-untyped-d
     for cell in range(n_cells):
         n_around = _neighbours(cell, table, keys, steps, around)
         for i in range(starts[cell], starts[cell + 1]):
-            is_core[i] = _has_neighbours(i, ordered, starts, around, n_around, eps, min_points)
+            is_core[i] = _has_neighbours(i, ordered, starts, around, n_around, most_squared, min_points)
     parents = np.arange(n_cells)
     for cell in range(n_cells):
         n_around = _neighbours(cell, table, keys, steps, around)
         for a in range(1, n_around):
             own, other = _root(parents, cell), _root(parents, around[a])
-            if around[a] > cell and own != other and _touch(ordered, is_core, cell, around[a], starts, eps):
+            if around[a] > cell and own != other and _touch(ordered, is_core, cell, around[a], starts, most_squared):
                 parents[max(own, other)] = min(own, other)
     number_of = _numbered(order, cell_of, is_core, starts, parents, n_cells)
     for cell in range(n_cells):
@@ -154,7 +158,9 @@ def dbscan(points, eps, min_points, steps, labels):  # type: ignore[no-untyped-d
             if is_core[i]:
                 labels[order[i]] = number_of[cell]
             else:
-                labels[order[i]] = _first_cluster(i, ordered, is_core, starts, around, n_around, number_of, eps)
+                labels[order[i]] = _first_cluster(
+                    i, ordered, is_core, starts, around, n_around, number_of, most_squared
+                )
 
 
 @njit(cache=True)

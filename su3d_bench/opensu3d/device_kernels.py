@@ -156,7 +156,7 @@ class DeviceVoxelMap:
         return _View(asked, voxels, rows.view(-1), place * 27)
 
     def _look_around(self, view: _View, queries: Tensor, gaps: Tensor, best: Tensor, found: Tensor) -> None:
-        """Looks where ``gaps`` (Q, 3, S) from ``queries`` (Q,) to the voxels about them leave room for a nearer point."""
+        """Looks where ``gaps`` (Q, 3, S) to the voxels about ``queries`` (Q,) leave room for a nearer point."""
         x, y, z = gaps.unbind(1)
         bounds = (x[:, :, None, None] + y[:, None, :, None]) + z[:, None, None, :]
         row, *steps = (bounds <= best[queries][:, None, None, None]).nonzero(as_tuple=True)

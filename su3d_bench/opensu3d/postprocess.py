@@ -53,7 +53,8 @@ def cluster(points: Float64Array, config: OpenSU3DConfig) -> Int64Array:
     labels = np.full(len(points), NOISE, np.int64)
     if len(points) >= config.dbscan_min_points:
         own = np.require(points, np.float64, ["C", "W"])
-        kernels.dbscan(own, config.dbscan_eps, config.dbscan_min_points, kernels.STEPS, labels)
+        eps = config.dbscan_eps
+        kernels.dbscan(own, eps, eps * eps, config.dbscan_min_points, kernels.STEPS, labels)
     return labels
 
 

@@ -68,10 +68,11 @@ class FrameCache:
         return self._root is not None
 
     def image_digest(self, rgb: UInt8Array) -> str:
-        """A digest of an image, which is taken once while one image is asked for: it is in the key of many entries."""
-        if self._last_image is None or self._last_image[0] is not rgb:
-            self._last_image = rgb, array_digest(rgb)
-        return self._last_image[1]
+        """A digest of an image, taken once while it is asked for that one image: it is in the key of many entries."""
+        last = self._last_image
+        if last is None or last[0] is not rgb:
+            last = self._last_image = rgb, array_digest(rgb)
+        return last[1]
 
     def frame_digest(self, frame: Frame, with_pose: bool) -> str:
         """A digest of colour, depth and intrinsics, and of the pose where the answer depends on it."""

@@ -126,7 +126,7 @@ def _sum_by(label: IndexArray, values: Float64Array, n: int) -> Float64Array:
     from su3d_bench.perception.segmenter_graph_kernels import sum_rows
 
     if values.ndim == 1:
-        return np.bincount(label, values, n)
+        return np.asarray(np.bincount(label, values, n), np.float64)
     sums: Float64Array = sum_rows(label, np.ascontiguousarray(values), n)
     return sums
 

@@ -1,0 +1,184 @@
+"""What a run of many jobs rests on: each file read a bounded number of times, sums that give the same numbers."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from painted import colour_perception
+
+from su3d_bench import finished_scenes, page_sources, runner, scene_run, store
+from su3d_bench.cli.main import main
+from su3d_bench.errors import DataError
+from su3d_bench.metrics import instance_ap, precision_recall, resampling
+from su3d_bench.scoring import pack_scores, unpack_scores
+from su3d_bench.statistics import growth_exponent, resample_weights
+
+HERE = Path(__file__).parent
+WORDS = ["run", "--scenes", f"{HERE}/painted.py:Painted/*", "--methods", f"{HERE}/painted.py:Collector"]
+PROTOCOLS = ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures", "--out", "out"]
+
+
+@pytest.fixture
+def finished(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """A run that is done, in the folder ``out`` below the current one."""
+    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    monkeypatch.setattr(finished_scenes, "build_perception", colour_perception)
+    monkeypatch.chdir(tmp_path)
+    assert main([*WORDS, *PROTOCOLS, "--jobs", "1"]) == 0
+    return tmp_path / "out"
+
+
+def test_a_finished_run_starts_no_worker_and_reads_each_seal_twice(
+    finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = (finished / "metrics.json").read_bytes()
+    reads: Counter[str] = Counter()
+    read_json = store.read_json
+
+    def counted(path: Path) -> Any:
+        reads[str(path)] += path.name == "done.json"
+        return read_json(path)
+
+    def no_units(work: Any, units: Any, *_: Any, **__: Any) -> Any:
+        assert not units
+        return iter(())
+
+    monkeypatch.setattr(store, "read_json", counted)
+    monkeypatch.setattr(runner, "run_units", no_units)
+    assert main([*WORDS, *PROTOCOLS]) == 0
+    assert (finished / "metrics.json").read_bytes() == before
+    n_jobs = len(list(finished.glob("scenes/*/*/done.json")))
+    assert n_jobs > 2
+    assert sum(reads.values()) <= 2 * n_jobs
+
+
+@pytest.mark.parametrize("name", ["prediction.npz", "counts.npz", "updates.csv", "log.txt"])
+def test_a_scene_with_a_damaged_file_is_no_finished_one(
+    finished: Path, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    damaged = finished / "scenes" / "painted.a" / "collector" / name
+    damaged.write_bytes(damaged.read_bytes()[:-1])
+    asked = []
+    run_units = runner.run_units
+
+    def seen(work: Any, units: Any, *rest: Any, **options: Any) -> Any:
+        asked.extend(job.scene for job in units)
+        return run_units(work, units, *rest, **options)
+
+    monkeypatch.setattr(runner, "run_units", seen)
+    assert main([*WORDS, *PROTOCOLS, "--jobs", "1"]) == 0
+    assert asked == ["painted/a"]
+
+
+def test_listing_the_jobs_reads_each_seal_twice(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    reads: list[Path] = []
+    read_json = store.read_json
+    monkeypatch.setattr(store, "read_json", lambda path: (reads.append(path), read_json(path))[1])
+    assert main([*WORDS, *PROTOCOLS, "--dry-run"]) == 0
+    n_jobs = len(list(finished.glob("scenes/*/collector/done.json")))
+    assert len([path for path in reads if path.name == "done.json"]) <= 2 * n_jobs
+
+
+def made_scene(rng: np.random.Generator, n_rows: int, has_ties: bool) -> instance_ap.InstanceCounts:
+    """Counts of three classes, the last of which has no instance, with ``n_rows`` counted predictions."""
+    n_missed = rng.integers(1, 4, (3, 10)) * np.array([[1], [1], [0]])
+    class_index = rng.integers(0, 3, n_rows).astype(np.int32)
+    return instance_ap.InstanceCounts(
+        class_index=class_index,
+        threshold_index=rng.integers(0, 10, n_rows).astype(np.int32),
+        score=rng.integers(0, 5, n_rows) / 4 if has_ties else rng.random(n_rows),
+        is_true=(rng.random(n_rows) < 0.5) & (class_index < 2),
+        n_missed=n_missed,
+        n_truth=np.array([n_rows + 4, rng.integers(0, 2) * (n_rows + 4), 0]),
+        n_small_truth=np.zeros(3, np.int64),
+        n_predictions=np.full(3, n_rows),
+    )
+
+
+@pytest.mark.parametrize(("n_scenes", "n_rows", "has_ties"), [(1, 3, False), (7, 40, True), (5, 900, False)])
+def test_compiled_curves_give_the_same_bits(
+    n_scenes: int, n_rows: int, has_ties: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rng = np.random.default_rng(n_rows)
+    counts = [made_scene(rng, n_rows, has_ties) for _ in range(n_scenes)]
+    weights = resample_weights(n_scenes, 90)
+    found = {}
+    for many in (10**9, 0):
+        monkeypatch.setattr(precision_recall, "MANY_ROWS", many)
+        monkeypatch.setattr(resampling, "MANY_ROWS", many)
+        together, each = instance_ap.combine(counts), instance_ap.combine_each(counts)
+        assert not np.isnan(together.ap)
+        drawn = resampling.resampled_ap(counts, weights)
+        values = [(one.ap, one.ap50, one.ap25) for one in (together, *each)]
+        found[many] = [*(one.table for one in (together, *each)), values, *drawn.values()]
+    for plain, compiled in zip(*found.values(), strict=True):
+        np.testing.assert_array_equal(plain, compiled)
+
+
+def test_ap_of_each_scene_is_that_of_the_scene_alone() -> None:
+    rng = np.random.default_rng(4)
+    counts = [made_scene(rng, 30, True) for _ in range(4)]
+    for one, each in zip(counts, instance_ap.combine_each(counts), strict=True):
+        np.testing.assert_array_equal(instance_ap.combine([one]).table, each.table)
+
+
+def test_growth_by_running_sums_is_that_of_the_rows_drawn() -> None:
+    rng = np.random.default_rng(8)
+    sizes = np.cumsum(rng.integers(1, 90, 403)).astype(np.float64)
+    costs = sizes**0.4 * np.exp(rng.normal(0, 0.3, 403))
+    x, y, n, length = np.log(sizes), np.log(costs), 403, 20
+    starts = np.random.default_rng(0).integers(0, n - length + 1, (1000, 21))
+    rows = (starts[:, :, None] + np.arange(length)).reshape(1000, -1)[:, :n]
+    slopes = [np.polyfit(x[drawn], y[drawn], 1)[0] for drawn in rows]
+    growth = growth_exponent(sizes, costs)
+    assert growth is not None
+    expected = [np.polyfit(x, y, 1)[0], *np.percentile(slopes, [2.5, 97.5])]
+    np.testing.assert_allclose([growth.exponent, growth.low, growth.high], expected, rtol=0, atol=1e-11)
+
+
+def test_counts_with_a_changed_byte_are_damaged_or_the_same() -> None:
+    rng = np.random.default_rng(3)
+    score = {"p": unpack_scores(_packed(rng))["p"]}
+    packed = pack_scores(score)
+    for place in range(0, len(packed), 41):
+        changed = packed[:place] + bytes([packed[place] ^ 0x55]) + packed[place + 1 :]
+        try:
+            found = unpack_scores(changed)
+        except DataError:
+            continue
+        assert pack_scores(found) == packed
+
+
+def _packed(rng: np.random.Generator) -> bytes:
+    from su3d_bench.metrics.scene_score import SceneScore
+
+    return pack_scores({"p": SceneScore("p", 1, made_scene(rng, 30, False), 3, 9, np.zeros(3, np.int64), ())})
+
+
+def test_the_page_of_many_jobs_holds_the_records_and_says_what_it_lacks(
+    finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def no_encoder(_: Any) -> Any:
+        raise AssertionError("nothing is scored again")
+
+    whole = page_sources.page_numbers([finished], no_encoder, with_errors=False)
+    assert whole["left_out"] is None
+    assert whole["timing"]
+    monkeypatch.setattr(page_sources, "MOST_JOBS", 1)
+    monkeypatch.setattr(page_sources, "MOST_MAPS", 1)
+    page = page_sources.page_numbers([finished], no_encoder)
+    assert page["results"] == whole["results"]
+    assert page["runs"] == whole["runs"]
+    assert [page[part] for part in ("confusions", "errors", "timing", "comparisons")] == [[], [], [], []]
+    assert page["left_out"].startswith(f"{len(planned(finished))} jobs, more than 1: ")
+    assert len(page_sources.scored_maps([finished])) == 1
+
+
+def planned(run: Path) -> list[tuple[str, str]]:
+    record = json.loads((run / "run.json").read_text())
+    return [(scene, method) for scene in record["scenes"] for method in record["methods"]]
