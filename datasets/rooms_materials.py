@@ -14,7 +14,7 @@ Rgb = tuple[float, float, float]  # linear light, 0..1
 
 
 class Texture(IntEnum):
-    """What ``rooms_shade_kernels`` knows how to paint."""
+    """What ``rooms_pattern_kernels`` knows how to paint."""
 
     PLAIN = 0
     WOOD = 1

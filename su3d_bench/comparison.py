@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -90,27 +91,68 @@ class Comparison:
         }
 
 
+class SideNumbers:
+    """What sides give, made once for all pairs that they are in."""
+
+    def __init__(self) -> None:
+        self._scores: dict[tuple[Path, str], dict[str, dict[str, SceneScore]]] = {}
+        self._resampled: dict[tuple[Path, str, str, tuple[str, ...]], _Resampled] = {}
+
+    def scores(self, side: Side) -> dict[str, dict[str, SceneScore]]:
+        """Protocol -> scene -> counts."""
+        key = side.run.folder.path, side.method
+        if key not in self._scores:
+            self._scores[key] = side.run.scores(side.method)
+        return self._scores[key]
+
+    def resampled(self, rules: ProtocolRules, side: Side, scores: Mapping[str, SceneScore]) -> _Resampled:
+        """The numbers over the scenes of ``scores``, and the headline metrics of resamples of them."""
+        key = side.run.folder.path, side.method, rules.name, tuple(scores)
+        if key not in self._resampled:
+            result = combine(rules, scores, with_intervals=False)
+            counts = [scores[scene].counts for scene in result.scenes]
+            rows = [result.per_scene[scene] for scene in result.scenes]
+            drawn = resampled_metrics(rules, counts, rows, resample_weights(len(rows)))
+            self._resampled[key] = _Resampled(result, counts, drawn)
+        return self._resampled[key]
+
+
+@dataclass(frozen=True)
+class _Resampled:
+    result: ProtocolResult
+    counts: Sequence[Counts]
+    drawn: Mapping[str, Float64Array]
+
+
 def compare(
-    left: str, right: str, *, method: str | None = None, protocols: Sequence[str] = (), per_class: bool = False
+    left: str,
+    right: str,
+    *,
+    method: str | None = None,
+    protocols: Sequence[str] = (),
+    per_class: bool = False,
+    numbers: SideNumbers | None = None,
 ) -> Comparison:
     """What ``right`` changes over ``left``, each the folder of a run or ``FOLDER:METHOD``.
 
-    Without methods those of one name are compared, or the only ones. Raises ``ConfigError`` where the two cannot be
-    compared, naming the first field that differs.
+    Without methods those of one name are compared, or the only ones; ``numbers`` are shared by calls on the same runs.
+    Raises ``ConfigError`` where the two cannot be compared, naming the first field that differs.
     """
     pairs = pair_methods(parse_side(left, method), parse_side(right, method))
     first, second = pairs[0]
     compared: list[ProtocolComparison] = []
     for one, other in pairs:
-        compared += _compare_methods(one, other, protocols, per_class)
+        compared += _compare_methods(one, other, protocols, per_class, numbers or SideNumbers())
     sides = [side for pair in pairs for side in pair]
     remarks = _remarks(first.run, second.run, {side.method for side in sides})
     remarks += [line for side in sides for line in _caveats(side)]
     return Comparison(first.run.name, second.run.name, tuple(compared), tuple(dict.fromkeys(remarks)))
 
 
-def _compare_methods(left: Side, right: Side, wanted: Sequence[str], per_class: bool) -> list[ProtocolComparison]:
-    counts, others = left.run.scores(left.method), right.run.scores(right.method)
+def _compare_methods(
+    left: Side, right: Side, wanted: Sequence[str], per_class: bool, numbers: SideNumbers
+) -> list[ProtocolComparison]:
+    counts, others = numbers.scores(left), numbers.scores(right)
     names = protocols_in_both(left, right, wanted)
     compared = []
     for name in names:
@@ -126,7 +168,8 @@ def _compare_methods(left: Side, right: Side, wanted: Sequence[str], per_class: 
         check_shapes(rules, left, sides[0])
         check_shapes(rules, right, sides[1])
         remarks = [*_scene_remarks(left, right, counts[name], others[name]), *_own_remarks(left, right, name)]
-        compared.append(_compare_protocol(rules, left, right, sides[0], sides[1], remarks, per_class))
+        each = [numbers.resampled(rules, *pair) for pair in zip((left, right), sides, strict=True)]
+        compared.append(_compare_protocol(rules, left, right, each[0], each[1], remarks, per_class))
     return compared
 
 
@@ -134,26 +177,20 @@ def _compare_protocol(
     rules: ProtocolRules,
     left: Side,
     right: Side,
-    left_scores: Mapping[str, SceneScore],
-    right_scores: Mapping[str, SceneScore],
+    one: _Resampled,
+    other: _Resampled,
     remarks: Sequence[str],
     per_class: bool,
 ) -> ProtocolComparison:
-    results = [combine(rules, scores, with_intervals=False) for scores in (left_scores, right_scores)]
+    results = one.result, other.result
     scenes = results[0].scenes
-    counts = [[scores[scene].counts for scene in scenes] for scores in (left_scores, right_scores)]
-    weights = resample_weights(len(scenes))
-    drawn = [
-        resampled_metrics(rules, own, [one.per_scene[scene] for scene in scenes], weights)
-        for own, one in zip(counts, results, strict=True)
-    ]
     metrics = {
         name: form_difference(
             (results[0].metrics[name], results[1].metrics[name]),
             scenes,
             np.array([results[0].per_scene[scene][name] for scene in scenes]),
             np.array([results[1].per_scene[scene][name] for scene in scenes]),
-            drawn[1][name] - drawn[0][name],
+            other.drawn[name] - one.drawn[name],
         )
         for name in rules.headline
     }
@@ -165,7 +202,7 @@ def _compare_protocol(
         right=right.method,
         scenes=scenes,
         metrics=metrics,
-        classes=_compare_classes(rules, results, counts) if per_class else {},
+        classes=_compare_classes(rules, results, (one.counts, other.counts)) if per_class else {},
         remarks=tuple(remarks),
     )
 

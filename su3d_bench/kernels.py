@@ -5,19 +5,30 @@ from __future__ import annotations
 import pickle
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cache as remembered
+from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core.caching import FunctionCache
+from numba.core.caching import FunctionCache, IndexDataCacheFile
+from numba.core.dispatcher import Dispatcher
 
+from su3d_bench.digests import digest_file
 from su3d_bench.kept_files import DAMAGE
 
 
 class MendingCache(FunctionCache):
     """Numba's own store of one function; what cannot be read is compiled again, what cannot be kept is used once.
 
-    Numba renames what it writes, but does not wait for the disk: after a power cut its files may hold anything.
+    Numba renames what it writes, but does not wait for the disk: after a power cut its files may hold anything. And it
+    looks at the function's own file alone: here a change in one from which that imports compiled functions counts too.
     """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)  # type: ignore[no-untyped-call]
+        if imported := imported_sources(function):
+            stamp = (self._impl.locator.get_source_stamp(), *map(_digest, imported))
+            self._cache_file = IndexDataCacheFile(self._cache_path, self._impl.filename_base, stamp)  # type: ignore[no-untyped-call]
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         try:
@@ -35,14 +46,31 @@ class MendingCache(FunctionCache):
             self.flush()  # type: ignore[no-untyped-call]
 
 
+def imported_sources(function: Callable[..., Any]) -> list[Path]:
+    """The files of the compiled functions that the file of ``function`` has imported, and of those that these have."""
+    own = function.__code__.co_filename
+    found, waiting = {own}, [function]
+    while waiting:
+        for value in list(waiting.pop().__globals__.values()):
+            if isinstance(value, Dispatcher) and value.py_func.__code__.co_filename not in found:
+                found.add(value.py_func.__code__.co_filename)
+                waiting.append(value.py_func)
+    return sorted(Path(name) for name in found - {own})
+
+
+@remembered
+def _digest(path: Path) -> str:
+    return digest_file(path)
+
+
 def njit(*, cache: bool, **options: Any) -> Callable[[Callable[..., Any]], Any]:
     """``numba.njit`` with such a store where ``cache``, and none where no folder can be written."""
 
     def compiled(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(**options)(function)
         if cache:
-            with suppress(RuntimeError):  # no place for it: neither beside the module nor in the user's cache
-                dispatcher._cache = MendingCache(function)  # type: ignore[no-untyped-call]
+            with suppress(RuntimeError, OSError):  # no place for it, beside the module or elsewhere, or no source
+                dispatcher._cache = MendingCache(function)
         return dispatcher
 
     return compiled

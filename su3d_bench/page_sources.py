@@ -10,7 +10,7 @@ from typing import Annotated, Any, TypeVar
 from pydantic import BaseModel, Field, ValidationError
 
 from su3d_bench.attribution import EncoderOf, attribute
-from su3d_bench.comparison import compare
+from su3d_bench.comparison import SideNumbers, compare
 from su3d_bench.config import KeyPath
 from su3d_bench.errors import StoreError, Su3dError
 from su3d_bench.finished_run import FinishedRun, read_run
@@ -215,16 +215,17 @@ def _comparisons(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
         pairs += [(one, method, other, method) for method in one.methods if method in other.methods]
     for run in runs:
         pairs += [(run, first, run, second) for first, second in itertools.combinations(run.methods, 2)]
-    return [_compared(runs, *pair) for pair in pairs[:MOST_PAIRS]]
+    numbers = SideNumbers()
+    return [_compared(runs, numbers, *pair) for pair in pairs[:MOST_PAIRS]]
 
 
 def _compared(
-    runs: Sequence[FinishedRun], one: FinishedRun, first: str, other: FinishedRun, second: str
+    runs: Sequence[FinishedRun], numbers: SideNumbers, one: FinishedRun, first: str, other: FinishedRun, second: str
 ) -> dict[str, Any]:
     sides = {"left": [runs.index(one), first], "right": [runs.index(other), second]}
     try:
         left, right = (f"{run.folder.path}:{method}" for run, method in ((one, first), (other, second)))
-        found = compare(left, right).to_json()
+        found = compare(left, right, numbers=numbers).to_json()
     except Su3dError as error:
         return {**sides, "protocols": [], "remarks": [], "reason": str(error)}
     return {**sides, "protocols": found["protocols"], "remarks": found["remarks"], "reason": None}

@@ -374,7 +374,7 @@ class JobFolder:
         Fields in ``known_later`` are not compared.
         """
         sealed = self._part(step, "key")
-        if not sealed:
+        if not sealed or (key.items() <= sealed.items() and sealed.keys() - key.keys() <= set(known_later)):
             return None
         for name in [*key, *(name for name in sealed if name not in key)]:
             if name not in known_later and sealed.get(name) != key.get(name):

@@ -51,7 +51,7 @@ def test_a_device_gives_the_same_map_and_pairs_on_lattices(
     one, other = maps(eps, device)
     for lattice_points, keep_density, refill in added:
         points = np.array(lattice_points, np.float64) * eps / 2 + offset
-        ids = rng.integers(0, 4, len(points)).astype(np.int32)
+        ids = rng.integers(0, 6, len(points)).astype(np.int32)
         here, there = (each.insert(points, ids, keep_density=keep_density, refill=refill) for each in (one, other))
         np.testing.assert_array_equal(there, here)
     assert_equal_maps(one, other, np.array(asked, np.float64) * eps / 2 + offset)
@@ -67,12 +67,30 @@ def test_a_device_gives_the_same_map_and_pairs_on_surfaces_that_are_seen_again(
     one, other = maps(0.02, device)
     for _ in range(4):
         points = rng.uniform(-0.8, 0.8, (9000, 3)) * [1, 1, 0.02] + offset + rng.uniform(-0.5, 0.5, 3) * [1, 1, 0]
-        ids = rng.integers(0, 4, len(points)).astype(np.int32)
+        ids = rng.integers(0, 6, len(points)).astype(np.int32)
         here, there = (each.insert(points, ids, keep_density=keep_density, refill=True) for each in (one, other))
         np.testing.assert_array_equal(there, here)
     queries = rng.uniform(-0.9, 0.9, (20_000, 3)) * [1, 1, 0.03] + offset
     assert_equal_maps(one, other, queries)
     assert 0 < np.count_nonzero(one.nearest(queries) < 0) < len(queries)
+
+
+@on_each_device
+@pytest.mark.parametrize("order", [(0, 1, 2, 3), (3, 2, 1, 0), (2, 0, 3, 1), (1, 3, 0, 2)])
+def test_of_points_equally_near_in_several_voxels_a_device_takes_the_lowest(
+    device: str, order: tuple[int, ...]
+) -> None:
+    points = np.array([[0.01, 0.0, 0.0], [-0.01, 0.0, 0.0], [0.0, 0.01, 0.0], [-0.01, 0.0, 0.0]])[list(order)]
+    _, filled = maps(0.02, device)
+    filled.insert(points, np.ones(4, np.int32), keep_density=False, refill=False)
+    assert filled.nearest(np.zeros((1, 3))).tolist() == [0]
+
+
+@on_each_device
+def test_a_point_at_exactly_eps_does_not_match_on_a_device(device: str) -> None:
+    _, filled = maps(0.25, device)
+    filled.insert(np.array([[0.25, 0.0, 0.0]]), np.ones(1, np.int32), keep_density=True, refill=True)
+    assert filled.nearest(np.array([[0.0, 0, 0], [np.nextafter(0.0, 1.0), 0, 0], [1e-9, 0, 0]])).tolist() == [-1, -1, 0]
 
 
 @on_each_device

@@ -106,3 +106,31 @@ def test_a_run_on_a_gpu_that_is_not_here_ends_before_any_work_in_one_line(
     error = capsys.readouterr().err
     assert error.count("\n") == 1 and "device 'cuda': torch sees no GPU here; use --device cpu" in error
     assert not (tmp_path / "run").exists()
+
+
+@needs_torch
+def test_a_run_hands_its_device_to_the_method_and_writes_the_same_bytes(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from su3d_bench.opensu3d import device_kernels
+
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
+    words = ["run", "--scenes", "rooms/living0", "--profile", "oracle", "--limit", "2", "--no-pictures", "--quiet"]
+    words += ["--protocols", "rooms-semantic", "--jobs", "1", "--set", "rooms.width=96", "rooms.height=72"]
+    words += ["rooms.mesh_spacing_m=0.2", "perception.cache=false"]
+    n_made = 0
+
+    class Counted(device_kernels.DeviceVoxelMap):
+        def __init__(self, eps: float, device: str) -> None:
+            nonlocal n_made
+            n_made += 1
+            super().__init__(eps, device)
+
+    monkeypatch.setattr(device_kernels, "DeviceVoxelMap", Counted)
+    predictions = []
+    for name in ("cpu", TORCH_ON_CPU):
+        monkeypatch.setattr("su3d_bench.scene_run.device_for", lambda device, index, name=name: name)
+        assert main([*words, "--out", str(tmp_path / name)]) == 0
+        predictions.append(next((tmp_path / name).glob("scenes/*/opensu3d/prediction.npz")).read_bytes())
+        assert (n_made > 0) == (name == TORCH_ON_CPU)
+    assert predictions[0] == predictions[1]

@@ -337,6 +337,23 @@ def test_a_compiled_kernel_whose_kept_form_is_damaged_is_compiled_again(tmp_path
     assert imported() == "42 1\n"
 
 
+def test_a_compiled_kernel_is_compiled_again_when_a_function_that_it_imports_has_changed(tmp_path: Path) -> None:
+    head = "from su3d_bench.kernels import njit\n"
+    inner = head + "@njit(cache=True)\ndef factor():\n    return {}\n"
+    middle = head + "from inner import factor\n@njit(cache=True)\ndef scaled(x):\n    return x * factor()\n"
+    outer = head + "from middle import scaled\n@njit(cache=True)\ndef more(x):\n    return scaled(x) + 1\n"
+    (tmp_path / "middle.py").write_text(middle)
+    (tmp_path / "outer.py").write_text(outer)
+
+    def told(value: int) -> str:
+        (tmp_path / "inner.py").write_text(inner.format(value))
+        environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path / "numba"), "PYTHONDONTWRITEBYTECODE": "1"}
+        words = [sys.executable, "-c", "from outer import more; print(more(10), sum(more.stats.cache_hits.values()))"]
+        return subprocess.run(words, cwd=tmp_path, env=environment, capture_output=True, text=True, check=True).stdout
+
+    assert [told(value) for value in (2, 2, 3)] == ["21 0\n", "21 1\n", "31 0\n"]
+
+
 def test_a_temporary_folder_that_cannot_be_made_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "not there"))
     with pytest.raises(StoreError, match=r"cannot make a temporary folder below .*not there: No such file"):

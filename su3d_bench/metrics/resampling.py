@@ -90,7 +90,7 @@ def _compiled_areas(rows: _Rows, bounds: Int64Array, n_truth: Int64Array, weight
 
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         list(threads.map(fill, range(0, len(weights), AT_ONCE)))  # raises what a thread raised
-    return areas.T
+    return np.ascontiguousarray(areas.T)  # the order of later sums follows the layout; so does the last bit
 
 
 def _weighted_areas(

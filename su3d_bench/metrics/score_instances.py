@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, Literal
 
 import numpy as np
@@ -17,6 +18,7 @@ from su3d_bench.metrics.labelling import (
     encoder_warning,
     scored_classes,
 )
+from su3d_bench.metrics.results import Counts
 from su3d_bench.metrics.scene_score import SceneScore, n_predictions, present
 from su3d_bench.protocols import ProtocolRules
 from su3d_bench.types import BoolArray, Float64Array, GroundTruth, Instances, Int64Array, Partition
@@ -50,17 +52,9 @@ def score_instances(
         rules.thresholds,
     )
     wanted = np.isin(values // instance_ap.INSTANCES_PER_CLASS, scored_ids)
-    distance = distance_to_masks(prediction.points, masks, truth.points, wanted)
     told = None if rules.class_agnostic else encoder_warning(rules, prediction, encoder)
-    return SceneScore(
-        protocol=rules.name,
-        version=rules.version,
-        counts=counts,
-        n_predictions=n_predictions(prediction),
-        n_scored=int(wanted.sum()),
-        n_farther=transfer.n_farther(distance[wanted]),
-        warnings=_instance_warnings(rules, truth, moved, scores, told),
-    )
+    warnings = _instance_warnings(rules, truth, moved, scores, told)
+    return score_of_masks(rules, counts, prediction, masks, truth.points, wanted, warnings)
 
 
 def truth_and_labels(
@@ -110,15 +104,29 @@ def encode_without_classes(
     return values
 
 
-def distance_to_masks(
-    points: transfer.Points, masks: transfer.Masks, targets: transfer.Points, wanted: BoolArray
-) -> Float64Array:
-    """How far the nearest point of any mask is from each wanted target, in metres; infinity beyond the last radius."""
-    covered = np.full(len(points), -1, np.int64)
+def score_of_masks(
+    rules: ProtocolRules,
+    counts: Counts,
+    prediction: Instances | Partition,
+    masks: transfer.Masks,
+    targets: transfer.Points,
+    wanted: BoolArray,
+    warnings: Sequence[str],
+) -> SceneScore:
+    """The score, with how far the ``wanted`` (P,) of ``targets`` (P, 3) are from the nearest point of any mask."""
+    covered = np.full(len(prediction.points), -1, np.int64)
     covered[masks.indices] = 0
     reach = max(transfer.COVERAGE_RADII_M)
-    _, distance = transfer.transfer_values(points, covered, covered, targets, wanted, reach)
-    return distance
+    _, distance = transfer.transfer_values(prediction.points, covered, covered, targets, wanted, reach)
+    return SceneScore(
+        protocol=rules.name,
+        version=rules.version,
+        counts=counts,
+        n_predictions=n_predictions(prediction),
+        n_scored=int(wanted.sum()),
+        n_farther=transfer.n_farther(distance[wanted]),
+        warnings=tuple(warnings),
+    )
 
 
 def _instance_warnings(

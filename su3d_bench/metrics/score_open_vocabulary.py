@@ -17,7 +17,7 @@ from su3d_bench.metrics.neighbours import transfer_each_mask
 from su3d_bench.metrics.openlex3d import OpenLexTruth
 from su3d_bench.metrics.query_ap import QueryTruth
 from su3d_bench.metrics.scene_score import SceneScore, n_predictions
-from su3d_bench.metrics.score_instances import distance_to_masks
+from su3d_bench.metrics.score_instances import score_of_masks
 from su3d_bench.metrics.score_semantic import has_feature
 from su3d_bench.protocols import ProtocolRules
 from su3d_bench.row_blocks import release_pages
@@ -221,17 +221,8 @@ def score_queries(
     )
     asked_for = np.unique(np.array([one for query in truth.queries for one in query.object_ids], np.int64))
     wanted = np.isin(truth.object_of_point, asked_for[asked_for >= 0])
-    distance = distance_to_masks(prediction.points, masks, truth.points, wanted)
     told = encoder_warning(rules, prediction, encoder)
-    return SceneScore(
-        protocol=rules.name,
-        version=rules.version,
-        counts=counts,
-        n_predictions=n_predictions(prediction),
-        n_scored=int(wanted.sum()),
-        n_farther=transfer.n_farther(distance[wanted]),
-        warnings=(told,) if told else (),
-    )
+    return score_of_masks(rules, counts, prediction, masks, truth.points, wanted, (told,) if told else ())
 
 
 def _moved(rules: ProtocolRules, points: Float32Array, masks: transfer.Masks, targets: Float32Array) -> transfer.Masks:

@@ -20,7 +20,7 @@ from su3d_bench.metrics.question_truths import (
     TrueAnswer,
 )
 from su3d_bench.metrics.scene_score import SceneScore, n_predictions
-from su3d_bench.metrics.score_instances import distance_to_masks
+from su3d_bench.metrics.score_instances import score_of_masks
 from su3d_bench.metrics.shares import ShareCounts
 from su3d_bench.protocols import VALUES_OF_METRIC, AnswerRules, MergeRules, ProtocolRules
 from su3d_bench.types import BoolArray, GroundTruth, Instances, Int64Array, Partition
@@ -187,13 +187,4 @@ def _scored(
     else:
         masks = transfer.masks_of_partition(prediction.instance, len(prediction.features))
     wanted = np.isin(truth.instance, np.array([*object_ids], np.int64))
-    distance = distance_to_masks(prediction.points, masks, truth.points, wanted)
-    return SceneScore(
-        protocol=rules.name,
-        version=rules.version,
-        counts=counts,
-        n_predictions=n_predictions(prediction),
-        n_scored=int(wanted.sum()),
-        n_farther=transfer.n_farther(distance[wanted]),
-        warnings=tuple(warnings),
-    )
+    return score_of_masks(rules, counts, prediction, masks, truth.points, wanted, warnings)
