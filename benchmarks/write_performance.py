@@ -1,7 +1,8 @@
 """``docs/performance.md``: a table a group of ``make bench``, what scripts measured, then whole runs.
 
 ``python benchmarks/write_performance.py build/bench.json docs/performance.md [--rooms RUN] [--corridors RUN ...]``: the
-runs are those of ``make bench-methods``; without them their sections stay as the page has them.
+runs are those of ``make bench-methods``; without them their sections stay as the page has them, and so does the list of
+marks, which is written by hand.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ HEAD = """# Performance
 Written by `make bench` on one machine: {hardware}.
 Times are medians; only the ratios within a table travel to another machine. No check fails because a machine was slow.
 """
+MARKS_TITLE = "## Marks"
 ROOMS_TITLE = "## Every method on rooms"
 CORRIDORS_TITLE = "## An update against the map"
 CORRIDORS_TEXT = """
@@ -190,7 +192,7 @@ def main() -> None:
     parser.add_argument("--corridors", type=Path, nargs="+", metavar="RUN")
     asked = parser.parse_args()
     before = asked.page.read_text(encoding="utf-8") if asked.page.exists() else ""
-    sections = [HEAD.format(hardware=hardware_line())]
+    sections = [HEAD.format(hardware=hardware_line()), section_of(before, MARKS_TITLE)]
     sections += benchmark_sections(json.loads(asked.benchmarks.read_text(encoding="utf-8"))["benchmarks"])
     sections += measured_sections(asked.measured)
     sections.append(rooms_section(asked.rooms) if asked.rooms else section_of(before, ROOMS_TITLE))

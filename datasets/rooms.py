@@ -137,7 +137,7 @@ class BuiltRoom:
 
 
 class Rooms:
-    """The dataset ``rooms``; ``root`` holds its cache."""
+    """Furnished rooms, made from their names; ``root`` holds what is kept of them."""
 
     name = "rooms"
     label_space = "replica"

@@ -47,9 +47,9 @@ def markdown(tables: Sequence[Table]) -> str:
 
 def _markdown(table: Table) -> str:
     rows = [[row.title, *(_marked(cell) for cell in row.cells)] for row in table.rows]
-    lines = aligned([[_pipes(text) for text in row] for row in [[table.head, *table.columns], *rows]])
+    lines = aligned([[_pipes(text) for text in row] for row in [[table.head, *table.columns], *rows]]) if rows else []
     notes = [f"- {_pipes(note)}" for note in table.notes]
-    return "\n".join([_pipes(table.caption), "", *lines, *([""] if notes else []), *notes])
+    return "\n\n".join("\n".join(part) for part in ([_pipes(table.caption)], lines, notes) if part)
 
 
 def _marked(cell: Cell) -> str:

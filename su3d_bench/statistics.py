@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 
@@ -19,14 +20,17 @@ MIN_FIT = 8
 LEAST_SPREAD = 1e-9  # of a resample's sizes, over that of all: below it a slope would be made of rounding
 
 
+@lru_cache(maxsize=1)  # every method and protocol of a run asks for the same
 def resample_weights(n_scenes: int, n_resamples: int = N_RESAMPLES, seed: int = SEED) -> Int64Array:
-    """How often each scene is drawn (R, S) when as many scenes as there are, are drawn with replacement.
+    """How often each scene is drawn (R, S) when as many scenes as there are, are drawn with replacement; read-only.
 
     >>> resample_weights(4, n_resamples=2).sum(axis=1).tolist()
     [4, 4]
     """
     shares = np.full(n_scenes, 1.0 / n_scenes)
-    return np.random.default_rng(seed).multinomial(n_scenes, shares, size=n_resamples).astype(np.int64)
+    weights: Int64Array = np.random.default_rng(seed).multinomial(n_scenes, shares, size=n_resamples).astype(np.int64)
+    weights.flags.writeable = False
+    return weights
 
 
 def bootstrap_interval(

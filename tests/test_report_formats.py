@@ -112,6 +112,10 @@ def test_markdown_keeps_its_columns_whatever_the_names() -> None:
     assert {len(re.findall(r"(?<!\\)\|", line)) for line in lines} == {4}
 
 
+def test_a_table_without_rows_is_its_caption_and_its_notes() -> None:
+    assert markdown([Table("none", "Nothing.", "method", (), (), ("left out: a",))]) == "Nothing.\n\n- left out: a\n"
+
+
 def test_csv_has_full_precision_and_every_note_once() -> None:
     table = protocol_table([measured(accuracy=1 / 3)], Shown(intervals=True), [])
     lines = list(csv.DictReader(io.StringIO(csv_text([table]))))
