@@ -3,9 +3,9 @@
     python benchmarks/dense_memory.py
     python benchmarks/dense_memory.py --points 400000 --dimensions 256 --features-in memory
 
-Images of a long wall are fused by ConceptFusion, each twice, so that every point is made once and averaged once. A
-process of its own does it, which reports the most that it held in each step (resident set, maps of files included) and
-before the first; the answer is one line of JSON a step.
+Images of a long wall are fused by ConceptFusion, each twice, so that every point is made once and averaged once: with
+features on disk, and in memory, as the peer. A process of its own does each, which reports the most that it held in
+each step (resident set, maps of files included) and before the first; one line of JSON a step.
 """
 
 from __future__ import annotations
@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from measured import write_measured
 
 from su3d_bench.baselines.conceptfusion import ConceptFusion, ConceptFusionConfig
 from su3d_bench.protocols import load_protocol
@@ -45,6 +46,7 @@ FOCAL_PX = 500.0
 WALL_M = 2.0
 N_STRIPES = 20
 RULES = load_protocol("rooms-semantic")
+WHERE = {"disk": "features on disk", "memory": "features in memory"}
 
 
 @dataclass
@@ -144,20 +146,47 @@ def work(n_points: int, n_dimensions: int, features_in: str, folder: Path) -> No
         found["features_bytes"] = prediction.features.nbytes
 
 
+def in_a_process(features_in: str, n_points: int, n_dimensions: int, folder: Path) -> list[dict[str, Any]]:
+    """What each step reported, in order; the prediction stays in ``folder``."""
+    words = ["--points", str(n_points), "--dimensions", str(n_dimensions), "--features-in", features_in]
+    command = [sys.executable, __file__, *words, "--folder", str(folder), "--here"]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    steps = [{"features_in": features_in} | json.loads(line) for line in done.stdout.splitlines()]
+    print(*map(json.dumps, steps), sep="\n", flush=True)
+    return steps
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, default=2_000_000)
     parser.add_argument("--dimensions", type=int, default=1024)
-    parser.add_argument("--features-in", default="disk", choices=("disk", "memory"))
+    parser.add_argument("--features-in", nargs="+", default=["disk", "memory"], choices=("disk", "memory"))
     parser.add_argument("--folder", type=Path, help="where the prediction is written; it must exist and is kept")
+    parser.add_argument("--json", type=Path, help="write the table for docs/performance.md")
     parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.here:
-        work(arguments.points, arguments.dimensions, arguments.features_in, arguments.folder)
+        work(arguments.points, arguments.dimensions, arguments.features_in[0], arguments.folder)
         return
-    with tempfile.TemporaryDirectory(prefix="dense-memory-") as made:
-        folder = ["--folder", str(arguments.folder or made)]
-        subprocess.run([sys.executable, __file__, *sys.argv[1:], *folder, "--here"], check=True)
+    told: dict[str, list[dict[str, Any]]] = {}
+    for where in arguments.features_in:
+        with tempfile.TemporaryDirectory(prefix="dense-memory-") as made:
+            told[where] = in_a_process(where, arguments.points, arguments.dimensions, arguments.folder or Path(made))
+    if arguments.json:
+        columns = ["step", *(f"{what}, {WHERE[word]}" for word in told for what in ("resident, MiB", "seconds"))]
+        rows = [
+            [
+                steps[0]["step"],
+                *(cell for one in steps for cell in (f"{one['peak_bytes'] / 2**20:.0f}", str(one["seconds"]))),
+            ]
+            for steps in zip(*told.values(), strict=True)
+        ]
+        n_points, n_bytes = (
+            next(iter(told.values()))[step][key] for step, key in ((1, "n_points"), (3, "features_bytes"))
+        )
+        title = f"A dense map of {n_points:,} points with {arguments.dimensions} features each"
+        notes = [f"The features take {n_bytes / 2**20:.0f} MiB in half precision on disk."]
+        write_measured(arguments.json, title, "python benchmarks/dense_memory.py", columns, rows, notes)
 
 
 if __name__ == "__main__":

@@ -119,13 +119,14 @@ def _resumed(folder: Path) -> Read:
     import pytest
     from painted import colour_perception
 
-    from su3d_bench import scene_run
+    from su3d_bench import finished_scenes, scene_run
 
     words = _command(copied_run(folder))
 
     def read() -> None:
         with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(scene_run, "build_perception", colour_perception)
+            for module in (scene_run, finished_scenes):
+                patch.setattr(module, "build_perception", colour_perception)
             called(words)
 
     return read

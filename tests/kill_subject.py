@@ -17,7 +17,7 @@ if str(Path(__file__).parent) not in sys.path:
 
 from painted import Collector, ColourPerception, Painted
 
-from su3d_bench import scene_run
+from su3d_bench import finished_scenes, scene_run
 from su3d_bench.interfaces import StageTimer
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.types import DenseFeatures, Detections, Frame, PerceptionNeeds, Prediction
@@ -64,6 +64,7 @@ def kept_perception(*_: Any, cache_root: Path, **__: Any) -> KeptPerception:
     return KeptPerception(cache_root)
 
 
-scene_run.build_perception = kept_perception  # type: ignore[assignment, attr-defined]
+for module in (scene_run, finished_scenes):
+    module.build_perception = kept_perception  # type: ignore[attr-defined]
 
 __all__ = ["Dense", "Painted"]

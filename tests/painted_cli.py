@@ -5,11 +5,12 @@ from unittest.mock import patch
 
 from painted import colour_perception
 
-from su3d_bench import scene_run
+from su3d_bench import finished_scenes, scene_run
 from su3d_bench.cli.main import main
 
 # At import, so that spawned workers, which import this file too, have it as well.
-patch.object(scene_run, "build_perception", colour_perception).start()
+for module in (scene_run, finished_scenes):
+    patch.object(module, "build_perception", colour_perception).start()
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -248,7 +248,7 @@ def test_labels_of_a_mapped_table_are_those_of_the_same_rows_in_memory(tmp_path:
 
 def test_a_map_larger_than_what_it_takes_is_fused_written_read_and_scored() -> None:
     """256 MB of features: no step may hold them all; benchmarks/dense_memory.py measures 2 M points x 1024 so."""
-    words = ["--points", "250000", "--dimensions", "512"]
+    words = ["--points", "250000", "--dimensions", "512", "--features-in", "disk"]
     script = HERE.parent / "benchmarks" / "dense_memory.py"
     done = subprocess.run([sys.executable, script, *words], capture_output=True, text=True, check=True)
     steps = {line["step"]: line for line in map(json.loads, done.stdout.splitlines())}

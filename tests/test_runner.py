@@ -18,7 +18,7 @@ from typing import Any
 import pytest
 from painted import ColourPerception, colour_perception
 
-from su3d_bench import scene_feeding, scene_run
+from su3d_bench import finished_scenes, scene_feeding, scene_run
 from su3d_bench.cli.main import main
 
 HERE = Path(__file__).parent
@@ -29,7 +29,8 @@ PROTOCOLS = ["--protocols", "rooms-semantic", "rooms-instance"]
 
 @pytest.fixture(autouse=True)
 def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.setattr(scene_run, "build_perception", colour_perception)
+    for module in (scene_run, finished_scenes):
+        monkeypatch.setattr(module, "build_perception", colour_perception)
     monkeypatch.chdir(tmp_path)
 
 
@@ -168,7 +169,8 @@ def test_changed_perception_is_refused_by_name(
     assert run(scenes="a") == 0
     other = colour_perception()
     other.digest = "colours-2"
-    monkeypatch.setattr(scene_run, "build_perception", lambda *_, **__: other)
+    for module in (scene_run, finished_scenes):
+        monkeypatch.setattr(module, "build_perception", lambda *_, **__: other)
     assert run(scenes="a") == 2
     assert "perception was colours-1, now colours-2" in capsys.readouterr().err
 
