@@ -69,7 +69,7 @@ class Rgbd:
     def __init__(self, root: Path, options: RgbdOptions | None = None) -> None:
         self.root = root
         self.options = options or RgbdOptions()
-        self._opened: dict[str, tuple[RgbdDescription, Recording]] = {}
+        self._last: tuple[str, RgbdDescription, Recording] | None = None
         self._checked: set[str] = set()
 
     def scenes(self) -> Sequence[str]:
@@ -147,11 +147,11 @@ class Rgbd:
         return self._open(scene)[1]
 
     def _open(self, scene: str) -> tuple[RgbdDescription, Recording]:
-        if scene not in self._opened:
+        if self._last is None or self._last[0] != scene:
             path, where = self._description(scene), f"{self.name}/{scene}"
             description = read_description(path, where)
-            self._opened[scene] = description, open_recording(path, description, where)
-        return self._opened[scene]
+            self._last = scene, description, open_recording(path, description, where)
+        return self._last[1:]
 
 
 def open_recording(path: Path, description: RgbdDescription, where: str) -> Recording:

@@ -81,7 +81,7 @@ class Tum:
     def __init__(self, root: Path, options: TumOptions | None = None) -> None:
         self.root = root
         self.options = options or TumOptions()
-        self._recordings: dict[str, Recording] = {}
+        self._last: tuple[str, Recording] | None = None
 
     def scenes(self) -> Sequence[str]:
         folders = [folder for place in self.places() if place.is_dir() for folder in sorted(place.iterdir())]
@@ -130,9 +130,9 @@ class Tum:
         raise DataError(f"tum: no sequence '{scene}'{suggest(scene, known) or '; known: ' + ', '.join(known[:8])}")
 
     def _recording(self, scene: str) -> Recording:
-        if scene not in self._recordings:
-            self._recordings[scene] = self._open(self._folder(scene), f"tum/{scene}")
-        return self._recordings[scene]
+        if self._last is None or self._last[0] != scene:
+            self._last = scene, self._open(self._folder(scene), f"tum/{scene}")
+        return self._last[1]
 
     def _open(self, path: Path, where: str) -> Recording:
         """The frames whose images and pose are there; what is missing is said once, as a warning."""

@@ -25,8 +25,8 @@ from su3d_bench.comparison_sides import (
 from su3d_bench.config import MOVES_NO_NUMBER
 from su3d_bench.errors import ConfigError
 from su3d_bench.finished_run import FinishedRun
-from su3d_bench.metrics.resampled_values import resampled_classes, resampled_metrics
-from su3d_bench.metrics.results import Counts, ProtocolResult
+from su3d_bench.metrics.resampled_values import resampled_classes
+from su3d_bench.metrics.results import Counts, ProtocolResult, resampled_metrics
 from su3d_bench.plain_text import printable
 from su3d_bench.protocols import ProtocolRules, load_protocol
 from su3d_bench.scoring import SceneScore, combine
@@ -295,7 +295,7 @@ def _remarks(left: FinishedRun, right: FinishedRun, methods: Set[str]) -> list[s
     changed = []
     for path in dict.fromkeys([*left.settings, *right.settings]):
         pair = (left.settings.get(path, "not set"), right.settings.get(path, "not set"))
-        is_aside = path[0] in _SETTINGS_ASIDE or (path[0] == "method" and path[1] not in methods)
+        is_aside = path[0] in _SETTINGS_ASIDE or (path[0] == "method" and methods.isdisjoint(path[1:2]))
         if not is_aside and pair[0] != pair[1]:
             changed.append(printable(f"{'.'.join(path)} {pair[0]} and {pair[1]}", 120))
     if changed:

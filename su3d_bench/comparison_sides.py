@@ -8,12 +8,9 @@ from pathlib import Path
 
 from su3d_bench.errors import ConfigError, suggest
 from su3d_bench.finished_run import FinishedRun, read_run
-from su3d_bench.metrics.instance_ap import InstanceCounts
-from su3d_bench.metrics.object_means import ObjectCounts
-from su3d_bench.metrics.semantic import SemanticCounts
-from su3d_bench.metrics.shares import ShareCounts
+from su3d_bench.metrics.count_shapes import check_against
 from su3d_bench.plain_text import printable
-from su3d_bench.protocols import VALUES_OF_METRIC, ProtocolRules, load_protocol
+from su3d_bench.protocols import ProtocolRules, load_protocol
 from su3d_bench.scoring import SceneScore
 
 
@@ -135,24 +132,7 @@ def rules_of(side: Side, protocol: str) -> ProtocolRules:
     return rules
 
 
-def _n_classes(rules: ProtocolRules, counts: InstanceCounts | SemanticCounts | ShareCounts) -> tuple[int, int]:
-    """How many classes, or values, counts have, and how many the rules have."""
-    if isinstance(counts, InstanceCounts):
-        return len(counts.n_truth), len(rules.curve_names)
-    if isinstance(counts, ShareCounts):
-        return len(counts.n_judged), len(VALUES_OF_METRIC[rules.metric])
-    return len(counts.is_present), len(rules.classes)
-
-
 def check_shapes(rules: ProtocolRules, side: Side, scores: Mapping[str, SceneScore]) -> None:
-    """A ``ConfigError`` where counts are of other classes than the rules here have."""
+    """A ``DataError`` where counts are of other classes than the rules here have."""
     for scene, score in scores.items():
-        counts = score.counts
-        if isinstance(counts, ObjectCounts):
-            continue
-        n, expected = _n_classes(rules, counts)
-        if n != expected:
-            raise ConfigError(
-                f"{side.name}: {printable(scene, 100)}: was scored with {n} classes, {rules.name} has {expected} here; "
-                "score both runs again"
-            )
+        check_against(rules, f"{side.name}: {printable(scene, 100)}", score.counts)

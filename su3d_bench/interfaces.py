@@ -144,7 +144,10 @@ class MethodAbout:
 
 @runtime_checkable
 class Encoder(Protocol):
-    """Two towers into one space of ``dim`` dimensions; all outputs L2-normalised float32."""
+    """Two towers into one space of ``dim`` dimensions; all outputs L2-normalised float32.
+
+    It may have ``device``, where it runs, ``cpu`` or a device of torch: its features are compared there too.
+    """
 
     name: str
     dim: int

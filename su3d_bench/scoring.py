@@ -19,6 +19,7 @@ from su3d_bench.errors import DataError, PredictionError
 from su3d_bench.interfaces import Encoder
 from su3d_bench.kept_files import DAMAGE, read_arrays
 from su3d_bench.metrics import instance_ap, object_means, semantic, shares, transfer
+from su3d_bench.metrics.count_shapes import check_against, checked_counts
 from su3d_bench.metrics.openlex3d import OpenLexTruth
 from su3d_bench.metrics.query_ap import QueryTruth
 from su3d_bench.metrics.question_truths import AnnotationTruth, ReasoningTruth, RetrievalTruth
@@ -161,6 +162,7 @@ def _ordered(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> list[tup
                 f"{scene}: was scored under {score.protocol} version {score.version}, not {rules.name} version "
                 f"{rules.version}; score it again"
             )
+        check_against(rules, scene, score.counts)
     return [(scene, scores[scene]) for scene in sorted(scores)]
 
 
@@ -217,13 +219,16 @@ def unpack_scores(data: bytes) -> dict[str, SceneScore]:
 
 def _unpack_one(name: str, arrays: Mapping[str, NDArray[Any]]) -> SceneScore:
     about = json.loads(arrays[f"{name}/about"].tobytes())
+    n_farther = np.array(about["n_farther"], np.int64)
+    if n_farther.shape != (len(transfer.COVERAGE_RADII_M),):
+        raise DataError(f"counts: 'n_farther' has the shape {n_farther.shape}; score the scene again")
     kind = _COUNTS[about["kind"]]
     return SceneScore(
         protocol=about["protocol"],
         version=about["version"],
-        counts=kind(**{field.name: arrays[f"{name}/{field.name}"] for field in fields(kind)}),
+        counts=checked_counts(kind, {field.name: arrays[f"{name}/{field.name}"] for field in fields(kind)}),
         n_predictions=about["n_predictions"],
         n_scored=about["n_scored"],
-        n_farther=np.array(about["n_farther"], np.int64),
+        n_farther=n_farther,
         warnings=tuple(about["warnings"]),
     )

@@ -22,8 +22,8 @@ from su3d_bench.cli.main import main
 from su3d_bench.comparison import compare
 from su3d_bench.errors import ConfigError, StoreError
 from su3d_bench.metrics import instance_ap, semantic
-from su3d_bench.metrics.resampled_values import resampled_classes, resampled_metrics
-from su3d_bench.metrics.results import metric_values
+from su3d_bench.metrics.resampled_values import resampled_classes
+from su3d_bench.metrics.results import metric_values, resampled_metrics
 from su3d_bench.protocols import load_protocol
 from su3d_bench.reports.comparison_table import comparison_tables
 from su3d_bench.statistics import MAX_EXACT_PAIRS, SignFlipTest, resample_weights, sign_flip_test
@@ -238,6 +238,8 @@ def test_settings_that_differ_are_named() -> None:
     assert "settings that differ: method.collector.drop 0 and 1" in compare("a", "b").remarks
     assert compare("b", "few").remarks == ()
     assert compare("a", "variants").remarks == ()  # of the variant, which is not compared, nothing is said
+    copy_as("a", "odd", "run.toml", lambda text: "method = 3\n" + text.replace("[method.collector]", "[other]"))
+    assert "method.collector.drop 0 and not set" in compare("a", "odd").remarks[0]
 
 
 def test_two_methods_of_one_run_are_compared() -> None:

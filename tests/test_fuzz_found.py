@@ -25,7 +25,8 @@ from su3d_bench.finished_run import read_run
 from su3d_bench.kept_files import DAMAGE, read_arrays
 from su3d_bench.leaderboard import leaderboard
 from su3d_bench.predictions.numpy_files import read_npy
-from su3d_bench.protocols import read_protocol
+from su3d_bench.protocols import load_protocol, read_protocol
+from su3d_bench.scoring import combine, unpack_scores
 from su3d_bench.store import is_file, read_json, read_prediction
 from su3d_bench.table_sources import check_paper
 
@@ -190,3 +191,39 @@ def test_a_prediction_with_a_field_of_another_kind_is_refused(tmp_path: Path, na
     np.savez(file, **arrays)  # type: ignore[arg-type]
     with pytest.raises(PredictionError, match=rf"prediction.npz: '{name}' is an array of shape"):
         read_prediction(file)
+
+
+@pytest.mark.parametrize("name", ["done.json", "counts.npz"])
+def test_an_empty_file_of_a_scene_ends_no_report_on_times(
+    tmp_path: Path, name: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = copied_run(tmp_path)
+    (run / "scenes" / "painted.a" / "collector" / name).write_bytes(b"")
+    assert main(["report", "timing", str(run)]) == 0
+    assert "collector" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("name", "array"),
+    [
+        ("n_missed", np.zeros((66, 10), "M8[ns]")),
+        ("n_truth", np.zeros(65, np.int64)),
+        ("class_index", np.full(30, 66, np.int32)),
+        ("threshold_index", np.full(30, -1, np.int32)),
+    ],
+)
+def test_counts_of_another_kind_shape_or_range_are_damaged(tmp_path: Path, name: str, array: NDArray[Any]) -> None:
+    file = copied_run(tmp_path) / "scenes" / "painted.a" / "collector" / "counts.npz"
+    arrays = read_arrays(file) | {f"rooms-instance/{name}": array}
+    np.savez(file, **arrays)  # type: ignore[arg-type]
+    with pytest.raises(DataError, match=rf"counts: '{name}'"):
+        unpack_scores(file.read_bytes())
+
+
+def test_counts_of_other_classes_than_the_rules_are_not_combined(tmp_path: Path) -> None:
+    file = copied_run(tmp_path) / "scenes" / "painted.a" / "collector" / "counts.npz"
+    scores = unpack_scores(file.read_bytes())
+    rules = load_protocol("rooms-semantic")
+    fewer = rules.model_copy(update={"classes": rules.classes[:-1]})
+    with pytest.raises(DataError, match="painted/a: was scored with 69 classes, rooms-semantic has 68 here"):
+        combine(fewer, {"painted/a": scores["rooms-semantic"]})

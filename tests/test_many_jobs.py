@@ -68,6 +68,13 @@ def test_a_scene_with_a_damaged_file_is_no_finished_one(
     assert asked == ["painted/a"]
 
 
+def test_pictures_that_were_not_asked_for_before_are_drawn(finished: Path) -> None:
+    assert not list(finished.glob("scenes/*/*/pictures/*"))
+    assert main([*WORDS, *(word for word in PROTOCOLS if word != "--no-pictures"), "--jobs", "1"]) == 0
+    n_jobs = len(list(finished.glob("scenes/*/*/done.json")))
+    assert len({path.parent for path in finished.glob("scenes/*/*/pictures/*.png")}) == n_jobs
+
+
 def test_listing_the_jobs_reads_each_seal_twice(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     reads = count_seals_read(monkeypatch)
     assert main([*WORDS, *PROTOCOLS, "--dry-run"]) == 0

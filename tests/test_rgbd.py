@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import logging
+import shutil
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -196,6 +198,15 @@ def test_a_trajectory_counts_missing_images_or_leaves_them_out(tmp_path: Path) -
     (folder / "data/trajectory.log").write_text(log_of(range(5)))
     with pytest.raises(DataError, match=r"trajectory\.log has 5 poses; expected 3, one an image, or 4, one a number"):
         open_scene(tmp_path)
+
+
+def test_of_many_scenes_one_is_in_memory(tmp_path: Path) -> None:
+    shutil.copytree(write_scene(tmp_path), tmp_path / "rgbd" / "chair")
+    rgbd = Rgbd(tmp_path)
+    first = weakref.ref(rgbd._recording("desk"))
+    assert first() is rgbd._recording("desk")
+    assert rgbd.digest("chair") != rgbd.digest("desk")
+    assert first() is None
 
 
 def test_descriptions_anywhere_can_be_named(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 
@@ -77,6 +78,16 @@ def test_a_recording_is_camera_images_and_a_rendered_one_is_marked(tmp_path: Pat
     (folder / "rooms.json").write_text("{}")
     assert Tum(tmp_path).info(SCENE, 1).image_domain == "rendered-rooms"
     assert Tum(tmp_path).digest(SCENE) != before
+
+
+def test_of_many_sequences_one_is_in_memory(tmp_path: Path) -> None:
+    for scene in "ab":
+        write_sequence(tmp_path, scene)
+    tum = Tum(tmp_path)
+    first = weakref.ref(tum._recording("a"))
+    assert first() is tum._recording("a")
+    assert tum.digest("b") != tum.digest("a")
+    assert first() is None
 
 
 @pytest.mark.parametrize(

@@ -88,6 +88,8 @@ def _anytime(run: FinishedRun, times: list[UpdateTimes]) -> list[Any]:
         if name != method or not result.anytime or result.metrics is None:
             continue
         shares = [*sorted(result.anytime.items()), (1.0, result.metrics)]
+        if any(len(one.maps) != len(shares) for one in times):
+            continue  # the record of a scene's maps is damaged
         for index, (share, metrics) in enumerate(shares):
             seconds = sum(_seconds_until(one, index) for one in times)
             headline = {metric: metrics.get(metric) for metric in result.headline}

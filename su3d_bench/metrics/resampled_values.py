@@ -1,58 +1,22 @@
-"""A protocol's metrics, and those of each class, when scenes are drawn with weights, from their additive counts.
+"""The metrics of each class when scenes are drawn with weights, from their additive counts.
 
 With weights of ones this is the value over all scenes, with a single one that of a scene alone.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import cast
 
 import numpy as np
 
-from su3d_bench.metrics import object_means, resampling, shares
+from su3d_bench.metrics import resampling
 from su3d_bench.metrics.instance_ap import InstanceCounts
 from su3d_bench.metrics.labelling import scored_classes
 from su3d_bench.metrics.results import CURVE_KINDS, Counts
 from su3d_bench.metrics.semantic import SemanticCounts
-from su3d_bench.protocols import SHARE_KINDS, VALUES_OF_METRIC, ProtocolRules
+from su3d_bench.protocols import SHARE_KINDS, ProtocolRules
 from su3d_bench.types import Float64Array, Int64Array
-
-
-def resampled_metrics(
-    rules: ProtocolRules,
-    counts: Sequence[Counts],
-    per_scene: Sequence[Mapping[str, float]],
-    weights: Int64Array,
-) -> dict[str, Float64Array]:
-    """Each headline metric (R,) of the scenes drawn ``weights`` (R, S) times, pooled or as the mean over scenes.
-
-    ``per_scene`` holds the metrics of each scene alone, from which the mean over scenes is formed.
-    """
-    if rules.aggregate == "scene-mean":
-        return {name: _weighted_mean([row[name] for row in per_scene], weights) for name in rules.headline}
-    if rules.kind in CURVE_KINDS:
-        pooled = resampling.resampled_ap(cast("Sequence[InstanceCounts]", counts), weights, rules.thresholds)
-    elif rules.kind == "categories":
-        values = object_means.resampled(cast("Sequence[object_means.ObjectCounts]", counts), weights)
-        pooled = dict(zip(VALUES_OF_METRIC[rules.metric], values.T, strict=True))
-    elif rules.kind in SHARE_KINDS:
-        values = shares.resampled(cast("Sequence[shares.ShareCounts]", counts), weights)
-        pooled = dict(zip(VALUES_OF_METRIC[rules.metric], values.T, strict=True))
-    else:
-        is_scored = scored_classes(rules) if rules.metric == "hovsg" else None
-        pooled = resampling.resampled_semantic(
-            cast("Sequence[SemanticCounts]", counts), weights, rules.metric, is_scored
-        )
-    return {name: pooled[name] for name in rules.headline}
-
-
-def _weighted_mean(values: Sequence[float], weights: Int64Array) -> Float64Array:
-    held = np.array(values)
-    is_number = ~np.isnan(held)
-    drawn = weights[:, is_number].astype(np.float64)
-    n = drawn.sum(axis=1)
-    return np.where(n > 0, (drawn * held[is_number]).sum(axis=1) / np.maximum(n, 1), np.nan)
 
 
 def class_columns(rules: ProtocolRules) -> tuple[str, ...]:

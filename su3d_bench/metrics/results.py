@@ -85,7 +85,7 @@ def form_result(
     rows = list(per_scene.values())
     intervals: dict[str, tuple[float, float] | None] = dict.fromkeys(rules.headline)
     if with_intervals and len(scenes) > 1:
-        resampled = _resampled(rules, counts, rows, resample_weights(len(scenes)))
+        resampled = resampled_metrics(rules, counts, rows, resample_weights(len(scenes)))
         intervals = {key: percentile_interval(resampled[key]) for key in rules.headline}
     return ProtocolResult(
         protocol=rules.name,
@@ -232,24 +232,30 @@ def _group_values(
     }
 
 
-def _resampled(
+def resampled_metrics(
     rules: ProtocolRules, counts: Sequence[Counts], rows: Sequence[Mapping[str, float]], weights: Int64Array
 ) -> dict[str, Float64Array]:
-    """The headline metrics of resampled scenes; ``rows`` are those of each scene alone."""
+    """Each headline metric (R,) of the scenes drawn ``weights`` (R, S) times, pooled or as the mean over scenes.
+
+    ``rows`` hold the metrics of each scene alone, from which the mean over scenes is formed. With weights of ones this
+    is the value over all scenes, with a single one that of a scene alone.
+    """
     if rules.aggregate == "scene-mean":
-        return {key: _weighted_mean(np.array([row[key] for row in rows]), weights) for key in rules.headline}
+        return {name: _weighted_mean(np.array([row[name] for row in rows]), weights) for name in rules.headline}
     if rules.kind in CURVE_KINDS:
         instances = cast("Sequence[instance_ap.InstanceCounts]", counts)
-        return resampling.resampled_ap(instances, weights, rules.thresholds)
-    if rules.kind == "categories":
+        pooled = resampling.resampled_ap(instances, weights, rules.thresholds)
+    elif rules.kind == "categories":
         values = object_means.resampled(cast("Sequence[object_means.ObjectCounts]", counts), weights)
-        return dict(zip(VALUES_OF_METRIC[rules.metric], values.T, strict=True))
-    if rules.kind in SHARE_KINDS:
+        pooled = dict(zip(VALUES_OF_METRIC[rules.metric], values.T, strict=True))
+    elif rules.kind in SHARE_KINDS:
         values = shares.resampled(cast("Sequence[shares.ShareCounts]", counts), weights)
-        return dict(zip(VALUES_OF_METRIC[rules.metric], values.T, strict=True))
-    confusions = cast("Sequence[semantic.SemanticCounts]", counts)
-    is_scored = scored_classes(rules) if rules.metric == "hovsg" else None
-    return resampling.resampled_semantic(confusions, weights, rules.metric, is_scored)
+        pooled = dict(zip(VALUES_OF_METRIC[rules.metric], values.T, strict=True))
+    else:
+        confusions = cast("Sequence[semantic.SemanticCounts]", counts)
+        is_scored = scored_classes(rules) if rules.metric == "hovsg" else None
+        pooled = resampling.resampled_semantic(confusions, weights, rules.metric, is_scored)
+    return {name: pooled[name] for name in rules.headline}
 
 
 def _weighted_mean(values: Float64Array, weights: Int64Array) -> Float64Array:

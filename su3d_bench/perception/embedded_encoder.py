@@ -52,8 +52,8 @@ class EmbeddedEncoder:
 
     Every text runs through the network alone and all on one thread, so that a feature never depends on what else is in
     the batch or on the machine's number of cores. Images run in batches where these give the bits that each image gives
-    alone, which is tried at the first use, and else alone too. On a ``device`` other than ``cpu`` torch runs both in
-    batches, and features differ from those of the CPU by rounding.
+    alone, which is tried at the first use, and else alone too. On a ``device`` other than ``cpu`` torch runs the
+    towers, images always in batches, and features differ from those of the CPU by rounding.
     """
 
     name = "su3d-embedded"
