@@ -16,39 +16,13 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 from torch_devices import TORCH_ON_CPU, on_each_device
+from wall import DISTANCE_M, HEIGHT, VOXEL_M, WIDTH, view
 
 from su3d_bench.executors import one_thread
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.timing import Timer
 from su3d_bench.types import Detections, Frame
-
-WIDTH, HEIGHT, FOCAL = 1200, 680, 600.0
-DISTANCE_M = 2.5
-VOXEL_M = 0.02
-
-
-def view() -> tuple[Frame, Detections]:
-    intrinsics = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1]])
-    depth_m = np.full((HEIGHT, WIDTH), DISTANCE_M, np.float32)
-    rgb = np.zeros((HEIGHT, WIDTH, 3), np.uint8)
-    masks = np.zeros((24, HEIGHT, WIDTH), np.bool_)
-    for k in range(24):
-        row, column = divmod(k, 6)
-        masks[k, 170 * row + 10 : 170 * row + 150, 200 * column + 10 : 200 * column + 180] = True
-    n = len(masks)
-    detections = Detections(
-        frame_index=0,
-        masks=masks,
-        boxes=np.zeros((n, 4), np.float32),
-        scores=np.full(n, 0.5, np.float32),
-        names=("thing",) * n,
-        captions=("",) * n,
-        crop_ratios=(0.8, 1.0, 1.2),
-        crop_features=np.ones((n, 3, 128), np.float32),
-        global_feature=np.ones(128, np.float32),
-    )
-    return Frame(0, 0.0, rgb, depth_m, np.eye(4), intrinsics), detections
 
 
 def every_second_pixel(frame: Frame, detections: Detections) -> tuple[Frame, Detections]:

@@ -4,7 +4,7 @@
     python benchmarks/big_map.py --points 1000000 --instances 250 --json build/measured/big_map.json
 
 Objects stand on a grid: boxes with a point every 2 cm or closer on their faces, each seen in three images; one is
-clustered as one. After them the wall of ``bench_update.py`` is fused, all of it again and again: those are the updates
+clustered as one. After them the wall of ``wall.py`` is fused, all of it again and again: those are the updates
 that are timed. Memory is the resident set, at its highest in each step.
 """
 
@@ -19,9 +19,9 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-from bench_update import view
 from dense_memory import RandomDirections
 from measured import write_measured
+from wall import view
 
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.opensu3d.tracking import View, record_of

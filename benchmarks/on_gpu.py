@@ -95,7 +95,8 @@ def measured(work: Callable[[], Arrays], repeats: int) -> tuple[Arrays, float]:
 def maps(n_points: int) -> Iterator[Comparison]:
     """A view of 204,000 points against a map, and what that map is after it took the view in."""
     from bench_association import EPS, case
-    from bench_update import every_second_pixel, filled, view
+    from bench_update import every_second_pixel, filled
+    from wall import view
 
     scene, frame = case(n_points).scene, case(n_points).frame
 

@@ -7,7 +7,7 @@ import re
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,6 +66,13 @@ def scene_name_parts(scene: str) -> tuple[str, int]:
         hint = suggest(scene, DEFAULT_SCENES) or f"; kinds: {', '.join(KIND_NAMES)}"
         raise DataError(f"rooms: no scene '{scene}'; a scene is a kind and a number such as office3{hint}")
     return match[1], int(match[2])
+
+
+@cache
+def _code_of_rooms() -> str:
+    """A key of the code that makes rooms: another code may make another mesh."""
+    sources = sorted(Path(__file__).parent.glob("rooms*.py"))
+    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
 
 
 def _generator(*words: object) -> np.random.Generator:
@@ -236,7 +243,7 @@ class Rooms:
         if number >= TRAINING_FROM or not self.root.is_dir():
             return None
         packages = package_versions(NUMERIC_PACKAGES)  # another Open3D may bake another last bit
-        words = GENERATOR_VERSION, self.options.n_frames, self.options.seed_offset, sorted(packages.items())
+        words = _code_of_rooms(), self.options.n_frames, self.options.seed_offset, sorted(packages.items())
         return self.root / "rooms" / digest_json(words)[:16]
 
     def visible_vertices(self, scene: str) -> dict[int, int]:

@@ -19,7 +19,8 @@ class FinishedScenes:
     """Tells the finished scenes of one run by the checks that a worker makes, each of which reads a file once.
 
     What all scenes share (methods, datasets, perception, their keys) is made once. A scene whose perception has a
-    digest of its own (profiles ``stored`` and ``oracle``) is left to a worker.
+    digest of its own (profiles ``stored`` and ``oracle``) is left to a worker; so is one that asks for a GPU, whose
+    properties only a process that occupies it can tell.
     """
 
     def __init__(self) -> None:
@@ -96,7 +97,7 @@ class FinishedScenes:
                     replies=job.folder / "language",
                     is_offline=job.is_offline,
                 )
-                if profile in SAME_EVERYWHERE
+                if profile in SAME_EVERYWHERE and config.models.device == "cpu"
                 else None
             )
         return self._perceptions[info.image_domain]

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from su3d_bench.digests import digest_json
+from su3d_bench.digests import digest_json, package_versions
 from su3d_bench.interfaces import Method
 from su3d_bench.perception.profiles import Perception
 from su3d_bench.protocols import load_protocol
@@ -17,6 +17,8 @@ from su3d_bench.types import SceneInfo
 
 LAYOUTS_OF_ROOMS = ("replica", "scannet", "tum")  # in which `datasets make rooms` writes files
 TRUE_PROPOSALS_CAVEAT = "proposals from the ground truth; a ceiling, not a result"
+DEVICE, CPU = "perception.models.device", '"cpu"'
+TORCH_PACKAGES = ("torch", "transformers")  # what computes where not all is done by the packages of every key
 NAMED_KINDS = ("annotation", "reasoning")  # labels n' of a file beside the map move their numbers
 
 
@@ -37,6 +39,8 @@ class JobInputs:
         key = {**self.config, "data": self.data_digest}
         if self.method.needs.frames:
             key |= {"profile": self.perception.profile, "perception": self.perception.digest}
+            if self.perception.profile == "paper" or self.config.get(DEVICE, CPU) != CPU:
+                key |= {f"packages.{name}": text for name, text in package_versions(TORCH_PACKAGES).items()}
         return key
 
     def score_key(self, predict_key: Mapping[str, str], folder: JobFolder) -> dict[str, str]:

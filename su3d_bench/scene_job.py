@@ -18,7 +18,7 @@ from su3d_bench.store import JobFolder
 CEILING_METHOD = "oracle"
 # Settings of perception that move no number, or whose part that does is in perception's digest.
 MOVES_NO_NUMBER = ("perception.cache", "perception.models.folder", "perception.models.paths", "perception.language.")
-FIELDS_KNOWN_LATER = ("data", "profile", "perception")
+FIELDS_KNOWN_LATER = ("data", "profile", "perception", "packages.torch", "packages.transformers")
 
 
 @dataclass(frozen=True)

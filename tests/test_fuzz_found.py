@@ -210,6 +210,7 @@ def test_an_empty_file_of_a_scene_ends_no_report_on_times(
         ("n_truth", np.zeros(65, np.int64)),
         ("class_index", np.full(30, 66, np.int32)),
         ("threshold_index", np.full(30, -1, np.int32)),
+        ("score", np.full(30, np.nan)),
     ],
 )
 def test_counts_of_another_kind_shape_or_range_are_damaged(tmp_path: Path, name: str, array: NDArray[Any]) -> None:

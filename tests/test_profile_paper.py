@@ -285,6 +285,8 @@ def test_a_room_runs_end_to_end(models: Path, tmp_path: Path, monkeypatch: pytes
     for method in methods:
         found = read_prediction(next((tmp_path / "out").glob(f"scenes/*/{method}/prediction.npz")))
         assert isinstance(found, Instances) and len(found) > 0
+        sealed = read_json(next((tmp_path / "out").glob(f"scenes/*/{method}/done.json")))
+        assert {"packages.torch", "packages.transformers"} <= sealed["steps"]["predict"]["key"].keys()
     assert "RAM++ is not here" in str(read_json(tmp_path / "out" / "metrics.json"))
 
 

@@ -46,6 +46,8 @@ def checked_counts(kind: type[Counts], arrays: Mapping[str, NDArray[Any]]) -> Co
         index = arrays.get(name, np.zeros(0, np.int32)) if axis in sizes else np.zeros(0, np.int32)
         if len(index) and not 0 <= index.min() <= index.max() < sizes[axis]:
             raise DataError(f"counts: '{name}' counts beyond the {sizes[axis]} {axis}; score the scene again")
+    if not np.isfinite(arrays.get("score", 0.0)).all():
+        raise DataError("counts: 'score' has values that are NaN or infinite; score the scene again")
     return kind(**{name: arrays[name] for name in ARRAYS[kind]})
 
 
