@@ -108,6 +108,9 @@ def test_a_processor_file_of_either_age_gives_the_transform(tmp_path: Path) -> N
         ({"size": 10**9, "crop_size": 10**9}, "expected a shortest edge"),
         ({"image_std": [0, 1, 1]}, "above 0"),
         ({"image_mean": ["a", 1, 1]}, "expected three numbers"),
+        ({"image_mean": [10**400, 1, 1]}, "expected three numbers"),
+        ({"image_std": [1, float("nan"), 1]}, "expected three numbers"),
+        ({"rescale_factor": 10**400}, "rescale_factor is 1000"),
         ({"resample": "cubic"}, "0 to 5"),
     ],
 )

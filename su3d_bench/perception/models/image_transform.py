@@ -27,6 +27,7 @@ CLIP_STD: Triple = (0.26862954, 0.26130258, 0.27577711)
 BICUBIC = 3  # PIL.Image.Resampling.BICUBIC, and ``resample`` in transformers' files
 TRANSFORM_VERSION = "1"
 LARGEST_SIZE = 2048
+LARGEST_VALUE = 1e6  # of a mean or a deviation; real ones lie between 0 and 255
 
 
 @dataclass(frozen=True)
@@ -94,7 +95,7 @@ def read_transform(path: Path, convention: Convention) -> ImageTransform:
         if content.get(step, True) is not True:
             raise DataError(f"{path}: {step} is {content[step]!r}; only true is supported")
     factor = content.get("rescale_factor", 1 / 255)
-    if not isinstance(factor, float | int) or abs(factor - 1 / 255) > 1e-9:
+    if not isinstance(factor, float | int) or not 0 <= factor <= 1 or abs(factor - 1 / 255) > 1e-9:
         raise DataError(f"{path}: rescale_factor is {str(factor)[:40]}; expected 1/255")
     fit, size = _size(path, content)
     resample = content.get("resample", BICUBIC)
@@ -132,9 +133,11 @@ def _is_size(value: Any) -> TypeGuard[int]:
 
 
 def _triple(path: Path, content: Mapping[str, Any], key: str) -> Triple:
-    values = content.get(key)
-    if isinstance(values, list) and len(values) == 3 and all(isinstance(value, float | int) for value in values):
+    values: Any = content.get(key)
+    is_triple = isinstance(values, list) and len(values) == 3
+    # The bound comes first: an integer of any length is compared, but not made a float.
+    if is_triple and all(isinstance(value, float | int) and abs(value) <= LARGEST_VALUE for value in values):
         red, green, blue = (float(value) for value in values)
-        if np.isfinite((red, green, blue)).all() and (key == "image_mean" or min(red, green, blue) > 0):
+        if key == "image_mean" or min(red, green, blue) > 0:
             return red, green, blue
     raise DataError(f"{path}: {key} is {str(values)[:80]}; expected three numbers, those of a deviation above 0")
