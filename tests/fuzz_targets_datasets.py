@@ -61,7 +61,7 @@ def _replica(folder: Path) -> Read:
 
 def _scannet(folder: Path) -> Read:
     from scannet_scan import write_floor_truth
-    from test_scannet import write_scan
+    from scannet_scans import write_scan
 
     from su3d_bench.datasets.scannet import ScanNet, ScannetOptions
 
@@ -71,7 +71,7 @@ def _scannet(folder: Path) -> Read:
 
 def _aligned_scannet(folder: Path) -> Read:
     from scannet_scan import write_floor_truth
-    from test_scannet import write_scan
+    from scannet_scans import write_scan
 
     from su3d_bench.datasets.scannet import ScanNet, ScannetOptions
 
@@ -95,7 +95,7 @@ def _sens(name: str) -> Make:
 def _scannet_export(form: str) -> Make:
     def make(folder: Path) -> Read:
         from scannet_scan import table_text, write_floor_truth
-        from test_scannet_exports import write_cpp_export, write_python_export
+        from scannet_toy import write_cpp_export, write_python_export
 
         from su3d_bench.datasets.scannet import ScanNet, ScannetOptions
 

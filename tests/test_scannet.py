@@ -5,11 +5,8 @@ from __future__ import annotations
 import json
 import logging
 import math
-import os
-import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -30,6 +27,7 @@ from scannet_scan import (
     write_floor_truth,
     write_recording,
 )
+from scannet_scans import WHERE, dataset, export, write_scan
 
 from su3d_bench.cli.main import main
 from su3d_bench.datasets.image_files import UInt16Array
@@ -42,22 +40,6 @@ from su3d_bench.errors import ConfigError, DataError, GroundTruthMissing
 from su3d_bench.planning import expand_scenes
 from su3d_bench.scene_job import Part
 from su3d_bench.types import Float64Array, UInt8Array
-
-WHERE = f"scannet/{SCAN}"
-
-
-def write_scan(root: Path, scan: str = SCAN, place: str = "scans", n_frames: int = 5, lost: Sequence[int] = ()) -> Path:
-    """A scan with recording and truth; the folder that it lies in."""
-    folder = root / place / scan
-    write_recording(folder / f"{scan}.sens", n_frames, lost)
-    write_floor_truth(folder, scan)
-    (folder / f"{scan}.txt").write_text("axisAlignment = 0 -1 0 5 1 0 0 6 0 0 1 7 0 0 0 1\ncolorHeight = 48\n")
-    (root / TABLE_NAME).write_text(table_text())
-    return folder
-
-
-def dataset(root: Path, **options: Any) -> ScanNet:
-    return ScanNet(root, ScannetOptions(**options))
 
 
 @pytest.mark.parametrize(
@@ -164,21 +146,6 @@ def test_options_are_strict() -> None:
     for options in ({"grid": "color"}, {"axes": True}, {"source": "zip"}):
         with pytest.raises(ValidationError):
             ScannetOptions(**options)
-
-
-def export(folder: Path, n_frames: int = 5) -> None:
-    """The same walk as the Python reader exports it, in millimetres of 1.5 m to tell it from the recording."""
-    import cv2
-
-    for name in ("color", "depth", "pose", "intrinsic"):
-        (folder / name).mkdir(parents=True)
-    head = header()
-    for name, matrix in (("intrinsic_color", head.intrinsic_colour), ("intrinsic_depth", head.intrinsic_depth)):
-        np.savetxt(folder / "intrinsic" / f"{name}.txt", matrix, "%f")
-    for i, x_m in enumerate(positions(n_frames)):
-        cv2.imwrite(str(folder / "color" / f"{i}.jpg"), floor_image(COLOUR_SIZE, x_m)[..., ::-1])
-        cv2.imwrite(str(folder / "depth" / f"{i}.png"), np.full(DEPTH_SIZE[::-1], 1500, np.uint16))
-        np.savetxt(folder / "pose" / f"{i}.txt", LOST if i == 1 else pose(x_m), "%f")
 
 
 def test_the_source_option_chooses_among_recording_and_export(tmp_path: Path) -> None:
@@ -354,106 +321,6 @@ def test_scans_of_the_marker_are_rendered_rooms_under_any_name(tmp_path: Path) -
     scannet = ScanNet(tmp_path)
     assert list(scannet.scenes()) == [SCAN, "kitchen3", "scene9000_00"]
     assert [scannet.info(scan, 1).image_domain for scan in scannet.scenes()] == ["camera", *["rendered-rooms"] * 2]
-
-
-def test_files_are_all_that_is_read(tmp_path: Path) -> None:
-    write_scan(tmp_path)
-    assert set(ScanNet(tmp_path).files(SCAN)) == {path for path in tmp_path.rglob("*") if path.is_file()}
-    shutil.rmtree(tmp_path / "scans")
-    export(tmp_path / "scans" / SCAN)
-    assert set(ScanNet(tmp_path).files(SCAN)) == {path for path in tmp_path.rglob("*") if path.is_file()}
-
-
-def test_every_fault_of_a_scan_is_named_at_once(tmp_path: Path) -> None:
-    folder = write_scan(tmp_path, lost=(1,))
-    assert list(ScanNet(tmp_path).problems(SCAN)) == []
-    content = (folder / f"{SCAN}.sens").read_bytes()
-    for x_m in (positions(5)[2], positions(5)[4]):  # stretched along the view
-        content = content.replace(
-            pose(x_m).astype("<f4").tobytes(), (pose(x_m) @ np.diag([1, 1, 2, 1])).astype("<f4").tobytes()
-        )
-    (folder / f"{SCAN}.sens").write_bytes(content)
-    (folder / f"{SCAN}.txt").write_text("axisAlignment = 1 2 3\n")
-    (folder / f"{SCAN}.aggregation.json").write_text("{")
-    (folder / f"{SCAN}_vh_clean_2.labels.ply").write_text("ply")
-    (tmp_path / TABLE_NAME).write_text("id\n")
-    lines = list(ScanNet(tmp_path).problems(SCAN))
-    assert lines[:2] == [
-        f"{WHERE}: frame {i}: the pose is not a rigid motion; copy the recording again" for i in (2, 4)
-    ]
-    assert [line.split(": ")[1] for line in lines[2:]] == [
-        TABLE_NAME,
-        f"{SCAN}.txt",
-        f"{SCAN}.aggregation.json",
-        f"{SCAN}_vh_clean_2.labels.ply",
-    ]
-    (folder / f"{SCAN}.aggregation.json").unlink()
-    os.truncate(folder / f"{SCAN}.sens", 1000)
-    lines = list(ScanNet(tmp_path).problems(SCAN))
-    assert lines[0].startswith(f"{WHERE}: {SCAN}.sens: frame ") and len(lines) == 4
-
-
-def test_an_export_of_the_other_reader_has_a_status(tmp_path: Path) -> None:
-    matrix = " ".join("1" if i % 5 == 0 else "0" for i in range(16))
-    facts = dict.fromkeys(("m_colorWidth", "m_colorHeight", "m_depthWidth", "m_depthHeight"), "8")
-    facts |= {"m_depthShift": "1000", "m_frames.size": "77"}
-    for camera in ("Color", "Depth"):
-        facts |= dict.fromkeys((f"m_calibration{camera}{kind}" for kind in ("Intrinsic", "Extrinsic")), matrix)
-    (tmp_path / SCAN).mkdir()
-    text = "".join(f"{key} = {value}\n" for key, value in facts.items())
-    (tmp_path / SCAN / "_info.txt").write_text(text)
-    assert ScanNet(tmp_path).status(SCAN).startswith("77 exported frames, no ground truth, ")
-
-
-def flip(path: Path, at: int) -> None:
-    content = bytearray(path.read_bytes())
-    content[at] ^= 1
-    path.write_bytes(bytes(content))
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda folder: flip(folder / f"{SCAN}.sens", 30),  # the colour intrinsics
-        lambda folder: flip(folder / f"{SCAN}.sens", -1),  # the last depth image
-        lambda folder: write_recording(folder / f"{SCAN}.sens", lost=(2,)),
-        lambda folder: flip(folder / f"{SCAN}_vh_clean_2.ply", -1),
-        lambda folder: flip(folder / f"{SCAN}_vh_clean_2.labels.ply", -1),
-        lambda folder: flip(folder / f"{SCAN}.aggregation.json", 40),
-        lambda folder: flip(folder / f"{SCAN}_vh_clean_2.0.010000.segs.json", 40),
-        lambda folder: flip(folder / f"{SCAN}.txt", 18),
-        lambda folder: flip(folder.parent.parent / TABLE_NAME, 90),
-    ],
-)
-def test_the_digest_moves_with_every_file(tmp_path: Path, change: Callable[[Path], object]) -> None:
-    folder = write_scan(tmp_path)
-    before = ScanNet(tmp_path).digest(SCAN)
-    assert ScanNet(tmp_path).digest(SCAN) == before
-    change(folder)
-    assert ScanNet(tmp_path).digest(SCAN) != before
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        lambda folder: os.truncate(folder / "color/2.jpg", 100),
-        lambda folder: flip(folder / "depth/4.png", -1),
-        lambda folder: flip(folder / "pose/3.txt", 0),
-        lambda folder: (folder / "intrinsic/intrinsic_depth.txt").write_text("32.001 0 15.5 0 32 11.5 0 0 1"),
-    ],
-)
-def test_the_digest_of_an_export_moves_with_its_files(tmp_path: Path, change: Callable[[Path], object]) -> None:
-    folder = tmp_path / SCAN
-    export(folder)
-    before = ScanNet(tmp_path).digest(SCAN)
-    change(folder)
-    assert ScanNet(tmp_path).digest(SCAN) != before
-
-
-def test_the_digest_moves_with_the_options(tmp_path: Path) -> None:
-    write_scan(tmp_path)
-    options: list[dict[str, Any]] = [{}, {"grid": "colour"}, {"axis_align": True}, {"source": "sens"}]
-    assert len({dataset(tmp_path, **one).digest(SCAN) for one in options}) == 4
 
 
 @pytest.mark.parametrize("profile", ["oracle", "embedded"])
