@@ -17,7 +17,7 @@ from su3d_bench.store import JobFolder
 
 CEILING_METHOD = "oracle"
 # Settings of perception that move no number, or whose part that does is in perception's digest.
-MOVES_NO_NUMBER = ("perception.cache", "perception.models.folder", "perception.models.paths", "perception.language.")
+NOT_IN_KEY = ("perception.cache", "perception.models.folder", "perception.models.paths", "perception.language.")
 FIELDS_KNOWN_LATER = ("data", "profile", "perception", "packages.torch", "packages.transformers")
 
 
@@ -95,7 +95,7 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
     for prefix, options in sections:
         for path, value in flatten(json.loads(options)):
             key[".".join((prefix, *path))] = json.dumps(value, ensure_ascii=False)
-    key = {name: text for name, text in key.items() if not name.startswith(MOVES_NO_NUMBER)}
+    key = {name: text for name, text in key.items() if not name.startswith(NOT_IN_KEY)}
     if hasattr(method, "inputs"):
         key |= {f"input.{name}": digest for name, digest in method.inputs.items()}
     return (

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from su3d_bench.errors import DataError
-from su3d_bench.opensu3d.voxel_map import checked_points
+from su3d_bench.opensu3d.voxel_map import checked_points, doubled
 from su3d_bench.types import Float64Array, Int32Array, Int64Array
 
 ABSENT = -1
@@ -274,11 +274,9 @@ class DeviceVoxelMap:
         self._keys, self._rows = merged
 
     def _reserve_points(self, n: int) -> None:
-        capacity = len(self._ids)
-        if n <= capacity:
+        capacity = doubled(len(self._ids), n)
+        if capacity == len(self._ids):
             return
-        while capacity < n:
-            capacity *= 2
         for name in ("_points", "_ids", "_following"):
             old = getattr(self, name)
             larger = self._empty((capacity, *old.shape[1:]), old.dtype)

@@ -148,11 +148,9 @@ class VoxelMap:
             self._double_blocks()
 
     def _reserve_points(self, n: int) -> None:
-        capacity = len(self._ids)
-        if n <= capacity:
+        capacity = doubled(len(self._ids), n)
+        if capacity == len(self._ids):
             return
-        while capacity < n:
-            capacity *= 2
         self._points = _grown(self._points, capacity, len(self))
         self._ids = _grown(self._ids, capacity, len(self))
         self._following = _grown(self._following, capacity, len(self))
@@ -188,6 +186,13 @@ def _grown(array: NDArray[Any], capacity: int, used: int) -> NDArray[Any]:
     larger = np.empty((capacity, *array.shape[1:]), array.dtype)
     larger[:used] = array[:used]
     return larger
+
+
+def doubled(capacity: int, n: int) -> int:
+    """``capacity``, doubled until ``n`` things have room."""
+    while capacity < n:
+        capacity *= 2
+    return capacity
 
 
 def checked_points(points: Float64Array) -> Float64Array:
