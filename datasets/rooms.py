@@ -69,12 +69,6 @@ def scene_name_parts(scene: str) -> tuple[str, int]:
 
 
 @cache
-def _code_of_rooms() -> str:
-    """A key of the code that makes rooms: another code may make another mesh."""
-    sources = sorted(Path(__file__).parent.glob("rooms*.py"))
-    return hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()
-
-
 def _generator(*words: object) -> np.random.Generator:
     """A random stream that the words fix, on every machine."""
     digest = hashlib.sha256("/".join(str(word) for word in words).encode()).digest()
@@ -230,20 +224,22 @@ class Rooms:
 
     def _scan_key(self, scene: str) -> str:
         """What a scan depends on: not the size of the images nor their noise."""
+        from su3d_bench.digests import package_digest
+
         scene_name_parts(scene)
         options = self.options
-        words = GENERATOR_VERSION, options.n_frames, options.mesh_spacing_m, options.seed_offset
+        words = package_digest("datasets"), options.n_frames, options.mesh_spacing_m, options.seed_offset
         return hashlib.sha256("/".join(str(word) for word in words).encode()).hexdigest()[:16]
 
     def _baked_folder(self, scene: str) -> Path | None:
         """Where mesh and walk are kept; None for the thousands of training, and where no data root was made yet."""
-        from su3d_bench.digests import NUMERIC_PACKAGES, digest_json, package_versions
+        from su3d_bench.digests import NUMERIC_PACKAGES, digest_json, package_digest, package_versions
 
         _, number = scene_name_parts(scene)
         if number >= TRAINING_FROM or not self.root.is_dir():
             return None
         packages = package_versions(NUMERIC_PACKAGES)  # another Open3D may bake another last bit
-        words = _code_of_rooms(), self.options.n_frames, self.options.seed_offset, sorted(packages.items())
+        words = package_digest("datasets"), self.options.n_frames, self.options.seed_offset, sorted(packages.items())
         return self.root / "rooms" / digest_json(words)[:16]
 
     def visible_vertices(self, scene: str) -> dict[int, int]:

@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
+import ast
 import hashlib
 import json
+import os
 import subprocess
 import sys
+import tomllib
+from collections.abc import Iterator
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import PackageNotFoundError, version
+from importlib.util import cache_from_source
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 PACKAGE_ROOT = Path(__file__).resolve().parent
-# What moves a number; the command line and the reports only show it.
-NUMERIC_FOLDERS = (
-    "",
-    "metrics",
-    "opensu3d",
-    "perception",
-    "perception/language",
-    "perception/models",
-    "predictions",
-    "questions",
-    "reasoning",
-    "datasets",
-    "baselines",
-    "rules",
-)
-NUMERIC_SUFFIXES = {".py", ".toml", ".json", ".tsv", ".csv", ".onnx", ".txt"}
+# What shows numbers and moves none; everything else of the package counts, in whatever folder it stands.
+ONLY_SHOWN = ("cli", "reports", "sheets")
+# No part of the program: what Python and file managers leave, texts for people, what type checkers read.
+NO_CODE = ("__pycache__", ".", ".pyc", ".md", "py.typed")
 NUMERIC_PACKAGES = ("numpy", "scipy", "scikit-learn", "opencv-python-headless", "onnxruntime", "open3d", "numba")
 RECORDED_PACKAGES = ("su3d-bench", *NUMERIC_PACKAGES, "pandas", "pydantic", "torch", "transformers")
 
@@ -50,13 +44,98 @@ def digest_file(path: Path) -> str:
 
 @cache
 def code_digest() -> str:
-    """A key of the installed code, rules, tables and weights that can move a number."""
+    """A key of the installed code, rules, tables and weights that can move a number.
+
+    Comments, docstrings and the layout of Python and TOML files leave it as it is. See ``package_digest``.
+    """
+    names = {path.relative_to(PACKAGE_ROOT).parts[0] for path in _sources(PACKAGE_ROOT)}
+    return package_digest(*sorted(names - set(ONLY_SHOWN)))[:16]
+
+
+@cache
+def package_digest(*names: str) -> str:
+    """A key of parts of the package: ``"metrics"``, all that lies in that folder and below, or one file.
+
+    Python counts by its syntax without docstrings, TOML by its values, anything else by its bytes. Raises
+    ``FileNotFoundError`` for a name under which no file lies: a key of nothing would fit any code.
+    """
     total = hashlib.sha256()
-    for folder in NUMERIC_FOLDERS:
-        for path in sorted((PACKAGE_ROOT / folder).iterdir()):
-            if path.is_file() and path.suffix in NUMERIC_SUFFIXES:
-                total.update(f"{folder}/{path.name} {digest_file(path)}\n".encode())
-    return total.hexdigest()[:16]
+    with _KeptDigests() as kept:
+        for name in names:
+            paths = sorted(_sources(PACKAGE_ROOT / name))
+            if not paths:
+                raise FileNotFoundError(f"{PACKAGE_ROOT / name}: holds no code of which a key could be made")
+            for path in paths:
+                total.update(f"{path.relative_to(PACKAGE_ROOT).as_posix()} {kept.digest(path)}\n".encode())
+    return total.hexdigest()
+
+
+def _sources(place: Path) -> Iterator[Path]:
+    """The files of ``place`` (a file, or a folder with all below) that belong to the program."""
+    if place.is_file():
+        yield place
+    elif place.is_dir():
+        for child in place.iterdir():
+            if not (child.name.startswith(NO_CODE[:2]) or child.name.endswith(NO_CODE[2:])):
+                yield from _sources(child)
+
+
+class _KeptDigests:
+    """Digests of source files by what they mean, kept beside Python's own compiled files.
+
+    As there, a file of the same time and size counts as the same; what is kept wrongly or cannot be kept is made anew.
+    """
+
+    def __init__(self) -> None:
+        self._place = Path(cache_from_source(str(PACKAGE_ROOT / "digests.py"))).with_suffix(".json")
+        self._is_changed = False
+        self._kept: dict[str, list[Any]] = {}
+
+    def __enter__(self) -> Self:
+        with suppress(OSError, ValueError, RecursionError):
+            kept = json.loads(self._place.read_text())
+            self._kept = kept if isinstance(kept, dict) else {}
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._is_changed:
+            with suppress(OSError):
+                self._place.parent.mkdir(exist_ok=True)
+                written = self._place.with_suffix(f".{os.getpid()}")
+                written.write_text(json.dumps(self._kept))
+                written.replace(self._place)
+
+    def digest(self, path: Path) -> str:
+        state = path.stat()
+        stamp = [state.st_mtime_ns, state.st_size]
+        name = path.relative_to(PACKAGE_ROOT).as_posix()
+        kept = self._kept.get(name)
+        if not isinstance(kept, list) or len(kept) != 2 or kept[0] != stamp or not isinstance(kept[1], str):
+            self._kept[name] = kept = [stamp, source_digest(path)]
+            self._is_changed = True
+        return str(kept[1])
+
+
+def source_digest(path: Path) -> str:
+    """SHA-256 of what a source file means to the program; of its bytes where it is no Python or TOML that parses."""
+    content = path.read_bytes()
+    with suppress(SyntaxError, ValueError):
+        if path.suffix == ".py":
+            return digest_bytes(_syntax(content).encode())
+        if path.suffix == ".toml":
+            return digest_bytes(repr(tomllib.loads(content.decode())).encode())
+    return digest_bytes(content)
+
+
+def _syntax(source: bytes) -> str:
+    """The syntax tree of a module as a text, without docstrings and places."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef) and (
+            ast.get_docstring(node, clean=False) is not None
+        ):
+            del node.body[0]
+    return ast.dump(tree)
 
 
 @cache

@@ -38,14 +38,6 @@ def content_key(*parts: str) -> str:
     return hasher.hexdigest()
 
 
-def source_digest(prefix: str) -> str:
-    """A digest of the source files of perception whose names begin with ``prefix``."""
-    hasher = hashlib.sha256()
-    for path in sorted(Path(__file__).parent.glob(f"{prefix}*.py")):
-        hasher.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
-    return hasher.hexdigest()
-
-
 def array_digest(*arrays: NDArray[Any]) -> str:
     """A hex digest of the values, shapes and types of ``arrays``."""
     hasher = hashlib.blake2b(digest_size=20)

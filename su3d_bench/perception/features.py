@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from su3d_bench.digests import package_digest
 from su3d_bench.interfaces import Encoder, StageTimer
-from su3d_bench.perception.cache import CachedRows, FrameCache, array_digest, content_key, source_digest
+from su3d_bench.perception.cache import CachedRows, FrameCache, array_digest, content_key
 from su3d_bench.perception.crops import crop_images
 from su3d_bench.types import Float32Array, Frame, PerceptionNeeds
 
@@ -52,7 +53,7 @@ class CropEncoder:
     def __init__(self, encoder: Encoder, cache: FrameCache) -> None:
         self._encoder = encoder
         self._cache = cache
-        self._source = source_digest("crops")
+        self._source = package_digest("perception")
         self._rows = CachedRows(cache, encoder.dim)
 
     def crops(

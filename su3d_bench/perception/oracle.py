@@ -8,7 +8,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.compiled_open3d import compiled_open3d
-from su3d_bench.perception.cache import array_digest, content_key, source_digest
+from su3d_bench.digests import package_digest
+from su3d_bench.perception.cache import array_digest, content_key
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.oracle_noise import OracleNoise, disturb
 from su3d_bench.types import Float32Array, Frame, InstanceMesh, Int32Array, Regions
@@ -110,7 +111,7 @@ class OracleSegmenter:
         names = [f"{key}={mesh.class_of_instance[key]}" for key in sorted(mesh.class_of_instance)]
         truth = array_digest(mesh.vertices, mesh.triangles, mesh.instance_of_triangle)
         self.digest = content_key(
-            "oracle", config.model_dump_json(), source_digest("oracle"), truth, *mesh.labels.names, *names
+            "oracle", config.model_dump_json(), package_digest("perception"), truth, *mesh.labels.names, *names
         )
 
     def segment(self, frame: Frame) -> Regions:

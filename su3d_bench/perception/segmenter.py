@@ -6,7 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.perception.cache import content_key, source_digest
+from su3d_bench.digests import package_digest
+from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.segmenter_config import SegmenterConfig
 from su3d_bench.perception.segmenter_graph import Graph
@@ -28,7 +29,7 @@ class RgbdSegmenter:
             weights = weights.model_copy(update={"bias": weights.bias - config.parts_caution})
         self._config = config.model_copy(update={"join": weights})
         self._level = level
-        self.digest = content_key("rgbd", level, config.model_dump_json(), source_digest("segmenter"))
+        self.digest = content_key("rgbd", level, config.model_dump_json(), package_digest("perception"))
 
     def segment(self, frame: Frame) -> Regions:
         """Masks that do not overlap, largest first."""
