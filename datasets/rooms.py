@@ -68,7 +68,6 @@ def scene_name_parts(scene: str) -> tuple[str, int]:
     return match[1], int(match[2])
 
 
-@cache
 def _generator(*words: object) -> np.random.Generator:
     """A random stream that the words fix, on every machine."""
     digest = hashlib.sha256("/".join(str(word) for word in words).encode()).digest()
