@@ -17,17 +17,17 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-TESTS = Path(__file__).resolve().parents[1] / "tests"
+SCENES = Path(__file__).resolve().parents[1] / "tests/support/scenes"
 METHODS = ("opensu3d", "sam3d", "conceptfusion")
 RUN = ("run", "--protocols", "rooms-semantic", "rooms-instance", "--anytime", "0.5", "--no-pictures", "--quiet")
 SUBJECTS = {
     "light": (
-        *RUN, "--scenes", *(f"{TESTS}/kill_subject.py:Painted/{scene}" for scene in "abc"),
-        "--methods", f"{TESTS}/painted.py:Collector", f"{TESTS}/kill_subject.py:Dense",
+        *RUN, "--scenes", *(f"{SCENES}/kill_subject.py:Painted/{scene}" for scene in "abc"),
+        "--methods", f"{SCENES}/painted.py:Collector", f"{SCENES}/kill_subject.py:Dense",
         "--set", "painted.n_frames=4", "painted.frame_ms=10.0", "collector.noise_m=0.01",
     ),
     "opensu3d": (
-        *RUN, "--scenes", *(f"{TESTS}/painted.py:Painted/{scene}" for scene in "ab"),
+        *RUN, "--scenes", *(f"{SCENES}/painted.py:Painted/{scene}" for scene in "ab"),
         "--methods", *METHODS, "--profile", "oracle",
         "--set", "painted.n_frames=4", *(f"{name}.stride=1" for name in METHODS),
     ),

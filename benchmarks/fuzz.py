@@ -25,10 +25,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import shared_with_tests  # noqa: F401
 from measured import write_measured
 
 HERE = Path(__file__).resolve()
-sys.path.insert(0, str(HERE.parents[1] / "tests"))
 
 HANGS_S = 120.0  # without a word of a process: far beyond the alarm of one input
 STARTS_S = 300.0  # until the first word: imports and the sample

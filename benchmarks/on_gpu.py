@@ -25,10 +25,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import shared_with_tests  # noqa: F401 - models, devices of torch
 from measured import write_measured
 from numpy.typing import NDArray
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))  # what tests make: models, devices of torch
 from tiny_encoders import noise_images, write_tiny_clip
 from tiny_models import DINO_PX, SAM_PX, blocks, tiny_dino, tiny_sam, tiny_tokenizer
 from torch_devices import TORCH_ON_CPU

@@ -101,8 +101,8 @@ def _comparisons(known: list[dict[str, Any]]) -> list[dict[str, Any]]:
 
 def opened(page: Path) -> dict[str, float]:
     """Milliseconds of one opening."""
-    sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "tests"))
     import chromium
+    import shared_with_tests  # noqa: F401
 
     chromium.FLAGS = (*chromium.FLAGS, "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
     with tempfile.TemporaryDirectory() as folder, chromium.Chromium(Path(folder), width=1440, height=900) as browser:

@@ -8,8 +8,8 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from places import ROOT
 
-ROOT = Path(__file__).resolve().parent.parent
 PACKAGE = ROOT / "su3d_bench"
 LINKED = ("datasets", "baselines", "reports")
 CODE = sorted(

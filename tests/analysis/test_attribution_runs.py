@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from painted import WordEncoder, colour_perception
+from places import SCENES
 from scored_room import ENCODER, NAMES, instances, noisy, room, truth_as_prediction
 
 import su3d_bench.reports.attribution_table
@@ -29,9 +30,8 @@ from su3d_bench.reports.attribution_table import MEANINGS
 from su3d_bench.scoring import score_scene
 from su3d_bench.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
 
-HERE = Path(__file__).parent
-PAINTED = f"{HERE}/painted.py:Painted"
-COLLECTOR = f"{HERE}/painted.py:Collector"
+PAINTED = f"{SCENES}/painted.py:Painted"
+COLLECTOR = f"{SCENES}/painted.py:Collector"
 ROOM_RULES = load_protocol("rooms-semantic")
 EXPLAINED = [
     name

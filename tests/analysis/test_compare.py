@@ -15,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from painted import colour_perception
+from places import SCENES
 
 import su3d_bench.reports.comparison_table
 from su3d_bench import scene_run
@@ -28,9 +29,8 @@ from su3d_bench.protocols import load_protocol
 from su3d_bench.reports.comparison_table import comparison_tables
 from su3d_bench.statistics import MAX_EXACT_PAIRS, SignFlipTest, resample_weights, sign_flip_test
 
-HERE = Path(__file__).parent
-PAINTED = f"{HERE}/painted.py:Painted"
-COLLECTOR = f"{HERE}/painted.py:Collector"
+PAINTED = f"{SCENES}/painted.py:Painted"
+COLLECTOR = f"{SCENES}/painted.py:Collector"
 
 
 # the sign-flip test

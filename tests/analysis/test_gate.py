@@ -13,6 +13,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 from painted import colour_perception
+from places import SCENES
 
 from su3d_bench import scene_run
 from su3d_bench.cli.main import main
@@ -21,7 +22,7 @@ from su3d_bench.gate import Reference, check, learn, read_reference
 from su3d_bench.gate_findings import Finding, Verdict
 from su3d_bench.reports.gate_report import github_lines, junit_xml, markdown, plain_lines
 
-PAINTED = f"{Path(__file__).parent}/painted.py"
+PAINTED = f"{SCENES}/painted.py"
 WORDS = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--methods", f"{PAINTED}:Collector"]
 WORDS += ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures", "--jobs", "1"]
 

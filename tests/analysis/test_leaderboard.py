@@ -10,12 +10,13 @@ from typing import Any
 
 import pytest
 from painted import colour_perception
+from places import SCENES
 
 from su3d_bench import scene_run
 from su3d_bench.cli.main import main
 from su3d_bench.leaderboard import leaderboard
 
-PAINTED = f"{Path(__file__).parent}/painted.py"
+PAINTED = f"{SCENES}/painted.py"
 
 
 @pytest.fixture(scope="module")

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 from made_programs import MASKS, SCENE, SURFACE, fed, frames, method, program, refused
 from painted import INTRINSICS, ColourPerception, colour_perception
+from places import SCENES
 
 from su3d_bench import scene_run
 from su3d_bench.baselines.command import Command, CommandConfig
@@ -28,8 +29,6 @@ from su3d_bench.predictions.base import VertexLabels, VertexMasks
 from su3d_bench.scene_tools import no_detections
 from su3d_bench.timing import Timer
 from su3d_bench.types import Instances, Surface
-
-HERE = Path(__file__).parent
 
 
 def test_the_exported_folder_reads_back_as_the_frames_that_went_in(tmp_path: Path) -> None:
@@ -295,7 +294,7 @@ np.savez(sys.argv[1] + "/prediction.npz", kind="Partition", points=points, insta
 """
     path = program(tmp_path, text)
     out = tmp_path / "run"
-    words = ["run", "--scenes", f"{HERE}/painted.py:Painted/a", "--methods", "command", "--no-pictures"]
+    words = ["run", "--scenes", f"{SCENES}/painted.py:Painted/a", "--methods", "command", "--no-pictures"]
     words += ["--protocols", "rooms-semantic", "--out", str(out), "--jobs", "1"]
     words += ["--set", f'command.command=["{sys.executable}", "{path}", "{{output}}"]']
     assert main(words) == 0, capsys.readouterr().err

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from grouped_clouds import cal_group_by_loop, cloud, ids, nearest_by_brute_force, patch, row
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from places import CASES
 
 from su3d_bench.baselines.group_overlap import (
     GroupedCloud,
@@ -32,7 +31,6 @@ from su3d_bench.baselines.group_overlap import (
 from su3d_bench.errors import DataError
 from su3d_bench.timing import Timer
 
-CASES = Path(__file__).parent / "cases"
 RULES = MergeRules()
 
 

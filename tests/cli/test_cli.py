@@ -10,15 +10,15 @@ from typing import Any
 
 import pytest
 from painted import colour_perception
+from places import SCENES
 
 from su3d_bench import scene_run
 from su3d_bench.cli import query
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.errors import EXIT_INTERNAL
 
-HERE = Path(__file__).parent
-PAINTED = f"{HERE}/painted.py:Painted"
-COLLECTOR = f"{HERE}/painted.py:Collector"
+PAINTED = f"{SCENES}/painted.py:Painted"
+COLLECTOR = f"{SCENES}/painted.py:Collector"
 RUN = ["run", "--scenes", f"{PAINTED}/*", "--methods", COLLECTOR, "--protocols", "rooms-semantic", "--no-pictures"]
 HEAVY = (
     "torch", "open3d", "open3d.cpu.pybind", "numba", "sklearn", "pandas", "matplotlib", "onnxruntime", "cv2", "scipy",
@@ -132,8 +132,8 @@ def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None
         (["run", "--scenes", f"{PAINTED}/e"], f"no scene matches '{PAINTED}/e'; did you mean '{PAINTED}/d'?"),
         (["run", "--scenes", "nothing"], "no scene matches 'nothing'; known datasets: rooms, replica"),
         ([*RUN, "--methods", "opensu3"], "unknown method 'opensu3'; did you mean 'opensu3d'?"),
-        ([*RUN, "--methods", f"{HERE}/painted.py:Colector"], f"method '{HERE}/painted.py:Colector': "),
-        ([*RUN, "--methods", f"{HERE}/none.py:X"], f"method '{HERE}/none.py:X': there is no file {HERE}/none.py"),
+        ([*RUN, "--methods", f"{SCENES}/painted.py:Colector"], f"method '{SCENES}/painted.py:Colector': "),
+        ([*RUN, "--methods", f"{SCENES}/none.py:X"], f"method '{SCENES}/none.py:X': there is no file {SCENES}/none.py"),
         ([*RUN, "--profile", "orcale"], "unknown profile 'orcale'; did you mean 'oracle'?"),
         ([*RUN, "--protocols", "room-semantic"], "unknown protocol 'room-semantic'; did you mean 'rooms-semantic'?"),
         (

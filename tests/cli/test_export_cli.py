@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from painted import colour_perception
+from places import SCENES
 from prediction_files import TOY, write_open3dis, write_scannet_text
 
 from su3d_bench import scene_run
@@ -18,8 +19,7 @@ from su3d_bench.predictions.formats import READERS, recognise
 from su3d_bench.protocols import load_protocol
 from su3d_bench.types import Instances, Partition
 
-HERE = Path(__file__).parent
-PAINTED, COLLECTOR = f"{HERE}/painted.py:Painted", f"{HERE}/painted.py:Collector"
+PAINTED, COLLECTOR = f"{SCENES}/painted.py:Painted", f"{SCENES}/painted.py:Collector"
 RULES = load_protocol("rooms-instance")
 
 

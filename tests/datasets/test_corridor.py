@@ -9,13 +9,14 @@ from typing import Any
 
 import numpy as np
 import pytest
+from places import ROOT
 
 from su3d_bench.registry import load
 from su3d_bench.reports.timing_plots import medians_by_size
 from su3d_bench.types import Float64Array, Int32Array
 from su3d_bench.update_times import UpdateTimes
 
-BENCHMARKS = Path(__file__).parent.parent / "benchmarks"
+BENCHMARKS = ROOT / "benchmarks"
 
 
 def corridor(**options: float) -> Any:

@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from places import REAL_RECORDINGS
 from scipy.spatial import cKDTree
 
 from su3d_bench.cli.main import main
@@ -19,8 +20,7 @@ from su3d_bench.store import read_prediction
 from su3d_bench.toml_text import write_toml
 from su3d_bench.types import Instances
 
-DATA = Path(__file__).resolve().parents[1] / "../shared/realdata"
-pytestmark = pytest.mark.skipif(not DATA.is_dir(), reason="needs the real recordings in ../shared/realdata")
+pytestmark = pytest.mark.skipif(not REAL_RECORDINGS.is_dir(), reason="needs the real recordings in ../shared/realdata")
 FRAME_FILES = {
     "colour": "frame-{index}.color.png",
     "depth": "frame-{index}.depth.png",
@@ -49,7 +49,7 @@ def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     for scene, keys in SCENES.items():
         folder = tmp_path / "data" / "rgbd" / scene
         folder.mkdir(parents=True)
-        place = os.path.relpath(DATA.resolve() / str(keys["folder"]), folder)
+        place = os.path.relpath(REAL_RECORDINGS.resolve() / str(keys["folder"]), folder)
         leaves = [((key,), value, "") for key, value in {**keys, "folder": place}.items()]
         (folder / "rgbd.toml").write_text(write_toml(leaves))
     monkeypatch.chdir(tmp_path)
@@ -68,7 +68,7 @@ def run(scene: str, *words: str) -> Instances:
 
 
 def stored_labels(*words: str) -> list[str]:
-    folder = DATA.resolve() / "label_fusion/labels"
+    folder = REAL_RECORDINGS.resolve() / "label_fusion/labels"
     return ["--profile", "stored", "--set", f"perception.stored.folder={folder}",
             "perception.stored.images=frame-{index}.segm.png", *words]  # fmt: skip
 
@@ -84,7 +84,8 @@ def test_fifteen_labelled_frames_give_exactly_the_two_labelled_objects_never_swa
     assert views[1 - parcel] == [[frame, 1] for frame in range(15)]
     trees = [cKDTree(found.points[found.mask(k)]) for k in (parcel, 1 - parcel)]
     for frame in Rgbd(root).frames("shelf", 1):
-        labels = cv2.imread(str(DATA / f"label_fusion/labels/frame-{frame.index:06d}.segm.png"), cv2.IMREAD_UNCHANGED)
+        image = REAL_RECORDINGS / f"label_fusion/labels/frame-{frame.index:06d}.segm.png"
+        labels = cv2.imread(str(image), cv2.IMREAD_UNCHANGED)
         for own, value in enumerate((48, 132)):
             pixels = (labels == value) & (frame.depth_m > 0)
             points = back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, pixels)
@@ -100,7 +101,7 @@ def test_labelled_frames_without_names_give_the_same_two_objects(root: Path) -> 
 
 @pytest.mark.parametrize(
     ("scene", "data", "extent_m"),
-    [("tum/tum_fr1desk_9", DATA, (2.6, 1.6, 1.3)), ("rgbd/chair", None, (1.5, 1.6, 2.6))],
+    [("tum/tum_fr1desk_9", REAL_RECORDINGS, (2.6, 1.6, 1.3)), ("rgbd/chair", None, (1.5, 1.6, 2.6))],
 )
 def test_recordings_run_unscored_with_the_embedded_segmenter(
     root: Path,
@@ -122,12 +123,12 @@ def test_recordings_run_unscored_with_the_embedded_segmenter(
 def test_the_poses_of_every_recording_agree_with_its_depth(root: Path) -> None:
     for scene in SCENES:
         assert check_convention(Rgbd(root).frames(scene, 1), scene) is None
-    tum = Tum(DATA.resolve())
+    tum = Tum(REAL_RECORDINGS.resolve())
     assert check_convention(tum.frames("tum_fr1desk_9", 1), "tum") is None
 
 
 def test_tum_reports_the_images_that_are_not_there(caplog: pytest.LogCaptureFixture) -> None:
-    frames = Tum(DATA.resolve()).frames("tum_fr1desk_9", 1)
+    frames = Tum(REAL_RECORDINGS.resolve()).frames("tum_fr1desk_9", 1)
     assert [frame.index for frame in frames] == list(range(9))
     assert "associate.txt: 1128 images named there are missing (the first: rgb/1305031453.659600.png)" in caplog.text
     assert frames[0].intrinsics[0, 0] == 517.3
@@ -137,7 +138,7 @@ def test_images_of_other_cameras_are_read_as_their_formats_say(root: Path) -> No
     """One frame each as NYU, SUN and TUM store them; PGM is big-endian."""
     from su3d_bench.datasets.image_files import decode_colour, decode_depth
 
-    folder = DATA / "open3d_rgbd/other_formats"
+    folder = REAL_RECORDINGS / "open3d_rgbd/other_formats"
     for colour, depth in (("NYU_color.ppm", "NYU_depth.pgm"), ("SUN_color.jpg", "SUN_depth.png"),
                           ("TUM_color.png", "TUM_depth.png")):  # fmt: skip
         assert decode_colour((folder / colour).read_bytes(), colour).shape == (480, 640, 3)

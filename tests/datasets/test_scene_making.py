@@ -150,7 +150,7 @@ def test_a_killed_process_leaves_its_frames_and_no_scene(
     tmp_path: Path, undisturbed: dict[str, dict[str, bytes]]
 ) -> None:
     command = [sys.executable, "-c", KILLED, "scannet", str(tmp_path)]
-    environment = os.environ | {"PYTHONPATH": str(Path(__file__).parent)}
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)}
     assert subprocess.run(command, env=environment, capture_output=True).returncode == -signal.SIGKILL
     assert scenes("scannet", tmp_path) == []
     again = Stage()

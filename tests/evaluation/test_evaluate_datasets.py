@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from evaluated_text import said, scene, write_texts, write_truth
+from places import SCENES
 from prediction_files import (
     write_scannet_text,
 )
@@ -18,8 +19,7 @@ from su3d_bench.datasets.openlex3d import VISIBLE_NAME
 from su3d_bench.errors import PredictionError
 from su3d_bench.evaluation import Request, evaluate
 
-HERE = Path(__file__).parent
-PAINTED = f"{HERE}/painted.py:Painted"
+PAINTED = f"{SCENES}/painted.py:Painted"
 
 
 # ---- datasets

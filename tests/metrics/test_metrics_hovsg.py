@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from places import CASES
 from scored_room import ENCODER, ID, LABELS, OneHotEncoder, instances, noisy, nothing, room, truth_as_prediction
 
 from su3d_bench.metrics.labelling import text_features
@@ -19,7 +19,7 @@ from su3d_bench.protocols import ProtocolRules, load_protocol
 from su3d_bench.scoring import combine, pack_scores, score_scene, unpack_scores
 from su3d_bench.types import DenseFeatures, Float32Array, GroundTruth, Instances, LabelSet, Partition, UInt8Array
 
-GOLDEN = json.loads((Path(__file__).parent / "cases/conceptgraphs_golden.json").read_text())["hovsg"]
+GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())["hovsg"]
 HOVSG, EXACT, OVO = (load_protocol(name) for name in ("replica-hovsg", "replica-hovsg-exact", "replica-ovo51"))
 VOTED = {"replica-hovsg": HOVSG, "replica-hovsg-exact": EXACT, "replica-ovo51": OVO}
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from fractions import Fraction
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from places import CASES
 
 from su3d_bench.errors import DataError, PredictionError
 from su3d_bench.metrics.dot_product import dot
@@ -26,7 +26,6 @@ from su3d_bench.metrics.instance_ap import (
 )
 from su3d_bench.protocols import load_protocol
 
-CASES = Path(__file__).parent / "cases"
 INSTANCE_CASES = sorted(p.stem for p in CASES.glob("inst*.json")) + sorted(p.stem for p in CASES.glob("replica*.json"))
 
 

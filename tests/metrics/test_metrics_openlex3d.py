@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,6 +19,7 @@ from open_scene import (
     nothing_at,
     perfect,
 )
+from places import CASES
 
 from su3d_bench.errors import DataError, PredictionError
 from su3d_bench.metrics import openlex3d, transfer
@@ -40,7 +40,7 @@ from su3d_bench.scoring import combine as combine_scenes
 from su3d_bench.scoring import pack_scores, score_scene, unpack_scores, why_not_scorable
 from su3d_bench.types import DenseFeatures, Partition, Prediction
 
-GOLDEN = json.loads((Path(__file__).parent / "cases/conceptgraphs_golden.json").read_text())
+GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())
 TOPN, RANKING = load_protocol("openlex3d-topn"), load_protocol("openlex3d-ranking")
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from open_scene import ENCODER, OBJECTS, WordEncoder, instances_with, nothing_at, perfect, query_truth
+from places import CASES
 
 from su3d_bench.errors import DataError, PredictionError
 from su3d_bench.metrics import instance_ap
@@ -22,7 +22,7 @@ from su3d_bench.protocols import ProtocolRules, load_protocol
 from su3d_bench.scoring import combine, pack_scores, score_scene, unpack_scores, why_not_scorable
 from su3d_bench.types import DenseFeatures, Instances
 
-GOLDEN = json.loads((Path(__file__).parent / "cases/conceptgraphs_golden.json").read_text())
+GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())
 OPENLEX, PLAIN = load_protocol("openlex3d-queries"), load_protocol("query-ap")
 PROTOCOLS = {"openlex3d-queries": OPENLEX, "query-ap": PLAIN}
 

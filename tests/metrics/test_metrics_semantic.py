@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from places import CASES
 
 from su3d_bench.metrics.semantic import (
     SemanticCounts,
@@ -22,7 +22,6 @@ from su3d_bench.metrics.semantic import (
     scannet_metrics,
 )
 
-CASES = Path(__file__).parent / "cases"
 GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())
 POOLING = GOLDEN["cg_pooling"]
 CONCEPTGRAPHS_CASES = {

@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 import pytest
+from places import CASES
 
 from su3d_bench.cli.main import main
 from su3d_bench.cli.protocols import read_remarks
@@ -21,7 +22,6 @@ from su3d_bench.protocols import (
     protocols_for,
 )
 
-CASES = Path(__file__).parent / "cases"
 NAMES = {
     "class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d", "openlex3d-queries",
     "openlex3d-ranking", "openlex3d-topn", "query-ap", "replica-conceptgraphs-ex1", "replica-conceptgraphs-ex4",

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from places import REAL_RECORDINGS
 from tiny_models import blocks, frame_of, paper_words, tiny_dino, tiny_sam, write_models
 
 from su3d_bench import registry
@@ -24,7 +25,6 @@ from su3d_bench.timing import Timer
 from su3d_bench.toml_text import write_toml
 from su3d_bench.types import Instances, PerceptionNeeds, SceneInfo, UInt8Array
 
-DATA = Path(__file__).resolve().parents[1] / "../shared/realdata"
 SCENE = SceneInfo("rgbd", "wall", 1, 1, "camera")
 # Random weights are sure of nothing, so little is asked of them.
 OPEN: dict[str, Any] = {
@@ -290,12 +290,12 @@ def test_a_room_runs_end_to_end(models: Path, tmp_path: Path, monkeypatch: pytes
     assert "RAM++ is not here" in str(read_json(tmp_path / "out" / "metrics.json"))
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="needs the real recordings in ../shared/realdata")
+@pytest.mark.skipif(not REAL_RECORDINGS.is_dir(), reason="needs the real recordings in ../shared/realdata")
 def test_real_frames_run_end_to_end(models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "data" / "rgbd" / "chair"
     folder.mkdir(parents=True)
     keys = {
-        "folder": os.path.relpath(DATA.resolve() / "open3d_rgbd", folder),
+        "folder": os.path.relpath(REAL_RECORDINGS.resolve() / "open3d_rgbd", folder),
         "colour": "color/{index}.jpg",
         "depth": "depth/{index}.png",
         "trajectory": "trajectory.log",

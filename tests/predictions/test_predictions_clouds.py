@@ -27,6 +27,7 @@ from cloud_files import (
     write_tensor,
 )
 from painted import Painted, WordEncoder
+from places import SCENES
 from prediction_files import CASES, refused
 
 from su3d_bench.datasets.pcd import write_pcd_points
@@ -93,7 +94,7 @@ def test_the_truth_in_each_format_is_scored_as_perfect(
     np.savez(tmp_path / "texts.npz", names=np.array(names), features=encoder.encode_texts(names))
     request = Request(
         (tmp_path / "maps",),
-        dataset=f"{Path(__file__).parent}/painted.py:Painted",
+        dataset=f"{SCENES}/painted.py:Painted",
         protocols=("rooms-semantic",),
         scenes=("a",),
         text_features=tmp_path / "texts.npz",

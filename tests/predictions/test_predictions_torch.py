@@ -15,13 +15,14 @@ from typing import Any
 import numpy as np
 import pytest
 from damage import damages, outcomes, truncations
+from places import CASES
 
 from su3d_bench.errors import PredictionError
 from su3d_bench.predictions import zip_files
 from su3d_bench.predictions.numpy_files import read_npy, read_npz
 from su3d_bench.predictions.torch_zip import SparseTensor, read_torch, torch_kind
 
-FILES = Path(__file__).parent / "cases" / "torch_files"  # written by torch 2.13.0
+FILES = CASES / "torch_files"  # written by torch 2.13.0
 MASKS = np.arange(36).reshape(12, 3) % 5 < 2
 EXPECTED: dict[str, Any] = {
     "openmask3d_masks.pt": MASKS.astype(np.float16),

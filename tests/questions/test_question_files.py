@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 from damage import damages, outcomes, truncations
+from places import SCENES
 
 from su3d_bench.cli.main import main
 from su3d_bench.errors import DataError
@@ -163,7 +164,7 @@ def test_wrong_requests_are_one_line(words: list[str], line: str, capsys: pytest
 def test_the_verb_makes_questions_from_classes_boxes_and_frames(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    scenes = f"{Path(__file__).parent}/painted.py:Painted/a"
+    scenes = f"{SCENES}/painted.py:Painted/a"
     words = ["questions", "make", "--scenes", scenes, "--quiet"]
     assert main([*words, "--colours", "--out", str(tmp_path / "q.toml")]) == 0
     assert "with known answers" in capsys.readouterr().out

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 import pytest
 from painted import WordEncoder, colour_perception
+from places import SCENES
 
 from su3d_bench import page_maps, scene_run
 from su3d_bench.cli import query
@@ -38,7 +39,7 @@ from su3d_bench.reports.html_page import page_html
 from su3d_bench.store import read_prediction, write_prediction
 from su3d_bench.types import DenseFeatures, Instances
 
-PAINTED = f"{Path(__file__).parent}/painted.py"
+PAINTED = f"{SCENES}/painted.py"
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(1)>&\"'<!--"
 
 

@@ -13,13 +13,14 @@ import chromium
 import pytest
 from chromium import Chromium, find_chromium
 from painted import WordEncoder, colour_perception
+from places import SCENES
 
 from su3d_bench import scene_run
 from su3d_bench.cli import query
 from su3d_bench.cli.main import main
 
 pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
-PAINTED = f"{Path(__file__).parent}/painted.py"
+PAINTED = f"{SCENES}/painted.py"
 # WebGL without a graphics card.
 SOFTWARE_GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 MIDDLE_SECTIONS = ("Scenes", "Classes", "Confusion", "Errors", "Timing", "Compare")

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 from painted import ColourPerception, colour_perception
+from places import SCENES
 
 from su3d_bench import scene_run
 from su3d_bench.cli.main import build_parser, main
@@ -17,8 +18,6 @@ from su3d_bench.errors import ConfigError
 from su3d_bench.reports.latex import latex
 from su3d_bench.reports.paper_tables import Shown, selection_tables
 from su3d_bench.table_sources import check_paper, choose, measured_results
-
-HERE = Path(__file__).parent
 
 
 @pytest.fixture(scope="module")
@@ -29,8 +28,8 @@ def sweep(tmp_path_factory: pytest.TempPathFactory) -> Path:
         patch.setattr(scene_run, "build_perception", colour_perception)
         patch.setattr(ColourPerception, "regions", lambda self: None, raising=False)
         patch.setenv("SU3D_DATA", str(out.parent / "data"))
-        words = ["ablate", "--method", f"{HERE}/painted.py:Collector", "--vary", "noise_m=0.0,0.3", "drop=1"]
-        words += ["--scenes", f"{HERE}/painted.py:Painted/*", "--protocols", "rooms-semantic", "rooms-instance"]
+        words = ["ablate", "--method", f"{SCENES}/painted.py:Collector", "--vary", "noise_m=0.0,0.3", "drop=1"]
+        words += ["--scenes", f"{SCENES}/painted.py:Painted/*", "--protocols", "rooms-semantic", "rooms-instance"]
         assert main([*words, "--no-pictures", "--out", str(out), "--jobs", "1", "--quiet"]) == 0
     return out
 

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from painted import colour_perception
+from places import SCENES
 
 from su3d_bench import scene_run
 from su3d_bench.cli.main import main
@@ -21,7 +22,7 @@ from su3d_bench.timing import peak_memory_bytes, start_memory_watch
 from su3d_bench.types import Float64Array
 from su3d_bench.update_times import MapCost, UpdateTimes, summarise
 
-PAINTED = f"{Path(__file__).parent}/painted.py"
+PAINTED = f"{SCENES}/painted.py"
 WORDS = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--methods", f"{PAINTED}:Collector"]
 WORDS += ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures", "--jobs", "1", "--anytime", "0.5", "0.1"]
 

@@ -8,12 +8,13 @@ from pathlib import Path
 import pytest
 from painted import colour_perception
 
+from places import SCENES
 from su3d_bench import scene_run
 from su3d_bench.ablation import ablation_rows, read_rows
 from su3d_bench.cli.main import main
 from su3d_bench.errors import ConfigError, StoreError
 
-PAINTED = f"{Path(__file__).parent}/painted.py"
+PAINTED = f"{SCENES}/painted.py"
 
 
 def test_the_papers_sweep_has_its_nine_rows_and_the_default_is_the_method_itself() -> None:

@@ -15,15 +15,15 @@ import psutil
 import pytest
 from painted import colour_perception
 
+from places import SCENES
 from su3d_bench import scene_run
 from su3d_bench.cli.main import main
 
 pytest.importorskip("ray", reason="the ray extra is not installed")
 pytest.importorskip("submitit", reason="the slurm extra is not installed")
 
-HERE = Path(__file__).parent
-PAINTED = f"{HERE}/painted_anywhere.py:Painted"
-COLLECTOR = f"{HERE}/painted_anywhere.py:Collector"
+PAINTED = f"{SCENES}/painted_anywhere.py:Painted"
+COLLECTOR = f"{SCENES}/painted_anywhere.py:Collector"
 NOISE = ("--set", "collector.noise_m=0.02", "painted.frame_ms=50")
 WHILE_LOADED_S = 300
 
@@ -90,7 +90,7 @@ def workers_of(node: Any) -> list[psutil.Process]:
 
 def test_a_machine_that_dies_in_mid_run_costs_no_scene_and_no_byte(cluster: Any) -> None:
     assert run("--jobs", "1", out="inline") == 0
-    command = [sys.executable, str(HERE / "painted_cli.py"), *words("--executor", "ray", out="ray")]
+    command = [sys.executable, str(SCENES / "painted_cli.py"), *words("--executor", "ray", out="ray")]
     driver = subprocess.Popen([*command, "--ray-address", cluster.address], stdout=subprocess.DEVNULL)
     at_work = workers_of(cluster.doomed)
     os.kill(cluster.doomed.all_processes["raylet"][0].process.pid, signal.SIGKILL)

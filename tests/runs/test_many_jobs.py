@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from painted import colour_perception
 
+from places import SCENES
 from su3d_bench import finished_scenes, page_sources, runner, scene_run, store
 from su3d_bench.cli.main import main
 from su3d_bench.errors import DataError
@@ -18,8 +19,7 @@ from su3d_bench.metrics import instance_ap, precision_recall, resampling
 from su3d_bench.scoring import pack_scores, unpack_scores
 from su3d_bench.statistics import growth_exponent, resample_weights
 
-HERE = Path(__file__).parent
-WORDS = ["run", "--scenes", f"{HERE}/painted.py:Painted/*", "--methods", f"{HERE}/painted.py:Collector"]
+WORDS = ["run", "--scenes", f"{SCENES}/painted.py:Painted/*", "--methods", f"{SCENES}/painted.py:Collector"]
 PROTOCOLS = ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures", "--out", "out"]
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 from painted import colour_perception
 
+from places import SCENES
 from su3d_bench import scene_run
 from su3d_bench.cli.main import main
 from su3d_bench.config import Settings
@@ -15,7 +16,7 @@ from su3d_bench.errors import ConfigError
 from su3d_bench.method_names import named_method
 from su3d_bench.planning import make_plan
 
-PAINTED = f"{Path(__file__).parent}/painted.py"
+PAINTED = f"{SCENES}/painted.py"
 
 
 def test_a_preset_sets_what_the_class_says() -> None:

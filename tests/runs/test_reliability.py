@@ -22,6 +22,7 @@ import numpy as np
 import pytest
 from painted import colour_perception
 
+from places import ROOT, SCENES
 from su3d_bench import scene_job, scene_run
 from su3d_bench.cli.main import main
 from su3d_bench.errors import StoreError
@@ -31,9 +32,8 @@ from su3d_bench.scoring import score_scene
 from su3d_bench.store import RunFolder, npz_bytes, read_npz
 from su3d_bench.temporary_folders import TemporaryFolder
 
-HERE = Path(__file__).parent
-KILLS = HERE.parent / "benchmarks" / "kill_at_random.py"
-SUBJECT = f"{HERE}/kill_subject.py"
+KILLS = ROOT / "benchmarks" / "kill_at_random.py"
+SUBJECT = f"{SCENES}/kill_subject.py"
 SETTINGS = ("--set", "painted.n_frames=3", "--protocols", "rooms-semantic", "--no-pictures", "--jobs", "1", "--quiet")
 
 
@@ -45,7 +45,7 @@ def _painted(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def run(*more: str, scenes: str = "[ab]", out: str = "out") -> int:
-    words = ["run", "--scenes", f"{HERE}/painted.py:Painted/{scenes}", "--methods", f"{SUBJECT}:Dense"]
+    words = ["run", "--scenes", f"{SCENES}/painted.py:Painted/{scenes}", "--methods", f"{SUBJECT}:Dense"]
     return main([*words, *SETTINGS, "--out", out, *more])
 
 

@@ -18,12 +18,12 @@ from typing import Any
 import pytest
 from painted import ColourPerception, colour_perception
 
+from places import SCENES
 from su3d_bench import finished_scenes, scene_feeding, scene_run
 from su3d_bench.cli.main import main
 
-HERE = Path(__file__).parent
-PAINTED = f"{HERE}/painted.py:Painted"
-COLLECTOR = f"{HERE}/painted.py:Collector"
+PAINTED = f"{SCENES}/painted.py:Painted"
+COLLECTOR = f"{SCENES}/painted.py:Collector"
 PROTOCOLS = ["--protocols", "rooms-semantic", "rooms-instance"]
 
 
@@ -44,7 +44,7 @@ def run(*more: str, scenes: str = "*", out: str = "out") -> int:
 
 
 def in_process(*more: str, out: str = "out") -> list[str]:
-    return [sys.executable, str(HERE / "painted_cli.py"), *words(*more, out=out)]
+    return [sys.executable, str(SCENES / "painted_cli.py"), *words(*more, out=out)]
 
 
 def metrics(out: str = "out") -> dict[str, Any]:
@@ -107,7 +107,7 @@ def test_updates_hold_a_row_a_frame_with_its_stages() -> None:
 def test_metrics_hold_no_path_date_or_time() -> None:
     assert run() == 0
     text = Path("out/metrics.json").read_text()
-    assert str(HERE) not in text
+    assert str(SCENES) not in text
     assert "202" not in text.replace("0.", "")
 
 

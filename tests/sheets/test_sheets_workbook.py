@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from made_sheets import HOSTILE, made
+from places import SUPPORT
 
 from su3d_bench.sheets.answers import read_answers
 from su3d_bench.sheets.items import ANSWER_COLUMNS
@@ -17,7 +18,6 @@ from su3d_bench.sheets.workbook import COLUMNS, HEADER_ROW, HIDDEN, workbook_byt
 
 openpyxl = pytest.importorskip("openpyxl", reason="needs the sheets extra")
 OFFICE = shutil.which("soffice") or shutil.which("libreoffice")
-HERE = Path(__file__).parent
 
 
 def office_python() -> str | None:
@@ -123,7 +123,7 @@ def test_a_workbook_filled_in_libreoffice_is_read_back(tmp_path: Path, hostile: 
     with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True) as office:
         try:
             words = [pipe, source.as_uri(), target.as_uri(), str(HEADER_ROW)]
-            fill = [python, str(HERE / "office_fill.py"), *words]
+            fill = [python, str(SUPPORT / "sheets" / "office_fill.py"), *words]
             done = subprocess.run(fill, capture_output=True, text=True, timeout=300, env={"PATH": "/usr/bin:/bin"})
             assert done.returncode == 0, done.stderr
             assert office.wait(60) == 0

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from box_room import INTRINSICS, images, pose
 from painted import colour_perception
+from places import ROOT, SCENES
 
 from su3d_bench import scene_run, store
 from su3d_bench.baselines import feature_table
@@ -31,7 +32,6 @@ from su3d_bench.store import features_beside, npz_bytes, read_prediction, write_
 from su3d_bench.timing import Timer
 from su3d_bench.types import DenseFeatures, Detections, Frame, Partition, SceneInfo
 
-HERE = Path(__file__).parent
 POINTS = np.arange(12, dtype=np.float32).reshape(4, 3)
 ROWS = np.arange(20, dtype=np.float16).reshape(4, 5)
 
@@ -249,7 +249,7 @@ def test_labels_of_a_mapped_table_are_those_of_the_same_rows_in_memory(tmp_path:
 def test_a_map_larger_than_what_it_takes_is_fused_written_read_and_scored() -> None:
     """256 MB of features: no step may hold them all; benchmarks/dense_memory.py measures 2 M points x 1024 so."""
     words = ["--points", "250000", "--dimensions", "512", "--features-in", "disk"]
-    script = HERE.parent / "benchmarks" / "dense_memory.py"
+    script = ROOT / "benchmarks" / "dense_memory.py"
     done = subprocess.run([sys.executable, script, *words], capture_output=True, text=True, check=True)
     steps = {line["step"]: line for line in map(json.loads, done.stdout.splitlines())}
     scored = steps["read and score"]
@@ -272,7 +272,7 @@ def in_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
 
 
 def run(*more: str) -> int:
-    words = ["run", "--scenes", f"{HERE}/painted.py:Painted/a", "--methods", "conceptfusion", "conceptfusion-sam"]
+    words = ["run", "--scenes", f"{SCENES}/painted.py:Painted/a", "--methods", "conceptfusion", "conceptfusion-sam"]
     settings = ["--stride", "1", "--set", "conceptfusion.height=24", "--set", "conceptfusion.width=32"]
     protocols = ["--protocols", "rooms-semantic", "rooms-instance", "--jobs", "1", "--out", "out"]
     return main([*words, *settings, *protocols, *more])

@@ -20,6 +20,7 @@ from conceptgraphs_scene import (
     mapped,
 )
 from painted import colour_perception
+from places import SCENES
 
 from su3d_bench import scene_run
 from su3d_bench.baselines.conceptgraphs import ConceptGraphs
@@ -218,7 +219,7 @@ def test_halves_of_an_object_stay_two_until_the_overlap_merge() -> None:
 
 def test_a_run_maps_painted_scenes_and_times_the_stages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    painted = f"{Path(__file__).parent}/painted.py:Painted/a"
+    painted = f"{SCENES}/painted.py:Painted/a"
     settings = ["conceptgraphs.stride=1", "conceptgraphs.max_bbox_area_ratio=1.0", "conceptgraphs.denoise_interval=2"]
     protocols = ["--protocols", "rooms-semantic", "rooms-instance"]
     out = [*protocols, "--no-pictures", "--jobs", "1", "--out", str(tmp_path / "out")]

@@ -20,13 +20,13 @@ import pytest
 from damage import damages, outcomes, truncations
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from places import CASES
 
 from su3d_bench.datasets.sens import MOTION_RECORD, SensFile, SensSource
 from su3d_bench.datasets.sens_header import SensHeader
 from su3d_bench.datasets.sens_write import SensFrame, colour_content, depth_content, stored_frame, write_sens
 from su3d_bench.errors import DataError, StoreError
 
-CASES = Path(__file__).parent / "cases"
 TOY, RAW_TOY = CASES / "sens01_toy.sens", CASES / "sens02_toy_raw.sens"
 WHERE = "scannet/scene0000_00"
 START_OF_SIZES = 80  # in a frame record

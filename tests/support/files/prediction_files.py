@@ -11,13 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from places import CASES
 
 from su3d_bench.errors import PredictionError
 from su3d_bench.predictions.formats import READERS
 from su3d_bench.store import write_prediction
 from su3d_bench.types import Instances
-
-CASES = Path(__file__).parent / "cases"
 
 
 def scenes_of(case: str) -> list[dict[str, Any]]:

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 from fuzzing import Make, Read, Target, every_one_of
+from places import CASES
 
 
 def _whole_dataset(make: Callable[[], Any], scene: str) -> Read:
@@ -86,7 +87,7 @@ def _sens(name: str) -> Make:
         from su3d_bench.datasets.sens import SensFile
 
         path = folder / "a.sens"
-        path.write_bytes((Path(__file__).parent / "cases" / name).read_bytes())
+        path.write_bytes((CASES / name).read_bytes())
         return lambda: read_whole(SensFile(path, WHERE))
 
     return make

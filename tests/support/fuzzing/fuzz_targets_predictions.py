@@ -9,8 +9,9 @@ from pathlib import Path
 
 import numpy as np
 from fuzzing import Make, Read, Target, every_one_of
+from places import CASES
 
-FILES = Path(__file__).parent / "cases" / "predictions"
+FILES = CASES / "predictions"
 
 
 def _format(name: str) -> Make:

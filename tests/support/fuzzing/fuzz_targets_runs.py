@@ -16,9 +16,9 @@ from typing import Any
 import numpy as np
 from cli_calls import called
 from fuzzing import Make, Read, Target, every_one_of
+from places import SCENES
 
-HERE = Path(__file__).parent
-COLLECTOR = f"{HERE}/painted.py:Collector"
+COLLECTOR = f"{SCENES}/painted.py:Collector"
 
 
 @functools.cache
@@ -39,7 +39,8 @@ def _made_run() -> Path:
 
 
 def _command(out: Path) -> list[str]:
-    words = ["run", "--scenes", f"{HERE}/painted.py:Painted/a", f"{HERE}/painted.py:Painted/b", "--methods", COLLECTOR]
+    painted = f"{SCENES}/painted.py:Painted"
+    words = ["run", "--scenes", f"{painted}/a", f"{painted}/b", "--methods", COLLECTOR]
     words += [f"{COLLECTOR}@drop=1", "--protocols", "rooms-semantic", "rooms-instance", "--no-pictures", "--jobs", "1"]
     return [*words, "--anytime", "0.5", "--out", str(out), "--quiet"]
 
@@ -103,7 +104,7 @@ def _verbs(folder: Path) -> Read:
             ["export", str(run), "--to", "openlex3d", "--method", "collector", "--out", str(folder / "out")],
             [*_command(run), "--dry-run"],
             ["refine", str(run), "--method", "collector"],
-            ["datasets", "check", f"{HERE}/painted.py:Painted/a"],
+            ["datasets", "check", f"{SCENES}/painted.py:Painted/a"],
         ]
     )
 

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
-from pathlib import Path
 
 from fuzz_mutations import NUMBERS, TEXTS
 from hypothesis import strategies as st
+from places import SCENES
 
 from su3d_bench.cli.main import build_parser
 
-HERE = Path(__file__).parent
 ODD = (
     *NUMBERS,
     *TEXTS,
@@ -54,7 +53,7 @@ KNOWN = (
         "folder/none",
         "a.py:A",
         "broken.py:A",
-        f"{HERE}/painted.py:None",
+        f"{SCENES}/painted.py:None",
     ),
     *(
         "opensu3d.top_m=3",

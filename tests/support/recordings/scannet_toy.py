@@ -7,11 +7,11 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from places import CASES
 
 from su3d_bench.datasets.rgbd_source import RgbdSource
 from su3d_bench.datasets.sens import SensFile, SensSource
 
-CASES = Path(__file__).parent / "cases"
 TOY = CASES / "sens01_toy.sens"
 SCENE = "scene0000_00"
 WHERE = f"scannet/{SCENE}"

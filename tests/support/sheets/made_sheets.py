@@ -5,18 +5,17 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
+from places import SCENES
 
 from su3d_bench.reports.item_picture import png_bytes
 from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import ASKS, SheetKind
 from su3d_bench.sheets.making import MadeSheets, Origin, make_sheets
 
-HERE = Path(__file__).parent
-PAINTED = f"{HERE}/painted.py:Painted"
-COLLECTOR = f"{HERE}/painted.py:Collector"
+PAINTED = f"{SCENES}/painted.py:Painted"
+COLLECTOR = f"{SCENES}/painted.py:Collector"
 METHODS = ("collector", "collector@noise_m=0.0", "collector@drop=1")
 RUN = [
     "run", "--scenes", f"{PAINTED}/a", "--methods", COLLECTOR, f"{COLLECTOR}@noise_m=0.0", f"{COLLECTOR}@drop=1",

@@ -1,0 +1,12 @@
+"""Where tests find what stands in files: cases, made scenes, real recordings beside the checkout."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+SUPPORT = Path(__file__).resolve().parent
+TESTS = SUPPORT.parent
+ROOT = TESTS.parent
+CASES = TESTS / "cases"
+SCENES = SUPPORT / "scenes"  # datasets and methods of tests, named by file: f"{SCENES}/painted.py:Painted"
+REAL_RECORDINGS = ROOT / "../shared/realdata"
