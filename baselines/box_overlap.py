@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.types import Float64Array, OrientedBox
+from su3d_bench.core.types import Float64Array, OrientedBox
 
 # The faces of PyTorch3D's boxes in our order of corners, where bit i of a corner is its side along axis i: PyTorch3D's
 # corners 0..7 are 0, 2, 6, 4, 1, 3, 7, 5 here.

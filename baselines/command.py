@@ -17,12 +17,12 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 from su3d_bench.baselines.command_frames import ColourFormat, FrameFolder
 from su3d_bench.baselines.command_prediction import as_prediction, class_names, needs_classes, read_output
 from su3d_bench.baselines.command_process import ContainerWatch, Finished, TreeWatch, Watch, run_program
-from su3d_bench.digests import digest_file
-from su3d_bench.errors import ConfigError, DataError, PredictionError, Su3dError
-from su3d_bench.interfaces import MethodAbout, SceneTools, StageTimer
-from su3d_bench.plain_text import printable
+from su3d_bench.core.digests import digest_file
+from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError
+from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
+from su3d_bench.core.plain_text import printable
 from su3d_bench.temporary_folders import TemporaryFolder
-from su3d_bench.types import Detections, Frame, PerceptionNeeds, Prediction, SceneInfo, Surface
+from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, Prediction, SceneInfo, Surface
 
 logger = logging.getLogger(__name__)
 logger.setLevel(logging.INFO)  # what a program prints goes to the log of its scene

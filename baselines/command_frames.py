@@ -8,11 +8,11 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.errors import DataError
-from su3d_bench.plain_text import printable
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.plain_text import printable
 from su3d_bench.store import make_folder, write_bytes, write_text
-from su3d_bench.toml_text import write_toml
-from su3d_bench.types import Float64Array, Frame, SceneInfo, Surface
+from su3d_bench.core.toml_text import write_toml
+from su3d_bench.core.types import Float64Array, Frame, SceneInfo, Surface
 
 LAYOUT_VERSION = 1
 MILLIMETRES = 1000.0

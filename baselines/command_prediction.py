@@ -8,12 +8,12 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.errors import PredictionError
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.metrics.transfer import masks_of_partition
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
 from su3d_bench.protocols import load_protocol, protocols_for
-from su3d_bench.types import Instances, Prediction, Surface
+from su3d_bench.core.types import Instances, Prediction, Surface
 
 
 def read_output(folder: Path, scene: str, format: str | None) -> ScenePrediction:

@@ -14,7 +14,7 @@ from pathlib import Path
 from threading import Thread
 from typing import IO, Any
 
-from su3d_bench.errors import ConfigError
+from su3d_bench.core.errors import ConfigError
 
 KEPT_CHARACTERS = 100_000  # of each stream, from its end: a log that a person still reads
 GRACE_S = 5.0  # between asking a program to stop and ending it

@@ -19,9 +19,9 @@ from su3d_bench.baselines.pixel_features import (
     picked,
 )
 from su3d_bench.baselines.point_fusion import ABSENT, PointFusion, View, view_of
-from su3d_bench.errors import DataError
-from su3d_bench.interfaces import MethodAbout, StageTimer
-from su3d_bench.types import DenseFeatures, Detections, Frame, Int64Array, PerceptionNeeds, SceneInfo
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.interfaces import MethodAbout, StageTimer
+from su3d_bench.core.types import DenseFeatures, Detections, Frame, Int64Array, PerceptionNeeds, SceneInfo
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
 VALID = {"no-zero-channel": has_no_zero_channel, "any-channel": has_any_channel}

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from su3d_bench.baselines.conceptfusion import LICENCE, PAPER, SOURCE, STATUS, ConceptFusion, ConceptFusionConfig
 from su3d_bench.baselines.pixel_features import Weights
-from su3d_bench.interfaces import MethodAbout
-from su3d_bench.types import PerceptionNeeds
+from su3d_bench.core.interfaces import MethodAbout
+from su3d_bench.core.types import PerceptionNeeds
 
 
 class ConceptFusionSamConfig(ConceptFusionConfig):

@@ -6,8 +6,8 @@ import numpy as np
 
 from su3d_bench.baselines.conceptgraphs_config import MappingConfig
 from su3d_bench.baselines.conceptgraphs_map import ObjectMap, warm_up
-from su3d_bench.interfaces import MethodAbout, StageTimer
-from su3d_bench.types import Detections, Frame, Instances, PerceptionNeeds, SceneInfo
+from su3d_bench.core.interfaces import MethodAbout, StageTimer
+from su3d_bench.core.types import Detections, Frame, Instances, PerceptionNeeds, SceneInfo
 
 CROP_PADDING_PX = 20  # the original's crops: the box and 20 px on every side
 

@@ -19,7 +19,7 @@ from su3d_bench.baselines.box_overlap import (
 )
 from su3d_bench.baselines.conceptgraphs_config import MappingConfig
 from su3d_bench.baselines.conceptgraphs_objects import MapObject
-from su3d_bench.types import Float64Array, Int64Array
+from su3d_bench.core.types import Float64Array, Int64Array
 
 LEAST_SIDE_M = 0.02  # thinner boxes are grown to it before they are intersected
 LEAST_IOU = 1e-6

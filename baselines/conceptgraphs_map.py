@@ -24,11 +24,11 @@ from su3d_bench.baselines.conceptgraphs_objects import (
     unit,
 )
 from su3d_bench.baselines.conceptgraphs_regions import LiftedRegion, kept_regions, lift, subtract_contained
-from su3d_bench.errors import DataError
-from su3d_bench.interfaces import StageTimer
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.interfaces import StageTimer
 from su3d_bench.predictions.clouds import instances_of
-from su3d_bench.timing import Timer
-from su3d_bench.types import Detections, Float32Array, Frame, Instances
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import Detections, Float32Array, Frame, Instances
 
 
 class ObjectMap:

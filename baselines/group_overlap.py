@@ -14,9 +14,9 @@ from functools import cached_property
 
 import numpy as np
 
-from su3d_bench.errors import DataError
-from su3d_bench.interfaces import StageTimer
-from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.interfaces import StageTimer
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 
 NO_GROUP = -1
 PAIR_RADIUS_VOXELS = 1.5  # the search radius in util.py's callers: 1.5 * voxel_size

@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.interfaces import RegionPerception
-from su3d_bench.types import BoolArray, Float64Array, Frame, Int64Array
+from su3d_bench.core.interfaces import RegionPerception
+from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int64Array
 
 
 @dataclass(frozen=True)

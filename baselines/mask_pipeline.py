@@ -18,9 +18,9 @@ from su3d_bench.baselines.mask_views import (
     visible_pixels,
 )
 from su3d_bench.baselines.proposals import ProposalConfig, make_proposals
-from su3d_bench.errors import DataError
-from su3d_bench.interfaces import SceneTools, StageTimer
-from su3d_bench.types import Float32Array, Float64Array, Frame, Instances, Int64Array, SceneInfo
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.interfaces import SceneTools, StageTimer
+from su3d_bench.core.types import Float32Array, Float64Array, Frame, Instances, Int64Array, SceneInfo
 
 Pixels = Annotated[int, Field(ge=2, le=65536)]
 

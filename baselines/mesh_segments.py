@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.types import Float32Array, Int32Array
+from su3d_bench.core.types import Float32Array, Int32Array
 
 THRESHOLD = 0.01  # kThresh of the released .segs.json files
 MIN_VERTICES = 20  # segMinVerts of the released files

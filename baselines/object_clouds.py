@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.types import BoolArray, Float64Array, Int32Array, Int64Array, OrientedBox
+from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array, OrientedBox
 
 LEAST_CLUSTER = 5  # points; a smaller largest cluster is not trusted and the whole cloud stays
 LEAST_FOR_ORIENTED_BOX = 4  # points that span a volume

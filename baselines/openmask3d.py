@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from su3d_bench.baselines.mask_pipeline import MaskPipeline, MaskPipelineConfig
-from su3d_bench.interfaces import MethodAbout, SceneTools, StageTimer
-from su3d_bench.types import Detections, Frame, Instances, PerceptionNeeds, SceneInfo
+from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
+from su3d_bench.core.types import Detections, Frame, Instances, PerceptionNeeds, SceneInfo
 
 
 class OpenMask3DConfig(MaskPipelineConfig):

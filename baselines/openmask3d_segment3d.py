@@ -12,7 +12,7 @@ from pydantic import Field
 
 from su3d_bench.baselines.mask_pipeline import MaskPipelineConfig
 from su3d_bench.baselines.openmask3d import OpenMask3D
-from su3d_bench.interfaces import MethodAbout
+from su3d_bench.core.interfaces import MethodAbout
 
 
 class OpenMask3DSegment3DConfig(MaskPipelineConfig):

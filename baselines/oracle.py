@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from su3d_bench.interfaces import MethodAbout, StageTimer
+from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.perception.naming import scene_caption
-from su3d_bench.types import Detections, Frame, GroundTruth, Instances, Int32Array, PerceptionNeeds, SceneInfo
+from su3d_bench.core.types import Detections, Frame, GroundTruth, Instances, Int32Array, PerceptionNeeds, SceneInfo
 
 
 class Oracle:

@@ -12,7 +12,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 
 Weights = Literal["softmax", "uniqueness"]
 Overlaps = Literal["sum", "small-over-large"]

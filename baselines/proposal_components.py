@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.types import Float32Array, Float64Array, Int64Array, Proposals
+from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, Proposals
 
 NOISE = -1
 

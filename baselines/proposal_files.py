@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from functools import cache
 from pathlib import Path
 
-from su3d_bench.digests import digest_file, digest_json
-from su3d_bench.errors import PredictionError
+from su3d_bench.core.digests import digest_file, digest_json
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.predictions.base import VertexMasks, shown
-from su3d_bench.types import Proposals, Surface
+from su3d_bench.core.types import Proposals, Surface
 
 
 def read_proposals(folder: Path, scene: str, surface: Surface) -> Proposals:

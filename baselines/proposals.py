@@ -12,10 +12,10 @@ from su3d_bench.baselines.mesh_segments import MIN_VERTICES, THRESHOLD
 from su3d_bench.baselines.proposal_components import PartRules, split_into_parts, voted_by_segments
 from su3d_bench.baselines.proposal_files import digest_of_folder, read_proposals
 from su3d_bench.baselines.surface_proposals import SOURCE, NodeChoice, segments_of, surface_proposals
-from su3d_bench.errors import DataError
-from su3d_bench.interfaces import SceneTools
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.interfaces import SceneTools
 from su3d_bench.metrics.transfer import Masks, transfer_masks
-from su3d_bench.types import Int64Array, Proposals, Surface
+from su3d_bench.core.types import Int64Array, Proposals, Surface
 
 Kind = Literal["auto", "files", "surface", "oracle"]
 Metres = Annotated[float, Field(gt=0, allow_inf_nan=False)]

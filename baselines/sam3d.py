@@ -30,23 +30,11 @@ from su3d_bench.baselines.group_overlap import (
     voxelise,
     without_small_groups,
 )
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.geometry import back_project, valid_depth
-from su3d_bench.interfaces import MethodAbout, SceneTools, StageTimer
-from su3d_bench.timing import Timer
-from su3d_bench.types import (
-    BoolArray,
-    Detections,
-    Float32Array,
-    Float64Array,
-    Frame,
-    Instances,
-    Int32Array,
-    Int64Array,
-    PerceptionNeeds,
-    SceneInfo,
-    Surface,
-)
+from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import BoolArray, Detections, Float32Array, Float64Array, Frame, Instances, Int32Array, Int64Array, PerceptionNeeds, SceneInfo, Surface
 
 logger = logging.getLogger(__name__)
 Metres = Annotated[float, Field(gt=0, allow_inf_nan=False)]

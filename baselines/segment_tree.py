@@ -12,8 +12,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.errors import DataError
-from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
 
 LEAST_PATCH_M = 0.02  # side of the cubes, where the mesh's edges are not longer
 FLAT_BEND = 0.01  # of a contact without any bend, so that flat borders still count by their length

@@ -22,7 +22,7 @@ from torch_devices import TORCH_ON_CPU, on_each_device
 
 from su3d_bench.executors import one_thread
 from su3d_bench.opensu3d.voxel_map import VoxelMap
-from su3d_bench.types import Float64Array
+from su3d_bench.core.types import Float64Array
 
 if TYPE_CHECKING:
     from su3d_bench.opensu3d.device_kernels import DeviceVoxelMap

@@ -20,8 +20,8 @@ from su3d_bench.baselines.conceptgraphs_regions import box_of
 from su3d_bench.baselines.group_overlap import GroupedCloud, voxelise
 from su3d_bench.baselines.sam3d import SAM3D, SAM3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
-from su3d_bench.timing import Timer
-from su3d_bench.types import Detections, Float64Array, Frame, Int64Array, SceneInfo
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import Detections, Float64Array, Frame, Int64Array, SceneInfo
 
 WIDTH, HEIGHT, FOCAL = 1200, 680, 600.0
 DISTANCE_M = 2.5

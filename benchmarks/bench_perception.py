@@ -21,8 +21,8 @@ from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.perception.embedded_encoder import IMAGE_SIZE, EmbeddedEncoder
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
 from su3d_bench.read_ahead import ReadAhead
-from su3d_bench.timing import Timer
-from su3d_bench.types import Frame
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import Frame
 
 N_FRAMES = 8
 NEEDS = OpenSU3D(OpenSU3D.Config()).needs

@@ -31,8 +31,8 @@ from su3d_bench.datasets.sens import FRAME_RECORD, SensFile
 from su3d_bench.datasets.sens_header import SensHeader, header_bytes
 from su3d_bench.datasets.sens_write import SensFrame, colour_content, depth_content, write_sens
 from su3d_bench.read_ahead import ReadAhead
-from su3d_bench.timing import calibration_ms
-from su3d_bench.types import Float32Array, Frame, UInt8Array
+from su3d_bench.core.timing import calibration_ms
+from su3d_bench.core.types import Float32Array, Frame, UInt8Array
 
 Images = tuple[UInt8Array, np.ndarray]  # colour (H, W, 3) and depth (H, W) of a frame
 N_REPLICA, N_SENS, N_DIFFERENT = 24, 48, 6  # frames that are read; images that they repeat

@@ -9,7 +9,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from su3d_bench.metrics.transfer import nearest
-from su3d_bench.types import Float32Array
+from su3d_bench.core.types import Float32Array
 
 GROUP = "nearest neighbours: 4 million candidates, 1 million questions"
 

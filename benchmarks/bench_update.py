@@ -21,8 +21,8 @@ from wall import DISTANCE_M, HEIGHT, VOXEL_M, WIDTH, view
 from su3d_bench.executors import one_thread
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
-from su3d_bench.timing import Timer
-from su3d_bench.types import Detections, Frame
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import Detections, Frame
 
 
 def every_second_pixel(frame: Frame, detections: Detections) -> tuple[Frame, Detections]:

@@ -28,8 +28,8 @@ from su3d_bench.opensu3d.tracking import View, record_of
 from su3d_bench.protocols import load_protocol
 from su3d_bench.scoring import combine, score_scene
 from su3d_bench.store import read_prediction, write_prediction
-from su3d_bench.timing import Timer, peak_memory_bytes, start_memory_watch
-from su3d_bench.types import Detections, Float32Array, Float64Array, GroundTruth, Int32Array, LabelSet, SceneInfo
+from su3d_bench.core.timing import Timer, peak_memory_bytes, start_memory_watch
+from su3d_bench.core.types import Detections, Float32Array, Float64Array, GroundTruth, Int32Array, LabelSet, SceneInfo
 
 RULES = load_protocol("rooms-semantic")
 CLASSES = [entry for entry in RULES.classes if not RULES.is_ignored(entry.name)]

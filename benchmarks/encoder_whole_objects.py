@@ -16,7 +16,7 @@ from su3d_bench.datasets.rooms_classes import CLASSES
 from su3d_bench.datasets.rooms_truth import STRUCTURE, RoomObject
 from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
 from su3d_bench.planning import data_root
-from su3d_bench.types import Float64Array, UInt8Array
+from su3d_bench.core.types import Float64Array, UInt8Array
 
 KINDS = ("living", "bedroom", "kitchen", "office", "bathroom", "studio")
 NUMBERS = (20030, 20031, 20032)

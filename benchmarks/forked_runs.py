@@ -103,8 +103,8 @@ def _timeless(path: Path) -> Any:
 
 def false_seals(folder: Path, expected: dict[str, Any]) -> list[str]:
     """Files that a seal vouches for, or a reader takes for a finished run, though they are not those of a whole run."""
-    from su3d_bench.digests import digest_file
-    from su3d_bench.errors import Su3dError
+    from su3d_bench.core.digests import digest_file
+    from su3d_bench.core.errors import Su3dError
     from su3d_bench.finished_run import read_run
     from su3d_bench.store import JobFolder
 

@@ -204,7 +204,7 @@ class Trial:
         return True
 
     def _lock(self, folder: Path) -> None:
-        from su3d_bench.errors import StoreError
+        from su3d_bench.core.errors import StoreError
         from su3d_bench.store import RunFolder
 
         try:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 
 from su3d_bench.datasets.replica_frames import Camera, ReplicaFrames, colour_name, depth_name
-from su3d_bench.types import Frame
+from su3d_bench.core.types import Frame
 
 SCALE = 6553.5  # depth units in a metre of Replica's render
 

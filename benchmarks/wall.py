@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.types import Detections, Frame
+from su3d_bench.core.types import Detections, Frame
 
 WIDTH, HEIGHT, FOCAL = 1200, 680, 600.0
 DISTANCE_M = 2.5

@@ -20,8 +20,8 @@ import numpy as np
 from su3d_bench.datasets.image_files import UInt16Array, image_size, read_bytes, sized_colour, sized_depth
 from su3d_bench.datasets.recorded_frames import numbers, read_text
 from su3d_bench.datasets.rgbd_source import SensorPair, Size
-from su3d_bench.errors import DataError
-from su3d_bench.types import Float64Array, UInt8Array
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Float64Array, UInt8Array
 
 FRAMES_PER_SECOND = 30.0  # of ScanNet's recordings; the exports have no times
 MOST_MISSING = 1000  # named; a stray file with a huge number makes all those before it missing

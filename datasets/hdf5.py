@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.errors import DataError
-from su3d_bench.types import Float32Array, Int32Array
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Float32Array, Int32Array
 
 FloatArray = NDArray[np.floating[Any]]
 BLOCK_BYTES = 16 << 20

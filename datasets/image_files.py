@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.errors import DataError
-from su3d_bench.types import UInt8Array
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import UInt8Array
 
 UInt16Array = NDArray[np.uint16]
 MAX_PIXELS = 100_000_000  # no RGB-D camera has more; a damaged header may promise 4 billion

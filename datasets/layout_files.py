@@ -6,7 +6,7 @@ import numpy as np
 
 from su3d_bench.datasets.image_files import UInt16Array
 from su3d_bench.datasets.ply import ListColumn
-from su3d_bench.types import Float32Array, Int32Array, UInt8Array
+from su3d_bench.core.types import Float32Array, Int32Array, UInt8Array
 
 JPEG_QUALITY = 95
 PNG_COMPRESSION = 3

@@ -17,12 +17,12 @@ import numpy as np
 
 from su3d_bench.datasets.pcd import read_pcd_points
 from su3d_bench.datasets.replica_truth import MESH_NAME, AnnotatedMesh
-from su3d_bench.errors import DataError, GroundTruthMissing
+from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.metrics.openlex3d import ObjectLabels, OpenLexTruth
 from su3d_bench.metrics.query_ap import QueryTruth, TextQuery
 from su3d_bench.metrics.transfer import nearest
-from su3d_bench.plain_text import printable
-from su3d_bench.types import Float32Array, Int64Array
+from su3d_bench.core.plain_text import printable
+from su3d_bench.core.types import Float32Array, Int64Array
 
 PROMPTS_NAME = "prompt_list.txt"
 CATEGORIES_NAME = "gt_categories.json"

@@ -9,7 +9,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 
 ByteOrder = Literal["<", ">"]
 BYTE_ORDERS: dict[str, ByteOrder] = {"ascii": "<", "binary_little_endian": "<", "binary_big_endian": ">"}

@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.types import Float64Array, Frame
+from su3d_bench.core.types import Float64Array, Frame
 
 N_ANCHORS = 4
 GAPS = (1, 3, 9, 27)  # frames between the two of a pair: fast and slow cameras, and strides, both find one that tells

@@ -14,9 +14,9 @@ from typing import Literal
 import numpy as np
 
 from su3d_bench.datasets.rgbd_source import SensorPair
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.geometry import are_rigid
-from su3d_bench.types import Float32Array, Float64Array, UInt8Array
+from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
 
 Grid = Literal["depth", "colour"]
 SAME_RAY_PX = 0.01  # two images whose pixels differ by less in their rays are taken as one; text files keep six digits

@@ -50,8 +50,8 @@ from su3d_bench.datasets.replica_truth import (
     triangle_mesh,
     vertex_truth,
 )
-from su3d_bench.errors import DataError, GroundTruthMissing, suggest
-from su3d_bench.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, SceneInfo, Surface
+from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
+from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, SceneInfo, Surface
 
 READER_VERSION = 2  # raise it whenever the same files come out as other frames or another truth
 

@@ -14,8 +14,8 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.datasets.replica_truth import INFO_NAME, AnnotatedMesh, read_objects, shown, whole_number
-from su3d_bench.errors import DataError
-from su3d_bench.types import Float64Array, OrientedBox
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Float64Array, OrientedBox
 
 SLACK_M = 0.05
 UNIT_TOLERANCE = 1e-2  # the release writes unit quaternions in single precision

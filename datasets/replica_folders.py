@@ -11,7 +11,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 
 OFFICIAL_SCENES = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")
 RENDER_FOLDERS = ("Replica", "replica", ".")

@@ -6,7 +6,7 @@ import json
 from functools import cache
 from pathlib import Path
 
-from su3d_bench.types import LabelSet
+from su3d_bench.core.types import LabelSet
 
 LABEL_SPACE = "replica"
 

@@ -23,9 +23,9 @@ from su3d_bench.datasets.replica_frames import colour_name, depth_name
 from su3d_bench.datasets.replica_labels import replica_label_set
 from su3d_bench.datasets.replica_truth import INFO_NAME, MESH_NAME
 from su3d_bench.datasets.scene_making import Scan, ScannedDataset, ScannedObject, SceneTarget, write_shared_text
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.store import json_text, make_folder, write_json, write_text
-from su3d_bench.types import Float64Array, Frame
+from su3d_bench.core.types import Float64Array, Frame
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
 DEPTH_SCALE = 6553.5  # of NICE-SLAM's render: 65535 is 10 m

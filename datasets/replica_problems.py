@@ -20,7 +20,7 @@ from su3d_bench.datasets.replica_frames import (
     trajectory_lines,
 )
 from su3d_bench.datasets.replica_truth import INFO_NAME, MESH_NAME, read_annotated_mesh
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 
 MOST_LINES = 20  # of one kind of fault; the rest is counted
 HEAD_BYTES = (4096, 1 << 18)  # a JPEG may carry its size behind the blocks of its camera, each below 64 KB

@@ -36,8 +36,8 @@ from su3d_bench.datasets.rgbd_files import (
     read_pose_file,
     read_trajectory_file,
 )
-from su3d_bench.errors import DataError, GroundTruthMissing, suggest
-from su3d_bench.types import Float32Array, Float64Array, Frame, GroundTruth, InstanceMesh, SceneInfo, Surface
+from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
+from su3d_bench.core.types import Float32Array, Float64Array, Frame, GroundTruth, InstanceMesh, SceneInfo, Surface
 
 logger = logging.getLogger(__name__)
 OTHER = {"camera_to_world": "world_to_camera", "world_to_camera": "camera_to_world"}

@@ -14,8 +14,8 @@ from typing import Protocol
 import numpy as np
 
 from su3d_bench.datasets.image_files import MAX_PIXELS, UInt16Array
-from su3d_bench.errors import DataError
-from su3d_bench.types import Float64Array, UInt8Array
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Float64Array, UInt8Array
 
 Size = tuple[int, int]  # width, height in pixels
 

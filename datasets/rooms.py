@@ -16,18 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.datasets.rooms_classes import CLASSES
 from su3d_bench.datasets.rooms_noise import LEVELS, add_noise
-from su3d_bench.errors import DataError, GroundTruthMissing, suggest
-from su3d_bench.types import (
-    Float64Array,
-    Frame,
-    GroundTruth,
-    ImageDomain,
-    InstanceMesh,
-    Int32Array,
-    LabelSet,
-    SceneInfo,
-    Surface,
-)
+from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
+from su3d_bench.core.types import Float64Array, Frame, GroundTruth, ImageDomain, InstanceMesh, Int32Array, LabelSet, SceneInfo, Surface
 
 if TYPE_CHECKING:  # what makes a room is imported where one is made: a list of scenes needs none of it
     from su3d_bench.datasets.rooms_layout import Plan
@@ -223,7 +213,7 @@ class Rooms:
 
     def _scan_key(self, scene: str) -> str:
         """What a scan depends on: not the size of the images nor their noise."""
-        from su3d_bench.digests import package_digest
+        from su3d_bench.core.digests import package_digest
 
         scene_name_parts(scene)
         options = self.options
@@ -232,7 +222,7 @@ class Rooms:
 
     def _baked_folder(self, scene: str) -> Path | None:
         """Where mesh and walk are kept; None for the thousands of training, and where no data root was made yet."""
-        from su3d_bench.digests import NUMERIC_PACKAGES, digest_json, package_digest, package_versions
+        from su3d_bench.core.digests import NUMERIC_PACKAGES, digest_json, package_digest, package_versions
 
         _, number = scene_name_parts(scene)
         if number >= TRAINING_FROM or not self.root.is_dir():

@@ -12,7 +12,7 @@ from su3d_bench.datasets.rooms_classes import CLASS_BY_NAME
 from su3d_bench.datasets.rooms_materials import Material, Rgb, of_kind, tone
 from su3d_bench.datasets.rooms_shapes import Shape, bounds
 from su3d_bench.datasets.rooms_sizes import size_word
-from su3d_bench.types import Float64Array
+from su3d_bench.core.types import Float64Array
 
 FOOT_HEIGHT_M = 0.025
 

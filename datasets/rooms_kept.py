@@ -12,7 +12,7 @@ import numpy as np
 
 from su3d_bench.datasets.rooms_mesh import RoomMesh
 from su3d_bench.kept_files import DAMAGE, filling, read_arrays
-from su3d_bench.types import Float64Array
+from su3d_bench.core.types import Float64Array
 
 Arrays = dict[str, Any]
 # Of every array of a mesh: its type, and its shape by what it counts; a number stands for itself.

@@ -12,7 +12,7 @@ from su3d_bench.compiled_open3d import compiled_open3d
 from su3d_bench.datasets.rooms_items import Item
 from su3d_bench.datasets.rooms_materials import Material
 from su3d_bench.datasets.rooms_shapes import Shape, rotation
-from su3d_bench.types import Float32Array, Float64Array, Int32Array
+from su3d_bench.core.types import Float32Array, Float64Array, Int32Array
 
 LIGHT_SPACING_M = 0.13  # between the points at which light is computed
 AMBIENT = 0.42

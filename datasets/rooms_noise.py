@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.types import BoolArray, Float32Array, UInt8Array
+from su3d_bench.core.types import BoolArray, Float32Array, UInt8Array
 
 
 @dataclass(frozen=True)

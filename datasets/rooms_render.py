@@ -8,7 +8,7 @@ import numpy as np
 
 from su3d_bench.compiled_open3d import compiled_open3d
 from su3d_bench.datasets.rooms_mesh import RoomMesh, caster
-from su3d_bench.types import Float32Array, Float64Array, Int32Array, UInt8Array
+from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, UInt8Array
 
 FOCAL_PER_WIDTH = 400.0 / 640.0  # a horizontal field of view of 77 degrees
 

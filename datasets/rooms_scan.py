@@ -10,9 +10,9 @@ import numpy as np
 from su3d_bench.compiled_open3d import compiled_open3d
 from su3d_bench.datasets.rooms_mesh import Grid, Patches, RoomMesh, at_rows, caster, cut, merge_equal
 from su3d_bench.datasets.rooms_render import Renderer, camera_intrinsics
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.kept_files import DAMAGE, filling, read_arrays
-from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
 
 VIEW_WIDTH, VIEW_HEIGHT = 160, 120  # of the depth images that decide what is visible: 1 cm a pixel at 1 m
 TOUR = 40  # frames are visited at this stride first, so that most faces are settled by the first few

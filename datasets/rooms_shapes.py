@@ -12,7 +12,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from su3d_bench.types import Float64Array
+from su3d_bench.core.types import Float64Array
 
 CREASE = np.cos(np.deg2rad(38.0))  # profile bends sharper than this are edges, softer ones are smooth
 

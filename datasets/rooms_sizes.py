@@ -6,7 +6,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from su3d_bench.types import Float64Array
+from su3d_bench.core.types import Float64Array
 
 # litres of the bounding box: the median of 200 instances, seeds (7, 0) to (7, 199); a test measures them again
 USUAL_VOLUME_L: Mapping[str, float] = {

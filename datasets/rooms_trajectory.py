@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from su3d_bench.compiled_open3d import compiled_open3d
 from su3d_bench.datasets.rooms_layout import Box
 from su3d_bench.datasets.rooms_mesh import RoomMesh, caster
-from su3d_bench.types import BoolArray, Float64Array
+from su3d_bench.core.types import BoolArray, Float64Array
 
 CELL_M = 0.1
 CLEAR_M = 0.32  # between the camera and anything at its height

@@ -10,7 +10,7 @@ import numpy as np
 
 from su3d_bench.datasets.rooms_classes import AFFORDANCES, CLASS_ID
 from su3d_bench.datasets.rooms_layout import FLAT, Box, Plan, box_of
-from su3d_bench.types import Float64Array
+from su3d_bench.core.types import Float64Array
 
 RELATIONS = ("on", "under", "next to", "in", "above")
 STRUCTURE = frozenset(("wall", "floor", "ceiling"))

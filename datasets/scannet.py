@@ -40,9 +40,9 @@ from su3d_bench.datasets.scannet_truth import (
     scannet200_truth,
     truth_names,
 )
-from su3d_bench.digests import digest_file
-from su3d_bench.errors import DataError, GroundTruthMissing, suggest
-from su3d_bench.types import Float64Array, Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo, Surface
+from su3d_bench.core.digests import digest_file
+from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
+from su3d_bench.core.types import Float64Array, Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo, Surface
 
 READER_VERSION = 1  # raise it whenever the same files come out as other frames or another truth
 logger = logging.getLogger(__name__)

@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.datasets.image_files import read_bytes
-from su3d_bench.errors import DataError
-from su3d_bench.types import Int64Array
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Int64Array
 
 PREFIX = "scannet."  # before scene ids and file names of the second release, not of the first
 MAX_SEGMENT_ID = 2**32 - 1

@@ -29,8 +29,8 @@ from su3d_bench.datasets.exported_frames import (
 from su3d_bench.datasets.recorded_frames import numbers, read_text
 from su3d_bench.datasets.rgbd_source import RgbdSource, SensorPair, Size
 from su3d_bench.datasets.sens import SensSource
-from su3d_bench.errors import DataError
-from su3d_bench.types import Float64Array
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Float64Array
 
 SourceKind = Literal["auto", "sens", "python", "cpp"]
 DEPTH_SHIFT = 1000.0  # of every recording of ScanNet; the Python reader does not export it

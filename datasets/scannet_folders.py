@@ -14,7 +14,7 @@ from pathlib import Path
 
 from su3d_bench.datasets.replica_folders import read_marker
 from su3d_bench.datasets.scannet_labels import TABLE_NAME
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 
 # The scenes of OpenSU3D's evaluation, in the order of its section IV-A.
 PAPER_SCENES = ("scene0000_00", "scene0034_00", "scene0164_03", "scene0525_01", "scene0549_00")

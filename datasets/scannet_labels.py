@@ -14,8 +14,8 @@ from functools import cache
 from pathlib import Path
 
 from su3d_bench.datasets.image_files import read_bytes
-from su3d_bench.errors import DataError
-from su3d_bench.types import LabelSet
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import LabelSet
 
 LABEL_SPACE = "scannet"
 TABLE_NAME = "scannetv2-labels.combined.tsv"

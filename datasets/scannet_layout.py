@@ -24,7 +24,7 @@ from su3d_bench.datasets.scene_making import ScannedDataset, SceneTarget, write_
 from su3d_bench.datasets.sens import FRAME_RECORD, MICROSECONDS, MOTION_RECORD
 from su3d_bench.datasets.sens_header import SensHeader
 from su3d_bench.datasets.sens_write import SensFrame, depth_content, write_sens
-from su3d_bench.types import Float64Array, Frame
+from su3d_bench.core.types import Float64Array, Frame
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
 DEPTH_SHIFT = 1000.0  # units a metre, of every recording of the release

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.datasets.image_files import read_bytes
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.geometry import are_rigid
-from su3d_bench.types import Float64Array
+from su3d_bench.core.types import Float64Array
 
 ALIGNMENT = "axisAlignment"
 

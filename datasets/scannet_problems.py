@@ -19,7 +19,7 @@ from su3d_bench.datasets.scannet_frames import classify_poses, faulty_pose, read
 from su3d_bench.datasets.scannet_labels import TABLE_NAME, read_label_table
 from su3d_bench.datasets.scannet_meta import meta_name, read_axis_alignment
 from su3d_bench.datasets.scannet_truth import labels_name, mesh_name, read_annotated_scan, truth_names
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 
 MOST_POSES = 20  # named one by one; the rest is counted
 

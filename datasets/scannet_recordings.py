@@ -13,9 +13,9 @@ from su3d_bench.datasets.rgbd_source import RgbdSource
 from su3d_bench.datasets.scannet_exports import INFO, SourceKind, python_layout, read_info
 from su3d_bench.datasets.sens import SensSource
 from su3d_bench.datasets.sens_header import MAX_HEADER_BYTES, header_bytes, parse_header
-from su3d_bench.digests import digest_bytes, digest_file
-from su3d_bench.errors import DataError
-from su3d_bench.types import Float64Array
+from su3d_bench.core.digests import digest_bytes, digest_file
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Float64Array
 
 TEXT = ".txt"
 

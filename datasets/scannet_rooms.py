@@ -10,7 +10,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 
 ROOM_NAME, SCAN_NAME = re.compile(r"([a-z]+)(\d{1,2})"), re.compile(r"scene9(\d)(\d\d)_00")
 # The columns of scannetv2-labels.combined.tsv in the order of the release.

@@ -34,8 +34,8 @@ from su3d_bench.datasets.scannet_labels import (
     nyu40_label_set,
     raw_label_set,
 )
-from su3d_bench.errors import DataError, GroundTruthMissing
-from su3d_bench.types import Float32Array, Float64Array, GroundTruth, InstanceMesh, Int32Array, Int64Array, Surface
+from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, InstanceMesh, Int32Array, Int64Array, Surface
 
 CORNER_NAMES = ("vertex_indices", "vertex_index")
 SAME_PLACE_M = 1e-3  # both files hold one mesh; text formats round its coordinates

@@ -13,8 +13,8 @@ from typing import Literal
 import numpy as np
 
 from su3d_bench.datasets.image_files import MAX_PIXELS
-from su3d_bench.errors import DataError
-from su3d_bench.types import Float64Array
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Float64Array
 
 ColourCompression = Literal["raw", "png", "jpeg"]
 DepthCompression = Literal["raw", "zlib"]

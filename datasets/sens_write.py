@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from su3d_bench.datasets.image_files import UInt16Array
 from su3d_bench.datasets.sens import FRAME_RECORD, MOTION_RECORD, SensFile
 from su3d_bench.datasets.sens_header import COUNT, ColourCompression, DepthCompression, SensHeader, header_bytes
-from su3d_bench.errors import StoreError
-from su3d_bench.types import Float64Array, UInt8Array
+from su3d_bench.core.errors import StoreError
+from su3d_bench.core.types import Float64Array, UInt8Array
 
 JPEG_QUALITY = 95  # OpenCV's own choice
 

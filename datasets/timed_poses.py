@@ -8,8 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.datasets.recorded_frames import numbers, read_text
-from su3d_bench.errors import DataError
-from su3d_bench.types import Float64Array
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Float64Array
 
 
 def rows_of(path: Path, where: str, n_words: int, form: str) -> list[tuple[int, list[str]]]:

@@ -35,8 +35,8 @@ from su3d_bench.datasets.recorded_frames import (
     read_text,
 )
 from su3d_bench.datasets.timed_poses import pose_at, read_trajectory, rows_of, seconds
-from su3d_bench.errors import DataError, GroundTruthMissing, suggest
-from su3d_bench.types import Float64Array, Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo
+from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
+from su3d_bench.core.types import Float64Array, Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo
 
 logger = logging.getLogger(__name__)
 READER_VERSION = 1  # raise it whenever the same files come out as other frames

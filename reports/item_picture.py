@@ -13,8 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.plain_text import printable
-from su3d_bench.types import BoolArray, UInt8Array
+from su3d_bench.core.plain_text import printable
+from su3d_bench.core.types import BoolArray, UInt8Array
 
 WIDTH, MARGIN, CAPTION = 960, 10, 24
 PHOTO_WIDTH, ZOOM_WIDTH = 560, 370

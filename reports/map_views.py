@@ -11,7 +11,7 @@ import numpy as np
 from su3d_bench.reports.pictures import DRAWN_SPACING_M, NO_INSTANCE, Cloud, thinned
 from su3d_bench.reports.reasoning_picture import project
 from su3d_bench.reports.render import OVERSAMPLING, Camera, View, colour, render, room_bounds, view_cameras
-from su3d_bench.types import BoolArray, Float64Array, Instances, Int32Array, Int64Array, UInt8Array
+from su3d_bench.core.types import BoolArray, Float64Array, Instances, Int32Array, Int64Array, UInt8Array
 
 PALE_GREY = 232
 RENDERED = 1.5  # times the size of the picture, for the room fills only a part of a view from a corner

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from su3d_bench.errors import ConfigError, suggest
-from su3d_bench.plain_text import printable
+from su3d_bench.core.errors import ConfigError, suggest
+from su3d_bench.core.plain_text import printable
 from su3d_bench.reports.measured import Measured
 from su3d_bench.reports.published import Figure, PaperTable, published
 from su3d_bench.reports.table_model import NOT_MEASURED, Cell, Origin, Table, TableRow, is_count

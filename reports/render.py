@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
 
 BACKGROUND = (252, 252, 250)
 OVERSAMPLING = 2

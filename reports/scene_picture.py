@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 from su3d_bench.reports.pictures import (
     NO_INSTANCE,
     Cloud,
@@ -22,7 +22,7 @@ from su3d_bench.reports.pictures import (
 from su3d_bench.reports.render import OVERSAMPLING, Camera, colour, render, room_bounds, view_cameras
 from su3d_bench.reports.scene_look import SceneLook
 from su3d_bench.store import make_folder, write_bytes
-from su3d_bench.types import Float32Array, Float64Array, GroundTruth, Int32Array, UInt8Array
+from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, UInt8Array
 
 WIDTH, DPI = 1920, 100
 MARGIN, HEADER, CAPTION = 16, 76, 26

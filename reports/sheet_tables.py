@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 from su3d_bench.reports.comparison_table import signed
 from su3d_bench.reports.paper_tables import percent
 from su3d_bench.reports.table_model import NOT_MEASURED, Cell, Table, TableRow

@@ -7,7 +7,7 @@ import html
 import io
 from collections.abc import Sequence
 
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 from su3d_bench.reports.table_model import Cell, Table, blocks_of
 from su3d_bench.reports.tables import aligned
 

@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 from su3d_bench.reports.timing_tables import AnytimePoint
 from su3d_bench.statistics import growth_exponent
 from su3d_bench.store import write_bytes
-from su3d_bench.types import Float64Array
+from su3d_bench.core.types import Float64Array
 from su3d_bench.update_times import MAP, UpdateTimes, pooled
 
 if TYPE_CHECKING:

@@ -12,11 +12,11 @@ from typing import Any
 
 from pydantic import BaseModel, ValidationError
 
-from su3d_bench import registry
-from su3d_bench.config import parse_value
-from su3d_bench.errors import ConfigError, StoreError, suggest
+from su3d_bench.core import registry
+from su3d_bench.core.config import parse_value
+from su3d_bench.core.errors import ConfigError, StoreError, suggest
 from su3d_bench.store import read_json, write_json
-from su3d_bench.toml_text import toml_value
+from su3d_bench.core.toml_text import toml_value
 
 FILE = "ablation.json"
 MOST_VARIANTS = 1000

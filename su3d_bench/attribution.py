@@ -13,25 +13,25 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench import registry
+from su3d_bench.core import registry
 from su3d_bench.comparison_sides import Side, refuse_unlike
-from su3d_bench.config import Setting, Settings, resolve
-from su3d_bench.errors import ConfigError, DataError, PredictionError, suggest
+from su3d_bench.core.config import Setting, Settings, resolve
+from su3d_bench.core.errors import ConfigError, DataError, PredictionError, suggest
 from su3d_bench.finished_run import FinishedRun, read_run
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics import attribution as instances
 from su3d_bench.metrics import attribution_semantic as semantic
 from su3d_bench.metrics.mask_overlaps import measure_overlaps
 from su3d_bench.metrics.results import Counts, metric_values
 from su3d_bench.metrics.scored_arrays import scored_masks, scored_points
 from su3d_bench.metrics.semantic import nan_mean
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 from su3d_bench.planning import data_root, dataset_targets
 from su3d_bench.protocols import ProtocolRules, load_protocol
 from su3d_bench.scene_job import Part, build_dataset
 from su3d_bench.scoring import SceneScore
 from su3d_bench.store import RunFolder, read_prediction
-from su3d_bench.types import DenseFeatures, GroundTruth, Prediction
+from su3d_bench.core.types import DenseFeatures, GroundTruth, Prediction
 
 SCHEMA = 1
 KINDS = {"instance": instances.KINDS, "semantic": semantic.CAUSES}

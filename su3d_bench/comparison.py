@@ -22,16 +22,16 @@ from su3d_bench.comparison_sides import (
     refuse_unlike,
     rules_of,
 )
-from su3d_bench.config import MOVES_NO_NUMBER
-from su3d_bench.errors import ConfigError
+from su3d_bench.core.config import MOVES_NO_NUMBER
+from su3d_bench.core.errors import ConfigError
 from su3d_bench.finished_run import FinishedRun
 from su3d_bench.metrics.resampled_values import resampled_classes
 from su3d_bench.metrics.results import Counts, ProtocolResult, resampled_metrics
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 from su3d_bench.protocols import ProtocolRules, load_protocol
 from su3d_bench.scoring import SceneScore, combine
 from su3d_bench.statistics import SignFlipTest, percentile_interval, resample_weights, sign_flip_test
-from su3d_bench.types import Float64Array
+from su3d_bench.core.types import Float64Array
 
 SCHEMA = 1
 # They move no number of a common scene.

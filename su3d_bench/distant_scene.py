@@ -12,8 +12,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from su3d_bench.digests import digest_bytes
-from su3d_bench.errors import StoreError
+from su3d_bench.core.digests import digest_bytes
+from su3d_bench.core.errors import StoreError
 from su3d_bench.executors import Report
 from su3d_bench.remote_folder import RemoteFolder
 from su3d_bench.scene_job import MethodOutcome, SceneJob

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.planning import Plan
 from su3d_bench.scene_job import Part, SceneJob, build_dataset, build_method, stride_of
 

@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
-from su3d_bench import registry
+from su3d_bench.core import registry
 from su3d_bench.datasets.query_files import VARIANT as QUERY_OBJECTS
 from su3d_bench.datasets.query_files import query_truth, read_query_file
-from su3d_bench.errors import ConfigError, DataError, GroundTruthMissing, PredictionError
+from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError
 from su3d_bench.evaluation_openlex import (
     VARIANTS,
     OpenLexRelease,
@@ -46,13 +46,13 @@ from su3d_bench.evaluation_truth import (
     text_scenes,
     text_variant,
 )
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics.query_ap import QueryTruth, TextQuery
 from su3d_bench.planning import data_root, why_not_fitting
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexMasks, shown
 from su3d_bench.predictions.scannet_text import ScannetText
 from su3d_bench.protocols import SHARE_KINDS, ProtocolRules, load_protocol, protocol_names
-from su3d_bench.types import GroundTruth, Instances
+from su3d_bench.core.types import GroundTruth, Instances
 
 __all__ = ["Evaluation", "ProtocolEvaluation", "Request", "evaluate"]
 

@@ -14,7 +14,7 @@ from su3d_bench.metrics.instance_ap import (
     stacked,
 )
 from su3d_bench.metrics.transfer import Masks
-from su3d_bench.types import Float64Array, Int64Array
+from su3d_bench.core.types import Float64Array, Int64Array
 
 
 def every_class_counts(

@@ -6,11 +6,11 @@ from typing import Any
 
 from su3d_bench.evaluation_openlex import score_on_objects
 from su3d_bench.evaluation_scoring import SceneOutcome
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.predictions.base import Content
 from su3d_bench.protocols import ProtocolRules
 from su3d_bench.questions.truths import question_truth
-from su3d_bench.types import GroundTruth
+from su3d_bench.core.types import GroundTruth
 
 
 def score_on_questions(

@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import numpy as np
 
-from su3d_bench.errors import PredictionError
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.evaluation_checks import MaskFacts
 from su3d_bench.evaluation_scoring import SceneOutcome
 from su3d_bench.metrics.instance_ap import InstanceCounts

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from su3d_bench.errors import ConfigError, PredictionError, StoreError, suggest
-from su3d_bench.plain_text import printable
+from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, suggest
+from su3d_bench.core.plain_text import printable
 from su3d_bench.predictions.base import Reader, shown
 from su3d_bench.predictions.formats import recognise
 from su3d_bench.store import read_json

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench import registry
-from su3d_bench.errors import PredictionError
+from su3d_bench.core import registry
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.evaluation_bound import every_class_counts
 from su3d_bench.evaluation_checks import (
     MaskFacts,
@@ -19,7 +19,7 @@ from su3d_bench.evaluation_checks import (
     mask_facts,
 )
 from su3d_bench.evaluation_truth import MAX_NYU40_ID, TextTruth
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics import instance_ap, semantic, transfer
 from su3d_bench.metrics.labelling import (
     candidate_classes,
@@ -34,7 +34,7 @@ from su3d_bench.metrics.score_instances import OBJECT, encode_without_classes
 from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
 from su3d_bench.protocols import ProtocolRules
 from su3d_bench.scoring import score_scene, why_not_scorable
-from su3d_bench.types import DenseFeatures, Float32Array, GroundTruth, Instances, Int64Array, Partition, Prediction
+from su3d_bench.core.types import DenseFeatures, Float32Array, GroundTruth, Instances, Int64Array, Partition, Prediction
 
 NAMED_KINDS = ("annotation", "reasoning")  # go by names alone
 # Ground truths of ScanNet and whose class ids they hold.

@@ -9,14 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.digests import digest_file
-from su3d_bench.errors import DataError, PredictionError
-from su3d_bench.interfaces import Encoder
-from su3d_bench.plain_text import printable
+from su3d_bench.core.digests import digest_file
+from su3d_bench.core.errors import DataError, PredictionError
+from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.plain_text import printable
 from su3d_bench.predictions.base import shown
 from su3d_bench.predictions.numpy_files import read_npz
 from su3d_bench.protocols import ProtocolRules
-from su3d_bench.types import Float32Array, UInt8Array
+from su3d_bench.core.types import Float32Array, UInt8Array
 
 
 @dataclass(frozen=True)

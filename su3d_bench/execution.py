@@ -6,8 +6,8 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.config import RunConfig, parse_value
-from su3d_bench.errors import ConfigError
+from su3d_bench.core.config import RunConfig, parse_value
+from su3d_bench.core.errors import ConfigError
 from su3d_bench.executors import Outcome, Report, Unit, Work, run_inline, run_processes
 
 # The options of executors on other machines; a value other than the default is refused elsewhere.

@@ -13,8 +13,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
-from su3d_bench.digests import NUMERIC_PACKAGES, code_digest, package_versions
-from su3d_bench.errors import ConfigError, ModelMissing, StoreError
+from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, package_versions
+from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError
 from su3d_bench.executors import Outcome, Report, Unit, Work, answer_of, limit_threads, unwrap
 
 CONNECT_S = 5.0  # a machine of a cluster in one network answers within milliseconds

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.errors import ConfigError, ModelMissing
+from su3d_bench.core.errors import ConfigError, ModelMissing
 from su3d_bench.executors import Outcome, Report, Unit, Work, answer_of, limit_threads, unwrap
 
 CLUSTERS = ("slurm", "local")  # submitit takes this machine for a cluster in silence where there is no Slurm

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.finished_run import FinishedRun
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 from su3d_bench.store import is_file
-from su3d_bench.types import Float64Array
+from su3d_bench.core.types import Float64Array
 from su3d_bench.update_times import MapCost, UpdateTimes
 
 MAX_UPDATES = 10_000_000

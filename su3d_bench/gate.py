@@ -14,12 +14,12 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from su3d_bench.config import MOVES_NO_NUMBER
-from su3d_bench.errors import ConfigError, StoreError
+from su3d_bench.core.config import MOVES_NO_NUMBER
+from su3d_bench.core.errors import ConfigError, StoreError
 from su3d_bench.finished_run import FinishedRun
 from su3d_bench.finished_updates import read_update_times
 from su3d_bench.gate_findings import Finding, Verdict
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 from su3d_bench.store import read_json
 from su3d_bench.update_times import MAP, WARM_UP, pooled
 

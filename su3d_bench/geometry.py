@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.errors import DataError
-from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int64Array
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array
 
 RIGID_TOLERANCE = 1e-2  # catches scaled, mirrored and transposed matrices, not the digits that a text file left out
 

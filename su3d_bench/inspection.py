@@ -20,7 +20,7 @@ import numpy as np
 
 from su3d_bench.datasets.image_files import decode_colour, decode_depth, read_bytes
 from su3d_bench.datasets.pose_convention import check_convention
-from su3d_bench.errors import DataError, GroundTruthMissing, Su3dError
+from su3d_bench.core.errors import DataError, GroundTruthMissing, Su3dError
 from su3d_bench.inspection_checks import (
     Finding,
     FrameFacts,
@@ -30,9 +30,9 @@ from su3d_bench.inspection_checks import (
     check_truth,
     facts_of,
 )
-from su3d_bench.interfaces import Dataset
-from su3d_bench.plain_text import printable
-from su3d_bench.types import Float32Array, Frame, InstanceMesh
+from su3d_bench.core.interfaces import Dataset
+from su3d_bench.core.plain_text import printable
+from su3d_bench.core.types import Float32Array, Frame, InstanceMesh
 
 SAMPLED_FRAMES = 20
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".ppm", ".pgm"}

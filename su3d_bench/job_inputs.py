@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from su3d_bench.digests import digest_json, package_versions
-from su3d_bench.interfaces import Method
+from su3d_bench.core.digests import digest_json, package_versions
+from su3d_bench.core.interfaces import Method
 from su3d_bench.perception.profiles import Perception
 from su3d_bench.protocols import load_protocol
 from su3d_bench.questions.refined import refined_digest
 from su3d_bench.scene_job import MethodOutcome, SceneJob
 from su3d_bench.store import JobFolder
-from su3d_bench.types import SceneInfo
+from su3d_bench.core.types import SceneInfo
 
 LAYOUTS_OF_ROOMS = ("replica", "scannet", "tum")  # in which `datasets make rooms` writes files
 TRUE_PROPOSALS_CAVEAT = "proposals from the ground truth; a ceiling, not a result"

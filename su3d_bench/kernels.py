@@ -13,7 +13,7 @@ import numba
 from numba.core.caching import FunctionCache, IndexDataCacheFile
 from numba.core.dispatcher import Dispatcher
 
-from su3d_bench.digests import digest_file
+from su3d_bench.core.digests import digest_file
 from su3d_bench.kept_files import DAMAGE
 
 

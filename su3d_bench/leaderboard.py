@@ -12,9 +12,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from su3d_bench.errors import ConfigError, Su3dError
+from su3d_bench.core.errors import ConfigError, Su3dError
 from su3d_bench.finished_run import FinishedRun, read_run
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 from su3d_bench.protocols import load_protocol, protocol_names
 from su3d_bench.reports.table_model import NOT_MEASURED, Cell, Origin, Table, TableRow
 from su3d_bench.scoring import combine

@@ -11,9 +11,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from su3d_bench import registry
-from su3d_bench.config import Setting, flatten, parse_value
-from su3d_bench.errors import ConfigError, suggest
+from su3d_bench.core import registry
+from su3d_bench.core.config import Setting, flatten, parse_value
+from su3d_bench.core.errors import ConfigError, suggest
 
 MOST_CHARACTERS = 120  # the name is a folder's name too
 _COMMA_OUTSIDE_BRACKETS = re.compile(r",(?![^\[]*\])")

@@ -11,12 +11,12 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench import registry
+from su3d_bench.core import registry
 from su3d_bench.attribution import EncoderOf
-from su3d_bench.config import Setting, Settings, resolve
-from su3d_bench.errors import Su3dError
+from su3d_bench.core.config import Setting, Settings, resolve
+from su3d_bench.core.errors import Su3dError
 from su3d_bench.finished_run import FinishedRun
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics.labelling import (
     candidate_classes,
     class_index_of_ids,
@@ -26,7 +26,7 @@ from su3d_bench.metrics.labelling import (
 )
 from su3d_bench.metrics.scene_score import present
 from su3d_bench.metrics.score_semantic import has_feature
-from su3d_bench.plain_text import printable, printable_json
+from su3d_bench.core.plain_text import printable, printable_json
 from su3d_bench.planning import data_root, dataset_targets
 from su3d_bench.protocols import ProtocolRules, load_protocol
 from su3d_bench.reports.html_map import (
@@ -44,7 +44,7 @@ from su3d_bench.reports.html_map import (
 from su3d_bench.reports.scene_look import SceneLook, look_at
 from su3d_bench.scene_job import Part, build_dataset
 from su3d_bench.store import read_prediction
-from su3d_bench.types import DenseFeatures, Frame, GroundTruth, Instances, Int64Array, Prediction
+from su3d_bench.core.types import DenseFeatures, Frame, GroundTruth, Instances, Int64Array, Prediction
 
 QUERIES = (
     "somewhere to sit",

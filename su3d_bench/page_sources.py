@@ -11,12 +11,12 @@ from pydantic import BaseModel, Field, ValidationError
 
 from su3d_bench.attribution import EncoderOf, attribute
 from su3d_bench.comparison import SideNumbers, compare
-from su3d_bench.config import KeyPath
-from su3d_bench.errors import StoreError, Su3dError
+from su3d_bench.core.config import KeyPath
+from su3d_bench.core.errors import StoreError, Su3dError
 from su3d_bench.finished_run import FinishedRun, read_run
 from su3d_bench.finished_updates import read_update_times
 from su3d_bench.metrics.semantic import SemanticCounts, concatenate
-from su3d_bench.plain_text import printable, printable_json
+from su3d_bench.core.plain_text import printable, printable_json
 from su3d_bench.protocols import load_protocol
 from su3d_bench.reports.html_data import confusion_cells, series_of, summary_data
 from su3d_bench.store import read_json

@@ -11,15 +11,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from su3d_bench import registry
-from su3d_bench.config import MOVES_NO_NUMBER, RunConfig, Settings, check_keys, check_names, read_assignments, resolve
-from su3d_bench.digests import code_digest, digest_json
+from su3d_bench.core import registry
+from su3d_bench.core.config import MOVES_NO_NUMBER, RunConfig, Settings, check_keys, check_names, read_assignments, resolve
+from su3d_bench.core.digests import code_digest, digest_json
 from su3d_bench.distant_scene import CACHE_ROOT, fetch_seals, mirror_of
-from su3d_bench.errors import ConfigError, DataError, StoreError, suggest
+from su3d_bench.core.errors import ConfigError, DataError, StoreError, suggest
 from su3d_bench.execution import ELSEWHERE, check_execution
-from su3d_bench.interfaces import Dataset
+from su3d_bench.core.interfaces import Dataset
 from su3d_bench.method_names import NamedMethod, named_method
-from su3d_bench.perception.models.devices import device_for
+from su3d_bench.core.devices import device_for
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
 from su3d_bench.protocols import ProtocolRules, load_protocol, protocols_for
 from su3d_bench.questions.truths import has_own_queries

@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
-from su3d_bench.errors import ConfigError, suggest
+from su3d_bench.core.errors import ConfigError, suggest
 
 RULES = Path(__file__).parent / "rules"
 _TABLE_PREFIX = "classes."  # rules/classes.<name>.toml holds a class table, not a protocol

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from su3d_bench.errors import ConfigError
+from su3d_bench.core.errors import ConfigError
 from su3d_bench.remote_folder import RemoteFolder
 from su3d_bench.scene_job import Part, build_dataset
 from su3d_bench.store import make_folder

@@ -15,8 +15,8 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.config import KeyPath, flatten
-from su3d_bench.digests import code_digest, git_state, package_versions
+from su3d_bench.core.config import KeyPath, flatten
+from su3d_bench.core.digests import code_digest, git_state, package_versions
 from su3d_bench.distant_scene import (
     DistantJob,
     failed_distant,
@@ -24,7 +24,7 @@ from su3d_bench.distant_scene import (
     run_distant_scene,
     send_records,
 )
-from su3d_bench.errors import StoreError
+from su3d_bench.core.errors import StoreError
 from su3d_bench.execution import ELSEWHERE, run_units
 from su3d_bench.executors import SCENE_DONE, Event, Report
 from su3d_bench.finished_scenes import FinishedScenes
@@ -36,8 +36,8 @@ from su3d_bench.scene_job import CEILING_METHOD, MethodOutcome, SceneJob
 from su3d_bench.scene_run import failed_outcomes, run_scene
 from su3d_bench.scoring import SceneScore, combine, combined_metrics, unpack_scores
 from su3d_bench.store import SCHEMA, JobFolder, remove_file, write_json, write_text
-from su3d_bench.timing import hardware_line, processor_digest
-from su3d_bench.toml_text import write_toml
+from su3d_bench.core.timing import hardware_line, processor_digest
+from su3d_bench.core.toml_text import write_toml
 
 Scores = Mapping[tuple[str, str], SceneScore]
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from su3d_bench import registry
-from su3d_bench.config import flatten
-from su3d_bench.digests import NUMERIC_PACKAGES, code_digest, package_versions
-from su3d_bench.errors import StoreError
-from su3d_bench.interfaces import Method
+from su3d_bench.core import registry
+from su3d_bench.core.config import flatten
+from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, package_versions
+from su3d_bench.core.errors import StoreError
+from su3d_bench.core.interfaces import Method
 from su3d_bench.store import JobFolder
 
 CEILING_METHOD = "oracle"

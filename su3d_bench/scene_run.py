@@ -14,11 +14,11 @@ from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any
 
-from su3d_bench.errors import GroundTruthMissing, StoreError, Su3dError
+from su3d_bench.core.errors import GroundTruthMissing, StoreError, Su3dError
 from su3d_bench.executors import Report
-from su3d_bench.interfaces import Method, SceneTools
+from su3d_bench.core.interfaces import Method, SceneTools
 from su3d_bench.job_inputs import JobInputs
-from su3d_bench.perception.models.devices import device_for
+from su3d_bench.core.devices import device_for
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
 from su3d_bench.protocols import SHARE_KINDS, ProtocolRules, load_protocol
 from su3d_bench.questions.refined import refined_names
@@ -40,8 +40,8 @@ from su3d_bench.scene_log import SceneLog
 from su3d_bench.scene_tools import FirstFrames, surface_of, true_proposals
 from su3d_bench.scoring import SceneScore, Truth, pack_scores, score_scene, why_not_scorable
 from su3d_bench.store import JobFolder, RunFolder, read_prediction, write_bytes, write_text
-from su3d_bench.timing import device_memory_bytes, peak_memory_bytes, start_memory_watch
-from su3d_bench.types import Frame, GroundTruth, InstanceMesh, Prediction, Proposals, SceneInfo
+from su3d_bench.core.timing import device_memory_bytes, peak_memory_bytes, start_memory_watch
+from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Prediction, Proposals, SceneInfo
 
 
 def run_scene(job: SceneJob, report: Report) -> tuple[MethodOutcome, ...]:

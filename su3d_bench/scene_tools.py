@@ -8,8 +8,8 @@ from typing import Any, overload
 
 import numpy as np
 
-from su3d_bench.errors import DataError
-from su3d_bench.types import Detections, Frame, GroundTruth, PerceptionNeeds, Proposals, Surface
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Detections, Frame, GroundTruth, PerceptionNeeds, Proposals, Surface
 
 
 @dataclass(frozen=True)

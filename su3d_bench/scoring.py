@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.errors import DataError, PredictionError
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.errors import DataError, PredictionError
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.kept_files import DAMAGE, read_arrays
 from su3d_bench.metrics import instance_ap, object_means, semantic, shares, transfer
 from su3d_bench.metrics.count_shapes import check_against, checked_counts
@@ -30,7 +30,7 @@ from su3d_bench.metrics.score_open_vocabulary import NEEDS_FEATURES, score_categ
 from su3d_bench.metrics.score_questions import labels_n, score_annotation, score_reasoning, score_retrieval
 from su3d_bench.metrics.score_semantic import score_semantic
 from su3d_bench.protocols import ProtocolRules
-from su3d_bench.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
+from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
 
 __all__ = ["SceneScore", "Truth", "combine", "pack_scores", "score_scene", "unpack_scores", "why_not_scorable"]
 

@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from su3d_bench.types import Float64Array, Int64Array
+from su3d_bench.core.types import Float64Array, Int64Array
 
 N_RESAMPLES = 1000
 SEED = 0

@@ -23,11 +23,11 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.digests import digest_file
-from su3d_bench.errors import PredictionError, StoreError
+from su3d_bench.core.digests import digest_file
+from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.kept_files import DAMAGE, read_arrays
 from su3d_bench.row_blocks import row_blocks
-from su3d_bench.types import DenseFeatures, Instances, Partition, Prediction
+from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
 
 SCHEMA = 1
 ROWS_AT_ONCE = 8192  # 16 MB of half precision at 1024 dimensions

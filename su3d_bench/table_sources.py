@@ -12,10 +12,10 @@ from typing import Annotated
 from pydantic import BaseModel, Field, ValidationError
 
 from su3d_bench.comparison_sides import Side, refuse_unlike, rules_of
-from su3d_bench.errors import ConfigError, StoreError, Su3dError, suggest
+from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, suggest
 from su3d_bench.finished_run import FinishedRun, read_run
 from su3d_bench.metrics.results import ProtocolResult
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 from su3d_bench.reports.latex import PrintedCell, printed_cells
 from su3d_bench.reports.measured import BY_PEOPLE, Measured
 from su3d_bench.reports.table_model import Origin, is_count

@@ -10,7 +10,7 @@ from contextlib import suppress
 from pathlib import Path
 from types import TracebackType
 
-from su3d_bench.errors import StoreError
+from su3d_bench.core.errors import StoreError
 
 HELD = ".held"  # a file in each folder that its process keeps locked; the lock ends with the process
 

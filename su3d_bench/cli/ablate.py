@@ -7,7 +7,7 @@ from typing import Any
 
 from su3d_bench.cli.flags import add_verb, remark
 from su3d_bench.cli.run import add_run_flags, carry_out, plan_of, show_plan
-from su3d_bench.errors import EXIT_DONE
+from su3d_bench.core.errors import EXIT_DONE
 
 
 def add_parser(verbs: Any) -> None:
@@ -35,7 +35,7 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench import registry
+    from su3d_bench.core import registry
     from su3d_bench.ablation import ablation_rows, write_rows
 
     rows = ablation_rows(arguments.method, arguments.vary, is_grid=arguments.grid)

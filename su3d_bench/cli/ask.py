@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 from su3d_bench.cli.flags import add_verb, add_whose_map, answer, answer_json, remark
 from su3d_bench.cli.language_flags import add_language_flags, chat_client, language_config
 from su3d_bench.cli.query import latest_run, no_map
-from su3d_bench.errors import EXIT_DONE, ConfigError, PredictionError, StoreError
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from su3d_bench.reasoning.answers import Answer
     from su3d_bench.reasoning.scene_map import SceneMap
     from su3d_bench.store import JobFolder, RunFolder
-    from su3d_bench.types import Instances
+    from su3d_bench.core.types import Instances
 
 SOLVERS = ("built-in", "llm")
 NAMES = ("auto", "label", "refined")
@@ -100,7 +100,7 @@ def _run_of(arguments: argparse.Namespace) -> RunFolder:
 
 def _map(run: RunFolder, arguments: argparse.Namespace) -> Instances:
     from su3d_bench.store import read_prediction
-    from su3d_bench.types import Instances
+    from su3d_bench.core.types import Instances
 
     job = run.job(arguments.scene, arguments.method)
     if not job.prediction.is_file():

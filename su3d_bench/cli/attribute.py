@@ -8,7 +8,7 @@ from typing import Any
 
 from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
 from su3d_bench.cli.query import encoder_of
-from su3d_bench.errors import EXIT_DONE
+from su3d_bench.core.errors import EXIT_DONE
 
 
 def add_parser(verbs: Any) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
-from su3d_bench.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
+from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
     from su3d_bench.gate_findings import Verdict

@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from su3d_bench.cli.flags import add_verb, answer, answer_json
-from su3d_bench.errors import EXIT_DONE
+from su3d_bench.core.errors import EXIT_DONE
 
 
 def add_parser(verbs: Any) -> None:

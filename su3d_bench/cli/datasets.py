@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.cli.flags import add_group, add_settings, add_verb, answer, answer_json
-from su3d_bench.errors import EXIT_DONE, DataError, Su3dError
+from su3d_bench.core.errors import EXIT_DONE, DataError, Su3dError
 
 LAYOUTS = ("native", "replica", "scannet", "scannet-python", "scannet-cpp", "tum")
 MAX_LISTED = 40
@@ -108,7 +108,7 @@ def _add_make(actions: Any) -> None:
 
 
 def call_list(arguments: argparse.Namespace) -> int:
-    from su3d_bench import registry
+    from su3d_bench.core import registry
 
     root = data_root()
     rows = [_row(name, registry.load("dataset", name), root) for name in registry.names("dataset")]

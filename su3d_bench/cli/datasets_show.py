@@ -9,9 +9,9 @@ from pathlib import Path
 from su3d_bench.cli.datasets_check import chosen_scenes
 from su3d_bench.cli.flags import answer, answer_json
 from su3d_bench.cli.progress import progress
-from su3d_bench.errors import EXIT_DONE, ConfigError
+from su3d_bench.core.errors import EXIT_DONE, ConfigError
 from su3d_bench.executors import Event
-from su3d_bench.plain_text import printable, printable_json
+from su3d_bench.core.plain_text import printable, printable_json
 from su3d_bench.reports.scene_look import look_at
 from su3d_bench.reports.scene_picture import draw_scene_picture, facts_line
 

@@ -11,11 +11,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
-from su3d_bench.errors import EXIT_DONE, ConfigError, PredictionError, suggest
-from su3d_bench.plain_text import printable
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, suggest
+from su3d_bench.core.plain_text import printable
 
 if TYPE_CHECKING:
-    from su3d_bench.interfaces import Encoder
+    from su3d_bench.core.interfaces import Encoder
     from su3d_bench.predictions.base import Content, Reader
     from su3d_bench.predictions.export import LabelledMasks
     from su3d_bench.protocols import ProtocolRules
@@ -107,7 +107,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 def _partial_remark(run: Path | None) -> tuple[str, ...]:
     """That a map is of the first frames only, where its run was limited."""
-    from su3d_bench.config import RunConfig, read_file, resolve
+    from su3d_bench.core.config import RunConfig, read_file, resolve
 
     limit = 0 if run is None else resolve(read_file(run / "run.toml"), (), RunConfig).limit
     return (f"partial: the map is of the first {limit} updates of the scene",) if limit else ()
@@ -149,7 +149,7 @@ def sources_of(path: Path, format: str | None, method: str | None) -> list[Sourc
 
 def _only_method(found: Mapping[str, Sequence[Path]]) -> str | None:
     """The one method that a run was asked for; the ceiling that comes with it is not meant."""
-    from su3d_bench.config import RunConfig, read_file, resolve
+    from su3d_bench.core.config import RunConfig, read_file, resolve
     from su3d_bench.scene_job import CEILING_METHOD
 
     run = _run_of(next(iter(found.values()))[0])
@@ -229,9 +229,9 @@ def _labelled(content: Content, source: Source, arguments: argparse.Namespace) -
 
 def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
     """The dataset and the scene of a prediction, with the options of the run that it lies in."""
-    from su3d_bench import registry
+    from su3d_bench.core import registry
     from su3d_bench.cli.datasets_check import chosen_scenes
-    from su3d_bench.config import RunConfig, read_file, resolve
+    from su3d_bench.core.config import RunConfig, read_file, resolve
     from su3d_bench.planning import data_root, dataset_targets
     from su3d_bench.scene_job import Part, build_dataset
 

@@ -33,8 +33,8 @@ def add_language_flags(parser: argparse.ArgumentParser) -> None:
 
 def language_config(arguments: argparse.Namespace) -> LanguageConfig:
     """The settings of the file, then ``--set``, then the flags; keys of other sections are left to other verbs."""
-    from su3d_bench.config import Setting, Settings, read_assignments, read_file, resolve
-    from su3d_bench.errors import ConfigError
+    from su3d_bench.core.config import Setting, Settings, read_assignments, read_file, resolve
+    from su3d_bench.core.errors import ConfigError
     from su3d_bench.perception.language.config import LanguageConfig
 
     settings = Settings() if arguments.config is None else read_file(arguments.config)

@@ -23,7 +23,7 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench import registry
+    from su3d_bench.core import registry
 
     if arguments.name is not None:
         return _show(arguments)
@@ -59,10 +59,10 @@ def _summary(method: Any) -> str:
 
 
 def _show(arguments: argparse.Namespace) -> int:
-    from su3d_bench import registry
-    from su3d_bench.config import flatten
+    from su3d_bench.core import registry
+    from su3d_bench.core.config import flatten
     from su3d_bench.reports.published import figures_of
-    from su3d_bench.toml_text import write_toml
+    from su3d_bench.core.toml_text import write_toml
 
     method = registry.load("method", arguments.name)
     defaults = method.Config().model_dump(mode="json")

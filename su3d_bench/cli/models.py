@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.flags import add_group, add_settings, add_verb, answer, answer_json, remark
-from su3d_bench.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
+from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
     from su3d_bench.perception.config import PerceptionConfig
@@ -83,7 +83,7 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
 
 
 def _perception_config(arguments: argparse.Namespace) -> PerceptionConfig:
-    from su3d_bench.config import Setting, Settings, read_assignments, resolve
+    from su3d_bench.core.config import Setting, Settings, read_assignments, resolve
     from su3d_bench.perception.config import PerceptionConfig
 
     settings = read_assignments(arguments.set, (), ())
@@ -216,7 +216,7 @@ def call_warm(arguments: argparse.Namespace) -> int:
 
 
 def _warm(arguments: argparse.Namespace) -> WarmUp:
-    from su3d_bench.perception.models.devices import device_for
+    from su3d_bench.core.devices import device_for
     from su3d_bench.perception.models.inspection import warm_encoder, warm_perception, warm_scene
     from su3d_bench.perception.models.loading import load_encoder
 

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.flags import add_verb, answer, answer_json
-from su3d_bench.errors import ConfigError, suggest
+from su3d_bench.core.errors import ConfigError, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.protocols import ProtocolRules
@@ -60,9 +60,9 @@ def call(arguments: argparse.Namespace) -> int:
 
 def _rules_text(rules: ProtocolRules, file: Path) -> str:
     """Every rule as a line, beneath it what the protocol's file says of it: its source, or that it is ours."""
-    from su3d_bench.config import flatten
+    from su3d_bench.core.config import flatten
     from su3d_bench.protocols import not_comparable_with
-    from su3d_bench.toml_text import toml_value
+    from su3d_bench.core.toml_text import toml_value
 
     remarks = read_remarks(file)
     shown = rules.model_dump(mode="json", exclude={"classes"}) | {"not_comparable_with": not_comparable_with(rules)}

@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.flags import add_verb, add_whose_map, answer, answer_json, remark
-from su3d_bench.errors import ConfigError, PredictionError, StoreError, suggest
+from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, suggest
 
 if TYPE_CHECKING:
-    from su3d_bench.interfaces import Encoder
+    from su3d_bench.core.interfaces import Encoder
     from su3d_bench.opensu3d.retrieval import Ranking
     from su3d_bench.store import RunFolder
-    from su3d_bench.types import Instances
+    from su3d_bench.core.types import Instances
 
 
 def add_parser(verbs: Any) -> None:
@@ -44,7 +44,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.opensu3d.retrieval import rank
     from su3d_bench.reports.pictures import draw_heat_map
     from su3d_bench.store import RunFolder, read_prediction
-    from su3d_bench.types import DenseFeatures, Instances
+    from su3d_bench.core.types import DenseFeatures, Instances
 
     if arguments.top < 1:
         raise ConfigError(f"--top {arguments.top}: at least 1 instance must be listed")
@@ -120,7 +120,7 @@ def no_map(run: RunFolder, scene: str, method: str) -> StoreError:
 
 def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
     """The text tower that the run's features go with, on ``device``; another one is an error, never a wrong ranking."""
-    from su3d_bench.config import read_file, resolve
+    from su3d_bench.core.config import read_file, resolve
     from su3d_bench.perception.cache import FrameCache
     from su3d_bench.perception.config import PerceptionConfig
     from su3d_bench.perception.embedded_encoder import EmbeddedEncoder

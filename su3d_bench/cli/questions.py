@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
-from su3d_bench.errors import EXIT_DONE, ConfigError, suggest
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.questions.model import Question
@@ -98,7 +98,7 @@ def _made(arguments: argparse.Namespace) -> list[Question]:
 
 
 def _part(target: str, part_class: Any) -> Any:
-    from su3d_bench import registry
+    from su3d_bench.core import registry
 
     dataset_class = registry.load("dataset", target)
     return part_class(target, str(dataset_class.name), dataset_class.Options().model_dump_json())
@@ -135,7 +135,7 @@ def _row(one: Question) -> dict[str, Any]:
 
 
 def _printable_row(one: Question) -> tuple[str, ...]:
-    from su3d_bench.plain_text import printable
+    from su3d_bench.core.plain_text import printable
 
     ids = "unknown" if one.answers is None else " ".join(map(str, one.answers))
     return printable(one.scene, 60), one.kind, printable(one.text, MOST_CHARACTERS), f"-> {ids}"

@@ -9,13 +9,13 @@ from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
 from su3d_bench.cli.language_flags import add_language_flags, chat_client, language_config
-from su3d_bench.errors import EXIT_DONE, ConfigError, PredictionError, StoreError, suggest
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.perception.language.refined_names import NameRecords
     from su3d_bench.perception.language.refinement import RefinedName, TopNames
     from su3d_bench.store import JobFolder, RunFolder
-    from su3d_bench.types import Instances
+    from su3d_bench.core.types import Instances
 
 REFINERS = ("vote", "model")
 
@@ -89,7 +89,7 @@ def _jobs(arguments: argparse.Namespace) -> dict[str, JobFolder]:
 
 def _scenes(run: RunFolder) -> list[str]:
     """The scenes that the run was asked for."""
-    from su3d_bench.plain_text import printable
+    from su3d_bench.core.plain_text import printable
     from su3d_bench.store import read_json
 
     record = read_json(run.path / "run.json")
@@ -101,7 +101,7 @@ def _scenes(run: RunFolder) -> list[str]:
 
 def _map(job: JobFolder) -> Instances:
     from su3d_bench.store import read_prediction
-    from su3d_bench.types import Instances
+    from su3d_bench.core.types import Instances
 
     prediction = read_prediction(job.prediction)
     if not isinstance(prediction, Instances) or prediction.view_names is None:

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
-from su3d_bench.errors import EXIT_DONE, ConfigError
+from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
 NAME = "html"
 MEGABYTE = 10**6
@@ -46,7 +46,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.cli.query import encoder_of
     from su3d_bench.page_maps import MOST_POINTS, QUERIES, page_scenes, points_of_each
     from su3d_bench.page_sources import page_numbers, scored_maps
-    from su3d_bench.plain_text import printable
+    from su3d_bench.core.plain_text import printable
     from su3d_bench.reports.html_page import page_html
     from su3d_bench.store import make_folder, write_text
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
-from su3d_bench.errors import EXIT_DONE
+from su3d_bench.core.errors import EXIT_DONE
 
 NAME = "leaderboard"
 FORMATS = ("markdown", "latex", "csv", "html")

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.flags import add_verb, answer, remark
-from su3d_bench.errors import EXIT_DONE
+from su3d_bench.core.errors import EXIT_DONE
 
 if TYPE_CHECKING:
     from su3d_bench.reports.table_model import Table

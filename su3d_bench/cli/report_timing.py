@@ -39,7 +39,7 @@ def add_parser(actions: Any) -> None:
 def call(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from su3d_bench.errors import ConfigError
+    from su3d_bench.core.errors import ConfigError
     from su3d_bench.finished_run import read_run
     from su3d_bench.reports.timing_tables import csv_text, markdown, methods_csv
     from su3d_bench.update_times import summarise

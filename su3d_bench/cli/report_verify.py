@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.cli.flags import add_verb, answer, answer_json
-from su3d_bench.errors import EXIT_CHECK_FAILED, EXIT_DONE
+from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE
 
 NAME = "verify"
 

@@ -8,10 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.flags import add_settings, add_verb, answer, answer_json, remark
-from su3d_bench.errors import EXIT_DONE, EXIT_INCOMPLETE
+from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE
 
 if TYPE_CHECKING:
-    from su3d_bench.config import KeyPath, Settings
+    from su3d_bench.core.config import KeyPath, Settings
     from su3d_bench.planning import Plan
     from su3d_bench.runner import RunResult
 
@@ -129,7 +129,7 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
 
 def settings_of(arguments: argparse.Namespace) -> Settings:
     """The file's settings, then those of the flags, which win."""
-    from su3d_bench.config import Setting, Settings, read_file
+    from su3d_bench.core.config import Setting, Settings, read_file
 
     settings = Settings() if arguments.config is None else read_file(arguments.config)
     flags: list[tuple[KeyPath, Any]] = [((name,), getattr(arguments, name)) for name in FLAGS_OF_KEYS]

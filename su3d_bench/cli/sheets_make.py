@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
 from su3d_bench.cli.language_flags import add_language_flags, chat_client, language_config
-from su3d_bench.errors import EXIT_DONE, ConfigError
+from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from su3d_bench.interfaces import Encoder
+    from su3d_bench.core.interfaces import Encoder
     from su3d_bench.perception.language.chat import ChatRequest
     from su3d_bench.questions.model import Question
     from su3d_bench.sheets.drafts import Draft

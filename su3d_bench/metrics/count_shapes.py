@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.metrics.instance_ap import InstanceCounts
 from su3d_bench.metrics.object_means import ObjectCounts
 from su3d_bench.metrics.results import Counts

@@ -8,7 +8,7 @@ import numpy as np
 
 from su3d_bench.metrics import instance_ap, transfer
 from su3d_bench.protocols import TransferRules
-from su3d_bench.types import GroundTruth, Instances, Int64Array, Partition
+from su3d_bench.core.types import GroundTruth, Instances, Int64Array, Partition
 
 NO_OBJECT = 0
 

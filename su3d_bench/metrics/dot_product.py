@@ -12,7 +12,7 @@ import math
 
 import numpy as np
 
-from su3d_bench.types import Float64Array
+from su3d_bench.core.types import Float64Array
 
 _SPLITTER = 134217729.0  # 2**27 + 1: Veltkamp's constant, cuts a double into two halves of 26 bits
 

@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from su3d_bench.errors import PredictionError
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.protocols import ProtocolRules
 from su3d_bench.row_blocks import row_blocks
-from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int64Array, Prediction
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, Prediction
 
 CPU = "cpu"
 _BLOCK_ROWS = 8192  # 34 MB of float64 at 512 dimensions, whatever the size of the map

@@ -11,11 +11,11 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.metrics import instance_ap
 from su3d_bench.metrics.instance_ap import InstanceCounts
 from su3d_bench.metrics.transfer import Masks
-from su3d_bench.types import Float32Array, Float64Array, Int64Array
+from su3d_bench.core.types import Float32Array, Float64Array, Int64Array
 
 SPACE = "queries"
 _SMALLEST_RANGE = 1e-8  # openlex3d's floor of the range over which similarities are stretched

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from su3d_bench.interfaces import Encoder
-from su3d_bench.types import GroundTruth, Instances, Int64Array
+from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.types import GroundTruth, Instances, Int64Array
 
 
 @dataclass(frozen=True)

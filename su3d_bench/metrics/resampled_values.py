@@ -16,7 +16,7 @@ from su3d_bench.metrics.labelling import scored_classes
 from su3d_bench.metrics.results import CURVE_KINDS, Counts
 from su3d_bench.metrics.semantic import SemanticCounts
 from su3d_bench.protocols import SHARE_KINDS, ProtocolRules
-from su3d_bench.types import Float64Array, Int64Array
+from su3d_bench.core.types import Float64Array, Int64Array
 
 
 def class_columns(rules: ProtocolRules) -> tuple[str, ...]:

@@ -12,7 +12,7 @@ import numpy as np
 from su3d_bench.metrics.instance_ap import THRESHOLDS, InstanceCounts, ap_columns
 from su3d_bench.metrics.precision_recall import MANY_ROWS
 from su3d_bench.metrics.semantic import SemanticCounts
-from su3d_bench.types import BoolArray, Float64Array, Int64Array
+from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 
 AT_ONCE = 64  # resamples that go through the rows side by side: their counts stay in the nearest cache
 _MAX_CELLS = 4_000_000  # of a (resamples, rows) block: 32 MB of float64

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.metrics.results import Counts
-from su3d_bench.types import BoolArray, Instances, Int64Array, Prediction
+from su3d_bench.core.types import BoolArray, Instances, Int64Array, Prediction
 
 
 @dataclass(frozen=True)

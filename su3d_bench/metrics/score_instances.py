@@ -8,8 +8,8 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.errors import DataError
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics import instance_ap, transfer
 from su3d_bench.metrics.labelling import (
     candidate_classes,
@@ -21,7 +21,7 @@ from su3d_bench.metrics.labelling import (
 from su3d_bench.metrics.results import Counts
 from su3d_bench.metrics.scene_score import SceneScore, n_predictions, present
 from su3d_bench.protocols import ProtocolRules
-from su3d_bench.types import BoolArray, Float64Array, GroundTruth, Instances, Int64Array, Partition
+from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Instances, Int64Array, Partition
 
 IntArray = NDArray[np.integer[Any]]
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.errors import PredictionError
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.geometry import voxel_coordinates
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics import object_means, openlex3d, query_ap, transfer
 from su3d_bench.metrics.labelling import cosines, device_of, encoder_warning, has_every_label, text_features
 from su3d_bench.metrics.neighbours import transfer_each_mask
@@ -21,7 +21,7 @@ from su3d_bench.metrics.score_instances import score_of_masks
 from su3d_bench.metrics.score_semantic import has_feature
 from su3d_bench.protocols import ProtocolRules
 from su3d_bench.row_blocks import release_pages
-from su3d_bench.types import DenseFeatures, Float32Array, Float64Array, Instances, Int64Array, Partition, Prediction
+from su3d_bench.core.types import DenseFeatures, Float32Array, Float64Array, Instances, Int64Array, Partition, Prediction
 
 NEEDS_FEATURES = "needs features to compare with texts, and the prediction has none"
 _BLOCK_UNITS = 2048  # 2048 units x 3407 prompts of float64 are 56 MB

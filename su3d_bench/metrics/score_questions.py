@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from su3d_bench.errors import PredictionError
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics import transfer
 from su3d_bench.metrics.covered_objects import NO_OBJECT, Covered, covered_objects
 from su3d_bench.metrics.labelling import cosines, device_of, encoder_warning, text_features
@@ -23,7 +23,7 @@ from su3d_bench.metrics.scene_score import SceneScore, n_predictions
 from su3d_bench.metrics.score_instances import score_of_masks
 from su3d_bench.metrics.shares import ShareCounts
 from su3d_bench.protocols import VALUES_OF_METRIC, AnswerRules, MergeRules, ProtocolRules
-from su3d_bench.types import BoolArray, GroundTruth, Instances, Int64Array, Partition
+from su3d_bench.core.types import BoolArray, GroundTruth, Instances, Int64Array, Partition
 
 WELL_MERGED, UNDER_MERGED, OVER_MERGED = "well-merged", "under-merged", "over-merged"
 

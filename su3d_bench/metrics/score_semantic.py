@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics import neighbours, semantic, transfer
 from su3d_bench.metrics.labelling import (
     candidate_classes,
@@ -16,7 +16,7 @@ from su3d_bench.metrics.labelling import (
 from su3d_bench.metrics.scene_score import SceneScore, n_predictions, present
 from su3d_bench.protocols import ProtocolRules
 from su3d_bench.row_blocks import row_blocks
-from su3d_bench.types import BoolArray, DenseFeatures, Float64Array, GroundTruth, Int64Array, Partition, Prediction
+from su3d_bench.core.types import BoolArray, DenseFeatures, Float64Array, GroundTruth, Int64Array, Partition, Prediction
 
 
 def score_semantic(

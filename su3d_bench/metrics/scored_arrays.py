@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics import neighbours, transfer
 from su3d_bench.metrics.attribution_semantic import LabelledPoints
 from su3d_bench.metrics.labelling import (
@@ -23,16 +23,7 @@ from su3d_bench.metrics.scene_score import present
 from su3d_bench.metrics.score_instances import masks_and_scores, truth_and_labels
 from su3d_bench.metrics.score_semantic import counted_classes, point_owners, points_and_owners, taking_part
 from su3d_bench.protocols import ProtocolRules
-from su3d_bench.types import (
-    BoolArray,
-    DenseFeatures,
-    Float64Array,
-    GroundTruth,
-    Instances,
-    Int64Array,
-    Partition,
-    Prediction,
-)
+from su3d_bench.core.types import BoolArray, DenseFeatures, Float64Array, GroundTruth, Instances, Int64Array, Partition, Prediction
 
 
 def scored_masks(

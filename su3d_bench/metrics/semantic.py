@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.types import BoolArray, Float64Array, Int64Array
+from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 
 IntArray = NDArray[np.integer[Any]]
 

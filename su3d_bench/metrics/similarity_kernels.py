@@ -9,7 +9,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from su3d_bench.types import Float64Array, Int64Array
+from su3d_bench.core.types import Float64Array, Int64Array
 
 # Sums of 4096 products of unit vectors differ between two orders by less than 1e-12; 1e-9 leaves room.
 SURE_GAP = 1e-9

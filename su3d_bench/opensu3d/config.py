@@ -10,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from su3d_bench.types import PerceptionNeeds
+from su3d_bench.core.types import PerceptionNeeds
 
 MultiScale = Literal["direct", "weighted"]
 MultiView = Literal["direct", "global"]

@@ -13,9 +13,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.opensu3d.voxel_map import checked_points, doubled
-from su3d_bench.types import Float64Array, Int32Array, Int64Array
+from su3d_bench.core.types import Float64Array, Int32Array, Int64Array
 
 ABSENT = -1
 VOXELS = 512  # of a block

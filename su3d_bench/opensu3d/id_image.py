@@ -8,7 +8,7 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.types import BoolArray, Int32Array, Int64Array
+from su3d_bench.core.types import BoolArray, Int32Array, Int64Array
 
 NO_DETECTION = -1
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.errors import PredictionError
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.opensu3d.feature_fusion import cosine
-from su3d_bench.types import Float64Array, Instances, Int64Array
+from su3d_bench.core.types import Float64Array, Instances, Int64Array
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.errors import DataError
-from su3d_bench.types import Float64Array, Int32Array, Int64Array
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Float64Array, Int32Array, Int64Array
 
 NO_INSTANCE = 0
 # Voxel coordinates are exact integers far beyond this; a coordinate above it is a pose in the wrong unit.

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from su3d_bench.types import BoolArray, Float32Array, Int64Array, UInt8Array
+from su3d_bench.core.types import BoolArray, Float32Array, Int64Array, UInt8Array
 
 
 def mask_boxes(masks: BoolArray) -> Float32Array:

@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.errors import DataError, ModelMissing
+from su3d_bench.core.errors import DataError, ModelMissing
 from su3d_bench.perception.embedded_text import TOKENIZER_VERSION, token_ids
-from su3d_bench.types import Float32Array, UInt8Array
+from su3d_bench.core.types import Float32Array, UInt8Array
 
 IMAGE_SIZE = 64
 DIM = 128

@@ -12,7 +12,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from su3d_bench.types import Int64Array
+from su3d_bench.core.types import Int64Array
 
 N_WORDS = 16
 N_GRAMS = 8

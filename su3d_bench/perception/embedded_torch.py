@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from su3d_bench.perception.models.devices import make_deterministic, require
-from su3d_bench.types import Float32Array
+from su3d_bench.core.devices import make_deterministic, require
+from su3d_bench.core.types import Float32Array
 
 if TYPE_CHECKING:
     from torch import nn

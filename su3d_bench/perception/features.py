@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.digests import package_digest
-from su3d_bench.interfaces import Encoder, StageTimer
+from su3d_bench.core.digests import package_digest
+from su3d_bench.core.interfaces import Encoder, StageTimer
 from su3d_bench.perception.cache import CachedRows, FrameCache, array_digest, content_key
 from su3d_bench.perception.crops import crop_images
-from su3d_bench.types import Float32Array, Frame, PerceptionNeeds
+from su3d_bench.core.types import Float32Array, Frame, PerceptionNeeds
 
 
 def regions_to_keep(

@@ -8,9 +8,9 @@ from importlib.resources import files
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.cache import content_key
-from su3d_bench.types import BoolArray, Float32Array, Float64Array, UInt8Array
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, UInt8Array
 
 # Colour words with the sRGB value that each stands for; chosen to be far apart in CIELAB.
 COLOURS: tuple[tuple[str, tuple[int, int, int]], ...] = (

@@ -8,11 +8,11 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.compiled_open3d import compiled_open3d
-from su3d_bench.digests import package_digest
+from su3d_bench.core.digests import package_digest
 from su3d_bench.perception.cache import array_digest, content_key
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.oracle_noise import OracleNoise, disturb
-from su3d_bench.types import Float32Array, Frame, InstanceMesh, Int32Array, Regions
+from su3d_bench.core.types import Float32Array, Frame, InstanceMesh, Int32Array, Regions
 
 if TYPE_CHECKING:
     import open3d

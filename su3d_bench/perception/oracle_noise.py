@@ -7,7 +7,7 @@ import math
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.types import BoolArray, UInt8Array
+from su3d_bench.core.types import BoolArray, UInt8Array
 
 
 class OracleNoise(BaseModel):

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from su3d_bench.errors import ConfigError, suggest
-from su3d_bench.interfaces import Encoder, RegionPerception, Segmenter, StageTimer
+from su3d_bench.core.errors import ConfigError, suggest
+from su3d_bench.core.interfaces import Encoder, RegionPerception, Segmenter, StageTimer
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.config import PerceptionConfig
 from su3d_bench.perception.crops import crop_images
@@ -24,7 +24,7 @@ from su3d_bench.perception.models.grounded_sam import (
 )
 from su3d_bench.perception.naming import scene_caption
 from su3d_bench.perception.regions import cached_regions
-from su3d_bench.types import Detections, Frame, PerceptionNeeds, Regions
+from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, Regions
 
 # What of the language model's settings moves a caption; times, prices and limits do not.
 MOVES_CAPTIONS = {"vision_model", "temperature", "seed", "max_answer_tokens", "image_detail", "max_image_px"}

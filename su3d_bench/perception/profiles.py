@@ -5,15 +5,15 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Protocol
 
-from su3d_bench.errors import ConfigError, suggest
-from su3d_bench.interfaces import Encoder, RegionPerception, StageTimer
+from su3d_bench.core.errors import ConfigError, suggest
+from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.config import PerceptionConfig
 from su3d_bench.perception.models.config import EMBEDDED
 from su3d_bench.perception.profile_embedded import CAMERA_CAVEAT, EmbeddedPerception
 from su3d_bench.perception.profile_oracle import ORACLE_CAVEAT, OraclePerception
 from su3d_bench.perception.profile_stored import STORED_CAVEAT, LabelImagePerception, StoredPerception
-from su3d_bench.types import Detections, Frame, ImageDomain, InstanceMesh, PerceptionNeeds, SceneInfo
+from su3d_bench.core.types import Detections, Frame, ImageDomain, InstanceMesh, PerceptionNeeds, SceneInfo
 
 __all__ = [
     "CAMERA_CAVEAT",

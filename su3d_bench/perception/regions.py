@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.interfaces import Encoder, Segmenter, StageTimer
+from su3d_bench.core.interfaces import Encoder, Segmenter, StageTimer
 from su3d_bench.perception.cache import FrameCache, content_key, pack_masks, unpack_masks
-from su3d_bench.timing import Timer
-from su3d_bench.types import BoolArray, Float32Array, Frame, Int64Array, Regions
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import BoolArray, Float32Array, Frame, Int64Array, Regions
 
 
 def cached_regions(

@@ -6,14 +6,14 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.digests import package_digest
+from su3d_bench.core.digests import package_digest
 from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.segmenter_config import SegmenterConfig
 from su3d_bench.perception.segmenter_graph import Graph
 from su3d_bench.perception.segmenter_pixels import superpixels
 from su3d_bench.perception.segmenter_rules import join_objects, region_quality, take_out_structure
-from su3d_bench.types import BoolArray, Float64Array, Frame, Int32Array, Regions
+from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int32Array, Regions
 
 __all__ = ["RgbdSegmenter", "SegmenterConfig"]
 

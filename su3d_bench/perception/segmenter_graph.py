@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.types import BoolArray, Float32Array, Float64Array, Int32Array
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array
 
 IndexArray = NDArray[np.intp]
 

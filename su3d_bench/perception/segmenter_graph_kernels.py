@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.kernels import njit
-from su3d_bench.types import Float32Array, Float64Array, Int32Array, Int64Array
+from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array
 
 
 @njit(cache=True)

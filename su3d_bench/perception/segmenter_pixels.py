@@ -6,7 +6,7 @@ import numpy as np
 
 from su3d_bench.perception.segmenter_config import SegmenterConfig
 from su3d_bench.perception.segmenter_graph import Graph, Pieces, measure_borders
-from su3d_bench.types import Float32Array, Float64Array, Frame, Int32Array, UInt8Array
+from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, UInt8Array
 
 
 def superpixels(frame: Frame, config: SegmenterConfig) -> tuple[Int32Array, Graph]:

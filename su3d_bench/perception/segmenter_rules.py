@@ -8,7 +8,7 @@ import numpy as np
 
 from su3d_bench.perception.segmenter_config import JoinWeights, SegmenterConfig
 from su3d_bench.perception.segmenter_graph import Graph, IndexArray, Pieces, contract, merge_cheapest
-from su3d_bench.types import BoolArray, Float64Array
+from su3d_bench.core.types import BoolArray, Float64Array
 
 
 def join_surfaces(graph: Graph, config: SegmenterConfig, is_apart: BoolArray | None = None) -> Graph:

@@ -23,11 +23,11 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, model_validator
 
-from su3d_bench.errors import DataError
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.kept_files import DAMAGE, read_arrays
 from su3d_bench.perception.naming import scene_caption
-from su3d_bench.types import Detections, Float32Array, Frame, Regions
+from su3d_bench.core.types import Detections, Float32Array, Frame, Regions
 
 _REQUIRED = ("image_size", "masks", "boxes", "scores", "names")
 _FEATURES = ("crop_ratios", "crop_features", "global_feature", "encoder")

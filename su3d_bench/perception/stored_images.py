@@ -18,8 +18,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.errors import ConfigError, DataError
-from su3d_bench.types import BoolArray, Float32Array, Frame, SceneInfo
+from su3d_bench.core.errors import ConfigError, DataError
+from su3d_bench.core.types import BoolArray, Float32Array, Frame, SceneInfo
 
 INDEX = "{index}"
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"

@@ -18,7 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from su3d_bench.errors import ModelMissing, Su3dError
+from su3d_bench.core.errors import ModelMissing, Su3dError
 from su3d_bench.perception.embedded_encoder import DIM, IMAGE_FILE, TEXT_FILE, EmbeddedEncoder
 from su3d_bench.perception.training_crops import FIRST_HELD_OUT_NUMBER, FIRST_TRAINING_NUMBER, make_crops, room_names
 from su3d_bench.perception.training_evaluation import Figure, measure

@@ -12,12 +12,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from su3d_bench import registry
+from su3d_bench.core import registry
 from su3d_bench.perception.captions import CropTruth, Neighbour
 from su3d_bench.perception.crops import crop_window
 from su3d_bench.perception.embedded_encoder import IMAGE_SIZE, log_size, shrink
 from su3d_bench.perception.segmenter import RgbdSegmenter, SegmenterConfig
-from su3d_bench.types import Float32Array, Frame, Int32Array, Int64Array, Regions, UInt8Array
+from su3d_bench.core.types import Float32Array, Frame, Int32Array, Int64Array, Regions, UInt8Array
 
 KINDS = ("living", "bedroom", "kitchen", "office", "bathroom", "studio")
 FIRST_TRAINING_NUMBER = 10000

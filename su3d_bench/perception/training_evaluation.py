@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.captions import Caption, CropTruth, class_words, fill, fixed_captions
 from su3d_bench.perception.captions_lexicon import ROOM_NAMES, SURFACES
 from su3d_bench.perception.training_crops import CropSet
-from su3d_bench.types import BoolArray, Float32Array, Int64Array
+from su3d_bench.core.types import BoolArray, Float32Array, Int64Array
 
 PROMPTS = ("an image of {a}", "{a} in a scene", "{}")
 MIN_POSITIVES = 3

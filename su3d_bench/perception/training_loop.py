@@ -26,7 +26,7 @@ from su3d_bench.perception.embedded_text import PADDING, token_ids
 from su3d_bench.perception.training_crops import CropSet
 from su3d_bench.perception.training_model import ImageTower, TextTower
 from su3d_bench.perception.training_targets import TruthTable
-from su3d_bench.types import Float32Array, Int64Array, UInt8Array
+from su3d_bench.core.types import Float32Array, Int64Array, UInt8Array
 
 logger = logging.getLogger(__name__)
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.perception.captions import Caption, CropTruth
-from su3d_bench.types import BoolArray, Float32Array
+from su3d_bench.core.types import BoolArray, Float32Array
 
 Names = dict[str, int]
 

@@ -9,9 +9,9 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from su3d_bench.errors import PredictionError
-from su3d_bench.plain_text import printable
-from su3d_bench.types import DenseFeatures, Float32Array, Float64Array, Instances, Int32Array, Int64Array, Partition
+from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.plain_text import printable
+from su3d_bench.core.types import DenseFeatures, Float32Array, Float64Array, Instances, Int32Array, Int64Array, Partition
 
 Numbering = Literal["id", "index"]
 MOST_POINTS = 100_000_000  # points of one scene; the largest scans of rooms have some millions

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.errors import DataError, PredictionError
-from su3d_bench.plain_text import printable
+from su3d_bench.core.errors import DataError, PredictionError
+from su3d_bench.core.plain_text import printable
 from su3d_bench.predictions.base import MOST_MASKS, MOST_POINTS, shown
 from su3d_bench.predictions.mask_arrays import kind_of
-from su3d_bench.types import Float32Array, Instances
+from su3d_bench.core.types import Float32Array, Instances
 
 ONES = "the format has no scores: 1 for every object"
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.errors import PredictionError
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.plain_pickles.pickles import read_pickle_file
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 from su3d_bench.predictions.base import MOST_MASKS, ScenePrediction, shown
 from su3d_bench.predictions.clouds import (
     ONES,
@@ -25,7 +25,7 @@ from su3d_bench.predictions.clouds import (
     without_nonfinite,
 )
 from su3d_bench.predictions.mask_arrays import kind_of
-from su3d_bench.types import Float32Array, Instances
+from su3d_bench.core.types import Float32Array, Instances
 
 SUFFIX = ".pkl.gz"
 POST = f"_post{SUFFIX}"

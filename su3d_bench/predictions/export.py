@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.datasets.pcd import write_pcd_points
-from su3d_bench.errors import PredictionError, StoreError
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.errors import PredictionError, StoreError
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics import transfer
 from su3d_bench.metrics.labelling import (
     candidate_classes,
@@ -26,12 +26,12 @@ from su3d_bench.metrics.labelling import (
     scored_classes,
 )
 from su3d_bench.metrics.scene_score import present
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
 from su3d_bench.predictions.openlex3d import CLOUD, EMBEDDINGS, INDEX
 from su3d_bench.protocols import ProtocolRules
 from su3d_bench.store import make_folder, write_text
-from su3d_bench.types import DenseFeatures, Float32Array, Float64Array, GroundTruth, Instances, Int64Array, Partition
+from su3d_bench.core.types import DenseFeatures, Float32Array, Float64Array, GroundTruth, Instances, Int64Array, Partition
 
 MASKS_FOLDER = "pred_mask"
 ROWS_AT_ONCE = 1 << 14

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from su3d_bench.errors import ConfigError, PredictionError, suggest
+from su3d_bench.core.errors import ConfigError, PredictionError, suggest
 from su3d_bench.predictions.base import Reader
 from su3d_bench.predictions.conceptgraphs import ConceptGraphs
 from su3d_bench.predictions.gradslam import Gradslam

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.errors import PredictionError
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.predictions.base import ScenePrediction, VertexMasks, shown
 from su3d_bench.predictions.mask_arrays import (
     NO_SCORES,
@@ -27,7 +27,7 @@ from su3d_bench.predictions.mask_arrays import (
 )
 from su3d_bench.predictions.numpy_files import npz_names, read_npz
 from su3d_bench.predictions.torch_zip import Kind, SparseTensor, read_torch, torch_kind
-from su3d_bench.types import Int32Array
+from su3d_bench.core.types import Int32Array
 
 
 def first_of_kind(path: Path, suffix: str, kinds: tuple[Kind, ...]) -> Path | None:

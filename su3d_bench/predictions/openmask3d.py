@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.errors import PredictionError
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.predictions.base import ScenePrediction, shown
 from su3d_bench.predictions.mask_archives import first_of_kind
 from su3d_bench.predictions.mask_arrays import (
@@ -21,7 +21,7 @@ from su3d_bench.predictions.mask_arrays import (
 )
 from su3d_bench.predictions.numpy_files import read_npy
 from su3d_bench.predictions.torch_zip import read_torch
-from su3d_bench.types import Float32Array
+from su3d_bench.core.types import Float32Array
 
 MASKS_SUFFIXES = ("_masks.pt", ".pt")
 FEATURES_SUFFIXES = ("_openmask3d_features.npy", "_features.npy", ".npy")

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.errors import PredictionError
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.predictions.base import MOST_POINTS, ScenePrediction, shown
 from su3d_bench.predictions.mask_archives import first_of_kind
 from su3d_bench.predictions.mask_arrays import NO_SCORES, kind_of, scene_file, scene_files, vertex_masks

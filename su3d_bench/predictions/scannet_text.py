@@ -11,13 +11,13 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.errors import PredictionError
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.metrics.instance_ap import last_line_of_each_mask_file
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 from su3d_bench.predictions.base import ScenePrediction, VertexLabels, shown
 from su3d_bench.predictions.mask_arrays import run_members, scene_file, scene_files, vertex_masks
 from su3d_bench.predictions.text_integers import integer_lines
-from su3d_bench.types import Int32Array
+from su3d_bench.core.types import Int32Array
 
 OWN_OUTPUT = "semantic_instance_evaluation"  # the original evaluator's own answer, which it leaves out
 MASK3D_FOLDER = "decoder_-1"  # Mask3D and Segment3D write the lists of the last decoder here

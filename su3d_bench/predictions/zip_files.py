@@ -10,8 +10,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from su3d_bench.errors import PredictionError
-from su3d_bench.plain_text import printable
+from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.plain_text import printable
 from su3d_bench.predictions.base import shown
 
 MOST_MEMBER = 4 << 30  # bytes; masks of a scene are some hundred MiB

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.types import Float64Array, Frame, GroundTruth, Int64Array
+from su3d_bench.core.types import Float64Array, Frame, GroundTruth, Int64Array
 
 N_FRAMES = 24  # ours: spread evenly, enough to see nearly everything of a room
 MOST_VERTICES = 300  # of one object

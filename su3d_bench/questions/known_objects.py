@@ -11,7 +11,7 @@ from su3d_bench.perception.embedded_text import words
 from su3d_bench.reasoning.named_objects import meant_by
 from su3d_bench.reasoning.relations import is_room_surface
 from su3d_bench.reasoning.scene_map import MapObject, SceneMap
-from su3d_bench.types import GroundTruth
+from su3d_bench.core.types import GroundTruth
 
 STRAY_PERCENT = 1.0  # ours: of an object's vertices at either end of an axis, which in a scan are often a neighbour's
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from su3d_bench.errors import GroundTruthMissing
+from su3d_bench.core.errors import GroundTruthMissing
 from su3d_bench.questions.colours import colour_words
 from su3d_bench.questions.generator import chosen, generate
 from su3d_bench.questions.known_objects import known_objects

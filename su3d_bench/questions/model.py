@@ -5,8 +5,8 @@ from __future__ import annotations
 import hashlib
 from dataclasses import dataclass
 
-from su3d_bench.errors import DataError
-from su3d_bench.plain_text import printable
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.plain_text import printable
 
 KINDS = ("instance", "affordance", "property", "relative")
 REASONING = "reasoning"

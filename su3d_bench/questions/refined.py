@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import logging
 
-from su3d_bench.digests import digest_file
-from su3d_bench.errors import StoreError
+from su3d_bench.core.digests import digest_file
+from su3d_bench.core.errors import StoreError
 from su3d_bench.metrics.question_truths import RefinedNames
 from su3d_bench.perception.language.refined_names import FILE_NAME, read_records
 from su3d_bench.questions.truths import voted_names
 from su3d_bench.store import JobFolder
-from su3d_bench.types import Instances
+from su3d_bench.core.types import Instances
 
 log = logging.getLogger(__name__)
 

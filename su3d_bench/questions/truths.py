@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics.question_truths import (
     AnnotationTruth,
     AskedText,
@@ -26,7 +26,7 @@ from su3d_bench.reasoning.named_objects import nearest_by
 from su3d_bench.reasoning.scene_map import map_of
 from su3d_bench.reasoning.solver import Solver
 from su3d_bench.scoring import QuestionTruth
-from su3d_bench.types import GroundTruth, Instances
+from su3d_bench.core.types import GroundTruth, Instances
 
 Refine = Callable[[Instances], RefinedNames | None]
 MOST_NAMES = 5  # the paper's m: n' comes from the names of so many best views

@@ -11,7 +11,7 @@ from functools import cache
 
 import numpy as np
 
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.captions_lexicon import GROUPS, SYNONYMS
 from su3d_bench.perception.embedded_text import words
 from su3d_bench.perception.naming import vocabulary

@@ -17,7 +17,7 @@ from su3d_bench.perception.language.prompts import STRATEGY
 from su3d_bench.reasoning.named_objects import meant_by
 from su3d_bench.reasoning.question_words import Phrase, read_question
 from su3d_bench.reasoning.scene_map import MapObject, SceneMap
-from su3d_bench.types import Float64Array
+from su3d_bench.core.types import Float64Array
 
 # The rules are the paper's; the sentence before them and the form of the answer are ours.
 _INTRODUCTION = (

@@ -15,7 +15,7 @@ from typing import Literal
 import numpy as np
 
 from su3d_bench.perception.embedded_text import words
-from su3d_bench.types import Float64Array
+from su3d_bench.core.types import Float64Array
 
 PairRelation = Literal["on", "under", "in", "above", "next to", "near"]
 PAIR_RELATIONS: tuple[PairRelation, ...] = ("on", "under", "in", "above", "next to", "near")

@@ -8,9 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
-from su3d_bench.errors import PredictionError
-from su3d_bench.plain_text import printable
-from su3d_bench.types import Float64Array, Instances
+from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.plain_text import printable
+from su3d_bench.core.types import Float64Array, Instances
 
 MOST_NAME, MOST_CAPTION = 80, 400  # characters; a hostile map may hold texts of any length
 

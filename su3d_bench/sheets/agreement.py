@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from su3d_bench.statistics import bootstrap_interval
-from su3d_bench.types import Float64Array, Int64Array
+from su3d_bench.core.types import Float64Array, Int64Array
 
 Interval = tuple[float, float]
 Ratings = Mapping[str, Mapping[str, str]]  # item -> annotator -> answer

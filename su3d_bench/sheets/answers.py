@@ -14,8 +14,8 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from su3d_bench.errors import DataError, ModelMissing
-from su3d_bench.plain_text import printable
+from su3d_bench.core.errors import DataError, ModelMissing
+from su3d_bench.core.plain_text import printable
 from su3d_bench.predictions.zip_files import DAMAGE
 from su3d_bench.reports.table_formats import FORMULA_STARTS
 from su3d_bench.sheets.items import ANSWER_COLUMNS

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.errors import ConfigError
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.errors import ConfigError
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics.question_truths import AskedText
 from su3d_bench.metrics.score_questions import (
     judge_merging,
@@ -17,7 +17,7 @@ from su3d_bench.metrics.score_questions import (
     labels_n,
 )
 from su3d_bench.opensu3d.retrieval import rank_all
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 from su3d_bench.protocols import ProtocolRules
 from su3d_bench.questions.generator import chosen, generate
 from su3d_bench.questions.known_objects import known_objects
@@ -26,7 +26,7 @@ from su3d_bench.questions.refined import refined_names
 from su3d_bench.questions.truths import own_questions, question_truth
 from su3d_bench.sheets.items import RIGHT, WRONG, SheetKind
 from su3d_bench.sheets.run_source import RunSource, mask_digest
-from su3d_bench.types import Float64Array, GroundTruth, Instances
+from su3d_bench.core.types import Float64Array, GroundTruth, Instances
 
 MOST_TEXT = 1000  # characters of a query, a label or an answer that a sheet shows
 NO_LABEL = "(no label)"

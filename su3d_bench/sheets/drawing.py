@@ -25,7 +25,7 @@ from su3d_bench.reports.pictures import instance_colours
 from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import SheetKind
 from su3d_bench.sheets.run_source import RunSource, mask_digest
-from su3d_bench.types import BoolArray, Float64Array, Frame, Instances, UInt8Array
+from su3d_bench.core.types import BoolArray, Float64Array, Frame, Instances, UInt8Array
 
 ANSWER_COLOUR, OTHER_COLOUR = (222, 74, 22), (32, 98, 196)  # those of reasoning_picture
 PALE_SHARE = 0.3

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.executors import Event, Report, run_inline, run_processes
 from su3d_bench.finished_run import read_run
 from su3d_bench.reports.heat_scales import Scale

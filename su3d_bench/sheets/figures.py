@@ -8,10 +8,10 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics.score_questions import labels_n
 from su3d_bench.opensu3d.retrieval import rank_all
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 from su3d_bench.questions.refined import refined_names
 from su3d_bench.reasoning.named_objects import nearest_by
 from su3d_bench.reasoning.scene_map import map_of
@@ -24,7 +24,7 @@ from su3d_bench.reports.map_views import DrawnMap, MapView, drawn_map, pale
 from su3d_bench.reports.pictures import ROOM_SURFACES, class_colours
 from su3d_bench.sheets.drawing import ANSWER_COLOUR, OTHER_COLOUR
 from su3d_bench.sheets.run_source import RunSource
-from su3d_bench.types import Float64Array, Frame, Instances, UInt8Array
+from su3d_bench.core.types import Float64Array, Frame, Instances, UInt8Array
 
 Subject = Literal["similarity", "labels", "reasoning"]
 SUBJECTS: tuple[Subject, ...] = ("similarity", "labels", "reasoning")

@@ -9,8 +9,8 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from su3d_bench.errors import DataError
-from su3d_bench.plain_text import printable
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.plain_text import printable
 from su3d_bench.sheets.scores import METRICS, SCHEMA, ScoreCell, Scores
 from su3d_bench.store import write_json
 

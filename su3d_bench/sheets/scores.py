@@ -16,7 +16,7 @@ from su3d_bench.sheets.agreement import Agreement, Interval, agreement, cohen_ka
 from su3d_bench.sheets.items import CANNOT_TELL, MERGES, RIGHT, Key, KeyItem, Sheet
 from su3d_bench.sheets.validation import LABELS, Judgement
 from su3d_bench.statistics import percentile_interval, resample_weights, sign_flip_test
-from su3d_bench.types import Float64Array, Int64Array
+from su3d_bench.core.types import Float64Array, Int64Array
 
 Judge = Literal["people", "automatic"]
 SCHEMA = 1

@@ -6,8 +6,8 @@ from collections import Counter, defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
-from su3d_bench.errors import DataError, suggest
-from su3d_bench.plain_text import printable
+from su3d_bench.core.errors import DataError, suggest
+from su3d_bench.core.plain_text import printable
 from su3d_bench.questions.model import KINDS
 from su3d_bench.sheets.answers import AnswerRow
 from su3d_bench.sheets.items import ASKS, Key, KeyItem, Sheet, SheetItem

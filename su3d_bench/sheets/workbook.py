@@ -9,8 +9,8 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-from su3d_bench.errors import ModelMissing
-from su3d_bench.plain_text import printable
+from su3d_bench.core.errors import ModelMissing
+from su3d_bench.core.plain_text import printable
 from su3d_bench.sheets.items import AnnotatorShare, Sheet
 from su3d_bench.store import ZIP_EPOCH
 

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from su3d_bench.metrics import attribution, instance_ap
 from su3d_bench.metrics.attribution import KINDS, LabelledMasks, ScoringRules, mend_scene
-from su3d_bench.types import Int32Array, Int64Array
+from su3d_bench.core.types import Int32Array, Int64Array
 
 SIZE = 200  # points an instance
 CLASSES = (3, 3, 3, 4, 4, 5)

@@ -20,7 +20,7 @@ from su3d_bench import scene_run
 from su3d_bench.attribution import KINDS, attribute
 from su3d_bench.cli import attribute as verb
 from su3d_bench.cli.main import main
-from su3d_bench.errors import ConfigError, DataError, PredictionError, Su3dError
+from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError
 from su3d_bench.metrics import attribution_semantic, semantic
 from su3d_bench.metrics.attribution import count_masks
 from su3d_bench.metrics.attribution_semantic import CAUSES, causes_of, mend_points
@@ -28,7 +28,7 @@ from su3d_bench.metrics.scored_arrays import scored_masks, scored_points
 from su3d_bench.protocols import load_protocol, protocol_names
 from su3d_bench.reports.attribution_table import MEANINGS
 from su3d_bench.scoring import score_scene
-from su3d_bench.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
+from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"

@@ -21,7 +21,7 @@ import su3d_bench.reports.comparison_table
 from su3d_bench import scene_run
 from su3d_bench.cli.main import main
 from su3d_bench.comparison import compare
-from su3d_bench.errors import ConfigError, StoreError
+from su3d_bench.core.errors import ConfigError, StoreError
 from su3d_bench.metrics import instance_ap, semantic
 from su3d_bench.metrics.resampled_values import resampled_classes
 from su3d_bench.metrics.results import metric_values, resampled_metrics

@@ -24,11 +24,11 @@ from su3d_bench.baselines.command_prediction import ClassNames, as_prediction, c
 from su3d_bench.cli.main import main
 from su3d_bench.datasets.replica_truth import read_surface
 from su3d_bench.datasets.rgbd import Rgbd
-from su3d_bench.errors import ConfigError, PredictionError
+from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.predictions.base import VertexLabels, VertexMasks
 from su3d_bench.scene_tools import no_detections
-from su3d_bench.timing import Timer
-from su3d_bench.types import Instances, Surface
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import Instances, Surface
 
 
 def test_the_exported_folder_reads_back_as_the_frames_that_went_in(tmp_path: Path) -> None:

@@ -28,8 +28,8 @@ from su3d_bench.baselines.group_overlap import (
     voxelise,
     without_small_groups,
 )
-from su3d_bench.errors import DataError
-from su3d_bench.timing import Timer
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.timing import Timer
 
 RULES = MergeRules()
 

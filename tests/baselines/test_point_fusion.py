@@ -10,8 +10,8 @@ from box_room import INTRINSICS, images, pose
 
 from su3d_bench.baselines.pixel_features import picked
 from su3d_bench.baselines.point_fusion import ABSENT, PointFusion, View, alpha, normals_of, view_of
-from su3d_bench.errors import DataError
-from su3d_bench.types import Frame
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Frame
 
 TOWARDS = np.array([0.0, 0.0, 1.0])
 

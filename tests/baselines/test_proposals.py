@@ -24,9 +24,9 @@ from su3d_bench.baselines.proposal_files import digest_of_folder, read_proposals
 from su3d_bench.baselines.proposals import ProposalConfig, make_proposals
 from su3d_bench.baselines.segment_tree import SegmentTree, contacts_of, is_within, merge_cost, merge_tree
 from su3d_bench.baselines.surface_proposals import NodeChoice, chosen_nodes, contrast, segments_of, surface_proposals
-from su3d_bench.errors import DataError, PredictionError
-from su3d_bench.interfaces import SceneTools
-from su3d_bench.types import Proposals, Surface
+from su3d_bench.core.errors import DataError, PredictionError
+from su3d_bench.core.interfaces import SceneTools
+from su3d_bench.core.types import Proposals, Surface
 
 MASKS = np.array([[1, 1, 0, 0, 0, 0], [0, 1, 1, 1, 0, 0], [0, 0, 0, 0, 0, 0]], bool)  # two overlap, one is empty
 SCENE: dict[str, Any] = {

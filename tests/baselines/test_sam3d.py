@@ -12,10 +12,10 @@ from grouped_clouds import HEIGHT, WIDTH, Plate, look
 from pydantic import ValidationError
 
 from su3d_bench.baselines.sam3d import SAM3D, SAM3DConfig, paint
-from su3d_bench.errors import DataError
-from su3d_bench.interfaces import SceneTools
-from su3d_bench.timing import Timer
-from su3d_bench.types import Detections, Frame, Instances, Proposals, SceneInfo, Surface
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.interfaces import SceneTools
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import Detections, Frame, Instances, Proposals, SceneInfo, Surface
 
 SCENE = SceneInfo("made", "plates", 4, 1, "rendered-rooms")
 TREE, INCREMENTAL = SAM3DConfig(), SAM3DConfig(schedule="incremental")

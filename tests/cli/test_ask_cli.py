@@ -20,7 +20,7 @@ from su3d_bench.cli.main import build_parser, main
 from su3d_bench.reports import reasoning_picture
 from su3d_bench.reports.reasoning_picture import SpokenOf, draw_reasoning
 from su3d_bench.store import JobFolder, RunFolder, write_json, write_prediction
-from su3d_bench.types import Instances
+from su3d_bench.core.types import Instances
 
 SCENE = "rooms/made"
 QUICK = ["backoff_s=0.001", "max_retries=1", "total_timeout_s=1.0", "max_failures_in_a_row=50"]

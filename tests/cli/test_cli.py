@@ -15,7 +15,7 @@ from places import SCENES
 from su3d_bench import scene_run
 from su3d_bench.cli import query
 from su3d_bench.cli.main import build_parser, main
-from su3d_bench.errors import EXIT_INTERNAL
+from su3d_bench.core.errors import EXIT_INTERNAL
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"
@@ -180,7 +180,7 @@ def test_a_misspelt_key_in_a_file_is_named_with_its_line(capsys: pytest.CaptureF
 
 
 def test_debug_shows_the_traceback() -> None:
-    from su3d_bench.errors import ConfigError
+    from su3d_bench.core.errors import ConfigError
 
     with pytest.raises(ConfigError):
         main(["run", "--debug", "--scenes", "nothing"])
@@ -189,7 +189,7 @@ def test_debug_shows_the_traceback() -> None:
 def test_an_internal_error_is_one_line_and_exit_code_4(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from su3d_bench import registry
+    from su3d_bench.core import registry
 
     def fail(kind: str) -> list[str]:
         raise RuntimeError("a mistake\nof ours")

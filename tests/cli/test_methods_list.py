@@ -7,10 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from su3d_bench import registry
+from su3d_bench.core import registry
 from su3d_bench.cli.main import main
-from su3d_bench.config import Setting, Settings
-from su3d_bench.interfaces import MethodAbout
+from su3d_bench.core.config import Setting, Settings
+from su3d_bench.core.interfaces import MethodAbout
 from su3d_bench.planning import make_plan
 from su3d_bench.reports.published import figures_of
 
@@ -63,7 +63,7 @@ def test_a_method_shows_its_settings_and_what_papers_report(capsys: pytest.Captu
 def test_the_settings_that_are_shown_can_be_used_as_they_stand(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
-    from su3d_bench.config import read_file
+    from su3d_bench.core.config import read_file
 
     (tmp_path / "mine.toml").write_text(told(capsys, "opensu3d"))
     assert read_file(tmp_path / "mine.toml").under(("method", "opensu3d"))

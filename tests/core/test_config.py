@@ -6,20 +6,9 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel, ConfigDict
 
-from su3d_bench.config import (
-    RunConfig,
-    Setting,
-    Settings,
-    check_keys,
-    check_names,
-    flatten,
-    nest,
-    read_assignments,
-    read_file,
-    resolve,
-)
-from su3d_bench.errors import ConfigError
-from su3d_bench.toml_text import key_lines, toml_value, write_toml
+from su3d_bench.core.config import RunConfig, Setting, Settings, check_keys, check_names, flatten, nest, read_assignments, read_file, resolve
+from su3d_bench.core.errors import ConfigError
+from su3d_bench.core.toml_text import key_lines, toml_value, write_toml
 
 
 class Inner(BaseModel):

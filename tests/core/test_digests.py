@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from su3d_bench import digests
+from su3d_bench.core import digests
 
 SOURCE = '"""What it is."""\n\n\ndef double(x):\n    """Twice ``x``."""\n    return 2 * x  # why\n'
 RULES = "# where it is from\nthreshold = 0.5\n[labels]\nnames = ['a', 'b']\n"

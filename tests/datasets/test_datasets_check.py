@@ -20,11 +20,11 @@ from painted import Painted
 from su3d_bench.cli.main import main
 from su3d_bench.datasets.replica import Replica
 from su3d_bench.datasets.rooms import RoomOptions, Rooms
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.inspection import SAMPLED_FRAMES, Inspection, inspect
 from su3d_bench.inspection_checks import Finding, check_frames, facts_of
-from su3d_bench.plain_text import printable, printable_json
-from su3d_bench.types import Frame
+from su3d_bench.core.plain_text import printable, printable_json
+from su3d_bench.core.types import Frame
 
 N_FRAMES = 8
 TREE = Path("replica_v1/room_0/habitat")

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from su3d_bench import registry
+from su3d_bench.core import registry
 from su3d_bench.cli.main import main
 from su3d_bench.datasets.layouts import LAYOUTS
 from su3d_bench.datasets.ply import read_ply
@@ -24,8 +24,8 @@ from su3d_bench.datasets.scannet_layout_truth import segment_of_vertex
 from su3d_bench.datasets.scannet_rooms import categories, room_of, scan_name
 from su3d_bench.datasets.scene_making import write_scene
 from su3d_bench.datasets.sens import SensFile
-from su3d_bench.errors import DataError
-from su3d_bench.types import Frame
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Frame
 
 ROOM, SCAN, N_FRAMES, SIZE = "bathroom0", "scene9400_00", 12, (80, 60)
 SCANNET = ("scannet", "scannet-python", "scannet-cpp")

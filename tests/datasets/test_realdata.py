@@ -17,8 +17,8 @@ from su3d_bench.datasets.rgbd import Rgbd
 from su3d_bench.datasets.tum import Tum
 from su3d_bench.geometry import back_project
 from su3d_bench.store import read_prediction
-from su3d_bench.toml_text import write_toml
-from su3d_bench.types import Instances
+from su3d_bench.core.toml_text import write_toml
+from su3d_bench.core.types import Instances
 
 pytestmark = pytest.mark.skipif(not REAL_RECORDINGS.is_dir(), reason="needs the real recordings in ../shared/realdata")
 FRAME_FILES = {

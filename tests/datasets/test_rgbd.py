@@ -21,8 +21,8 @@ from su3d_bench.datasets.rgbd import Rgbd, RgbdOptions
 from su3d_bench.datasets.rgbd_description import RgbdDescription
 from su3d_bench.datasets.rgbd_files import camera_to_world, read_intrinsics, read_pose_file, read_trajectory_file
 from su3d_bench.datasets.rooms import RoomOptions, Rooms
-from su3d_bench.errors import DataError, GroundTruthMissing
-from su3d_bench.toml_text import write_toml
+from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.core.toml_text import write_toml
 
 WIDTH, HEIGHT = 12, 8
 CAMERA = {"width": WIDTH, "height": HEIGHT, "intrinsic_matrix": [6.0, 0, 0, 0, 6.5, 0, 5.5, 3.5, 1]}

@@ -16,10 +16,10 @@ from typing import Any
 import pytest
 from scanned_stage import N_FRAMES, Stage, files_below
 
-from su3d_bench import registry
+from su3d_bench.core import registry
 from su3d_bench.datasets.layouts import LAYOUTS
 from su3d_bench.datasets.scene_making import finish_scene, plan_scenes, write_frames, write_scene
-from su3d_bench.errors import DataError, StoreError
+from su3d_bench.core.errors import DataError, StoreError
 
 ROOM = "living7"
 SCANNET = ("scannet", "scannet-python", "scannet-cpp")

@@ -18,7 +18,7 @@ from su3d_bench.datasets.rgbd import Rgbd
 from su3d_bench.datasets.rooms import RoomOptions, Rooms
 from su3d_bench.datasets.scannet import ScanNet, ScannetOptions
 from su3d_bench.datasets.tum import Tum
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.scene_tools import surface_of
 
 

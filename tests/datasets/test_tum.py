@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 
 from su3d_bench.datasets.timed_poses import pose_at, quaternion_poses, read_trajectory
 from su3d_bench.datasets.tum import Tum, TumOptions, associate
-from su3d_bench.errors import DataError, GroundTruthMissing
+from su3d_bench.core.errors import DataError, GroundTruthMissing
 
 WIDTH, HEIGHT = 12, 8
 CAMERA = "6.0 6.5 5.5 3.5\n"

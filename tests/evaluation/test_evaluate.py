@@ -26,7 +26,7 @@ from prediction_files import (
     write_scannet_text,
 )
 
-from su3d_bench.errors import ConfigError, DataError, PredictionError
+from su3d_bench.core.errors import ConfigError, DataError, PredictionError
 from su3d_bench.evaluation import Request, evaluate
 from su3d_bench.evaluation_bound import every_class_counts
 from su3d_bench.evaluation_scenes import Source, match_scenes

@@ -13,7 +13,7 @@ from prediction_files import (
     write_scannet_text,
 )
 
-from su3d_bench.errors import DataError, PredictionError
+from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.evaluation_checks import check_cloud, mask_facts
 from su3d_bench.evaluation_texts import read_text_features
 from su3d_bench.evaluation_truth import read_text_truth

@@ -15,7 +15,7 @@ from damage import damages, outcomes, truncations
 
 from su3d_bench.datasets import hdf5
 from su3d_bench.datasets.hdf5 import largest_column, read_rows, row_blocks
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 
 NAME = "pc_points"
 WHERE = f"replica/room0: {NAME}.h5"

@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from su3d_bench.datasets.ply import Column, ListColumn, PlyElement, PlyFile, read_ply, write_ply
-from su3d_bench.errors import DataError, StoreError
+from su3d_bench.core.errors import DataError, StoreError
 
 FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
 TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")

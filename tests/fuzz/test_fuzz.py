@@ -13,7 +13,7 @@ from fuzz_mutations import MOST_BYTES, _json, _text, mutated
 from fuzz_targets import TARGETS
 from fuzzing import BadMessage, Input, Read, Sample, Target, bounded_addresses, every_one_of
 
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 
 N_INPUTS = 2_400
 WEIGHT = sum(one.weight for one in TARGETS.values())

@@ -18,11 +18,11 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 from test_fuzz_cli import EXAMPLES
 
-from su3d_bench.config import Setting, Settings, check_keys, flatten, read_file, resolve
-from su3d_bench.errors import Su3dError
+from su3d_bench.core.config import Setting, Settings, check_keys, flatten, read_file, resolve
+from su3d_bench.core.errors import Su3dError
 from su3d_bench.perception.config import PerceptionConfig
-from su3d_bench.registry import DATASETS, METHODS, load
-from su3d_bench.toml_text import write_toml
+from su3d_bench.core.registry import DATASETS, METHODS, load
+from su3d_bench.core.toml_text import write_toml
 
 SECTIONS: dict[tuple[str, ...], type[BaseModel]] = {
     **{("method", name): load("method", name).Config for name in METHODS},

@@ -8,12 +8,12 @@ import numpy as np
 import pytest
 from scored_room import instances
 
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.metrics.instance_ap import per_scene
 from su3d_bench.metrics.score_instances import encode_without_classes
 from su3d_bench.protocols import load_protocol
 from su3d_bench.scoring import combine, score_scene
-from su3d_bench.types import DenseFeatures, GroundTruth, Instances, LabelSet, Partition
+from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, LabelSet, Partition
 
 NAMES = ("class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d")
 CHAIR, WALL, OTHER = 2, 1, 1000  # 1000 is none of the 200

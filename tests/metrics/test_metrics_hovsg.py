@@ -17,7 +17,7 @@ from su3d_bench.metrics.labelling import text_features
 from su3d_bench.metrics.semantic import confusion_matrix, hovsg_metrics, per_scene
 from su3d_bench.protocols import ProtocolRules, load_protocol
 from su3d_bench.scoring import combine, pack_scores, score_scene, unpack_scores
-from su3d_bench.types import DenseFeatures, Float32Array, GroundTruth, Instances, LabelSet, Partition, UInt8Array
+from su3d_bench.core.types import DenseFeatures, Float32Array, GroundTruth, Instances, LabelSet, Partition, UInt8Array
 
 GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())["hovsg"]
 HOVSG, EXACT, OVO = (load_protocol(name) for name in ("replica-hovsg", "replica-hovsg-exact", "replica-ovo51"))

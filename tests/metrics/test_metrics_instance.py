@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from places import CASES
 
-from su3d_bench.errors import DataError, PredictionError
+from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.metrics.dot_product import dot
 from su3d_bench.metrics.instance_ap import (
     THRESHOLDS,

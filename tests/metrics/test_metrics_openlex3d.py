@@ -21,7 +21,7 @@ from open_scene import (
 )
 from places import CASES
 
-from su3d_bench.errors import DataError, PredictionError
+from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.metrics import openlex3d, transfer
 from su3d_bench.metrics.object_means import ObjectCounts, combine, concatenate, resampled
 from su3d_bench.metrics.openlex3d import (
@@ -38,7 +38,7 @@ from su3d_bench.metrics.score_open_vocabulary import voxel_means
 from su3d_bench.protocols import CATEGORIES, load_protocol
 from su3d_bench.scoring import combine as combine_scenes
 from su3d_bench.scoring import pack_scores, score_scene, unpack_scores, why_not_scorable
-from su3d_bench.types import DenseFeatures, Partition, Prediction
+from su3d_bench.core.types import DenseFeatures, Partition, Prediction
 
 GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())
 TOPN, RANKING = load_protocol("openlex3d-topn"), load_protocol("openlex3d-ranking")

@@ -25,11 +25,11 @@ from scored_room import (
     truth_as_prediction,
 )
 
-from su3d_bench.errors import DataError, PredictionError
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.errors import DataError, PredictionError
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.protocols import ProtocolRules, load_protocol
 from su3d_bench.scoring import combine, pack_scores, score_scene, unpack_scores
-from su3d_bench.types import LabelSet, Prediction
+from su3d_bench.core.types import LabelSet, Prediction
 
 # ---- several scenes
 

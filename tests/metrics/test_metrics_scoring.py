@@ -20,15 +20,10 @@ from scored_room import (
     truth_as_prediction,
 )
 
-from su3d_bench.errors import PredictionError
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.protocols import load_protocol
 from su3d_bench.scoring import combine, score_scene, why_not_scorable
-from su3d_bench.types import (
-    DenseFeatures,
-    GroundTruth,
-    LabelSet,
-    Partition,
-)
+from su3d_bench.core.types import DenseFeatures, GroundTruth, LabelSet, Partition
 
 
 @pytest.mark.parametrize("with_labels", [True, False])

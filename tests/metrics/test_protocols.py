@@ -11,7 +11,7 @@ from places import CASES
 from su3d_bench.cli.main import main
 from su3d_bench.cli.protocols import read_remarks
 from su3d_bench.datasets.rooms_classes import CLASSES
-from su3d_bench.errors import ConfigError
+from su3d_bench.core.errors import ConfigError
 from su3d_bench.metrics.instance_ap import MIN_REGION_SIZE, THRESHOLDS
 from su3d_bench.protocols import (
     RULES,

@@ -12,7 +12,7 @@ import pytest
 from scored_room import ENCODER, NAMES, OneHotEncoder, instances, nothing, room, truth_as_prediction
 
 from su3d_bench.cli.main import main
-from su3d_bench.errors import ConfigError, PredictionError
+from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.evaluation_openlex import why_not_lex_content
 from su3d_bench.evaluation_questions import score_on_questions
 from su3d_bench.metrics.covered_objects import covered_objects
@@ -26,7 +26,7 @@ from su3d_bench.predictions.base import VertexMasks
 from su3d_bench.protocols import load_protocol, protocols_for, read_protocol, rules_file
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.scoring import combine, pack_scores, score_scene, unpack_scores, why_not_scorable
-from su3d_bench.types import Partition
+from su3d_bench.core.types import Partition
 
 RULES = load_protocol("rooms-retrieval")
 REASONING = load_protocol("rooms-reasoning")

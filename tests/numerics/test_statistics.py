@@ -10,7 +10,7 @@ import pytest
 import su3d_bench.statistics
 from su3d_bench.metrics import instance_ap, resampling, semantic
 from su3d_bench.statistics import bootstrap_interval, percentile_interval, resample_weights
-from su3d_bench.types import Float64Array, Int64Array
+from su3d_bench.core.types import Float64Array, Int64Array
 
 
 def test_the_examples_in_the_docstrings_run() -> None:

@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from torch_devices import on_each_device
 
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.opensu3d.voxel_map import VoxelMap
-from su3d_bench.types import Float64Array
+from su3d_bench.core.types import Float64Array
 
 if TYPE_CHECKING:
     from su3d_bench.opensu3d.device_kernels import DeviceVoxelMap

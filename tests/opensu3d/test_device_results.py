@@ -14,7 +14,7 @@ from su3d_bench.metrics.labelling import cosines, most_similar
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
-from su3d_bench.timing import Timer
+from su3d_bench.core.timing import Timer
 
 
 @on_each_device

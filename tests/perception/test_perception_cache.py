@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 from perception_fakes import CountingEncoder, still_life
 
-from su3d_bench.errors import StoreError
+from su3d_bench.core.errors import StoreError
 from su3d_bench.kept_files import read_arrays
 from su3d_bench.perception.cache import FrameCache, content_key, pack_masks, unpack_masks
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
-from su3d_bench.timing import Timer
-from su3d_bench.types import Detections, PerceptionNeeds, SceneInfo
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import Detections, PerceptionNeeds, SceneInfo
 
 SCENE = SceneInfo("rooms", "living0", n_frames=1, stride=1, image_domain="rendered-rooms")
 

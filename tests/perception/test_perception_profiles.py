@@ -9,12 +9,12 @@ import pytest
 from perception_fakes import CountingEncoder, still_life
 from pydantic import ValidationError
 
-from su3d_bench.errors import ConfigError
+from su3d_bench.core.errors import ConfigError
 from su3d_bench.perception.features import regions_to_keep
 from su3d_bench.perception.naming import Namer, NamingConfig, colour_word, scene_caption, vocabulary, with_article
 from su3d_bench.perception.profiles import PerceptionConfig, build_perception, resolve_profile
-from su3d_bench.timing import Timer
-from su3d_bench.types import ImageDomain, PerceptionNeeds, SceneInfo
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import ImageDomain, PerceptionNeeds, SceneInfo
 
 
 def scene(domain: ImageDomain) -> SceneInfo:

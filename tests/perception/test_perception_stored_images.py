@@ -13,13 +13,13 @@ import pytest
 from damage import damages, outcomes, truncations
 from perception_fakes import CountingEncoder, still_life
 
-from su3d_bench.config import Setting, Settings, resolve
-from su3d_bench.errors import ConfigError, DataError
+from su3d_bench.core.config import Setting, Settings, resolve
+from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
 from su3d_bench.perception.stored import StoredConfig
 from su3d_bench.perception.stored_images import LabelImages, read_names
-from su3d_bench.timing import Timer
-from su3d_bench.types import PerceptionNeeds, SceneInfo
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import PerceptionNeeds, SceneInfo
 
 SCENE = SceneInfo("rgbd", "desk", n_frames=1, stride=1, image_domain="camera")
 PATTERN = "frame-{index}.segm.png"

@@ -25,7 +25,7 @@ from su3d_bench.datasets.openlex3d import (
 )
 from su3d_bench.datasets.ply import ListColumn
 from su3d_bench.datasets.replica_truth import AnnotatedMesh
-from su3d_bench.errors import DataError, GroundTruthMissing
+from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.metrics.openlex3d import ObjectLabels
 from su3d_bench.metrics.query_ap import TextQuery
 from su3d_bench.protocols import load_protocol

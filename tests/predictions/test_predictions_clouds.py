@@ -37,7 +37,7 @@ from su3d_bench.predictions import clouds, gradslam
 from su3d_bench.predictions.base import ScenePrediction
 from su3d_bench.predictions.formats import READERS, recognise
 from su3d_bench.protocols import load_protocol
-from su3d_bench.types import DenseFeatures, Instances, Partition
+from su3d_bench.core.types import DenseFeatures, Instances, Partition
 
 
 def read(path: Path, scene: str = "room0", format: str | None = None) -> ScenePrediction:

@@ -32,7 +32,7 @@ from prediction_files import (
     written_in,
 )
 
-from su3d_bench.errors import ConfigError, PredictionError
+from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.metrics.instance_ap import last_line_of_each_mask_file
 from su3d_bench.predictions import text_integers
 from su3d_bench.predictions.base import ScenePrediction, VertexLabels, VertexMasks
@@ -40,7 +40,7 @@ from su3d_bench.predictions.formats import READERS, format_names, recognise
 from su3d_bench.predictions.mask_arrays import run_members
 from su3d_bench.predictions.text_integers import integer_lines
 from su3d_bench.store import write_prediction
-from su3d_bench.types import DenseFeatures, Instances, Partition, Prediction
+from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
 
 MASK_CASES = sorted(p.stem for kind in ("inst", "replica", "scannet200") for p in CASES.glob(f"{kind}*.npz"))
 LABEL_CASES = sorted(p.stem for p in CASES.glob("sem*.npz"))

@@ -20,7 +20,7 @@ from damage import damages, outcomes, truncations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from su3d_bench.errors import PredictionError
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.plain_pickles import pickle_machine
 from su3d_bench.plain_pickles.pickle_constructors import CONSTRUCTORS
 from su3d_bench.plain_pickles.pickles import Forgotten, Inert, read_pickle, read_pickle_file

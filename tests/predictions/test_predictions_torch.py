@@ -17,7 +17,7 @@ import pytest
 from damage import damages, outcomes, truncations
 from places import CASES
 
-from su3d_bench.errors import PredictionError
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.predictions import zip_files
 from su3d_bench.predictions.numpy_files import read_npy, read_npz
 from su3d_bench.predictions.torch_zip import SparseTensor, read_torch, torch_kind

@@ -11,7 +11,7 @@ from damage import damages, outcomes, truncations
 from places import SCENES
 
 from su3d_bench.cli.main import main
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.questions.files import csv_text, paper_queries, read_questions, toml_text, write_questions
 from su3d_bench.questions.model import KINDS, new_question
 

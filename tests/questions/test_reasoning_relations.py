@@ -24,7 +24,7 @@ from su3d_bench.reasoning.relations import (
 )
 from su3d_bench.reasoning.scene_map import SceneMap
 from su3d_bench.reasoning.solver import Solver
-from su3d_bench.types import Float64Array
+from su3d_bench.core.types import Float64Array
 
 
 def moved(bounds: Float64Array, x: float, y: float, z: float) -> Float64Array:

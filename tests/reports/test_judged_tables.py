@@ -11,7 +11,7 @@ from measured_rows import SCENES, measured
 from simulated_annotators import RATES, SCHEMES, annotation_set, answered, reasoning_set, retrieval_set
 
 from su3d_bench.cli.main import main
-from su3d_bench.errors import ConfigError
+from su3d_bench.core.errors import ConfigError
 from su3d_bench.reports.judged_tables import judged_table
 from su3d_bench.reports.latex import latex
 from su3d_bench.reports.measured import Measured

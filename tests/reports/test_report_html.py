@@ -37,7 +37,7 @@ from su3d_bench.reports.html_map import (
 )
 from su3d_bench.reports.html_page import page_html
 from su3d_bench.store import read_prediction, write_prediction
-from su3d_bench.types import DenseFeatures, Instances
+from su3d_bench.core.types import DenseFeatures, Instances
 
 PAINTED = f"{SCENES}/painted.py"
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(1)>&\"'<!--"

@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from measured_rows import SCENES, measured, measured_instances
 
-from su3d_bench.errors import ConfigError
+from su3d_bench.core.errors import ConfigError
 from su3d_bench.reports.ablation_table import SweepRow, ablation_table
 from su3d_bench.reports.latex import latex
 from su3d_bench.reports.paper_tables import Shown, paper_table, protocol_table, selection_tables

@@ -14,12 +14,12 @@ from places import SCENES
 
 from su3d_bench import scene_run
 from su3d_bench.cli.main import main
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.finished_run import read_run
 from su3d_bench.finished_updates import read_update_times
 from su3d_bench.statistics import growth_exponent
-from su3d_bench.timing import peak_memory_bytes, start_memory_watch
-from su3d_bench.types import Float64Array
+from su3d_bench.core.timing import peak_memory_bytes, start_memory_watch
+from su3d_bench.core.types import Float64Array
 from su3d_bench.update_times import MapCost, UpdateTimes, summarise
 
 PAINTED = f"{SCENES}/painted.py"

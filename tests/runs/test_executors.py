@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from su3d_bench.errors import StoreError
+from su3d_bench.core.errors import StoreError
 from su3d_bench.executors import ONE_THREAD, Event, Report, run_inline, run_processes
 
 

@@ -13,7 +13,7 @@ from painted import colour_perception
 from places import SCENES
 from su3d_bench import finished_scenes, page_sources, runner, scene_run, store
 from su3d_bench.cli.main import main
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.execution import run_units
 from su3d_bench.metrics import instance_ap, precision_recall, resampling
 from su3d_bench.scoring import pack_scores, unpack_scores

@@ -11,8 +11,8 @@ from painted import colour_perception
 from places import SCENES
 from su3d_bench import scene_run
 from su3d_bench.cli.main import main
-from su3d_bench.config import Settings
-from su3d_bench.errors import ConfigError
+from su3d_bench.core.config import Settings
+from su3d_bench.core.errors import ConfigError
 from su3d_bench.method_names import named_method
 from su3d_bench.planning import make_plan
 
@@ -60,7 +60,7 @@ def test_a_wrong_variant_is_one_line(text: str, message: str) -> None:
 
 
 def test_a_variant_takes_its_base_settings_then_its_own(tmp_path: Path) -> None:
-    from su3d_bench.config import Setting
+    from su3d_bench.core.config import Setting
 
     asked = Settings((Setting(("scenes",), ["rooms/living0"], "x"), Setting(("methods",), ["opensu3d@top_m=1"], "x")))
     words = ["opensu3d.top_m=7", "opensu3d.eps=0.03"]

@@ -7,9 +7,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import pytest
 
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.read_ahead import ReadAhead
-from su3d_bench.types import Frame
+from su3d_bench.core.types import Frame
 
 N_FRAMES = 40
 

@@ -25,7 +25,7 @@ from painted import colour_perception
 from places import ROOT, SCENES
 from su3d_bench import scene_job, scene_run
 from su3d_bench.cli.main import main
-from su3d_bench.errors import StoreError
+from su3d_bench.core.errors import StoreError
 from su3d_bench.kept_files import filling
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.scoring import score_scene

@@ -15,7 +15,7 @@ from su3d_bench.reports.pictures import (
     instance_colours,
 )
 from su3d_bench.reports.render import BACKGROUND, Camera, colour, render, room_bounds, view_cameras
-from su3d_bench.types import DenseFeatures, Float32Array, GroundTruth, Instances, LabelSet, Partition
+from su3d_bench.core.types import DenseFeatures, Float32Array, GroundTruth, Instances, LabelSet, Partition
 
 
 def plate(z: float, half: float = 0.5) -> Float32Array:

@@ -6,7 +6,7 @@ from typing import Any
 
 from su3d_bench.job_inputs import caveat_of
 from su3d_bench.reports.tables import headline, markdown_table
-from su3d_bench.types import PerceptionNeeds, SceneInfo
+from su3d_bench.core.types import PerceptionNeeds, SceneInfo
 
 
 def result(method: str = "opensu3d", **more: Any) -> dict[str, Any]:

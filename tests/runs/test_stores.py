@@ -12,7 +12,7 @@ from test_clusters import COLLECTOR, PAINTED, assert_equal_runs, deterministic_f
 
 from su3d_bench import scene_feeding, scene_run
 from su3d_bench.cli.main import main
-from su3d_bench.errors import ConfigError, StoreError
+from su3d_bench.core.errors import ConfigError, StoreError
 from su3d_bench.planning import data_root
 from su3d_bench.remote_data import files_of_scenes
 from su3d_bench.remote_folder import RemoteFolder

@@ -12,7 +12,7 @@ from counted_sheets import both, scored, workbook
 from damage import damages, outcomes, truncations
 from simulated_annotators import annotation_set, answered, as_csv, retrieval_set
 
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.sheets.answers import parse_csv, parse_workbook, read_answers
 from su3d_bench.sheets.items import ANSWER_COLUMNS, Key, Sheet, read_key, write_key
 from su3d_bench.sheets.score_file import read_scores, write_scores

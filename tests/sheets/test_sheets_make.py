@@ -18,7 +18,7 @@ from PIL import Image
 from su3d_bench import scene_run
 from su3d_bench.cli import query
 from su3d_bench.cli.main import main
-from su3d_bench.errors import ConfigError, DataError
+from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.executors import run_processes
 from su3d_bench.finished_run import read_run
 from su3d_bench.protocols import load_protocol
@@ -41,7 +41,7 @@ from su3d_bench.sheets.items import (
 from su3d_bench.sheets.making import table_csv, write_sheets
 from su3d_bench.sheets.reasoning_drafts import built_in, reasoning_drafts
 from su3d_bench.sheets.run_source import RunSource
-from su3d_bench.types import Frame
+from su3d_bench.core.types import Frame
 
 TEXTS = tuple(f"thing {k}" for k in range(12))
 

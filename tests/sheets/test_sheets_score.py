@@ -20,7 +20,7 @@ from su3d_bench.sheets.items import Key, Sheet, write_key, write_sheet
 from su3d_bench.sheets.score_file import read_scores
 from su3d_bench.sheets.scores import ScoreCell, Scores, paired_p
 from su3d_bench.statistics import sign_flip_test
-from su3d_bench.types import Float64Array
+from su3d_bench.core.types import Float64Array
 
 
 def cells_of(scores: Scores, judge: str = "people") -> dict[tuple[str, str], ScoreCell]:

@@ -23,14 +23,14 @@ from su3d_bench.baselines import feature_table
 from su3d_bench.baselines.conceptfusion import ConceptFusion, ConceptFusionConfig
 from su3d_bench.baselines.feature_table import FeatureTable
 from su3d_bench.cli.main import main
-from su3d_bench.errors import PredictionError, StoreError
+from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.metrics.labelling import most_similar
 from su3d_bench.metrics.score_semantic import has_feature
 from su3d_bench.predictions.own_runs import OwnRuns
 from su3d_bench.scratch import scratch_folder
 from su3d_bench.store import features_beside, npz_bytes, read_prediction, write_prediction
-from su3d_bench.timing import Timer
-from su3d_bench.types import DenseFeatures, Detections, Frame, Partition, SceneInfo
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import DenseFeatures, Detections, Frame, Partition, SceneInfo
 
 POINTS = np.arange(12, dtype=np.float32).reshape(4, 3)
 ROWS = np.arange(20, dtype=np.float16).reshape(4, 5)

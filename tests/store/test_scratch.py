@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from su3d_bench.errors import StoreError
+from su3d_bench.core.errors import StoreError
 from su3d_bench.scratch import Scratch
 
 

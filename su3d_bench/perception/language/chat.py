@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from su3d_bench.digests import digest_bytes, digest_json
-from su3d_bench.types import UInt8Array
+from su3d_bench.core.digests import digest_bytes, digest_json
+from su3d_bench.core.types import UInt8Array
 
 Purpose = Literal["caption", "refine", "ask"]
 CHARACTERS_A_TOKEN = 4  # OpenAI's rule of thumb for English

@@ -8,7 +8,7 @@ from concurrent.futures import ThreadPoolExecutor
 from time import monotonic, sleep
 from typing import Protocol
 
-from su3d_bench.errors import ModelMissing, StoreError
+from su3d_bench.core.errors import ModelMissing, StoreError
 from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.language.reply_store import ReplyStore

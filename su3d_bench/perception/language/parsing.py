@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from su3d_bench.perception.embedded_text import words
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 
 MOST_READ = 8000  # characters of an answer; a name, a caption or an answer stands within
 MOST_NAME_CHARACTERS, MOST_NAME_WORDS = 60, 5

@@ -8,8 +8,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
-from su3d_bench.digests import digest_file
-from su3d_bench.errors import StoreError
+from su3d_bench.core.digests import digest_file
+from su3d_bench.core.errors import StoreError
 from su3d_bench.perception.language.refinement import RefinedName, TopNames
 from su3d_bench.store import JobFolder, read_json, write_json
 

@@ -17,8 +17,8 @@ from typing import Any
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from su3d_bench.digests import digest_json
-from su3d_bench.errors import StoreError
+from su3d_bench.core.digests import digest_json
+from su3d_bench.core.errors import StoreError
 from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.store import json_text, make_folder, write_bytes, write_text
 

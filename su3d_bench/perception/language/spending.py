@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from su3d_bench.errors import ConfigError, RunIncomplete
+from su3d_bench.core.errors import ConfigError, RunIncomplete
 from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.perception.language.config import LanguageConfig
 

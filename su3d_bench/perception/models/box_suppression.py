@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.types import Float32Array, Float64Array, Int64Array
+from su3d_bench.core.types import Float32Array, Float64Array, Int64Array
 
 
 def corners_of(boxes: Float32Array, height: int, width: int) -> Float32Array:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from types import MappingProxyType
 from typing import Literal
 
-from su3d_bench.errors import ConfigError, suggest
+from su3d_bench.core.errors import ConfigError, suggest
 
 Kind = Literal["encoder", "segmenter", "detector", "tagger"]
 FormName = Literal["transformers", "open_clip", "original", "onnx"]

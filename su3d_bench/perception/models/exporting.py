@@ -6,9 +6,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from su3d_bench.errors import ConfigError
+from su3d_bench.core.errors import ConfigError
 from su3d_bench.perception.models.catalogue import MODELS, ModelEntry
-from su3d_bench.perception.models.devices import require
+from su3d_bench.core.devices import require
 from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.onnx_export import Parity
 from su3d_bench.perception.models.sam_onnx import SamManifest, export_sam

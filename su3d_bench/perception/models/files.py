@@ -14,8 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.digests import digest_bytes, digest_file
-from su3d_bench.errors import ConfigError, ModelMissing, StoreError
+from su3d_bench.core.digests import digest_bytes, digest_file
+from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError
 from su3d_bench.perception.models.catalogue import FormName, ModelEntry, ModelForm, model_entry
 from su3d_bench.store import make_folder, read_json, write_json
 

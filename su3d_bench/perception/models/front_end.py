@@ -6,12 +6,12 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 
-from su3d_bench.errors import ConfigError, ModelMissing
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.errors import ConfigError, ModelMissing
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.models.catalogue import FormName
 from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig
-from su3d_bench.perception.models.devices import device_for, precision_for, require, require_installed
+from su3d_bench.core.devices import device_for, precision_for, require, require_installed
 from su3d_bench.perception.models.files import ModelFiles, locate
 from su3d_bench.perception.models.grounded_sam import Networks
 from su3d_bench.perception.models.grounding_dino import GroundingDino

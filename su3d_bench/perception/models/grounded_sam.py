@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict
 
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.models.automatic_masks import AutomaticMaskConfig, AutomaticMasks
@@ -19,7 +19,7 @@ from su3d_bench.perception.models.sam import Sam, SeenImage
 from su3d_bench.perception.models.tagging import Tagger, chosen_tags
 from su3d_bench.perception.regions import encode_boxes
 from su3d_bench.perception.tagging_words import ADDED_TAGS, BACKGROUND_TAGS, STOP_WORDS
-from su3d_bench.types import BoolArray, Float32Array, Frame, Int64Array, Regions
+from su3d_bench.core.types import BoolArray, Float32Array, Frame, Int64Array, Regions
 
 # Moves the digest when what lies between the networks changes.
 FRONT_END_VERSION = "1"

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.types import Float32Array, UInt8Array
+from su3d_bench.core.types import Float32Array, UInt8Array
 
 # ImageNet's mean and standard deviation of red, green and blue in 0..1, which all three models were trained with.
 MEAN = (0.485, 0.456, 0.406)

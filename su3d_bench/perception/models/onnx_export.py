@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.errors import ModelMissing, StoreError
+from su3d_bench.core.errors import ModelMissing, StoreError
 from su3d_bench.store import make_folder
 
 # 17 has LayerNormalization as one operator; newer ones bring nothing that our towers use.

@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from su3d_bench.digests import digest_file
-from su3d_bench.errors import DataError
+from su3d_bench.core.digests import digest_file
+from su3d_bench.core.errors import DataError
 from su3d_bench.perception.models.files import ModelFiles, file_sha256
 from su3d_bench.perception.models.onnx_export import OPSET, Parity
 from su3d_bench.perception.models.weights import bounded, read_settings

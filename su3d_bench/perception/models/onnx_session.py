@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal
 
-from su3d_bench.errors import DataError, ModelMissing
+from su3d_bench.core.errors import DataError, ModelMissing
 from su3d_bench.perception.models.weights import bounded
 
 Provider = Literal["cpu", "cuda", "tensorrt"]

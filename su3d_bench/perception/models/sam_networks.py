@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.perception.models.sam import Prompts
-from su3d_bench.types import Float32Array
+from su3d_bench.core.types import Float32Array
 
 
 class TorchSam:

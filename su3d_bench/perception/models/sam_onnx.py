@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.errors import CheckFailed, DataError
+from su3d_bench.core.errors import CheckFailed, DataError
 from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
 from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.onnx_export import Parity, compare_outputs, export_onnx
@@ -28,7 +28,7 @@ from su3d_bench.perception.models.onnx_session import Provider, open_session
 from su3d_bench.perception.models.pretrained import load_sam
 from su3d_bench.perception.models.sam import Prompts
 from su3d_bench.store import make_folder, write_json
-from su3d_bench.types import Float32Array, Int64Array
+from su3d_bench.core.types import Float32Array, Int64Array
 
 FORMAT = "su3d-bench onnx segmenter 1"
 ENCODER_FILE, DECODER_FILE = "encoder.onnx", "decoder.onnx"

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.errors import CheckFailed, DataError, StoreError
+from su3d_bench.core.errors import CheckFailed, DataError, StoreError
 from su3d_bench.perception.models import towers_transformers
 from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
 from su3d_bench.perception.models.encoder import EncoderSpec, check_spec, unit_rows
@@ -33,7 +33,7 @@ from su3d_bench.perception.models.onnx_session import Provider, open_session
 from su3d_bench.perception.models.text_tokens import read_tokeniser
 from su3d_bench.perception.models.weights import bounded
 from su3d_bench.store import make_folder, write_json
-from su3d_bench.types import Float32Array, Int64Array
+from su3d_bench.core.types import Float32Array, Int64Array
 
 FORMAT = "su3d-bench onnx encoder 1"
 IMAGE_FILE, TEXT_FILE = "image.onnx", "text.onnx"

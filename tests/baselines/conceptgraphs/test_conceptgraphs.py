@@ -28,7 +28,7 @@ from su3d_bench.baselines.conceptgraphs_config import MappingConfig
 from su3d_bench.cli.main import main
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
-from su3d_bench.timing import Timer
+from su3d_bench.core.timing import Timer
 
 LEFT, RIGHT = Plate((-0.5, 0.0)), Plate((0.0, 0.5))
 BARE = QUIET.model_copy(update={"obj_min_detections": 0})

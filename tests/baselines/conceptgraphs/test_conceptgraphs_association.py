@@ -35,7 +35,7 @@ from su3d_bench.baselines.conceptgraphs_objects import (
     seen_enough,
 )
 from su3d_bench.baselines.object_clouds import voxel_average
-from su3d_bench.types import OrientedBox
+from su3d_bench.core.types import OrientedBox
 
 PAPER = QUIET.model_copy(update={"association": "paper"})
 

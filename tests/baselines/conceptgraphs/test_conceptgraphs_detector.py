@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 from conceptgraphs_scene import SCENE, Plate, at_cosine, axis, contents, look, mapped
 
-from su3d_bench import registry
+from su3d_bench.core import registry
 from su3d_bench.baselines.conceptgraphs import ConceptGraphs
 from su3d_bench.baselines.conceptgraphs_config import MappingConfig
 from su3d_bench.baselines.conceptgraphs_detector import ConceptGraphsDetector, DetectorConfig
-from su3d_bench.timing import Timer
+from su3d_bench.core.timing import Timer
 
 QUIET = DetectorConfig(noise_m=0.0, max_bbox_area_ratio=1.0)
 LEFT, RIGHT = Plate((-0.5, 0.0), name="desk"), Plate((0.0, 0.5), name="lamp", feature=axis(1), text=axis(1))

@@ -12,7 +12,7 @@ import pytest
 
 from su3d_bench.datasets.pose_convention import FLIP, check_convention, judge_convention
 from su3d_bench.datasets.rooms import RoomOptions, Rooms
-from su3d_bench.types import Float64Array, Frame
+from su3d_bench.core.types import Float64Array, Frame
 
 Reading = Callable[[Float64Array], Float64Array]
 N_FRAMES = 45

@@ -7,9 +7,9 @@ import pytest
 
 from su3d_bench.datasets.registration import Grid, Registration, filled, make_registration
 from su3d_bench.datasets.rgbd_source import SensorPair
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.geometry import are_rigid
-from su3d_bench.types import Float32Array, Float64Array, UInt8Array
+from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
 
 
 def intrinsics(focal: float, size: tuple[int, int]) -> Float64Array:

@@ -34,8 +34,8 @@ from su3d_bench.datasets.replica import Replica
 from su3d_bench.datasets.replica_folders import original_name
 from su3d_bench.datasets.replica_frames import read_camera, read_trajectory
 from su3d_bench.datasets.replica_truth import object_of_vertex
-from su3d_bench.errors import DataError, GroundTruthMissing
-from su3d_bench.types import Frame
+from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.core.types import Frame
 
 Change = Callable[[Path], object]
 

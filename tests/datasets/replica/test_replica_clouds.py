@@ -15,10 +15,10 @@ from scored_room import instances
 
 from su3d_bench.datasets.replica import Replica
 from su3d_bench.datasets.replica_clouds import N_EMBEDDING, read_first_pose
-from su3d_bench.errors import DataError, GroundTruthMissing
+from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.protocols import load_protocol
 from su3d_bench.scoring import combine, score_scene
-from su3d_bench.types import Float32Array, Instances
+from su3d_bench.core.types import Float32Array, Instances
 
 Change = Callable[[Path], object]
 RUG, FLOOR, DOOR, PICTURE = 98, 40, 37, 59

@@ -18,7 +18,7 @@ from su3d_bench.datasets.replica_truth import INFO_NAME, MESH_NAME
 from su3d_bench.datasets.rooms import Rooms
 from su3d_bench.datasets.scene_making import ScannedDataset, finish_scene, plan_scenes, write_frames
 from su3d_bench.datasets.scene_making import write_scene as write_scene_in
-from su3d_bench.errors import DataError, StoreError
+from su3d_bench.core.errors import DataError, StoreError
 
 LAYOUT = ReplicaLayout()
 

@@ -16,7 +16,7 @@ from replica_scene import QUADS, TWO_OBJECTS, info_table, write_original, write_
 
 from su3d_bench.datasets import replica_boxes
 from su3d_bench.datasets.replica import Replica
-from su3d_bench.errors import DataError, GroundTruthMissing
+from su3d_bench.core.errors import DataError, GroundTruthMissing
 
 Change = Callable[[Path], object]
 

@@ -14,7 +14,7 @@ from scored_room import instances
 from su3d_bench.datasets.ply import PlyElement, write_ply
 from su3d_bench.datasets.replica import Replica
 from su3d_bench.datasets.replica_label_files import OVO_CLASSES, read_whole_numbers
-from su3d_bench.errors import DataError, GroundTruthMissing
+from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.protocols import load_protocol
 from su3d_bench.scoring import combine, score_scene
 

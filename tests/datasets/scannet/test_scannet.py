@@ -36,10 +36,10 @@ from su3d_bench.datasets.scannet import ScanNet, ScannetOptions
 from su3d_bench.datasets.scannet_folders import PAPER_SCENES, find_scans, split_scenes
 from su3d_bench.datasets.scannet_frames import read_walk
 from su3d_bench.datasets.scannet_labels import TABLE_NAME
-from su3d_bench.errors import ConfigError, DataError, GroundTruthMissing
+from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing
 from su3d_bench.planning import expand_scenes
 from su3d_bench.scene_job import Part
-from su3d_bench.types import Float64Array, UInt8Array
+from su3d_bench.core.types import Float64Array, UInt8Array
 
 
 @pytest.mark.parametrize(

@@ -23,7 +23,7 @@ from scannet_toy import (
 from su3d_bench.datasets.exported_frames import ExportedFrames
 from su3d_bench.datasets.scannet_exports import find_source, open_cpp_export, open_python_export, read_info
 from su3d_bench.datasets.sens import SensFile, SensSource
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 
 # ---------------------------------------------------------------- what lies there is read
 

@@ -38,7 +38,7 @@ from su3d_bench.datasets.scannet_truth import (
     scannet200_truth,
     truth_names,
 )
-from su3d_bench.errors import DataError, GroundTruthMissing
+from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.metrics.instance_ap import encode_ground_truth
 from su3d_bench.protocols import load_protocol
 

@@ -25,7 +25,7 @@ from places import CASES
 from su3d_bench.datasets.sens import MOTION_RECORD, SensFile, SensSource
 from su3d_bench.datasets.sens_header import SensHeader
 from su3d_bench.datasets.sens_write import SensFrame, colour_content, depth_content, stored_frame, write_sens
-from su3d_bench.errors import DataError, StoreError
+from su3d_bench.core.errors import DataError, StoreError
 
 TOY, RAW_TOY = CASES / "sens01_toy.sens", CASES / "sens02_toy_raw.sens"
 WHERE = "scannet/scene0000_00"

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from su3d_bench.errors import DataError, ModelMissing
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.errors import DataError, ModelMissing
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception import embedded_encoder
 from su3d_bench.perception.embedded_encoder import (
     DIM,
@@ -25,7 +25,7 @@ from su3d_bench.perception.embedded_encoder import (
     log_size,
     shrink,
 )
-from su3d_bench.types import UInt8Array
+from su3d_bench.core.types import UInt8Array
 
 FOLDER = Path(embedded_encoder.__file__).parent
 TEXTS = ("an image of a chair", "plant on table", "table on plant", "a green towel", "place to sit")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from su3d_bench import registry
+from su3d_bench.core import registry
 from su3d_bench.perception.captions import (
     Caption,
     CropTruth,

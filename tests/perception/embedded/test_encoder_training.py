@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from su3d_bench.errors import ModelMissing
+from su3d_bench.core.errors import ModelMissing
 from su3d_bench.perception import training
 from su3d_bench.perception.captions import fill
 from su3d_bench.perception.embedded_encoder import EmbeddedEncoder

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scored_room import instances
 
-from su3d_bench.errors import PredictionError, StoreError
+from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.perception.language.captioner import Captioner
 from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.perception.language.client import ChatClient
@@ -23,7 +23,7 @@ from su3d_bench.perception.language.refined_names import read_records, records_o
 from su3d_bench.perception.language.refinement import ModelRefiner, TopNames, top_names, vote
 from su3d_bench.perception.language.reply_store import ReplyStore
 from su3d_bench.store import JobFolder, prediction_arrays, prediction_from_arrays, write_prediction
-from su3d_bench.types import Instances
+from su3d_bench.core.types import Instances
 
 NAMES = ("white sofa", "sofa", "couch", "trash can", "indoor-plant")
 

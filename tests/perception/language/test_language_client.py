@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from chat_server import KEY, Answered, ChatServer, chat_server, error, quick_config
 
-from su3d_bench.errors import ConfigError, ModelMissing, RunIncomplete, StoreError
+from su3d_bench.core.errors import ConfigError, ModelMissing, RunIncomplete, StoreError
 from su3d_bench.perception.language.chat import ChatRequest, Image, fitted
 from su3d_bench.perception.language.client import ChatClient
 from su3d_bench.perception.language.config import LanguageConfig, Price

@@ -21,7 +21,7 @@ from su3d_bench.perception.models.automatic_masks import (
 )
 from su3d_bench.perception.models.sam import Prompts, Sam
 from su3d_bench.perception.models.sam_networks import TorchSam
-from su3d_bench.types import BoolArray, Float32Array
+from su3d_bench.core.types import BoolArray, Float32Array
 
 
 def mask_of(rows: str) -> BoolArray:

@@ -12,7 +12,7 @@ from su3d_bench.perception.models.model_images import (
     size_with_longest_side,
     size_with_shortest_side,
 )
-from su3d_bench.types import Float32Array
+from su3d_bench.core.types import Float32Array
 
 
 def boxes_of(*rows: tuple[float, ...]) -> Float32Array:

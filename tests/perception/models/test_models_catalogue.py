@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from su3d_bench.digests import digest_file
-from su3d_bench.errors import ConfigError, ModelMissing
+from su3d_bench.core.digests import digest_file
+from su3d_bench.core.errors import ConfigError, ModelMissing
 from su3d_bench.perception.models import files as model_files
 from su3d_bench.perception.models.catalogue import MODELS, PROFILE_MODELS, model_entry
 from su3d_bench.perception.models.config import ModelsConfig

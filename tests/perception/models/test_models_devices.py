@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 from tiny_encoders import needs_models
 
-from su3d_bench.errors import ConfigError
-from su3d_bench.perception.models.devices import Batches, device_for, first_batch, precision_for
-from su3d_bench.types import Float32Array
+from su3d_bench.core.errors import ConfigError
+from su3d_bench.core.devices import Batches, device_for, first_batch, precision_for
+from su3d_bench.core.types import Float32Array
 
 
 @needs_models

@@ -18,7 +18,7 @@ from su3d_bench.perception.models.grounding_dino import (
     tag_of,
     text_prompt,
 )
-from su3d_bench.types import Float32Array
+from su3d_bench.core.types import Float32Array
 
 RGB = blocks(40, 60)
 TAGS = ("cat", "coffee table", "sofa")

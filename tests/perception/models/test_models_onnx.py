@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from tiny_encoders import noise_images, write_tiny_clip, write_tiny_siglip
 
-from su3d_bench.errors import CheckFailed, ConfigError, DataError, ModelMissing
+from su3d_bench.core.errors import CheckFailed, ConfigError, DataError, ModelMissing
 from su3d_bench.perception.models import onnx_export
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.files import locate

@@ -12,8 +12,8 @@ import numpy as np
 import pytest
 from tiny_encoders import noise_images
 
-from su3d_bench.errors import DataError, ModelMissing
-from su3d_bench.interfaces import Encoder
+from su3d_bench.core.errors import DataError, ModelMissing
+from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.image_transform import ImageTransform
 from su3d_bench.perception.models.loading import load_encoder

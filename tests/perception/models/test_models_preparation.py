@@ -16,7 +16,7 @@ from tiny_encoders import (
     write_clip_tokenizer,
 )
 
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.perception.models.image_transform import CLIP_MEAN, CLIP_STD, ImageTransform, read_transform
 from su3d_bench.perception.models.text_tokens import canonical_text
 

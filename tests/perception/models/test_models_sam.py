@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from tiny_models import SAM_PX, blocks, frame_of, tiny_sam
 
-from su3d_bench.errors import DataError
+from su3d_bench.core.errors import DataError
 from su3d_bench.perception.models import sam_onnx
 from su3d_bench.perception.models.catalogue import model_entry
 from su3d_bench.perception.models.files import ModelFiles
@@ -19,7 +19,7 @@ from su3d_bench.perception.models.pretrained import fill_sam, sam_config, sam_na
 from su3d_bench.perception.models.sam import Prompts, Sam
 from su3d_bench.perception.models.sam_networks import TorchSam
 from su3d_bench.perception.models.tagging import WordTagger
-from su3d_bench.types import BoolArray, Float32Array, UInt8Array
+from su3d_bench.core.types import BoolArray, Float32Array, UInt8Array
 
 RGB = blocks(40, 60)
 BOXES = np.array([[5, 5, 30, 30], [0, 0, 60, 40], [22.5, 3.25, 41, 39]], np.float32)

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from tiny_models import blocks
 
-from su3d_bench.errors import DataError, ModelMissing
+from su3d_bench.core.errors import DataError, ModelMissing
 from su3d_bench.perception.models.catalogue import model_entry
 from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.tagging import (
@@ -27,7 +27,7 @@ from su3d_bench.perception.models.tagging import (
 )
 from su3d_bench.perception.naming import vocabulary
 from su3d_bench.perception.tagging_words import ADDED_TAGS, BACKGROUND_TAGS, STOP_WORDS
-from su3d_bench.types import Float32Array, UInt8Array
+from su3d_bench.core.types import Float32Array, UInt8Array
 
 RGB = blocks(40, 60)
 

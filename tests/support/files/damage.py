@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 
 import numpy as np
 
-from su3d_bench.errors import DataError, Su3dError
+from su3d_bench.core.errors import DataError, Su3dError
 
 N_DAMAGES = 2_000
 MOST_SECONDS = 20.0  # one read of a small file; generous, for a busy machine, yet no endless loop passes

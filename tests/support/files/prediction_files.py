@@ -13,10 +13,10 @@ import numpy as np
 import pytest
 from places import CASES
 
-from su3d_bench.errors import PredictionError
+from su3d_bench.core.errors import PredictionError
 from su3d_bench.predictions.formats import READERS
 from su3d_bench.store import write_prediction
-from su3d_bench.types import Instances
+from su3d_bench.core.types import Instances
 
 
 def scenes_of(case: str) -> list[dict[str, Any]]:

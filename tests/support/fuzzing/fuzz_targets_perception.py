@@ -128,7 +128,7 @@ def _completion(folder: Path) -> Read:
 
 
 def _refined_names(folder: Path) -> Read:
-    from su3d_bench.digests import digest_file
+    from su3d_bench.core.digests import digest_file
     from su3d_bench.perception.language.refined_names import FILE_NAME, read_records
     from su3d_bench.store import RunFolder
 

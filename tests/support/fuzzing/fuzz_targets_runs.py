@@ -206,15 +206,15 @@ def _config(name: str, *more: str) -> Make:
 
 def _method_config(folder: Path) -> Read:
     """The settings of all methods of our own in one file."""
-    from su3d_bench.config import check_keys, read_file, resolve
+    from su3d_bench.core.config import check_keys, read_file, resolve
     from su3d_bench.perception.config import PerceptionConfig
-    from su3d_bench.registry import METHODS, load
-    from su3d_bench.toml_text import write_toml
+    from su3d_bench.core.registry import METHODS, load
+    from su3d_bench.core.toml_text import write_toml
 
     classes = {name: load("method", name).Config for name in METHODS}
     leaves: list[Any] = []
     for name, model in classes.items():
-        from su3d_bench.config import flatten
+        from su3d_bench.core.config import flatten
 
         try:
             values = model().model_dump(mode="json")
@@ -260,7 +260,7 @@ def _ablation(folder: Path) -> Read:
 def _assignments(folder: Path) -> Read:
     """Words of ``--set``, of variants and of ``--vary``, one a line of a file."""
     from su3d_bench.ablation import ablation_rows
-    from su3d_bench.config import parse_value, read_assignments
+    from su3d_bench.core.config import parse_value, read_assignments
     from su3d_bench.method_names import named_method
 
     lines = ("opensu3d.top_m=10", "top_m=10,5", "perception.cache=false", "rooms.width=64", "opensu3d.a='x'")

@@ -17,7 +17,7 @@ from types import FrameType
 
 from fuzz_mutations import mutated
 
-from su3d_bench.errors import GroundTruthMissing, Su3dError
+from su3d_bench.core.errors import GroundTruthMissing, Su3dError
 
 MOST_SECONDS = 20.0  # one read of a small file; generous, for a busy machine
 MOST_GROWN_BYTES = 256 << 20  # how far the peak of resident memory may stand above what was there before the read

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from su3d_bench.types import Float32Array, Float64Array, Frame, InstanceMesh, LabelSet, UInt8Array
+from su3d_bench.core.types import Float32Array, Float64Array, Frame, InstanceMesh, LabelSet, UInt8Array
 
 INTRINSICS: Float64Array = np.array([[100.0, 0, 79.5], [0, 100.0, 59.5], [0, 0, 1]])
 

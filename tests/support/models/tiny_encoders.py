@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from su3d_bench.types import UInt8Array
+from su3d_bench.core.types import UInt8Array
 
 needs_models = pytest.mark.skipif(
     find_spec("torch") is None or find_spec("transformers") is None,
@@ -27,7 +27,7 @@ def write_tiny_clip(folder: Path, seed: int = 0, weights: str = "model.safetenso
     """A CLIP of two layers as transformers saves it; ``weights`` may be ``pytorch_model.bin``, the older form."""
     import torch
 
-    from su3d_bench.perception.models.devices import require_transformers
+    from su3d_bench.core.devices import require_transformers
 
     require_transformers("this test")  # quiet from here on
     from transformers import CLIPConfig, CLIPModel
@@ -64,7 +64,7 @@ def write_tiny_siglip(folder: Path, seed: int = 0) -> Path:
     import torch
     from tokenizers import Tokenizer, models, pre_tokenizers
 
-    from su3d_bench.perception.models.devices import require_transformers
+    from su3d_bench.core.devices import require_transformers
 
     require_transformers("this test")
     from transformers import SiglipConfig, SiglipModel

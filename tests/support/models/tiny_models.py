@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.types import Frame, UInt8Array
+from su3d_bench.core.types import Frame, UInt8Array
 
 SAM_PX = 64
 DINO_PX = (48, 80)

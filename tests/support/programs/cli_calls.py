@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from fuzzing import BadMessage, fault_of_message
 
 from su3d_bench.cli.main import main
-from su3d_bench.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INCOMPLETE, EXIT_INTERNAL, Su3dError
+from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, EXIT_INCOMPLETE, EXIT_INTERNAL, Su3dError
 
 MOST_LINES = 200  # on stderr: faults of many answers are listed one by one
 

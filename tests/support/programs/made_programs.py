@@ -12,11 +12,11 @@ import pytest
 from painted import Painted
 
 from su3d_bench.baselines.command import Command, CommandConfig
-from su3d_bench.errors import DataError, PredictionError
-from su3d_bench.interfaces import SceneTools
+from su3d_bench.core.errors import DataError, PredictionError
+from su3d_bench.core.interfaces import SceneTools
 from su3d_bench.scene_tools import no_detections
-from su3d_bench.timing import Timer
-from su3d_bench.types import Frame, SceneInfo, Surface
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import Frame, SceneInfo, Surface
 
 SCENE = SceneInfo("rooms", "a b", 6, 1, "rendered-rooms", seed=7)
 SURFACE = Surface(

@@ -8,7 +8,7 @@ import h5py
 import numpy as np
 
 from su3d_bench.datasets.replica_clouds import N_EMBEDDING
-from su3d_bench.types import Float32Array
+from su3d_bench.core.types import Float32Array
 
 SEQUENCE = "Replica-semantic/room_0/Sequence_1"
 CLOUDS = f"{SEQUENCE}/saved-maps-gt/pointclouds"

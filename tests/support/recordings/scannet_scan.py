@@ -12,7 +12,7 @@ import numpy as np
 from su3d_bench.datasets.ply import ListColumn, PlyElement, write_ply
 from su3d_bench.datasets.sens_header import SensHeader
 from su3d_bench.datasets.sens_write import SensFrame, colour_content, depth_content, write_sens
-from su3d_bench.types import Float64Array, UInt8Array
+from su3d_bench.core.types import Float64Array, UInt8Array
 
 SCAN = "scene0000_00"
 COLUMNS, ROWS, SPACING_M = 6, 4, 0.5  # of the vertices of the small mesh

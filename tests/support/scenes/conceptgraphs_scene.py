@@ -11,8 +11,8 @@ from su3d_bench.baselines.conceptgraphs_config import MappingConfig
 from su3d_bench.baselines.conceptgraphs_objects import MapObject, Sighting
 from su3d_bench.baselines.object_clouds import bounding_box
 from su3d_bench.perception.crops import mask_boxes
-from su3d_bench.timing import Timer
-from su3d_bench.types import Detections, Frame, Instances, SceneInfo
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import Detections, Frame, Instances, SceneInfo
 
 SCENE = SceneInfo("made", "plates", 4, 1, "rendered-rooms", seed=7)
 WIDTH, HEIGHT, FOCAL = 96, 72, 72.0

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.baselines.group_overlap import GroupedCloud
-from su3d_bench.types import Detections, Float64Array, Frame, Int64Array
+from su3d_bench.core.types import Detections, Float64Array, Frame, Int64Array
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 120.0
 INTRINSICS = np.array([[FOCAL, 0, (WIDTH - 1) / 2], [0, FOCAL, (HEIGHT - 1) / 2], [0, 0, 1.0]])

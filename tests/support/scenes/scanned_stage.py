@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.types import Frame
+from su3d_bench.core.types import Frame
 
 CHAIR, WALL = 20, 93
 WIDTH, HEIGHT, N_FRAMES = 16, 12, 5

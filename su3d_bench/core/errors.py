@@ -9,7 +9,7 @@ from __future__ import annotations
 import difflib
 from collections.abc import Iterable
 
-from su3d_bench.plain_text import printable
+from su3d_bench.core.plain_text import printable
 
 MOST_CHARACTERS = 1000  # of a message, which may quote a hostile file and name a deep folder
 EXIT_DONE = 0

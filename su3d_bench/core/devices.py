@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from su3d_bench.errors import ConfigError, ModelMissing
+from su3d_bench.core.errors import ConfigError, ModelMissing
 
 Item = TypeVar("Item")
 Done = TypeVar("Done")

@@ -15,8 +15,8 @@ from typing import Annotated, Any, Literal, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from su3d_bench.errors import ConfigError, suggest
-from su3d_bench.toml_text import key_lines
+from su3d_bench.core.errors import ConfigError, suggest
+from su3d_bench.core.toml_text import key_lines
 
 Model = TypeVar("Model", bound=BaseModel)
 KeyPath = tuple[str, ...]

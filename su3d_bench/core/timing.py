@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.types import Float64Array, Int64Array
+from su3d_bench.core.types import Float64Array, Int64Array
 
 
 class Timer:

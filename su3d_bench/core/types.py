@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.errors import DataError, PredictionError
+from su3d_bench.core.errors import DataError, PredictionError
 
 BoolArray = NDArray[np.bool_]
 UInt8Array = NDArray[np.uint8]

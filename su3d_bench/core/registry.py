@@ -11,7 +11,7 @@ from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.errors import ConfigError, suggest
+from su3d_bench.core.errors import ConfigError, suggest
 
 DATASETS = {
     "rooms": "su3d_bench.datasets.rooms:Rooms",
