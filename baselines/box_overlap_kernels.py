@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.kernels import njit
+from su3d_bench.numerics.compiled import njit
 
 MOST_CORNERS = 16  # a rectangle cut by six planes has at most ten
 COINCIDENT_M = 1e-9

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from su3d_bench.kernels import njit
+from su3d_bench.numerics.compiled import njit
 
 ONE = np.float32(1.0)
 ZERO = np.float32(0.0)

@@ -35,7 +35,7 @@ def density_clusters(points: Float64Array, eps_m: float, min_points: int) -> Int
 
     A point is a neighbour of itself.
     """
-    from su3d_bench.opensu3d import cluster_kernels as kernels
+    from su3d_bench.numerics import clusters as kernels
 
     labels = np.full(len(points), kernels.NOISE, np.int64)
     if len(points):
@@ -86,7 +86,7 @@ class _Grid:
 
 def _grid(points: Float64Array, origin: Float64Array, side_m: float) -> _Grid:
     from su3d_bench.baselines import object_clouds_kernels as kernels
-    from su3d_bench.cell_kernels import ABSENT
+    from su3d_bench.numerics.cells import ABSENT
 
     n = len(points)
     table = np.full(1 << (2 * n).bit_length(), ABSENT, np.int32)

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.geometry import valid_depth
+from su3d_bench.numerics.geometry import valid_depth
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int64Array
 
 LEAST_ALPHA, MOST_ALPHA = 1e-7, 1.01  # get_alpha

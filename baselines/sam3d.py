@@ -31,7 +31,7 @@ from su3d_bench.baselines.group_overlap import (
     without_small_groups,
 )
 from su3d_bench.core.errors import DataError
-from su3d_bench.geometry import back_project, valid_depth
+from su3d_bench.numerics.geometry import back_project, valid_depth
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import BoolArray, Detections, Float32Array, Float64Array, Frame, Instances, Int32Array, Int64Array, PerceptionNeeds, SceneInfo, Surface

@@ -15,7 +15,7 @@ import numpy as np
 
 from su3d_bench.datasets.rgbd_source import SensorPair
 from su3d_bench.core.errors import DataError
-from su3d_bench.geometry import are_rigid
+from su3d_bench.numerics.geometry import are_rigid
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
 
 Grid = Literal["depth", "colour"]

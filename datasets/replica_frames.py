@@ -20,7 +20,7 @@ import numpy as np
 from su3d_bench.datasets.image_files import decode_colour, decode_depth, read_bytes
 from su3d_bench.datasets.replica_truth import shown
 from su3d_bench.core.errors import DataError
-from su3d_bench.geometry import are_rigid
+from su3d_bench.numerics.geometry import are_rigid
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
 
 CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")

@@ -15,7 +15,7 @@ from su3d_bench.datasets.recorded_frames import Folder, numbers, pinhole, read_t
 from su3d_bench.datasets.rgbd_description import INDEX, RgbdDescription
 from su3d_bench.datasets.timed_poses import quaternion_poses, rows_of, seconds, unit_quaternion
 from su3d_bench.core.errors import DataError
-from su3d_bench.geometry import are_rigid
+from su3d_bench.numerics.geometry import are_rigid
 from su3d_bench.core.types import Float64Array
 
 MAX_NUMBER = 2**31 - 1  # maps keep the numbers of frames in 32 bits; time stamps in names do not fit

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.compiled_open3d import compiled_open3d
+from su3d_bench.numerics.open3d_core import compiled_open3d
 from su3d_bench.datasets.rooms_items import Item
 from su3d_bench.datasets.rooms_materials import Material
 from su3d_bench.datasets.rooms_shapes import Shape, rotation

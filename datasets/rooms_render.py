@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.compiled_open3d import compiled_open3d
+from su3d_bench.numerics.open3d_core import compiled_open3d
 from su3d_bench.datasets.rooms_mesh import RoomMesh, caster
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, UInt8Array
 

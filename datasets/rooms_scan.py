@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.compiled_open3d import compiled_open3d
+from su3d_bench.numerics.open3d_core import compiled_open3d
 from su3d_bench.datasets.rooms_mesh import Grid, Patches, RoomMesh, at_rows, caster, cut, merge_equal
 from su3d_bench.datasets.rooms_render import Renderer, camera_intrinsics
 from su3d_bench.core.errors import DataError

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.datasets.rooms_pattern_kernels import surface_colour
-from su3d_bench.kernels import njit
+from su3d_bench.numerics.compiled import njit
 
 compiled: Any = njit(cache=True)
 inlined: Any = njit(cache=True, inline="never")

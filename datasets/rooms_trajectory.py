@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.compiled_open3d import compiled_open3d
+from su3d_bench.numerics.open3d_core import compiled_open3d
 from su3d_bench.datasets.rooms_layout import Box
 from su3d_bench.datasets.rooms_mesh import RoomMesh, caster
 from su3d_bench.core.types import BoolArray, Float64Array

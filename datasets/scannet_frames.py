@@ -10,7 +10,7 @@ import numpy as np
 from su3d_bench.datasets.registration import Registration
 from su3d_bench.datasets.rgbd_source import RgbdSource
 from su3d_bench.core.errors import DataError
-from su3d_bench.geometry import are_rigid
+from su3d_bench.numerics.geometry import are_rigid
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int64Array
 
 N_DEPTH_VALUES = 1 << 16

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.geometry import back_project, valid_depth
+from su3d_bench.numerics.geometry import back_project, valid_depth
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame
 
 PROBES = 300  # points of an instance that are looked for in every frame

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.statistics import Growth
+from su3d_bench.numerics.statistics import Growth
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.update_times import MAP, TOTAL, MethodSummary, StageSummary, UpdateTimes
 

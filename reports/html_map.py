@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.geometry import voxel_coordinates
+from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.metrics.transfer import nearest, row_ids
 from su3d_bench.core.types import DenseFeatures, Float32Array, Float64Array, Instances, Int32Array, Int64Array, Prediction, UInt8Array
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.geometry import back_project, valid_depth
+from su3d_bench.numerics.geometry import back_project, valid_depth
 from su3d_bench.core.interfaces import Dataset
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, GroundTruth, UInt8Array
 

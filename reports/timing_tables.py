@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 from su3d_bench.reports.tables import NOT_MEASURED, aligned, percent
-from su3d_bench.statistics import Growth
+from su3d_bench.numerics.statistics import Growth
 from su3d_bench.update_times import MethodSummary, StageSummary
 
 MIB = 2**20

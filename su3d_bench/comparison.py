@@ -30,7 +30,7 @@ from su3d_bench.metrics.results import Counts, ProtocolResult, resampled_metrics
 from su3d_bench.core.plain_text import printable
 from su3d_bench.protocols import ProtocolRules, load_protocol
 from su3d_bench.scoring import SceneScore, combine
-from su3d_bench.statistics import SignFlipTest, percentile_interval, resample_weights, sign_flip_test
+from su3d_bench.numerics.statistics import SignFlipTest, percentile_interval, resample_weights, sign_flip_test
 from su3d_bench.core.types import Float64Array
 
 SCHEMA = 1

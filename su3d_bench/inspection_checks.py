@@ -14,7 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from su3d_bench.geometry import RIGID_TOLERANCE
+from su3d_bench.numerics.geometry import RIGID_TOLERANCE
 from su3d_bench.core.types import Float32Array, Float64Array, Frame
 
 Severity = Literal["error", "warning", "note"]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.statistics import Growth, growth_exponent
+from su3d_bench.numerics.statistics import Growth, growth_exponent
 from su3d_bench.core.types import Float64Array
 
 # Stages that are no part of keeping the map: reading the frame, and perception.

@@ -6,7 +6,7 @@ import numpy as np
 from numba.core import types
 from numba.extending import intrinsic
 
-from su3d_bench.kernels import njit
+from su3d_bench.numerics.compiled import njit
 
 
 @intrinsic

@@ -12,7 +12,7 @@ import numpy as np
 from su3d_bench.metrics import instance_ap, object_means, resampling, semantic, shares
 from su3d_bench.metrics.labelling import scored_classes
 from su3d_bench.protocols import AP_NAMES, SHARE_KINDS, VALUES_OF_METRIC, ProtocolRules
-from su3d_bench.statistics import percentile_interval, resample_weights
+from su3d_bench.numerics.statistics import percentile_interval, resample_weights
 from su3d_bench.core.types import Float64Array, Int64Array
 
 Counts = instance_ap.InstanceCounts | semantic.SemanticCounts | object_means.ObjectCounts | shares.ShareCounts

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.geometry import voxel_coordinates
+from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics import object_means, openlex3d, query_ap, transfer
 from su3d_bench.metrics.labelling import cosines, device_of, encoder_warning, has_every_label, text_features

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.kernels import njit
+from su3d_bench.numerics.compiled import njit
 
 ABSENT = -1
 OWNED, BACKGROUND, DROPPED = 0, 1, 2  # what the pixels of a ring become

@@ -48,7 +48,7 @@ def caption_of(name: str) -> str:
 
 def cluster(points: Float64Array, config: OpenSU3DConfig) -> Int64Array:
     """DBSCAN label (N,) of each point: 0, 1, ... or NOISE."""
-    from su3d_bench.opensu3d import cluster_kernels as kernels
+    from su3d_bench.numerics import clusters as kernels
 
     labels = np.full(len(points), NOISE, np.int64)
     if len(points) >= config.dbscan_min_points:

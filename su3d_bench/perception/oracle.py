@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.compiled_open3d import compiled_open3d
+from su3d_bench.numerics.open3d_core import compiled_open3d
 from su3d_bench.core.digests import package_digest
 from su3d_bench.perception.cache import array_digest, content_key
 from su3d_bench.perception.crops import mask_boxes

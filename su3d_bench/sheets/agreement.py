@@ -8,7 +8,7 @@ from itertools import combinations
 
 import numpy as np
 
-from su3d_bench.statistics import bootstrap_interval
+from su3d_bench.numerics.statistics import bootstrap_interval
 from su3d_bench.core.types import Float64Array, Int64Array
 
 Interval = tuple[float, float]

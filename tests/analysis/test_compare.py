@@ -27,7 +27,7 @@ from su3d_bench.metrics.resampled_values import resampled_classes
 from su3d_bench.metrics.results import metric_values, resampled_metrics
 from su3d_bench.protocols import load_protocol
 from su3d_bench.reports.comparison_table import comparison_tables
-from su3d_bench.statistics import MAX_EXACT_PAIRS, SignFlipTest, resample_weights, sign_flip_test
+from su3d_bench.numerics.statistics import MAX_EXACT_PAIRS, SignFlipTest, resample_weights, sign_flip_test
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"

@@ -7,9 +7,9 @@ import doctest
 import numpy as np
 import pytest
 
-import su3d_bench.statistics
+import su3d_bench.numerics.statistics
 from su3d_bench.metrics import instance_ap, resampling, semantic
-from su3d_bench.statistics import bootstrap_interval, percentile_interval, resample_weights
+from su3d_bench.numerics.statistics import bootstrap_interval, percentile_interval, resample_weights
 from su3d_bench.core.types import Float64Array, Int64Array
 
 

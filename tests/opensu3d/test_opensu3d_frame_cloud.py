@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.geometry import back_project, valid_depth
+from su3d_bench.numerics.geometry import back_project, valid_depth
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.frame_cloud import frame_cloud
 from su3d_bench.opensu3d.id_image import NO_DETECTION

@@ -17,7 +17,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.finished_run import read_run
 from su3d_bench.finished_updates import read_update_times
-from su3d_bench.statistics import growth_exponent
+from su3d_bench.numerics.statistics import growth_exponent
 from su3d_bench.core.timing import peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Float64Array
 from su3d_bench.update_times import MapCost, UpdateTimes, summarise

@@ -17,7 +17,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.execution import run_units
 from su3d_bench.metrics import instance_ap, precision_recall, resampling
 from su3d_bench.scoring import pack_scores, unpack_scores
-from su3d_bench.statistics import growth_exponent, resample_weights
+from su3d_bench.numerics.statistics import growth_exponent, resample_weights
 
 WORDS = ["run", "--scenes", f"{SCENES}/painted.py:Painted/*", "--methods", f"{SCENES}/painted.py:Collector"]
 PROTOCOLS = ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures", "--out", "out"]

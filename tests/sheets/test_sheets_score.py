@@ -19,7 +19,7 @@ from su3d_bench.reports.table_formats import csv_text, html_page, markdown
 from su3d_bench.sheets.items import Key, Sheet, write_key, write_sheet
 from su3d_bench.sheets.score_file import read_scores
 from su3d_bench.sheets.scores import ScoreCell, Scores, paired_p
-from su3d_bench.statistics import sign_flip_test
+from su3d_bench.numerics.statistics import sign_flip_test
 from su3d_bench.core.types import Float64Array
 
 

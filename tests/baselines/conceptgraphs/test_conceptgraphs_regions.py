@@ -15,7 +15,7 @@ from su3d_bench.baselines.conceptgraphs_config import MappingConfig
 from su3d_bench.baselines.conceptgraphs_regions import LiftedRegion, kept_regions, lift, subtract_contained
 from su3d_bench.baselines.object_clouds import bounding_box, density_clusters, largest_cluster, voxel_average
 from su3d_bench.core.errors import DataError
-from su3d_bench.geometry import back_project
+from su3d_bench.numerics.geometry import back_project
 from su3d_bench.perception.profiles import PerceptionConfig, build_perception
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Detections

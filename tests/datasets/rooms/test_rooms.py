@@ -17,7 +17,7 @@ from su3d_bench.datasets.rooms_kept import MESH_ARRAYS, kept_mesh, kept_walk
 from su3d_bench.datasets.rooms_mesh import RoomMesh
 from su3d_bench.datasets.rooms_scan import RoomScan
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.geometry import back_project
+from su3d_bench.numerics.geometry import back_project
 
 SMALL = Rooms.Options(width=96, height=72, n_frames=80, mesh_spacing_m=0.03)
 SCENE = "bathroom7"

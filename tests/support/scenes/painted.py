@@ -18,7 +18,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.geometry import back_project
+from su3d_bench.numerics.geometry import back_project
 from su3d_bench.core.interfaces import StageTimer
 from su3d_bench.core.types import Detections, Float32Array, Frame, GroundTruth, InstanceMesh, Instances, LabelSet, PerceptionNeeds, Prediction, SceneInfo, UInt8Array
 

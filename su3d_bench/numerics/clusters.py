@@ -12,8 +12,8 @@ import math
 
 import numpy as np
 
-from su3d_bench.cell_kernels import ABSENT, slot_of
-from su3d_bench.kernels import njit
+from su3d_bench.numerics.cells import ABSENT, slot_of
+from su3d_bench.numerics.compiled import njit
 
 NOISE = -1
 # Of 5x5x5 cells around one, the nearest first; a point within eps lies in one of them.
