@@ -106,7 +106,7 @@ def false_seals(folder: Path, expected: dict[str, Any]) -> list[str]:
     from su3d_bench.core.digests import digest_file
     from su3d_bench.core.errors import Su3dError
     from su3d_bench.finished_run import read_run
-    from su3d_bench.store import JobFolder
+    from su3d_bench.store.run_folder import JobFolder
 
     wrong = []
     for done in folder.rglob("done.json"):

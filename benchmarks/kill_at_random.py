@@ -205,7 +205,7 @@ class Trial:
 
     def _lock(self, folder: Path) -> None:
         from su3d_bench.core.errors import StoreError
-        from su3d_bench.store import RunFolder
+        from su3d_bench.store.run_folder import RunFolder
 
         try:
             with RunFolder(folder).locked():

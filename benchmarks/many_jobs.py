@@ -33,7 +33,7 @@ from su3d_bench.metrics.semantic import SemanticCounts
 from su3d_bench.planning import Plan, make_plan
 from su3d_bench.runner import summarise
 from su3d_bench.scoring import SceneScore, pack_scores, unpack_scores
-from su3d_bench.store import RunFolder, make_folder
+from su3d_bench.store.run_folder import RunFolder, make_folder
 from su3d_bench.core.types import ImageDomain, SceneInfo
 
 N_FRAMES = 20

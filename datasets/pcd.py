@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from su3d_bench.datasets.ply_header import clip
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.plain_text import printable
-from su3d_bench.store import write_bytes
+from su3d_bench.store.run_folder import write_bytes
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
 
 MOST_HEADER_BYTES = 1 << 16  # headers have some hundred

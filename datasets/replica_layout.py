@@ -24,7 +24,7 @@ from su3d_bench.datasets.replica_labels import replica_label_set
 from su3d_bench.datasets.replica_truth import INFO_NAME, MESH_NAME
 from su3d_bench.datasets.scene_making import Scan, ScannedDataset, ScannedObject, SceneTarget, write_shared_text
 from su3d_bench.core.errors import DataError
-from su3d_bench.store import json_text, make_folder, write_json, write_text
+from su3d_bench.store.run_folder import json_text, make_folder, write_json, write_text
 from su3d_bench.core.types import Float64Array, Frame
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes

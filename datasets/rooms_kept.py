@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.datasets.rooms_mesh import RoomMesh
-from su3d_bench.kept_files import DAMAGE, filling, read_arrays
+from su3d_bench.store.atomic import DAMAGE, filling, read_arrays
 from su3d_bench.core.types import Float64Array
 
 Arrays = dict[str, Any]

@@ -19,7 +19,7 @@ from su3d_bench.datasets.scannet_meta import meta_name
 from su3d_bench.datasets.scannet_rooms import categories, nyu40_colours, scene_type
 from su3d_bench.datasets.scannet_truth import labels_name, mesh_name
 from su3d_bench.datasets.scene_making import Scan, ScannedDataset
-from su3d_bench.store import make_folder, write_text
+from su3d_bench.store.run_folder import make_folder, write_text
 from su3d_bench.core.types import Float64Array, Int64Array, UInt8Array
 
 MIN_COSINE = 0.9  # faces that meet at more than 26 degrees belong to two segments

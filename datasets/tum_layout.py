@@ -10,7 +10,7 @@ from typing import Any
 from su3d_bench.datasets.layout_files import depth_in_units, png_bytes
 from su3d_bench.datasets.replica_folders import MARKER
 from su3d_bench.datasets.scene_making import FRAMES_PER_SECOND, ScannedDataset, SceneTarget
-from su3d_bench.store import make_folder, write_json, write_text
+from su3d_bench.store.run_folder import make_folder, write_json, write_text
 from su3d_bench.core.types import Frame
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes

@@ -9,7 +9,7 @@ from typing import Any
 
 from su3d_bench.reports.attribution_table import n_text
 from su3d_bench.reports.comparison_table import signed
-from su3d_bench.store import make_folder, write_bytes
+from su3d_bench.store.run_folder import make_folder, write_bytes
 
 DPI = 100
 PANEL_WIDTH, ROW_HEIGHT, PANEL_EXTRA = 4.6, 0.34, 1.25  # inches

@@ -13,7 +13,7 @@ from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.plain_text import printable
 from su3d_bench.reports.item_picture import Tag
 from su3d_bench.reports.scene_picture import drawable
-from su3d_bench.store import make_folder, write_bytes
+from su3d_bench.store.run_folder import make_folder, write_bytes
 from su3d_bench.core.types import UInt8Array
 
 FORMATS = ("pdf", "png", "svg")

@@ -21,7 +21,7 @@ from su3d_bench.reports.pictures import (
 )
 from su3d_bench.reports.render import OVERSAMPLING, Camera, colour, render, room_bounds, view_cameras
 from su3d_bench.reports.scene_look import SceneLook
-from su3d_bench.store import make_folder, write_bytes
+from su3d_bench.store.run_folder import make_folder, write_bytes
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, UInt8Array
 
 WIDTH, DPI = 1920, 100

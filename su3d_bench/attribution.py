@@ -30,7 +30,7 @@ from su3d_bench.planning import data_root, dataset_targets
 from su3d_bench.protocols import ProtocolRules, load_protocol
 from su3d_bench.scene_job import Part, build_dataset
 from su3d_bench.scoring import SceneScore
-from su3d_bench.store import RunFolder, read_prediction
+from su3d_bench.store.run_folder import RunFolder, read_prediction
 from su3d_bench.core.types import DenseFeatures, GroundTruth, Prediction
 
 SCHEMA = 1

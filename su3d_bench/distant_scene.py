@@ -18,8 +18,8 @@ from su3d_bench.executors import Report
 from su3d_bench.remote_folder import RemoteFolder
 from su3d_bench.scene_job import MethodOutcome, SceneJob
 from su3d_bench.scene_run import failed_outcomes, run_scene
-from su3d_bench.store import RunFolder, make_folder, write_bytes
-from su3d_bench.temporary_folders import TemporaryFolder
+from su3d_bench.store.run_folder import RunFolder, make_folder, write_bytes
+from su3d_bench.store.temporary_folders import TemporaryFolder
 
 CACHE_ROOT = "~/.cache/su3d-bench/cache"
 SEAL = "done.json"

@@ -10,7 +10,7 @@ from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, sug
 from su3d_bench.core.plain_text import printable
 from su3d_bench.predictions.base import Reader, shown
 from su3d_bench.predictions.formats import recognise
-from su3d_bench.store import read_json
+from su3d_bench.store.run_folder import read_json
 
 OWN_FORMAT = "su3d-bench"
 

@@ -11,7 +11,7 @@ import numpy as np
 from su3d_bench.core.errors import DataError
 from su3d_bench.finished_run import FinishedRun
 from su3d_bench.core.plain_text import printable
-from su3d_bench.store import is_file
+from su3d_bench.store.run_folder import is_file
 from su3d_bench.core.types import Float64Array
 from su3d_bench.update_times import MapCost, UpdateTimes
 

@@ -12,7 +12,7 @@ from su3d_bench.perception.profiles import Perception
 from su3d_bench.protocols import load_protocol
 from su3d_bench.questions.refined import refined_digest
 from su3d_bench.scene_job import MethodOutcome, SceneJob
-from su3d_bench.store import JobFolder
+from su3d_bench.store.run_folder import JobFolder
 from su3d_bench.core.types import SceneInfo
 
 LAYOUTS_OF_ROOMS = ("replica", "scannet", "tum")  # in which `datasets make rooms` writes files

@@ -43,7 +43,7 @@ from su3d_bench.reports.html_map import (
 )
 from su3d_bench.reports.scene_look import SceneLook, look_at
 from su3d_bench.scene_job import Part, build_dataset
-from su3d_bench.store import read_prediction
+from su3d_bench.store.run_folder import read_prediction
 from su3d_bench.core.types import DenseFeatures, Frame, GroundTruth, Instances, Int64Array, Prediction
 
 QUERIES = (

@@ -19,7 +19,7 @@ from su3d_bench.metrics.semantic import SemanticCounts, concatenate
 from su3d_bench.core.plain_text import printable, printable_json
 from su3d_bench.protocols import load_protocol
 from su3d_bench.reports.html_data import confusion_cells, series_of, summary_data
-from su3d_bench.store import read_json
+from su3d_bench.store.run_folder import read_json
 from su3d_bench.update_times import summarise
 
 MOST_PAIRS = 40  # pairs of methods that are compared: all of nine methods, and a few seconds

@@ -35,7 +35,7 @@ from su3d_bench.scene_job import (
     config_key,
     refuse_other_run,
 )
-from su3d_bench.store import RunFolder
+from su3d_bench.store.run_folder import RunFolder
 
 DATA_ROOT = "~/.cache/su3d-bench/data"
 NO_SYSTEMS = (CEILING_METHOD, "command")  # what `--methods all` leaves out: the truth itself, and programs of others

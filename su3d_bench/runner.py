@@ -35,7 +35,7 @@ from su3d_bench.protocols import ProtocolRules, load_protocol
 from su3d_bench.scene_job import CEILING_METHOD, MethodOutcome, SceneJob
 from su3d_bench.scene_run import failed_outcomes, run_scene
 from su3d_bench.scoring import SceneScore, combine, combined_metrics, unpack_scores
-from su3d_bench.store import SCHEMA, JobFolder, remove_file, write_json, write_text
+from su3d_bench.store.run_folder import SCHEMA, JobFolder, remove_file, write_json, write_text
 from su3d_bench.core.timing import hardware_line, processor_digest
 from su3d_bench.core.toml_text import write_toml
 

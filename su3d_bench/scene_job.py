@@ -13,7 +13,7 @@ from su3d_bench.core.config import flatten
 from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, package_versions
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.interfaces import Method
-from su3d_bench.store import JobFolder
+from su3d_bench.store.run_folder import JobFolder
 
 CEILING_METHOD = "oracle"
 # Settings of perception that move no number, or whose part that does is in perception's digest.

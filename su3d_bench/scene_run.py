@@ -39,7 +39,7 @@ from su3d_bench.scene_job import (
 from su3d_bench.scene_log import SceneLog
 from su3d_bench.scene_tools import FirstFrames, surface_of, true_proposals
 from su3d_bench.scoring import SceneScore, Truth, pack_scores, score_scene, why_not_scorable
-from su3d_bench.store import JobFolder, RunFolder, read_prediction, write_bytes, write_text
+from su3d_bench.store.run_folder import JobFolder, RunFolder, read_prediction, write_bytes, write_text
 from su3d_bench.core.timing import device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Prediction, Proposals, SceneInfo
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.kept_files import DAMAGE, read_arrays
+from su3d_bench.store.atomic import DAMAGE, read_arrays
 from su3d_bench.metrics import instance_ap, object_means, semantic, shares, transfer
 from su3d_bench.metrics.count_shapes import check_against, checked_counts
 from su3d_bench.metrics.openlex3d import OpenLexTruth

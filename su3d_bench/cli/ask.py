@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from su3d_bench.reasoning.answers import Answer
     from su3d_bench.reasoning.scene_map import SceneMap
-    from su3d_bench.store import JobFolder, RunFolder
+    from su3d_bench.store.run_folder import JobFolder, RunFolder
     from su3d_bench.core.types import Instances
 
 SOLVERS = ("built-in", "llm")
@@ -93,13 +93,13 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _run_of(arguments: argparse.Namespace) -> RunFolder:
-    from su3d_bench.store import RunFolder
+    from su3d_bench.store.run_folder import RunFolder
 
     return latest_run(arguments.scene, arguments.method) if arguments.run is None else RunFolder(arguments.run)
 
 
 def _map(run: RunFolder, arguments: argparse.Namespace) -> Instances:
-    from su3d_bench.store import read_prediction
+    from su3d_bench.store.run_folder import read_prediction
     from su3d_bench.core.types import Instances
 
     job = run.job(arguments.scene, arguments.method)

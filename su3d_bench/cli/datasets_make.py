@@ -22,7 +22,7 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, suggest
 from su3d_bench.executors import Event, Report, run_inline, run_processes
 from su3d_bench.planning import data_root, expand_scenes
 from su3d_bench.scene_job import Part, build_dataset
-from su3d_bench.store import RunFolder, make_folder
+from su3d_bench.store.run_folder import RunFolder, make_folder
 
 FRAMES_A_UNIT = 400  # a quarter of a room: enough that building the room anew in each process does not matter
 WHAT_A_LAYOUT_TAKES = ("scan", "objects", "trajectory", "intrinsics")

@@ -274,7 +274,7 @@ def _encoder(content: Content, source: Source, rules: ProtocolRules, texts: Path
     from su3d_bench.cli.query import encoder_of
     from su3d_bench.evaluation_scoring import n_feature_dimensions
     from su3d_bench.evaluation_texts import encoder_for, read_text_features
-    from su3d_bench.store import RunFolder
+    from su3d_bench.store.run_folder import RunFolder
 
     n_dimensions = n_feature_dimensions(rules, content)
     if n_dimensions is None:

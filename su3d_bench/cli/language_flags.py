@@ -11,7 +11,7 @@ from su3d_bench.cli.flags import add_settings
 if TYPE_CHECKING:
     from su3d_bench.perception.language.client import ChatClient
     from su3d_bench.perception.language.config import LanguageConfig
-    from su3d_bench.store import RunFolder
+    from su3d_bench.store.run_folder import RunFolder
 
 PREFIX = ("perception", "language")
 

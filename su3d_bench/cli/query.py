@@ -14,7 +14,7 @@ from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, sug
 if TYPE_CHECKING:
     from su3d_bench.core.interfaces import Encoder
     from su3d_bench.opensu3d.retrieval import Ranking
-    from su3d_bench.store import RunFolder
+    from su3d_bench.store.run_folder import RunFolder
     from su3d_bench.core.types import Instances
 
 
@@ -43,7 +43,7 @@ def call(arguments: argparse.Namespace) -> int:
     limit_threads()
     from su3d_bench.opensu3d.retrieval import rank
     from su3d_bench.reports.pictures import draw_heat_map
-    from su3d_bench.store import RunFolder, read_prediction
+    from su3d_bench.store.run_folder import RunFolder, read_prediction
     from su3d_bench.core.types import DenseFeatures, Instances
 
     if arguments.top < 1:
@@ -90,7 +90,7 @@ def _rows(instances: Instances, ranking: Ranking, top: int) -> list[dict[str, An
 
 def latest_run(scene: str, method: str) -> RunFolder:
     """The run folder below ``runs/`` whose map of the scene is the youngest."""
-    from su3d_bench.store import RunFolder
+    from su3d_bench.store.run_folder import RunFolder
 
     runs = [RunFolder(path) for path in Path("runs").glob("*") if path.is_dir()]
     made = [(run.job(scene, method).prediction, run) for run in runs if run.job(scene, method).prediction.is_file()]
@@ -103,7 +103,7 @@ def latest_run(scene: str, method: str) -> RunFolder:
 
 def no_map(run: RunFolder, scene: str, method: str) -> StoreError:
     """The error of a run without such a map: the names that it has instead, else the command that would make it."""
-    from su3d_bench.store import read_json
+    from su3d_bench.store.run_folder import read_json
 
     record: Any = None
     with suppress(StoreError):
@@ -128,7 +128,7 @@ def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
     from su3d_bench.perception.models.encoder import FoundationEncoder
     from su3d_bench.perception.models.loading import load_encoder
     from su3d_bench.planning import cache_root
-    from su3d_bench.store import read_json
+    from su3d_bench.store.run_folder import read_json
 
     record = read_json(run.path / "run.json")
     record = record if isinstance(record, dict) else {}

@@ -14,7 +14,7 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, Stor
 if TYPE_CHECKING:
     from su3d_bench.perception.language.refined_names import NameRecords
     from su3d_bench.perception.language.refinement import RefinedName, TopNames
-    from su3d_bench.store import JobFolder, RunFolder
+    from su3d_bench.store.run_folder import JobFolder, RunFolder
     from su3d_bench.core.types import Instances
 
 REFINERS = ("vote", "model")
@@ -72,7 +72,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 def _jobs(arguments: argparse.Namespace) -> dict[str, JobFolder]:
     """Scene -> folder of its map, of the scenes asked for."""
-    from su3d_bench.store import RunFolder
+    from su3d_bench.store.run_folder import RunFolder
 
     run = RunFolder(arguments.run)
     known = _scenes(run)
@@ -90,7 +90,7 @@ def _jobs(arguments: argparse.Namespace) -> dict[str, JobFolder]:
 def _scenes(run: RunFolder) -> list[str]:
     """The scenes that the run was asked for."""
     from su3d_bench.core.plain_text import printable
-    from su3d_bench.store import read_json
+    from su3d_bench.store.run_folder import read_json
 
     record = read_json(run.path / "run.json")
     scenes = record.get("scenes") if isinstance(record, dict) else None
@@ -100,7 +100,7 @@ def _scenes(run: RunFolder) -> list[str]:
 
 
 def _map(job: JobFolder) -> Instances:
-    from su3d_bench.store import read_prediction
+    from su3d_bench.store.run_folder import read_prediction
     from su3d_bench.core.types import Instances
 
     prediction = read_prediction(job.prediction)
@@ -113,7 +113,7 @@ def _map(job: JobFolder) -> Instances:
 
 def _estimate(tops: dict[str, list[TopNames]], arguments: argparse.Namespace) -> int:
     from su3d_bench.perception.language.refinement import ModelRefiner
-    from su3d_bench.store import RunFolder
+    from su3d_bench.store.run_folder import RunFolder
 
     if arguments.refiner != "model":
         answer("the vote asks no model: nothing to pay")
@@ -134,7 +134,7 @@ def _refine(
 ) -> tuple[dict[str, Sequence[RefinedName]], str]:
     """Labels n' of each scene, and the model that chose them."""
     from su3d_bench.perception.language.refinement import ModelRefiner, vote
-    from su3d_bench.store import RunFolder
+    from su3d_bench.store.run_folder import RunFolder
 
     if arguments.refiner == "vote":
         return {scene: [vote(top) for top in of_scene] for scene, of_scene in tops.items()}, ""

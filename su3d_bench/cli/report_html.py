@@ -48,7 +48,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.page_sources import page_numbers, scored_maps
     from su3d_bench.core.plain_text import printable
     from su3d_bench.reports.html_page import page_html
-    from su3d_bench.store import make_folder, write_text
+    from su3d_bench.store.run_folder import make_folder, write_text
 
     if not 0 < arguments.most_megabytes <= 1000:
         raise ConfigError(f"--most-megabytes {arguments.most_megabytes:g}: must be above 0 and at most 1000")

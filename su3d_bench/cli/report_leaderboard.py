@@ -37,7 +37,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.leaderboard import leaderboard, tables
     from su3d_bench.reports.latex import latex
     from su3d_bench.reports.table_formats import csv_text, html_page, markdown
-    from su3d_bench.store import make_folder, write_text
+    from su3d_bench.store.run_folder import make_folder, write_text
 
     found = leaderboard(arguments.folder, arguments.protocols)
     if arguments.json:

@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_limits
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.protocols import ProtocolRules
-from su3d_bench.row_blocks import row_blocks
+from su3d_bench.store.row_blocks import row_blocks
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, Prediction
 
 CPU = "cpu"

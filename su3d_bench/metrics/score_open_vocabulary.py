@@ -20,7 +20,7 @@ from su3d_bench.metrics.scene_score import SceneScore, n_predictions
 from su3d_bench.metrics.score_instances import score_of_masks
 from su3d_bench.metrics.score_semantic import has_feature
 from su3d_bench.protocols import ProtocolRules
-from su3d_bench.row_blocks import release_pages
+from su3d_bench.store.row_blocks import release_pages
 from su3d_bench.core.types import DenseFeatures, Float32Array, Float64Array, Instances, Int64Array, Partition, Prediction
 
 NEEDS_FEATURES = "needs features to compare with texts, and the prediction has none"

@@ -15,7 +15,7 @@ from su3d_bench.metrics.labelling import (
 )
 from su3d_bench.metrics.scene_score import SceneScore, n_predictions, present
 from su3d_bench.protocols import ProtocolRules
-from su3d_bench.row_blocks import row_blocks
+from su3d_bench.store.row_blocks import row_blocks
 from su3d_bench.core.types import BoolArray, DenseFeatures, Float64Array, GroundTruth, Int64Array, Partition, Prediction
 
 

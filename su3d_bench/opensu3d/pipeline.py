@@ -19,7 +19,7 @@ from su3d_bench.opensu3d.postprocess import segments_of, to_instances
 from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View, record_of
 from su3d_bench.opensu3d.voxel_map import NO_INSTANCE, VoxelMap
 from su3d_bench.core.devices import CPU
-from su3d_bench.scratch import Scratch
+from su3d_bench.store.scratch import Scratch
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Detections, Frame, Instances, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
 

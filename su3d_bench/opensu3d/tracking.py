@@ -10,7 +10,7 @@ import numpy as np
 from su3d_bench.core.errors import DataError
 from su3d_bench.opensu3d.config import Fusion
 from su3d_bench.opensu3d.feature_fusion import fuse_scales
-from su3d_bench.scratch import Scratch, StoredRows
+from su3d_bench.store.scratch import Scratch, StoredRows
 from su3d_bench.core.types import Detections, Float64Array, Int32Array, Int64Array
 
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.interfaces import StageTimer
-from su3d_bench.kept_files import DAMAGE, filling, read_arrays
+from su3d_bench.store.atomic import DAMAGE, filling, read_arrays
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, UInt8Array
 

@@ -25,7 +25,7 @@ from pydantic import BaseModel, ConfigDict, model_validator
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.kept_files import DAMAGE, read_arrays
+from su3d_bench.store.atomic import DAMAGE, read_arrays
 from su3d_bench.perception.naming import scene_caption
 from su3d_bench.core.types import Detections, Float32Array, Frame, Regions
 

@@ -30,7 +30,7 @@ from su3d_bench.core.plain_text import printable
 from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
 from su3d_bench.predictions.openlex3d import CLOUD, EMBEDDINGS, INDEX
 from su3d_bench.protocols import ProtocolRules
-from su3d_bench.store import make_folder, write_text
+from su3d_bench.store.run_folder import make_folder, write_text
 from su3d_bench.core.types import DenseFeatures, Float32Array, Float64Array, GroundTruth, Instances, Int64Array, Partition
 
 MASKS_FOLDER = "pred_mask"

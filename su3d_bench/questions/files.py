@@ -16,7 +16,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.plain_text import printable
 from su3d_bench.questions.foreign_files import is_foreign, read_foreign
 from su3d_bench.questions.model import ALL_KINDS, KINDS, Question, new_question
-from su3d_bench.store import write_text
+from su3d_bench.store.run_folder import write_text
 from su3d_bench.core.toml_text import toml_value
 
 PAPER = Path(__file__).parent / "paper_queries.toml"

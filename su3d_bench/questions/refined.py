@@ -9,7 +9,7 @@ from su3d_bench.core.errors import StoreError
 from su3d_bench.metrics.question_truths import RefinedNames
 from su3d_bench.perception.language.refined_names import FILE_NAME, read_records
 from su3d_bench.questions.truths import voted_names
-from su3d_bench.store import JobFolder
+from su3d_bench.store.run_folder import JobFolder
 from su3d_bench.core.types import Instances
 
 log = logging.getLogger(__name__)

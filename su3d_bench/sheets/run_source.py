@@ -19,7 +19,7 @@ from su3d_bench.core.plain_text import printable
 from su3d_bench.planning import data_root, dataset_targets, why_not_fitting
 from su3d_bench.protocols import ProtocolRules, load_protocol, protocol_names
 from su3d_bench.scene_job import Part, build_dataset
-from su3d_bench.store import read_prediction
+from su3d_bench.store.run_folder import read_prediction
 from su3d_bench.core.types import Frame, GroundTruth, Instances
 
 MOST_FRAMES = 32  # of a scene, among which the best view of an object is looked for

@@ -12,7 +12,7 @@ from pydantic import TypeAdapter, ValidationError
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.plain_text import printable
 from su3d_bench.sheets.scores import METRICS, SCHEMA, ScoreCell, Scores
-from su3d_bench.store import write_json
+from su3d_bench.store.run_folder import write_json
 
 FILE = "scores.json"
 MOST_BYTES = 64 << 20

@@ -19,7 +19,7 @@ from scored_room import instances
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.reports import reasoning_picture
 from su3d_bench.reports.reasoning_picture import SpokenOf, draw_reasoning
-from su3d_bench.store import JobFolder, RunFolder, write_json, write_prediction
+from su3d_bench.store.run_folder import JobFolder, RunFolder, write_json, write_prediction
 from su3d_bench.core.types import Instances
 
 SCENE = "rooms/made"

@@ -22,7 +22,7 @@ from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.loading import load_encoder
 from su3d_bench.protocols import load_protocol
-from su3d_bench.store import RunFolder
+from su3d_bench.store.run_folder import RunFolder
 
 needs_models = pytest.mark.skipif(
     any(find_spec(name) is None for name in ("torch", "transformers", "onnx")),

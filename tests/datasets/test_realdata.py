@@ -16,7 +16,7 @@ from su3d_bench.datasets.pose_convention import check_convention
 from su3d_bench.datasets.rgbd import Rgbd
 from su3d_bench.datasets.tum import Tum
 from su3d_bench.numerics.geometry import back_project
-from su3d_bench.store import read_prediction
+from su3d_bench.store.run_folder import read_prediction
 from su3d_bench.core.toml_text import write_toml
 from su3d_bench.core.types import Instances
 

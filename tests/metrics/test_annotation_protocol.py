@@ -20,7 +20,7 @@ from su3d_bench.protocols import load_protocol
 from su3d_bench.questions.refined import refined_digest, refined_names
 from su3d_bench.questions.truths import Refine, question_truth, voted_names
 from su3d_bench.scoring import score_scene, why_not_scorable
-from su3d_bench.store import JobFolder, write_bytes
+from su3d_bench.store.run_folder import JobFolder, write_bytes
 from su3d_bench.core.types import Instances, Partition
 
 RULES = load_protocol("rooms-annotation")

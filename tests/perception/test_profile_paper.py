@@ -20,7 +20,7 @@ from su3d_bench.perception.config import PerceptionConfig
 from su3d_bench.perception.language.captioner import CropCaption
 from su3d_bench.perception.models.tagging import WORDS_CAVEAT
 from su3d_bench.perception.profiles import Perception, build_perception, check_models, resolve_profile
-from su3d_bench.store import read_json, read_prediction
+from su3d_bench.store.run_folder import read_json, read_prediction
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.toml_text import write_toml
 from su3d_bench.core.types import Instances, PerceptionNeeds, SceneInfo, UInt8Array

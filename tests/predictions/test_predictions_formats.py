@@ -39,7 +39,7 @@ from su3d_bench.predictions.base import ScenePrediction, VertexLabels, VertexMas
 from su3d_bench.predictions.formats import READERS, format_names, recognise
 from su3d_bench.predictions.mask_arrays import run_members
 from su3d_bench.predictions.text_integers import integer_lines
-from su3d_bench.store import write_prediction
+from su3d_bench.store.run_folder import write_prediction
 from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
 
 MASK_CASES = sorted(p.stem for kind in ("inst", "replica", "scannet200") for p in CASES.glob(f"{kind}*.npz"))

@@ -36,7 +36,7 @@ from su3d_bench.reports.html_map import (
     thinned,
 )
 from su3d_bench.reports.html_page import page_html
-from su3d_bench.store import read_prediction, write_prediction
+from su3d_bench.store.run_folder import read_prediction, write_prediction
 from su3d_bench.core.types import DenseFeatures, Instances
 
 PAINTED = f"{SCENES}/painted.py"

@@ -11,7 +11,8 @@ import pytest
 from painted import colour_perception
 
 from places import SCENES
-from su3d_bench import finished_scenes, page_sources, runner, scene_run, store
+from su3d_bench import finished_scenes, page_sources, runner, scene_run
+from su3d_bench.store import run_folder as store
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.execution import run_units

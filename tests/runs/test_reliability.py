@@ -26,11 +26,11 @@ from places import ROOT, SCENES
 from su3d_bench import scene_job, scene_run
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import StoreError
-from su3d_bench.kept_files import filling
+from su3d_bench.store.atomic import filling
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.scoring import score_scene
-from su3d_bench.store import RunFolder, npz_bytes, read_npz
-from su3d_bench.temporary_folders import TemporaryFolder
+from su3d_bench.store.run_folder import RunFolder, npz_bytes, read_npz
+from su3d_bench.store.temporary_folders import TemporaryFolder
 
 KILLS = ROOT / "benchmarks" / "kill_at_random.py"
 SUBJECT = f"{SCENES}/kill_subject.py"

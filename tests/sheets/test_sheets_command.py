@@ -20,7 +20,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.protocols import load_protocol
 from su3d_bench.sheets.items import read_key, read_sheet
 from su3d_bench.sheets.run_source import RunSource
-from su3d_bench.store import RunFolder, read_prediction, write_prediction
+from su3d_bench.store.run_folder import RunFolder, read_prediction, write_prediction
 from su3d_bench.core.types import Instances
 
 QUESTION = "How many chairs are there?"

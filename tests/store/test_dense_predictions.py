@@ -18,7 +18,8 @@ from box_room import INTRINSICS, images, pose
 from painted import colour_perception
 from places import ROOT, SCENES
 
-from su3d_bench import scene_run, store
+from su3d_bench import scene_run
+from su3d_bench.store import run_folder as store
 from su3d_bench.baselines import feature_table
 from su3d_bench.baselines.conceptfusion import ConceptFusion, ConceptFusionConfig
 from su3d_bench.baselines.feature_table import FeatureTable
@@ -27,8 +28,8 @@ from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.metrics.labelling import most_similar
 from su3d_bench.metrics.score_semantic import has_feature
 from su3d_bench.predictions.own_runs import OwnRuns
-from su3d_bench.scratch import scratch_folder
-from su3d_bench.store import features_beside, npz_bytes, read_prediction, write_prediction
+from su3d_bench.store.scratch import scratch_folder
+from su3d_bench.store.run_folder import features_beside, npz_bytes, read_prediction, write_prediction
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import DenseFeatures, Detections, Frame, Partition, SceneInfo
 

@@ -17,7 +17,7 @@ from typing import Any
 from su3d_bench.core.digests import digest_bytes, digest_file
 from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError
 from su3d_bench.perception.models.catalogue import FormName, ModelEntry, ModelForm, model_entry
-from su3d_bench.store import make_folder, read_json, write_json
+from su3d_bench.store.run_folder import make_folder, read_json, write_json
 
 DEFAULT_FOLDER = "~/.cache/su3d-bench/models"
 DIGEST_FOLDER = "model-digests"

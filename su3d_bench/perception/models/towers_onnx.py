@@ -32,7 +32,7 @@ from su3d_bench.perception.models.onnx_manifest import (
 from su3d_bench.perception.models.onnx_session import Provider, open_session
 from su3d_bench.perception.models.text_tokens import read_tokeniser
 from su3d_bench.perception.models.weights import bounded
-from su3d_bench.store import make_folder, write_json
+from su3d_bench.store.run_folder import make_folder, write_json
 from su3d_bench.core.types import Float32Array, Int64Array
 
 FORMAT = "su3d-bench onnx encoder 1"

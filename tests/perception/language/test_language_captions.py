@@ -22,7 +22,7 @@ from su3d_bench.perception.language.parsing import Described, answered, chosen_n
 from su3d_bench.perception.language.refined_names import read_records, records_of, write_records
 from su3d_bench.perception.language.refinement import ModelRefiner, TopNames, top_names, vote
 from su3d_bench.perception.language.reply_store import ReplyStore
-from su3d_bench.store import JobFolder, prediction_arrays, prediction_from_arrays, write_prediction
+from su3d_bench.store.run_folder import JobFolder, prediction_arrays, prediction_from_arrays, write_prediction
 from su3d_bench.core.types import Instances
 
 NAMES = ("white sofa", "sofa", "couch", "trash can", "indoor-plant")

@@ -15,7 +15,7 @@ from places import CASES
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.predictions.formats import READERS
-from su3d_bench.store import write_prediction
+from su3d_bench.store.run_folder import write_prediction
 from su3d_bench.core.types import Instances
 
 

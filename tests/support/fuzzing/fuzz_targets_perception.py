@@ -130,7 +130,7 @@ def _completion(folder: Path) -> Read:
 def _refined_names(folder: Path) -> Read:
     from su3d_bench.core.digests import digest_file
     from su3d_bench.perception.language.refined_names import FILE_NAME, read_records
-    from su3d_bench.store import RunFolder
+    from su3d_bench.store.run_folder import RunFolder
 
     job = RunFolder(folder).job("rooms/living0", "opensu3d")
     job.prepare()
@@ -144,7 +144,7 @@ def _refined_names(folder: Path) -> Read:
 def _kept_files(folder: Path) -> Read:
     from test_store import small_map
 
-    from su3d_bench.store import prediction_arrays, read_json, read_npz, write_npz
+    from su3d_bench.store.run_folder import prediction_arrays, read_json, read_npz, write_npz
 
     write_npz(folder / "a.npz", prediction_arrays(small_map()))
     (folder / "a.json").write_text(json.dumps({"a": [1, 2.5, None], "b": {"c": "text"}}))

@@ -104,7 +104,7 @@ def _own_prediction(kind: str) -> Make:
     def make(folder: Path) -> Read:
         from prediction_files import own_instances
 
-        from su3d_bench.store import read_prediction, write_prediction
+        from su3d_bench.store.run_folder import read_prediction, write_prediction
         from su3d_bench.core.types import DenseFeatures, Partition, Prediction
 
         points = np.zeros((3, 3), np.float32)

@@ -25,8 +25,8 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import PredictionError, StoreError
-from su3d_bench.kept_files import DAMAGE, read_arrays
-from su3d_bench.row_blocks import row_blocks
+from su3d_bench.store.atomic import DAMAGE, read_arrays
+from su3d_bench.store.row_blocks import row_blocks
 from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
 
 SCHEMA = 1
