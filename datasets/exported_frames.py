@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.datasets.image_files import UInt16Array, image_size, read_bytes, sized_colour, sized_depth
+from su3d_bench.formats.images import UInt16Array, image_size, read_bytes, sized_colour, sized_depth
 from su3d_bench.datasets.recorded_frames import numbers, read_text
 from su3d_bench.datasets.rgbd_source import SensorPair, Size
 from su3d_bench.core.errors import DataError

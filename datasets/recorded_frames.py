@@ -11,7 +11,7 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from su3d_bench.datasets.image_files import UInt16Array, decode_colour, decode_depth, read_bytes
+from su3d_bench.formats.images import UInt16Array, decode_colour, decode_depth, read_bytes
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.datasets.hdf5 import largest_column, read_rows
+from su3d_bench.formats.hdf5 import largest_column, read_rows
 from su3d_bench.datasets.replica_folders import FUSED_CLOUD
 from su3d_bench.datasets.replica_frames import poses_of_lines
 from su3d_bench.datasets.replica_labels import replica_label_set

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from su3d_bench.datasets.image_files import PNG_SIGNATURE
+from su3d_bench.formats.images import PNG_SIGNATURE
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError
 

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.datasets.image_files import decode_colour, decode_depth, read_bytes
+from su3d_bench.formats.images import decode_colour, decode_depth, read_bytes
 from su3d_bench.datasets.replica_truth import shown
 from su3d_bench.core.errors import DataError
 from su3d_bench.numerics.geometry import are_rigid

@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.datasets.ply import read_ply
-from su3d_bench.datasets.ply_header import MAX_HEADER_BYTES, read_header
+from su3d_bench.formats.ply import read_ply
+from su3d_bench.formats.ply_header import MAX_HEADER_BYTES, read_header
 from su3d_bench.datasets.replica_labels import replica_label_set
 from su3d_bench.datasets.replica_truth import vertex_positions
 from su3d_bench.core.errors import DataError

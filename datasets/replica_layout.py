@@ -9,15 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.datasets.layout_files import (
-    JPEG_QUALITY,
-    depth_in_units,
-    jpeg_bytes,
-    list_column,
-    png_bytes,
-    triangles_of,
-)
-from su3d_bench.datasets.ply import Column, PlyElement, write_ply
+from su3d_bench.formats.layout_files import JPEG_QUALITY, depth_in_units, jpeg_bytes, list_column, png_bytes, triangles_of
+from su3d_bench.formats.ply import Column, PlyElement, write_ply
 from su3d_bench.datasets.replica_folders import original_name
 from su3d_bench.datasets.replica_frames import colour_name, depth_name
 from su3d_bench.datasets.replica_labels import replica_label_set

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from su3d_bench.datasets.image_files import JPEG_END, JPEG_END_WITHIN, PNG_SIGNATURE, image_size
+from su3d_bench.formats.images import JPEG_END, JPEG_END_WITHIN, PNG_SIGNATURE, image_size
 from su3d_bench.datasets.replica_boxes import SLACK_M, objects_outside_boxes, read_boxes
 from su3d_bench.datasets.replica_frames import (
     Camera,

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.datasets.image_files import read_bytes
+from su3d_bench.formats.images import read_bytes
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Int64Array
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from su3d_bench.datasets.image_files import read_bytes
+from su3d_bench.formats.images import read_bytes
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import LabelSet
 

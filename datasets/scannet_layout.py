@@ -13,8 +13,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from su3d_bench.datasets.image_files import image_size
-from su3d_bench.datasets.layout_files import JPEG_QUALITY, depth_in_units, jpeg_bytes
+from su3d_bench.formats.images import image_size
+from su3d_bench.formats.layout_files import JPEG_QUALITY, depth_in_units, jpeg_bytes
 from su3d_bench.datasets.scannet_labels import TABLE_NAME
 from su3d_bench.datasets.scannet_layout_truth import write_scan_truth
 from su3d_bench.datasets.scannet_meta import meta_name

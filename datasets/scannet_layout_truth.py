@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.datasets.layout_files import list_column, triangles_of
-from su3d_bench.datasets.ply import Column, PlyElement, write_ply
+from su3d_bench.formats.layout_files import list_column, triangles_of
+from su3d_bench.formats.ply import Column, PlyElement, write_ply
 from su3d_bench.datasets.scannet_annotations import aggregation_name, segments_name
 from su3d_bench.datasets.scannet_meta import meta_name
 from su3d_bench.datasets.scannet_rooms import categories, nyu40_colours, scene_type

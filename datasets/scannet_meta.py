@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.datasets.image_files import read_bytes
+from su3d_bench.formats.images import read_bytes
 from su3d_bench.core.errors import DataError
 from su3d_bench.numerics.geometry import are_rigid
 from su3d_bench.core.types import Float64Array

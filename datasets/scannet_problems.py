@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.datasets.exported_frames import EXPORT_AGAIN, IncompleteExport
-from su3d_bench.datasets.ply import read_ply
+from su3d_bench.formats.ply import read_ply
 from su3d_bench.datasets.registration import Grid, make_registration
 from su3d_bench.datasets.rgbd_source import RgbdSource
 from su3d_bench.datasets.scannet_annotations import aggregation_name, read_objects, read_segments, segments_name

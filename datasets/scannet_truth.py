@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.datasets.ply import ListColumn, PlyFile, read_ply
+from su3d_bench.formats.ply import ListColumn, PlyFile, read_ply
 from su3d_bench.datasets.scannet_annotations import (
     AnnotatedObject,
     aggregation_name,

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.datasets.image_files import JPEG_START, PNG_SIGNATURE, UInt16Array, image_size, sized_colour
+from su3d_bench.formats.images import JPEG_START, PNG_SIGNATURE, UInt16Array, image_size, sized_colour
 from su3d_bench.datasets.rgbd_source import SensorPair
 from su3d_bench.datasets.sens_header import COUNT, MAX_FRAMES, MAX_HEADER_BYTES, SensHeader, parse_header
 from su3d_bench.core.errors import DataError

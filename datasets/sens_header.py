@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.datasets.image_files import MAX_PIXELS
+from su3d_bench.formats.images import MAX_PIXELS
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array
 

@@ -13,7 +13,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.datasets.image_files import UInt16Array
+from su3d_bench.formats.images import UInt16Array
 from su3d_bench.datasets.sens import FRAME_RECORD, MOTION_RECORD, SensFile
 from su3d_bench.datasets.sens_header import COUNT, ColourCompression, DepthCompression, SensHeader, header_bytes
 from su3d_bench.core.errors import StoreError

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.datasets.layout_files import depth_in_units, png_bytes
+from su3d_bench.formats.layout_files import depth_in_units, png_bytes
 from su3d_bench.datasets.replica_folders import MARKER
 from su3d_bench.datasets.scene_making import FRAMES_PER_SECOND, ScannedDataset, SceneTarget
 from su3d_bench.store.run_folder import make_folder, write_json, write_text

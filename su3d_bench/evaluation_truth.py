@@ -18,7 +18,7 @@ from su3d_bench.core.plain_text import printable
 from su3d_bench.planning import data_root
 from su3d_bench.predictions.base import MOST_POINTS, shown
 from su3d_bench.predictions.mask_arrays import scene_files
-from su3d_bench.predictions.text_integers import integer_lines
+from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.protocols import ProtocolRules
 from su3d_bench.core.types import Int64Array
 

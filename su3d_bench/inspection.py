@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.datasets.image_files import decode_colour, decode_depth, read_bytes
+from su3d_bench.formats.images import decode_colour, decode_depth, read_bytes
 from su3d_bench.datasets.pose_convention import check_convention
 from su3d_bench.core.errors import DataError, GroundTruthMissing, Su3dError
 from su3d_bench.inspection_checks import (

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.perception.stored_images import numbered_files
-from su3d_bench.plain_pickles.pickles import read_pickle_file
+from su3d_bench.formats.pickles.pickles import read_pickle_file
 from su3d_bench.core.plain_text import printable
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, Regions, SceneInfo
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.datasets.pcd import write_pcd_points
+from su3d_bench.formats.pcd import write_pcd_points
 from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics import transfer

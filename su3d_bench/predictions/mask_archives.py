@@ -25,8 +25,8 @@ from su3d_bench.predictions.mask_arrays import (
     scores_of,
     vertex_masks,
 )
-from su3d_bench.predictions.numpy_files import npz_names, read_npz
-from su3d_bench.predictions.torch_zip import Kind, SparseTensor, read_torch, torch_kind
+from su3d_bench.formats.numpy_files import npz_names, read_npz
+from su3d_bench.formats.torch_zip import Kind, SparseTensor, read_torch, torch_kind
 from su3d_bench.core.types import Int32Array
 
 

@@ -16,7 +16,7 @@ from su3d_bench.predictions.base import ScenePrediction, shown
 from su3d_bench.predictions.clouds import checked_points, folders_with, named_once, without_nonfinite
 from su3d_bench.predictions.hovsg import read_cloud
 from su3d_bench.predictions.mask_arrays import kind_of
-from su3d_bench.predictions.numpy_files import read_npy
+from su3d_bench.formats.numpy_files import read_npy
 from su3d_bench.core.types import Float32Array, Int32Array, Partition
 
 CLOUD = "point_cloud.pcd"

@@ -19,8 +19,8 @@ from su3d_bench.predictions.mask_arrays import (
     scene_files,
     vertex_masks,
 )
-from su3d_bench.predictions.numpy_files import read_npy
-from su3d_bench.predictions.torch_zip import read_torch
+from su3d_bench.formats.numpy_files import read_npy
+from su3d_bench.formats.torch_zip import read_torch
 from su3d_bench.core.types import Float32Array
 
 MASKS_SUFFIXES = ("_masks.pt", ".pt")

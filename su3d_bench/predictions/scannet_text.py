@@ -16,7 +16,7 @@ from su3d_bench.metrics.instance_ap import last_line_of_each_mask_file
 from su3d_bench.core.plain_text import printable
 from su3d_bench.predictions.base import ScenePrediction, VertexLabels, shown
 from su3d_bench.predictions.mask_arrays import run_members, scene_file, scene_files, vertex_masks
-from su3d_bench.predictions.text_integers import integer_lines
+from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.core.types import Int32Array
 
 OWN_OUTPUT = "semantic_instance_evaluation"  # the original evaluator's own answer, which it leaves out

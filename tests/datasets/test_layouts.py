@@ -16,7 +16,7 @@ import pytest
 from su3d_bench.core import registry
 from su3d_bench.cli.main import main
 from su3d_bench.datasets.layouts import LAYOUTS
-from su3d_bench.datasets.ply import read_ply
+from su3d_bench.formats.ply import read_ply
 from su3d_bench.datasets.rooms import Rooms
 from su3d_bench.datasets.rooms_classes import CLASSES
 from su3d_bench.datasets.scannet_exports import open_cpp_export, open_python_export

@@ -136,7 +136,7 @@ def test_tum_reports_the_images_that_are_not_there(caplog: pytest.LogCaptureFixt
 
 def test_images_of_other_cameras_are_read_as_their_formats_say(root: Path) -> None:
     """One frame each as NYU, SUN and TUM store them; PGM is big-endian."""
-    from su3d_bench.datasets.image_files import decode_colour, decode_depth
+    from su3d_bench.formats.images import decode_colour, decode_depth
 
     folder = REAL_RECORDINGS / "open3d_rgbd/other_formats"
     for colour, depth in (("NYU_color.ppm", "NYU_depth.pgm"), ("SUN_color.jpg", "SUN_depth.png"),

@@ -12,7 +12,7 @@ from scannet_scan import SCAN, grid, write_mesh, write_recording
 from scannet_scan import write_truth as write_scan_truth
 from test_rgbd import write_scene
 
-from su3d_bench.datasets.ply import ListColumn, PlyElement, write_ply
+from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 from su3d_bench.datasets.replica import Replica
 from su3d_bench.datasets.rgbd import Rgbd
 from su3d_bench.datasets.rooms import RoomOptions, Rooms

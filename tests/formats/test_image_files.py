@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from su3d_bench.datasets.image_files import decode_colour
+from su3d_bench.formats.images import decode_colour
 
 RANDOM = np.random.default_rng(0)
 BGR = cv2.GaussianBlur(RANDOM.integers(0, 256, (61, 77, 3), np.uint8), (0, 0), 2)

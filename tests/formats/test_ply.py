@@ -11,7 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from su3d_bench.datasets.ply import Column, ListColumn, PlyElement, PlyFile, read_ply, write_ply
+from su3d_bench.formats.ply import Column, ListColumn, PlyElement, PlyFile, read_ply, write_ply
 from su3d_bench.core.errors import DataError, StoreError
 
 FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")

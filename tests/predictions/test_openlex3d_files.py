@@ -23,7 +23,7 @@ from su3d_bench.datasets.openlex3d import (
     read_queries,
     replica_corners,
 )
-from su3d_bench.datasets.ply import ListColumn
+from su3d_bench.formats.ply import ListColumn
 from su3d_bench.datasets.replica_truth import AnnotatedMesh
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.metrics.openlex3d import ObjectLabels

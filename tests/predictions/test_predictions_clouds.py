@@ -30,8 +30,8 @@ from painted import Painted, WordEncoder
 from places import SCENES
 from prediction_files import CASES, refused
 
-from su3d_bench.datasets.pcd import write_pcd_points
-from su3d_bench.datasets.ply import PlyElement, write_ply
+from su3d_bench.formats.pcd import write_pcd_points
+from su3d_bench.formats.ply import PlyElement, write_ply
 from su3d_bench.evaluation import Request, evaluate
 from su3d_bench.predictions import clouds, gradslam
 from su3d_bench.predictions.base import ScenePrediction

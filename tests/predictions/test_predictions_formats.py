@@ -34,11 +34,11 @@ from prediction_files import (
 
 from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.metrics.instance_ap import last_line_of_each_mask_file
-from su3d_bench.predictions import text_integers
+from su3d_bench.formats import text_integers
 from su3d_bench.predictions.base import ScenePrediction, VertexLabels, VertexMasks
 from su3d_bench.predictions.formats import READERS, format_names, recognise
 from su3d_bench.predictions.mask_arrays import run_members
-from su3d_bench.predictions.text_integers import integer_lines
+from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.store.run_folder import write_prediction
 from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
 

@@ -18,9 +18,9 @@ from damage import damages, outcomes, truncations
 from places import CASES
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.predictions import zip_files
-from su3d_bench.predictions.numpy_files import read_npy, read_npz
-from su3d_bench.predictions.torch_zip import SparseTensor, read_torch, torch_kind
+from su3d_bench.formats import zip_files
+from su3d_bench.formats.numpy_files import read_npy, read_npz
+from su3d_bench.formats.torch_zip import SparseTensor, read_torch, torch_kind
 
 FILES = CASES / "torch_files"  # written by torch 2.13.0
 MASKS = np.arange(36).reshape(12, 3) % 5 < 2

@@ -29,7 +29,7 @@ from replica_scene import (
     write_render,
 )
 
-from su3d_bench.datasets.ply import ListColumn, PlyElement, write_ply
+from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 from su3d_bench.datasets.replica import Replica
 from su3d_bench.datasets.replica_folders import original_name
 from su3d_bench.datasets.replica_frames import read_camera, read_trajectory

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scanned_stage import CHAIR, N_FRAMES, WALL, Stage, Surface, files_below
 
-from su3d_bench.datasets.ply import ListColumn, read_ply
+from su3d_bench.formats.ply import ListColumn, read_ply
 from su3d_bench.datasets.replica import Replica
 from su3d_bench.datasets.replica_layout import DEPTH_SCALE, ReplicaLayout
 from su3d_bench.datasets.replica_truth import INFO_NAME, MESH_NAME

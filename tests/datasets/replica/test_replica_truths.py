@@ -11,7 +11,7 @@ from replica_clouds import CLOUDS, REFERENCE, SEQUENCE, write_clouds
 from replica_scene import CHAIR, QUADS, TABLE, TWO_OBJECTS, write_original, write_render
 from scored_room import instances
 
-from su3d_bench.datasets.ply import PlyElement, write_ply
+from su3d_bench.formats.ply import PlyElement, write_ply
 from su3d_bench.datasets.replica import Replica
 from su3d_bench.datasets.replica_label_files import OVO_CLASSES, read_whole_numbers
 from su3d_bench.core.errors import DataError, GroundTruthMissing

@@ -30,7 +30,7 @@ from scannet_scan import (
 from scannet_scans import WHERE, dataset, export, write_scan
 
 from su3d_bench.cli.main import main
-from su3d_bench.datasets.image_files import UInt16Array
+from su3d_bench.formats.images import UInt16Array
 from su3d_bench.datasets.rgbd_source import SensorPair
 from su3d_bench.datasets.scannet import ScanNet, ScannetOptions
 from su3d_bench.datasets.scannet_folders import PAPER_SCENES, find_scans, split_scenes

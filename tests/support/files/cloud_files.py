@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from prediction_files import TorchFile
 
-from su3d_bench.datasets.pcd import write_pcd_points
-from su3d_bench.datasets.ply import PlyElement, write_ply
+from su3d_bench.formats.pcd import write_pcd_points
+from su3d_bench.formats.ply import PlyElement, write_ply
 
 RNG = np.random.default_rng(0)
 NAMES = ["couch", "lamp", "wall"]

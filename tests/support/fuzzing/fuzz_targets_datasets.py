@@ -168,7 +168,7 @@ def _ply(form: str) -> Make:
     def make(folder: Path) -> Read:
         from test_ply import MIXED, mesh_bytes
 
-        from su3d_bench.datasets.ply import read_ply
+        from su3d_bench.formats.ply import read_ply
 
         (folder / "made").mkdir()
         (folder / "a.ply").write_bytes(mesh_bytes(folder / "made", form, MIXED))
@@ -181,7 +181,7 @@ def _pcd(form: str) -> Make:
     def make(folder: Path) -> Read:
         from test_pcd import forms
 
-        from su3d_bench.datasets.pcd import read_pcd_points
+        from su3d_bench.formats.pcd import read_pcd_points
 
         (folder / "a.pcd").write_bytes(forms()[form])
         return lambda: read_pcd_points(folder / "a.pcd", "map: a.pcd")
@@ -193,7 +193,7 @@ def _hdf5(**options: Any) -> Make:
     def make(folder: Path) -> Read:
         from test_hdf5 import write
 
-        from su3d_bench.datasets.hdf5 import largest_column, n_columns_of, read_rows
+        from su3d_bench.formats.hdf5 import largest_column, n_columns_of, read_rows
 
         path = write(folder, **options)
         asked = (lambda: n_columns_of(path, "a"), lambda: read_rows(path, 3, "a"), lambda: largest_column(path, 3, "a"))
@@ -206,7 +206,7 @@ def _image(suffix: str) -> Make:
     def make(folder: Path) -> Read:
         import cv2
 
-        from su3d_bench.datasets.image_files import decode_colour, decode_depth, image_size, read_bytes
+        from su3d_bench.formats.images import decode_colour, decode_depth, image_size, read_bytes
 
         values = np.arange(24 * 32, dtype=np.uint16).reshape(24, 32) * 80
         path, is_depth = folder / f"a{suffix}", suffix in (".depth.png", ".pgm")

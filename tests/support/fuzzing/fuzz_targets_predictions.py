@@ -66,8 +66,8 @@ def _pickle(kind: str) -> Make:
     def make(folder: Path) -> Read:
         from test_predictions_pickles import written
 
-        from su3d_bench.plain_pickles.pickles import read_pickle_file
-        from su3d_bench.predictions.numpy_files import read_npy_value
+        from su3d_bench.formats.pickles.pickles import read_pickle_file
+        from su3d_bench.formats.numpy_files import read_npy_value
 
         path = folder / kind
         path.write_bytes(written(folder, kind))
@@ -80,8 +80,8 @@ def _archive(name: str) -> Make:
     def make(folder: Path) -> Read:
         from test_predictions_torch import whole
 
-        from su3d_bench.predictions.numpy_files import read_npy, read_npz
-        from su3d_bench.predictions.torch_zip import read_torch, torch_kind
+        from su3d_bench.formats.numpy_files import read_npy, read_npz
+        from su3d_bench.formats.torch_zip import read_torch, torch_kind
 
         path = folder / name
         path.write_bytes(whole(folder, name))

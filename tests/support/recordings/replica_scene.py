@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from su3d_bench.datasets.ply import ListColumn, PlyElement, write_ply
+from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 from su3d_bench.datasets.replica_labels import replica_label_set
 
 WIDTH, HEIGHT, SCALE = 12, 8, 6553.5

@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from su3d_bench.datasets.ply import ListColumn, PlyElement, write_ply
+from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 from su3d_bench.datasets.replica_labels import replica_label_set
 
 WIDTH, HEIGHT, FOCAL, SCALE = 48, 36, 24.0, 6553.5

@@ -14,11 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.plain_pickles.pickle_constructors import MOST_DIMENSIONS, SIMPLE_TYPE, RefusedError, check_texts
-from su3d_bench.plain_pickles.pickles import read_pickle
+from su3d_bench.formats.pickles.pickle_constructors import MOST_DIMENSIONS, SIMPLE_TYPE, RefusedError, check_texts
+from su3d_bench.formats.pickles.pickles import read_pickle
 from su3d_bench.core.plain_text import printable
 from su3d_bench.predictions.base import shown
-from su3d_bench.predictions.zip_files import opened_zip, read_member
+from su3d_bench.formats.zip_files import opened_zip, read_member
 
 MAGIC = b"\x93NUMPY"
 MOST_HEADER = 10_000  # NumPy's own limit

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import BinaryIO, cast
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.plain_pickles.pickle_constructors import CONSTRUCTORS, Constructors, Forgotten, Inert, RefusedError
-from su3d_bench.plain_pickles.pickle_machine import PickleMachine
+from su3d_bench.formats.pickles.pickle_constructors import CONSTRUCTORS, Constructors, Forgotten, Inert, RefusedError
+from su3d_bench.formats.pickles.pickle_machine import PickleMachine
 from su3d_bench.core.plain_text import printable
 
 __all__ = ["Forgotten", "Inert", "read_pickle", "read_pickle_file"]

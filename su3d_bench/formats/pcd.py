@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.datasets.ply_header import clip
+from su3d_bench.formats.ply_header import clip
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.plain_text import printable
 from su3d_bench.store.run_folder import write_bytes
@@ -192,7 +192,7 @@ def _table(columns: list[NDArray[Any]]) -> Float64Array:
 
 def _inflated(packed: UInt8Array, n_plain: int) -> UInt8Array | None:
     """The ``n_plain`` bytes that LZF packed; None where it packed anything else."""
-    from su3d_bench.datasets.pcd_kernels import inflate
+    from su3d_bench.formats.pcd_kernels import inflate
 
     plain = np.zeros(n_plain, np.uint8)
     return plain if inflate(packed, plain) == n_plain else None

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.datasets.image_files import UInt16Array
-from su3d_bench.datasets.ply import ListColumn
+from su3d_bench.formats.images import UInt16Array
+from su3d_bench.formats.ply import ListColumn
 from su3d_bench.core.types import Float32Array, Int32Array, UInt8Array
 
 JPEG_QUALITY = 95
