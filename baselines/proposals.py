@@ -14,7 +14,7 @@ from su3d_bench.baselines.proposal_files import digest_of_folder, read_proposals
 from su3d_bench.baselines.surface_proposals import SOURCE, NodeChoice, segments_of, surface_proposals
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import SceneTools
-from su3d_bench.metrics.transfer import Masks, transfer_masks
+from su3d_bench.metrics.matching.nearest import Masks, transfer_masks
 from su3d_bench.core.types import Int64Array, Proposals, Surface
 
 Kind = Literal["auto", "files", "surface", "oracle"]

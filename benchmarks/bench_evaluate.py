@@ -16,16 +16,8 @@ import pytest
 from numpy.typing import NDArray
 
 from su3d_bench.evaluation import Request, evaluate
-from su3d_bench.metrics.instance_ap import (
-    MIN_REGION_SIZE,
-    THRESHOLDS,
-    InstanceAP,
-    InstanceCounts,
-    combine,
-    count_class,
-    per_scene,
-)
-from su3d_bench.protocols import load_protocol
+from su3d_bench.metrics.instance.average_precision import MIN_REGION_SIZE, THRESHOLDS, InstanceAP, InstanceCounts, combine, count_class, per_scene
+from su3d_bench.metrics.protocols import load_protocol
 
 N_SCENES, N_POINTS, N_MASKS, N_INSTANCES = 8, 200_000, 150, 90
 PROTOCOL = "replica-openmask3d"

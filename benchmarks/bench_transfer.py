@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from su3d_bench.metrics.transfer import nearest
+from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.core.types import Float32Array
 
 GROUP = "nearest neighbours: 4 million candidates, 1 million questions"

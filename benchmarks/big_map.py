@@ -25,8 +25,8 @@ from wall import view
 
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.opensu3d.tracking import View, record_of
-from su3d_bench.protocols import load_protocol
-from su3d_bench.scoring import combine, score_scene
+from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.store.run_folder import read_prediction, write_prediction
 from su3d_bench.core.timing import Timer, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Detections, Float32Array, Float64Array, GroundTruth, Int32Array, LabelSet, SceneInfo

@@ -17,8 +17,8 @@ import numpy as np
 from su3d_bench.datasets.rooms import Rooms
 from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
 from su3d_bench.planning import data_root
-from su3d_bench.protocols import ProtocolRules, load_protocol
-from su3d_bench.scoring import combine, score_scene
+from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.store.run_folder import RunFolder, read_prediction
 from su3d_bench.core.types import GroundTruth, Instances
 

@@ -34,7 +34,7 @@ from torch_devices import TORCH_ON_CPU
 
 from su3d_bench.cli.main import main as command_line
 from su3d_bench.core.errors import ConfigError, ModelMissing
-from su3d_bench.metrics.labelling import cosines, most_similar
+from su3d_bench.metrics.matching.labelling import cosines, most_similar
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.perception.embedded_encoder import EmbeddedEncoder

@@ -21,9 +21,9 @@ from su3d_bench.core import registry
 from su3d_bench.baselines.openmask3d import OpenMask3DConfig
 from su3d_bench.baselines.openmask3d_segment3d import OpenMask3DSegment3DConfig
 from su3d_bench.baselines.proposals import ProposalConfig, make_proposals
-from su3d_bench.metrics.transfer import Masks, transfer_masks
+from su3d_bench.metrics.matching.nearest import Masks, transfer_masks
 from su3d_bench.planning import data_root
-from su3d_bench.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.core.types import Float64Array, GroundTruth, Proposals
 
 LIMITS = (0.25, 0.5, 0.75)

@@ -21,17 +21,7 @@ from su3d_bench.reports.tables import aligned
 from su3d_bench.reports.timing_plots import draw_update_cost
 from su3d_bench.numerics.statistics import Growth
 from su3d_bench.core.timing import hardware_line
-from su3d_bench.update_times import (
-    MAP,
-    NOT_MAP,
-    TOTAL,
-    WARM_UP,
-    MethodSummary,
-    StageSummary,
-    UpdateTimes,
-    pooled,
-    summarise,
-)
+from su3d_bench.metrics.costs import MAP, NOT_MAP, TOTAL, WARM_UP, MethodSummary, StageSummary, UpdateTimes, pooled, summarise
 
 HEAD = """# Performance
 

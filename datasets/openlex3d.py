@@ -18,9 +18,9 @@ import numpy as np
 from su3d_bench.formats.pcd import read_pcd_points
 from su3d_bench.datasets.replica_truth import MESH_NAME, AnnotatedMesh
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.metrics.openlex3d import ObjectLabels, OpenLexTruth
-from su3d_bench.metrics.query_ap import QueryTruth, TextQuery
-from su3d_bench.metrics.transfer import nearest
+from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels, OpenLexTruth
+from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
+from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.core.plain_text import printable
 from su3d_bench.core.types import Float32Array, Int64Array
 

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from su3d_bench.reports.tables import NOT_MEASURED, aligned, percent
 from su3d_bench.numerics.statistics import Growth
-from su3d_bench.update_times import MethodSummary, StageSummary
+from su3d_bench.metrics.costs import MethodSummary, StageSummary
 
 MIB = 2**20
 CACHE = "cache"

@@ -25,11 +25,11 @@ from su3d_bench.comparison_sides import (
 from su3d_bench.core.config import MOVES_NO_NUMBER
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.finished_run import FinishedRun
-from su3d_bench.metrics.resampled_values import resampled_classes
-from su3d_bench.metrics.results import Counts, ProtocolResult, resampled_metrics
+from su3d_bench.metrics.results.resampled_values import resampled_classes
+from su3d_bench.metrics.results.results import Counts, ProtocolResult, resampled_metrics
 from su3d_bench.core.plain_text import printable
-from su3d_bench.protocols import ProtocolRules, load_protocol
-from su3d_bench.scoring import SceneScore, combine
+from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.scoring import SceneScore, combine
 from su3d_bench.numerics.statistics import SignFlipTest, percentile_interval, resample_weights, sign_flip_test
 from su3d_bench.core.types import Float64Array
 

@@ -10,8 +10,8 @@ from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.finished_run import FinishedRun, read_run
 from su3d_bench.metrics.count_shapes import check_against
 from su3d_bench.core.plain_text import printable
-from su3d_bench.protocols import ProtocolRules, load_protocol
-from su3d_bench.scoring import SceneScore
+from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.scoring import SceneScore
 
 
 @dataclass(frozen=True)

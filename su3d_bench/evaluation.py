@@ -47,11 +47,11 @@ from su3d_bench.evaluation_truth import (
     text_variant,
 )
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.metrics.query_ap import QueryTruth, TextQuery
+from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
 from su3d_bench.planning import data_root, why_not_fitting
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexMasks, shown
 from su3d_bench.predictions.scannet_text import ScannetText
-from su3d_bench.protocols import SHARE_KINDS, ProtocolRules, load_protocol, protocol_names
+from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules, load_protocol, protocol_names
 from su3d_bench.core.types import GroundTruth, Instances
 
 __all__ = ["Evaluation", "ProtocolEvaluation", "Request", "evaluate"]

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.metrics.transfer import Masks
+from su3d_bench.metrics.matching.nearest import Masks
 from su3d_bench.core.plain_text import printable
-from su3d_bench.protocols import ProtocolRules
+from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array
 
 NEAR_IOU = 0.9  # pairs above it are the same object twice

@@ -24,12 +24,12 @@ from su3d_bench.core.errors import GroundTruthMissing
 from su3d_bench.evaluation_checks import check_cloud, empty_warnings, mask_facts
 from su3d_bench.evaluation_scoring import SceneOutcome
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.metrics.openlex3d import OpenLexTruth
-from su3d_bench.metrics.query_ap import QueryTruth
-from su3d_bench.metrics.transfer import masks_of
+from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
+from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
+from su3d_bench.metrics.matching.nearest import masks_of
 from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
-from su3d_bench.protocols import ProtocolRules
-from su3d_bench.scoring import QuestionTruth, score_scene, why_not_scorable
+from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.scoring import QuestionTruth, score_scene, why_not_scorable
 from su3d_bench.core.types import Instances, Prediction
 
 DATASET = "replica"  # of those that OpenLex3D labels, the one whose mesh can be read here

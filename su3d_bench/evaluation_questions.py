@@ -8,7 +8,7 @@ from su3d_bench.evaluation_openlex import score_on_objects
 from su3d_bench.evaluation_scoring import SceneOutcome
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.predictions.base import Content
-from su3d_bench.protocols import ProtocolRules
+from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.core.types import GroundTruth
 

@@ -12,11 +12,11 @@ import numpy as np
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.evaluation_checks import MaskFacts
 from su3d_bench.evaluation_scoring import SceneOutcome
-from su3d_bench.metrics.instance_ap import InstanceCounts
-from su3d_bench.metrics.results import ProtocolResult, metric_values
+from su3d_bench.metrics.instance.average_precision import InstanceCounts
+from su3d_bench.metrics.results.results import ProtocolResult, metric_values
 from su3d_bench.metrics.scene_score import SceneScore
-from su3d_bench.protocols import SHARE_KINDS, ProtocolRules
-from su3d_bench.scoring import combine
+from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules
+from su3d_bench.metrics.scoring import combine
 
 SCHEMA = 1
 EVERY_CONFIDENCE = "every confidence is"

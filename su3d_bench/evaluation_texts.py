@@ -15,7 +15,7 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.plain_text import printable
 from su3d_bench.predictions.base import shown
 from su3d_bench.formats.numpy_files import read_npz
-from su3d_bench.protocols import ProtocolRules
+from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.core.types import Float32Array, UInt8Array
 
 

@@ -13,7 +13,7 @@ from su3d_bench.finished_run import FinishedRun
 from su3d_bench.core.plain_text import printable
 from su3d_bench.store.run_folder import is_file
 from su3d_bench.core.types import Float64Array
-from su3d_bench.update_times import MapCost, UpdateTimes
+from su3d_bench.metrics.costs import MapCost, UpdateTimes
 
 MAX_UPDATES = 10_000_000
 

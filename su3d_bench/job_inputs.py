@@ -9,7 +9,7 @@ from typing import Any
 from su3d_bench.core.digests import digest_json, package_versions
 from su3d_bench.core.interfaces import Method
 from su3d_bench.perception.profiles import Perception
-from su3d_bench.protocols import load_protocol
+from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.questions.refined import refined_digest
 from su3d_bench.scene_job import MethodOutcome, SceneJob
 from su3d_bench.store.run_folder import JobFolder

@@ -17,18 +17,12 @@ from su3d_bench.core.config import Setting, Settings, resolve
 from su3d_bench.core.errors import Su3dError
 from su3d_bench.finished_run import FinishedRun
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.metrics.labelling import (
-    candidate_classes,
-    class_index_of_ids,
-    classes_of_prediction,
-    cosines,
-    scored_classes,
-)
+from su3d_bench.metrics.matching.labelling import candidate_classes, class_index_of_ids, classes_of_prediction, cosines, scored_classes
 from su3d_bench.metrics.scene_score import present
-from su3d_bench.metrics.score_semantic import has_feature
+from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.core.plain_text import printable, printable_json
 from su3d_bench.planning import data_root, dataset_targets
-from su3d_bench.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.reports.html_map import (
     Cloud,
     box_in_view,

@@ -21,7 +21,7 @@ from su3d_bench.core.interfaces import Dataset
 from su3d_bench.method_names import NamedMethod, named_method
 from su3d_bench.core.devices import device_for
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
-from su3d_bench.protocols import ProtocolRules, load_protocol, protocols_for
+from su3d_bench.metrics.protocols import ProtocolRules, load_protocol, protocols_for
 from su3d_bench.questions.truths import has_own_queries
 from su3d_bench.remote_data import DataPlace, RemoteData, data_place
 from su3d_bench.remote_folder import is_url

@@ -28,13 +28,13 @@ from su3d_bench.core.errors import StoreError
 from su3d_bench.execution import ELSEWHERE, run_units
 from su3d_bench.executors import SCENE_DONE, Event, Report
 from su3d_bench.finished_scenes import FinishedScenes
-from su3d_bench.metrics.results import plain_json
+from su3d_bench.metrics.results.results import plain_json
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.planning import Plan, cache_root
-from su3d_bench.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.scene_job import CEILING_METHOD, MethodOutcome, SceneJob
 from su3d_bench.scene_run import failed_outcomes, run_scene
-from su3d_bench.scoring import SceneScore, combine, combined_metrics, unpack_scores
+from su3d_bench.metrics.scoring import SceneScore, combine, combined_metrics, unpack_scores
 from su3d_bench.store.run_folder import SCHEMA, JobFolder, remove_file, write_json, write_text
 from su3d_bench.core.timing import hardware_line, processor_digest
 from su3d_bench.core.toml_text import write_toml

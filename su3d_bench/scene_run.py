@@ -20,7 +20,7 @@ from su3d_bench.core.interfaces import Method, SceneTools
 from su3d_bench.job_inputs import JobInputs
 from su3d_bench.core.devices import device_for
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
-from su3d_bench.protocols import SHARE_KINDS, ProtocolRules, load_protocol
+from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules, load_protocol
 from su3d_bench.questions.refined import refined_names
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.read_ahead import N_AHEAD, ReadAhead
@@ -38,7 +38,7 @@ from su3d_bench.scene_job import (
 )
 from su3d_bench.scene_log import SceneLog
 from su3d_bench.scene_tools import FirstFrames, surface_of, true_proposals
-from su3d_bench.scoring import SceneScore, Truth, pack_scores, score_scene, why_not_scorable
+from su3d_bench.metrics.scoring import SceneScore, Truth, pack_scores, score_scene, why_not_scorable
 from su3d_bench.store.run_folder import JobFolder, RunFolder, read_prediction, write_bytes, write_text
 from su3d_bench.core.timing import device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Prediction, Proposals, SceneInfo

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from su3d_bench.core.interfaces import Encoder
     from su3d_bench.predictions.base import Content, Reader
     from su3d_bench.predictions.export import LabelledMasks
-    from su3d_bench.protocols import ProtocolRules
+    from su3d_bench.metrics.protocols import ProtocolRules
 
 TARGETS = ("openlex3d", "scannet")
 
@@ -250,7 +250,7 @@ def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
 def _rules(name: str | None, dataset: Any) -> ProtocolRules:
     """The protocol of ``name``, or the dataset's only one of instances with classes."""
     from su3d_bench.planning import why_not_fitting
-    from su3d_bench.protocols import load_protocol, protocols_for
+    from su3d_bench.metrics.protocols import load_protocol, protocols_for
 
     fitting = {rules.name: rules for rules in map(load_protocol, protocols_for(dataset.name)) if _has_masks(rules)}
     if name is None:

@@ -11,7 +11,7 @@ from su3d_bench.cli.flags import add_verb, answer, answer_json
 from su3d_bench.core.errors import ConfigError, suggest
 
 if TYPE_CHECKING:
-    from su3d_bench.protocols import ProtocolRules
+    from su3d_bench.metrics.protocols import ProtocolRules
 
 ACTIONS = ("list", "show")
 HEADING = ""  # stands for the comments above the first rule of a file
@@ -34,7 +34,7 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.protocols import load_protocol, protocol_names, rules_file
+    from su3d_bench.metrics.protocols import load_protocol, protocol_names, rules_file
 
     if arguments.action not in ACTIONS:
         hint = suggest(arguments.action, ACTIONS) or "; known: list, show NAME"
@@ -61,7 +61,7 @@ def call(arguments: argparse.Namespace) -> int:
 def _rules_text(rules: ProtocolRules, file: Path) -> str:
     """Every rule as a line, beneath it what the protocol's file says of it: its source, or that it is ours."""
     from su3d_bench.core.config import flatten
-    from su3d_bench.protocols import not_comparable_with
+    from su3d_bench.metrics.protocols import not_comparable_with
     from su3d_bench.core.toml_text import toml_value
 
     remarks = read_remarks(file)
@@ -88,7 +88,7 @@ def read_remarks(file: Path) -> dict[str, list[str]]:
     A comment ``no cap_m ...`` speaks of the rule that it names; comments with no rule after them belong to their
     section.
     """
-    from su3d_bench.protocols import ProtocolRules, TransferRules
+    from su3d_bench.metrics.protocols import ProtocolRules, TransferRules
 
     remarks: dict[str, list[str]] = {}
     section, waiting, has_key = "", list[str](), False

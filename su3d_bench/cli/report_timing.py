@@ -10,7 +10,7 @@ from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
 
 if TYPE_CHECKING:
     from su3d_bench.finished_run import FinishedRun
-    from su3d_bench.update_times import UpdateTimes
+    from su3d_bench.metrics.costs import UpdateTimes
 
 NAME = "timing"
 
@@ -42,7 +42,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.core.errors import ConfigError
     from su3d_bench.finished_run import read_run
     from su3d_bench.reports.timing_tables import csv_text, markdown, methods_csv
-    from su3d_bench.update_times import summarise
+    from su3d_bench.metrics.costs import summarise
 
     if arguments.warm_up < 0 or not arguments.camera_rate > 0:
         raise ConfigError("--warm-up is a count from 0, --camera-rate a number above 0")

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.metrics.instance_ap import InstanceCounts
-from su3d_bench.metrics.object_means import ObjectCounts
-from su3d_bench.metrics.results import Counts
-from su3d_bench.metrics.semantic import SemanticCounts
-from su3d_bench.metrics.shares import ShareCounts
-from su3d_bench.protocols import VALUES_OF_METRIC, ProtocolRules
+from su3d_bench.metrics.instance.average_precision import InstanceCounts
+from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts
+from su3d_bench.metrics.results.results import Counts
+from su3d_bench.metrics.semantic.confusion import SemanticCounts
+from su3d_bench.metrics.questions.shares import ShareCounts
+from su3d_bench.metrics.protocols import VALUES_OF_METRIC, ProtocolRules
 
 # Of each array: the kind of its numbers and its axes; axes of one name are equally long.
 ARRAYS: dict[type[Counts], dict[str, tuple[str, tuple[str, ...]]]] = {

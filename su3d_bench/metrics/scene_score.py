@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.metrics.results import Counts
+from su3d_bench.metrics.results.results import Counts
 from su3d_bench.core.types import BoolArray, Instances, Int64Array, Prediction
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.metrics.instance_ap import last_line_of_each_mask_file
+from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file
 from su3d_bench.core.plain_text import printable
 from su3d_bench.predictions.base import ScenePrediction, VertexLabels, shown
 from su3d_bench.predictions.mask_arrays import run_members, scene_file, scene_files, vertex_masks

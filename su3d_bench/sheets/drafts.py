@@ -10,15 +10,11 @@ import numpy as np
 
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.metrics.question_truths import AskedText
-from su3d_bench.metrics.score_questions import (
-    judge_merging,
-    judge_retrieval,
-    labels_n,
-)
+from su3d_bench.metrics.questions.truths import AskedText
+from su3d_bench.metrics.questions.score import judge_merging, judge_retrieval, labels_n
 from su3d_bench.opensu3d.retrieval import rank_all
 from su3d_bench.core.plain_text import printable
-from su3d_bench.protocols import ProtocolRules
+from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.questions.generator import chosen, generate
 from su3d_bench.questions.known_objects import known_objects
 from su3d_bench.questions.model import KINDS, Question

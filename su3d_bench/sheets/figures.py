@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.metrics.score_questions import labels_n
+from su3d_bench.metrics.questions.score import labels_n
 from su3d_bench.opensu3d.retrieval import rank_all
 from su3d_bench.core.plain_text import printable
 from su3d_bench.questions.refined import refined_names

@@ -9,14 +9,14 @@ import numpy as np
 
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.metrics.covered_objects import Covered
-from su3d_bench.metrics.question_truths import GivenAnswer, ReasoningTruth, TrueAnswer
-from su3d_bench.metrics.score_questions import are_objects_right, is_answer_right
+from su3d_bench.metrics.instance.covered_objects import Covered
+from su3d_bench.metrics.questions.truths import GivenAnswer, ReasoningTruth, TrueAnswer
+from su3d_bench.metrics.questions.score import are_objects_right, is_answer_right
 from su3d_bench.perception.language.chat import ChatRequest
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.core.plain_text import printable
-from su3d_bench.protocols import ProtocolRules
+from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.questions.model import REASONING, Question, question_id
 from su3d_bench.questions.refined import refined_names
 from su3d_bench.questions.truths import question_truth

@@ -21,13 +21,14 @@ from su3d_bench.attribution import KINDS, attribute
 from su3d_bench.cli import attribute as verb
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError
-from su3d_bench.metrics import attribution_semantic, semantic
-from su3d_bench.metrics.attribution import count_masks
-from su3d_bench.metrics.attribution_semantic import CAUSES, causes_of, mend_points
-from su3d_bench.metrics.scored_arrays import scored_masks, scored_points
-from su3d_bench.protocols import load_protocol, protocol_names
+from su3d_bench.metrics.attribution import points as attribution_semantic
+from su3d_bench.metrics.semantic import confusion as semantic
+from su3d_bench.metrics.attribution.masks import count_masks
+from su3d_bench.metrics.attribution.points import CAUSES, causes_of, mend_points
+from su3d_bench.metrics.attribution.arrays import scored_masks, scored_points
+from su3d_bench.metrics.protocols import load_protocol, protocol_names
 from su3d_bench.reports.attribution_table import MEANINGS
-from su3d_bench.scoring import score_scene
+from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
 
 PAINTED = f"{SCENES}/painted.py:Painted"

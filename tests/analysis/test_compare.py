@@ -22,10 +22,11 @@ from su3d_bench import scene_run
 from su3d_bench.cli.main import main
 from su3d_bench.comparison import compare
 from su3d_bench.core.errors import ConfigError, StoreError
-from su3d_bench.metrics import instance_ap, semantic
-from su3d_bench.metrics.resampled_values import resampled_classes
-from su3d_bench.metrics.results import metric_values, resampled_metrics
-from su3d_bench.protocols import load_protocol
+from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.semantic import confusion as semantic
+from su3d_bench.metrics.results.resampled_values import resampled_classes
+from su3d_bench.metrics.results.results import metric_values, resampled_metrics
+from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.reports.comparison_table import comparison_tables
 from su3d_bench.numerics.statistics import MAX_EXACT_PAIRS, SignFlipTest, resample_weights, sign_flip_test
 

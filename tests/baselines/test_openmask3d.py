@@ -26,7 +26,7 @@ from su3d_bench.baselines.openmask3d import OpenMask3D, OpenMask3DConfig
 from su3d_bench.baselines.openmask3d_segment3d import OpenMask3DSegment3D, OpenMask3DSegment3DConfig
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import SceneTools
-from su3d_bench.metrics.labelling import most_similar
+from su3d_bench.metrics.matching.labelling import most_similar
 from su3d_bench.perception.regions import region_under
 from su3d_bench.scene_tools import no_detections
 from su3d_bench.core.timing import Timer

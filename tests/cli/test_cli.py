@@ -106,7 +106,7 @@ def test_methods_tell_their_settings_as_a_file_would_have_them(capsys: pytest.Ca
 
 
 def test_a_protocol_shows_every_rule(capsys: pytest.CaptureFixture[str]) -> None:
-    from su3d_bench.protocols import load_protocol
+    from su3d_bench.metrics.protocols import load_protocol
 
     assert main(["protocols", "show", "rooms-semantic"]) == 0
     text = capsys.readouterr().out

@@ -16,7 +16,7 @@ from su3d_bench.cli import query
 from su3d_bench.cli.main import main
 from su3d_bench.predictions.base import VertexMasks
 from su3d_bench.predictions.formats import READERS, recognise
-from su3d_bench.protocols import load_protocol
+from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.core.types import Instances, Partition
 
 PAINTED, COLLECTOR = f"{SCENES}/painted.py:Painted", f"{SCENES}/painted.py:Collector"

@@ -21,7 +21,7 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.loading import load_encoder
-from su3d_bench.protocols import load_protocol
+from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.store.run_folder import RunFolder
 
 needs_models = pytest.mark.skipif(

@@ -28,12 +28,12 @@ from prediction_files import (
 
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError
 from su3d_bench.evaluation import Request, evaluate
-from su3d_bench.evaluation_bound import every_class_counts
+from su3d_bench.metrics.instance.evaluation_bound import every_class_counts
 from su3d_bench.evaluation_scenes import Source, match_scenes
-from su3d_bench.metrics.instance_ap import THRESHOLDS, combine, per_scene
-from su3d_bench.metrics.transfer import Masks
+from su3d_bench.metrics.instance.average_precision import THRESHOLDS, combine, per_scene
+from su3d_bench.metrics.matching.nearest import Masks
 from su3d_bench.predictions.formats import READERS
-from su3d_bench.protocols import load_protocol
+from su3d_bench.metrics.protocols import load_protocol
 
 # ---- numbers and what stands beside them
 
@@ -219,7 +219,7 @@ def test_an_empty_first_scene_decides_nothing(tmp_path: Path) -> None:
 
 
 def test_a_protocol_of_the_user_counts_missing_scenes(tmp_path: Path) -> None:
-    from su3d_bench.protocols import rules_file
+    from su3d_bench.metrics.protocols import rules_file
 
     text = rules_file("scannet-instance").read_text().replace('name = "scannet-instance"', 'name = "mine"')
     (tmp_path / "mine.toml").write_text(text)

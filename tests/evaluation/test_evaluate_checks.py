@@ -17,7 +17,7 @@ from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.evaluation_checks import check_cloud, mask_facts
 from su3d_bench.evaluation_texts import read_text_features
 from su3d_bench.evaluation_truth import read_text_truth
-from su3d_bench.metrics.transfer import Masks
+from su3d_bench.metrics.matching.nearest import Masks
 
 # ---- checks
 

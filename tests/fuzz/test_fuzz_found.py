@@ -25,8 +25,8 @@ from su3d_bench.finished_run import read_run
 from su3d_bench.store.atomic import DAMAGE, read_arrays
 from su3d_bench.leaderboard import leaderboard
 from su3d_bench.formats.numpy_files import read_npy
-from su3d_bench.protocols import load_protocol, read_protocol
-from su3d_bench.scoring import combine, unpack_scores
+from su3d_bench.metrics.protocols import load_protocol, read_protocol
+from su3d_bench.metrics.scoring import combine, unpack_scores
 from su3d_bench.store.run_folder import is_file, read_json, read_prediction
 from su3d_bench.table_sources import check_paper
 

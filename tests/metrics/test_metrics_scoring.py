@@ -21,8 +21,8 @@ from scored_room import (
 )
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.protocols import load_protocol
-from su3d_bench.scoring import combine, score_scene, why_not_scorable
+from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.scoring import combine, score_scene, why_not_scorable
 from su3d_bench.core.types import DenseFeatures, GroundTruth, LabelSet, Partition
 
 

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 import su3d_bench.numerics.statistics
-from su3d_bench.metrics import instance_ap, resampling, semantic
+from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.results import resampling
+from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.numerics.statistics import bootstrap_interval, percentile_interval, resample_weights
 from su3d_bench.core.types import Float64Array, Int64Array
 

@@ -10,7 +10,7 @@ from test_opensu3d_pipeline import SCENE, TWINS, contents, look
 from torch_devices import TORCH_ON_CPU, needs_torch, on_each_device
 
 from su3d_bench.cli.main import main
-from su3d_bench.metrics.labelling import cosines, most_similar
+from su3d_bench.metrics.matching.labelling import cosines, most_similar
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
@@ -58,7 +58,7 @@ def test_a_block_in_which_every_choice_is_clear_is_not_computed_again(monkeypatc
     text, features = np.eye(4), np.eye(4)[[2, 0, 3]]
     expected = most_similar(features, text)
     monkeypatch.setattr(
-        "su3d_bench.metrics.labelling._normalised", lambda rows: rows if len(rows) == 4 else refuse(rows)
+        "su3d_bench.metrics.matching.labelling._normalised", lambda rows: rows if len(rows) == 4 else refuse(rows)
     )
     assert most_similar(features, text, TORCH_ON_CPU).tolist() == expected.tolist() == [2, 0, 3]
     with pytest.raises(AssertionError):  # a tie is

@@ -26,10 +26,10 @@ from su3d_bench.datasets.openlex3d import (
 from su3d_bench.formats.ply import ListColumn
 from su3d_bench.datasets.replica_truth import AnnotatedMesh
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.metrics.openlex3d import ObjectLabels
-from su3d_bench.metrics.query_ap import TextQuery
-from su3d_bench.protocols import load_protocol
-from su3d_bench.scoring import combine, score_scene
+from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels
+from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
+from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.scoring import combine, score_scene
 
 WHERE = "replica/room0: file"
 CATEGORIES = {

@@ -36,7 +36,7 @@ from su3d_bench.evaluation import Request, evaluate
 from su3d_bench.predictions import clouds, gradslam
 from su3d_bench.predictions.base import ScenePrediction
 from su3d_bench.predictions.formats import READERS, recognise
-from su3d_bench.protocols import load_protocol
+from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.core.types import DenseFeatures, Instances, Partition
 
 

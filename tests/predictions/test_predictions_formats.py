@@ -33,7 +33,7 @@ from prediction_files import (
 )
 
 from su3d_bench.core.errors import ConfigError, PredictionError
-from su3d_bench.metrics.instance_ap import last_line_of_each_mask_file
+from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file
 from su3d_bench.formats import text_integers
 from su3d_bench.predictions.base import ScenePrediction, VertexLabels, VertexMasks
 from su3d_bench.predictions.formats import READERS, format_names, recognise

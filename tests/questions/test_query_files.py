@@ -14,7 +14,7 @@ from su3d_bench.datasets.query_files import read_query_file
 from su3d_bench.datasets.replica import Replica
 from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.evaluation import Request, evaluate
-from su3d_bench.metrics.query_ap import TextQuery
+from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
 
 TOML = """[[query]]
 scene = "replica/room0"

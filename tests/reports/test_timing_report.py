@@ -20,7 +20,7 @@ from su3d_bench.finished_updates import read_update_times
 from su3d_bench.numerics.statistics import growth_exponent
 from su3d_bench.core.timing import peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Float64Array
-from su3d_bench.update_times import MapCost, UpdateTimes, summarise
+from su3d_bench.metrics.costs import MapCost, UpdateTimes, summarise
 
 PAINTED = f"{SCENES}/painted.py"
 WORDS = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--methods", f"{PAINTED}:Collector"]

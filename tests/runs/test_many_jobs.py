@@ -16,8 +16,10 @@ from su3d_bench.store import run_folder as store
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.execution import run_units
-from su3d_bench.metrics import instance_ap, precision_recall, resampling
-from su3d_bench.scoring import pack_scores, unpack_scores
+from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance import precision_recall
+from su3d_bench.metrics.results import resampling
+from su3d_bench.metrics.scoring import pack_scores, unpack_scores
 from su3d_bench.numerics.statistics import growth_exponent, resample_weights
 
 WORDS = ["run", "--scenes", f"{SCENES}/painted.py:Painted/*", "--methods", f"{SCENES}/painted.py:Collector"]

@@ -17,7 +17,7 @@ from painted import colour_perception
 from su3d_bench import scene_run
 from su3d_bench.cli import query
 from su3d_bench.cli.main import main
-from su3d_bench.protocols import load_protocol
+from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.sheets.items import read_key, read_sheet
 from su3d_bench.sheets.run_source import RunSource
 from su3d_bench.store.run_folder import RunFolder, read_prediction, write_prediction

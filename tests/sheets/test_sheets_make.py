@@ -21,7 +21,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.executors import run_processes
 from su3d_bench.finished_run import read_run
-from su3d_bench.protocols import load_protocol
+from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.questions.model import new_question
 from su3d_bench.reports.frame_views import best_view, mask_in_frame, seen_in
 from su3d_bench.reports.heat_scales import SCALES, scale_stops, similarity_colours
@@ -206,7 +206,7 @@ def test_labels_are_asked_in_drawn_order_and_equal_ones_once(
     assert {one.stands_for["label 1"] for one in same} <= {("n", "n'"), ("n",)}
     judged = [one for one in same if one.automatic]
     assert judged and all(one.automatic["label 1"] == "right" for one in judged)
-    from su3d_bench.metrics.question_truths import RefinedNames
+    from su3d_bench.metrics.questions.truths import RefinedNames
     from su3d_bench.sheets import drafts
 
     names = {"refined_names": lambda job, found: RefinedNames(("<b>lamp</b>",) * len(found), "test")}

@@ -25,8 +25,8 @@ from su3d_bench.baselines.conceptfusion import ConceptFusion, ConceptFusionConfi
 from su3d_bench.baselines.feature_table import FeatureTable
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError, StoreError
-from su3d_bench.metrics.labelling import most_similar
-from su3d_bench.metrics.score_semantic import has_feature
+from su3d_bench.metrics.matching.labelling import most_similar
+from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.predictions.own_runs import OwnRuns
 from su3d_bench.store.scratch import scratch_folder
 from su3d_bench.store.run_folder import features_beside, npz_bytes, read_prediction, write_prediction

@@ -16,8 +16,8 @@ from scored_room import instances
 from su3d_bench.datasets.replica import Replica
 from su3d_bench.datasets.replica_clouds import N_EMBEDDING, read_first_pose
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.protocols import load_protocol
-from su3d_bench.scoring import combine, score_scene
+from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.core.types import Float32Array, Instances
 
 Change = Callable[[Path], object]

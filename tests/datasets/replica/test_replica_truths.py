@@ -15,8 +15,8 @@ from su3d_bench.formats.ply import PlyElement, write_ply
 from su3d_bench.datasets.replica import Replica
 from su3d_bench.datasets.replica_label_files import OVO_CLASSES, read_whole_numbers
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.protocols import load_protocol
-from su3d_bench.scoring import combine, score_scene
+from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.scoring import combine, score_scene
 
 
 def write_mesh(path: Path, n_vertices: int, at: float = 0.0) -> None:

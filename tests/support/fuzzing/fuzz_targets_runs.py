@@ -134,7 +134,7 @@ def _resumed(folder: Path) -> Read:
 
 
 def _counts(folder: Path) -> Read:
-    from su3d_bench.scoring import unpack_scores
+    from su3d_bench.metrics.scoring import unpack_scores
 
     file = next(_made_run().glob("scenes/*.a/collector/counts.npz"))
     (folder / "counts.npz").write_bytes(file.read_bytes())
@@ -234,7 +234,7 @@ def _method_config(folder: Path) -> Read:
 
 
 def _protocol(folder: Path) -> Read:
-    from su3d_bench.protocols import read_protocol, rules_file
+    from su3d_bench.metrics.protocols import read_protocol, rules_file
 
     for name in ("rooms-semantic", "openlex3d-topn", "rooms-instance"):
         (folder / f"{name}.toml").write_bytes(rules_file(name).read_bytes())

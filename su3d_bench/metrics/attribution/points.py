@@ -19,8 +19,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.metrics import semantic
-from su3d_bench.metrics.semantic import SemanticCounts
+from su3d_bench.metrics.semantic import confusion as semantic
+from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 
 CAUSES = ("geometry", "background", "association", "label")

@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.protocols import ProtocolRules
+from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.store.row_blocks import row_blocks
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, Prediction
 
@@ -110,7 +110,7 @@ def cosines(features: NDArray[Any], text: NDArray[Any], device: str = CPU) -> Fl
     [[0.0, 1.0], [0.0, 0.0]]
     """
     if device != CPU:
-        from su3d_bench.metrics import similarity_kernels
+        from su3d_bench.metrics.matching import kernels as similarity_kernels
 
         return similarity_kernels.cosines(
             *(similarity_kernels.directions_on(device, rows) for rows in (features, text))
@@ -149,7 +149,7 @@ def _sure_on(device: str, text: np.ndarray) -> Callable[[np.ndarray], Int64Array
     """What finds the row of ``text`` most similar to each row of a block; it gives None where it cannot be sure."""
     if device == CPU:
         return lambda _: None
-    from su3d_bench.metrics import similarity_kernels as kernels
+    from su3d_bench.metrics.matching import kernels as kernels
 
     directions = kernels.directions_on(device, text)
     return lambda block: kernels.sure_most_similar(kernels.directions_on(device, block), directions)

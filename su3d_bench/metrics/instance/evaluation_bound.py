@@ -6,14 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from su3d_bench.metrics.instance_ap import (
-    INSTANCES_PER_CLASS,
-    InstanceCounts,
-    count_class,
-    intersections,
-    stacked,
-)
-from su3d_bench.metrics.transfer import Masks
+from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS, InstanceCounts, count_class, intersections, stacked
+from su3d_bench.metrics.matching.nearest import Masks
 from su3d_bench.core.types import Float64Array, Int64Array
 
 

@@ -10,12 +10,12 @@ from typing import cast
 
 import numpy as np
 
-from su3d_bench.metrics import resampling
-from su3d_bench.metrics.instance_ap import InstanceCounts
-from su3d_bench.metrics.labelling import scored_classes
-from su3d_bench.metrics.results import CURVE_KINDS, Counts
-from su3d_bench.metrics.semantic import SemanticCounts
-from su3d_bench.protocols import SHARE_KINDS, ProtocolRules
+from su3d_bench.metrics.results import resampling
+from su3d_bench.metrics.instance.average_precision import InstanceCounts
+from su3d_bench.metrics.matching.labelling import scored_classes
+from su3d_bench.metrics.results.results import CURVE_KINDS, Counts
+from su3d_bench.metrics.semantic.confusion import SemanticCounts
+from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules
 from su3d_bench.core.types import Float64Array, Int64Array
 
 

@@ -9,9 +9,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.metrics.instance_ap import THRESHOLDS, InstanceCounts, ap_columns
-from su3d_bench.metrics.precision_recall import MANY_ROWS
-from su3d_bench.metrics.semantic import SemanticCounts
+from su3d_bench.metrics.instance.average_precision import THRESHOLDS, InstanceCounts, ap_columns
+from su3d_bench.metrics.instance.precision_recall import MANY_ROWS
+from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 
 AT_ONCE = 64  # resamples that go through the rows side by side: their counts stay in the nearest cache
@@ -72,7 +72,7 @@ def _areas(rows: _Rows, bounds: Int64Array, n_truth: Int64Array, weights: Int64A
 
 def _compiled_areas(rows: _Rows, bounds: Int64Array, n_truth: Int64Array, weights: Int64Array) -> Float64Array:
     """``_areas`` of many rows, up to rounding, by compiled loops on all cores."""
-    from su3d_bench.metrics.precision_recall_kernels import resampled_areas
+    from su3d_bench.metrics.instance.kernels import resampled_areas
 
     areas = np.zeros((len(bounds) - 1, len(weights)))
     class_of_cell = np.repeat(np.arange(n_truth.shape[1]), len(areas) // n_truth.shape[1])

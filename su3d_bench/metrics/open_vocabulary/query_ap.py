@@ -12,9 +12,9 @@ from typing import Literal
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.metrics import instance_ap
-from su3d_bench.metrics.instance_ap import InstanceCounts
-from su3d_bench.metrics.transfer import Masks
+from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance.average_precision import InstanceCounts
+from su3d_bench.metrics.matching.nearest import Masks
 from su3d_bench.core.types import Float32Array, Float64Array, Int64Array
 
 SPACE = "queries"

@@ -11,15 +11,18 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.metrics import object_means, openlex3d, query_ap, transfer
-from su3d_bench.metrics.labelling import cosines, device_of, encoder_warning, has_every_label, text_features
-from su3d_bench.metrics.neighbours import transfer_each_mask
-from su3d_bench.metrics.openlex3d import OpenLexTruth
-from su3d_bench.metrics.query_ap import QueryTruth
+from su3d_bench.metrics.open_vocabulary import object_means
+from su3d_bench.metrics.open_vocabulary import openlex3d
+from su3d_bench.metrics.open_vocabulary import query_ap
+from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, has_every_label, text_features
+from su3d_bench.metrics.matching.votes import transfer_each_mask
+from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
+from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
 from su3d_bench.metrics.scene_score import SceneScore, n_predictions
-from su3d_bench.metrics.score_instances import score_of_masks
-from su3d_bench.metrics.score_semantic import has_feature
-from su3d_bench.protocols import ProtocolRules
+from su3d_bench.metrics.instance.score import score_of_masks
+from su3d_bench.metrics.semantic.score import has_feature
+from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.store.row_blocks import release_pages
 from su3d_bench.core.types import DenseFeatures, Float32Array, Float64Array, Instances, Int64Array, Partition, Prediction
 

@@ -6,7 +6,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from su3d_bench.metrics.dot_product import dot
+from su3d_bench.metrics.instance.dot_product import dot
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 
 MOST_REMEMBERED_ROWS = 12  # small curves repeat from scene to scene, longer ones hardly ever
@@ -64,7 +64,7 @@ def average_precisions(
     score, is_true = score[order], is_true[order]
     found = np.full(len(n_missed), np.nan)
     if len(cell) >= MANY_ROWS:
-        from su3d_bench.metrics import precision_recall_kernels as kernels
+        from su3d_bench.metrics.instance import kernels as kernels
 
         kernels.areas(score, is_true, bounds, n_missed, is_wanted, found)
         return found

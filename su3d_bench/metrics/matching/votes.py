@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.metrics.transfer import Masks, Points, row_ids
+from su3d_bench.metrics.matching.nearest import Masks, Points, row_ids
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 
 _MAX_CELLS = 4_000_000  # neighbours held at once
