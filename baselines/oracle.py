@@ -6,7 +6,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
-from su3d_bench.perception.naming import scene_caption
+from su3d_bench.perception.embedded.naming import scene_caption
 from su3d_bench.core.types import Detections, Frame, GroundTruth, Instances, Int32Array, PerceptionNeeds, SceneInfo
 
 

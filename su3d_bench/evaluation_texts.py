@@ -112,7 +112,7 @@ def encoder_for(rules: ProtocolRules, n_dimensions: int, given: TextFeatures | N
         if given.dim != n_dimensions:
             return f"the features have {n_dimensions} dimensions, those in {given.path.name} {given.dim}"
         return GivenTexts(given, rules)
-    from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
+    from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 
     embedded = EmbeddedEncoder()
     if n_dimensions == embedded.dim and (is_own or rules.encoder in {None, embedded.name}):

@@ -156,7 +156,7 @@ def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> An
 
 def _nearest_name(noun: str, names: Sequence[str]) -> tuple[str, float]:
     """The embedded encoder's opinion, which is loaded for it only now."""
-    from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
+    from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
     from su3d_bench.reasoning.named_objects import nearest_by
 
     return nearest_by(EmbeddedEncoder())(noun, names)

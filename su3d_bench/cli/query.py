@@ -123,9 +123,9 @@ def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
     from su3d_bench.core.config import read_file, resolve
     from su3d_bench.perception.cache import FrameCache
     from su3d_bench.perception.config import PerceptionConfig
-    from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
+    from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
     from su3d_bench.perception.models.catalogue import encoder_known_as
-    from su3d_bench.perception.models.encoder import FoundationEncoder
+    from su3d_bench.perception.models.encoders.encoder import FoundationEncoder
     from su3d_bench.perception.models.loading import load_encoder
     from su3d_bench.planning import cache_root
     from su3d_bench.store.run_folder import read_json

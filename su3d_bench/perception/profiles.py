@@ -10,9 +10,9 @@ from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.config import PerceptionConfig
 from su3d_bench.perception.models.config import EMBEDDED
-from su3d_bench.perception.profile_embedded import CAMERA_CAVEAT, EmbeddedPerception
-from su3d_bench.perception.profile_oracle import ORACLE_CAVEAT, OraclePerception
-from su3d_bench.perception.profile_stored import STORED_CAVEAT, LabelImagePerception, StoredPerception
+from su3d_bench.perception.embedded.perception import CAMERA_CAVEAT, EmbeddedPerception
+from su3d_bench.perception.oracle.perception import ORACLE_CAVEAT, OraclePerception
+from su3d_bench.perception.stored.perception import STORED_CAVEAT, LabelImagePerception, StoredPerception
 from su3d_bench.core.types import Detections, Frame, ImageDomain, InstanceMesh, PerceptionNeeds, SceneInfo
 
 __all__ = [
@@ -117,7 +117,7 @@ def build_perception(
         if config.stored.images is not None:
             return LabelImagePerception(config, scene, encoder, cache)
         if config.stored.detections is not None:
-            from su3d_bench.perception.profile_gsa import GsaPerception
+            from su3d_bench.perception.stored.profile_gsa import GsaPerception
 
             return GsaPerception(config.stored.folder, config.stored.detections, scene, encoder, cache)
         return StoredPerception(config.stored.folder, scene, encoder, cache)
@@ -130,7 +130,7 @@ def _paper(
     config: PerceptionConfig, encoder: Encoder, cache: FrameCache, replies: Path, is_offline: bool, job_index: int
 ) -> Perception:
     from su3d_bench.perception.models.front_end import load_networks
-    from su3d_bench.perception.profile_paper import PaperPerception
+    from su3d_bench.perception.paper import PaperPerception
 
     captioner = None
     if config.paper.captions == "model":

@@ -12,8 +12,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from su3d_bench.perception.captions_lexicon import AFFORDANCES, SYNONYMS
-from su3d_bench.perception.naming import with_article
+from su3d_bench.perception.embedded.lexicon import AFFORDANCES, SYNONYMS
+from su3d_bench.perception.embedded.naming import with_article
 from su3d_bench.questions.known_objects import plain_name
 from su3d_bench.questions.model import KINDS, Question, new_question
 from su3d_bench.reasoning.named_objects import meant_by

@@ -6,8 +6,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from su3d_bench.perception.captions_lexicon import GROUPS
-from su3d_bench.perception.embedded_text import words
+from su3d_bench.perception.embedded.lexicon import GROUPS
+from su3d_bench.perception.embedded.text import words
 from su3d_bench.reasoning.named_objects import meant_by
 from su3d_bench.reasoning.relations import is_room_surface
 from su3d_bench.reasoning.scene_map import MapObject, SceneMap

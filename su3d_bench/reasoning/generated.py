@@ -156,6 +156,6 @@ def _plural(name: str) -> str:
 
 
 def _article(name: str) -> str:
-    from su3d_bench.perception.naming import with_article
+    from su3d_bench.perception.embedded.naming import with_article
 
     return with_article(name)

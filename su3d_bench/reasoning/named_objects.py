@@ -12,9 +12,9 @@ from functools import cache
 import numpy as np
 
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.perception.captions_lexicon import GROUPS, SYNONYMS
-from su3d_bench.perception.embedded_text import words
-from su3d_bench.perception.naming import vocabulary
+from su3d_bench.perception.embedded.lexicon import GROUPS, SYNONYMS
+from su3d_bench.perception.embedded.text import words
+from su3d_bench.perception.embedded.naming import vocabulary
 from su3d_bench.reasoning.relations import is_room_surface
 from su3d_bench.reasoning.scene_map import MapObject, SceneMap
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.perception.embedded_text import words
+from su3d_bench.perception.embedded.text import words
 from su3d_bench.perception.language.chat import ChatRequest, n_tokens
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.language.prompts import STRATEGY

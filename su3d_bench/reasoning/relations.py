@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.perception.embedded_text import words
+from su3d_bench.perception.embedded.text import words
 from su3d_bench.core.types import Float64Array
 
 PairRelation = Literal["on", "under", "in", "above", "next to", "near"]

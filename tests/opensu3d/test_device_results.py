@@ -13,7 +13,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.metrics.matching.labelling import cosines, most_similar
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
-from su3d_bench.perception.embedded_encoder import EmbeddedEncoder
+from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.core.timing import Timer
 
 

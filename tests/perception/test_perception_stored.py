@@ -11,7 +11,7 @@ from perception_fakes import CountingEncoder, still_life
 
 from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
-from su3d_bench.perception.stored import StoredConfig, read_stored, stored_path, write_stored
+from su3d_bench.perception.stored.npz_files import StoredConfig, read_stored, stored_path, write_stored
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Detections, PerceptionNeeds, SceneInfo
 

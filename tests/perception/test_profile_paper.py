@@ -14,11 +14,11 @@ from tiny_models import blocks, frame_of, paper_words, tiny_dino, tiny_sam, writ
 from su3d_bench.core import registry
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, ModelMissing
-from su3d_bench.perception import profile_paper
+from su3d_bench.perception import paper as profile_paper
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.config import PerceptionConfig
 from su3d_bench.perception.language.captioner import CropCaption
-from su3d_bench.perception.models.tagging import WORDS_CAVEAT
+from su3d_bench.perception.models.masks.tagging import WORDS_CAVEAT
 from su3d_bench.perception.profiles import Perception, build_perception, check_models, resolve_profile
 from su3d_bench.store.run_folder import read_json, read_prediction
 from su3d_bench.core.timing import Timer
@@ -154,7 +154,7 @@ def test_each_methods_published_mask_settings_reach_the_models(
 
 
 def config_words() -> tuple[str, ...]:
-    from su3d_bench.perception.naming import vocabulary
+    from su3d_bench.perception.embedded.naming import vocabulary
 
     return vocabulary()
 
@@ -204,7 +204,7 @@ def test_stand_ins_for_ram_are_said_beside_every_number(models: Path, tmp_path: 
 
 def test_a_vision_model_gives_names_and_captions_where_it_is_asked_for(models: Path, tmp_path: Path) -> None:
     from su3d_bench.perception.models.front_end import load_networks
-    from su3d_bench.perception.profile_paper import PaperPerception
+    from su3d_bench.perception.paper import PaperPerception
 
     class Describing:
         def captions(self, crops: list[UInt8Array], names: tuple[str, ...]) -> list[CropCaption]:
@@ -317,8 +317,8 @@ def test_the_networks_run_on_a_gpu(device: str) -> None:
         pytest.skip("needs a GPU that torch can use")
     import copy
 
-    from su3d_bench.perception.models.sam import Sam
-    from su3d_bench.perception.models.sam_networks import TorchSam
+    from su3d_bench.perception.models.masks.sam import Sam
+    from su3d_bench.perception.models.masks.sam_networks import TorchSam
 
     boxes = np.array([[5, 5, 60, 60], [0, 0, 128, 96]], np.float32)
     sams = [Sam(TorchSam(tiny_sam())), Sam(TorchSam(copy.deepcopy(tiny_sam()).to(device)))]

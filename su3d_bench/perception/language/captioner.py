@@ -12,7 +12,7 @@ from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.language.parsing import described, is_refusal
 from su3d_bench.perception.language.prompts import DESCRIBE
-from su3d_bench.perception.naming import scene_caption
+from su3d_bench.perception.embedded.naming import scene_caption
 from su3d_bench.core.types import UInt8Array
 
 logger = logging.getLogger(__name__)

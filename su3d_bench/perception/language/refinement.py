@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.perception.embedded_text import words
+from su3d_bench.perception.embedded.text import words
 from su3d_bench.perception.language.captioner import reason_of
 from su3d_bench.perception.language.chat import ChatRequest
 from su3d_bench.perception.language.client import LanguageModel

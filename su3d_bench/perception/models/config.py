@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.core.devices import DEVICE, EXPECTED_DEVICE
-from su3d_bench.perception.models.onnx_session import Provider
+from su3d_bench.perception.models.onnx.session import Provider
 
 EMBEDDED = "embedded"
 Precision = Literal["auto", "float32", "float16", "bfloat16"]

@@ -7,9 +7,9 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from su3d_bench.perception.models.automatic_masks import AutomaticMaskConfig
+from su3d_bench.perception.models.masks.automatic_masks import AutomaticMaskConfig
 from su3d_bench.perception.models.catalogue import MODELS
-from su3d_bench.perception.models.grounded_sam import GroundedConfig
+from su3d_bench.perception.models.masks.grounded_sam import GroundedConfig
 
 TaggerName = Literal["auto", "ram", "ram-onnx", "words"]
 

@@ -15,16 +15,8 @@ import pytest
 
 from su3d_bench.core.errors import DataError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.perception import embedded_encoder
-from su3d_bench.perception.embedded_encoder import (
-    DIM,
-    IMAGE_FILE,
-    IMAGE_SIZE,
-    TEXT_FILE,
-    EmbeddedEncoder,
-    log_size,
-    shrink,
-)
+from su3d_bench.perception.embedded import encoder as embedded_encoder
+from su3d_bench.perception.embedded.encoder import DIM, IMAGE_FILE, IMAGE_SIZE, TEXT_FILE, EmbeddedEncoder, log_size, shrink
 from su3d_bench.core.types import UInt8Array
 
 FOLDER = Path(embedded_encoder.__file__).parent

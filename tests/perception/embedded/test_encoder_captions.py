@@ -6,19 +6,10 @@ import numpy as np
 import pytest
 
 from su3d_bench.core import registry
-from su3d_bench.perception.captions import (
-    Caption,
-    CropTruth,
-    Neighbour,
-    class_caption,
-    class_words,
-    draw_caption,
-    fixed_captions,
-    wrong_relation,
-)
-from su3d_bench.perception.captions_lexicon import AFFORDANCES, GROUPS, SYNONYMS
-from su3d_bench.perception.embedded_text import words
-from su3d_bench.perception.training_targets import TruthTable
+from su3d_bench.perception.embedded.captions import Caption, CropTruth, Neighbour, class_caption, class_words, draw_caption, fixed_captions, wrong_relation
+from su3d_bench.perception.embedded.lexicon import AFFORDANCES, GROUPS, SYNONYMS
+from su3d_bench.perception.embedded.text import words
+from su3d_bench.perception.embedded.training.targets import TruthTable
 
 GREEN_PLANT = CropTruth("indoor-plant", "green", "ceramic", "small", (Neighbour("on", "shelf", "brown"),))
 RED_SOFA = CropTruth("sofa", "red", "fabric", "large", (Neighbour("with", "cushion", "blue"),), "living")

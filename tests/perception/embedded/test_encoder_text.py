@@ -7,8 +7,8 @@ import doctest
 import numpy as np
 import pytest
 
-from su3d_bench.perception import embedded_text
-from su3d_bench.perception.embedded_text import N_IDS, N_ROWS, N_WORDS, PADDING, fnv1a, token_ids, words
+from su3d_bench.perception.embedded import text as embedded_text
+from su3d_bench.perception.embedded.text import N_IDS, N_ROWS, N_WORDS, PADDING, fnv1a, token_ids, words
 
 
 def test_examples_in_docstrings_run() -> None:

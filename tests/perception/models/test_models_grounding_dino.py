@@ -10,14 +10,7 @@ import numpy as np
 import pytest
 from tiny_models import DINO_PX, blocks, tiny_dino, tiny_tokenizer
 
-from su3d_bench.perception.models.grounding_dino import (
-    CONCEPTGRAPHS_BOXES,
-    BoxConfig,
-    GroundingDino,
-    is_in_phrase,
-    tag_of,
-    text_prompt,
-)
+from su3d_bench.perception.models.masks.grounding_dino import CONCEPTGRAPHS_BOXES, BoxConfig, GroundingDino, is_in_phrase, tag_of, text_prompt
 from su3d_bench.core.types import Float32Array
 
 RGB = blocks(40, 60)

@@ -15,7 +15,7 @@ from tiny_encoders import noise_images
 from su3d_bench.core.errors import DataError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.models.config import ModelsConfig
-from su3d_bench.perception.models.image_transform import ImageTransform
+from su3d_bench.perception.models.encoders.image_transform import ImageTransform
 from su3d_bench.perception.models.loading import load_encoder
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'su3d-bench[models]'")

@@ -123,7 +123,7 @@ def write_clip_tokenizer(folder: Path) -> int:
 
 
 def _write_preprocessor(folder: Path, settings: dict[str, object]) -> None:
-    from su3d_bench.perception.models.image_transform import CLIP_MEAN, CLIP_STD
+    from su3d_bench.perception.models.encoders.image_transform import CLIP_MEAN, CLIP_STD
 
     usual = {"image_mean": list(CLIP_MEAN), "image_std": list(CLIP_STD), "resample": 3, "do_resize": True}
     (folder / "preprocessor_config.json").write_text(json.dumps(usual | settings))

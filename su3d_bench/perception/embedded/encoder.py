@@ -1,0 +1,159 @@
+"""The encoder that the project trained itself, run by ONNX Runtime: no download, no GPU, no torch; on a GPU by torch.
+
+Its training and its measured accuracy are in ``model_card.md`` beside the weights.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.core.errors import DataError, ModelMissing
+from su3d_bench.perception.embedded.text import TOKENIZER_VERSION, token_ids
+from su3d_bench.core.types import Float32Array, UInt8Array
+
+IMAGE_SIZE = 64
+DIM = 128
+IMAGE_FILE = "embedded_image.onnx"
+TEXT_FILE = "embedded_text.onnx"
+PREPROCESSING_VERSION = "1"
+BATCH = 32  # images that run through the network together: 1.6 times as fast as one by one, and no gain beyond
+N_TRIED = 5  # images by which a machine shows that a batch moves no bit; odd, so that kernels meet a remainder
+
+
+def shrink(image: UInt8Array) -> UInt8Array:
+    """``image`` (h, w, 3) stretched to 64 x 64: by area where an axis shrinks, linearly where it grows.
+
+    The axes are resampled apart because OpenCV's area mode stops averaging in both as soon as one of them grows.
+    """
+    import cv2
+
+    height, width = image.shape[:2]
+    across = cv2.INTER_AREA if width >= IMAGE_SIZE else cv2.INTER_LINEAR
+    down = cv2.INTER_AREA if height >= IMAGE_SIZE else cv2.INTER_LINEAR
+    if across == down:
+        return np.asarray(cv2.resize(image, (IMAGE_SIZE, IMAGE_SIZE), interpolation=across), np.uint8)
+    narrow = cv2.resize(image, (IMAGE_SIZE, height), interpolation=across)
+    return np.asarray(cv2.resize(narrow, (IMAGE_SIZE, IMAGE_SIZE), interpolation=down), np.uint8)
+
+
+def log_size(height: int, width: int) -> tuple[float, float]:
+    """What the stretch takes away: log2 of the crop's height and width in pixels, 0 at 64 and 1 at 256."""
+    return float(np.log2(height) - 6.0) / 2.0, float(np.log2(width) - 6.0) / 2.0
+
+
+class EmbeddedEncoder:
+    """Two small towers, trained on rendered rooms only; files are read at the first use.
+
+    Every text runs through the network alone and all on one thread, so that a feature never depends on what else is in
+    the batch or on the machine's number of cores. Images run in batches where these give the bits that each image gives
+    alone, which is tried at the first use, and else alone too. On a ``device`` other than ``cpu`` torch runs the
+    towers, images always in batches, and features differ from those of the CPU by rounding.
+    """
+
+    name = "su3d-embedded"
+    dim = DIM
+
+    def __init__(self, folder: Path | None = None, device: str = "cpu") -> None:
+        self._folder = Path(__file__).parent if folder is None else folder
+        self.device = device
+
+    @cached_property
+    def digest(self) -> str:
+        """Moves with the weights of either tower, with the preprocessing, the tokenizer and the kind of device."""
+        return self._digest_on(self.device.partition(":")[0])
+
+    def is_same_space(self, digest: str) -> bool:
+        """Whether ``digest`` is of these weights and this preparation, be it on another device."""
+        return digest in (self._digest_on("cpu"), self._digest_on("cuda"))
+
+    def _digest_on(self, kind: str) -> str:
+        versions = f"{PREPROCESSING_VERSION}/{TOKENIZER_VERSION}/{IMAGE_SIZE}/{DIM}"
+        versions += "" if kind == "cpu" else f"/torch on {kind}"
+        content = hashlib.sha256(versions.encode())
+        for name in (IMAGE_FILE, TEXT_FILE):
+            content.update(hashlib.sha256(self._path(name).read_bytes()).digest())
+        return content.hexdigest()
+
+    def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
+        """Features (N, 128) of RGB crops (h, w, 3) uint8 at their native size."""
+        for row, image in enumerate(images):
+            if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
+                raise DataError(
+                    f"image {row}: {image.shape} {image.dtype}; expected (height, width, 3) uint8, not empty"
+                )
+        pixels = np.zeros((len(images), IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
+        log_sizes = np.zeros((len(images), 2), np.float32)
+        for row, image in enumerate(images):
+            pixels[row], log_sizes[row] = shrink(image), log_size(*image.shape[:2])
+        return self.encode_shrunk(pixels, log_sizes)
+
+    def encode_shrunk(self, pixels: UInt8Array, log_sizes: Float32Array) -> Float32Array:
+        """Features (N, 128) of ``shrink``'s images (N, 64, 64, 3) and the ``log_size`` (N, 2) of their crops."""
+        return self._in_batches(pixels, log_sizes, self._batch)
+
+    def _in_batches(self, pixels: UInt8Array, log_sizes: Float32Array, n: int) -> Float32Array:
+        features = np.zeros((len(pixels), DIM), np.float32)
+        for start in range(0, len(pixels), n):
+            rows = slice(start, start + n)
+            inputs = {"pixels": pixels[rows], "log_size": log_sizes[rows]}
+            features[rows] = self._image_tower.run(None, inputs)[0]
+        return features
+
+    @cached_property
+    def _batch(self) -> int:
+        """How many images run together: 1 where the kernels chosen on this machine round otherwise in a batch."""
+        if self.device != "cpu":
+            return BATCH
+        noise = np.random.default_rng(0)
+        pixels = noise.integers(0, 256, (N_TRIED, IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
+        log_sizes = noise.uniform(-1, 1, (N_TRIED, 2)).astype(np.float32)
+        alone = self._in_batches(pixels, log_sizes, 1)
+        return BATCH if np.array_equal(alone, self._in_batches(pixels, log_sizes, N_TRIED)) else 1
+
+    def encode_texts(self, texts: Sequence[str]) -> Float32Array:
+        """Features (N, 128) of texts; a text of articles alone gives the tower's feature of no words."""
+        features = np.zeros((len(texts), DIM), np.float32)
+        for row, ids in enumerate(token_ids(texts)):
+            features[row] = self._text_tower.run(None, {"ids": ids[None]})[0][0]
+        return features
+
+    @cached_property
+    def _image_tower(self) -> Any:
+        return self._tower(self._path(IMAGE_FILE), is_image=True)
+
+    @cached_property
+    def _text_tower(self) -> Any:
+        return self._tower(self._path(TEXT_FILE), is_image=False)
+
+    def _tower(self, path: Path, *, is_image: bool) -> Any:
+        if self.device == "cpu":
+            return _session(path)
+        from su3d_bench.perception.embedded.torch_towers import TorchTower
+
+        return TorchTower(path, is_image=is_image, device=self.device)
+
+    def _path(self, name: str) -> Path:
+        path = self._folder / name
+        if not path.is_file():
+            raise ModelMissing(
+                f"encoder '{self.name}': there is no {path}; reinstall the package, or train the towers anew with: "
+                f"python -m su3d_bench.perception.training --out {self._folder}"
+            )
+        return path
+
+
+def _session(path: Path) -> Any:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    options.inter_op_num_threads = 1
+    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
+    options.log_severity_level = 3
+    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])

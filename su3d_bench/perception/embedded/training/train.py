@@ -1,0 +1,205 @@
+"""Train the embedded encoder on rendered rooms that no benchmark uses, export it and measure it.
+
+    python -m su3d_bench.perception.training --out DIR --rooms 360 --minutes 30 --seed 0
+
+Needs the models extra (torch, onnx). Time decides how many steps are made, so two trainings differ in their weights.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import importlib.util
+import json
+import logging
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from su3d_bench.core.errors import ModelMissing, Su3dError
+from su3d_bench.perception.embedded.encoder import DIM, IMAGE_FILE, TEXT_FILE, EmbeddedEncoder
+from su3d_bench.perception.embedded.training.crops import FIRST_HELD_OUT_NUMBER, FIRST_TRAINING_NUMBER, make_crops, room_names
+from su3d_bench.perception.embedded.training.evaluation import Figure, measure
+
+if TYPE_CHECKING:
+    from su3d_bench.perception.embedded.training.loop import Towers, TrainingPlan
+
+logger = logging.getLogger(__name__)
+
+CARD_JSON, CARD_TEXT = "model_card.json", "model_card.md"
+
+
+@dataclass(frozen=True)
+class Order:
+    """What to train on and for how long."""
+
+    out: Path
+    cache: Path
+    rooms: int
+    held_out_rooms: int
+    frames_per_room: int
+    minutes: float
+    seed: int
+    jobs: int
+    max_steps: int | None
+    snapshot_minutes: float | None
+
+
+def run(order: Order) -> tuple[Figure, ...]:
+    """Renders, trains, exports and measures; writes the two ONNX files and the model card into ``order.out``."""
+    for package in ("torch", "onnx"):
+        if importlib.util.find_spec(package) is None:
+            raise ModelMissing(f"training needs {package}: pip install 'su3d-bench[models]'")
+    from su3d_bench.perception.embedded.training.training_export import export, largest_difference
+    from su3d_bench.perception.embedded.training.loop import TrainingPlan, train
+
+    names = room_names(order.rooms, FIRST_TRAINING_NUMBER)
+    crops = make_crops(names, order.frames_per_room, order.seed, order.cache, order.jobs)
+    held_names = room_names(order.held_out_rooms, FIRST_HELD_OUT_NUMBER)
+    held_out = make_crops(held_names, order.frames_per_room, order.seed, order.cache, order.jobs)
+    logger.info("%d crops to train on, %d held out", len(crops), len(held_out))
+    plan = TrainingPlan(
+        order.minutes,
+        order.seed,
+        max_steps=order.max_steps,
+        threads=order.jobs,
+        snapshot_minutes=order.snapshot_minutes,
+    )
+    towers = train(crops, plan, keep=lambda snapshot: export(snapshot, order.out))
+    export(towers, order.out)
+    encoder = EmbeddedEncoder(order.out)
+    class_names = sorted({truth.class_name for truth in crops.truths} - {""})
+    features = encoder.encode_shrunk(held_out.pixels, held_out.log_sizes)
+    figures = measure(encoder, held_out, features, class_names)
+    difference = largest_difference(towers, order.out, held_out.first(256), [*class_names, "plant on a shelf"])
+    _write_card(order, plan, towers, (len(crops), len(held_out)), class_names, figures, difference)
+    return figures
+
+
+def _write_card(
+    order: Order,
+    plan: TrainingPlan,
+    towers: Towers,
+    n_crops: tuple[int, int],
+    class_names: Sequence[str],
+    figures: Sequence[Figure],
+    difference: float,
+) -> None:
+    files = {name: (order.out / name).read_bytes() for name in (IMAGE_FILE, TEXT_FILE)}
+    card = {
+        "name": EmbeddedEncoder.name,
+        "digest": EmbeddedEncoder(order.out).digest,
+        "dimensions": DIM,
+        "files": {
+            name: {"bytes": len(data), "sha256": hashlib.sha256(data).hexdigest()} for name, data in files.items()
+        },
+        "training": {
+            "rooms": order.rooms,
+            "first_room_number": FIRST_TRAINING_NUMBER,
+            "frames_per_room": order.frames_per_room,
+            "crops": n_crops[0],
+            "seed": order.seed,
+            "batch_size": plan.batch_size,
+            "learning_rate": plan.learning_rate,
+            "weight_decay": plan.weight_decay,
+            "steps": towers.n_steps,
+            "crops_seen": towers.n_crops_seen,
+            "minutes": round(towers.minutes, 1),
+            "threads": plan.threads,
+            "classes": list(class_names),
+        },
+        "held_out": {
+            "rooms": order.held_out_rooms,
+            "first_room_number": FIRST_HELD_OUT_NUMBER,
+            "crops": n_crops[1],
+            "figures": [asdict(figure) for figure in figures],
+        },
+        "largest_difference_from_torch": difference,
+    }
+    (order.out / CARD_JSON).write_text(json.dumps(card, indent=1) + "\n")
+    (order.out / CARD_TEXT).write_text(_card_text(order, towers, n_crops, len(class_names), files, figures, difference))
+
+
+def _card_text(
+    order: Order,
+    towers: Towers,
+    n_crops: tuple[int, int],
+    n_classes: int,
+    files: dict[str, bytes],
+    figures: Sequence[Figure],
+    difference: float,
+) -> str:
+    sizes = ", ".join(f"`{name}` {len(data) / 1e6:.2f} MB" for name, data in files.items())
+    rows = "\n".join(f"| {f.name} | {100 * f.value:.1f} % | {100 * f.chance:.2f} % | {f.n} |" for f in figures)
+    return f"""# Model card: {EmbeddedEncoder.name}
+
+Two small towers, image and text, into one space of {DIM} dimensions; {sizes}. Written by
+`python -m su3d_bench.perception.training`; the same facts for programs are in `{CARD_JSON}`.
+
+## What it is for
+Naming, describing and retrieving objects of the built-in rooms (dataset `rooms`, and the same rooms in Replica's
+layout) without downloads and without a GPU. It has seen nothing else: **on camera images its answers mean little**;
+use the profile `stored` with features of a large model there. It knows the words of `captions_lexicon.py`; other words
+reach it through shared 4-grams only, which is weak.
+
+## How it was trained
+- Data: {n_crops[0]} crops of {order.rooms} rooms, `<kind>{FIRST_TRAINING_NUMBER}` and on, {order.frames_per_room}
+  images a room from its trajectory, rendered by the project's own generator; benchmark rooms have numbers below
+  {FIRST_TRAINING_NUMBER}. {n_classes} classes.
+- Crops: the object's box, a careless box, a part of the object, the built-in segmenter's boxes, at ratios 0.8, 1, 1.2,
+  2 and 4, and whole images. A wide crop's captions tell the neighbours that it shows ("cushion on sofa"), a whole
+  image's the kind of room.
+- Augmentation: mirroring, light, contrast, tint, noise, shifts, hidden patches, other apparent sizes.
+- Loss: cross-entropy over one caption a class, and a contrastive loss with every true crop-caption pair of the batch
+  as a positive, at the fixed temperature 0.05.
+- Seed {order.seed}, {towers.n_steps} steps of 256 crops in {towers.minutes:.1f} minutes on the CPU.
+
+## What it can tell
+Measured with the exported files on {n_crops[1]} crops of {order.held_out_rooms} rooms that took no part in training
+(`<kind>{FIRST_HELD_OUT_NUMBER}` and on).
+
+| figure | value | chance | trials |
+| --- | --- | --- | --- |
+{rows}
+
+ONNX Runtime and torch differ by at most {difference:.1e} in any feature.
+
+## Known limits
+- Objects of a few pixels, and parts without the rest (a chair's leg, a lamp's foot), are often misnamed.
+- Words that the lexicon lacks, sentences of more than 16 words and negation are not understood.
+- Sizes ("large") are judged from pixels: a crop does not tell the distance.
+"""
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """The command line; the answer is the table of figures."""
+    parser = argparse.ArgumentParser(prog="python -m su3d_bench.perception.training", description=__doc__)
+    parser.add_argument("--out", type=Path, required=True, help="folder for the two ONNX files and the model card")
+    parser.add_argument("--cache", type=Path, help="folder for rendered crops; default: OUT/crops")
+    parser.add_argument("--rooms", type=int, default=360)
+    parser.add_argument("--held-out-rooms", type=int, default=24)
+    parser.add_argument("--frames-per-room", type=int, default=6)
+    parser.add_argument("--minutes", type=float, default=30.0)
+    parser.add_argument("--max-steps", type=int, help="end earlier, after this many steps")
+    parser.add_argument("--snapshot-minutes", type=float, help="also export what there is, every so many minutes")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--jobs", type=int, default=2, help="processes that render, threads that train")
+    given = parser.parse_args(arguments)
+    values = {**vars(given), "cache": given.cache or given.out / "crops"}
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", stream=sys.stderr)
+    try:
+        figures = run(Order(**values))
+    except Su3dError as error:
+        sys.stderr.write(f"{error}\n")
+        return error.exit_code
+    for figure in figures:
+        sys.stdout.write(
+            f"{100 * figure.value:6.1f} %  (chance {100 * figure.chance:.2f} %, n {figure.n})  {figure.name}\n"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,106 @@
+"""CLIP through open_clip, from its own checkpoint files, where the user has the package."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.devices import first_batch, make_deterministic, require
+from su3d_bench.perception.models.encoders.encoder import EncoderSpec
+from su3d_bench.perception.models.files import ModelFiles
+from su3d_bench.perception.models.encoders.image_transform import Convention, ImageTransform
+from su3d_bench.perception.models.weights import bounded, read_weights
+from su3d_bench.core.types import Float32Array, Int64Array
+
+N_TOKENS, N_WORDS = 77, 49408
+
+
+def require_open_clip(name: str) -> Any:
+    """The module open_clip; its import needs a torchvision that matches torch."""
+    try:
+        return require("open_clip", f"encoder '{name}' with perception.models.runtime 'open_clip'")
+    except (RuntimeError, AttributeError) as error:
+        raise DataError(
+            f"open_clip cannot be imported ({bounded(error, 80)}); install a torchvision that matches torch, or use "
+            "perception.models.runtime = 'torch'"
+        ) from error
+
+
+def read_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
+    """What open_clip knows of the architecture."""
+    open_clip = require_open_clip(files.entry.name)
+    config = open_clip.get_model_config(files.form.architecture)
+    if config is None:
+        raise DataError(f"open_clip {open_clip.__version__} knows no '{files.form.architecture}'; install a newer one")
+    transform = ImageTransform(int(config["vision_cfg"]["image_size"]), convention=convention)
+    text = config["text_cfg"]
+    n_tokens, n_words = text.get("context_length", N_TOKENS), text.get("vocab_size", N_WORDS)
+    return EncoderSpec(int(config["embed_dim"]), n_tokens, n_words, "clip", 0, transform)
+
+
+def load_model(files: ModelFiles) -> Any:
+    """The model in evaluation mode and float32 on the CPU, with every weight out of the file."""
+    open_clip = require_open_clip(files.entry.name)
+    with _without_warnings():  # of random weights, which are replaced below
+        model = open_clip.create_model(files.form.architecture, pretrained=None, precision="fp32", device="cpu")
+    try:
+        model.load_state_dict(read_weights(files.weights), strict=True)
+    except RuntimeError as error:
+        raise DataError(f"{files.weights}: is no {files.form.architecture}: {bounded(error)}") from error
+    return model.eval()
+
+
+@contextmanager
+def _without_warnings() -> Iterator[None]:
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        yield
+    finally:
+        logging.disable(before)
+
+
+def read_tokeniser(files: ModelFiles) -> Callable[[Sequence[str]], Int64Array]:
+    """open_clip's own tokenizer, whose words come with the package."""
+    tokenizer = require_open_clip(files.entry.name).get_tokenizer(files.form.architecture)
+
+    def tokens(texts: Sequence[str]) -> Int64Array:
+        if not texts:
+            return np.zeros((0, N_TOKENS), np.int64)
+        return np.asarray(tokenizer(list(texts)).numpy(), np.int64)
+
+    return tokens
+
+
+class OpenClipTowers:
+    """The towers of an open_clip model on one device in one precision."""
+
+    def __init__(self, model: Any, device: str, precision: str, batch: int) -> None:
+        import torch
+
+        make_deterministic(device)
+        self._dtype = getattr(torch, precision)
+        self._device = device
+        self._model = model.to(device=device, dtype=self._dtype)
+        n_bytes = sum(p.numel() * p.element_size() for p in model.parameters())
+        # 30 MB an image in float32: about ViT-H-14's widest layer four times over
+        self.batch = batch or first_batch(device, 7_500_000 * self._dtype.itemsize, n_bytes)
+
+    def image_features(self, pixels: Float32Array) -> Float32Array:
+        import torch
+
+        with torch.inference_mode():
+            values = torch.from_numpy(pixels).to(self._device, self._dtype)
+            return np.asarray(self._model.encode_image(values).float().cpu().numpy(), np.float32)
+
+    def text_features(self, tokens: Int64Array) -> Float32Array:
+        import torch
+
+        with torch.inference_mode():
+            ids = torch.from_numpy(tokens).to(self._device)
+            return np.asarray(self._model.encode_text(ids).float().cpu().numpy(), np.float32)

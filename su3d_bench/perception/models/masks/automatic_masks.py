@@ -1,0 +1,242 @@
+"""SAM's automatic masks: a grid of points over the image and over crops of it, the good masks kept once each.
+
+The order of steps, the filters and their ties are those of the original's ``SamAutomaticMaskGenerator``, whose names
+the settings keep.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import product
+from types import MappingProxyType
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from su3d_bench.perception.crops import mask_boxes
+from su3d_bench.perception.models.masks.box_suppression import suppress
+from su3d_bench.core.devices import Batches
+from su3d_bench.perception.models.masks.sam import FULL_SIZE_AT_ONCE, MASK_THRESHOLD, OBJECT_POINT, Prompts, Sam, SeenImage
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, Regions, UInt8Array
+
+CROP_EDGE_PX = 20.0  # a box so near to a crop's edge is taken as cut by it
+Share = float
+
+
+class AutomaticMaskConfig(BaseModel):
+    """How automatic masks are made; the defaults are the original's. Thresholds of 0 filter nothing."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    points_per_side: int = Field(default=32, ge=1, le=256)
+    points_per_batch: int = Field(default=64, ge=1, le=4096)
+    pred_iou_thresh: Share = Field(default=0.88, ge=0, le=1)
+    stability_score_thresh: Share = Field(default=0.95, ge=0, le=1)
+    stability_score_offset: float = Field(default=1.0, ge=0)
+    box_nms_thresh: Share = Field(default=0.7, ge=0, le=1)
+    crop_n_layers: int = Field(default=0, ge=0, le=4)
+    crop_nms_thresh: Share = Field(default=0.7, ge=0, le=1)
+    crop_overlap_ratio: Share = Field(default=512 / 1500, ge=0, lt=1)
+    crop_n_points_downscale_factor: int = Field(default=1, ge=1)
+    min_mask_region_area: int = Field(default=0, ge=0)
+
+
+# What each method's own program asks SAM for; "sam" is SAM3D's, the defaults.
+AUTOMATIC_MASKS: Mapping[str, AutomaticMaskConfig] = MappingProxyType(
+    {
+        "sam": AutomaticMaskConfig(),
+        # ConceptGraphs, generate_gsa_results.py, class set "none"
+        "conceptgraphs": AutomaticMaskConfig(points_per_side=12, points_per_batch=144, min_mask_region_area=100),
+        # ConceptFusion, extract_conceptfusion_features.py; its command line's points and area are not used there
+        "conceptfusion": AutomaticMaskConfig(
+            points_per_side=8, pred_iou_thresh=0.92, crop_n_layers=1, crop_n_points_downscale_factor=2
+        ),
+    }
+)
+
+
+@dataclass(frozen=True)
+class Crop:
+    """A part of the image, x0 y0 x1 y1, of one ``layer``: 0 is the whole image."""
+
+    box: tuple[int, int, int, int]
+    layer: int
+
+
+def point_grid(n_per_side: int) -> Float64Array:
+    """Points (n * n, 2), x y in shares of a crop, row by row, half a step from its edges."""
+    offset = 1 / (2 * n_per_side)
+    steps = np.linspace(offset, 1 - offset, n_per_side)
+    return np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+
+
+def crops_of(height: int, width: int, n_layers: int, overlap_ratio: float) -> list[Crop]:
+    """The whole image, then 4, 16, ... crops a layer, column by column; neighbours share ``overlap_ratio`` of its
+    shorter side, halved from layer to layer."""
+    crops = [Crop((0, 0, width, height), 0)]
+    for layer in range(1, n_layers + 1):
+        n_side = 2**layer
+        overlap = int(overlap_ratio * min(height, width) * (2 / n_side))
+        crop_width = int(np.ceil((overlap * (n_side - 1) + width) / n_side))
+        crop_height = int(np.ceil((overlap * (n_side - 1) + height) / n_side))
+        lefts = [(crop_width - overlap) * i for i in range(n_side)]
+        tops = [(crop_height - overlap) * i for i in range(n_side)]
+        crops += [
+            Crop((left, top, min(left + crop_width, width), min(top + crop_height, height)), layer)
+            for left, top in product(lefts, tops)
+        ]
+    return crops
+
+
+def stability(logits: Any, offset: float) -> Any:
+    """How little masks (N, H, W) move with the threshold: IoU (N,) of those at threshold + and - ``offset``.
+
+    NaN where both are empty.
+    """
+    inner = (logits > MASK_THRESHOLD + offset).sum(dim=(-2, -1))
+    outer = (logits > MASK_THRESHOLD - offset).sum(dim=(-2, -1))
+    return inner / outer
+
+
+def is_cut_by_crop(boxes: Float32Array, crop: Crop, height: int, width: int) -> BoolArray:
+    """Which boxes (K, 4), in pixels of the image, reach an edge of ``crop`` that is no edge of the image."""
+    near_crop = np.abs(boxes - np.array(crop.box, np.float32)) <= CROP_EDGE_PX
+    near_image = np.abs(boxes - np.array([0, 0, width, height], np.float32)) <= CROP_EDGE_PX
+    return np.asarray((near_crop & ~near_image).any(axis=1), np.bool_)
+
+
+def without_small_parts(mask: BoolArray, min_area_px: int, part: Literal["holes", "islands"]) -> tuple[BoolArray, bool]:
+    """``mask`` with its small holes filled, or without its small islands but for the largest where all are small.
+
+    Parts are 8-connected; small is below ``min_area_px``. Second, whether there was any small part.
+    """
+    import cv2
+
+    searched = ~mask if part == "holes" else mask
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(searched.astype(np.uint8), connectivity=8)
+    areas = stats[1:, cv2.CC_STAT_AREA]
+    is_small = areas < min_area_px
+    if not is_small.any():
+        return mask, False
+    if part == "islands" and is_small.all():
+        is_small[np.argmax(areas)] = False
+    changed = np.isin(labels, 1 + np.flatnonzero(is_small))
+    return (mask | changed if part == "holes" else mask & ~changed), True
+
+
+@dataclass(frozen=True)
+class _Found:
+    """Masks cut to their windows (K, 4) in the image, right and bottom exclusive, with predicted IoU (K,)."""
+
+    cuts: list[BoolArray]
+    windows: Int64Array
+    scores: Float32Array
+    crop_areas: Float64Array
+
+    @property
+    def boxes(self) -> Float32Array:
+        """The original's boxes: first and last pixel, which makes them a pixel smaller than the windows."""
+        return np.asarray(self.windows - np.array([0, 0, 1, 1]), np.float32)
+
+    def at(self, kept: Int64Array) -> _Found:
+        return _Found([self.cuts[k] for k in kept], self.windows[kept], self.scores[kept], self.crop_areas[kept])
+
+    @staticmethod
+    def joined(parts: list[_Found]) -> _Found:
+        return _Found(
+            [cut for part in parts for cut in part.cuts],
+            np.concatenate([part.windows for part in parts]),
+            np.concatenate([part.scores for part in parts]),
+            np.concatenate([part.crop_areas for part in parts]),
+        )
+
+
+class AutomaticMasks:
+    """Every region that SAM finds in an image without being told where to look."""
+
+    def __init__(self, sam: Sam, config: AutomaticMaskConfig) -> None:
+        self._sam = sam
+        self._config = config
+        self._batches = Batches(config.points_per_batch)
+
+    def regions(self, rgb: UInt8Array) -> Regions:
+        """The masks of ``rgb`` in the original's order: best predicted IoU first, those of small crops before.
+
+        Scores are the predicted IoU, which the network may put a little above 1 and which is cut there.
+        """
+        config = self._config
+        height, width = rgb.shape[:2]
+        crops = crops_of(height, width, config.crop_n_layers, config.crop_overlap_ratio)
+        found = _Found.joined([self._in_crop(rgb, crop) for crop in crops])
+        if len(crops) > 1:
+            found = found.at(suppress(found.boxes, 1 / found.crop_areas, config.crop_nms_thresh))
+        masks = np.zeros((len(found.cuts), height, width), bool)
+        for mask, cut, (x0, y0, x1, y1) in zip(masks, found.cuts, found.windows.tolist(), strict=True):
+            mask[y0:y1, x0:x1] = cut
+        scores = found.scores
+        if config.min_mask_region_area:
+            masks, kept = self._cleaned(masks)
+            scores = scores[kept]
+        # A mask without pixels passes where the filters are off; a region has some.
+        is_something = masks.any(axis=(1, 2))
+        masks = masks[is_something]
+        return Regions(masks, mask_boxes(masks), np.clip(scores[is_something], 0, 1).astype(np.float32))
+
+    def _in_crop(self, rgb: UInt8Array, crop: Crop) -> _Found:
+        x0, y0, x1, y1 = crop.box
+        image = self._sam.look(np.ascontiguousarray(rgb[y0:y1, x0:x1]))
+        n_side = int(self._config.points_per_side / self._config.crop_n_points_downscale_factor**crop.layer)
+        points = (point_grid(max(n_side, 1)) * np.array([x1 - x0, y1 - y0])).astype(np.float32)
+        batches = self._batches.run(range(len(points)), lambda part: self._from_points(image, points[part], crop, rgb))
+        found = _Found.joined(batches)
+        return found.at(suppress(found.boxes, found.scores, self._config.box_nms_thresh))
+
+    def _from_points(self, image: SeenImage, points: Float32Array, crop: Crop, rgb: UInt8Array) -> _Found:
+        """The three masks at each point that pass the filters, which look at one mask alone, whatever the batch."""
+        labels = np.full((len(points), 1), OBJECT_POINT, np.int64)
+        logits, predicted = self._sam.decode(image, Prompts(points[:, None], labels), is_single=False)
+        logits, predicted = logits.flatten(0, 1), predicted.flatten(0, 1)
+        if self._config.pred_iou_thresh > 0:
+            # Before the masks grow to full size, which changes nothing and saves most of the work.
+            is_good = predicted > self._config.pred_iou_thresh
+            logits, predicted = logits[is_good], predicted[is_good]
+        parts = [
+            self._large(image, logits[at : at + FULL_SIZE_AT_ONCE], predicted[at : at + FULL_SIZE_AT_ONCE], crop, rgb)
+            for at in range(0, max(len(logits), 1), FULL_SIZE_AT_ONCE)
+        ]
+        return _Found.joined(parts)
+
+    def _large(self, image: SeenImage, logits: Any, predicted: Any, crop: Crop, rgb: UInt8Array) -> _Found:
+        """Those of some masks that are stable and not cut by the crop."""
+        if len(logits):
+            logits = self._sam.full_size(image, logits)
+            if self._config.stability_score_thresh > 0:
+                is_stable = stability(logits, self._config.stability_score_offset)
+                is_stable = is_stable >= self._config.stability_score_thresh
+                logits, predicted = logits[is_stable], predicted[is_stable]
+        x0, y0, x1, y1 = crop.box
+        masks = (logits > MASK_THRESHOLD).cpu().numpy() if len(logits) else np.zeros((0, y1 - y0, x1 - x0), bool)
+        inside = mask_boxes(masks).astype(np.int64)
+        cuts = [mask[b:d, a:c].copy() for mask, (a, b, c, d) in zip(masks, inside.tolist(), strict=True)]
+        windows = inside + np.array([x0, y0, x0, y0])
+        area = np.full(len(masks), float((x1 - x0) * (y1 - y0)))
+        found = _Found(cuts, windows, predicted.cpu().numpy().astype(np.float32), area)
+        return found.at(np.flatnonzero(~is_cut_by_crop(found.boxes, crop, *rgb.shape[:2])))
+
+    def _cleaned(self, masks: BoolArray) -> tuple[BoolArray, Int64Array]:
+        """``masks`` without small holes and islands, duplicates that this makes taken out; which of them are left.
+
+        Masks that needed no cleaning come first and win over those that did.
+        """
+        smallest = self._config.min_mask_region_area
+        cleaned, is_unchanged = masks.copy(), np.zeros(len(masks), np.float32)
+        for k, mask in enumerate(masks):
+            filled, had_holes = without_small_parts(mask, smallest, "holes")
+            cleaned[k], had_islands = without_small_parts(filled, smallest, "islands")
+            is_unchanged[k] = not (had_holes or had_islands)
+        boxes = mask_boxes(cleaned) - np.array([0, 0, 1, 1], np.float32)
+        most = max(self._config.box_nms_thresh, self._config.crop_nms_thresh)
+        kept = suppress(boxes, is_unchanged, most)
+        return cleaned[kept], kept

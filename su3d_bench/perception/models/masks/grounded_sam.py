@@ -1,0 +1,138 @@
+"""GroundedSAM: tags of the image, boxes of what they name, masks in the boxes; and SAM without any tag."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict
+
+from su3d_bench.core.interfaces import Encoder
+from su3d_bench.perception.cache import content_key
+from su3d_bench.perception.crops import mask_boxes
+from su3d_bench.perception.models.masks.automatic_masks import AutomaticMaskConfig, AutomaticMasks
+from su3d_bench.perception.models.masks.grounding_dino import CONCEPTGRAPHS_BOXES, BoxConfig, GroundingDino
+from su3d_bench.perception.models.masks.sam import Sam, SeenImage
+from su3d_bench.perception.models.masks.tagging import Tagger, chosen_tags
+from su3d_bench.perception.regions import encode_boxes
+from su3d_bench.perception.models.masks.tagging_words import ADDED_TAGS, BACKGROUND_TAGS, STOP_WORDS
+from su3d_bench.core.types import BoolArray, Float32Array, Frame, Int64Array, Regions
+
+# Moves the digest when what lies between the networks changes.
+FRONT_END_VERSION = "1"
+# ConceptGraphs calls every region so that no text named; a method that needs better names asks for grounded masks.
+UNNAMED = "item"
+
+
+class GroundedConfig(BaseModel):
+    """How named regions come about; the defaults are OpenSU3D's.
+
+    ``masks``: SAM's best of three in each box by predicted IoU, or the one that it gives when asked for one, as in the
+    Grounded-SAM demonstrations. ``region_boxes``: the mask's, or the detector's. Tags that contain one of
+    ``stop_words`` are left out, ``added_tags`` are asked for in every image.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    boxes: BoxConfig = BoxConfig()
+    stop_words: tuple[str, ...] = ()
+    added_tags: tuple[str, ...] = ()
+    masks: Literal["best-of-three", "single"] = "best-of-three"
+    region_boxes: Literal["mask", "detector"] = "mask"
+
+
+# What methods ask for by PerceptionNeeds.grounding; "paper" is configured.
+GROUNDED_MASKS: Mapping[str, GroundedConfig] = MappingProxyType(
+    {
+        # generate_gsa_results.py --class_set ram --add_bg_classes; its --accumu_classes carries tags on from frame to
+        # frame in an order that changes from run to run, and is left out.
+        "conceptgraphs": GroundedConfig(
+            boxes=CONCEPTGRAPHS_BOXES,
+            stop_words=STOP_WORDS,
+            added_tags=(*ADDED_TAGS, *BACKGROUND_TAGS),
+            region_boxes="detector",
+        )
+    }
+)
+
+
+@dataclass(frozen=True)
+class Networks:
+    """What the segmenters run, read from disk when first asked for; ``digest`` moves with weights and precision."""
+
+    tagger: Tagger
+    load_detector: Callable[[], GroundingDino]
+    load_sam: Callable[[], Sam]
+    digest: str
+
+
+class GroundedSam:
+    """``Segmenter`` of named regions."""
+
+    name = "grounded-sam"
+
+    def __init__(self, networks: Networks, config: GroundedConfig) -> None:
+        self._networks = networks
+        self._config = config
+        settings = config.model_dump_json()
+        self.digest = content_key(self.name, FRONT_END_VERSION, settings, networks.tagger.digest, networks.digest)
+
+    def segment(self, frame: Frame) -> Regions:
+        """Named regions, the detector's best first; empty where no tag is found."""
+        config = self._config
+        tags = chosen_tags(self._networks.tagger.tags(frame.rgb), config.stop_words, config.added_tags)
+        found = self._networks.load_detector().detect(frame.rgb, tags, config.boxes)
+        # A box beyond the image's edge has been cut to a line there.
+        found = found.at(np.flatnonzero((found.boxes[:, 2:] > found.boxes[:, :2]).all(axis=1)))
+        height, width = frame.rgb.shape[:2]
+        if not len(found.names):
+            return Regions(np.zeros((0, height, width), bool), found.boxes, found.scores, ())
+        sam = self._networks.load_sam()
+        image = sam.look(frame.rgb)
+        masks, _ = sam.from_boxes(image, found.boxes, is_single=config.masks == "single")
+        kept = np.flatnonzero(masks.any(axis=(1, 2)))
+        masks, found = masks[kept], found.at(kept)
+        boxes = mask_boxes(masks) if config.region_boxes == "mask" else found.boxes
+        return Regions(masks, boxes, found.scores, found.names)
+
+
+class SamRegions:
+    """``RegionPerception``: one mask at points that a method chooses; SAM looks at each frame once."""
+
+    def __init__(self, networks: Networks, encoder: Encoder) -> None:
+        self.dim = encoder.dim
+        self._networks = networks
+        self._encoder = encoder
+        self._last: tuple[Frame, SeenImage] | None = None
+
+    def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
+        """SAM's single mask (H, W) of what all ``points`` lie on and its predicted IoU; empty and 0 for no points."""
+        if not len(points):
+            return np.zeros(frame.depth_m.shape, np.bool_), 0.0
+        sam = self._networks.load_sam()
+        if self._last is None or self._last[0] is not frame:
+            self._last = frame, sam.look(frame.rgb)
+        return sam.from_points(self._last[1], points.astype(np.float32))
+
+    def encode_regions(self, frame: Frame, mask: BoolArray, boxes: Int64Array) -> Float32Array:
+        """Features of the crops, whatever the mask: what surrounds a region tells of it too."""
+        return encode_boxes(self._encoder, frame, boxes)
+
+
+class AutomaticSam:
+    """``Segmenter`` of every region, none of them named."""
+
+    name = "sam-automatic"
+
+    def __init__(self, networks: Networks, config: AutomaticMaskConfig) -> None:
+        self._networks = networks
+        self._config = config
+        self.digest = content_key(self.name, FRONT_END_VERSION, config.model_dump_json(), networks.digest)
+
+    def segment(self, frame: Frame) -> Regions:
+        """Regions as SAM finds them by itself, every one called an item."""
+        regions = AutomaticMasks(self._networks.load_sam(), self._config).regions(frame.rgb)
+        return Regions(regions.masks, regions.boxes, regions.scores, (UNNAMED,) * len(regions.scores))

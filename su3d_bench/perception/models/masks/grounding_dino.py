@@ -1,0 +1,168 @@
+"""GroundingDINO: boxes of the things that a text names, each with the words that it was found by.
+
+The network is ``transformers``' GroundingDinoForObjectDetection; what goes in and how its answer is read is here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from su3d_bench.perception.models.masks.box_suppression import corners_of, suppress
+from su3d_bench.perception.models.encoders.model_images import normalised, resized, size_with_shortest_side
+from su3d_bench.core.types import BoolArray, Float32Array, Int64Array, UInt8Array
+
+# The published network's images: T.RandomResize([800], max_size=1333).
+SHORTEST_PX, LONGEST_PX = 800, 1333
+
+
+class BoxConfig(BaseModel):
+    """Which boxes count; the defaults are the paper's (section IV-A: box and text 0.25, IoU 0.4).
+
+    ``names``: a box is called by the ``phrase`` that it was found by, as in the Grounded-SAM demonstrations, or by the
+    ``tag`` that the phrase stands for and left out where it stands for none, as in ConceptGraphs.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    box_threshold: float = Field(default=0.25, ge=0, le=1)
+    text_threshold: float = Field(default=0.25, ge=0, le=1)
+    nms_iou: float = Field(default=0.4, ge=0, le=1)
+    names: Literal["phrase", "tag"] = "phrase"
+
+
+# ConceptGraphs-Detect, generate_gsa_results.py
+CONCEPTGRAPHS_BOXES = BoxConfig(box_threshold=0.2, text_threshold=0.2, nms_iou=0.5, names="tag")
+
+
+@dataclass(frozen=True)
+class NamedBoxes:
+    """Boxes (K, 4) x0 y0 x1 y1 in pixels inside the image, their scores (K,) and one name each, the best first."""
+
+    boxes: Float32Array
+    scores: Float32Array
+    names: tuple[str, ...]
+
+    def at(self, kept: Int64Array) -> NamedBoxes:
+        """Those of ``kept`` in that order."""
+        return NamedBoxes(self.boxes[kept], self.scores[kept], tuple(self.names[k] for k in kept))
+
+
+def clean_tag(tag: str) -> str:
+    """``tag`` as it goes into a prompt: lower case, single blanks, none of the marks that part tags for the network.
+
+    >>> clean_tag("  T.V.  Screen?")
+    't v screen'
+    """
+    return " ".join(tag.lower().replace(".", " ").replace("?", " ").split())
+
+
+def text_prompt(tags: Sequence[str]) -> str:
+    """One text of all ``tags``, each closed by a full stop.
+
+    >>> text_prompt(["Cat", "coffee  table"])
+    'cat. coffee table.'
+    """
+    return " ".join(f"{clean_tag(tag)}." for tag in tags)
+
+
+def tag_of(phrase: str, tags: Sequence[str]) -> str | None:
+    """The tag that ``phrase`` stands for: itself, else the first that it contains; None for no tag."""
+    if phrase in tags:
+        return phrase
+    return next((tag for tag in tags if tag in phrase), None)
+
+
+def is_in_phrase(probabilities: Float32Array, text_threshold: float, n_tokens: int) -> BoolArray:
+    """Which tokens (K, T) each of K boxes is found by: those above the threshold but for the text's first and last.
+
+    These two mark its ends; the original leaves out its first, and the last place of the longest text.
+    """
+    chosen: BoolArray = probabilities > text_threshold
+    chosen[:, 0] = False
+    chosen[:, min(n_tokens, chosen.shape[1]) - 1 :] = False
+    return chosen
+
+
+class GroundingDino:
+    """The network with its tokenizer, on its device."""
+
+    def __init__(
+        self, model: Any, tokenizer: Any, shortest_px: int = SHORTEST_PX, longest_px: int = LONGEST_PX
+    ) -> None:
+        self.model = model.eval()
+        self.tokenizer = tokenizer
+        self._sides_px = (shortest_px, longest_px)
+        self._max_tokens: int = model.config.max_text_len
+
+    def detect(self, rgb: UInt8Array, tags: Sequence[str], config: BoxConfig) -> NamedBoxes:
+        """The things in ``rgb`` (H, W, 3) that ``tags`` name, the best first; empty for no tags.
+
+        Tags that the network's text is too short for are asked for in a text of their own; the original cuts them off.
+        """
+        tags = [tag for tag in dict.fromkeys(clean_tag(tag) for tag in tags) if tag]
+        parts = [self._found(rgb, part, config) for part in self._texts(tags)]
+        found = NamedBoxes(
+            np.concatenate([part.boxes for part in parts] or [np.zeros((0, 4), np.float32)]),
+            np.concatenate([part.scores for part in parts] or [np.zeros(0, np.float32)]),
+            tuple(name for part in parts for name in part.names),
+        )
+        found = found.at(suppress(found.boxes, found.scores, config.nms_iou))
+        # A box found by marks alone has no name; it goes.
+        named = [tag_of(name, tags) if config.names == "tag" else name or None for name in found.names]
+        kept = np.flatnonzero([name is not None for name in named])
+        return NamedBoxes(found.boxes[kept], found.scores[kept], tuple(name for name in named if name is not None))
+
+    def answer(self, pixels: Float32Array, text: str) -> tuple[Float32Array, Float32Array, list[int]]:
+        """Token probabilities (Q, T) and boxes (Q, 4), centre and size in shares, for pixels (3, H, W), and the text's
+        tokens."""
+        import torch
+
+        tokens = self.tokenizer(text, return_tensors="pt", return_token_type_ids=True).to(self.model.device)
+        image = torch.from_numpy(pixels[None]).to(self.model.device, self.model.dtype)
+        with torch.inference_mode():
+            answer = self.model(
+                pixel_values=image,
+                pixel_mask=torch.ones(image.shape[0], *image.shape[2:], dtype=torch.int64, device=image.device),
+                input_ids=tokens["input_ids"],
+                token_type_ids=tokens["token_type_ids"],
+                attention_mask=tokens["attention_mask"],
+            )
+            probabilities = torch.sigmoid(answer.logits[0].float())
+        return probabilities.cpu().numpy(), answer.pred_boxes[0].float().cpu().numpy(), tokens["input_ids"][0].tolist()
+
+    def pixels(self, rgb: UInt8Array) -> Float32Array:
+        """``rgb`` (H, W, 3) as the network takes it, (3, h, w)."""
+        height, width = rgb.shape[:2]
+        return normalised(resized(rgb, *size_with_shortest_side(height, width, *self._sides_px)))
+
+    def _found(self, rgb: UInt8Array, tags: Sequence[str], config: BoxConfig) -> NamedBoxes:
+        """Everything above the thresholds, in the network's order."""
+        probabilities, boxes, tokens = self.answer(self.pixels(rgb), text_prompt(tags))
+        scores = probabilities.max(axis=1)
+        kept = np.flatnonzero(scores > config.box_threshold)
+        chosen = is_in_phrase(probabilities[kept], config.text_threshold, len(tokens))
+        names = tuple(self._phrase([tokens[i] for i in np.flatnonzero(row[: len(tokens)])]) for row in chosen)
+        height, width = rgb.shape[:2]
+        limits = np.array([width, height, width, height], np.float32)
+        corners = np.clip(corners_of(boxes[kept], height, width), 0, limits)
+        return NamedBoxes(corners, scores[kept], names)
+
+    def _phrase(self, tokens: list[int]) -> str:
+        """Tokens as words; full stops between them go, as in the original."""
+        return " ".join(self.tokenizer.decode(tokens).replace(".", "").split())
+
+    def _texts(self, tags: Sequence[str]) -> list[list[str]]:
+        """``tags`` in order in as few parts as the network's longest text allows."""
+        parts: list[list[str]] = []
+        for tag in tags:
+            longer = [*parts[-1], tag] if parts else []
+            if longer and len(self.tokenizer(text_prompt(longer))["input_ids"]) <= self._max_tokens:
+                parts[-1] = longer
+            else:
+                parts.append([tag])
+        return parts

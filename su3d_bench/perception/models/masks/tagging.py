@@ -1,0 +1,213 @@
+"""What is in an image, as words: RAM++, or the words of a list that an encoder finds likeliest."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from su3d_bench.core.errors import DataError, ModelMissing
+from su3d_bench.core.interfaces import Encoder
+from su3d_bench.perception.cache import content_key
+from su3d_bench.core.devices import make_deterministic, require
+from su3d_bench.perception.models.files import ModelFiles
+from su3d_bench.perception.models.encoders.model_images import normalised, resized
+from su3d_bench.perception.models.weights import bounded, read_weights
+from su3d_bench.perception.embedded.naming import vocabulary, with_article
+from su3d_bench.core.types import Float32Array, UInt8Array
+
+RAM_PX = 384
+RAM_TAG_LIST = "ram_tag_list.txt"
+WORDS_CAVEAT = "tags: RAM++ is not here; the words of a list that the encoder finds likeliest stand in for its tags"
+MAX_WORDS, MAX_WORD_LENGTH = 20_000, 100
+MAX_LIST_BYTES = 1 << 21
+
+
+class Tagger(Protocol):
+    """Words for what an image shows; ``caveat`` says what must be said of them."""
+
+    name: str
+    digest: str
+    caveat: str | None
+
+    def tags(self, rgb: UInt8Array) -> tuple[str, ...]: ...
+
+
+class RamTagger:
+    """RAM++ through its published package, ``ram``."""
+
+    name = "ram"
+    caveat: str | None = None
+
+    def __init__(self, load: Callable[[], Any], device: str, digest: str) -> None:
+        self._load = load
+        self._device = device
+        self.digest = content_key("ram", digest)
+
+    @cached_property
+    def _model(self) -> Any:
+        return self._load()
+
+    def tags(self, rgb: UInt8Array) -> tuple[str, ...]:
+        """The tags of ``rgb`` (H, W, 3) in the order of RAM++'s list."""
+        import torch
+
+        pixels = torch.from_numpy(ram_pixels(rgb)[None]).to(self._device)
+        with torch.inference_mode():
+            english, _ = self._model.generate_tag(pixels)
+        return tuple(tag for tag in str(english[0]).split(" | ") if tag)
+
+
+class OnnxRamTagger:
+    """RAM++ exported by its own ``onnx/export.py``: ``image`` (1, 3, 384, 384) to ``tag`` (1, T), 1 where it holds."""
+
+    name = "ram-onnx"
+    caveat: str | None = None
+
+    def __init__(self, load: Callable[[], Any], tag_list: Sequence[str], digest: str) -> None:
+        self._load = load
+        self._tag_list = tuple(tag_list)
+        self.digest = content_key("ram-onnx", digest, *self._tag_list)
+
+    @cached_property
+    def _session(self) -> Any:
+        return self._load()
+
+    def tags(self, rgb: UInt8Array) -> tuple[str, ...]:
+        """The tags of ``rgb`` (H, W, 3) in the order of the list."""
+        is_there = self._session.run(None, {self._session.get_inputs()[0].name: ram_pixels(rgb)[None]})[0]
+        if is_there.shape != (1, len(self._tag_list)):
+            raise DataError(
+                f"tagger 'ram-onnx': the model answers {is_there.shape}, {RAM_TAG_LIST} has {len(self._tag_list)} "
+                "tags; both must come from one version of the package"
+            )
+        return tuple(self._tag_list[index] for index in np.flatnonzero(is_there[0] > 0.5))
+
+
+class WordTagger:
+    """The ``n_tags`` words of a list that are likeliest somewhere in the image, the likeliest first.
+
+    A word counts as much as its similarity in the best of six views: the image, its quarters, and its middle.
+    """
+
+    name = "words"
+    caveat: str | None = WORDS_CAVEAT
+
+    def __init__(self, encoder: Encoder, words: Sequence[str], n_tags: int, prompt: str = "{} in a scene") -> None:
+        self._encoder = encoder
+        self._words = tuple(words)
+        self._n_tags = n_tags
+        self._prompt = prompt
+        self._text_features: Float32Array | None = None
+        self.digest = content_key("words", encoder.digest, str(n_tags), prompt, *self._words)
+
+    def tags(self, rgb: UInt8Array) -> tuple[str, ...]:
+        """At most ``n_tags`` words for ``rgb`` (H, W, 3)."""
+        if self._text_features is None:
+            prompts = [self._prompt.replace("{}", with_article(word)) for word in self._words]
+            self._text_features = self._encoder.encode_texts(prompts)
+        views = self._encoder.encode_images(_views(rgb))
+        # einsum sums in one order whatever the number of threads; a matrix product may not.
+        similarity = np.einsum("vd,wd->vw", views.astype(np.float64), self._text_features.astype(np.float64))
+        order = np.argsort(-similarity.max(axis=0), kind="stable")
+        return tuple(self._words[index] for index in order[: self._n_tags])
+
+
+def _views(rgb: UInt8Array) -> list[UInt8Array]:
+    height, width = rgb.shape[:2]
+    half_height, half_width = max(height // 2, 1), max(width // 2, 1)
+    corners = [
+        (top, left)
+        for top, left in (
+            (0, 0),
+            (0, width - half_width),
+            (height - half_height, 0),
+            (height - half_height, width - half_width),
+            ((height - half_height) // 2, (width - half_width) // 2),
+        )
+    ]
+    parts = [np.ascontiguousarray(rgb[top : top + half_height, left : left + half_width]) for top, left in corners]
+    return [rgb, *parts]
+
+
+def ram_pixels(rgb: UInt8Array) -> Float32Array:
+    """``rgb`` (H, W, 3) as RAM++ takes it, (3, 384, 384): squeezed to a square, whatever its shape."""
+    return normalised(resized(rgb, RAM_PX, RAM_PX))
+
+
+def chosen_tags(tags: Iterable[str], stop_words: Sequence[str], added: Sequence[str]) -> tuple[str, ...]:
+    """``tags`` once each and ``added``, without those that contain a stop word; ConceptGraphs' order of steps.
+
+    >>> chosen_tags(["bed", "bedroom", "lamp"], ["room"], ["other item"])
+    ('bed', 'lamp', 'other item')
+    """
+    named = dict.fromkeys([*(tag.strip() for tag in tags if tag.strip()), *added])
+    return tuple(tag for tag in named if not any(word in tag.lower() for word in stop_words))
+
+
+def read_word_list(path: Path | None) -> tuple[str, ...]:
+    """The words of a text file, one a line, empty lines and those that begin with # aside; None: our own list."""
+    if path is None:
+        return vocabulary()
+    try:
+        if path.stat().st_size > MAX_LIST_BYTES:
+            raise DataError(f"{path}: has {path.stat().st_size} bytes; expected a list of words, one a line")
+        lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
+    except OSError as error:
+        raise DataError(f"{path}: the list of words cannot be read ({error.strerror})") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{path}: is no UTF-8 text; expected a list of words, one a line") from error
+    words = tuple(line for line in lines if line and not line.startswith("#"))
+    if not 1 <= len(words) <= MAX_WORDS:
+        raise DataError(f"{path}: has {len(words)} words; expected 1 to {MAX_WORDS}")
+    for word in words:
+        if len(word) > MAX_WORD_LENGTH or not word.isprintable():
+            raise DataError(f"{path}: {word[:40]!r} is no word; expected short printable texts")
+    return words
+
+
+def load_ram(files: ModelFiles, device: str) -> Any:
+    """RAM++ of the package ``ram`` with its published weights; raises ``ModelMissing`` where it is not there."""
+    try:
+        models = require("ram.models", "tagger 'ram-plus'")
+    except ModelMissing as error:
+        raise ModelMissing(
+            "tagger 'ram-plus': its package is not installed (pip install "
+            "git+https://github.com/xinyu1205/recognize-anything.git); export it, or "
+            "set perception.paper.tagger to words"
+        ) from error
+    make_deterministic(device)
+    try:
+        # Without a file: the package would read it in full, and weights are read as plain tensors alone.
+        model = models.ram_plus(pretrained="", image_size=RAM_PX, vit="swin_l")
+    except OSError as error:  # the package makes its tokenizer from bert-base-uncased
+        raise ModelMissing(
+            f"tagger 'ram-plus': its package cannot be set up ({bounded(error)}); it needs the tokenizer of "
+            "bert-base-uncased in the Hugging Face cache"
+        ) from error
+    fill_ram(model, read_weights(files.weights), files)
+    return model.eval().to(device)
+
+
+def fill_ram(model: Any, tensors: dict[str, Any], files: ModelFiles) -> None:
+    """Give ``model`` its weights under the names of the package's own loader; raises ``DataError`` where some lack."""
+    # Made by the model itself from its window size.
+    made = ("relative_position_index", "attn_mask")
+    kept = {
+        name.replace("vision_multi", "tagging_head"): tensor
+        for name, tensor in tensors.items()
+        if not any(part in name for part in made)
+    }
+    try:
+        missing = model.load_state_dict(kept, strict=False).missing_keys
+    except RuntimeError as error:
+        raise DataError(f"{files.weights}: does not fit RAM++ ({bounded(error)}); fetch it anew") from error
+    missing = [name for name in missing if not any(part in name for part in made)]
+    if missing:
+        raise DataError(
+            f"{files.weights}: lacks {len(missing)} tensors, such as {missing[0][:80]}; fetch it from "
+            f"{files.form.source}"
+        )

@@ -1,0 +1,231 @@
+"""Detections made elsewhere, read from one npz file a frame (from label images: ``stored_images.py``).
+
+``<folder>/<dataset>.<scene>/frame000040.npz`` holds the K regions of the frame with index 40:
+
+- ``image_size`` (2,) integers: height, width of the masks, which must be the frame's
+- ``masks`` (K, ceil(height * width / 8)) uint8: ``numpy.packbits`` of each mask, row by row
+- ``boxes`` (K, 4) numbers: x0 y0 x1 y1 in pixels inside the image, right and bottom exclusive
+- ``scores`` (K,) numbers in 0..1;  ``names`` (K,) texts, none empty;  ``captions`` (K,) texts, optional
+- optional, all four together: ``crop_ratios`` (R,), ``crop_features`` (K, R, D), ``global_feature`` (D,) and
+  ``encoder`` (), the digest of the encoder that made them, which must be the encoder of the run
+
+Files are plain arrays: nothing in them is unpickled. ``write_stored`` writes the format.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, model_validator
+
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.interfaces import Encoder
+from su3d_bench.store.atomic import DAMAGE, read_arrays
+from su3d_bench.perception.embedded.naming import scene_caption
+from su3d_bench.core.types import Detections, Float32Array, Frame, Regions
+
+_REQUIRED = ("image_size", "masks", "boxes", "scores", "names")
+_FEATURES = ("crop_ratios", "crop_features", "global_feature", "encoder")
+_OPTIONAL = ("captions", *_FEATURES)
+
+
+class StoredConfig(BaseModel):
+    """Where the detections of the profile ``stored`` lie: npz files, unless one of the two patterns is set.
+
+    ``images`` (``frame-{index}.segm.png``) names label images, ``detections``
+    (``{scene}/gsa_detections_none/frame{index}.pkl.gz``) ConceptGraphs' files, both relative to ``folder``; ``names``
+    is a TOML or JSON file of names for the values of label images.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    folder: Path | None = None
+    images: str | None = None
+    detections: str | None = None
+    names: Path | None = None
+
+    @model_validator(mode="after")
+    def _names_are_of_images(self) -> StoredConfig:
+        if self.names is not None and self.images is None:
+            raise ValueError("names are given to the values of label images; set stored.images too")
+        if self.images is not None and self.detections is not None:
+            raise ValueError("stored.images and stored.detections name two makers of masks; set one of them")
+        return self
+
+
+@dataclass(frozen=True)
+class StoredFeatures:
+    """Features that came with the detections, as in ``Detections``."""
+
+    crop_ratios: tuple[float, ...]
+    crop_features: Float32Array
+    global_feature: Float32Array
+
+
+@dataclass(frozen=True)
+class StoredFrame:
+    """One file: named and captioned regions, and features where the file has them."""
+
+    regions: Regions
+    features: StoredFeatures | None
+
+
+def stored_path(folder: Path, dataset: str, scene: str, frame_index: int) -> Path:
+    """The file that holds the detections of a frame."""
+    return folder / f"{dataset}.{scene}" / f"frame{frame_index:06d}.npz"
+
+
+def write_stored(path: Path, detections: Detections, encoder: Encoder | None) -> None:
+    """Write ``detections`` in the stored format, with their features where the ``encoder`` that made them is given."""
+    n, height, width = detections.masks.shape
+    arrays: dict[str, NDArray[Any]] = {
+        "image_size": np.array([height, width], np.int64),
+        "masks": np.packbits(detections.masks.reshape(n, height * width), axis=1),
+        "boxes": detections.boxes,
+        "scores": detections.scores,
+        "names": np.array(detections.names, np.str_),
+        "captions": np.array(detections.captions, np.str_),
+    }
+    if encoder is not None:
+        arrays["crop_ratios"] = np.array(detections.crop_ratios, np.float64)
+        arrays["crop_features"] = detections.crop_features
+        arrays["global_feature"] = detections.global_feature
+        arrays["encoder"] = np.array(encoder.digest)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez_compressed(path, allow_pickle=False, **arrays)
+
+
+def read_stored(path: Path, frame: Frame, encoder: Encoder) -> StoredFrame:
+    """The detections in ``path``, checked against ``frame`` and the run's ``encoder``; raises ``DataError``."""
+    where = f"stored detections of frame {frame.index}"
+    arrays = _load(path, where)
+    _check_keys(arrays, where)
+    n = _check_rows(arrays, where)
+    regions = Regions(
+        masks=_masks(arrays, frame, n, where),
+        boxes=_boxes(arrays, frame, where),
+        scores=_scores(arrays, where),
+        names=_texts(arrays, "names", where),
+        captions=_captions(arrays, where),
+    )
+    return StoredFrame(regions, _features(arrays, encoder, n, where))
+
+
+def _load(path: Path, where: str) -> dict[str, NDArray[Any]]:
+    try:
+        return read_arrays(path)
+    except FileNotFoundError:
+        raise DataError(
+            f"{where}: there is no file {path}; a frame without detections has a file with 0 rows"
+        ) from None
+    except DAMAGE as error:
+        raise DataError(f"{where}: {path} is not an npz file of plain arrays ({error})") from error
+
+
+def _check_keys(arrays: Mapping[str, NDArray[Any]], where: str) -> None:
+    missing = [key for key in _REQUIRED if key not in arrays]
+    unknown = [key for key in arrays if key not in _REQUIRED + _OPTIONAL]
+    partial = [key for key in _FEATURES if key in arrays]
+    if missing:
+        raise DataError(f"{where}: array '{missing[0]}' is missing; needed: {', '.join(_REQUIRED)}")
+    if unknown:
+        raise DataError(f"{where}: unknown array '{unknown[0]}'; known: {', '.join(_REQUIRED + _OPTIONAL)}")
+    if partial and len(partial) < len(_FEATURES):
+        raise DataError(f"{where}: has '{partial[0]}' but not all of {', '.join(_FEATURES)}; give all four or none")
+
+
+def _check_rows(arrays: Mapping[str, NDArray[Any]], where: str) -> int:
+    shapes = {"masks": 2, "boxes": 2, "scores": 1, "names": 1, "captions": 1}
+    n = len(arrays["scores"]) if arrays["scores"].ndim else -1
+    for key, n_axes in shapes.items():
+        if key in arrays and (arrays[key].ndim != n_axes or len(arrays[key]) != n):
+            raise DataError(f"{where}: '{key}' has shape {arrays[key].shape}; expected {n_axes} axes and {n} rows")
+    for key in ("masks", "boxes", "scores", "image_size"):
+        if arrays[key].dtype.kind not in "biuf":
+            raise DataError(f"{where}: '{key}' holds {arrays[key].dtype}; expected numbers")
+    return n
+
+
+def _masks(arrays: Mapping[str, NDArray[Any]], frame: Frame, n: int, where: str) -> NDArray[np.bool_]:
+    size, height, width = arrays["image_size"], *frame.depth_m.shape
+    if size.shape != (2,) or (int(size[0]), int(size[1])) != (height, width):
+        raise DataError(f"{where}: image_size is {size.tolist()}, the frame has height {height} and width {width}")
+    packed, n_bytes = arrays["masks"], -(-height * width // 8)
+    if packed.dtype != np.uint8 or packed.shape[1] != n_bytes:
+        raise DataError(f"{where}: 'masks' is {packed.shape} {packed.dtype}; expected ({n}, {n_bytes}) uint8")
+    masks = np.unpackbits(packed, axis=1, count=height * width).astype(bool).reshape(n, height, width)
+    empty = np.flatnonzero(~masks.any(axis=(1, 2)))
+    if len(empty):
+        raise DataError(f"{where}, region {int(empty[0])}: the mask is empty; leave the region out")
+    return masks
+
+
+def _boxes(arrays: Mapping[str, NDArray[Any]], frame: Frame, where: str) -> Float32Array:
+    boxes = arrays["boxes"].astype(np.float32)
+    if boxes.shape[1] != 4:
+        raise DataError(f"{where}: 'boxes' has shape {boxes.shape}; expected four columns x0 y0 x1 y1")
+    height, width = frame.depth_m.shape
+    x0, y0, x1, y1 = boxes.T
+    bad = ~((x0 >= 0) & (y0 >= 0) & (x1 <= width) & (y1 <= height) & (x0 < x1) & (y0 < y1))
+    if bad.any():
+        k = int(np.flatnonzero(bad)[0])
+        raise DataError(f"{where}, region {k}: box {boxes[k].tolist()} is empty or outside the {width}x{height} image")
+    return boxes
+
+
+def _scores(arrays: Mapping[str, NDArray[Any]], where: str) -> Float32Array:
+    scores = arrays["scores"].astype(np.float32)
+    bad = np.flatnonzero(~((scores >= 0) & (scores <= 1)))
+    if len(bad):
+        raise DataError(f"{where}, region {int(bad[0])}: score {float(scores[bad[0]])} is not in 0..1")
+    return scores
+
+
+def _texts(arrays: Mapping[str, NDArray[Any]], key: str, where: str) -> tuple[str, ...]:
+    values = arrays[key]
+    if values.dtype.kind != "U" and len(values):
+        raise DataError(f"{where}: '{key}' holds {values.dtype}; expected texts (numpy type U)")
+    texts = tuple(str(value) for value in values)
+    for k, text in enumerate(texts):
+        if not text.strip():
+            raise DataError(f"{where}, region {k}: '{key}' holds an empty text")
+    return texts
+
+
+def _captions(arrays: Mapping[str, NDArray[Any]], where: str) -> tuple[str, ...]:
+    if "captions" in arrays:
+        return _texts(arrays, "captions", where)
+    return tuple(scene_caption(name) for name in _texts(arrays, "names", where))
+
+
+def _features(arrays: Mapping[str, NDArray[Any]], encoder: Encoder, n: int, where: str) -> StoredFeatures | None:
+    if "encoder" not in arrays:
+        return None
+    made_by = str(arrays["encoder"])
+    if made_by != encoder.digest:
+        raise DataError(
+            f"{where}: features were made by encoder {made_by[:12]}, the run uses {encoder.name} "
+            f"{encoder.digest[:12]}; leave the features out to have them computed"
+        )
+    ratios, crops, whole = (arrays[key] for key in ("crop_ratios", "crop_features", "global_feature"))
+    expected = (n, ratios.size, encoder.dim)
+    if ratios.ndim != 1 or crops.shape != expected or whole.shape != (encoder.dim,):
+        raise DataError(
+            f"{where}: crop_features {crops.shape} and global_feature {whole.shape}; expected {expected} and "
+            f"({encoder.dim},)"
+        )
+    norms = np.linalg.norm(crops.astype(np.float64), axis=2)
+    bad = np.argwhere(~(np.abs(norms - 1) < 1e-3))
+    if len(bad):
+        k, r = (int(value) for value in bad[0])
+        raise DataError(
+            f"{where}, region {k}: its feature at ratio {float(ratios[r])} has length {norms[k, r]:.4g}, not 1"
+        )
+    if not abs(float(np.linalg.norm(whole.astype(np.float64))) - 1) < 1e-3:
+        raise DataError(f"{where}: global_feature is not of length 1")
+    return StoredFeatures(tuple(float(r) for r in ratios), crops.astype(np.float32), whole.astype(np.float32))
