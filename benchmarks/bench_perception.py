@@ -14,8 +14,8 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 from replica_files import write_replica
 
-from su3d_bench.datasets.replica_frames import ReplicaFrames
-from su3d_bench.datasets.rooms import RoomOptions, Rooms
+from su3d_bench.datasets.replica.frames import ReplicaFrames
+from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 from su3d_bench.executors import one_thread
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.perception.embedded.encoder import IMAGE_SIZE, EmbeddedEncoder

@@ -25,11 +25,11 @@ from PIL import Image
 from pytest_benchmark.fixture import BenchmarkFixture
 from replica_files import SCALE, write_replica
 
-from su3d_bench.datasets.replica_frames import ReplicaFrames
-from su3d_bench.datasets.rooms import RoomOptions, Rooms
-from su3d_bench.datasets.sens import FRAME_RECORD, SensFile
-from su3d_bench.datasets.sens_header import SensHeader, header_bytes
-from su3d_bench.datasets.sens_write import SensFrame, colour_content, depth_content, write_sens
+from su3d_bench.datasets.replica.frames import ReplicaFrames
+from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
+from su3d_bench.datasets.scannet.sens.read import FRAME_RECORD, SensFile
+from su3d_bench.datasets.scannet.sens.header import SensHeader, header_bytes
+from su3d_bench.datasets.scannet.sens.write import SensFrame, colour_content, depth_content, write_sens
 from su3d_bench.read_ahead import ReadAhead
 from su3d_bench.core.timing import calibration_ms
 from su3d_bench.core.types import Float32Array, Frame, UInt8Array

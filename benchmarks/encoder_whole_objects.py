@@ -11,9 +11,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from su3d_bench.datasets.rooms import Rooms
-from su3d_bench.datasets.rooms_classes import CLASSES
-from su3d_bench.datasets.rooms_truth import STRUCTURE, RoomObject
+from su3d_bench.datasets.rooms.dataset import Rooms
+from su3d_bench.datasets.rooms.classes import CLASSES
+from su3d_bench.datasets.rooms.truth import STRUCTURE, RoomObject
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.planning import data_root
 from su3d_bench.core.types import Float64Array, UInt8Array

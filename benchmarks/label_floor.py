@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.datasets.rooms import Rooms
+from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.planning import data_root
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.datasets.rooms import Rooms
+from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.perception.models.masks.automatic_masks import AUTOMATIC_MASKS, AutomaticMasks
 from su3d_bench.core.devices import make_deterministic, precision_for, require_transformers
 from su3d_bench.perception.models.masks.grounding_dino import BoxConfig, GroundingDino

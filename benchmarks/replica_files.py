@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from su3d_bench.datasets.replica_frames import Camera, ReplicaFrames, colour_name, depth_name
+from su3d_bench.datasets.replica.frames import Camera, ReplicaFrames, colour_name, depth_name
 from su3d_bench.core.types import Frame
 
 SCALE = 6553.5  # depth units in a metre of Replica's render

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from su3d_bench.datasets.replica_layout import ReplicaLayout
-from su3d_bench.datasets.scannet_export_layout import CppRecording, PythonRecording
-from su3d_bench.datasets.scannet_layout import ScannetLayout, SensRecording
-from su3d_bench.datasets.scene_making import Layout
-from su3d_bench.datasets.tum_layout import TumLayout
+from su3d_bench.datasets.replica.writing import ReplicaLayout
+from su3d_bench.datasets.scannet.writing.exports import CppRecording, PythonRecording
+from su3d_bench.datasets.scannet.writing.layout import ScannetLayout, SensRecording
+from su3d_bench.datasets.writing import Layout
+from su3d_bench.datasets.tum.writing import TumLayout
 
 _ALL: tuple[Layout, ...] = (
     ReplicaLayout(),

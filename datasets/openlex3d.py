@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from su3d_bench.formats.pcd import read_pcd_points
-from su3d_bench.datasets.replica_truth import MESH_NAME, AnnotatedMesh
+from su3d_bench.datasets.replica.mesh_truth import MESH_NAME, AnnotatedMesh
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels, OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery

@@ -18,8 +18,8 @@ from su3d_bench.datasets.openlex3d import (
     queries_truth,
     replica_corners,
 )
-from su3d_bench.datasets.replica_folders import find_original_scene, original_name
-from su3d_bench.datasets.replica_truth import read_annotated_mesh
+from su3d_bench.datasets.replica.folders import find_original_scene, original_name
+from su3d_bench.datasets.replica.mesh_truth import read_annotated_mesh
 from su3d_bench.core.errors import GroundTruthMissing
 from su3d_bench.evaluation_checks import check_cloud, empty_warnings, mask_facts
 from su3d_bench.evaluation_scoring import SceneOutcome

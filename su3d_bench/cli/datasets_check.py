@@ -15,8 +15,8 @@ from su3d_bench.cli.progress import progress
 from su3d_bench.core.config import read_assignments, resolve
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 from su3d_bench.executors import Event
-from su3d_bench.inspection import Inspection, TruthVariant, inspect
-from su3d_bench.inspection_checks import Finding
+from su3d_bench.datasets.checks import Inspection, TruthVariant, inspect
+from su3d_bench.datasets.checks_of_frames import Finding
 from su3d_bench.core.plain_text import printable, printable_json
 from su3d_bench.planning import data_root, dataset_targets, expand_scenes
 from su3d_bench.scene_job import Part, build_dataset

@@ -17,7 +17,7 @@ from su3d_bench.core import registry
 from su3d_bench.cli.flags import answer, answer_json, remark
 from su3d_bench.core.config import read_assignments, resolve
 from su3d_bench.datasets.layouts import LAYOUTS
-from su3d_bench.datasets.scene_making import SceneTarget, finish_scene, plan_scenes, write_frames
+from su3d_bench.datasets.writing import SceneTarget, finish_scene, plan_scenes, write_frames
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, suggest
 from su3d_bench.executors import Event, Report, run_inline, run_processes
 from su3d_bench.planning import data_root, expand_scenes

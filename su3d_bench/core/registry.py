@@ -14,11 +14,11 @@ from typing import Any
 from su3d_bench.core.errors import ConfigError, suggest
 
 DATASETS = {
-    "rooms": "su3d_bench.datasets.rooms:Rooms",
-    "replica": "su3d_bench.datasets.replica:Replica",
-    "scannet": "su3d_bench.datasets.scannet:ScanNet",
-    "tum": "su3d_bench.datasets.tum:Tum",
-    "rgbd": "su3d_bench.datasets.rgbd:Rgbd",
+    "rooms": "su3d_bench.datasets.rooms.dataset:Rooms",
+    "replica": "su3d_bench.datasets.replica.dataset:Replica",
+    "scannet": "su3d_bench.datasets.scannet.dataset:ScanNet",
+    "tum": "su3d_bench.datasets.tum.dataset:Tum",
+    "rgbd": "su3d_bench.datasets.rgbd.dataset:Rgbd",
 }
 METHODS = {
     "opensu3d": "su3d_bench.opensu3d.pipeline:OpenSU3D",

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.formats.hdf5 import n_columns_of, read_rows, row_blocks
-from su3d_bench.datasets.replica_clouds import moved, read_first_pose
+from su3d_bench.datasets.replica.cloud_truth import moved, read_first_pose
 from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.core.plain_text import printable
 from su3d_bench.predictions.base import ScenePrediction, shown

@@ -22,8 +22,8 @@ from su3d_bench.baselines.command import Command, CommandConfig
 from su3d_bench.baselines.command_frames import FrameFolder, write_mesh
 from su3d_bench.baselines.command_prediction import ClassNames, as_prediction, class_names
 from su3d_bench.cli.main import main
-from su3d_bench.datasets.replica_truth import read_surface
-from su3d_bench.datasets.rgbd import Rgbd
+from su3d_bench.datasets.replica.mesh_truth import read_surface
+from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.predictions.base import VertexLabels, VertexMasks
 from su3d_bench.scene_tools import no_detections

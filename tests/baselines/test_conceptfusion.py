@@ -14,8 +14,8 @@ from scannet_scan import SCAN, write_recording
 from su3d_bench.baselines.conceptfusion import ConceptFusion, ConceptFusionConfig
 from su3d_bench.baselines.conceptfusion_sam import ConceptFusionSam
 from su3d_bench.baselines.pixel_features import mixed_features, mixing_weights, paint
-from su3d_bench.datasets.replica import Replica
-from su3d_bench.datasets.scannet import ScanNet
+from su3d_bench.datasets.replica.dataset import Replica
+from su3d_bench.datasets.scannet.dataset import ScanNet
 from su3d_bench.core.errors import DataError
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D

@@ -16,7 +16,7 @@ from box_room import COLOURS, write_box_room
 from painted import LABELS, Painted
 
 from su3d_bench.cli.main import build_parser, main
-from su3d_bench.datasets.replica import Replica
+from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.core.errors import DataError
 from su3d_bench.reports.scene_look import CAMERAS, SceneLook, look_at
 from su3d_bench.reports.scene_picture import WIDTH, draw_scene_picture, facts_line

@@ -18,7 +18,7 @@ from scanned_stage import N_FRAMES, Stage, files_below
 
 from su3d_bench.core import registry
 from su3d_bench.datasets.layouts import LAYOUTS
-from su3d_bench.datasets.scene_making import finish_scene, plan_scenes, write_frames, write_scene
+from su3d_bench.datasets.writing import finish_scene, plan_scenes, write_frames, write_scene
 from su3d_bench.core.errors import DataError, StoreError
 
 ROOM = "living7"

@@ -14,8 +14,8 @@ from damage import damages, outcomes, truncations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from su3d_bench.datasets.timed_poses import pose_at, quaternion_poses, read_trajectory
-from su3d_bench.datasets.tum import Tum, TumOptions, associate
+from su3d_bench.datasets.tum.timed_poses import pose_at, quaternion_poses, read_trajectory
+from su3d_bench.datasets.tum.dataset import Tum, TumOptions, associate
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 
 WIDTH, HEIGHT = 12, 8

@@ -24,7 +24,7 @@ from su3d_bench.datasets.openlex3d import (
     replica_corners,
 )
 from su3d_bench.formats.ply import ListColumn
-from su3d_bench.datasets.replica_truth import AnnotatedMesh
+from su3d_bench.datasets.replica.mesh_truth import AnnotatedMesh
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery

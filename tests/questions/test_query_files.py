@@ -11,7 +11,7 @@ from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render
 
 from su3d_bench.cli.main import main
 from su3d_bench.datasets.query_files import read_query_file
-from su3d_bench.datasets.replica import Replica
+from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.evaluation import Request, evaluate
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery

@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scored_room import instances
 
-from su3d_bench.datasets.rooms import Rooms
+from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.reasoning.generated import generate_questions
 from su3d_bench.reasoning.question_words import Phrase, read_phrase

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from su3d_bench.datasets.registration import Grid, Registration, filled, make_registration
-from su3d_bench.datasets.rgbd_source import SensorPair
+from su3d_bench.datasets.recordings.registration import Grid, Registration, filled, make_registration
+from su3d_bench.datasets.recordings.source import SensorPair
 from su3d_bench.core.errors import DataError
 from su3d_bench.numerics.geometry import are_rigid
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array

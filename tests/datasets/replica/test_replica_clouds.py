@@ -13,8 +13,8 @@ from replica_clouds import CLOUDS, REFERENCE, SEQUENCE, first_pose, write_clouds
 from replica_scene import CHAIR, TABLE, WALL, write_render
 from scored_room import instances
 
-from su3d_bench.datasets.replica import Replica
-from su3d_bench.datasets.replica_clouds import N_EMBEDDING, read_first_pose
+from su3d_bench.datasets.replica.dataset import Replica
+from su3d_bench.datasets.replica.cloud_truth import N_EMBEDDING, read_first_pose
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene

@@ -12,10 +12,10 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial import cKDTree
 
-from su3d_bench.datasets.rooms import DEFAULT_SCENES, N_STRUCTURE, Rooms
-from su3d_bench.datasets.rooms_kept import MESH_ARRAYS, kept_mesh, kept_walk
-from su3d_bench.datasets.rooms_mesh import RoomMesh
-from su3d_bench.datasets.rooms_scan import RoomScan
+from su3d_bench.datasets.rooms.dataset import DEFAULT_SCENES, N_STRUCTURE, Rooms
+from su3d_bench.datasets.rooms.kept import MESH_ARRAYS, kept_mesh, kept_walk
+from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh
+from su3d_bench.datasets.rooms.scan import RoomScan
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.numerics.geometry import back_project
 

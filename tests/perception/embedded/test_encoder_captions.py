@@ -65,7 +65,7 @@ def test_no_two_classes_share_a_name() -> None:
 
 
 def test_lexicon_knows_the_rooms_classes_and_what_they_are_for() -> None:
-    from su3d_bench.datasets.rooms_classes import CLASSES  # the lexicon itself may not know the dataset
+    from su3d_bench.datasets.rooms.classes import CLASSES
 
     known = {room_class.name for room_class in CLASSES}
     named = {*SYNONYMS, *(name for names in (*AFFORDANCES.values(), *GROUPS.values()) for name in names)}
@@ -73,4 +73,4 @@ def test_lexicon_knows_the_rooms_classes_and_what_they_are_for() -> None:
     for room_class in CLASSES:
         for phrase in room_class.affordances:
             assert room_class.name in AFFORDANCES.get(phrase, ()), (room_class.name, phrase)
-    assert registry.DATASETS["rooms"].startswith("su3d_bench.datasets.rooms")
+    assert registry.DATASETS["rooms"].startswith("su3d_bench.datasets.rooms.dataset")

@@ -44,7 +44,7 @@ def _replica(folder: Path) -> Read:
     from test_replica_problems import box
     from test_replica_truths import write_labels
 
-    from su3d_bench.datasets.replica import Replica
+    from su3d_bench.datasets.replica.dataset import Replica
 
     write_render(folder, n_frames=2)
     habitat = write_original(folder, QUADS, [0, 0, 5, 5], TWO_OBJECTS)
@@ -64,7 +64,7 @@ def _scannet(folder: Path) -> Read:
     from scannet_scan import write_floor_truth
     from scannet_scans import write_scan
 
-    from su3d_bench.datasets.scannet import ScanNet, ScannetOptions
+    from su3d_bench.datasets.scannet.dataset import ScanNet, ScannetOptions
 
     write_floor_truth(write_scan(folder, n_frames=2), spacing_m=0.5)
     return _whole_dataset(lambda: ScanNet(folder, ScannetOptions()), "scene0000_00")
@@ -74,7 +74,7 @@ def _aligned_scannet(folder: Path) -> Read:
     from scannet_scan import write_floor_truth
     from scannet_scans import write_scan
 
-    from su3d_bench.datasets.scannet import ScanNet, ScannetOptions
+    from su3d_bench.datasets.scannet.dataset import ScanNet, ScannetOptions
 
     write_floor_truth(write_scan(folder, n_frames=2, lost=[1]), spacing_m=0.5)
     return _whole_dataset(lambda: ScanNet(folder, ScannetOptions(axis_align=True)), "scene0000_00")
@@ -84,7 +84,7 @@ def _sens(name: str) -> Make:
     def make(folder: Path) -> Read:
         from test_sens import WHERE, read_whole
 
-        from su3d_bench.datasets.sens import SensFile
+        from su3d_bench.datasets.scannet.sens.read import SensFile
 
         path = folder / "a.sens"
         path.write_bytes((CASES / name).read_bytes())
@@ -98,7 +98,7 @@ def _scannet_export(form: str) -> Make:
         from scannet_scan import table_text, write_floor_truth
         from scannet_toy import write_cpp_export, write_python_export
 
-        from su3d_bench.datasets.scannet import ScanNet, ScannetOptions
+        from su3d_bench.datasets.scannet.dataset import ScanNet, ScannetOptions
 
         scan = folder / "scans" / "scene0000_00"
         (write_python_export if form == "python" else write_cpp_export)(scan)
@@ -114,7 +114,7 @@ def _rgbd(**changes: Any) -> Make:
         from scannet_scan import grid, write_mesh
         from test_rgbd import write_scene
 
-        from su3d_bench.datasets.rgbd import Rgbd
+        from su3d_bench.datasets.rgbd.dataset import Rgbd
 
         write_mesh(write_scene(folder, n_frames=2, mesh="mesh.ply", **changes) / "data/mesh.ply", *grid(3, 2))
         return _whole_dataset(lambda: Rgbd(folder), "desk")
@@ -125,7 +125,7 @@ def _rgbd(**changes: Any) -> Make:
 def _tum(folder: Path) -> Read:
     from test_tum import SCENE, write_sequence
 
-    from su3d_bench.datasets.tum import Tum
+    from su3d_bench.datasets.tum.dataset import Tum
 
     sequence = write_sequence(folder, n_frames=2)
     pairs = [f"100.{k} rgb/100.{k}00000.png 100.{k} depth/100.{k}04000.png\n" for k in range(2)]
@@ -134,7 +134,7 @@ def _tum(folder: Path) -> Read:
 
 
 def _rooms(folder: Path) -> Read:
-    from su3d_bench.datasets.rooms_scan import RoomScan, read_scan, write_scan
+    from su3d_bench.datasets.rooms.scan import RoomScan, read_scan, write_scan
 
     points = np.zeros((5, 3), np.float32)
     faces = np.array([[0, 1, 2]], np.int32)
@@ -145,7 +145,7 @@ def _rooms(folder: Path) -> Read:
 def _rooms_mesh(folder: Path) -> Read:
     from test_rooms import made_mesh
 
-    from su3d_bench.datasets.rooms_kept import kept_mesh
+    from su3d_bench.datasets.rooms.kept import kept_mesh
 
     whole = made_mesh()
     kept_mesh(folder / "a.npz", lambda: whole)

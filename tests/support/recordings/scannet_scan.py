@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
-from su3d_bench.datasets.sens_header import SensHeader
-from su3d_bench.datasets.sens_write import SensFrame, colour_content, depth_content, write_sens
+from su3d_bench.datasets.scannet.sens.header import SensHeader
+from su3d_bench.datasets.scannet.sens.write import SensFrame, colour_content, depth_content, write_sens
 from su3d_bench.core.types import Float64Array, UInt8Array
 
 SCAN = "scene0000_00"

@@ -21,8 +21,8 @@ from scannet_scan import (
     write_recording,
 )
 
-from su3d_bench.datasets.scannet import ScanNet, ScannetOptions
-from su3d_bench.datasets.scannet_labels import TABLE_NAME
+from su3d_bench.datasets.scannet.dataset import ScanNet, ScannetOptions
+from su3d_bench.datasets.scannet.labels import TABLE_NAME
 
 WHERE = f"scannet/{SCAN}"
 

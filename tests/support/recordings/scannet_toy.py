@@ -9,8 +9,8 @@ import cv2
 import numpy as np
 from places import CASES
 
-from su3d_bench.datasets.rgbd_source import RgbdSource
-from su3d_bench.datasets.sens import SensFile, SensSource
+from su3d_bench.datasets.recordings.source import RgbdSource
+from su3d_bench.datasets.scannet.sens.read import SensFile, SensSource
 
 TOY = CASES / "sens01_toy.sens"
 SCENE = "scene0000_00"

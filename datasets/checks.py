@@ -1,0 +1,350 @@
+"""What a scene holds and what is wrong with it: every file, every frame, and whether frames and truth meet.
+
+Where a reader gives up at the first fault, the check goes on: a dataset that has ``problems(scene)`` names its faults
+itself, one line each, and the files that it lists are looked at one by one.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+from collections.abc import Callable, Container, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.formats.images import decode_colour, decode_depth, read_bytes
+from su3d_bench.datasets.recordings.pose_convention import check_convention
+from su3d_bench.core.errors import DataError, GroundTruthMissing, Su3dError
+from su3d_bench.datasets.checks_of_frames import Finding, FrameFacts, Meeting, Severity, check_frames, check_truth, facts_of
+from su3d_bench.core.interfaces import Dataset
+from su3d_bench.core.plain_text import printable
+from su3d_bench.core.types import Float32Array, Frame, InstanceMesh
+
+SAMPLED_FRAMES = 20
+IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".ppm", ".pgm"}
+FRAME_OF_A_FILE = re.compile(r"\bframe \d")
+SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
+
+
+@dataclass(frozen=True)
+class DepthStatistics:
+    """Over the frames that were read: least 1st percentile, median of medians, greatest 99th percentile, mean share of
+    the pixels that have a depth."""
+
+    near_m: float
+    median_m: float
+    far_m: float
+    valid_share: float
+
+
+@dataclass(frozen=True)
+class TruthVariant:
+    """One form of ground truth: its counts, or the ``reason`` why it is not here."""
+
+    variant: str
+    reason: str | None
+    n_points: int = 0
+    n_objects: int = 0
+    n_classes: int = 0
+
+
+@dataclass(frozen=True)
+class Inspection:
+    """What is known of a scene after a check; ``digest`` is the data key that results of this scene carry.
+
+    ``n_frames`` is None where the frames cannot be counted; ``n_read`` of them were read. ``meeting`` is None where
+    there is no truth or no frame.
+    """
+
+    scene: str
+    n_frames: int | None
+    n_read: int
+    n_files: int
+    size: tuple[int, int] | None
+    depth: DepthStatistics | None
+    truth: tuple[TruthVariant, ...]
+    meeting: Meeting | None
+    digest: str | None
+    findings: tuple[Finding, ...]
+    elapsed_s: float
+
+    def count(self, severity: Severity) -> int:
+        return sum(one.severity == severity for one in self.findings)
+
+
+Progress = Callable[[int, int], None]
+
+
+def inspect(
+    dataset: Dataset,
+    scene: str,
+    *,
+    is_quick: bool = False,
+    n_threads: int = 1,
+    progress: Progress = lambda n_done, n_frames: None,
+) -> Inspection:
+    """Look at everything of ``scene`` and go on after each fault; ``progress`` gets (frames read, frames to read).
+
+    All frames are read, from ``n_threads`` threads, or ``SAMPLED_FRAMES`` evenly spaced ones where ``is_quick`` or
+    where the scene is made on demand and has no file that could be damaged.
+    """
+    started = time.perf_counter()
+    found = _Findings(f"{dataset.name}/{scene}")
+    with _warnings_as_findings(found):
+        return _inspect(dataset, scene, found, is_quick, n_threads, progress, started)
+
+
+def _inspect(
+    dataset: Dataset, scene: str, found: _Findings, is_quick: bool, n_threads: int, progress: Progress, started: float
+) -> Inspection:
+    n_problems = _ask_for_problems(dataset, scene, found)
+    listed = found.attempt("file", lambda: tuple(dataset.files(scene)))
+    files, is_made_on_demand = listed or (), listed == () and not n_problems
+    frames = found.attempt("frame", lambda: _counted_frames(dataset, scene))
+    facts: list[FrameFacts] = []
+    if frames is not None:
+        positions = _positions(len(frames), is_quick or is_made_on_demand)
+        facts, broken = _read_frames(frames, positions, found, 1 if is_made_on_demand else n_threads, progress)
+    _look_at_files(files, found, decode=frames is None)
+    for finding in check_frames(facts):
+        found.add(finding)
+    if frames is not None and not is_made_on_demand:
+        _look_at_convention(_Readable(frames, broken), facts, found)
+    truth, points = _look_at_truth(dataset, scene, found)
+    meeting = None
+    if points is not None and facts:
+        meeting, findings = check_truth(facts, points)
+        for finding in findings:
+            found.add(finding)
+    digest = found.attempt("digest", lambda: dataset.digest(scene))
+    return Inspection(
+        scene=found.scene,
+        n_frames=None if frames is None else len(frames),
+        n_read=len(facts),
+        n_files=len(files),
+        size=(facts[0].width, facts[0].height) if facts else None,
+        depth=_depth_statistics(facts),
+        truth=truth,
+        meeting=meeting,
+        digest=digest,
+        findings=found.sorted(),
+        elapsed_s=time.perf_counter() - started,
+    )
+
+
+class _Findings:
+    """Collects what is found of one scene, each fault once though several steps come upon it."""
+
+    def __init__(self, scene: str) -> None:
+        self.scene = scene
+        self._findings: dict[tuple[str, str], Finding] = {}
+
+    @property
+    def n(self) -> int:
+        return len(self._findings)
+
+    def add(self, finding: Finding) -> None:
+        text = printable(finding.text.removeprefix(f"{self.scene}: ").removeprefix(f"{finding.where}: "))
+        where = printable(finding.where)
+        if not any((place, text) in self._findings for place in (where, "")):
+            self._findings[where, text] = Finding(finding.severity, finding.check, where, text)
+
+    def add_fault(self, check: str, where: str, error: Exception) -> None:
+        """A finding of what was raised, unless it is about a file whose fault is known."""
+        text = str(error) if isinstance(error, Su3dError | OSError) else f"{type(error).__name__}: {error}"
+        text = printable(text.removeprefix(f"{self.scene}: "))
+        first = text.partition(" ")[0].rstrip(":")
+        is_of_a_file = "." in first and not FRAME_OF_A_FILE.search(text)  # of a recording, another frame may be broken
+        if not (is_of_a_file and self.mentions(Path(first))):
+            self.add(Finding("error", check, where, text))
+
+    def attempt(self, check: str, work: Callable[[], Any]) -> Any:
+        """What ``work`` gives; None where it fails, which is a finding."""
+        try:
+            return work()
+        except (Su3dError, OSError) as error:
+            self.add_fault(check, "", error)
+            return None
+
+    def mentions(self, path: Path) -> bool:
+        """Whether a fault of this file is known; several steps find it and say it in their own words."""
+        parent, name = re.escape(path.parent.name), re.escape(path.name)
+        named = re.compile(rf"(?:(?<![\w.-]){parent}/|(?<![\w./-])){name}(?!\w)")
+        return any(path.name in text and named.search(text) for _, text in self._findings)
+
+    def has_error(self, checks: Container[str]) -> bool:
+        return any(one.severity == "error" and one.check in checks for one in self._findings.values())
+
+    def sorted(self) -> tuple[Finding, ...]:
+        """Errors first, then warnings, then notes, each in the order found."""
+        return tuple(sorted(self._findings.values(), key=lambda one: SEVERITIES.index(one.severity)))
+
+
+@contextmanager
+def _warnings_as_findings(found: _Findings) -> Iterator[None]:
+    """What readers warn of in the block becomes findings, as it becomes part of a run's record."""
+
+    class Listener(logging.Handler):
+        def emit(self, record: logging.LogRecord) -> None:
+            found.add(Finding("warning", "reader", "", record.getMessage()))
+
+    listener, package = Listener(logging.WARNING), logging.getLogger("su3d_bench")
+    package.addHandler(listener)
+    try:
+        yield
+    finally:
+        package.removeHandler(listener)
+
+
+def _counted_frames(dataset: Dataset, scene: str) -> Sequence[Frame]:
+    """The frames; a ``DataError`` where they are not as many as the dataset says, or none."""
+    info, frames = dataset.info(scene, 1), dataset.frames(scene, 1)
+    if len(frames) != info.n_frames:
+        raise DataError(f"the dataset counts {info.n_frames} frames and gives {len(frames)}")
+    if not len(frames):
+        raise DataError("the scene has no frames")
+    return frames
+
+
+def _positions(n_frames: int, is_sampled: bool) -> Sequence[int]:
+    if not is_sampled or n_frames <= SAMPLED_FRAMES:
+        return range(n_frames)
+    return [int(position) for position in np.linspace(0, n_frames - 1, SAMPLED_FRAMES)]
+
+
+def _read_frames(
+    frames: Sequence[Frame], positions: Sequence[int], found: _Findings, n_threads: int, progress: Progress
+) -> tuple[list[FrameFacts], set[int]]:
+    """Facts of the frames that can be read, and the positions of those that cannot; each of these is named."""
+
+    def read(position: int) -> FrameFacts | Exception:
+        try:
+            return facts_of(frames[position])
+        except Exception as error:  # noqa: BLE001 - a plug-in may raise anything; every broken frame is named
+            return error
+
+    facts, broken = [], set()
+    pool = ThreadPoolExecutor(n_threads)
+    try:
+        progress(0, len(positions))
+        for n_done, (position, outcome) in enumerate(zip(positions, pool.map(read, positions), strict=True), 1):
+            if isinstance(outcome, FrameFacts):
+                facts.append(outcome)
+            else:
+                broken.add(position)
+                found.add_fault("frame", f"frame {position}", outcome)
+            progress(n_done, len(positions))
+    finally:
+        pool.shutdown(cancel_futures=True)
+    return facts, broken
+
+
+def _ask_for_problems(dataset: Dataset, scene: str, found: _Findings) -> int:
+    """Take over what the dataset itself names, and count it."""
+    if not hasattr(dataset, "problems"):
+        return 0
+    try:
+        for line in dataset.problems(scene):
+            found.add(Finding("error", "file", "", line))
+    except (Su3dError, OSError) as error:
+        found.add_fault("file", "", error)
+    return found.n
+
+
+class _Readable(Sequence[Frame]):
+    """Frames without those that are known to be broken."""
+
+    def __init__(self, frames: Sequence[Frame], broken: Container[int]) -> None:
+        self._frames = frames
+        self._positions = [position for position in range(len(frames)) if position not in broken]
+
+    def __len__(self) -> int:
+        return len(self._positions)
+
+    def __getitem__(self, position: int) -> Frame:  # type: ignore[override]
+        return self._frames[self._positions[position]]
+
+
+def _look_at_convention(frames: Sequence[Frame], facts: Sequence[FrameFacts], found: _Findings) -> None:
+    """Whether depth and poses agree between frames; asked only where each of them is usable by itself."""
+    if not facts or found.has_error(("pose", "intrinsics", "size")):
+        return
+    line = found.attempt("convention", lambda: check_convention(frames, found.scene))
+    if line is not None:
+        found.add(Finding("error", "convention", "", line))
+
+
+def _look_at_files(files: Sequence[Path], found: _Findings, *, decode: bool) -> None:
+    """Name every file that is missing, empty or unreadable, and with ``decode`` every damaged image."""
+    for path in files:
+        name = f"{path.parent.name}/{path.name}"
+        reason = _fault_of_file(path, name, decode)
+        if reason is not None and not found.mentions(path):
+            found.add(Finding("error", "file", "", reason))
+
+
+def _fault_of_file(path: Path, name: str, decode: bool) -> str | None:
+    try:
+        if decode and path.suffix.lower() in IMAGE_SUFFIXES:
+            content = read_bytes(path, name)
+            is_depth = path.suffix.lower() == ".pgm" or content[24:26] == b"\x10\x00"  # a PNG of one channel, 16 bits
+            (decode_depth if is_depth else decode_colour)(content, name)
+            return None
+        with path.open("rb") as stream:
+            return None if stream.read(1) else f"{name} is empty; copy the file again"
+    except FileNotFoundError:
+        return f"{name} is missing; copy the file again"
+    except OSError as error:
+        return f"{name} cannot be read: {error.strerror}"
+    except DataError as error:
+        return str(error)
+
+
+def _look_at_truth(
+    dataset: Dataset, scene: str, found: _Findings
+) -> tuple[tuple[TruthVariant, ...], Float32Array | None]:
+    """What there is of every variant, and the points of the first one that is here."""
+    rows: list[TruthVariant] = []
+    points = None
+    for variant in getattr(dataset, "variants", ()):
+        try:
+            truth = dataset.ground_truth(scene, variant)
+        except GroundTruthMissing as error:
+            rows.append(TruthVariant(variant, printable(str(error).removeprefix(f"{found.scene}: "))))
+            continue
+        except DataError as error:
+            found.add_fault("truth", "", error)
+            rows.append(TruthVariant(variant, printable(str(error).removeprefix(f"{found.scene}: "))))
+            continue
+        points = truth.points if points is None else points
+        n_objects, n_classes = (len(np.unique(ids[ids != 0])) for ids in (truth.instance, truth.semantic))
+        rows.append(TruthVariant(variant, None, len(truth.points), n_objects, n_classes))
+    if points is not None:
+        found.attempt("truth", lambda: _instance_mesh(dataset, scene))
+    return tuple(rows), points
+
+
+def _instance_mesh(dataset: Dataset, scene: str) -> InstanceMesh | None:
+    """The mesh, which is read for its faults; None where the truth is no mesh."""
+    try:
+        return dataset.instance_mesh(scene)
+    except GroundTruthMissing:
+        return None
+
+
+def _depth_statistics(facts: Sequence[FrameFacts]) -> DepthStatistics | None:
+    with_depth = [one for one in facts if one.valid_share > 0]
+    if not with_depth:
+        return None
+    return DepthStatistics(
+        near_m=min(one.near_m for one in with_depth),
+        median_m=float(np.median([one.median_m for one in with_depth])),
+        far_m=max(one.far_m for one in with_depth),
+        valid_share=float(np.mean([one.valid_share for one in facts])),
+    )

@@ -1,0 +1,113 @@
+"""Everything that is wrong with the files of a Replica scene, one line each, where a reader stops at the first fault.
+
+Images are judged by their first and last bytes; decoding them is the reader's part.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+from su3d_bench.formats.images import JPEG_END, JPEG_END_WITHIN, PNG_SIGNATURE, image_size
+from su3d_bench.datasets.replica.boxes import SLACK_M, objects_outside_boxes, read_boxes
+from su3d_bench.datasets.replica.frames import Camera, check_frames_complete, colour_name, depth_name, poses_of_lines, read_camera, trajectory_lines
+from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, MESH_NAME, read_annotated_mesh
+from su3d_bench.core.errors import DataError
+
+MOST_LINES = 20  # of one kind of fault; the rest is counted
+HEAD_BYTES = (4096, 1 << 18)  # a JPEG may carry its size behind the blocks of its camera, each below 64 KB
+PNG_END = b"IEND\xaeB`\x82"  # the last chunk with its checksum
+
+
+def render_problems(tree: Path, scene: str, where: str) -> Iterator[str]:
+    """Faults of camera, trajectory and images of the scene in a render ``tree``."""
+    camera, lines = None, []
+    try:
+        camera = read_camera(tree / "cam_params.json", where)
+    except DataError as error:
+        yield str(error)
+    try:
+        lines = trajectory_lines(tree / scene / "traj.txt", where)
+    except DataError as error:
+        yield str(error)
+    yield from _shortened(_pose_problems(lines, where), f"{where}: traj.txt")
+    try:
+        check_frames_complete(tree / scene, len(lines), where)
+    except DataError as error:
+        yield str(error)
+    yield from _shortened(_image_problems(tree / scene, len(lines), camera, where), f"{where}: results/")
+
+
+def _shortened(problems: Iterator[str], where: str) -> Iterator[str]:
+    n_more = 0
+    for n, line in enumerate(problems):
+        if n < MOST_LINES:
+            yield line
+        else:
+            n_more += 1
+    if n_more:
+        yield f"{where}: {n_more} more faults of this kind"
+
+
+def _pose_problems(lines: list[str], where: str) -> Iterator[str]:
+    for number, line in enumerate(lines, 1):
+        try:
+            poses_of_lines([line], f"{where}: traj.txt", number)
+        except DataError as error:
+            yield str(error)
+
+
+def _image_problems(folder: Path, n_frames: int, camera: Camera | None, where: str) -> Iterator[str]:
+    """Images that are there and cannot be right; missing ones are counted elsewhere."""
+    for index in range(n_frames):
+        for name in (colour_name(index), depth_name(index)):
+            try:
+                with (folder / name).open("rb") as file:
+                    head = file.read(HEAD_BYTES[0])
+                    if image_size(head) is None:
+                        head += file.read(HEAD_BYTES[1])
+                    file.seek(max(0, file.seek(0, 2) - JPEG_END_WITHIN))
+                    tail = file.read()
+            except FileNotFoundError:
+                continue
+            except OSError as error:
+                yield f"{where}: {name} cannot be read: {error.strerror}"
+                continue
+            fault = _image_fault(head, tail, camera)
+            if fault:
+                yield f"{where}: {name}{fault}"
+
+
+def _image_fault(head: bytes, tail: bytes, camera: Camera | None) -> str | None:
+    size = image_size(head)
+    is_whole = tail.endswith(PNG_END) if head.startswith(PNG_SIGNATURE) else JPEG_END in tail
+    if size is None or not is_whole:
+        return ": no image, or cut short; copy the file again"
+    if camera is not None and size != (camera.width, camera.height):
+        return f" is {size[0]}x{size[1]} but cam_params.json says {camera.width}x{camera.height}"
+    return None
+
+
+def original_problems(original: Path | None, where: str) -> Iterator[str]:
+    """Faults of the scene in the original release; a scene without any of it is not at fault."""
+    if original is None:
+        return
+    missing = [name for name in (MESH_NAME, INFO_NAME) if not (original / name).exists()]
+    for name in missing:
+        yield f"{where}: {name} is missing in {original}; copy it there"
+    if INFO_NAME in missing:
+        return
+    try:
+        boxes = read_boxes(original / INFO_NAME, where)
+        if MESH_NAME in missing:
+            return
+        outside = objects_outside_boxes(read_annotated_mesh(original, where), boxes)
+    except DataError as error:
+        yield str(error)
+        return
+    lines = (
+        f"{where}: {INFO_NAME}: object {one} has faces {beyond_m:.2f} m beyond its box and the slack of {SLACK_M} m; "
+        "the boxes are of another mesh"
+        for one, beyond_m in outside.items()
+    )
+    yield from _shortened(lines, f"{where}: {INFO_NAME}")

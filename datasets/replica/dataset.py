@@ -1,0 +1,241 @@
+"""Replica: NICE-SLAM's RGB-D render for input, the original release for ground truth."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict
+
+from su3d_bench.datasets.replica.boxes import read_boxes
+from su3d_bench.datasets.replica.cloud_truth import cloud_files, conceptgraphs_truth
+from su3d_bench.datasets.replica.replica_digest import digest_of
+from su3d_bench.datasets.replica.folders import CLOUDS_URL, FUSED_CLOUD, HOW_TO_GET_LABELS, INSTANCE_FOLDERS, ORIGINAL_URL, REFERENCE_CLOUD, RENDER_FOLDERS, SEMANTIC_FOLDERS, SEMANTIC_LABEL_FOLDERS, RenderTree, find_label_file, find_original_scene, find_render_tree, find_semantic_sequence, no_render_tree, original_name, read_marker
+from su3d_bench.datasets.replica.frames import ReplicaFrames, check_frames_complete, colour_name, depth_name, read_camera, read_trajectory
+from su3d_bench.datasets.replica.label_file_truth import LabelledMesh, class_file_truth, instance_file_truth
+from su3d_bench.datasets.replica.checks import original_problems, render_problems
+from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, MESH_NAME, AnnotatedMesh, corner_truth, read_annotated_mesh, read_surface, triangle_mesh, vertex_truth
+from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
+from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, SceneInfo, Surface
+
+READER_VERSION = 2  # raise it whenever the same files come out as other frames or another truth
+
+
+class ReplicaOptions(BaseModel):
+    """Replica has no settings: its files say everything."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Replica:
+    """NICE-SLAM's render of Replica, with ground truth from the original release; read below the data root."""
+
+    name = "replica"
+    label_space = "replica"
+    variants: tuple[str, ...] = ("mesh-vertices", "face-corners", "conceptgraphs", "openmask3d", "ovo-51")
+    Options = ReplicaOptions
+
+    def __init__(self, root: Path, options: ReplicaOptions | None = None) -> None:
+        self.root = root
+        self.options = options or ReplicaOptions()
+        self._mesh: tuple[str, AnnotatedMesh] | None = None
+
+    @cached_property
+    def tree(self) -> RenderTree:
+        """The render tree; a ``DataError`` that says how to get data where there is none."""
+        tree = find_render_tree(self.root)
+        if tree is None:
+            raise no_render_tree(self.root)
+        return tree
+
+    def scenes(self) -> Sequence[str]:
+        """The official scenes that are here, in their order, then every other scene of the render tree."""
+        return self.tree.scenes
+
+    def places(self) -> Sequence[Path]:
+        """Where the render tree is, or else would be looked for, in that order."""
+        tree = find_render_tree(self.root)
+        return [tree.folder] if tree is not None else [self.root / name for name in RENDER_FOLDERS]
+
+    def status(self, scene: str) -> str:
+        """A word on the scene from a quick look: poses and ground truth; ``info`` checks every file's presence."""
+        try:
+            n_poses = (self._folder(scene) / "traj.txt").read_bytes().rstrip().count(b"\n") + 1
+        except OSError:
+            return "traj.txt is missing"
+        try:
+            truth = f"ground truth in {self._original(scene)}"
+        except GroundTruthMissing as error:
+            truth = str(error).partition(": ")[2]
+            original = find_original_scene(self.root, scene)
+            if original is not None and (original / INFO_NAME).exists():
+                truth = f"{len(self.object_boxes(scene))} boxes of objects, no mesh ({original / MESH_NAME} is missing)"
+        released = []
+        for variant, files in self._released_truths(scene).items():
+            missing = [path.name for path in files if not path.exists()]
+            released += [f"{variant} without its {missing[0]}" if missing else variant] if files else []
+        return f"{n_poses} frames, {truth}" + (f"; also {', '.join(released)}" if released else "")
+
+    def info(self, scene: str, stride: int) -> SceneInfo:
+        """Cheap facts and a check that the scene's frames are complete; the domain tells made scenes from scans."""
+        folder = self._folder(scene)
+        n_poses = len(read_trajectory(folder / "traj.txt", self._where(scene)))
+        check_frames_complete(folder, n_poses, self._where(scene))
+        return SceneInfo(self.name, scene, len(range(0, n_poses, stride)), stride, self._image_domain(scene))
+
+    def frames(self, scene: str, stride: int) -> Sequence[Frame]:
+        folder, where = self._folder(scene), self._where(scene)
+        camera = read_camera(self.tree.folder / "cam_params.json", where)
+        poses = read_trajectory(folder / "traj.txt", where)
+        check_frames_complete(folder, len(poses), where)
+        return ReplicaFrames(folder, where, camera, poses, range(0, len(poses), stride))
+
+    def files(self, scene: str) -> Sequence[Path]:
+        folder = self._folder(scene)
+        n_poses = len(read_trajectory(folder / "traj.txt", self._where(scene)))
+        images = [folder / name(index) for index in range(n_poses) for name in (colour_name, depth_name)]
+        return (self.tree.folder / "cam_params.json", folder / "traj.txt", *images, *self._truth_files(scene))
+
+    def digest(self, scene: str) -> str:
+        """A key of the content of every file; ``image_key`` says what it cannot see in an image."""
+        folder = self._folder(scene)
+        files = (self.tree.folder / "cam_params.json", folder / "traj.txt", *self._truth_files(scene))
+        parts = (f"replica {READER_VERSION}", scene, self._image_domain(scene))
+        return digest_of(parts, files, sorted(folder.glob("results/*")), self._where(scene))
+
+    def problems(self, scene: str) -> Iterator[str]:
+        """What is wrong with the scene's files, one line each; what has no entry is no fault but void."""
+        self._folder(scene)
+        yield from render_problems(self.tree.folder, scene, self._where(scene))
+        yield from original_problems(find_original_scene(self.root, scene), self._where(scene))
+
+    def ground_truth(self, scene: str, variant: str) -> GroundTruth:
+        self._folder(scene)
+        match variant:
+            case "mesh-vertices":
+                return vertex_truth(self._annotated_mesh(scene))
+            case "face-corners":
+                return corner_truth(self._annotated_mesh(scene))
+            case "conceptgraphs":
+                return self._cloud_truth(scene)
+            case "openmask3d" | "ovo-51":
+                return self._label_file_truth(scene, variant)
+        hint = suggest(variant, self.variants) or f"; known: {', '.join(self.variants)}"
+        raise GroundTruthMissing(f"{self._where(scene)}: no ground truth '{variant}'{hint}")
+
+    def object_boxes(self, scene: str) -> Mapping[int, OrientedBox]:
+        """Object id of the original release -> its box in the world, from ``info_semantic.json`` alone."""
+        self._folder(scene)
+        original = find_original_scene(self.root, scene)
+        if original is None or not (original / INFO_NAME).exists():
+            raise GroundTruthMissing(
+                f"{self._where(scene)}: no boxes of objects; expected {original_name(scene)}/{INFO_NAME} of the "
+                f"original release ({ORIGINAL_URL}) in {self.root / 'replica_v1'}"
+            )
+        return read_boxes(original / INFO_NAME, self._where(scene))
+
+    def instance_mesh(self, scene: str) -> InstanceMesh:
+        return triangle_mesh(self._annotated_mesh(scene))
+
+    def surface(self, scene: str) -> Surface:
+        """The mesh beside the render, whose vertices label files for OpenMask3D and OVO describe."""
+        self._folder(scene)
+        mesh = self._render_mesh(scene)
+        if not mesh.exists():
+            raise DataError(f"{self._where(scene)}: no mesh; {mesh.name} is missing in {self.tree.folder}")
+        return read_surface(mesh, f"{self._where(scene)}: {mesh.name}")
+
+    def _where(self, scene: str) -> str:
+        return f"{self.name}/{scene}"
+
+    def _render_mesh(self, scene: str) -> Path:
+        return self.tree.folder / f"{scene}_mesh.ply"
+
+    def _folder(self, scene: str) -> Path:
+        if scene not in self.tree.scenes:
+            hint = suggest(scene, self.tree.scenes) or f"; {self.tree.folder} has {', '.join(self.tree.scenes[:8])}"
+            raise DataError(f"replica: no scene '{scene}'{hint}")
+        return self.tree.folder / scene
+
+    def _image_domain(self, scene: str) -> ImageDomain:
+        return "rendered-rooms" if scene in read_marker(self.tree.folder) else "camera"
+
+    def _truth_files(self, scene: str) -> tuple[Path, ...]:
+        """The render's mesh and every file of ground truth that is here, of whatever variant."""
+        original = find_original_scene(self.root, scene)
+        names = (MESH_NAME, INFO_NAME)
+        found = [self._render_mesh(scene)] + ([] if original is None else [original / name for name in names])
+        released = self._released_truths(scene)
+        found += [path for files in released.values() for path in files]
+        if released["openmask3d"] or released["ovo-51"]:
+            found += [mesh.path for mesh in self._labelled_meshes(scene)]
+        return tuple(path for path in dict.fromkeys(found) if path.exists())
+
+    def _released_truths(self, scene: str) -> dict[str, tuple[Path, ...]]:
+        """Variant -> its files, of what others than Replica's makers released; none where nothing of it is here."""
+        sequence = find_semantic_sequence(self.root, scene)
+        clouds = () if sequence is None else (*cloud_files(sequence), self._folder(scene) / REFERENCE_CLOUD)
+        labels = {variant: self._label_file(scene, variant) for variant in ("openmask3d", "ovo-51")}
+        return {"conceptgraphs": clouds} | {
+            variant: () if path is None else (path,) for variant, path in labels.items()
+        }
+
+    def _label_file(self, scene: str, variant: str) -> Path | None:
+        if variant == "openmask3d":
+            return find_label_file(self.root, scene, INSTANCE_FOLDERS, "instance_labels_")
+        return find_label_file(self.root, scene, SEMANTIC_LABEL_FOLDERS, "semantic_labels_")
+
+    def _labelled_meshes(self, scene: str) -> list[LabelledMesh]:
+        """The meshes whose vertices a label file may describe, that of the render first, as the authors used it."""
+        original, render = find_original_scene(self.root, scene), self._render_mesh(scene)
+        meshes = [LabelledMesh(render, render.name)]
+        if original is not None:
+            meshes.append(LabelledMesh(original / MESH_NAME, MESH_NAME))
+        return [mesh for mesh in meshes if mesh.path.exists()]
+
+    def _label_file_truth(self, scene: str, variant: str) -> GroundTruth:
+        path, where = self._label_file(scene, variant), self._where(scene)
+        if path is None:
+            folder = INSTANCE_FOLDERS[0] if variant == "openmask3d" else SEMANTIC_LABEL_FOLDERS[0]
+            raise GroundTruthMissing(
+                f"{where}: no ground truth '{variant}'; expected {folder}/{scene}.txt, one label a vertex, in "
+                f"{self.tree.folder}; {HOW_TO_GET_LABELS[variant]}"
+            )
+        make = instance_file_truth if variant == "openmask3d" else class_file_truth
+        return make(path, self._labelled_meshes(scene), where)
+
+    def _cloud_truth(self, scene: str) -> GroundTruth:
+        where, sequence = self._where(scene), find_semantic_sequence(self.root, scene)
+        reference = self._folder(scene) / REFERENCE_CLOUD
+        if sequence is None:
+            raise GroundTruthMissing(
+                f"{where}: no ground truth 'conceptgraphs'; expected {original_name(scene)}/Sequence_1/{FUSED_CLOUD} "
+                f"of its authors ({CLOUDS_URL}) in {self.root / SEMANTIC_FOLDERS[0]}; replica-mesh-ex6 needs none of it"
+            )
+        if not reference.exists():
+            raise GroundTruthMissing(
+                f"{where}: no ground truth 'conceptgraphs'; the points to be scored, {REFERENCE_CLOUD}, are missing in "
+                f"{reference.parents[2]}; make them with run_slam_rgb.py of ConceptGraphs (stride 5, 480x640)"
+            )
+        return conceptgraphs_truth(sequence, reference, where)
+
+    def _annotated_mesh(self, scene: str) -> AnnotatedMesh:
+        """The mesh of ``scene``; the last one is kept, because every protocol asks for it anew."""
+        if self._mesh is None or self._mesh[0] != scene:
+            self._folder(scene)
+            self._mesh = scene, read_annotated_mesh(self._original(scene), self._where(scene))
+        return self._mesh[1]
+
+    def _original(self, scene: str) -> Path:
+        """The scene's folder in the original release, with both files of the truth."""
+        original, where = find_original_scene(self.root, scene), self._where(scene)
+        if original is None:
+            raise GroundTruthMissing(
+                f"{where}: no ground truth; expected {original_name(scene)}/{MESH_NAME} of the original release "
+                f"({ORIGINAL_URL}) in {self.root / 'replica_v1'}"
+            )
+        for name in (MESH_NAME, INFO_NAME):
+            if not (original / name).exists():
+                raise GroundTruthMissing(f"{where}: no ground truth; {original / name} is missing")
+        return original

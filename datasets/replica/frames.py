@@ -1,0 +1,194 @@
+"""Posed RGB-D frames of the render that NICE-SLAM distributes: cam_params.json, traj.txt, results/.
+
+Depth is uint16, metres are value / scale, 0 is invalid; a pose is a row-major 4x4 camera-to-world matrix with OpenCV
+axes in the z-up world of the original mesh, taken as it is. A fault in any file fails the scene: the release is
+complete, so a gap or a NaN means a damaged copy, and a number computed around it would not be the scene's.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.formats.images import decode_colour, decode_depth, read_bytes
+from su3d_bench.datasets.replica.mesh_truth import shown
+from su3d_bench.core.errors import DataError
+from su3d_bench.numerics.geometry import are_rigid
+from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
+
+CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
+FRAMES_PER_SECOND = 30.0  # the release has no timestamps
+N_DEPTH_VALUES = 1 << 16
+MOST_OF_CAMERA = 1e9  # pixels, focal lengths and depth units stay far below
+
+
+@dataclass(frozen=True)
+class Camera:
+    """Image size in pixels, intrinsics (3, 3), and how many depth units make a metre."""
+
+    width: int
+    height: int
+    intrinsics: Float64Array
+    scale: float
+
+
+def read_camera(path: Path, where: str) -> Camera:
+    """The camera of ``cam_params.json``; ``where`` begins each message."""
+    where = f"{where}: {path.name}"
+    try:
+        content = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise DataError(f"{where} cannot be read: {error.strerror}; it belongs into {path.parent}") from error
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{where}: not JSON ({error}); copy the file again") from error
+    table = content.get("camera") if isinstance(content, dict) else None
+    if not isinstance(table, dict):
+        raise DataError(f"{where}: has no table 'camera'; expected {{'camera': {{{', '.join(CAMERA_KEYS)}}}}}")
+    w, h, fx, fy, cx, cy, scale = (_number(table, key, where) for key in CAMERA_KEYS)
+    for key, value in (("w", w), ("h", h), ("fx", fx), ("fy", fy), ("scale", scale)):
+        if value <= 0:
+            raise DataError(f"{where}: '{key}' is {value:g}; it must be above 0")
+    if not (w.is_integer() and h.is_integer()):
+        raise DataError(f"{where}: the image size {w:g}x{h:g} is not in whole pixels")
+    if not (0 <= cx <= w and 0 <= cy <= h):
+        raise DataError(f"{where}: the principal point ({cx:g}, {cy:g}) lies outside the image of {w:g}x{h:g}")
+    return Camera(int(w), int(h), np.array([[fx, 0.0, cx], [0.0, fy, cy], [0.0, 0.0, 1.0]]), scale)
+
+
+def _number(table: dict[str, Any], key: str, where: str) -> float:
+    if key not in table:
+        raise DataError(f"{where}: 'camera' has no '{key}'; expected {', '.join(CAMERA_KEYS)}")
+    value = table[key]
+    # NaN is not below any bound, and an integer of any length can be compared where it cannot become a float
+    if isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < MOST_OF_CAMERA:
+        raise DataError(f"{where}: '{key}' is {shown(value)}; expected a number")
+    return float(value)
+
+
+def read_trajectory(path: Path, where: str) -> Float64Array:
+    """Camera-to-world poses (n, 4, 4), one a line; ``where`` begins each message."""
+    return poses_of_lines(trajectory_lines(path, where), f"{where}: traj.txt")
+
+
+def trajectory_lines(path: Path, where: str) -> list[str]:
+    """The lines of ``traj.txt``, at least one."""
+    try:
+        lines = path.read_text(encoding="utf-8").rstrip().splitlines()
+    except OSError as error:
+        raise DataError(f"{where}: traj.txt cannot be read: {error.strerror}; expected it in {path.parent}") from error
+    except UnicodeDecodeError as error:
+        raise DataError(f"{where}: traj.txt is not a text file; copy it again") from error
+    if not lines:
+        raise DataError(f"{where}: traj.txt is empty; expected one pose a line")
+    return lines
+
+
+def poses_of_lines(lines: Sequence[str], where: str, first_line: int = 1) -> Float64Array:
+    """Rigid camera-to-world poses (n, 4, 4), one a line; ``where`` names the file, ``first_line`` counts from 1."""
+    poses = np.array([_values(line, f"{where} line {n}") for n, line in enumerate(lines, first_line)])
+    poses = poses.reshape(-1, 4, 4)
+    is_rigid = are_rigid(poses)
+    if not is_rigid.all():
+        raise DataError(
+            f"{where} line {first_line + int(np.argmin(is_rigid))}: not a rigid motion; expected a row-major "
+            "camera-to-world matrix with last row 0 0 0 1"
+        )
+    return poses
+
+
+def _values(line: str, where: str) -> list[float]:
+    words = line.split()
+    if len(words) != 16:
+        raise DataError(f"{where} has {len(words)} values; expected 16, a row-major 4x4 camera-to-world matrix")
+    try:
+        values = [float(word) for word in words]
+    except ValueError as error:
+        raise DataError(f"{where}: {str(error)[:80]}; expected 16 numbers") from error
+    for value, word in zip(values, words, strict=True):
+        if not math.isfinite(value):
+            raise DataError(f"{where}: the pose holds '{word[:20]}'; mend the trajectory or leave the scene out")
+    return values
+
+
+def check_frames_complete(scene_folder: Path, n_poses: int, where: str) -> None:
+    """Raise ``DataError`` unless results/ holds exactly colour and depth of frames 0 to ``n_poses`` - 1."""
+    folder = scene_folder / "results"
+    try:
+        names = [path.name for path in folder.iterdir()]
+    except OSError as error:
+        raise DataError(f"{where}: results/ cannot be read: {error.strerror}; expected it in {scene_folder}") from error
+    colours = {int(match[1]) for name in names if (match := re.fullmatch(r"frame(\d{6,9})\.jpg", name))}
+    depths = {int(match[1]) for name in names if (match := re.fullmatch(r"depth(\d{6,9})\.png", name))}
+    n_frames = max(colours | depths, default=-1) + 1
+    if n_frames == 0:
+        raise DataError(f"{where}: results/ holds no frames; expected frame000000.jpg and depth000000.png and so on")
+    for indices, file_name in ((colours, colour_name), (depths, depth_name)):
+        if len(indices) < n_frames:
+            first = next(index for index in range(n_frames) if index not in indices)
+            n_missing = n_frames - len(indices)
+            others = "" if n_missing == 1 else f", and {n_missing - 1} more"
+            raise DataError(f"{where}: {file_name(first)} is missing{others}; copy results/ again")
+    if n_frames != n_poses:
+        raise DataError(
+            f"{where}: traj.txt has {n_poses} poses but results/ has {n_frames} frames; copy the scene again"
+        )
+
+
+def colour_name(index: int) -> str:
+    return f"results/frame{index:06d}.jpg"
+
+
+def depth_name(index: int) -> str:
+    return f"results/depth{index:06d}.png"
+
+
+class ReplicaFrames(Sequence[Frame]):
+    """The frames at ``indices``, each read when it is asked for; a file that cannot be used is a ``DataError``."""
+
+    def __init__(self, folder: Path, where: str, camera: Camera, poses: Float64Array, indices: range) -> None:
+        self._folder, self._where, self._camera = folder, where, camera
+        self._poses, self._indices = poses, indices
+        self._depth_m_of_value = (np.arange(N_DEPTH_VALUES) / camera.scale).astype(np.float32)
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def __getitem__(self, position: int) -> Frame:  # type: ignore[override]
+        index = self._indices[position]
+        rgb = self._read_colour(index)
+        depth_m = self._read_depth(index, rgb)
+        return Frame(index, index / FRAMES_PER_SECOND, rgb, depth_m, self._poses[index], self._camera.intrinsics)
+
+    def _read_colour(self, index: int) -> UInt8Array:
+        where, content = self._read(colour_name(index))
+        rgb = decode_colour(content, where)
+        if rgb.shape[:2] != (self._camera.height, self._camera.width):
+            raise DataError(
+                f"{where} is {rgb.shape[1]}x{rgb.shape[0]} but cam_params.json says {self._camera.width}x"
+                f"{self._camera.height}; it belongs to another render"
+            )
+        return rgb
+
+    def _read_depth(self, index: int, rgb: UInt8Array) -> Float32Array:
+        where, content = self._read(depth_name(index))
+        values = decode_depth(content, where)
+        if values.shape != rgb.shape[:2]:
+            raise DataError(
+                f"{where} is {values.shape[1]}x{values.shape[0]} and {colour_name(index)} is {rgb.shape[1]}x"
+                f"{rgb.shape[0]}; both must have one size"
+            )
+        if not values.any():
+            raise DataError(f"{where}: empty depth, no pixel is above 0; copy the file again or leave the scene out")
+        depth_m: Float32Array = self._depth_m_of_value.take(values)  # half the time of an index
+        return depth_m
+
+    def _read(self, name: str) -> tuple[str, bytes]:
+        where = f"{self._where}: {name}"
+        return where, read_bytes(self._folder / name, where, "copy results/ again")

@@ -1,0 +1,133 @@
+"""Scenes in the exact layout of Replica: the render tree and the original release."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.formats.layout_files import JPEG_QUALITY, depth_in_units, jpeg_bytes, list_column, png_bytes, triangles_of
+from su3d_bench.formats.ply import Column, PlyElement, write_ply
+from su3d_bench.datasets.replica.folders import original_name
+from su3d_bench.datasets.replica.frames import colour_name, depth_name
+from su3d_bench.datasets.replica.replica_labels import replica_label_set
+from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, MESH_NAME
+from su3d_bench.datasets.writing import Scan, ScannedDataset, ScannedObject, SceneTarget, write_shared_text
+from su3d_bench.core.errors import DataError
+from su3d_bench.store.run_folder import json_text, make_folder, write_json, write_text
+from su3d_bench.core.types import Float64Array, Frame
+
+LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
+DEPTH_SCALE = 6553.5  # of NICE-SLAM's render: 65535 is 10 m
+RENDER_FOLDER, ORIGINAL_FOLDER = "Replica", "replica_v1"
+STAGED_ORIGINAL, STAGED_MESH = ".original", ".mesh.ply"
+
+
+@dataclass(frozen=True)
+class ReplicaLayout:
+    """``Replica/<scene>/`` with the frames, the annotated mesh in ``replica_v1``; one camera for all scenes."""
+
+    name: str = "replica"
+    reader: str = "replica"
+    settings: Sequence[Any] = (LAYOUT_VERSION, DEPTH_SCALE, JPEG_QUALITY)
+
+    def scenes_folder(self, out: Path) -> Path:
+        return out / RENDER_FOLDER
+
+    def scene_name(self, scene: str) -> str:
+        return scene
+
+    def target(self, scene: str, key: str, out: Path) -> SceneTarget:
+        folder, mesh = out / RENDER_FOLDER / scene, out / RENDER_FOLDER / f"{scene}_mesh.ply"
+        original = out / ORIGINAL_FOLDER / original_name(scene)
+        truth = (mesh, original / MESH_NAME, original / INFO_NAME)
+        return SceneTarget(scene, key, folder, "results", truth, ((STAGED_ORIGINAL, original), (STAGED_MESH, mesh)))
+
+    def marker_extras(self, names: Sequence[str]) -> dict[str, Any]:
+        return {}
+
+    def write_shared(self, dataset: ScannedDataset, scene: str, out: Path) -> None:
+        make_folder(out / ORIGINAL_FOLDER)
+        height, width = dataset.frames(scene, 1)[0].depth_m.shape
+        k = dataset.intrinsics
+        sizes = {"w": width, "h": height, "fx": k[0, 0], "fy": k[1, 1], "cx": k[0, 2], "cy": k[1, 2]}
+        text = json_text({"camera": sizes | {"scale": DEPTH_SCALE}})
+        complaint = f"is another camera than that of {dataset.name} ({width}x{height})"
+        write_shared_text(out / RENDER_FOLDER / "cam_params.json", text, complaint)
+
+    def frame_names(self, index: int) -> Sequence[str]:
+        return colour_name(index), depth_name(index)
+
+    def frame_files(self, frame: Frame) -> Sequence[bytes]:
+        return jpeg_bytes(frame.rgb), png_bytes(depth_in_units(frame.depth_m, DEPTH_SCALE))
+
+    def write_truth(self, dataset: ScannedDataset, target: SceneTarget) -> None:
+        """Trajectory, annotated mesh, table of objects and plain mesh."""
+        scan = dataset.scan(target.scene)
+        staged = target.partial / STAGED_ORIGINAL
+        make_folder((staged / MESH_NAME).parent)
+        write_ply(staged / MESH_NAME, _annotated_mesh(scan))
+        write_json(staged / INFO_NAME, _info(dataset.objects(target.scene)))
+        write_ply(target.partial / STAGED_MESH, _plain_mesh(scan))
+        poses = dataset.trajectory(target.scene)
+        lines = [" ".join(repr(float(value)) for value in pose.reshape(-1)) for pose in poses]
+        write_text(target.partial / "traj.txt", "\n".join(lines) + "\n")
+
+    def join(self, dataset: ScannedDataset, target: SceneTarget) -> None:
+        """Nothing: every frame has files of its own."""
+
+
+def _vertex_element(scan: Scan) -> PlyElement:
+    columns: dict[str, Column] = {}
+    for names, array in ((("x", "y", "z"), scan.vertices), (("nx", "ny", "nz"), scan.normals)):
+        columns |= {name: array[:, i].astype(np.float32) for i, name in enumerate(names)}
+    columns |= {name: scan.colours[:, i].astype(np.uint8) for i, name in enumerate(("red", "green", "blue"))}
+    return PlyElement("vertex", len(scan.vertices), columns)
+
+
+def _annotated_mesh(scan: Scan) -> list[PlyElement]:
+    """Quads with ``object_id`` of 16 bits, as in the release."""
+    if scan.object_id.max(initial=0) > np.iinfo(np.uint16).max or scan.object_id.min(initial=0) < 0:
+        raise DataError(f"object ids go to {scan.object_id.max()}; the layout has 16 bits, 0 to 65535")
+    faces: dict[str, Column] = {
+        "vertex_indices": list_column(scan.faces),
+        "object_id": scan.object_id.astype(np.uint16),
+    }
+    return [_vertex_element(scan), PlyElement("face", len(scan.faces), faces)]
+
+
+def _plain_mesh(scan: Scan) -> list[PlyElement]:
+    """The same surface as triangles, without labels."""
+    triangles = triangles_of(scan.faces)
+    return [_vertex_element(scan), PlyElement("face", len(triangles), {"vertex_indices": list_column(triangles)})]
+
+
+def _info(objects: Sequence[ScannedObject]) -> dict[str, Any]:
+    """The content of ``info_semantic.json``."""
+    labels = replica_label_set()
+    class_of_id = {one.id: one.class_id for one in objects}
+    return {
+        "classes": [{"id": i, "name": name} for i, name in zip(labels.ids, labels.names, strict=True)],
+        "gravity_center": [0.0, 0.0, 0.0],
+        "gravity_dir": [0.0, 0.0, -1.0],
+        "id_to_label": [class_of_id.get(one, -1) for one in range(max(class_of_id, default=-1) + 1)],
+        "objects": [
+            {
+                "class_id": one.class_id,
+                "class_name": one.class_name,
+                "id": one.id,
+                "oriented_bbox": _oriented_box(np.array(one.box_min, np.float64), np.array(one.box_max, np.float64)),
+            }
+            for one in objects
+        ],
+    }
+
+
+def _oriented_box(low: Float64Array, high: Float64Array) -> dict[str, Any]:
+    return {
+        "abb": {"center": ((low + high) / 2).tolist(), "sizes": (high - low).tolist()},
+        "orientation": {"rotation": [0.0, 0.0, 0.0, 1.0], "translation": [0.0, 0.0, 0.0]},
+    }

@@ -1,0 +1,253 @@
+"""Any folder of colour, depth and pose files, described by one ``rgbd.toml`` (see ``rgbd_description.py``).
+
+A scene is ``rgbd/<scene>/rgbd.toml`` below the data root, or a TOML file or a folder with ``rgbd.toml`` that the option
+``files`` names. Frames that lack an image or a pose are said once and left out. There is no ground truth.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, field_validator
+
+from su3d_bench.datasets.recordings.pose_convention import ROTATED, judge_convention
+from su3d_bench.datasets.recordings.recorded_frames import N_DEPTH_VALUES, Folder, RecordedFrame, RecordedFrames, Recording, left_out, pinhole
+from su3d_bench.datasets.replica.mesh_truth import read_surface
+from su3d_bench.datasets.rgbd.description import FILE_NAME, INDEX, RgbdDescription, read_description
+from su3d_bench.datasets.rgbd.files import Pose, camera_to_world, files_of, read_intrinsics, read_pose_file, read_trajectory_file
+from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
+from su3d_bench.core.types import Float32Array, Float64Array, Frame, GroundTruth, InstanceMesh, SceneInfo, Surface
+
+logger = logging.getLogger(__name__)
+OTHER = {"camera_to_world": "world_to_camera", "world_to_camera": "camera_to_world"}
+OTHER |= {"opencv": "opengl", "opengl": "opencv"}
+READER_VERSION = 1  # raise it whenever the same files come out as other frames
+
+
+class RgbdOptions(BaseModel):
+    """``files``: descriptions outside the data root, each a TOML file or a folder that holds ``rgbd.toml``."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    files: tuple[Path, ...] = ()
+
+    @field_validator("files", mode="before")
+    @classmethod
+    def _one_is_a_list_of_one(cls, value: Any) -> Any:
+        return [value] if isinstance(value, str) else value
+
+
+class Rgbd:
+    """Any folder of colour, depth and pose files that an rgbd.toml describes; unscored, without ground truth."""
+
+    name = "rgbd"
+    label_space = "none"
+    variants: tuple[str, ...] = ()
+    Options = RgbdOptions
+
+    def __init__(self, root: Path, options: RgbdOptions | None = None) -> None:
+        self.root = root
+        self.options = options or RgbdOptions()
+        self._last: tuple[str, RgbdDescription, Recording] | None = None
+        self._checked: set[str] = set()
+
+    def scenes(self) -> Sequence[str]:
+        """The scenes of the option ``files`` in its order, then those below the data root."""
+        found = tuple(self._descriptions())
+        if not found:
+            raise DataError(
+                f"rgbd: no scene in {self.root / 'rgbd'} (a scene is a folder with {FILE_NAME}); describe a folder of "
+                "images in such a file there, or name the file: --set rgbd.files=path/to/rgbd.toml"
+            )
+        return found
+
+    def places(self) -> Sequence[Path]:
+        """What is searched for descriptions."""
+        return [*self.options.files, self.root / "rgbd"]
+
+    def info(self, scene: str, stride: int) -> SceneInfo:
+        return SceneInfo(self.name, scene, len(RecordedFrames(self._recording(scene), stride)), stride, "camera")
+
+    def frames(self, scene: str, stride: int) -> Sequence[Frame]:
+        """The frames, once their depth images and poses were seen to agree, unless the description forgoes that."""
+        description, recording = self._open(scene)
+        if description.check_convention and scene not in self._checked:
+            place = f"{recording.where}: {self._description(scene).name}"
+            _check_convention(RecordedFrames(recording), description, place)
+            self._checked.add(scene)
+        return RecordedFrames(recording, stride)
+
+    def files(self, scene: str) -> Sequence[Path]:
+        recording = self._recording(scene)
+        return (*recording.files, *recording.images())
+
+    def digest(self, scene: str) -> str:
+        return self._recording(scene).digest((self.name, READER_VERSION, scene))
+
+    def problems(self, scene: str) -> Iterator[str]:
+        """Frames that lack an image or a usable pose, one line each; the others go on without them."""
+        yield from self._recording(scene).missing
+
+    def ground_truth(self, scene: str, variant: str) -> GroundTruth:
+        raise GroundTruthMissing(f"rgbd/{scene}: no ground truth '{variant}'; folders of images have none")
+
+    def instance_mesh(self, scene: str) -> InstanceMesh:
+        raise GroundTruthMissing(f"rgbd/{scene}: no annotated mesh; folders of images have none")
+
+    def surface(self, scene: str) -> Surface:
+        """The mesh that the description names."""
+        description, recording = self._open(scene)
+        place = f"{recording.where}: {self._description(scene).name}"
+        if description.mesh is None:
+            raise DataError(f'{place} names no mesh; add one in the world of the poses: mesh = "mesh.ply"')
+        return read_surface(recording.folder.file(description.mesh, place), f"{recording.where}: {description.mesh}")
+
+    def _descriptions(self) -> dict[str, Path]:
+        """Scene -> description; a file is called by its own name, or by its folder's where it is an ``rgbd.toml``."""
+        place = self.root / "rgbd"
+        below = [folder / FILE_NAME for folder in (sorted(place.iterdir()) if place.is_dir() else ())]
+        named = [path / FILE_NAME if path.is_dir() else path for path in self.options.files]
+        found: dict[str, Path] = {}
+        for path in (*named, *(path for path in below if path.is_file())):
+            name = path.resolve().parent.name if path.name == FILE_NAME else path.stem
+            if name in found and found[name] != path:
+                raise DataError(f"rgbd: scene '{name}' is described twice, in {found[name]} and {path}; rename one")
+            found[name] = path
+        return found
+
+    def _description(self, scene: str) -> Path:
+        found = self._descriptions()
+        if scene not in found:
+            known = self.scenes()
+            raise DataError(f"rgbd: no scene '{scene}'{suggest(scene, known) or '; known: ' + ', '.join(known[:8])}")
+        return found[scene]
+
+    def _recording(self, scene: str) -> Recording:
+        return self._open(scene)[1]
+
+    def _open(self, scene: str) -> tuple[RgbdDescription, Recording]:
+        if self._last is None or self._last[0] != scene:
+            path, where = self._description(scene), f"{self.name}/{scene}"
+            description = read_description(path, where)
+            self._last = scene, description, open_recording(path, description, where)
+        return self._last[1:]
+
+
+def open_recording(path: Path, description: RgbdDescription, where: str) -> Recording:
+    """The usable frames of what the TOML file ``path`` describes; what is missing is said once, as a warning."""
+    place = f"{where}: {path.name}"
+    folder = _folder(path, description, place)
+    colours, depths = (files_of(folder, name, place) for name in (description.colour, description.depth))
+    poses = _poses(folder, description, sorted(colours.keys() | depths.keys()), where, place)
+    if INDEX not in description.colour and not len(colours) == len(depths) == len(poses.of_number):
+        raise DataError(
+            f"{place}: {len(colours)} colour files, {len(depths)} depth files and {len(poses.of_number)} poses match; "
+            f"files pair up in order only where there are as many of each, otherwise by {INDEX}"
+        )
+    frames, missing = [], []
+    for number in sorted(colours.keys() | depths.keys() | poses.of_number.keys()):
+        colour, depth, pose = colours.get(number), depths.get(number), poses.of_number.get(number)
+        if colour is None or depth is None or pose is None:
+            parts = zip(("colour", "depth", "pose"), (colour, depth, pose), strict=True)
+            missing.append(f"frame {number}, no {' and no '.join(name for name, part in parts if part is None)}")
+        else:
+            time_s = poses.times_s.get(number, number / description.frames_per_second)
+            frames.append(RecordedFrame(number, time_s, colour, depth, pose))
+    if not frames:
+        raise DataError(f"{place}: no frame has colour, depth and a pose (the first: {missing[0]})")
+    if missing:
+        logger.warning("%s", left_out(where, missing, "frames lack an image or a usable pose", len(frames)))
+    intrinsics, size, camera_files = _intrinsics(folder, description, where, place)
+    mesh = () if description.mesh is None else (folder.file(description.mesh, place),)
+    files = (path, *camera_files, *poses.files, *mesh)
+    lines = tuple(f"{where}: {line}" for line in missing)
+    return Recording(where, folder, tuple(frames), intrinsics, depth_table(description), files, size, lines)
+
+
+def _folder(path: Path, description: RgbdDescription, place: str) -> Folder:
+    try:
+        if (path.parent / description.folder).is_dir():
+            return Folder(path.parent / description.folder)
+    except OSError:  # a name too long for the file system
+        pass
+    raise DataError(f"{place}: folder = {description.folder[:80]!r}: there is no such folder beside {path.name}")
+
+
+@dataclass(frozen=True)
+class _Poses:
+    """Poses and, where they have them, times in seconds by the number of the frame, and the files they came from."""
+
+    of_number: dict[int, Pose]
+    times_s: dict[int, float]
+    files: tuple[Path, ...]
+
+
+def _poses(folder: Folder, description: RgbdDescription, images: list[int], where: str, place: str) -> _Poses:
+    if description.pose is not None:
+        found = {}
+        names = files_of(folder, description.pose, place)
+        for number, name in names.items():
+            values = read_pose_file(folder.path / name, f"{where}: {name}")
+            found[number] = camera_to_world(values, description, f"{where}: {name}")
+        return _Poses(found, {}, tuple(folder.path / name for name in names.values()))
+    assert description.trajectory is not None
+    path, where = folder.file(description.trajectory, place), f"{where}: {description.trajectory}"
+    matrices, times_s = read_trajectory_file(path, description.trajectory_format, where)
+    numbers = images if len(matrices) == len(images) else range(images[0], images[-1] + 1)
+    if len(matrices) != len(numbers):
+        raise DataError(
+            f"{where} has {len(matrices)} poses; expected {len(images)}, one an image"
+            + (
+                f", or {len(numbers)}, one a number from {images[0]} to {images[-1]}"
+                if len(numbers) > len(images)
+                else ""
+            )
+        )
+    rows = zip(numbers, matrices, strict=True)
+    found = {n: camera_to_world(values, description, f"{where}, pose {k}") for k, (n, values) in enumerate(rows)}
+    return _Poses(found, dict(zip(numbers, times_s or (), strict=False)), (path,))
+
+
+def _intrinsics(
+    folder: Folder, description: RgbdDescription, where: str, place: str
+) -> tuple[Float64Array, tuple[int, int] | None, tuple[Path, ...]]:
+    """Intrinsics, the image size where a file says it, and that file."""
+    if description.intrinsics is not None:
+        return pinhole(*description.intrinsics, where=place), None, ()
+    assert description.intrinsics_file is not None
+    path = folder.file(description.intrinsics_file, place)
+    return *read_intrinsics(path, f"{where}: {description.intrinsics_file}"), (path,)
+
+
+@lru_cache(maxsize=8)
+def depth_table(description: RgbdDescription) -> Float32Array:
+    """Metres (65536,) of every value that a depth image can hold, 0 where it means that there is no depth."""
+    stored = np.arange(N_DEPTH_VALUES, dtype=np.uint32)
+    bits = description.depth_rotated_bits
+    values = ((stored >> bits) | (stored << (16 - bits))) & 0xFFFF
+    depth_m = (values * description.depth_unit_m).astype(np.float32)
+    depth_m[np.isin(values, description.depth_invalid)] = 0
+    depth_m.setflags(write=False)
+    return depth_m
+
+
+def _check_convention(frames: Sequence[Frame], description: RgbdDescription, place: str) -> None:
+    """Raise ``DataError`` where another reading of the poses agrees clearly better with the depth images."""
+    finding = judge_convention(frames)
+    if finding is None:
+        return
+    changes = [f'{key} = "{OTHER[getattr(description, key)]}"' for key in finding.changes(description.camera_axes)]
+    if finding.depth_factor == ROTATED and description.depth_rotated_bits == 0:
+        changes.append("depth_rotated_bits = 3")
+    elif finding.depth_factor != 1:
+        changes.append(f"depth_unit_m = {description.depth_unit_m * finding.depth_factor:g}")
+    raise DataError(
+        f"{place}: {finding.shares} with {' and '.join(changes)}; set that, or check_convention = false to read the "
+        "files as they are described"
+    )

@@ -1,0 +1,171 @@
+"""The files that ``rgbd.toml`` names: which belong together, and the poses and intrinsics in them."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Sequence
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.datasets.recordings.recorded_frames import Folder, numbers, pinhole, read_text
+from su3d_bench.datasets.rgbd.description import INDEX, RgbdDescription
+from su3d_bench.datasets.tum.timed_poses import quaternion_poses, rows_of, seconds, unit_quaternion
+from su3d_bench.core.errors import DataError
+from su3d_bench.numerics.geometry import are_rigid
+from su3d_bench.core.types import Float64Array
+
+MAX_NUMBER = 2**31 - 1  # maps keep the numbers of frames in 32 bits; time stamps in names do not fit
+MAX_DISTANCE_M = 1e6  # of a camera from the origin
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+Pose = Float64Array | None  # None: tracking was lost, the matrix holds numbers that are not finite
+
+
+def files_of(folder: Folder, pattern: str, where: str) -> dict[int, str]:
+    """Number -> name below the folder, ascending: that at ``{index}``, or the place in numeric order."""
+    directory, _, name_pattern = pattern.rpartition("/")
+    if any(character in directory for character in "*?{}"):
+        raise DataError(f"{where}: {pattern!r}: the folder of a pattern is fixed; *, ? and {INDEX} stand in file names")
+    parent = folder.file(directory, where) if directory else folder.path
+    try:
+        names = [child.name for child in parent.iterdir()]
+    except OSError as error:
+        raise DataError(f"{where}: {pattern[:80]!r}: {parent.name}/ cannot be read: {error.strerror}") from error
+    prefix = f"{directory}/" if directory else ""
+    if INDEX in name_pattern:
+        found = _numbered(names, name_pattern, where)
+    else:
+        matching = sorted((name for name in names if fnmatchcase(name, name_pattern)), key=_numeric_order)
+        found = dict(enumerate(matching))
+    if not found:
+        raise DataError(f"{where}: no file matches {pattern[:80]!r}")
+    return {number: _checked(folder, prefix + found[number], where) for number in sorted(found)}
+
+
+def _checked(folder: Folder, name: str, where: str) -> str:
+    folder.file(name, where)
+    return name
+
+
+def _numbered(names: Sequence[str], pattern: str, where: str) -> dict[int, str]:
+    before, _, behind = pattern.partition(INDEX)
+    form = re.compile(re.escape(before) + r"(\d{1,18})" + re.escape(behind), re.ASCII)
+    found: dict[int, str] = {}
+    for name in sorted(names):
+        if match := form.fullmatch(name):
+            number = int(match[1])
+            if number > MAX_NUMBER:
+                raise DataError(
+                    f"{where}: {name[:60]}: the number is above {MAX_NUMBER}; name the files with * instead"
+                )
+            if number in found:
+                raise DataError(
+                    f"{where}: {found[number][:60]} and {name[:60]} have one number; expected one file each"
+                )
+            found[number] = name
+    return found
+
+
+def _numeric_order(name: str) -> tuple[list[int], str]:
+    return [int(digits) for digits in re.findall(r"[0-9]{1,18}", name)], name
+
+
+def read_pose_file(path: Path, where: str) -> list[float]:
+    """The 16 numbers of a 4x4 matrix, row by row."""
+    words = read_text(path, where).split()
+    if len(words) != 16:
+        raise DataError(f"{where} has {len(words)} values; expected 16, a 4x4 matrix")
+    return numbers(words, where)
+
+
+def read_trajectory_file(path: Path, form: str, where: str) -> tuple[list[list[float]], list[float] | None]:
+    """The 16 numbers of each pose, row by row, and the times in seconds where the file has them."""
+    if form == "open3d":
+        return _open3d_log(read_text(path, where).split("\n"), where), None
+    if form == "kitti":
+        rows = rows_of(path, where, 12, "12 numbers, the upper rows of a 4x4 matrix")
+        return [[*numbers(words, f"{where} line {n}"), 0.0, 0.0, 0.0, 1.0] for n, words in rows], None
+    matrices, times_s = [], []
+    for n, words in rows_of(path, where, 8, "'time tx ty tz qx qy qz qw'"):
+        values = numbers(words[1:], f"{where} line {n}")
+        times_s.append(seconds(words[0], f"{where} line {n}"))
+        quaternion = unit_quaternion(values[3:], f"{where} line {n}")
+        matrices.append(quaternion_poses(np.array([values[:3]]), np.array([quaternion]))[0].reshape(-1).tolist())
+    return matrices, times_s
+
+
+def _open3d_log(lines: list[str], where: str) -> list[list[float]]:
+    """Blocks of a line of three integers and four lines of a matrix, as Open3D writes ``.log`` files."""
+    while lines and not lines[-1].strip():
+        lines.pop()
+    if not lines or len(lines) % 5:
+        raise DataError(f"{where} has {len(lines)} lines; expected blocks of five, three integers and a 4x4 matrix")
+    matrices = []
+    for start in range(0, len(lines), 5):
+        if not re.fullmatch(r"\s*-?[0-9]{1,18}(\s+-?[0-9]{1,18}){2}\s*", lines[start]):
+            raise DataError(f"{where} line {start + 1}: {lines[start][:40]!r}; expected three integers")
+        matrix: list[float] = []
+        for line in range(start + 1, start + 5):
+            row = numbers(lines[line].split(), f"{where} line {line + 1}")
+            if len(row) != 4:
+                raise DataError(f"{where} line {line + 1} has {len(row)} values; expected 4, a row of a 4x4 matrix")
+            matrix += row
+        matrices.append(matrix)
+    return matrices
+
+
+def camera_to_world(values: Sequence[float], description: RgbdDescription, where: str) -> Pose:
+    """The pose with OpenCV axes out of 16 numbers as the description says they are meant."""
+    matrix = np.array(values).reshape(4, 4)
+    if not np.isfinite(matrix).all():
+        return None
+    if np.abs(matrix[:3, 3]).max() > MAX_DISTANCE_M or not are_rigid(matrix[None])[0]:
+        raise DataError(f"{where}: not a rigid motion in metres; expected a rotation, a translation and 0 0 0 1")
+    if description.pose_direction == "world_to_camera":
+        matrix = np.linalg.inv(matrix)
+    return matrix @ OPENGL_TO_OPENCV if description.camera_axes == "opengl" else matrix
+
+
+def read_intrinsics(path: Path, where: str) -> tuple[Float64Array, tuple[int, int] | None]:
+    """Intrinsics (3, 3), and the image size where the file says it: Open3D's JSON does, a matrix in a text does not."""
+    text = read_text(path, where)
+    if path.suffix == ".json":
+        return _open3d_camera(text, where)
+    values = numbers(text.split(), where)
+    if len(values) not in (9, 16):
+        raise DataError(f"{where} has {len(values)} values; expected a 3x3 matrix, or a 4x4 one")
+    side = 3 if len(values) == 9 else 4
+    return _pinhole_matrix(np.array(values).reshape(side, side)[:3, :3], where), None
+
+
+def _open3d_camera(text: str, where: str) -> tuple[Float64Array, tuple[int, int]]:
+    try:
+        content = json.loads(text)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{where}: not JSON; copy the file again") from error
+    if isinstance(content, dict) and isinstance(content.get("intrinsic"), dict):
+        content = content["intrinsic"]  # of Open3D's PinholeCameraParameters
+    values = content.get("intrinsic_matrix") if isinstance(content, dict) else None
+    if not (isinstance(values, list) and len(values) == 9 and all(map(_is_number, values))):
+        raise DataError(
+            f"{where}: 'intrinsic_matrix' is not a list of 9 numbers, column by column, as Open3D writes it"
+        )
+    size = content.get("width"), content.get("height")
+    if not all(isinstance(side, int) and not isinstance(side, bool) and 0 < side < 100_000 for side in size):
+        raise DataError(f"{where}: width and height are {str(size)[:60]}; expected whole pixels")
+    return _pinhole_matrix(np.array(values, np.float64).reshape(3, 3).T, where), size
+
+
+def _is_number(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < MAX_DISTANCE_M
+
+
+def _pinhole_matrix(matrix: Float64Array, where: str) -> Float64Array:
+    """The matrix, if it is one of a pinhole camera without skew."""
+    (fx, skew, cx), (below, fy, cy) = matrix[:2]
+    if max(abs(skew), abs(below)) > 1e-6 * max(abs(fx), 1) or not np.array_equal(matrix[2], (0, 0, 1)):
+        raise DataError(f"{where}: not a pinhole camera; expected fx 0 cx, 0 fy cy, 0 0 1")
+    return pinhole(float(fx), float(fy), float(cx), float(cy), where)

@@ -1,0 +1,289 @@
+"""Built-in procedural indoor scenes: made on demand from a name, rendered by ray casting, fully known."""
+
+from __future__ import annotations
+
+import hashlib
+import re
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from su3d_bench.datasets.rooms.classes import CLASSES
+from su3d_bench.datasets.rooms.rendering.rooms_noise import LEVELS, add_noise
+from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
+from su3d_bench.core.types import Float64Array, Frame, GroundTruth, ImageDomain, InstanceMesh, Int32Array, LabelSet, SceneInfo, Surface
+
+if TYPE_CHECKING:  # what makes a room is imported where one is made: a list of scenes needs none of it
+    from su3d_bench.datasets.rooms.plan import Plan
+    from su3d_bench.datasets.rooms.rendering.mesh import Patches, RoomMesh
+    from su3d_bench.datasets.rooms.rendering.render import RenderedFrame, Renderer
+    from su3d_bench.datasets.rooms.scan import RoomScan
+    from su3d_bench.datasets.rooms.truth import Query, RoomObject, RoomTruth
+
+GENERATOR_VERSION = 3  # raise it whenever a scene of the same name comes out different
+DEFAULT_SCENES = ("living0", "bedroom0", "kitchen0", "office0", "bathroom0", "studio0", "living1", "office1")
+KIND_NAMES = ("living", "bedroom", "kitchen", "office", "bathroom", "studio")  # the keys of rooms_kinds.KINDS
+TRAINING_FROM = 10_000  # numbers from here on are kept for training the embedded encoder; no benchmark uses them
+FRAMES_PER_SECOND = 30.0
+N_STRUCTURE = 6  # floor, ceiling and four walls have the ids 1..6
+ROOMS_IN_MEMORY = 2
+LABELS = LabelSet("replica", tuple(c.id for c in CLASSES), tuple(c.name for c in CLASSES))
+
+
+class RoomOptions(BaseModel):
+    """Image size, length of the walk, sensor noise (0 none, 1 mild, 2 strong), density of the scan."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    width: int = Field(default=640, ge=16, le=4096)
+    height: int = Field(default=480, ge=16, le=4096)
+    n_frames: int = Field(default=1600, ge=1, le=100_000)
+    noise: int = Field(default=0, ge=0, lt=len(LEVELS))
+    mesh_spacing_m: float = Field(default=0.015, ge=0.004, le=0.2)
+    seed_offset: int = Field(default=0, ge=0)
+
+
+def scene_name_parts(scene: str) -> tuple[str, int]:
+    """Kind and number of a scene name; raises ``DataError`` for what is no scene."""
+    match = re.fullmatch(r"([a-z]+)(0|[1-9]\d{0,5})", scene)
+    if match is None or match[1] not in KIND_NAMES:
+        hint = suggest(scene, DEFAULT_SCENES) or f"; kinds: {', '.join(KIND_NAMES)}"
+        raise DataError(f"rooms: no scene '{scene}'; a scene is a kind and a number such as office3{hint}")
+    return match[1], int(match[2])
+
+
+def _generator(*words: object) -> np.random.Generator:
+    """A random stream that the words fix, on every machine."""
+    digest = hashlib.sha256("/".join(str(word) for word in words).encode()).digest()
+    return np.random.default_rng(int.from_bytes(digest[:8], "little"))
+
+
+@dataclass
+class BuiltRoom:
+    """A furnished room; what is costly is made when first asked for, and kept in ``folder`` if there is one."""
+
+    scene: str
+    options: RoomOptions
+    folder: Path | None
+
+    @cached_property
+    def plan(self) -> Plan:
+        from su3d_bench.datasets.rooms.recipes import furnish
+
+        return furnish(scene_name_parts(self.scene)[0], _generator("room", self.scene, self.options.seed_offset))
+
+    @cached_property
+    def truth(self) -> RoomTruth:
+        from su3d_bench.datasets.rooms.truth import truth_of
+
+        return truth_of(self.scene, scene_name_parts(self.scene)[0], self.plan)
+
+    @cached_property
+    def patches(self) -> Patches:
+        from su3d_bench.datasets.rooms.rendering.mesh import gather_patches
+
+        return gather_patches(self.plan.placed)
+
+    @cached_property
+    def mesh(self) -> RoomMesh:
+        from su3d_bench.datasets.rooms.kept import kept_mesh
+
+        return kept_mesh(self._kept_in("mesh"), self._bake)
+
+    def _bake(self) -> RoomMesh:
+        from su3d_bench.datasets.rooms.rendering.mesh import build_mesh
+
+        exposure = float(_generator("exposure", self.scene, self.options.seed_offset).uniform(0.58, 0.72))
+        return build_mesh(self.patches, self.plan.lights, exposure)
+
+    @cached_property
+    def renderer(self) -> Renderer:
+        from su3d_bench.datasets.rooms.rendering.render import Renderer
+
+        return Renderer(self.mesh, self.options.width, self.options.height)
+
+    @cached_property
+    def trajectory(self) -> Float64Array:
+        from su3d_bench.datasets.rooms.kept import kept_walk
+
+        return kept_walk(self._kept_in("walk"), self.options.n_frames, self._walk)
+
+    def _kept_in(self, what: str) -> Path | None:
+        return None if self.folder is None else self.folder / f"{self.scene}.{what}.npz"
+
+    def _walk(self) -> Float64Array:
+        from su3d_bench.datasets.rooms.walk import walk
+
+        plan = self.plan
+        size = plan.width, plan.depth, plan.height
+        rng = _generator("walk", self.scene, self.options.seed_offset)
+        return walk(self.mesh, list(plan.boxes.values()), size, N_STRUCTURE, self.options.n_frames, rng)
+
+
+class Rooms:
+    """Furnished rooms, made from their names; ``root`` holds what is kept of them."""
+
+    name = "rooms"
+    label_space = "replica"
+    renders_frames = True
+    variants: tuple[str, ...] = ("mesh-vertices", "face-corners")
+    image_domain: ImageDomain = "rendered-rooms"
+    Options = RoomOptions
+
+    def __init__(self, root: Path, options: RoomOptions | None = None) -> None:
+        self.root = root
+        self.options = options or RoomOptions()
+        self._rooms: OrderedDict[str, BuiltRoom] = OrderedDict()
+
+    @property
+    def intrinsics(self) -> Float64Array:
+        from su3d_bench.datasets.rooms.rendering.render import camera_intrinsics
+
+        return camera_intrinsics(self.options.width, self.options.height)
+
+    def scenes(self) -> Sequence[str]:
+        return DEFAULT_SCENES
+
+    def files(self, scene: str) -> Sequence[Path]:
+        scene_name_parts(scene)
+        return ()
+
+    def digest(self, scene: str) -> str:
+        scene_name_parts(scene)
+        words = f"rooms/{GENERATOR_VERSION}/{scene}/{self.options.model_dump_json()}"
+        return hashlib.sha256(words.encode()).hexdigest()
+
+    def info(self, scene: str, stride: int) -> SceneInfo:
+        scene_name_parts(scene)
+        n_frames = len(range(0, self.options.n_frames, stride))
+        return SceneInfo(self.name, scene, n_frames, stride, self.image_domain)
+
+    def truth(self, scene: str) -> RoomTruth:
+        return self._room(scene).truth
+
+    def objects(self, scene: str) -> tuple[RoomObject, ...]:
+        return self._room(scene).truth.objects
+
+    def queries(self, scene: str) -> tuple[Query, ...]:
+        """Texts of four kinds with all right answers, on what the walk sees."""
+        from su3d_bench.datasets.rooms.truth import queries
+
+        return queries(self.truth(scene), self.visible_vertices(scene))
+
+    def trajectory(self, scene: str) -> Float64Array:
+        """Camera-to-world poses (n_frames, 4, 4), OpenCV axes, z up, metres."""
+        return self._room(scene).trajectory
+
+    def render(self, scene: str, view: int | Float64Array) -> RenderedFrame:
+        """The noise-free images at a frame of the walk or at any camera-to-world pose."""
+        room = self._room(scene)
+        pose = room.trajectory[view] if isinstance(view, int | np.integer) else np.asarray(view, np.float64)
+        return room.renderer.render(pose)
+
+    def frames(self, scene: str, stride: int) -> Sequence[Frame]:
+        """Every ``stride``-th frame, rendered when asked for."""
+        scene_name_parts(scene)
+        return RoomFrames(self, scene, range(0, self.options.n_frames, stride))
+
+    def frame(self, scene: str, index: int) -> Frame:
+        room = self._room(scene)
+        pose = room.trajectory[index]
+        image = room.renderer.render(pose)
+        rng = _generator("noise", scene, self.options.seed_offset, index)
+        rgb, depth_m = add_noise(image.rgb, image.depth_m, self.options.noise, rng)
+        return Frame(index, index / FRAMES_PER_SECOND, rgb, depth_m, pose, self.intrinsics)
+
+    def scan(self, scene: str) -> RoomScan:
+        """The ground-truth surface; made once, then read from the cache."""
+        from su3d_bench.datasets.rooms.scan import read_scan, scan_room, write_scan
+
+        path = self.root / "rooms" / self._scan_key(scene) / f"{scene}.npz"
+        found = read_scan(path)
+        if found is None:
+            room = self._room(scene)
+            found = scan_room(room.patches, room.mesh, room.trajectory, self.options.mesh_spacing_m)
+            write_scan(path, found)
+        return found
+
+    def _scan_key(self, scene: str) -> str:
+        """What a scan depends on: not the size of the images nor their noise."""
+        from su3d_bench.core.digests import package_digest
+
+        scene_name_parts(scene)
+        options = self.options
+        words = package_digest("datasets"), options.n_frames, options.mesh_spacing_m, options.seed_offset
+        return hashlib.sha256("/".join(str(word) for word in words).encode()).hexdigest()[:16]
+
+    def _baked_folder(self, scene: str) -> Path | None:
+        """Where mesh and walk are kept; None for the thousands of training, and where no data root was made yet."""
+        from su3d_bench.core.digests import NUMERIC_PACKAGES, digest_json, package_digest, package_versions
+
+        _, number = scene_name_parts(scene)
+        if number >= TRAINING_FROM or not self.root.is_dir():
+            return None
+        packages = package_versions(NUMERIC_PACKAGES)  # another Open3D may bake another last bit
+        words = package_digest("datasets"), self.options.n_frames, self.options.seed_offset, sorted(packages.items())
+        return self.root / "rooms" / digest_json(words)[:16]
+
+    def visible_vertices(self, scene: str) -> dict[int, int]:
+        """Scan vertices of each object id; objects that the walk never sees have none."""
+        counts = np.bincount(self.scan(scene).object_of_vertex(), minlength=len(self.objects(scene)) + 1)
+        return {object_id: int(n) for object_id, n in enumerate(counts) if object_id}
+
+    def ground_truth(self, scene: str, variant: str) -> GroundTruth:
+        """Labelled scan vertices (``mesh-vertices``) or the corners of every face in face order (``face-corners``)."""
+        if variant not in self.variants:
+            raise GroundTruthMissing(
+                f"rooms/{scene}: no ground truth '{variant}'; there is {' and '.join(self.variants)}"
+            )
+        scan = self.scan(scene)
+        if variant == "mesh-vertices":
+            points, owner = scan.vertices, scan.object_of_vertex()
+        else:
+            points, owner = scan.vertices[scan.faces.reshape(-1)], np.repeat(scan.object_id, 4)
+        source = f"rooms generator {GENERATOR_VERSION}: surface seen on the walk, {variant}"
+        return GroundTruth(points, self._class_of_object(scene)[owner], owner, LABELS, variant, source)
+
+    def _class_of_object(self, scene: str) -> Int32Array:
+        return np.array([0, *[one.class_id for one in self.objects(scene)]], np.int32)
+
+    def instance_mesh(self, scene: str) -> InstanceMesh:
+        """The rendered mesh itself, whole: hidden sides included."""
+        mesh = self._room(scene).mesh
+        classes = {one.id: one.class_id for one in self.objects(scene)}
+        return InstanceMesh(mesh.vertices, mesh.triangles, mesh.instance_of_triangle, classes, LABELS)
+
+    def surface(self, scene: str) -> Surface:
+        """The scan without labels, each quad (0, 1, 2, 3) as the triangles (0, 1, 2) and (0, 2, 3).
+
+        Its vertices are those of ``mesh-vertices``, in their order. No edge leads from one object to another.
+        """
+        scan = self.scan(scene)
+        return Surface(scan.vertices, scan.faces[:, [0, 1, 2, 0, 2, 3]].reshape(-1, 3))
+
+    def _room(self, scene: str) -> BuiltRoom:
+        if scene not in self._rooms:
+            self._rooms[scene] = BuiltRoom(scene, self.options, self._baked_folder(scene))
+            while len(self._rooms) > ROOMS_IN_MEMORY:
+                self._rooms.popitem(last=False)
+        self._rooms.move_to_end(scene)
+        return self._rooms[scene]
+
+
+class RoomFrames(Sequence[Frame]):
+    """Frames of one room, each rendered when it is asked for."""
+
+    def __init__(self, rooms: Rooms, scene: str, indices: range) -> None:
+        self._rooms, self._scene, self._indices = rooms, scene, indices
+
+    def __len__(self) -> int:
+        return len(self._indices)
+
+    def __getitem__(self, position: int) -> Frame:  # type: ignore[override]
+        return self._rooms.frame(self._scene, self._indices[position])

@@ -1,0 +1,339 @@
+"""Where things stand: a room's plan that refuses collisions, and ways to place an item in it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from su3d_bench.datasets.rooms.objects.catalog import make
+from su3d_bench.datasets.rooms.objects.items import Item, Part, Spot
+from su3d_bench.datasets.rooms.objects.materials import Material, Texture, mix, shade, tone
+from su3d_bench.datasets.rooms.rendering.mesh import Light, Placed
+from su3d_bench.datasets.rooms.objects.shapes import Shape, rotation
+from su3d_bench.core.types import Float64Array
+
+GAP_M = 0.002  # between touching faces, so that neither flickers through the other
+WALL_YAW = (0.0, -90.0, 180.0, 90.0)  # of an item with its back to the wall at y = depth, x = width, y = 0, x = 0
+FLAT = frozenset(("rug", "mat"))
+
+
+@dataclass(frozen=True)
+class Box:
+    low: Float64Array
+    high: Float64Array
+
+    def meets(self, other: Box, gap: float = 0.0) -> bool:
+        """Overlap, with ``gap`` metres of horizontal air around."""
+        pad = np.array([gap, gap, 0.0])
+        return bool(((self.low - pad < other.high) & (other.low < self.high + pad)).all())
+
+
+def box_of(placed: Placed) -> Box:
+    corners = np.concatenate([part.shape.quads.reshape(-1, 3) for part in placed.item.parts])
+    world = placed.to_world(corners)
+    return Box(world.min(axis=0), world.max(axis=0))
+
+
+class Plan:
+    """A room being furnished; every method that places answers ``None`` where there is no room."""
+
+    def __init__(self, rng: np.random.Generator, width: float, depth: float, height: float) -> None:
+        self.rng = rng
+        self.width, self.depth, self.height = width, depth, height
+        self.placed: list[Placed] = []
+        self.boxes: dict[int, Box] = {}
+        self.parent: dict[int, tuple[int, str]] = {}  # what holds an item, and how: on, in
+        self.rests_also_on: list[tuple[int, int]] = []  # where one slab lies on several
+        self.mount: dict[int, str] = {}
+        self.keep_free: list[Box] = []
+        self.lights: list[Light] = []
+        self._used: dict[str, set[str]] = {}
+
+    def new(self, class_name: str, model: str | None = None, colour: str | None = None) -> Item:
+        """An item in a colour that its class does not have in this room yet, as far as there are such."""
+        used = self._used.setdefault(class_name, set())
+        item = make(class_name, self.rng, model, colour, frozenset(used))
+        used.add(item.colour)
+        return item
+
+    def wall_length(self, wall: int) -> float:
+        return self.width if wall % 2 == 0 else self.depth
+
+    def wall_point(self, wall: int, along: float, off: float) -> tuple[float, float]:
+        points = ((along, self.depth - off), (self.width - off, along), (along, off), (off, along))
+        return points[wall]
+
+    def add(self, item: Item, x: float, y: float, z: float, yaw: float, mount: str) -> Placed:
+        placed = Placed(len(self.placed) + 1, item, yaw, np.array([x, y, z]))
+        self.placed.append(placed)
+        self.mount[placed.id] = mount
+        if mount != "room":
+            self.boxes[placed.id] = box_of(placed)
+        return placed
+
+    def try_at(
+        self, item: Item, x: float, y: float, yaw: float, z: float | None = None, gap: float = 0.0,
+        mount: str = "floor", ignore: Sequence[int] = (),
+    ) -> Placed | None:  # fmt: skip
+        """Places the item where it fits; ``z`` None stands it on the floor or on the rug that lies there."""
+        candidate = Placed(0, item, yaw, np.array([x, y, 0.0 if z is None else z]))
+        room = box_of(candidate)
+        if z is None:
+            under = [b for i, b in self.boxes.items() if self._flat(i) and b.meets(room)]
+            lift = max([GAP_M, *[float(b.high[2]) + GAP_M / 2 for b in under]])
+            raised = np.array([0.0, 0.0, lift])
+            room = Box(room.low + raised, room.high + raised)
+            z = lift
+        limits = np.array([self.width, self.depth, self.height])
+        if (room.low[:2] < GAP_M / 2).any() or (room.high > limits - GAP_M / 2).any():
+            return None
+        if mount == "floor" and item.class_name not in FLAT and any(room.meets(free) for free in self.keep_free):
+            return None
+        flat_itself = item.class_name in FLAT
+        for other, taken in self.boxes.items():
+            if other in ignore or (self._flat(other) and not flat_itself):
+                continue
+            if room.meets(taken, gap):
+                return None
+        return self.add(item, x, y, z, yaw, mount)
+
+    def _flat(self, placed_id: int) -> bool:
+        return self.placed[placed_id - 1].item.class_name in FLAT
+
+    def against_wall(
+        self, item: Item, walls: Sequence[int] = (0, 1, 2, 3), gap: float = 0.05, corner: bool = False
+    ) -> Placed | None:
+        """Back to a wall, at a random place along it (or in a corner)."""
+        order = [int(w) for w in self.rng.permutation(list(walls))]
+        half = item.size[0] / 2
+        for wall in order * 14:
+            length = self.wall_length(wall)
+            if length < 2 * half + 0.02:
+                continue
+            along = float(self.rng.uniform(half + 0.01, length - half - 0.01))
+            if corner:
+                along = half + 0.02 if self.rng.random() < 0.5 else length - half - 0.02
+            x, y = self.wall_point(wall, along, item.size[1] / 2 + 0.006)
+            found = self.try_at(item, x, y, WALL_YAW[wall], None, gap)
+            if found:
+                return found
+        return None
+
+    def hang(self, item: Item, wall: int, along: float, z: float, gap: float = 0.03) -> Placed | None:
+        """Fixed to a wall with its lower edge at height ``z``."""
+        half = item.size[0] / 2
+        if not half < along < self.wall_length(wall) - half:
+            return None
+        x, y = self.wall_point(wall, along, item.size[1] / 2 + GAP_M)
+        return self.try_at(item, x, y, WALL_YAW[wall], z, gap, mount="wall")
+
+    def hang_somewhere(self, item: Item, z: float, walls: Sequence[int] = (0, 1, 2, 3)) -> Placed | None:
+        for wall in [int(w) for w in self.rng.permutation(list(walls))] * 10:
+            half = item.size[0] / 2 + 0.05
+            along = float(self.rng.uniform(half, self.wall_length(wall) - half))
+            found = self.hang(item, wall, along, z)
+            if found:
+                return found
+        return None
+
+    def wall_of(self, placed: Placed) -> tuple[int, float]:
+        """The wall behind an item, and its place along that wall."""
+        wall = WALL_YAW.index(placed.yaw)
+        return wall, float(placed.position[0] if wall % 2 == 0 else placed.position[1])
+
+    def hang_above(self, item: Item, anchor: Placed, z: float, shift: float = 0.0) -> Placed | None:
+        wall, along = self.wall_of(anchor)
+        return self.hang(item, wall, along + shift, z)
+
+    def beside(self, item: Item, anchor: Placed, gap: float = 0.06, back: bool = True) -> Placed | None:
+        """To the left or right of an item, backs aligned."""
+        for side in self.rng.permutation([-1, 1]):
+            local = np.array(
+                [
+                    side * (anchor.item.size[0] / 2 + gap + item.size[0] / 2),
+                    (anchor.item.size[1] - item.size[1]) / 2 if back else 0.0,
+                    0.0,
+                ]
+            )
+            x, y, _ = anchor.to_world(local)
+            found = self.try_at(item, float(x), float(y), anchor.yaw, None, 0.01)
+            if found:
+                return found
+        return None
+
+    def facing(self, item: Item, anchor: Placed, distance: float, shift: float = 0.0, turn: float = 180.0,
+               jitter: float = 0.0) -> Placed | None:  # fmt: skip
+        """In front of an item; ``turn`` 180 looks at it."""
+        depth = item.size[1] if turn % 180 == 0 else item.size[0]
+        local = np.array([shift, -(anchor.item.size[1] / 2 + distance + depth / 2), 0.0])
+        x, y, _ = anchor.to_world(local)
+        yaw = anchor.yaw + turn + float(self.rng.uniform(-jitter, jitter))
+        return self.try_at(item, float(x), float(y), yaw, None, 0.01)
+
+    def somewhere(self, item: Item, gap: float = 0.1, margin: float = 0.1) -> Placed | None:
+        """Anywhere on the floor, rather near a wall."""
+        reach = max(item.size[0], item.size[1]) / 2 + margin
+        for _ in range(60):
+            wall = int(self.rng.integers(0, 4))
+            along = float(self.rng.uniform(reach, max(reach + 0.01, self.wall_length(wall) - reach)))
+            x, y = self.wall_point(wall, along, reach + float(self.rng.uniform(0, 0.25)))
+            yaw = WALL_YAW[wall] + float(self.rng.uniform(-20, 20))
+            found = self.try_at(item, x, y, yaw, None, gap)
+            if found:
+                return found
+        return None
+
+    def on(
+        self, item: Item, anchor: Placed, role: str = "top", where: str = "any", turn: float = 8.0, gap: float = 0.015
+    ) -> Placed | None:
+        """On (or in) one of the anchor's spots; ``where``: any, centre, back, front, left, right."""
+        spots = [spot for spot in anchor.item.spots if spot.role == role and spot.clearance >= item.size[2]]
+        for spot in [spots[int(k)] for k in self.rng.permutation(len(spots))] if spots else []:
+            for _ in range(24):
+                yaw = float(self.rng.uniform(-turn, turn))
+                local = self._within(item, spot, where, yaw)
+                if local is None:
+                    break
+                x, y, z = anchor.to_world(np.array([*local, spot.z]))
+                found = self.try_at(item, float(x), float(y), anchor.yaw + yaw, float(z) + GAP_M, gap, "object",
+                                    ignore=self._chain(anchor.id))  # fmt: skip
+                if found:
+                    self.parent[found.id] = (anchor.id, "in" if role == "inside" else "on")
+                    return found
+        return None
+
+    def _chain(self, placed_id: int) -> list[int]:
+        chain = [placed_id]
+        while chain[-1] in self.parent:
+            chain.append(self.parent[chain[-1]][0])
+        return chain
+
+    def _within(self, item: Item, spot: Spot, where: str, yaw: float) -> tuple[float, float] | None:
+        """A place at which what the item stands on lies in the spot."""
+        (x0, y0), (x1, y1) = item.foot
+        feet = np.array([[x0, y0, 0], [x0, y1, 0], [x1, y0, 0], [x1, y1, 0]]) @ rotation("z", yaw).T
+        low = spot.x0 - feet[:, 0].min(), spot.y0 - feet[:, 1].min()
+        high = spot.x1 - feet[:, 0].max(), spot.y1 - feet[:, 1].max()
+        if low[0] > high[0] + 1e-9 or low[1] > high[1] + 1e-9:
+            return None
+        x = float(self.rng.uniform(low[0], max(low[0], high[0])))
+        y = float(self.rng.uniform(low[1], max(low[1], high[1])))
+        if where == "centre":
+            return (low[0] + high[0]) / 2, (low[1] + high[1]) / 2
+        if where in ("back", "front"):
+            return x, high[1] if where == "back" else low[1]
+        if where in ("left", "right"):
+            return low[0] if where == "left" else high[0], y
+        return x, y
+
+    def finish_lights(self) -> None:
+        """A light under each hanging lamp, or under the ceiling's middle where none hangs, and above floor lamps."""
+        hanging = [p for p in self.placed if p.item.class_name == "lamp" and self.mount[p.id] == "ceiling"]
+        for lamp in hanging:
+            x, y, z = lamp.position
+            self.lights.append(Light((float(x), float(y), float(z) - 0.14), (1.5, 1.44, 1.32), 0.22))
+        if not hanging:
+            self.lights.append(Light((self.width / 2, self.depth / 2, self.height - 0.2), (1.5, 1.46, 1.38), 0.35))
+        standing = [p for p in self.placed if p.item.class_name == "lamp" and p.item.size[2] > 1.2][:1]
+        for lamp in standing:
+            x, y, _ = lamp.position
+            top = float(lamp.position[2] + lamp.item.size[2])
+            self.lights.append(Light((float(x), float(y), top + 0.12), (0.5, 0.42, 0.3), 0.08))
+
+
+def _face(width: float, height: float, material: Material, name: str, colour: str, made_of: str) -> Item:
+    """A single upright rectangle that faces -y, x from 0 to ``width``."""
+    quads = np.array([[[0, 0, 0], [width, 0, 0], [width, 0, height], [0, 0, height]]], np.float64)
+    shape = Shape(quads, np.broadcast_to(np.array([0.0, -1.0, 0.0]), (1, 4, 3)).copy())
+    return Item(name, colour, made_of, "medium", (Part(shape, material),), (), np.array([width, 0.0, height]))
+
+
+def _level(width: float, depth: float, up: float, material: Material, name: str, colour: str, made_of: str) -> Item:
+    quads = np.array([[[0, 0, 0], [width, 0, 0], [width, depth, 0], [0, depth, 0]]], np.float64)
+    shape = Shape(quads, np.broadcast_to(np.array([0.0, 0.0, up]), (1, 4, 3)).copy())
+    return Item(name, colour, made_of, "medium", (Part(shape, material),), (), np.array([width, depth, 0.0]))
+
+
+def add_shell(plan: Plan, tiled: bool) -> None:
+    """Floor, ceiling and the four walls, each an object of its own."""
+    rng = plan.rng
+    made_of = "stone" if tiled or rng.random() < 0.2 else "wooden"
+    floor_colour = str(
+        rng.choice(["beige", "grey", "white"] if made_of == "stone" else ["brown", "beige", "beige", "grey"])
+    )
+    base = tone(floor_colour, rng)
+    seed = int(rng.integers(1, 999))
+    if made_of == "stone":
+        ground = Material(Texture.TILES, base, shade(base, 0.6), float(rng.uniform(0.28, 0.42)), 0.25, seed=seed)
+    else:
+        ground = Material(Texture.PLANKS, base, shade(base, 0.55), 0.035, 0.15, seed=seed)
+    plan.add(_level(plan.width, plan.depth, 1.0, ground, "floor", floor_colour, made_of), 0, 0, 0, 0, "room")
+    lid = Material(Texture.PLAIN, tone("white"), shade(tone("white"), 0.95))
+    plan.add(_level(plan.width, plan.depth, -1.0, lid, "ceiling", "white", "stone"), 0, 0, plan.height, 0, "room")
+    colour = str(rng.choice(["white", "white", "beige", "grey", "yellow", "green", "blue", "pink"]))
+    rgb = mix(tone(colour, rng), tone("white"), 0.0 if colour in ("white", "grey") else 0.55)
+    style = 2 if tiled else int(rng.choice([0, 0, 1, 3]))
+    second = shade(rgb, 0.8)
+    paint = Material(
+        Texture.WALL, rgb, second, float(rng.uniform(0.12, 0.3)), 0.3 if tiled else 0.02, 0.0, style, seed=seed
+    )
+    accent = Material(Texture.WALL, shade(rgb, 0.8), shade(rgb, 0.66), 0.2, 0.02, 0.0, 0, seed=seed)
+    accent_wall = int(rng.integers(0, 4)) if not tiled and rng.random() < 0.4 else -1
+    corners = ((0.0, plan.depth), (plan.width, plan.depth), (plan.width, 0.0), (0.0, 0.0))
+    for wall in range(4):
+        material = accent if wall == accent_wall else paint
+        face = _face(plan.wall_length(wall), plan.height, material, "wall", colour, "stone")
+        plan.add(face, *corners[wall], 0.0, WALL_YAW[wall], "room")
+
+
+def add_openings(plan: Plan, n_windows: int, cover: str) -> None:
+    """A door, windows with what covers them, and the floor in front kept free."""
+    rng = plan.rng
+    door = plan.new("door")
+    wall = int(rng.integers(0, 4))
+    length = plan.wall_length(wall)
+    along = 0.16 + door.size[0] / 2 if rng.random() < 0.5 else length - 0.16 - door.size[0] / 2
+    x, y = plan.wall_point(wall, along, door.size[1] / 2 + GAP_M)
+    placed = plan.try_at(door, x, y, WALL_YAW[wall], GAP_M, mount="wall")
+    assert placed is not None
+    plan.keep_free.append(_in_front(plan, wall, along, door.size[0] / 2 + 0.05, 0.85, 0.0, 2.0))
+    side = 1.0 if along < length / 2 else -1.0
+    plan.hang(plan.new("switch"), wall, along + side * (door.size[0] / 2 + 0.22), 1.05)
+    free = [w for w in range(4) if w != wall]
+    for chosen in [int(w) for w in rng.permutation(free)][:n_windows]:
+        _add_window(plan, chosen, cover)
+
+
+def _in_front(plan: Plan, wall: int, along: float, half: float, reach: float, z0: float, z1: float) -> Box:
+    ax, ay = plan.wall_point(wall, along - half, 0.0)
+    bx, by = plan.wall_point(wall, along + half, reach)
+    return Box(np.array([min(ax, bx), min(ay, by), z0]), np.array([max(ax, bx), max(ay, by), z1]))
+
+
+def _add_window(plan: Plan, wall: int, cover: str) -> None:
+    window = plan.new("window")
+    margin = window.size[0] / 2 + 0.55
+    if plan.wall_length(wall) < 2 * margin:
+        return
+    along = float(plan.rng.uniform(margin, plan.wall_length(wall) - margin))
+    sill = float(plan.rng.uniform(0.92, 1.02))
+    placed = plan.hang(window, wall, along, sill)
+    if placed is None:
+        return
+    x, y = plan.wall_point(wall, along, 0.35)
+    power = float(plan.rng.uniform(0.7, 1.1))
+    plan.lights.append(Light((x, y, sill + 0.6), (0.88 * power, 0.97 * power, 1.1 * power), 0.4))
+    if cover == "curtain":
+        colour = str(plan.rng.choice(["red", "green", "blue", "yellow", "orange", "purple", "pink", "beige", "grey"]))
+        panel = plan.new("curtain", colour=colour)
+        for side in (-1, 1):
+            plan.hang(panel, wall, along + side * (window.size[0] / 2 + panel.size[0] / 2 + 0.06), 0.04, 0.0)
+    elif cover == "blinds":
+        blind = plan.new("blinds")
+        off = window.size[1] + 0.012 + blind.size[1] / 2
+        bx, by = plan.wall_point(wall, along, off)
+        plan.try_at(blind, bx, by, WALL_YAW[wall], sill + window.size[2] - blind.size[2] * 0.9, mount="wall",
+                    ignore=[placed.id])  # fmt: skip
+    plan.keep_free.append(_in_front(plan, wall, along, window.size[0] / 2, 0.5, sill + 0.05, 2.3))

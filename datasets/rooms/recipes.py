@@ -1,0 +1,201 @@
+"""Recipes: what belongs in a living room, bedroom, kitchen, office, bathroom, studio, and where."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from su3d_bench.datasets.rooms.objects.counter import counter_run
+from su3d_bench.datasets.rooms.groups import SMALL_DECOR, bath_shelf, choose, cushioned_bench, desk_place, dining_table, filled_basket, floor_things, hang_ceiling_lamp, long_walls, plant_on_stand, seating, stock, stocked_shelf, television, wall_things
+from su3d_bench.datasets.rooms.plan import Plan, add_openings, add_shell
+
+
+def living(plan: Plan) -> None:
+    sofa = seating(plan)
+    television(plan, sofa)
+    stocked_shelf(plan, n=7)
+    cabinet = plan.against_wall(plan.new("cabinet"))
+    stock(plan, cabinet, [*choose(plan, SMALL_DECOR, 3)])
+    plan.against_wall(plan.new("lamp", "floor_lamp"), corner=True)
+    plant_on_stand(plan)
+    filled_basket(plan, "blanket")
+    plan.somewhere(plan.new(str(plan.rng.choice(["beanbag", "stool"]))))
+    cushioned_bench(plan)
+    floor_things(
+        plan,
+        [str(n) for n in plan.rng.permutation(["backpack", "exercise-ball", "box", "indoor-plant", "umbrella"])[:3]],
+    )
+    wall_things(plan, 2)
+
+
+def bedroom(plan: Plan) -> None:
+    item = plan.new("bed")
+    bed = plan.against_wall(item, gap=0.3) or plan.against_wall(item)
+    if bed:
+        rug = plan.new("rug")
+        if plan.facing(rug, bed, -0.7, turn=0.0) is None:
+            plan.facing(plan.new("rug"), bed, -0.9, turn=0.0)
+        for _ in range(2):
+            stand = plan.beside(plan.new("nightstand"), bed, 0.07)
+            stock(
+                plan,
+                stand,
+                [("lamp", "table_lamp"), *choose(plan, [("book", "book_stack"), "cup", "tissue-paper", "candle"], 1)],
+            )
+        for side in ("left", "right"):
+            plan.on(plan.new("pillow"), bed, "head", side, turn=3.0, gap=0.0)
+        plan.on(plan.new("blanket", "blanket"), bed, "seat", turn=6.0)
+        plan.on(plan.new("cushion", "flat_cushion"), bed, "seat", turn=20.0)
+        plan.hang_above(plan.new("picture"), bed, 1.35)
+    wardrobe = plan.against_wall(plan.new("wardrobe"))
+    cabinet = plan.against_wall(plan.new("cabinet"))
+    stock(plan, cabinet, choose(plan, SMALL_DECOR, 4))
+    if wardrobe is None or plan.rng.random() < 0.5:
+        stocked_shelf(plan, n=6)
+    else:
+        desk_place(plan, laptop=True)
+    filled_basket(plan, "blanket")
+    plant_on_stand(plan)
+    plan.somewhere(plan.new(str(plan.rng.choice(["stool", "beanbag", "beanbag"]))))
+    if plan.rng.random() < 0.5:
+        cushioned_bench(plan)
+    floor_things(plan, [str(n) for n in plan.rng.permutation(["backpack", "box", "exercise-ball", "umbrella"])[:3]])
+    wall_things(plan, 2)
+
+
+def kitchen(plan: Plan) -> None:
+    counter_run(plan)
+    fridge = plan.against_wall(plan.new("refrigerator"), gap=0.02)
+    if fridge:
+        plan.on(plan.new("box"), fridge, turn=6.0)
+    dining_table(plan, 3)
+    cabinet = plan.against_wall(plan.new("cabinet"))
+    stock(
+        plan,
+        cabinet,
+        choose(
+            plan, ["bowl", "vase", "chopping-board", "bottle", "pot", "indoor-plant", "knife-block", "paper-towel"], 5
+        ),
+    )
+    plan.against_wall(plan.new("bin"), gap=0.04)
+    rack = plan.new("shelf", "wall_shelf")
+    hung = plan.hang_somewhere(rack, 1.45)
+    if hung:
+        for name in ("cup", "bottle", "bowl", "indoor-plant"):
+            plan.on(plan.new(name), hung, turn=3.0)
+    floor_things(plan, ["stool", "mat", "box", "umbrella"])
+    wall_things(plan, 1)
+
+
+def office(plan: Plan) -> None:
+    for laptop in (False, bool(plan.rng.random() < 0.4)):
+        desk_place(plan, laptop)
+    stocked_shelf(plan, [("book", "books"), "box"], 7)
+    cabinet = plan.against_wall(plan.new("cabinet"))
+    stock(plan, cabinet, choose(plan, [*SMALL_DECOR, "box", "paper-towel"], 3))
+    if plan.rng.random() < 0.6:
+        sofa = plan.against_wall(plan.new("sofa"))
+        if sofa:
+            plan.on(plan.new("cushion", "cushion"), sofa, "seat", "back", turn=6.0)
+            plan.on(plan.new("cushion", "cushion"), sofa, "seat", "back", turn=6.0)
+    else:
+        cushioned_bench(plan)
+    plan.against_wall(plan.new("lamp", "floor_lamp"), corner=True)
+    hung = plan.hang_somewhere(plan.new("shelf", "wall_shelf"), 1.45)
+    stock(plan, hung, [("book", "books"), "sculpture", "indoor-plant"])
+    plant_on_stand(plan)
+    floor_things(
+        plan, [str(n) for n in plan.rng.permutation(["backpack", "umbrella", "box", "exercise-ball", "basket"])[:3]]
+    )
+    wall_things(plan, 2, n_plugs=3)
+
+
+def bathroom(plan: Plan) -> None:
+    tub = plan.against_wall(plan.new("bathtub"), long_walls(plan), 0.02, corner=True)
+    sink_item = plan.new("sink", "pedestal_sink")
+    sink = plan.against_wall(sink_item, gap=0.5) or plan.against_wall(sink_item, gap=0.1)
+    if sink:
+        for side in (-1, 1):
+            towel = plan.new("towel", "towel_rail")
+            if plan.hang_above(towel, sink, 0.85, side * (sink_item.size[0] / 2 + towel.size[0] / 2 + 0.07)):
+                break
+    toilet = plan.against_wall(plan.new("toilet"), gap=0.18)
+    if toilet:
+        plan.beside(plan.new("bin"), toilet, 0.12)
+    if tub:
+        plan.facing(plan.new("mat"), tub, 0.05, turn=0.0)
+    bath_shelf(plan)
+    cabinet = plan.against_wall(plan.new("cabinet"))
+    stock(
+        plan,
+        cabinet,
+        [("towel", "folded_towel"), *choose(plan, ["candle", "bottle", "tissue-paper", "indoor-plant", "cup"], 3)],
+    )
+    hung = plan.hang_somewhere(plan.new("shelf", "wall_shelf"), 1.4)
+    stock(plan, hung, ["bottle", "cup", "candle", ("towel", "folded_towel")])
+    filled_basket(plan, "towel")
+    floor_things(plan, ["stool"])
+    plan.hang_somewhere(plan.new("towel", "towel_rail"), 0.95)
+    wall_things(plan, 1, clock=False, n_plugs=1)
+
+
+def studio(plan: Plan) -> None:
+    """One room to live, sleep and work in."""
+    bed = plan.against_wall(plan.new("bed"), gap=0.2, corner=True)
+    if bed:
+        for side in ("left", "right"):
+            plan.on(plan.new("pillow"), bed, "head", side, turn=3.0, gap=0.0)
+        plan.on(plan.new("blanket", "blanket"), bed, "seat", turn=6.0)
+        stand = plan.beside(plan.new("nightstand"), bed, 0.07)
+        stock(plan, stand, [("lamp", "table_lamp"), "cup"])
+    sofa = seating(plan)
+    television(plan, sofa)
+    desk_place(plan, laptop=bool(plan.rng.random() < 0.5))
+    plan.against_wall(plan.new("wardrobe"))
+    stocked_shelf(plan, n=6)
+    plan.against_wall(plan.new("refrigerator"))
+    cabinet = plan.against_wall(plan.new("cabinet"))
+    stock(plan, cabinet, ["microwave", "pot", "paper-towel", "bottle"])
+    floor_things(
+        plan,
+        [str(n) for n in plan.rng.permutation(["backpack", "umbrella", "box", "exercise-ball", "basket", "stool"])[:3]],
+    )
+    wall_things(plan, 2)
+
+
+@dataclass(frozen=True)
+class Kind:
+    """Ranges of a kind of room, metres, and its recipe."""
+
+    width: tuple[float, float]
+    depth: tuple[float, float]
+    windows: tuple[int, int]
+    tiled: bool
+    furnish: Callable[[Plan], None]
+
+
+KINDS: Mapping[str, Kind] = {
+    "living": Kind((5.0, 6.0), (4.3, 5.0), (1, 2), False, living),
+    "bedroom": Kind((4.2, 5.0), (3.9, 4.6), (1, 2), False, bedroom),
+    "kitchen": Kind((4.2, 5.0), (3.8, 4.4), (1, 2), False, kitchen),
+    "office": Kind((4.5, 5.4), (4.0, 4.7), (1, 2), False, office),
+    "bathroom": Kind((3.4, 4.0), (3.1, 3.6), (1, 1), True, bathroom),
+    "studio": Kind((6.2, 7.0), (4.9, 5.5), (2, 2), False, studio),
+}
+
+
+def furnish(kind: str, rng: np.random.Generator) -> Plan:
+    """A furnished room of the kind."""
+    rules = KINDS[kind]
+    plan = Plan(rng, float(rng.uniform(*rules.width)), float(rng.uniform(*rules.depth)), float(rng.uniform(2.5, 2.75)))
+    add_shell(plan, rules.tiled)
+    cover = "blinds" if rules.tiled else str(rng.choice(["curtain", "curtain", "blinds"]))
+    add_openings(plan, int(rng.integers(rules.windows[0], rules.windows[1] + 1)), cover)
+    n_lamps = 2 if kind == "studio" else 1
+    for k in range(n_lamps):
+        hang_ceiling_lamp(plan, plan.width * (k + 1) / (n_lamps + 1), plan.depth * float(rng.uniform(0.45, 0.55)))
+    rules.furnish(plan)
+    plan.finish_lights()
+    return plan

@@ -1,0 +1,71 @@
+"""Colour, depth and instance images of a room by ray casting."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from su3d_bench.numerics.open3d_core import compiled_open3d
+from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh, caster
+from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, UInt8Array
+
+FOCAL_PER_WIDTH = 400.0 / 640.0  # a horizontal field of view of 77 degrees
+
+
+@dataclass(frozen=True)
+class RenderedFrame:
+    """``rgb`` (H, W, 3), ``depth_m`` (H, W) along the axis, ``instance`` (H, W) object ids; 0 where a ray misses."""
+
+    rgb: UInt8Array
+    depth_m: Float32Array
+    instance: Int32Array
+
+
+def camera_intrinsics(width: int, height: int) -> Float64Array:
+    focal = FOCAL_PER_WIDTH * width
+    return np.array([[focal, 0.0, (width - 1) / 2], [0.0, focal, (height - 1) / 2], [0.0, 0.0, 1.0]])
+
+
+class Renderer:
+    """Renders one room at one image size."""
+
+    def __init__(self, mesh: RoomMesh, width: int, height: int) -> None:
+        self.width, self.height = width, height
+        self._mesh = mesh
+        self._scene = caster(mesh.vertices, mesh.triangles)
+        focal_inverse = np.linalg.inv(camera_intrinsics(width, height))
+        u, v = np.meshgrid(np.arange(width), np.arange(height))
+        pixels = np.stack([u.ravel(), v.ravel(), np.ones(width * height)], axis=1)
+        self._directions = pixels @ focal_inverse.T  # camera z is 1: the distance along a ray is the depth
+
+    def render(self, camera_to_world: Float64Array) -> RenderedFrame:
+        from su3d_bench.datasets.rooms.rendering.shade_kernels import shade
+
+        rays, t_hit, primitive, uv = self._cast(camera_to_world)
+        n, mesh = len(rays), self._mesh
+        rgb, depth, instance = np.empty((n, 3), np.uint8), np.empty(n, np.float32), np.empty(n, np.int32)
+        origin = camera_to_world[:3, 3].astype(np.float32)
+        shade(t_hit, primitive, uv, rays[:, 3:], origin, mesh.triangles, mesh.normals, mesh.texture,
+              mesh.light, mesh.instance_of_triangle, mesh.material_of_triangle, mesh.materials, mesh.lights,
+              rgb, depth, instance)  # fmt: skip
+        shape = (self.height, self.width)
+        return RenderedFrame(rgb.reshape(*shape, 3), depth.reshape(shape), instance.reshape(shape))
+
+    def depth_and_instance(self, camera_to_world: Float64Array) -> tuple[Float32Array, Int32Array]:
+        """The images without colour: (H, W) depth in metres (0 for a miss) and object ids."""
+        _, t_hit, primitive, _ = self._cast(camera_to_world)
+        hit = np.isfinite(t_hit)
+        ids = self._mesh.instance_of_triangle[np.where(hit, primitive, 0)]
+        shape = (self.height, self.width)
+        return np.where(hit, t_hit, np.float32(0)).reshape(shape), np.where(hit, ids, np.int32(0)).reshape(shape)
+
+    def _cast(self, pose: Float64Array) -> tuple[Float32Array, Float32Array, Int32Array, Float32Array]:
+        from su3d_bench.datasets.rooms.rendering.shade_kernels import aim
+
+        o3d = compiled_open3d()
+
+        rays = np.empty((self.width * self.height, 6), np.float32)
+        aim(self._directions, pose, rays)
+        answer = self._scene.cast_rays(o3d.core.Tensor(rays))  # type: ignore[attr-defined]
+        return rays, answer["t_hit"].numpy(), answer["primitive_ids"].numpy(), answer["primitive_uvs"].numpy()

@@ -1,0 +1,157 @@
+"""Compiled shading: baked light and highlights on textures, one pixel at a time; and the grids of a face.
+
+Imported lazily: numba takes a second to load. The columns of a material row are those of ``Material.row``.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.datasets.rooms.rendering.pattern_kernels import surface_colour
+from su3d_bench.numerics.compiled import njit
+
+compiled: Any = njit(cache=True)
+inlined: Any = njit(cache=True, inline="never")
+
+
+@compiled
+def shade(t_hit, primitive, uv, rays, origin, triangles, normals, texture, light,  # type: ignore[no-untyped-def]
+          instance_of_triangle, material_of_triangle, materials, lights, rgb, depth, instance):  # fmt: skip
+    """Fills ``rgb``, ``depth`` and ``instance`` of every pixel from the ray caster's answer."""
+    for i in range(t_hit.shape[0]):
+        t = t_hit[i]
+        if not t < 1e9:
+            depth[i] = 0.0
+            instance[i] = 0
+            rgb[i, 0] = 0
+            rgb[i, 1] = 0
+            rgb[i, 2] = 0
+            continue
+        triangle = primitive[i]
+        i0, i1, i2 = triangles[triangle, 0], triangles[triangle, 1], triangles[triangle, 2]
+        b1, b2 = uv[i, 0], uv[i, 1]
+        b0 = 1 - b1 - b2
+        depth[i] = t
+        instance[i] = instance_of_triangle[triangle]
+        x = b0 * texture[i0, 0] + b1 * texture[i1, 0] + b2 * texture[i2, 0]
+        y = b0 * texture[i0, 1] + b1 * texture[i1, 1] + b2 * texture[i2, 1]
+        z = b0 * texture[i0, 2] + b1 * texture[i1, 2] + b2 * texture[i2, 2]
+        e1x, e1y, e1z = (
+            texture[i1, 0] - texture[i0, 0],
+            texture[i1, 1] - texture[i0, 1],
+            texture[i1, 2] - texture[i0, 2],
+        )
+        e2x, e2y, e2z = (
+            texture[i2, 0] - texture[i0, 0],
+            texture[i2, 1] - texture[i0, 1],
+            texture[i2, 2] - texture[i0, 2],
+        )
+        px, py, pz = abs(e1y * e2z - e1z * e2y), abs(e1z * e2x - e1x * e2z), abs(e1x * e2y - e1y * e2x)
+        if pz >= px and pz >= py:
+            u, v = x, y
+        elif px >= py:
+            u, v = y, z
+        else:
+            u, v = x, z
+        row = materials[material_of_triangle[triangle]]
+        kind, scale, gloss, glow, axis, seed = int(row[0]), row[7], row[8], row[9], int(row[10]), row[15]
+        r, g, b = surface_colour(kind, x, y, z, u, v, row, scale, axis, seed)
+        lr = b0 * light[i0, 0] + b1 * light[i1, 0] + b2 * light[i2, 0]
+        lg = b0 * light[i0, 1] + b1 * light[i1, 1] + b2 * light[i2, 1]
+        lb = b0 * light[i0, 2] + b1 * light[i1, 2] + b2 * light[i2, 2]
+        spark = np.float32(0.0)
+        if gloss > 0.1:
+            spark = _highlight(i, t, b0, b1, b2, i0, i1, i2, normals, rays, origin, lights, gloss)
+            spark *= min(1.0, 1.3 * (lr + lg + lb) / 3)
+        rgb[i, 0] = _encode(r * (lr + glow) + spark)
+        rgb[i, 1] = _encode(g * (lg + glow) + spark)
+        rgb[i, 2] = _encode(b * (lb + glow) + spark)
+
+
+@inlined
+def _encode(value):  # type: ignore[no-untyped-def]
+    """Linear light to sRGB 0..255 with a soft shoulder, so that nothing clips hard."""
+    if value > 0.75:
+        value = 0.75 + 0.25 * (1 - math.exp(-(value - 0.75) * 4))
+    return np.uint8(255.0 * max(0.0, value) ** 0.4545 + 0.5)
+
+
+@inlined
+def _highlight(i, t, b0, b1, b2, i0, i1, i2, normals, rays, origin, lights, gloss):  # type: ignore[no-untyped-def]
+    nx = b0 * normals[i0, 0] + b1 * normals[i1, 0] + b2 * normals[i2, 0]
+    ny = b0 * normals[i0, 1] + b1 * normals[i1, 1] + b2 * normals[i2, 1]
+    nz = b0 * normals[i0, 2] + b1 * normals[i1, 2] + b2 * normals[i2, 2]
+    dx, dy, dz = rays[i, 0], rays[i, 1], rays[i, 2]
+    length = math.sqrt(dx * dx + dy * dy + dz * dz)
+    wx, wy, wz = origin[0] + t * dx, origin[1] + t * dy, origin[2] + t * dz
+    dx, dy, dz = dx / length, dy / length, dz / length
+    facing = dx * nx + dy * ny + dz * nz
+    rx, ry, rz = dx - 2 * facing * nx, dy - 2 * facing * ny, dz - 2 * facing * nz
+    total = gloss * 0.10 * max(0.0, rz + 0.2)  # the bright upper half of a room, mirrored
+    for k in range(lights.shape[0]):
+        lx, ly, lz = lights[k, 0] - wx, lights[k, 1] - wy, lights[k, 2] - wz
+        distance = math.sqrt(lx * lx + ly * ly + lz * lz) + 1e-6
+        cosine = (rx * lx + ry * ly + rz * lz) / distance
+        if cosine > 0.8:
+            total += gloss * 0.5 * lights[k, 3] * cosine ** (20.0 + 60.0 * gloss)
+    return np.float32(total)
+
+
+@compiled
+def aim(directions, pose, rays):  # type: ignore[no-untyped-def]
+    """Fills ``rays`` (N, 6) with origin and direction in the world."""
+    for i in range(len(directions)):
+        for k in range(3):
+            rays[i, k] = pose[k, 3]
+            rays[i, 3 + k] = (
+                pose[k, 0] * directions[i, 0] + pose[k, 1] * directions[i, 1] + pose[k, 2] * directions[i, 2]
+            )
+
+
+@compiled
+def subdivide(quads, longest, points, corner):  # type: ignore[no-untyped-def]
+    """Writes the grid of each quad, side by side, as (quad, u, v) rows of ``points`` and vertex indices ``corner``.
+
+    With empty outputs it only counts; answers (vertices, faces).
+    """
+    n_points, n_faces = 0, 0
+    fill = len(points) > 0
+    for q in range(len(quads)):
+        u_edge, v_edge = 0.0, 0.0
+        for k in range(3):
+            u_edge += (quads[q, 1, k] - quads[q, 0, k]) ** 2
+            v_edge += (quads[q, 3, k] - quads[q, 0, k]) ** 2
+        u_other, v_other = 0.0, 0.0
+        for k in range(3):
+            u_other += (quads[q, 2, k] - quads[q, 3, k]) ** 2
+            v_other += (quads[q, 2, k] - quads[q, 1, k]) ** 2
+        nu = max(1, math.ceil(math.sqrt(max(u_edge, u_other)) / longest[q] - 1e-6))
+        nv = max(1, math.ceil(math.sqrt(max(v_edge, v_other)) / longest[q] - 1e-6))
+        if fill:
+            for i in range(nu + 1):
+                for j in range(nv + 1):
+                    at = n_points + i * (nv + 1) + j
+                    points[at, 0], points[at, 1], points[at, 2] = q, i / nu, j / nv
+            for i in range(nu):
+                for j in range(nv):
+                    base = n_points + i * (nv + 1) + j
+                    at = n_faces + i * nv + j
+                    corner[at, 0], corner[at, 1] = base, base + nv + 1
+                    corner[at, 2], corner[at, 3] = base + nv + 2, base + 1
+        n_points += (nu + 1) * (nv + 1)
+        n_faces += nu * nv
+    return n_points, n_faces
+
+
+@compiled
+def bilinear(quads, points, out):  # type: ignore[no-untyped-def]
+    """Values at (quad, u, v) rows from the values at the quads' four corners."""
+    for i in range(len(points)):
+        q, u, v = int(points[i, 0]), points[i, 1], points[i, 2]
+        for k in range(out.shape[1]):
+            near = quads[q, 0, k] * (1 - u) + quads[q, 1, k] * u
+            far = quads[q, 3, k] * (1 - u) + quads[q, 2, k] * u
+            out[i, k] = near * (1 - v) + far * v

@@ -1,0 +1,127 @@
+"""The ground-truth surface of a room: what a scanner on the walk would have seen, in small even quads."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields
+from pathlib import Path
+
+import numpy as np
+
+from su3d_bench.numerics.open3d_core import compiled_open3d
+from su3d_bench.datasets.rooms.rendering.mesh import Grid, Patches, RoomMesh, at_rows, caster, cut, merge_equal
+from su3d_bench.datasets.rooms.rendering.render import Renderer, camera_intrinsics
+from su3d_bench.core.errors import DataError
+from su3d_bench.store.atomic import DAMAGE, filling, read_arrays
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
+
+VIEW_WIDTH, VIEW_HEIGHT = 160, 120  # of the depth images that decide what is visible: 1 cm a pixel at 1 m
+TOUR = 40  # frames are visited at this stride first, so that most faces are settled by the first few
+
+
+@dataclass(frozen=True)
+class RoomScan:
+    """``vertices`` (V, 3) m, ``normals`` (V, 3) unit, ``colours`` (V, 3); ``faces`` (F, 4) quads, ``object_id`` (F,).
+
+    No vertex belongs to two objects.
+    """
+
+    vertices: Float32Array
+    normals: Float32Array
+    colours: UInt8Array
+    faces: Int32Array
+    object_id: Int32Array
+
+    def object_of_vertex(self) -> Int32Array:
+        owner = np.zeros(len(self.vertices), np.int32)
+        owner[self.faces] = self.object_id[:, None]
+        return owner
+
+
+def scan_room(patches: Patches, mesh: RoomMesh, poses: Float64Array, spacing_m: float) -> RoomScan:
+    """The faces of about ``spacing_m`` that at least one of the poses sees."""
+    grid = cut(patches, np.full(len(patches.corners), spacing_m))
+    points = at_rows(patches.corners, grid.rows)
+    owner = patches.object_id[grid.quad_of_face]
+    seen = _visible(points, grid, owner, mesh, poses)
+    faces = grid.faces[seen]
+    return _welded(points, at_rows(patches.normals, grid.rows), faces, owner[seen], mesh)
+
+
+def _visible(points: Float64Array, grid: Grid, owner: Int32Array, mesh: RoomMesh, poses: Float64Array) -> BoolArray:
+    from su3d_bench.datasets.rooms.rendering.scan_kernels import drop_seen
+
+    corners = [points[grid.faces[:, k]] for k in range(4)]
+    normals = np.cross(corners[2] - corners[0], corners[3] - corners[1])
+    size = np.linalg.norm(normals, axis=1, keepdims=True)
+    normals = (normals / np.maximum(size, 1e-15)).astype(np.float32)
+    centres = (sum(corners[1:], corners[0]) / 4).astype(np.float32)
+    renderer = Renderer(mesh, VIEW_WIDTH, VIEW_HEIGHT)
+    intrinsics = camera_intrinsics(VIEW_WIDTH, VIEW_HEIGHT)
+    seen = np.zeros(len(centres), np.bool_)
+    active = np.flatnonzero(size[:, 0] > 1e-10).astype(np.int32)
+    n_active = len(active)
+    for index in (i for start in range(TOUR) for i in range(start, len(poses), TOUR)):
+        pose = poses[index]
+        depth, instance = renderer.depth_and_instance(pose)
+        n_active = drop_seen(active, n_active, centres, normals, owner, seen, pose.astype(np.float32),
+                             np.float32(intrinsics[0, 0]), np.float32(intrinsics[0, 2]), np.float32(intrinsics[1, 2]),
+                             depth, instance)  # fmt: skip
+    return seen
+
+
+def _welded(
+    points: Float64Array, normals: Float64Array, faces: Int32Array, owner: Int32Array, mesh: RoomMesh
+) -> RoomScan:
+    """One vertex for all corners of an object at one place, and none for what no face uses."""
+    used = np.zeros(len(points), bool)
+    used[faces] = True
+    object_of_point = np.zeros(len(points), np.int64)
+    object_of_point[faces] = owner[:, None]
+    kept = np.flatnonzero(used)
+    keys = np.column_stack([np.round(points[kept] * 10_000).astype(np.int64), object_of_point[kept]])
+    first, group = merge_equal(keys)
+    vertex_of_point = np.zeros(len(points), np.int32)
+    vertex_of_point[kept] = group
+    vertices = points[kept][first].astype(np.float32)
+    summed = np.column_stack([np.bincount(group, normals[kept, k], len(first)) for k in range(3)])
+    lengths = np.linalg.norm(summed, axis=1, keepdims=True)
+    smooth = np.where(lengths > 1e-6, summed / np.maximum(lengths, 1e-6), normals[kept][first])
+    return RoomScan(vertices, smooth.astype(np.float32), surface_colours(mesh, vertices), vertex_of_point[faces], owner)
+
+
+def surface_colours(mesh: RoomMesh, points: Float32Array) -> UInt8Array:
+    """The lit colour (N, 3) of the surface nearest to each point, without highlights."""
+    from su3d_bench.datasets.rooms.rendering.shade_kernels import shade
+
+    o3d = compiled_open3d()
+
+    nearest = caster(mesh.vertices, mesh.triangles).compute_closest_points(o3d.core.Tensor(points))  # type: ignore[attr-defined]
+    n = len(points)
+    dull = mesh.materials.copy()
+    dull[:, 8] = 0.0  # the column of gloss
+    rgb, depth, instance = np.empty((n, 3), np.uint8), np.empty(n, np.float32), np.empty(n, np.int32)
+    shade(np.ones(n, np.float32), nearest["primitive_ids"].numpy(), nearest["primitive_uvs"].numpy(), points,
+          np.zeros(3, np.float32), mesh.triangles, mesh.normals, mesh.texture, mesh.light,
+          mesh.instance_of_triangle, mesh.material_of_triangle, dull, mesh.lights, rgb, depth, instance)  # fmt: skip
+    return rgb
+
+
+def read_scan(path: Path) -> RoomScan | None:
+    """The scan in a cache file; ``None`` where there is none or the file is damaged."""
+    try:
+        stored = read_arrays(path)
+        return RoomScan(*(stored[field.name] for field in fields(RoomScan)))
+    except DAMAGE:
+        return None
+
+
+def write_scan(path: Path, scan: RoomScan) -> None:
+    """Puts the scan where concurrent readers see either nothing or all of it."""
+    try:
+        with filling(path) as stream:
+            if stream is not None:
+                np.savez(stream, **{field.name: getattr(scan, field.name) for field in fields(RoomScan)})
+    except OSError as error:
+        raise DataError(
+            f"rooms: cannot write the scan to {path} ({error.strerror}); set SU3D_DATA to a folder that can be written"
+        ) from error

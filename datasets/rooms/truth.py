@@ -1,0 +1,210 @@
+"""What is true of a room: its objects, how they relate, and questions with all their right answers."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from su3d_bench.datasets.rooms.classes import AFFORDANCES, CLASS_ID
+from su3d_bench.datasets.rooms.plan import FLAT, Box, Plan, box_of
+from su3d_bench.core.types import Float64Array
+
+RELATIONS = ("on", "under", "next to", "in", "above")
+STRUCTURE = frozenset(("wall", "floor", "ceiling"))
+OPENINGS = frozenset(("door", "window"))
+NEXT_TO_M, NEXT_TO_ON_M = 0.3, 0.12  # on the floor and walls, and among things that share a support
+MIN_VISIBLE_VERTICES = 100  # ScanNet's smallest instance that counts
+MAX_ANSWER_SHARE = 1 / 3
+MIN_BEARING_RAD = 0.05  # two things nearer to one line of sight are neither left nor right of each other
+
+
+@dataclass(frozen=True)
+class RoomObject:
+    """One object; ``id`` is its number in instance images, scans and meshes. Boxes are axis-aligned, world metres.
+
+    ``size_word`` compares with the usual size of the class; ``support`` is floor, wall, ceiling, object, or room for
+    what the room itself is made of.
+    """
+
+    id: int
+    class_id: int
+    class_name: str
+    colour: str
+    material: str
+    size_m: tuple[float, float, float]
+    size_word: str
+    centre: tuple[float, float, float]
+    box_min: tuple[float, float, float]
+    box_max: tuple[float, float, float]
+    support: str
+
+
+@dataclass(frozen=True)
+class Relation:
+    """``subject`` stands in ``relation`` to ``object``; both are object ids."""
+
+    subject: int
+    relation: str
+    object: int
+
+
+@dataclass(frozen=True)
+class RoomTruth:
+    scene: str
+    kind: str
+    objects: tuple[RoomObject, ...]
+    relations: tuple[Relation, ...]
+
+    def by_id(self, object_id: int) -> RoomObject:
+        return self.objects[object_id - 1]
+
+    def left_of(self, eye: tuple[float, float, float] | None = None) -> tuple[Relation, ...]:
+        """Which of two neighbours stands left of the other for who looks at both from ``eye`` (the room's middle).
+
+        Apart from ``relations``, for it is the only relation that depends on where one stands.
+        """
+        if eye is None:
+            eye = next(one.centre for one in self.objects if one.class_name == "floor")
+        pairs = {(link.subject, link.object) for link in self.relations if link.relation == "next to"}
+        return tuple(
+            Relation(a, "left of", b)
+            for a, b in sorted(pairs)
+            if _bearing(eye, self.by_id(a).centre, self.by_id(b).centre) > MIN_BEARING_RAD
+        )
+
+
+@dataclass(frozen=True)
+class Query:
+    """A text and the ids of every object that answers it; ``kind``: instance, affordance, property, relative."""
+
+    text: str
+    kind: str
+    answers: tuple[int, ...]
+
+
+def _bearing(eye: tuple[float, ...], a: tuple[float, ...], b: tuple[float, ...]) -> float:
+    """Angle in radians, seen from above, by which ``a`` stands left of ``b`` for who looks at them from ``eye``."""
+    angle_a = math.atan2(a[1] - eye[1], a[0] - eye[0])
+    angle_b = math.atan2(b[1] - eye[1], b[0] - eye[0])
+    return math.remainder(angle_a - angle_b, math.tau)
+
+
+def truth_of(scene: str, kind: str, plan: Plan) -> RoomTruth:
+    objects = tuple(_object(plan, placed_id) for placed_id in range(1, len(plan.placed) + 1))
+    return RoomTruth(scene, kind, objects, tuple(_relations(plan)))
+
+
+def _triple(values: Float64Array) -> tuple[float, float, float]:
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def _object(plan: Plan, placed_id: int) -> RoomObject:
+    placed = plan.placed[placed_id - 1]
+    box, item = box_of(placed), placed.item
+    support = "room" if item.class_name in STRUCTURE | OPENINGS else plan.mount[placed_id]
+    return RoomObject(
+        placed_id, CLASS_ID[item.class_name], item.class_name, item.colour, item.material, _triple(item.size),
+        item.size_word, _triple((box.low + box.high) / 2), _triple(box.low), _triple(box.high), support,
+    )  # fmt: skip
+
+
+def _relations(plan: Plan) -> Iterator[Relation]:
+    for subject, (holder, relation) in sorted(plan.parent.items()):
+        yield Relation(subject, relation, holder)
+    for subject, holder in plan.rests_also_on:
+        yield Relation(subject, "on", holder)
+    ids = [i for i in range(1, len(plan.placed) + 1) if plan.placed[i - 1].item.class_name not in STRUCTURE]
+    for a in ids:
+        for b in ids:
+            if a != b:
+                yield from _between(plan, a, b)
+
+
+def _between(plan: Plan, a: int, b: int) -> Iterator[Relation]:
+    name_a, name_b = plan.placed[a - 1].item.class_name, plan.placed[b - 1].item.class_name
+    box_a, box_b = plan.boxes[a], plan.boxes[b]
+    if name_a in FLAT and plan.mount[b] == "floor" and name_b not in FLAT and _shared_ground(box_a, box_b) > 0.2:
+        yield Relation(a, "under", b)
+    elif plan.mount[a] in ("wall", "ceiling") and plan.mount[b] == "floor" and name_a not in OPENINGS:
+        rise = float(box_a.low[2] - box_b.high[2])
+        if (
+            0 < rise < (2.2 if plan.mount[a] == "ceiling" else 1.0)
+            and _shared_ground(_wide(box_a), _wide(box_b)) > 0.15
+        ):
+            yield Relation(a, "above", b)
+    if _are_neighbours(plan, a, b):
+        yield Relation(a, "next to", b)
+
+
+def _wide(box: Box) -> Box:
+    pad = np.array([0.1, 0.1, 0.0])
+    return Box(box.low - pad, box.high + pad)
+
+
+def _shared_ground(a: Box, b: Box) -> float:
+    """Overlap of the two footprints as a share of the smaller one."""
+    sides = np.clip(np.minimum(a.high, b.high)[:2] - np.maximum(a.low, b.low)[:2], 0, None)
+    smaller = min(float(np.prod((a.high - a.low)[:2])), float(np.prod((b.high - b.low)[:2])))
+    return float(np.prod(sides)) / max(smaller, 1e-9)
+
+
+def _are_neighbours(plan: Plan, a: int, b: int) -> bool:
+    names = {plan.placed[a - 1].item.class_name, plan.placed[b - 1].item.class_name}
+    if names & FLAT or plan.mount[a] == "ceiling" or plan.mount[b] == "ceiling":
+        return False
+    if (plan.mount[a] == "object") != (plan.mount[b] == "object"):
+        return False
+    limit = NEXT_TO_M
+    if plan.mount[a] == "object":
+        if plan.parent.get(a) != plan.parent.get(b):
+            return False
+        limit = NEXT_TO_ON_M
+    box_a, box_b = plan.boxes[a], plan.boxes[b]
+    apart = np.clip(np.maximum(box_a.low - box_b.high, box_b.low - box_a.high), 0, None)
+    overlap_z = min(box_a.high[2], box_b.high[2]) - max(box_a.low[2], box_b.low[2])
+    return float(np.hypot(apart[0], apart[1])) <= limit and float(overlap_z) > -0.15
+
+
+def queries(truth: RoomTruth, n_visible_vertices: Mapping[int, int] | None = None) -> tuple[Query, ...]:
+    """Questions of four kinds with every right answer.
+
+    Objects with fewer than 100 visible scan vertices are neither asked for nor answers; a question that more than a
+    third of the objects answer is left out, and so are the walls, the floor and the ceiling.
+    """
+    shown = [
+        one
+        for one in truth.objects
+        if one.class_name not in STRUCTURE
+        and (n_visible_vertices is None or n_visible_vertices.get(one.id, 0) >= MIN_VISIBLE_VERTICES)
+    ]
+    answers: dict[tuple[str, str], set[int]] = {}
+    for one in shown:
+        for kind, text in _texts(one):
+            answers.setdefault((kind, text), set()).add(one.id)
+    counted = {one.id for one in shown}
+    for link in truth.relations:
+        if link.subject in counted and link.object in counted:
+            subject, holder = truth.by_id(link.subject).class_name, truth.by_id(link.object).class_name
+            text = f"{subject} {link.relation} {_article(holder)}"
+            answers.setdefault(("relative", text), set()).add(link.subject)
+    limit = max(1, int(len(shown) * MAX_ANSWER_SHARE))
+    found = [Query(text, kind, tuple(sorted(ids))) for (kind, text), ids in answers.items() if len(ids) <= limit]
+    return tuple(sorted(found, key=lambda query: (query.kind, query.text)))
+
+
+def _article(name: str) -> str:
+    return ("an " if name[0] in "aeiou" else "a ") + name
+
+
+def _texts(one: RoomObject) -> Iterator[tuple[str, str]]:
+    yield "instance", one.class_name
+    for phrase in AFFORDANCES[one.class_name]:
+        yield "affordance", phrase
+    yield "property", f"{one.colour} {one.class_name}"
+    yield "property", f"{one.material} {one.class_name}"
+    if one.size_word != "medium":
+        yield "property", f"{one.size_word} {one.class_name}"

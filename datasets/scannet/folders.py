@@ -1,0 +1,113 @@
+"""Where scans of ScanNet lie below the data root, in whichever layout they were put there, and which scans there are.
+
+A scan is a folder such as ``scene0000_00``. Its recording and its annotations may lie in folders of that name in
+different places: frames are often exported beside the release.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+from su3d_bench.datasets.replica.folders import read_marker
+from su3d_bench.datasets.scannet.labels import TABLE_NAME
+from su3d_bench.core.errors import DataError
+
+# The scenes of OpenSU3D's evaluation, in the order of its section IV-A.
+PAPER_SCENES = ("scene0000_00", "scene0034_00", "scene0164_03", "scene0525_01", "scene0549_00")
+SPLITS = ("train", "val", "test")
+BASES = ("", "scannet", "ScanNet", "scannetv2", "ScanNetV2", "scannet_v2", "scannet200", "ScanNet200")
+# "scans" and "scans_test" as the download script makes them, "v2/scans" as the server has them
+SUBFOLDERS = (
+    "",
+    "scans",
+    "scans_test",
+    "v2/scans",
+    "public/v2/scans",
+    *(f"scans/{split}" for split in SPLITS),
+    *SPLITS,
+    "validation",
+)
+PLACES = tuple(dict.fromkeys("/".join(part for part in (b, s) if part) or "." for b in BASES for s in SUBFOLDERS))
+TABLE_FOLDERS = ("tasks", "metadata", "v2/tasks")  # beside the scans, where some keep the label table
+SCAN_NAME = re.compile(r"scene\d{4}_\d{2}")
+EXPORTS = ("pose", "data/pose", "exported", "_info.txt")  # what tells a folder with exported frames
+SCANNET_URL = "http://www.scan-net.org"
+
+
+@dataclass(frozen=True)
+class ScanFolders:
+    """``folders`` of each scan, the first place first; ``made`` are scans that `datasets make` rendered."""
+
+    root: Path
+    places: tuple[Path, ...]
+    folders: Mapping[str, tuple[Path, ...]]
+    made: frozenset[str]
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        """The paper's scenes that are here, in its order, then every other scan."""
+        first = [scan for scan in PAPER_SCENES if scan in self.folders]
+        return (*first, *sorted(set(self.folders) - set(first)))
+
+    def find_file(self, scan: str, name: str) -> Path | None:
+        """The file ``name`` of a scan, from the first of its folders that has it."""
+        return next((path for folder in self.folders[scan] if (path := folder / name).is_file()), None)
+
+    def find_label_table(self) -> Path | None:
+        """The label table: in a folder with scans, above one, or in the usual folders beside them."""
+        return next((path for folder in self.table_folders() if (path := folder / TABLE_NAME).is_file()), None)
+
+    def table_folders(self) -> list[Path]:
+        """Where the label table is looked for, the nearest to the scans first."""
+        near = [one for place in self.places for one in (place, *place.parents) if one.is_relative_to(self.root)]
+        near += [self.root, *(self.root / base for base in BASES if base)]
+        return list(dict.fromkeys(folder / name for folder in near for name in (".", *TABLE_FOLDERS)))
+
+
+def find_scans(root: Path) -> ScanFolders:
+    """Every scan in ``PLACES`` below ``root``; none is no error here."""
+    folders: dict[str, list[Path]] = {}
+    places, made, seen = [], set[str](), set[tuple[int, int]]()
+    for place in (root / name for name in PLACES):
+        try:
+            identity = place.stat().st_dev, place.stat().st_ino
+            children = sorted(child for child in place.iterdir() if child.is_dir())
+        except OSError:
+            continue
+        if identity in seen:  # a link, or a file system that takes scannet and ScanNet for one
+            continue
+        seen.add(identity)
+        rooms = read_marker(place)
+        scans = [child for child in children if _is_scan(child, rooms)]
+        if scans:
+            places.append(place)
+            made |= {scan.name for scan in scans if scan.name in rooms}
+        for scan in scans:
+            folders.setdefault(scan.name, []).append(scan)
+    return ScanFolders(root, tuple(places), {scan: tuple(found) for scan, found in folders.items()}, frozenset(made))
+
+
+def _is_scan(folder: Path, rooms: Mapping[str, str]) -> bool:
+    if SCAN_NAME.fullmatch(folder.name) or (folder / f"{folder.name}.sens").is_file():
+        return True
+    # Rooms in the layout of another dataset have a marker of the same name.
+    return folder.name in rooms and any((folder / part).exists() for part in EXPORTS)
+
+
+@cache
+def split_scenes(split: str) -> tuple[str, ...]:
+    """The scans of an official split in the order of its list: Tasks/Benchmark/scannetv2_<split>.txt of ScanNet."""
+    return tuple(Path(__file__).with_name(f"scannetv2_{split}.txt").read_text(encoding="utf-8").split())
+
+
+def no_scans(root: Path) -> DataError:
+    """What to say where no scan was found."""
+    return DataError(
+        f"scannet: no scan in {root} or in its folders scans, scannet, scannet/scans (a scan is a folder such as "
+        f"scene0000_00 with scene0000_00.sens or exported frames); ask for the data at {SCANNET_URL}, set SU3D_DATA to "
+        f"where it is, or make rooms in this layout: su3d-bench datasets make rooms --layout scannet --out {root}"
+    )

@@ -1,0 +1,230 @@
+"""ScanNet recordings in whichever form they lie in a scan's folder: the ``.sens`` file, or what a reader exported.
+
+Sources: ScanNet, SensReader/python/SensorData.py and SensReader/c++/sensorData.h at commit 3830fce; OpenMask3D, README
+and openmask3d/configs at commit 3bc3fc5.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from su3d_bench.datasets.recordings.exported_frames import EXPORT_AGAIN, ExportedFrames, FrameFiles, by_number, check_complete, every_kth, list_folder, read_matrix, read_size, square
+from su3d_bench.datasets.recordings.recorded_frames import numbers, read_text
+from su3d_bench.datasets.recordings.source import RgbdSource, SensorPair, Size
+from su3d_bench.datasets.scannet.sens.read import SensSource
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Float64Array
+
+SourceKind = Literal["auto", "sens", "python", "cpp"]
+DEPTH_SHIFT = 1000.0  # of every recording of ScanNet; the Python reader does not export it
+COLOUR_SIZE, DEPTH_SIZE = (1296, 968), (640, 480)  # of ScanNet's cameras; OpenMask3D's intrinsic_resolution
+OFF_CENTRE = 0.1  # of the image; ScanNet's principal points are within 0.02 of the middle
+INFO = "_info.txt"
+COUNT_KEY, SHIFT_KEY = "m_frames.size", "m_depthShift"
+SIZE_KEYS = ("m_colorWidth", "m_colorHeight", "m_depthWidth", "m_depthHeight")
+MATRIX_KEYS = tuple(
+    f"m_calibration{camera}{kind}" for camera in ("Color", "Depth") for kind in ("Intrinsic", "Extrinsic")
+)
+
+
+@dataclass(frozen=True)
+class PythonLayout:
+    """The folders of an export that has one for each kind of file."""
+
+    colour: str = "color"
+    depth: str = "depth"
+    pose: str = "pose"
+    cameras: str = "intrinsic"
+
+
+PYTHON_LAYOUTS = (
+    PythonLayout(),  # ScanNet's Python reader, and OpenMask3D for a single scene
+    PythonLayout(cameras="intrinsics"),  # SegmentAnything3D's copy of that reader
+    PythonLayout("data_compressed/color", "data_compressed/depth", "data/pose", "data/intrinsic"),  # OpenMask3D, all
+)
+
+
+def find_source(folder: Path, scene: str, where: str, kind: SourceKind = "auto") -> RgbdSource:
+    """The recording in a scan's folder; where there are several the ``.sens`` file, else that of the Python reader.
+
+    Exports may lie in the folder itself, in ``exported/`` or in a folder with the name of the scene. ``DataError``
+    names all that was looked for where there is none.
+    """
+    try:
+        source = _first_source(folder, scene, where, kind)
+    except OSError as error:
+        raise DataError(f"{where}: {folder} cannot be read: {error.strerror}") from error
+    if source is not None:
+        return source
+    looked_for = {
+        "sens": f"{scene}.sens",
+        "python": "color/, depth/, pose/ and intrinsic/ (or data/ and data_compressed/)",
+        "cpp": f"{INFO} and frame-000000.color.jpg and so on",
+    }
+    wanted = [text for name, text in looked_for.items() if kind in ("auto", name)]
+    raise DataError(
+        f"{where}: no recording in {folder}; looked for {'; '.join(wanted)}"
+        + ("" if kind == "sens" else f"; exports also in exported/ and {scene}/")
+    )
+
+
+def _first_source(folder: Path, scene: str, where: str, kind: SourceKind) -> RgbdSource | None:
+    sens, places = folder / f"{scene}.sens", [folder / name for name in ("", "exported", scene)]
+    if kind in ("auto", "sens") and sens.exists():
+        return SensSource(sens, where)
+    for place in places if kind in ("auto", "python") else ():
+        if python_layout(place) is not None:
+            return open_python_export(place, where)
+    for place in places if kind in ("auto", "cpp") else ():
+        if (place / INFO).exists():
+            return open_cpp_export(place, where)
+    return None
+
+
+def python_layout(folder: Path) -> PythonLayout | None:
+    """The layout in which frames lie in ``folder``; None where none do."""
+    found = [one for one in PYTHON_LAYOUTS if (folder / one.colour).is_dir() or (folder / one.pose).is_dir()]
+    with_cameras = [one for one in found if (folder / one.cameras).is_dir()]
+    return next(iter(with_cameras or found), None)
+
+
+def open_python_export(folder: Path, where: str) -> ExportedFrames:
+    """The export of ScanNet's Python reader in ``folder``, or one that OpenMask3D prepared."""
+    layout = python_layout(folder) or PYTHON_LAYOUTS[0]
+    kinds = {
+        f"{name}/{{}}{ending}": by_number(list_folder(folder, name, where), pattern, f"{where}: {name}/")
+        for name, ending, pattern in (
+            (layout.colour, ".jpg", r"(\d{1,9})\.(?:jpg|png)"),
+            (layout.depth, ".png", r"(\d{1,9})\.png"),
+            (layout.pose, ".txt", r"(\d{1,9})\.txt"),
+        )
+    }
+    known = set().union(*kinds.values())
+    if not known:
+        raise DataError(f"{where}: {layout.colour}/, {layout.depth}/ and {layout.pose}/ hold no frames; {EXPORT_AGAIN}")
+    expected = every_kth(known)
+    check_complete(kinds, expected, where)
+    colours, depths, poses = kinds.values()
+    frames = [
+        FrameFiles(n, f"{layout.colour}/{colours[n]}", f"{layout.depth}/{depths[n]}", f"{layout.pose}/{poses[n]}")
+        for n in expected
+    ]
+    camera, camera_files = _python_camera(folder, layout, frames[0], where)
+    return ExportedFrames(folder, where, camera, frames, camera_files, "as the first frame")
+
+
+def _python_camera(folder: Path, layout: PythonLayout, first: FrameFiles, where: str) -> tuple[SensorPair, list[str]]:
+    """The cameras, and the names of the files that describe them."""
+    colour_size, depth_size = read_size(folder, first.colour, where), read_size(folder, first.depth, where)
+    names = [
+        f"{layout.cameras}/{kind}_{camera}.txt" for kind in ("intrinsic", "extrinsic") for camera in ("color", "depth")
+    ]
+    colour_name, depth_name = names[:2]
+    there = [name for name in names if (folder / name).exists()]
+    if colour_name not in there:
+        raise DataError(f"{where}: {colour_name} is missing; {EXPORT_AGAIN}")
+    if depth_name not in there and depth_size != colour_size:
+        raise DataError(
+            f"{where}: {depth_name} is missing, and depth images of {depth_size[0]}x{depth_size[1]} cannot take the "
+            f"intrinsics of colour images of {colour_size[0]}x{colour_size[1]}; {EXPORT_AGAIN}"
+        )
+    colour_intrinsics = _fitted_intrinsics(folder, colour_name, where, colour_size, COLOUR_SIZE)
+    depth_intrinsics = colour_intrinsics
+    if depth_name in there:
+        depth_intrinsics = _fitted_intrinsics(folder, depth_name, where, depth_size, DEPTH_SIZE)
+    colour_extrinsic, depth_extrinsic = (
+        read_matrix(folder, name, where) if name in there else np.eye(4) for name in names[2:]
+    )
+    camera = SensorPair(
+        colour_size=colour_size,
+        depth_size=depth_size,
+        colour_intrinsics=colour_intrinsics,
+        depth_intrinsics=depth_intrinsics,
+        colour_extrinsic=colour_extrinsic,
+        depth_extrinsic=depth_extrinsic,
+        depth_shift=DEPTH_SHIFT,
+        where=f"{where}: {layout.cameras}/",
+    )
+    return camera, there
+
+
+def _fitted_intrinsics(folder: Path, name: str, where: str, size: Size, full_size: Size) -> Float64Array:
+    """The intrinsics (3, 3) of images of ``size``; where the images were made smaller but the file was left, scaled.
+
+    OpenMask3D's layouts and the Python reader's resizing leave the file as it was for images of ``full_size``.
+    """
+    matrix = read_matrix(folder, name, where, (4, 3))[:3, :3]
+    centre, sizes, full_sizes = matrix[:2, 2] + 0.5, np.array(size), np.array(full_size)
+    if (np.abs(centre / sizes - 0.5) <= OFF_CENTRE).all():
+        return matrix
+    if (np.abs(centre / full_sizes - 0.5) <= OFF_CENTRE).all():
+        scaled = matrix.copy()
+        scaled[:2, 2] += 0.5  # the middle of the first pixel is at 0
+        scaled[:2] *= (sizes / full_sizes)[:, None]
+        scaled[:2, 2] -= 0.5
+        return scaled
+    if ((centre >= 0) & (centre <= sizes)).all():
+        return matrix
+    raise DataError(
+        f"{where}: {name} has its principal point at ({matrix[0, 2]:g}, {matrix[1, 2]:g}), outside the images of "
+        f"{size[0]}x{size[1]}; it belongs to images of another size"
+    )
+
+
+def open_cpp_export(folder: Path, where: str) -> ExportedFrames:
+    """The export of ScanNet's C++ reader in ``folder``."""
+    camera, n_frames = read_info(folder / INFO, where)
+    names: dict[str, list[str]] = {"color": [], "depth": [], "pose": []}
+    for name in list_folder(folder, ".", where):
+        if name.startswith("frame-"):
+            names.get(name.partition(".")[2].partition(".")[0], names["color"]).append(name)
+    kinds = {
+        f"frame-{{:06d}}.{kind}.{ending.split('|')[0]}": by_number(
+            names[kind], rf"frame-(\d{{6,9}})\.{kind}\.(?:{ending})", f"{where}: the export"
+        )
+        for kind, ending in (("color", "jpg|png"), ("depth", "pgm"), ("pose", "txt"))
+    }
+    expected = range(n_frames)
+    check_complete(kinds, expected, where)
+    colours, depths, poses = kinds.values()
+    frames = [FrameFiles(n, colours[n], depths[n], poses[n]) for n in expected]
+    return ExportedFrames(folder, where, camera, frames, [INFO], f"as {INFO} says")
+
+
+def read_info(path: Path, where: str) -> tuple[SensorPair, int]:
+    """The cameras and the number of frames in the ``_info.txt`` of the C++ reader's export."""
+    where = f"{where}: {path.name}"
+    parts = [line.partition("=") for line in read_text(path, where, EXPORT_AGAIN).splitlines()]
+    table = {key.strip(): value.split() for key, _, value in parts}
+    for key in (*SIZE_KEYS, SHIFT_KEY, *MATRIX_KEYS, COUNT_KEY):
+        if key not in table:
+            raise DataError(f"{where}: has no '{key}'; {EXPORT_AGAIN}")
+    colour_width, colour_height, depth_width, depth_height = (_count(table[key], key, where) for key in SIZE_KEYS)
+    shift = numbers(table[SHIFT_KEY], f"{where}: '{SHIFT_KEY}'")
+    if len(shift) != 1:
+        raise DataError(f"{where}: '{SHIFT_KEY}' has {len(shift)} values; expected 1")
+    colour, colour_extrinsic, depth, depth_extrinsic = (square(table[key], f"{where}: '{key}'") for key in MATRIX_KEYS)
+    camera = SensorPair(
+        colour_size=(colour_width, colour_height),
+        depth_size=(depth_width, depth_height),
+        colour_intrinsics=colour[:3, :3],
+        depth_intrinsics=depth[:3, :3],
+        colour_extrinsic=colour_extrinsic,
+        depth_extrinsic=depth_extrinsic,
+        depth_shift=shift[0],
+        where=where,
+    )
+    return camera, _count(table[COUNT_KEY], COUNT_KEY, where)
+
+
+def _count(words: Sequence[str], key: str, where: str) -> int:
+    text = " ".join(words)
+    if not re.fullmatch(r"[0-9]{1,9}", text) or int(text) == 0:
+        raise DataError(f"{where}: '{key}' is {text[:20]!r}; expected a number above 0")
+    return int(text)

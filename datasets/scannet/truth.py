@@ -1,0 +1,252 @@
+"""Ground truth of a scan, one row a vertex of ``_vh_clean_2.ply`` in the order of the file.
+
+As Mask3D and OpenMask3D prepare it: an instance id is the object's id + 1, 0 where no object claims the vertex; the
+class is the NYU40 id in ``_vh_clean_2.labels.ply``, or for ScanNet200 the raw id of the object's category. Classes that
+a protocol does not have stay in the truth, they are void there.
+
+The first release differs: its ``labels.ply`` holds raw ids, which are line numbers of another table. Classes then come
+from the objects' categories. A file holds raw ids when one of its labels exceeds 40, or when more of its labels are the
+raw ids of the objects' categories than are their NYU40 ids.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from su3d_bench.formats.ply import ListColumn, PlyFile, read_ply
+from su3d_bench.datasets.scannet.annotations import AnnotatedObject, aggregation_name, object_of_vertex, read_objects, read_segments, segments_name
+from su3d_bench.datasets.scannet.labels import MAX_NYU40_ID, TABLE_NAME, LabelTable, nyu40_label_set, raw_label_set
+from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, InstanceMesh, Int32Array, Int64Array, Surface
+
+CORNER_NAMES = ("vertex_indices", "vertex_index")
+SAME_PLACE_M = 1e-3  # both files hold one mesh; text formats round its coordinates
+logger = logging.getLogger(__name__)
+
+
+def mesh_name(scan: str) -> str:
+    return f"{scan}_vh_clean_2.ply"
+
+
+def labels_name(scan: str) -> str:
+    return f"{scan}_vh_clean_2.labels.ply"
+
+
+def truth_names(scan: str) -> tuple[str, ...]:
+    """The files that ground truth is read from, beside the label table."""
+    return mesh_name(scan), labels_name(scan), aggregation_name(scan), segments_name(scan)
+
+
+@dataclass(frozen=True)
+class AnnotatedScan:
+    """``vertices`` (V, 3) in the scan's frame; ``triangles`` (T, 3); ``labels`` (V,) as ``labels.ply`` has them;
+    ``object_of_vertex`` (V,) rows of ``objects``, -1 for none; ``where`` begins each message."""
+
+    where: str
+    vertices: Float32Array
+    triangles: Int32Array
+    labels: Int64Array
+    objects: Sequence[AnnotatedObject]
+    object_of_vertex: Int64Array
+
+    @property
+    def instance(self) -> Int32Array:
+        """Instance id of each vertex, 0 for none."""
+        return np.array([*(one.id + 1 for one in self.objects), 0], np.int32)[self.object_of_vertex]
+
+    def of_category(self, value_of: Mapping[str, int]) -> Int32Array:
+        """What ``value_of`` says of each vertex's category; 0 where no object or no entry is."""
+        return np.array([*(value_of.get(one.category, 0) for one in self.objects), 0], np.int32)[self.object_of_vertex]
+
+
+def read_annotated_scan(files: Mapping[str, Path], scan: str, where: str) -> AnnotatedScan:
+    """The mesh of ``scan`` with its annotation; ``files`` has the path of each of ``truth_names``."""
+    segments = read_segments(files[segments_name(scan)], scan, where)
+    objects = read_objects(files[aggregation_name(scan)], scan, where)
+    mesh_where = f"{where}: {mesh_name(scan)}"
+    mesh = read_ply(files[mesh_name(scan)], mesh_where)
+    vertices = _vertices(mesh, mesh_where)
+    _check_one_mesh(segments, vertices, scan, where)
+    labels = _labels(files[labels_name(scan)], vertices, f"{where}: {labels_name(scan)}", mesh_name(scan))
+    triangles = _triangles(mesh, len(vertices), mesh_where)
+    return AnnotatedScan(where, vertices, triangles, labels, objects, object_of_vertex(segments, objects))
+
+
+def read_surface(mesh: Path, segments: Path | None, scan: str, where: str) -> Surface:
+    """The mesh of ``scan`` without labels, with the published segments where their file is there."""
+    mesh_where = f"{where}: {mesh.name}"
+    file = read_ply(mesh, mesh_where)
+    vertices = _vertices(file, mesh_where)
+    triangles = _triangles(file, len(vertices), mesh_where)
+    if segments is None:
+        return Surface(vertices, triangles)
+    ids = read_segments(segments, scan, where)
+    _check_one_mesh(ids, vertices, scan, where)
+    # Ids may exceed 32 bits, and only which of them are equal is of use.
+    return Surface(vertices, triangles, np.unique(ids, return_inverse=True)[1].reshape(-1).astype(np.int32))
+
+
+def _check_one_mesh(segments: Int64Array, vertices: Float32Array, scan: str, where: str) -> None:
+    if len(segments) != len(vertices):
+        raise DataError(
+            f"{where}: {segments_name(scan)} has {len(segments)} vertices, {mesh_name(scan)} has {len(vertices)}; they "
+            "belong to two meshes"
+        )
+
+
+def moved(vertices: Float32Array, motion: Float64Array) -> Float32Array:
+    """``vertices`` (V, 3) moved by a rigid ``motion`` (4, 4)."""
+    return (vertices.astype(np.float64) @ motion[:3, :3].T + motion[:3, 3]).astype(np.float32)
+
+
+def aligned(scan: AnnotatedScan, motion: Float64Array) -> AnnotatedScan:
+    """The scan moved by a rigid ``motion`` (4, 4)."""
+    return replace(scan, vertices=moved(scan.vertices, motion))
+
+
+def _vertices(file: PlyFile, where: str) -> Float32Array:
+    element = file.element("vertex")
+    if element is None or element.n_rows == 0:
+        raise DataError(f"{where}: has no vertices; expected the decimated mesh of the release")
+    columns = [element.columns.get(axis) for axis in "xyz"]
+    if any(column is None or isinstance(column, ListColumn) for column in columns):
+        raise DataError(f"{where}: vertices have no 'x', 'y', 'z'; expected the decimated mesh of the release")
+    with np.errstate(over="ignore"):
+        vertices = np.stack([np.asarray(column) for column in columns], axis=1).astype(np.float32)
+    if not np.isfinite(vertices).all():
+        row = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
+        raise DataError(f"{where}: vertex {row} is at {vertices[row].tolist()}; copy the file again")
+    return vertices
+
+
+def _labels(path: Path, vertices: Float32Array, where: str, mesh: str) -> Int64Array:
+    """The labels of a mesh that must be the one of ``vertices``, vertex by vertex."""
+    file = read_ply(path, where)
+    labelled = _vertices(file, where)
+    if len(labelled) != len(vertices):
+        raise DataError(f"{where}: has {len(labelled)} vertices, {mesh} has {len(vertices)}; they belong to two meshes")
+    is_elsewhere = np.abs(labelled.astype(np.float64) - vertices).max(axis=1) > SAME_PLACE_M
+    if is_elsewhere.any():
+        row = int(np.argmax(is_elsewhere))
+        raise DataError(
+            f"{where}: vertex {row} is at {labelled[row].tolist()}, in {mesh} at {vertices[row].tolist()}; they belong "
+            "to two meshes"
+        )
+    element = file.element("vertex")
+    assert element is not None
+    labels = element.columns.get("label")
+    if labels is None or isinstance(labels, ListColumn) or labels.dtype.kind == "f":
+        raise DataError(f"{where}: vertices have no property 'label' of whole numbers; take the file of the release")
+    if labels.min() < 0:
+        raise DataError(f"{where}: vertex {int(np.argmin(labels))} has the label {labels.min()}; expected 0 or more")
+    return labels.astype(np.int64)
+
+
+def _triangles(file: PlyFile, n_vertices: int, where: str) -> Int32Array:
+    """Rows of three vertices; none where the file has no faces."""
+    element = file.element("face")
+    if element is None or element.n_rows == 0:
+        return np.zeros((0, 3), np.int32)
+    corners = next((element.columns[name] for name in CORNER_NAMES if name in element.columns), None)
+    if not isinstance(corners, ListColumn) or corners.values.dtype.kind == "f" or (corners.lengths != 3).any():
+        raise DataError(f"{where}: faces are no triangles of 'vertex_indices'; expected the mesh of the release")
+    if corners.values.min() < 0 or corners.values.max() >= n_vertices:
+        first = int(np.flatnonzero((corners.values < 0) | (corners.values >= n_vertices))[0])
+        raise DataError(
+            f"{where}: face {first // 3} names vertex {corners.values[first]}, the mesh has {n_vertices} (0.."
+            f"{n_vertices - 1})"
+        )
+    return corners.values.reshape(-1, 3).astype(np.int32)
+
+
+def nyu40_truth(scan: AnnotatedScan, table: LabelTable | None) -> GroundTruth:
+    """Classes of NYU40; ``table`` is needed for files of the first release alone."""
+    semantic, source = nyu40_of_vertex(scan, table)
+    return GroundTruth(
+        scan.vertices,
+        semantic,
+        scan.instance,
+        nyu40_label_set(),
+        "nyu40-vertices",
+        f"vertices of _vh_clean_2.ply with {source} and the objects of .aggregation.json",
+    )
+
+
+def scannet200_truth(scan: AnnotatedScan, table: LabelTable) -> GroundTruth:
+    """Raw ids of the objects' categories."""
+    _say_what_is_unknown(scan, table)
+    return GroundTruth(
+        scan.vertices,
+        scan.of_category(table.raw_id_of),
+        scan.instance,
+        raw_label_set(table),
+        "scannet200-vertices",
+        "vertices of _vh_clean_2.ply with the raw ids of the objects' categories in .aggregation.json",
+    )
+
+
+def nyu40_of_vertex(scan: AnnotatedScan, table: LabelTable | None) -> tuple[Int32Array, str]:
+    """The NYU40 class of each vertex, 0 for none, and where it is from."""
+    if not _holds_raw_ids(scan, table):
+        return scan.labels.astype(np.int32), "the labels of _vh_clean_2.labels.ply"
+    if table is None:
+        raise GroundTruthMissing(
+            f"{scan.where}: the labels are raw ids of the first release (the largest: {scan.labels.max()}); their "
+            f"classes are in {TABLE_NAME}, which is not beside the scans"
+        )
+    _say_what_is_unknown(scan, table)
+    return scan.of_category(table.nyu40_of), "the NYU40 classes of the objects' categories"
+
+
+def _holds_raw_ids(scan: AnnotatedScan, table: LabelTable | None) -> bool:
+    if scan.labels.max() > MAX_NYU40_ID:
+        return True
+    if table is None:
+        return False
+    is_annotated = scan.object_of_vertex >= 0
+    n_raw, n_nyu40 = (
+        int((scan.labels == scan.of_category(value_of))[is_annotated].sum())
+        for value_of in (table.raw_id_of, table.nyu40_of)
+    )
+    return n_raw > n_nyu40
+
+
+def _say_what_is_unknown(scan: AnnotatedScan, table: LabelTable) -> None:
+    """A warning that counts the categories without a row; their vertices are void."""
+    unknown = [row for row, one in enumerate(scan.objects) if one.category not in table.nyu40_of]
+    if unknown:
+        categories = sorted({scan.objects[row].category for row in unknown})
+        logger.warning(
+            "%s: categories without a row in %s: %d (the first: %s); vertices made void: %d",
+            scan.where, TABLE_NAME, len(categories), ascii(categories[0][:40]),
+            int(np.isin(scan.object_of_vertex, unknown).sum()),
+        )  # fmt: skip
+
+
+def instance_mesh(scan: AnnotatedScan, table: LabelTable | None) -> InstanceMesh:
+    """The triangles, each with the instance of most of its vertices, 0 where all three differ; classes of NYU40.
+
+    The class of an instance is that of most of its vertices, the lowest where several have as many.
+    """
+    if len(scan.triangles) == 0:
+        raise DataError(f"{scan.where}: the mesh has no faces to project; copy _vh_clean_2.ply again")
+    instance = scan.instance
+    first, second, third = instance[scan.triangles].T
+    of_triangle = np.where((first == second) | (first == third), first, np.where(second == third, second, 0))
+    semantic, _ = nyu40_of_vertex(scan, table)
+    n_classes = MAX_NYU40_ID + 1
+    ids = np.unique(instance[instance > 0])
+    counts = np.bincount(instance.astype(np.int64) * n_classes + semantic, minlength=(instance.max() + 1) * n_classes)
+    classes = counts.reshape(-1, n_classes)[ids].argmax(axis=1)
+    return InstanceMesh(
+        scan.vertices,
+        scan.triangles,
+        of_triangle.astype(np.int32),
+        {int(one): int(class_id) for one, class_id in zip(ids, classes, strict=True) if class_id > 0},
+        nyu40_label_set(),
+    )

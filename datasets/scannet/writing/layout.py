@@ -1,0 +1,172 @@
+"""Scenes in the exact layout of ScanNet: ``scans/<scan>/`` with recording, mesh and annotation, the label table above.
+
+The recording is a ``.sens`` file here; the exports of the two original readers are in ``scannet_export_layout``.
+"""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from su3d_bench.formats.images import image_size
+from su3d_bench.formats.layout_files import JPEG_QUALITY, depth_in_units, jpeg_bytes
+from su3d_bench.datasets.scannet.labels import TABLE_NAME
+from su3d_bench.datasets.scannet.writing.truth import write_scan_truth
+from su3d_bench.datasets.scannet.scannet_meta import meta_name
+from su3d_bench.datasets.scannet.writing.categories import label_table_text, room_of, scan_name
+from su3d_bench.datasets.scannet.truth import truth_names
+from su3d_bench.datasets.writing import ScannedDataset, SceneTarget, write_shared_text
+from su3d_bench.datasets.scannet.sens.read import FRAME_RECORD, MICROSECONDS, MOTION_RECORD
+from su3d_bench.datasets.scannet.sens.header import SensHeader
+from su3d_bench.datasets.scannet.sens.write import SensFrame, depth_content, write_sens
+from su3d_bench.core.types import Float64Array, Frame
+
+LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
+DEPTH_SHIFT = 1000.0  # units a metre, of every recording of the release
+SCANS_FOLDER = "scans"
+SENSOR_NAME = "StructureSensor"  # as the release has it, readers may know it
+PIECES = ".frames"
+
+
+class Recording(Protocol):
+    """How the frames of a scan are stored; ``name`` is the layout's."""
+
+    @property
+    def name(self) -> str: ...
+
+    def holder(self, scan: str) -> str:
+        """What holds the frames in the folder of the scan: ``SceneTarget.frames``."""
+        ...
+
+    def frame_names(self, index: int) -> Sequence[str]: ...
+    def frame_files(self, frame: Frame) -> Sequence[bytes]: ...
+
+    def join(self, dataset: ScannedDataset, target: SceneTarget) -> None:
+        """Write what is more than a frame, the holder last where it is a file."""
+        ...
+
+
+@dataclass(frozen=True)
+class ScannetLayout:
+    """Rooms as scans ``scene9000_00`` and so on (see ``scannet_rooms``), frames as ``recording`` stores them."""
+
+    recording: Recording
+    reader: str = "scannet"
+
+    @property
+    def name(self) -> str:
+        return self.recording.name
+
+    @property
+    def settings(self) -> Sequence[Any]:
+        return LAYOUT_VERSION, self.name, DEPTH_SHIFT, JPEG_QUALITY
+
+    def scenes_folder(self, out: Path) -> Path:
+        return out / SCANS_FOLDER
+
+    def scene_name(self, scene: str) -> str:
+        return scan_name(scene)
+
+    def target(self, scene: str, key: str, out: Path) -> SceneTarget:
+        scan = scan_name(scene)
+        folder = out / SCANS_FOLDER / scan
+        names = (*truth_names(scan), meta_name(scan))
+        return SceneTarget(scene, key, folder, self.recording.holder(scan), tuple(folder / name for name in names))
+
+    def marker_extras(self, names: Sequence[str]) -> dict[str, Any]:
+        return {"rooms": {scan: room for scan in names if (room := room_of(scan)) is not None}}
+
+    def write_shared(self, dataset: ScannedDataset, scene: str, out: Path) -> None:
+        write_shared_text(out / TABLE_NAME, label_table_text(), "is another label table than that of the rooms")
+
+    def frame_names(self, index: int) -> Sequence[str]:
+        return self.recording.frame_names(index)
+
+    def frame_files(self, frame: Frame) -> Sequence[bytes]:
+        return self.recording.frame_files(frame)
+
+    def write_truth(self, dataset: ScannedDataset, target: SceneTarget) -> None:
+        write_scan_truth(dataset, target.scene, target.folder.name, target.partial)
+
+    def join(self, dataset: ScannedDataset, target: SceneTarget) -> None:
+        self.recording.join(dataset, target)
+
+
+@dataclass(frozen=True)
+class SensRecording:
+    """One ``.sens`` file: JPEG colour, zlib depth, no motion data; joined of the records that were written one by one.
+
+    Time stamps are microseconds from the first frame.
+    """
+
+    name: str = "scannet"
+
+    def holder(self, scan: str) -> str:
+        return f"{scan}.sens"
+
+    def frame_names(self, index: int) -> Sequence[str]:
+        return (f"{PIECES}/{index:06d}.record",)
+
+    def frame_files(self, frame: Frame) -> Sequence[bytes]:
+        colour, depth = jpeg_bytes(frame.rgb), depth_content(depth_in_units(frame.depth_m, DEPTH_SHIFT), "zlib")
+        record = np.zeros((), FRAME_RECORD)
+        record["camera_to_world"] = frame.camera_to_world
+        record["colour_timestamp"] = record["depth_timestamp"] = round(frame.timestamp_s * MICROSECONDS)
+        record["colour_bytes"], record["depth_bytes"] = len(colour), len(depth)
+        return (record.tobytes() + colour + depth,)
+
+    def join(self, dataset: ScannedDataset, target: SceneTarget) -> None:
+        if not target.has_frames:
+            n_frames = len(dataset.frames(target.scene, 1))
+            pieces = [target.partial / name for index in range(n_frames) for name in self.frame_names(index)]
+            header = sens_header(dataset.intrinsics, size_of(_frame_of(pieces[0].read_bytes()).colour))
+            records = (_frame_of(piece.read_bytes()) for piece in pieces)
+            write_sens(target.partial / target.frames, header, records, np.zeros(0, MOTION_RECORD))
+        if (target.partial / PIECES).exists():
+            shutil.rmtree(target.partial / PIECES)
+
+
+def _frame_of(piece: bytes) -> SensFrame:
+    record = np.frombuffer(piece, FRAME_RECORD, 1)[0]
+    times = int(record["colour_timestamp"]), int(record["depth_timestamp"])
+    end_of_colour = FRAME_RECORD.itemsize + int(record["colour_bytes"])
+    pose = record["camera_to_world"].astype(np.float64)
+    return SensFrame(pose, *times, piece[FRAME_RECORD.itemsize : end_of_colour], piece[end_of_colour:])
+
+
+def size_of(jpeg: bytes) -> tuple[int, int]:
+    """Width and height of a colour image, and so of the depth image beside it."""
+    size = image_size(jpeg)
+    assert size is not None
+    return size
+
+
+def intrinsics_4x4(intrinsics: Float64Array) -> Float64Array:
+    """The camera as ScanNet's files have it, fx 0 cx 0 / 0 fy cy 0 / 0 0 1 0 / 0 0 0 1, in the digits of float32."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = intrinsics
+    return matrix.astype(np.float32).astype(np.float64)
+
+
+def sens_header(intrinsics: Float64Array, size: tuple[int, int]) -> SensHeader:
+    """The header of a recording whose two cameras are one."""
+    camera, (width, height) = intrinsics_4x4(intrinsics), size
+    return SensHeader(
+        sensor_name=SENSOR_NAME,
+        intrinsic_colour=camera,
+        extrinsic_colour=np.eye(4),
+        intrinsic_depth=camera,
+        extrinsic_depth=np.eye(4),
+        colour_compression="jpeg",
+        depth_compression="zlib",
+        colour_width=width,
+        colour_height=height,
+        depth_width=width,
+        depth_height=height,
+        depth_shift=DEPTH_SHIFT,
+    )

@@ -1,0 +1,216 @@
+"""The layout of the TUM RGB-D benchmark: time stamps, images and a trajectory that were recorded side by side.
+
+A sequence is a folder below the data root, ``tum/`` or ``TUM/`` with
+
+- ``rgb.txt``, ``depth.txt``: lines ``time file``, files relative to the folder; lines that begin with # are comments
+- ``associate.txt`` (optional): lines ``time colour-file time depth-file``; without it, images pair up by time
+- ``groundtruth.txt``: lines ``time tx ty tz qx qy qz qw``, camera-to-world, seconds and metres
+- ``camera.txt`` (optional, ours): one line ``fx fy cx cy``, pixels; without it, the benchmark's figures for the camera
+  that the sequence's name tells (``fr1``, ``freiburg2``, ...), else the ROS default
+- the images: 8-bit colour; 16-bit depth registered to it, 5000 units a metre, 0 where there is none
+
+``rooms.json`` in the folder marks a sequence that ``datasets make`` rendered. There is no ground truth of objects.
+"""
+
+from __future__ import annotations
+
+import logging
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field
+
+from su3d_bench.datasets.recordings.recorded_frames import N_DEPTH_VALUES, Folder, RecordedFrame, RecordedFrames, Recording, left_out, numbers, pinhole, read_text
+from su3d_bench.datasets.tum.timed_poses import pose_at, read_trajectory, rows_of, seconds
+from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
+from su3d_bench.core.types import Float64Array, Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo
+
+logger = logging.getLogger(__name__)
+READER_VERSION = 1  # raise it whenever the same files come out as other frames
+FOLDERS = (".", "tum", "TUM")
+UNITS_PER_METRE = 5000.0  # the benchmark's page "file formats"
+DEPTH_M_OF_VALUE = (np.arange(N_DEPTH_VALUES) / UNITS_PER_METRE).astype(np.float32)
+MAX_CANDIDATES = 2_000_000  # pairs of images near in time; a recording has about two an image
+# fx fy cx cy of the colour cameras: the benchmark's page "file formats", section "intrinsic camera calibration".
+CAMERAS = {
+    "1": (517.3, 516.5, 318.6, 255.3),
+    "2": (520.9, 521.0, 325.1, 249.7),
+    "3": (535.4, 539.2, 320.1, 247.6),
+    "": (525.0, 525.0, 319.5, 239.5),  # "ROS default"
+}
+Stamped = tuple[float, str]  # time in seconds, file name
+
+
+class TumOptions(BaseModel):
+    """How images and poses are put together.
+
+    ``max_difference_s``: images further apart in time are no pair; a colour image without a pose within it is left out.
+    ``pose``: that at the colour image's time between its two neighbours (linear, spherical; the nearest alone where
+    the other is further away than ``max_difference_s``), or the ``nearest``. ``intrinsics``: fx fy cx cy, instead of
+    ``camera.txt`` and the benchmark's figures.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    max_difference_s: float = Field(default=0.02, gt=0, le=1)  # the benchmark's associate.py
+    pose: Literal["interpolate", "nearest"] = "interpolate"
+    intrinsics: tuple[float, float, float, float] | None = None
+
+
+class Tum:
+    """Sequences in the layout of the TUM RGB-D benchmark; unscored, because they have no ground truth of objects."""
+
+    name = "tum"
+    label_space = "none"
+    variants: tuple[str, ...] = ()
+    Options = TumOptions
+
+    def __init__(self, root: Path, options: TumOptions | None = None) -> None:
+        self.root = root
+        self.options = options or TumOptions()
+        self._last: tuple[str, Recording] | None = None
+
+    def scenes(self) -> Sequence[str]:
+        folders = [folder for place in self.places() if place.is_dir() for folder in sorted(place.iterdir())]
+        found = [folder.name for folder in folders if _is_sequence(folder)]
+        if not found:
+            raise DataError(
+                f"tum: no sequence in {self.root} or in its folder tum (a sequence is a folder with rgb.txt and "
+                "depth.txt); unpack one there or set SU3D_DATA to where they are"
+            )
+        return tuple(dict.fromkeys(found))
+
+    def places(self) -> Sequence[Path]:
+        """The folders that are searched for sequences."""
+        return [self.root / name for name in FOLDERS]
+
+    def info(self, scene: str, stride: int) -> SceneInfo:
+        frames = RecordedFrames(self._recording(scene), stride)
+        domain: ImageDomain = "rendered-rooms" if (self._folder(scene) / "rooms.json").is_file() else "camera"
+        return SceneInfo(self.name, scene, len(frames), stride, domain)
+
+    def frames(self, scene: str, stride: int) -> Sequence[Frame]:
+        return RecordedFrames(self._recording(scene), stride)
+
+    def files(self, scene: str) -> Sequence[Path]:
+        recording = self._recording(scene)
+        return (*recording.files, *recording.images())
+
+    def digest(self, scene: str) -> str:
+        return self._recording(scene).digest((self.name, READER_VERSION, scene, self.info(scene, 1).image_domain))
+
+    def problems(self, scene: str) -> Iterator[str]:
+        """What the lists name and is not there, one line each; the frames go on without it."""
+        yield from self._recording(scene).missing
+
+    def ground_truth(self, scene: str, variant: str) -> GroundTruth:
+        raise GroundTruthMissing(f"tum/{scene}: no ground truth '{variant}'; the benchmark has none of objects")
+
+    def instance_mesh(self, scene: str) -> InstanceMesh:
+        raise GroundTruthMissing(f"tum/{scene}: no annotated mesh; the benchmark has none")
+
+    def _folder(self, scene: str) -> Path:
+        for place in self.places():
+            if "/" not in scene and _is_sequence(place / scene):
+                return place / scene
+        known = self.scenes()
+        raise DataError(f"tum: no sequence '{scene}'{suggest(scene, known) or '; known: ' + ', '.join(known[:8])}")
+
+    def _recording(self, scene: str) -> Recording:
+        if self._last is None or self._last[0] != scene:
+            self._last = scene, self._open(self._folder(scene), f"tum/{scene}")
+        return self._last[1]
+
+    def _open(self, path: Path, where: str) -> Recording:
+        """The frames whose images and pose are there; what is missing is said once, as a warning."""
+        folder, limit_s = Folder(path), self.options.max_difference_s
+        has_pairs = (path / "associate.txt").exists()
+        pairs = read_pairs(path, where) if has_pairs else associate(path, where, limit_s)
+        lists = ("associate.txt",) if has_pairs else ("rgb.txt", "depth.txt")
+        named = f"{where}: {' and '.join(lists)}"
+        times_s, poses = read_trajectory(path / "groundtruth.txt", f"{where}: groundtruth.txt")
+        frames, missing, unposed = [], [], []
+        for index, ((colour_s, colour), (_, depth)) in enumerate(pairs):
+            absent = [name for name in (colour, depth) if not folder.file(name, named).is_file()]
+            missing += absent
+            if absent:
+                continue
+            # The colour image's time, as the benchmark's generate_registered_pointcloud.py: depth has its stamps late,
+            # and in fr1/desk depth images agree better with each other under it (88 % of the pixels against 80 %).
+            pose = pose_at(colour_s, times_s, poses, limit_s, interpolate=self.options.pose == "interpolate")
+            if pose is None:
+                unposed.append(colour)
+            else:
+                frames.append(RecordedFrame(index, colour_s, colour, depth, pose))
+        no_pose = f"colour images have no pose within {limit_s:g} s in groundtruth.txt"
+        remarks = [left_out(named, missing, "images named there are missing", len(frames))] if missing else []
+        remarks += [left_out(where, unposed, no_pose, len(frames))] if unposed else []
+        if not frames:
+            raise DataError(remarks[0] if remarks else f"{named}: no two images within {limit_s:g} s")
+        for line in remarks:
+            logger.warning("%s", line)
+        camera = ("camera.txt",) if (path / "camera.txt").exists() else ()
+        files = tuple(path / name for name in (*lists, *camera, "groundtruth.txt"))
+        lines = (
+            *(f"{named}: {name} is missing; copy it there" for name in missing),
+            *(f"{where}: {name} has no pose within {limit_s:g} s in groundtruth.txt" for name in unposed),
+        )
+        intrinsics = self._intrinsics(path, where)
+        return Recording(where, folder, tuple(frames), intrinsics, DEPTH_M_OF_VALUE, files, missing=lines)
+
+    def _intrinsics(self, path: Path, where: str) -> Float64Array:
+        if self.options.intrinsics is not None:
+            return pinhole(*self.options.intrinsics, where=f"{where}: option intrinsics")
+        if (path / "camera.txt").exists():
+            where = f"{where}: camera.txt"
+            words = read_text(path / "camera.txt", where).split()
+            if len(words) != 4:
+                raise DataError(f"{where}: has {len(words)} values; expected one line fx fy cx cy")
+            fx, fy, cx, cy = numbers(words, where)
+            return pinhole(fx, fy, cx, cy, where)
+        camera = re.search(r"(?:freiburg|fr)([123])", path.name)
+        return pinhole(*CAMERAS[camera[1] if camera else ""], where=where)
+
+
+def _is_sequence(folder: Path) -> bool:
+    """Whether the folder is a sequence; hidden ones are being made."""
+    if folder.name.startswith("."):
+        return False
+    return (folder / "rgb.txt").is_file() and (folder / "depth.txt").is_file()
+
+
+def read_pairs(folder: Path, where: str) -> list[tuple[Stamped, Stamped]]:
+    """The rows of ``associate.txt``."""
+    where = f"{where}: associate.txt"
+    rows = rows_of(folder / "associate.txt", where, 4, "'time colour-file time depth-file'")
+    place = f"{where} line"
+    return [((seconds(a, f"{place} {n}"), b), (seconds(c, f"{place} {n}"), d)) for n, (a, b, c, d) in rows]
+
+
+def associate(folder: Path, where: str, max_difference_s: float) -> list[tuple[Stamped, Stamped]]:
+    """Colour and depth images nearest in time, the nearest pair first, each image once, as associate.py does it."""
+    lists = []
+    for name in ("rgb.txt", "depth.txt"):
+        rows = rows_of(folder / name, f"{where}: {name}", 2, "'time file'")
+        stamped = {seconds(time, f"{where}: {name} line {number}"): file for number, (time, file) in rows}
+        lists.append(sorted(stamped.items()))
+    colours, depths = lists
+    colour_s, depth_s = (np.array([time for time, _ in stamped]) for stamped in lists)
+    first = np.searchsorted(depth_s, colour_s - max_difference_s)
+    n_near = np.searchsorted(depth_s, colour_s + max_difference_s, side="right") - first
+    if (n := int(n_near.sum())) > MAX_CANDIDATES:
+        raise DataError(f"{where}: rgb.txt and depth.txt: {n} pairs within {max_difference_s:g} s; lower the limit")
+    left = np.repeat(np.arange(len(colours)), n_near)
+    right = np.arange(len(left)) - np.repeat(np.cumsum(n_near) - n_near - first, n_near)
+    difference_s = np.abs(colour_s[left] - depth_s[right])
+    partner: dict[int, int] = {}
+    taken: set[int] = set()
+    for k in np.lexsort((right, left, difference_s)):
+        i, j = int(left[k]), int(right[k])
+        if difference_s[k] < max_difference_s and i not in partner and j not in taken:
+            partner[i] = j
+            taken.add(j)
+    return [(colours[i], depths[j]) for i, j in sorted(partner.items())]

@@ -1,0 +1,243 @@
+"""Scenes of a scanned dataset, written as files in another dataset's layout: taken up again, whole or not at all.
+
+A scene is built in a hidden folder beside its place and moved there when it is whole; a killed process leaves frames
+that the next one takes over, and no scene that looks finished. ``rooms.json`` in the folder of the scenes names those
+that were made here, each with the key of what it was made from.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+from su3d_bench.datasets.replica.folders import MARKER, read_marker
+from su3d_bench.core.digests import digest_json
+from su3d_bench.core.errors import StoreError
+from su3d_bench.store.run_folder import make_folder, write_bytes, write_json, write_text
+from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, UInt8Array
+
+FRAMES_PER_SECOND = 30.0
+
+
+class ScannedObject(Protocol):
+    """An object with its id in the scan, its class, and its axis-aligned box in the world, metres."""
+
+    @property
+    def id(self) -> int: ...
+    @property
+    def class_id(self) -> int: ...
+    @property
+    def class_name(self) -> str: ...
+    @property
+    def box_min(self) -> Sequence[float]: ...
+    @property
+    def box_max(self) -> Sequence[float]: ...
+
+
+class Scan(Protocol):
+    """``vertices`` and ``normals`` (V, 3), ``colours`` (V, 3), ``faces`` (F, 4) quads, ``object_id`` (F,)."""
+
+    @property
+    def vertices(self) -> Float32Array: ...
+    @property
+    def normals(self) -> Float32Array: ...
+    @property
+    def colours(self) -> UInt8Array: ...
+    @property
+    def faces(self) -> Int32Array: ...
+    @property
+    def object_id(self) -> Int32Array: ...
+
+
+class ScannedDataset(Protocol):
+    """What can be written: Replica's classes, one camera at ``FRAMES_PER_SECOND``, frames at full rate and a scan."""
+
+    name: str
+
+    @property
+    def intrinsics(self) -> Float64Array: ...
+    def digest(self, scene: str) -> str: ...
+    def objects(self, scene: str) -> Sequence[ScannedObject]: ...
+    def trajectory(self, scene: str) -> Float64Array: ...
+    def frames(self, scene: str, stride: int) -> Sequence[Frame]: ...
+    def scan(self, scene: str) -> Scan: ...
+
+
+@dataclass(frozen=True)
+class SceneTarget:
+    """One scene to be made, under the ``key`` of what it is made from.
+
+    ``folder`` bears the scene's name in the layout. ``frames`` is the name in it of what holds the frames; where that
+    is one file, it is written whole. ``truth`` are the other files without which the scene is not whole. ``apart`` are
+    files and folders with a place outside ``folder``, each with its name while the scene is built.
+    """
+
+    scene: str
+    key: str
+    folder: Path
+    frames: str
+    truth: tuple[Path, ...] = ()
+    apart: tuple[tuple[str, Path], ...] = ()
+
+    @property
+    def partial(self) -> Path:
+        """Where the scene is built; it bears the key, so that frames of another making are never taken over."""
+        return self.folder.with_name(f".{self.folder.name}.{self.key[:12]}.partial")
+
+    @property
+    def has_frames(self) -> bool:
+        return (self.folder / self.frames).exists() or (self.partial / self.frames).is_file()
+
+    @property
+    def is_whole(self) -> bool:
+        return all(path.exists() for path in (self.folder / self.frames, *self.truth))
+
+
+class Layout(Protocol):
+    """How the scenes of one dataset are named, and how their frames and their truth are written.
+
+    ``name`` is that of ``--layout``, ``reader`` the dataset that reads it. ``settings`` is what moves a byte of a scene
+    besides the scene itself, the layout's version first.
+    """
+
+    @property
+    def name(self) -> str: ...
+    @property
+    def reader(self) -> str: ...
+    @property
+    def settings(self) -> Sequence[Any]: ...
+
+    def scenes_folder(self, out: Path) -> Path: ...
+
+    def scene_name(self, scene: str) -> str:
+        """What the scene is called in the layout; a ``DataError`` where it has no name for it."""
+        ...
+
+    def target(self, scene: str, key: str, out: Path) -> SceneTarget: ...
+
+    def marker_extras(self, names: Sequence[str]) -> dict[str, Any]:
+        """What else the marker says of the scenes, by their names in the layout."""
+        ...
+
+    def write_shared(self, dataset: ScannedDataset, scene: str, out: Path) -> None:
+        """Write what all scenes share; a ``StoreError`` where there is another."""
+        ...
+
+    def frame_names(self, index: int) -> Sequence[str]:
+        """The files of a frame, by their names in the folder in which the scene is built."""
+        ...
+
+    def frame_files(self, frame: Frame) -> Sequence[bytes]:
+        """The content of each of ``frame_names``."""
+        ...
+
+    def write_truth(self, dataset: ScannedDataset, target: SceneTarget) -> None:
+        """Write all files but those of the frames into ``target.partial``."""
+        ...
+
+    def join(self, dataset: ScannedDataset, target: SceneTarget) -> None:
+        """Make in ``target.partial`` what takes all frames at once; called when the rest is written."""
+        ...
+
+
+def plan_scenes(layout: Layout, dataset: ScannedDataset, scenes: Sequence[str], out: Path) -> list[SceneTarget]:
+    """The scenes that are not yet whole below ``out``, which is made ready for them; one caller at a time.
+
+    Raises ``StoreError`` where ``out`` cannot be written or holds one of the scenes, or what they share, from
+    elsewhere.
+    """
+    folder = layout.scenes_folder(out)
+    make_folder(folder)
+    targets = [layout.target(scene, digest_json([dataset.digest(scene), *layout.settings]), out) for scene in scenes]
+    marked = read_marker(folder)
+    for target in targets:
+        if target.folder.exists() and marked.get(target.folder.name) != target.key:
+            raise StoreError(
+                f"{target.folder}: holds another '{target.folder.name}', made elsewhere or with other options; delete "
+                "it or choose another folder with --out"
+            )
+    pending = [target for target in targets if not target.is_whole]
+    if not pending:
+        return []
+    layout.write_shared(dataset, pending[0].scene, out)
+    marked |= {target.folder.name: target.key for target in targets}
+    marker = {"generator": f"su3d-bench {dataset.name}", "version": layout.settings[0]}
+    marker |= {"scenes": dict(sorted(marked.items()))} | layout.marker_extras(sorted(marked))
+    write_json(folder / MARKER, marker)
+    for target in pending:
+        for leftover in target.partial.rglob(".*.tmp"):
+            leftover.unlink(missing_ok=True)
+    return pending
+
+
+def write_shared_text(path: Path, text: str, complaint: str) -> None:
+    """Write a file that all scenes share; where it is there with another content, a ``StoreError`` that says so."""
+    if path.exists() and path.read_text(encoding="utf-8", errors="replace") != text:
+        raise StoreError(f"{path}: {complaint}, and all scenes of a folder share one; choose another folder with --out")
+    write_text(path, text)
+
+
+def write_frames(
+    layout: Layout,
+    dataset: ScannedDataset,
+    target: SceneTarget,
+    indices: range,
+    report: Callable[[int], None] = lambda n_done: None,
+) -> None:
+    """The files of the frames at ``indices``; those that an earlier process has written are kept."""
+    if target.has_frames:
+        return
+    for folder in {(target.partial / name).parent: None for name in layout.frame_names(0)}:
+        make_folder(folder)
+    frames = dataset.frames(target.scene, 1)
+    for n_done, index in enumerate(indices, 1):
+        paths = [target.partial / name for name in layout.frame_names(index)]
+        if not all(path.exists() for path in paths):
+            for path, content in zip(paths, layout.frame_files(frames[index]), strict=True):
+                write_bytes(path, content)
+        report(n_done)
+
+
+def finish_scene(layout: Layout, dataset: ScannedDataset, target: SceneTarget) -> None:
+    """Move everything to its place, the scene's folder last: only then is there a scene."""
+    try:
+        layout.join(dataset, target)
+        for name, place in target.apart:
+            if place.is_dir():
+                shutil.rmtree(place)
+            place.parent.mkdir(parents=True, exist_ok=True)
+            os.replace(target.partial / name, place)
+        if target.folder.exists():
+            _add_files(target.partial, target.folder)
+        else:
+            os.replace(target.partial, target.folder)
+        for leftover in target.folder.parent.glob(f".{target.folder.name}.*.partial"):
+            shutil.rmtree(leftover)
+    except OSError as error:
+        raise StoreError(f"cannot write {target.folder}: {error.strerror or error}") from error
+
+
+def _add_files(source: Path, folder: Path) -> None:
+    """Move every file below ``source`` to the same place below ``folder``."""
+    for path in sorted(path for path in source.rglob("*") if path.is_file()):
+        place = folder / path.relative_to(source)
+        place.parent.mkdir(parents=True, exist_ok=True)
+        os.replace(path, place)
+
+
+def write_scene(
+    layout: Layout,
+    dataset: ScannedDataset,
+    scene: str,
+    out: Path,
+    report: Callable[[int], None] = lambda n_done: None,
+) -> None:
+    """Write one scene whole; nothing is done where it is there already."""
+    for target in plan_scenes(layout, dataset, [scene], out):
+        write_frames(layout, dataset, target, range(len(dataset.frames(scene, 1))), report)
+        layout.write_truth(dataset, target)
+        finish_scene(layout, dataset, target)
