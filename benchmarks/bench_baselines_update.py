@@ -13,12 +13,12 @@ import numpy as np
 import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 
-from su3d_bench.baselines.conceptfusion import ConceptFusion, ConceptFusionConfig
-from su3d_bench.baselines.conceptgraphs import ConceptGraphs
-from su3d_bench.baselines.conceptgraphs_objects import MapObject, Sighting
-from su3d_bench.baselines.conceptgraphs_regions import box_of
-from su3d_bench.baselines.group_overlap import GroupedCloud, voxelise
-from su3d_bench.baselines.sam3d import SAM3D, SAM3DConfig
+from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig
+from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
+from su3d_bench.baselines.conceptgraphs.objects import MapObject, Sighting
+from su3d_bench.baselines.conceptgraphs.regions import box_of
+from su3d_bench.baselines.sam3d.overlap import GroupedCloud, voxelise
+from su3d_bench.baselines.sam3d.method import SAM3D, SAM3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Detections, Float64Array, Frame, Int64Array, SceneInfo

@@ -25,7 +25,7 @@ from typing import Any
 import numpy as np
 from measured import write_measured
 
-from su3d_bench.baselines.conceptfusion import ConceptFusion, ConceptFusionConfig
+from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.store.run_folder import read_prediction, write_prediction

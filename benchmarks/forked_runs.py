@@ -139,6 +139,6 @@ def load_modules(subject: str) -> None:
     if subject == "opensu3d":
         import sklearn.cluster  # noqa: F401
 
-        import su3d_bench.baselines.conceptfusion
-        import su3d_bench.baselines.sam3d
+        import su3d_bench.baselines.conceptfusion.method
+        import su3d_bench.baselines.sam3d.method
         import su3d_bench.opensu3d.pipeline  # noqa: F401

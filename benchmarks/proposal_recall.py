@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core import registry
-from su3d_bench.baselines.openmask3d import OpenMask3DConfig
-from su3d_bench.baselines.openmask3d_segment3d import OpenMask3DSegment3DConfig
-from su3d_bench.baselines.proposals import ProposalConfig, make_proposals
+from su3d_bench.baselines.openmask3d.method import OpenMask3DConfig
+from su3d_bench.baselines.openmask3d.openmask3d_segment3d import OpenMask3DSegment3DConfig
+from su3d_bench.baselines.openmask3d.proposals import ProposalConfig, make_proposals
 from su3d_bench.metrics.matching.nearest import Masks, transfer_masks
 from su3d_bench.planning import data_root
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol

@@ -22,15 +22,15 @@ DATASETS = {
 }
 METHODS = {
     "opensu3d": "su3d_bench.opensu3d.pipeline:OpenSU3D",
-    "conceptfusion": "su3d_bench.baselines.conceptfusion:ConceptFusion",
-    "conceptfusion-sam": "su3d_bench.baselines.conceptfusion_sam:ConceptFusionSam",
-    "conceptgraphs": "su3d_bench.baselines.conceptgraphs:ConceptGraphs",
-    "conceptgraphs-detector": "su3d_bench.baselines.conceptgraphs_detector:ConceptGraphsDetector",
-    "openmask3d": "su3d_bench.baselines.openmask3d:OpenMask3D",
-    "openmask3d-segment3d": "su3d_bench.baselines.openmask3d_segment3d:OpenMask3DSegment3D",
-    "sam3d": "su3d_bench.baselines.sam3d:SAM3D",
+    "conceptfusion": "su3d_bench.baselines.conceptfusion.method:ConceptFusion",
+    "conceptfusion-sam": "su3d_bench.baselines.conceptfusion.conceptfusion_sam:ConceptFusionSam",
+    "conceptgraphs": "su3d_bench.baselines.conceptgraphs.method:ConceptGraphs",
+    "conceptgraphs-detector": "su3d_bench.baselines.conceptgraphs.conceptgraphs_detector:ConceptGraphsDetector",
+    "openmask3d": "su3d_bench.baselines.openmask3d.method:OpenMask3D",
+    "openmask3d-segment3d": "su3d_bench.baselines.openmask3d.openmask3d_segment3d:OpenMask3DSegment3D",
+    "sam3d": "su3d_bench.baselines.sam3d.method:SAM3D",
     "oracle": "su3d_bench.baselines.oracle:Oracle",
-    "command": "su3d_bench.baselines.command:Command",
+    "command": "su3d_bench.baselines.command.method:Command",
 }
 GROUPS = {"dataset": "su3d_bench.datasets", "method": "su3d_bench.methods"}
 BUILT_IN = {"dataset": DATASETS, "method": METHODS}

@@ -18,9 +18,9 @@ from painted import INTRINSICS, ColourPerception, colour_perception
 from places import SCENES
 
 from su3d_bench import scene_run
-from su3d_bench.baselines.command import Command, CommandConfig
-from su3d_bench.baselines.command_frames import FrameFolder, write_mesh
-from su3d_bench.baselines.command_prediction import ClassNames, as_prediction, class_names
+from su3d_bench.baselines.command.method import Command, CommandConfig
+from su3d_bench.baselines.command.frames import FrameFolder, write_mesh
+from su3d_bench.baselines.command.prediction import ClassNames, as_prediction, class_names
 from su3d_bench.cli.main import main
 from su3d_bench.datasets.replica.mesh_truth import read_surface
 from su3d_bench.datasets.rgbd.dataset import Rgbd

@@ -14,8 +14,8 @@ import pytest
 from made_programs import MASKS, fed, refused
 from pydantic import ValidationError
 
-from su3d_bench.baselines.command import Command, CommandConfig
-from su3d_bench.baselines.command_process import ContainerWatch, run_program
+from su3d_bench.baselines.command.method import Command, CommandConfig
+from su3d_bench.baselines.command.process import ContainerWatch, run_program
 
 
 def test_a_timeout_ends_children_too_even_those_that_left_the_group(tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ import pytest
 from grouped_clouds import HEIGHT, WIDTH, Plate, look
 from pydantic import ValidationError
 
-from su3d_bench.baselines.sam3d import SAM3D, SAM3DConfig, paint
+from su3d_bench.baselines.sam3d.method import SAM3D, SAM3DConfig, paint
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import SceneTools
 from su3d_bench.core.timing import Timer

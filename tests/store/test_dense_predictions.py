@@ -20,9 +20,9 @@ from places import ROOT, SCENES
 
 from su3d_bench import scene_run
 from su3d_bench.store import run_folder as store
-from su3d_bench.baselines import feature_table
-from su3d_bench.baselines.conceptfusion import ConceptFusion, ConceptFusionConfig
-from su3d_bench.baselines.feature_table import FeatureTable
+from su3d_bench.baselines.conceptfusion import feature_table
+from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig
+from su3d_bench.baselines.conceptfusion.feature_table import FeatureTable
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.metrics.matching.labelling import most_similar

@@ -23,8 +23,8 @@ from painted import colour_perception
 from places import SCENES
 
 from su3d_bench import scene_run
-from su3d_bench.baselines.conceptgraphs import ConceptGraphs
-from su3d_bench.baselines.conceptgraphs_config import MappingConfig
+from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
+from su3d_bench.baselines.conceptgraphs.config import MappingConfig
 from su3d_bench.cli.main import main
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D

@@ -10,10 +10,10 @@ import pytest
 from conceptgraphs_scene import DIMENSION, HEIGHT, QUIET, SCENE, WIDTH, Plate, block, look
 from perception_fakes import CountingEncoder, still_life
 
-from su3d_bench.baselines.conceptgraphs import ConceptGraphs
-from su3d_bench.baselines.conceptgraphs_config import MappingConfig
-from su3d_bench.baselines.conceptgraphs_regions import LiftedRegion, kept_regions, lift, subtract_contained
-from su3d_bench.baselines.object_clouds import bounding_box, density_clusters, largest_cluster, voxel_average
+from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
+from su3d_bench.baselines.conceptgraphs.config import MappingConfig
+from su3d_bench.baselines.conceptgraphs.regions import LiftedRegion, kept_regions, lift, subtract_contained
+from su3d_bench.baselines.conceptgraphs.clouds import bounding_box, density_clusters, largest_cluster, voxel_average
 from su3d_bench.core.errors import DataError
 from su3d_bench.numerics.geometry import back_project
 from su3d_bench.perception.profiles import PerceptionConfig, build_perception

@@ -142,7 +142,7 @@ def _proposals(folder: Path) -> Read:
     from prediction_files import write_openmask3d, write_scannet_text
     from test_proposals import SCENE, flat
 
-    from su3d_bench.baselines.proposal_files import digest_of_folder, read_proposals
+    from su3d_bench.baselines.openmask3d.proposal_files import digest_of_folder, read_proposals
 
     write_scannet_text(folder / "text", SCENE)
     write_openmask3d(folder / "torch", SCENE, np.zeros((3, 4)))
@@ -160,7 +160,7 @@ def _command_output(folder: Path) -> Read:
     from prediction_files import TOY, write_openyolo3d
     from test_proposals import flat
 
-    from su3d_bench.baselines.command_prediction import as_prediction, read_output
+    from su3d_bench.baselines.command.prediction import as_prediction, read_output
 
     write_openyolo3d(folder, TOY)
     n = TOY["masks"].shape[1]

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from painted import Painted
 
-from su3d_bench.baselines.command import Command, CommandConfig
+from su3d_bench.baselines.command.method import Command, CommandConfig
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import SceneTools
 from su3d_bench.scene_tools import no_detections

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.baselines.conceptgraphs_config import MappingConfig
-from su3d_bench.baselines.conceptgraphs_objects import MapObject, Sighting
-from su3d_bench.baselines.object_clouds import bounding_box
+from su3d_bench.baselines.conceptgraphs.config import MappingConfig
+from su3d_bench.baselines.conceptgraphs.objects import MapObject, Sighting
+from su3d_bench.baselines.conceptgraphs.clouds import bounding_box
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Detections, Frame, Instances, SceneInfo

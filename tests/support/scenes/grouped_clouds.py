@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.baselines.group_overlap import GroupedCloud
+from su3d_bench.baselines.sam3d.overlap import GroupedCloud
 from su3d_bench.core.types import Detections, Float64Array, Frame, Int64Array
 
 WIDTH, HEIGHT, FOCAL = 160, 120, 120.0

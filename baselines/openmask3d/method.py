@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from su3d_bench.baselines.mask_pipeline import MaskPipeline, MaskPipelineConfig
+from su3d_bench.baselines.openmask3d.mask_pipeline import MaskPipeline, MaskPipelineConfig
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
 from su3d_bench.core.types import Detections, Frame, Instances, PerceptionNeeds, SceneInfo
 

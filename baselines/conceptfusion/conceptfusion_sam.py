@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from su3d_bench.baselines.conceptfusion import LICENCE, PAPER, SOURCE, STATUS, ConceptFusion, ConceptFusionConfig
-from su3d_bench.baselines.pixel_features import Weights
+from su3d_bench.baselines.conceptfusion.method import LICENCE, PAPER, SOURCE, STATUS, ConceptFusion, ConceptFusionConfig
+from su3d_bench.baselines.conceptfusion.pixel_features import Weights
 from su3d_bench.core.interfaces import MethodAbout
 from su3d_bench.core.types import PerceptionNeeds
 

@@ -121,7 +121,7 @@ def nearest_points(
     """
     found, squared = np.full(len(queries), -1, np.int64), np.full(len(queries), np.inf, np.float32)
     if len(queries) and len(points):
-        from su3d_bench.baselines import group_overlap_kernels as kernels
+        from su3d_bench.baselines.sam3d import kernels as kernels
 
         asked, given = _float32(queries), _float32(points)
         starts = np.zeros((1 << (len(given) - 1).bit_length()) + 1, np.int64)

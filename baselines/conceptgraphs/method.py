@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.baselines.conceptgraphs_config import MappingConfig
-from su3d_bench.baselines.conceptgraphs_map import ObjectMap, warm_up
+from su3d_bench.baselines.conceptgraphs.config import MappingConfig
+from su3d_bench.baselines.conceptgraphs.map import ObjectMap, warm_up
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.types import Detections, Frame, Instances, PerceptionNeeds, SceneInfo
 

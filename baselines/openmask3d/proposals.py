@@ -8,10 +8,10 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from su3d_bench.baselines.mesh_segments import MIN_VERTICES, THRESHOLD
-from su3d_bench.baselines.proposal_components import PartRules, split_into_parts, voted_by_segments
-from su3d_bench.baselines.proposal_files import digest_of_folder, read_proposals
-from su3d_bench.baselines.surface_proposals import SOURCE, NodeChoice, segments_of, surface_proposals
+from su3d_bench.baselines.mesh_segments.segments import MIN_VERTICES, THRESHOLD
+from su3d_bench.baselines.openmask3d.components import PartRules, split_into_parts, voted_by_segments
+from su3d_bench.baselines.openmask3d.proposal_files import digest_of_folder, read_proposals
+from su3d_bench.baselines.openmask3d.surface_proposals import SOURCE, NodeChoice, segments_of, surface_proposals
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import SceneTools
 from su3d_bench.metrics.matching.nearest import Masks, transfer_masks

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.baselines.mesh_segments import MIN_VERTICES, THRESHOLD, mesh_segments
-from su3d_bench.baselines.segment_tree import SegmentTree, contacts_of, is_within, merge_tree
+from su3d_bench.baselines.mesh_segments.segments import MIN_VERTICES, THRESHOLD, mesh_segments
+from su3d_bench.baselines.openmask3d.segment_tree import SegmentTree, contacts_of, is_within, merge_tree
 from su3d_bench.core.types import Float64Array, Int64Array, Proposals, Surface
 
 SOURCE = "weight-free proposals from the mesh's shape, not a network's"

@@ -16,20 +16,7 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.baselines.group_overlap import (
-    NO_GROUP,
-    GroupedCloud,
-    MergeRules,
-    ensemble,
-    groups_on_surface,
-    match_pairs,
-    merge,
-    merge_regions,
-    numbered,
-    renumber,
-    voxelise,
-    without_small_groups,
-)
+from su3d_bench.baselines.sam3d.overlap import NO_GROUP, GroupedCloud, MergeRules, ensemble, groups_on_surface, match_pairs, merge, merge_regions, numbered, renumber, voxelise, without_small_groups
 from su3d_bench.core.errors import DataError
 from su3d_bench.numerics.geometry import back_project, valid_depth
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
@@ -233,7 +220,7 @@ class SAM3D:
         """Groups of the vertices after the ensemble, and the cloud with its views under the new numbers."""
         segments = surface.segments
         if segments is None:
-            from su3d_bench.baselines.mesh_segments import mesh_segments
+            from su3d_bench.baselines.mesh_segments.segments import mesh_segments
 
             segments = mesh_segments(surface.vertices, surface.triangles)
         large = without_small_groups(

@@ -56,7 +56,7 @@ def visible_pixels(
     beside a hole of the depth image, whose depth is 0, a point within the tolerance of the camera's plane is seen,
     whichever side it is on; one in the plane itself falls on the first pixel.
     """
-    from su3d_bench.baselines.mask_views_kernels import project
+    from su3d_bench.baselines.openmask3d.kernels import project
 
     projection = intrinsics @ np.linalg.inv(frame.camera_to_world)[:3]
     pixels: Int32Array = project(points, projection, frame.depth_m, depth_tolerance_m)
@@ -88,7 +88,7 @@ class MaskViews:
 
 def count_pixels(pixels: Int32Array, proposals: Proposals, n_image: int) -> Int64Array:
     """How many distinct ones of ``pixels`` (V,), of the ``n_image`` that there are, each mask covers (K,)."""
-    from su3d_bench.baselines.mask_views_kernels import count_distinct
+    from su3d_bench.baselines.openmask3d.kernels import count_distinct
 
     counts: Int64Array = count_distinct(pixels, proposals.indptr, proposals.indices, n_image)
     return counts

@@ -67,7 +67,7 @@ def axis_aligned_iou(a: Extents, b: Extents) -> Float64Array:
 
 def oriented_iou(a: Sequence[OrientedBox], b: Sequence[OrientedBox]) -> Float64Array:
     """IoU (A, B) of oriented boxes, exact up to rounding; every side must be longer than 0."""
-    from su3d_bench.baselines import box_overlap_kernels as kernels
+    from su3d_bench.baselines.conceptgraphs import kernels as kernels
 
     shared = kernels.intersection_volumes(*_arrays(a), *_arrays(b))
     volume_a = np.array([box.sizes.prod() for box in a])

@@ -141,7 +141,7 @@ class PointFusion:
         and its normal within the angle. Of several the highest count wins, then the smallest distance to the pixel's
         point (which gradslam calls the distance to the ray), then the older point.
         """
-        from su3d_bench.baselines import point_fusion_kernels
+        from su3d_bench.baselines.conceptfusion import kernels as point_fusion_kernels
 
         matched = np.full(view.height * view.width, ABSENT, np.int64)
         point_fusion_kernels.associate(

@@ -25,7 +25,7 @@ def mesh_segments(
     over its number of vertices; then segments below ``min_vertices`` join a neighbour. Vertices without a triangle are
     segments of their own. A degenerate triangle has no normal: its vertices join others by size alone.
     """
-    from su3d_bench.baselines.mesh_segments_kernels import edges_of, joined, sort_as_gnu
+    from su3d_bench.baselines.mesh_segments.kernels import edges_of, joined, sort_as_gnu
 
     edges, weights = edges_of(np.ascontiguousarray(vertices, np.float32), np.ascontiguousarray(triangles, np.int32))
     sort_as_gnu(weights, edges)

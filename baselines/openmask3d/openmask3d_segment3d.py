@@ -10,8 +10,8 @@ from typing import Annotated
 
 from pydantic import Field
 
-from su3d_bench.baselines.mask_pipeline import MaskPipelineConfig
-from su3d_bench.baselines.openmask3d import OpenMask3D
+from su3d_bench.baselines.openmask3d.mask_pipeline import MaskPipelineConfig
+from su3d_bench.baselines.openmask3d.method import OpenMask3D
 from su3d_bench.core.interfaces import MethodAbout
 
 

@@ -14,9 +14,9 @@ from typing import Annotated, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from su3d_bench.baselines.command_frames import ColourFormat, FrameFolder
-from su3d_bench.baselines.command_prediction import as_prediction, class_names, needs_classes, read_output
-from su3d_bench.baselines.command_process import ContainerWatch, Finished, TreeWatch, Watch, run_program
+from su3d_bench.baselines.command.frames import ColourFormat, FrameFolder
+from su3d_bench.baselines.command.prediction import as_prediction, class_names, needs_classes, read_output
+from su3d_bench.baselines.command.process import ContainerWatch, Finished, TreeWatch, Watch, run_program
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer

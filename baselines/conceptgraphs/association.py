@@ -9,16 +9,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from su3d_bench.baselines.box_overlap import (
-    are_coplanar,
-    axis_aligned_iou,
-    extents_of_boxes,
-    extents_of_clouds,
-    grown,
-    oriented_iou,
-)
-from su3d_bench.baselines.conceptgraphs_config import MappingConfig
-from su3d_bench.baselines.conceptgraphs_objects import MapObject
+from su3d_bench.baselines.conceptgraphs.boxes import are_coplanar, axis_aligned_iou, extents_of_boxes, extents_of_clouds, grown, oriented_iou
+from su3d_bench.baselines.conceptgraphs.config import MappingConfig
+from su3d_bench.baselines.conceptgraphs.objects import MapObject
 from su3d_bench.core.types import Float64Array, Int64Array
 
 LEAST_SIDE_M = 0.02  # thinner boxes are grown to it before they are intersected
