@@ -11,7 +11,7 @@ import re
 import sys
 from pathlib import Path
 
-from su3d_bench.reports.tables import markdown_table
+from su3d_bench.reports.tables.run import markdown_table
 
 README = Path(__file__).resolve().parent.parent / "README.md"
 BEGIN = "<!-- demo table: written by `su3d-bench run`, checked by .ci/check_readme.py -->\n"

@@ -133,7 +133,7 @@ def load_modules(subject: str) -> None:
     limit_threads()
     import su3d_bench.cli.main
     import su3d_bench.planning
-    import su3d_bench.reports.tables
+    import su3d_bench.reports.tables.run
     import su3d_bench.runner
 
     if subject == "opensu3d":

@@ -26,7 +26,7 @@ from su3d_bench.cli.query import encoder_of
 from su3d_bench.executors import limit_threads
 from su3d_bench.page_maps import QUERIES, page_scenes, points_of_each
 from su3d_bench.page_sources import page_numbers, scored_maps
-from su3d_bench.reports.html_page import page_html
+from su3d_bench.reports.page.page import page_html
 
 N_SCENES, N_METHODS = 20, 8
 MOST_BYTES, MOST_MS = 30_000_000, 3000.0

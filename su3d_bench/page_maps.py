@@ -23,19 +23,8 @@ from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.core.plain_text import printable, printable_json
 from su3d_bench.planning import data_root, dataset_targets
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.reports.html_map import (
-    Cloud,
-    box_in_view,
-    colour_plane,
-    frame_cover,
-    index_plane,
-    nearest_classes,
-    nearest_colours,
-    pack_map,
-    point_owners,
-    thinned,
-)
-from su3d_bench.reports.scene_look import SceneLook, look_at
+from su3d_bench.reports.page.maps import Cloud, box_in_view, colour_plane, frame_cover, index_plane, nearest_classes, nearest_colours, pack_map, point_owners, thinned
+from su3d_bench.reports.pictures.scene_look import SceneLook, look_at
 from su3d_bench.scene_job import Part, build_dataset
 from su3d_bench.store.run_folder import read_prediction
 from su3d_bench.core.types import DenseFeatures, Frame, GroundTruth, Instances, Int64Array, Prediction

@@ -18,7 +18,7 @@ from su3d_bench.finished_updates import read_update_times
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
 from su3d_bench.core.plain_text import printable, printable_json
 from su3d_bench.metrics.protocols import load_protocol
-from su3d_bench.reports.html_data import confusion_cells, series_of, summary_data
+from su3d_bench.reports.page.numbers import confusion_cells, series_of, summary_data
 from su3d_bench.store.run_folder import read_json
 from su3d_bench.metrics.costs import summarise
 

@@ -24,7 +24,7 @@ from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules, load_protoc
 from su3d_bench.questions.refined import refined_names
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.read_ahead import N_AHEAD, ReadAhead
-from su3d_bench.reports.pictures import draw_scene
+from su3d_bench.reports.pictures.maps import draw_scene
 from su3d_bench.scene_feeding import Feeding
 from su3d_bench.scene_job import (
     MethodOutcome,

@@ -166,7 +166,7 @@ def _draw(
     instances: Instances, scene: SceneMap, found: Answer, job: JobFolder, arguments: argparse.Namespace
 ) -> Path | None:
     """Draw the answer; None where it names no object."""
-    from su3d_bench.reports.reasoning_picture import SpokenOf, draw_reasoning
+    from su3d_bench.reports.pictures.answers import SpokenOf, draw_reasoning
 
     if not found.object_ids:
         if arguments.out is not None:

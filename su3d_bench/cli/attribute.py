@@ -43,8 +43,8 @@ def call(arguments: argparse.Namespace) -> int:
 
     limit_threads()
     from su3d_bench.attribution import attribute
-    from su3d_bench.reports.attribution_picture import draw_attribution
-    from su3d_bench.reports.attribution_table import attribution_tables
+    from su3d_bench.reports.pictures.attribution import draw_attribution
+    from su3d_bench.reports.tables.attribution import attribution_tables
 
     found = attribute(
         arguments.run,

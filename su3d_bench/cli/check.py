@@ -11,7 +11,7 @@ from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
-    from su3d_bench.gate_findings import Verdict
+    from su3d_bench.reports.gate_findings import Verdict
 
 
 def add_parser(verbs: Any) -> None:
@@ -82,7 +82,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
     from su3d_bench.finished_run import read_run
     from su3d_bench.gate import check, read_reference
-    from su3d_bench.reports.gate_report import github_lines, plain_lines
+    from su3d_bench.reports.gate import github_lines, plain_lines
 
     verdict = check(read_run(arguments.runs[0]), read_reference(arguments.against))
     _write(verdict, arguments)
@@ -99,7 +99,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
 
 def _write(verdict: Verdict, arguments: argparse.Namespace) -> None:
-    from su3d_bench.reports.gate_report import junit_xml, markdown
+    from su3d_bench.reports.gate import junit_xml, markdown
     from su3d_bench.store.run_folder import make_folder, write_text
 
     for path, text in ((arguments.markdown, markdown), (arguments.junit, junit_xml)):

@@ -39,7 +39,7 @@ def call(arguments: argparse.Namespace) -> int:
 
     limit_threads()
     from su3d_bench.comparison import compare
-    from su3d_bench.reports.comparison_table import comparison_tables
+    from su3d_bench.reports.tables.comparison import comparison_tables
 
     found = compare(
         arguments.left,

@@ -12,8 +12,8 @@ from su3d_bench.cli.progress import progress
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
 from su3d_bench.executors import Event
 from su3d_bench.core.plain_text import printable, printable_json
-from su3d_bench.reports.scene_look import look_at
-from su3d_bench.reports.scene_picture import draw_scene_picture, facts_line
+from su3d_bench.reports.pictures.scene_look import look_at
+from su3d_bench.reports.pictures.scene import draw_scene_picture, facts_line
 
 
 def show(arguments: argparse.Namespace) -> int:

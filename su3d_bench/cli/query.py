@@ -42,7 +42,7 @@ def call(arguments: argparse.Namespace) -> int:
 
     limit_threads()
     from su3d_bench.opensu3d.retrieval import rank
-    from su3d_bench.reports.pictures import draw_heat_map
+    from su3d_bench.reports.pictures.maps import draw_heat_map
     from su3d_bench.store.run_folder import RunFolder, read_prediction
     from su3d_bench.core.types import DenseFeatures, Instances
 

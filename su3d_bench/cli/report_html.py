@@ -47,7 +47,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.page_maps import MOST_POINTS, QUERIES, page_scenes, points_of_each
     from su3d_bench.page_sources import page_numbers, scored_maps
     from su3d_bench.core.plain_text import printable
-    from su3d_bench.reports.html_page import page_html
+    from su3d_bench.reports.page.page import page_html
     from su3d_bench.store.run_folder import make_folder, write_text
 
     if not 0 < arguments.most_megabytes <= 1000:

@@ -12,7 +12,7 @@ from su3d_bench.cli.flags import add_verb, answer, remark
 from su3d_bench.core.errors import EXIT_DONE
 
 if TYPE_CHECKING:
-    from su3d_bench.reports.table_model import Table
+    from su3d_bench.reports.tables.model import Table
 
 NAME = "tables"
 FORMATS = ("markdown", "latex", "csv", "html")
@@ -80,9 +80,9 @@ def call(arguments: argparse.Namespace) -> int:
 
 def _tables(arguments: argparse.Namespace) -> list[Table]:
     from su3d_bench.ablation import read_rows
-    from su3d_bench.reports.ablation_table import SweepRow, ablation_table
-    from su3d_bench.reports.judged_tables import JUDGED, judged_table
-    from su3d_bench.reports.paper_tables import Shown, paper_table, selection_tables
+    from su3d_bench.reports.tables.ablation_table import SweepRow, ablation_table
+    from su3d_bench.reports.tables.judged import JUDGED, judged_table
+    from su3d_bench.reports.tables.paper import Shown, paper_table, selection_tables
     from su3d_bench.table_sources import choose, is_scores, measured_results
 
     shown = Shown(
@@ -110,7 +110,7 @@ def _tables(arguments: argparse.Namespace) -> list[Table]:
 
 
 def _formatter(name: str) -> Callable[[Sequence[Table]], str]:
-    from su3d_bench.reports.latex import latex
-    from su3d_bench.reports.table_formats import csv_text, html_page, markdown
+    from su3d_bench.reports.tables.latex import latex
+    from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
 
     return {"markdown": markdown, "latex": latex, "csv": csv_text, "html": html_page}[name]

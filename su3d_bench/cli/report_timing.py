@@ -41,7 +41,7 @@ def call(arguments: argparse.Namespace) -> int:
 
     from su3d_bench.core.errors import ConfigError
     from su3d_bench.finished_run import read_run
-    from su3d_bench.reports.timing_tables import csv_text, markdown, methods_csv
+    from su3d_bench.reports.tables.timing import csv_text, markdown, methods_csv
     from su3d_bench.metrics.costs import summarise
 
     if arguments.warm_up < 0 or not arguments.camera_rate > 0:
@@ -80,7 +80,7 @@ def _times(run: FinishedRun, method: str) -> list[UpdateTimes]:
 
 def _anytime(run: FinishedRun, times: list[UpdateTimes]) -> list[Any]:
     """The maps midway and the last one, where the run scored some midway."""
-    from su3d_bench.reports.timing_tables import AnytimePoint
+    from su3d_bench.reports.tables.timing import AnytimePoint
 
     method = times[0].method
     points = []
@@ -106,7 +106,7 @@ def _seconds_until(times: UpdateTimes, index: int) -> float:
 def _write(
     arguments: argparse.Namespace, files: dict[str, str], times: list[list[UpdateTimes]], anytime: list[Any]
 ) -> None:
-    from su3d_bench.reports.timing_plots import draw_timing
+    from su3d_bench.reports.pictures.timing import draw_timing
     from su3d_bench.store.run_folder import make_folder, write_text
 
     make_folder(arguments.out)

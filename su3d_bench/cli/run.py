@@ -157,7 +157,7 @@ def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
 
 
 def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
-    from su3d_bench.reports.tables import markdown_table
+    from su3d_bench.reports.tables.run import markdown_table
 
     if arguments.json:
         answer_json(result.metrics)

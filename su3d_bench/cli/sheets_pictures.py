@@ -43,8 +43,8 @@ def call(arguments: argparse.Namespace) -> int:
     limit_threads()
     from su3d_bench.cli.query import encoder_of
     from su3d_bench.finished_run import read_run
-    from su3d_bench.reports.figure_grid import draw_grid
-    from su3d_bench.reports.heat_scales import scale_stops
+    from su3d_bench.reports.pictures.figures import draw_grid
+    from su3d_bench.reports.pictures.heat_scales import scale_stops
     from su3d_bench.sheets.figures import Figures
     from su3d_bench.sheets.run_source import RunSource
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from su3d_bench.core.errors import DataError, ModelMissing
 from su3d_bench.core.plain_text import printable
 from su3d_bench.formats.zip_files import DAMAGE
-from su3d_bench.reports.table_formats import FORMULA_STARTS
+from su3d_bench.reports.tables.formats import FORMULA_STARTS
 from su3d_bench.sheets.items import ANSWER_COLUMNS
 
 MOST_BYTES = 256 << 20  # of one file: a workbook holds its pictures

@@ -8,20 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.reports.frame_views import best_view, mask_in_frame
-from su3d_bench.reports.heat_scales import Scale, scale_stops, similarity_colours
-from su3d_bench.reports.item_picture import (
-    LOW_HEIGHT,
-    PHOTO_WIDTH,
-    ZOOM_WIDTH,
-    ItemParts,
-    Panel,
-    Tag,
-    compose,
-    png_bytes,
-)
-from su3d_bench.reports.map_views import DrawnMap, MapView, drawn_map, pale
-from su3d_bench.reports.pictures import instance_colours
+from su3d_bench.reports.pictures.frame_views import best_view, mask_in_frame
+from su3d_bench.reports.pictures.heat_scales import Scale, scale_stops, similarity_colours
+from su3d_bench.reports.pictures.items import LOW_HEIGHT, PHOTO_WIDTH, ZOOM_WIDTH, ItemParts, Panel, Tag, compose, png_bytes
+from su3d_bench.reports.pictures.map_views import DrawnMap, MapView, drawn_map, pale
+from su3d_bench.reports.pictures.maps import instance_colours
 from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import SheetKind
 from su3d_bench.sheets.run_source import RunSource, mask_digest

@@ -16,12 +16,12 @@ from su3d_bench.questions.refined import refined_names
 from su3d_bench.reasoning.named_objects import nearest_by
 from su3d_bench.reasoning.scene_map import map_of
 from su3d_bench.reasoning.solver import Solver
-from su3d_bench.reports.figure_grid import Cell, GridRow
-from su3d_bench.reports.frame_views import seen_in
-from su3d_bench.reports.heat_scales import Scale, similarity_colours
-from su3d_bench.reports.item_picture import Tag
-from su3d_bench.reports.map_views import DrawnMap, MapView, drawn_map, pale
-from su3d_bench.reports.pictures import ROOM_SURFACES, class_colours
+from su3d_bench.reports.pictures.figures import Cell, GridRow
+from su3d_bench.reports.pictures.frame_views import seen_in
+from su3d_bench.reports.pictures.heat_scales import Scale, similarity_colours
+from su3d_bench.reports.pictures.items import Tag
+from su3d_bench.reports.pictures.map_views import DrawnMap, MapView, drawn_map, pale
+from su3d_bench.reports.pictures.maps import ROOM_SURFACES, class_colours
 from su3d_bench.sheets.drawing import ANSWER_COLOUR, OTHER_COLOUR
 from su3d_bench.sheets.run_source import RunSource
 from su3d_bench.core.types import Float64Array, Frame, Instances, UInt8Array

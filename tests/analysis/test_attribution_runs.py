@@ -15,7 +15,7 @@ from painted import WordEncoder, colour_perception
 from places import SCENES
 from scored_room import ENCODER, NAMES, instances, noisy, room, truth_as_prediction
 
-import su3d_bench.reports.attribution_table
+import su3d_bench.reports.tables.attribution
 from su3d_bench import scene_run
 from su3d_bench.attribution import KINDS, attribute
 from su3d_bench.cli import attribute as verb
@@ -27,7 +27,7 @@ from su3d_bench.metrics.attribution.masks import count_masks
 from su3d_bench.metrics.attribution.points import CAUSES, causes_of, mend_points
 from su3d_bench.metrics.attribution.arrays import scored_masks, scored_points
 from su3d_bench.metrics.protocols import load_protocol, protocol_names
-from su3d_bench.reports.attribution_table import MEANINGS
+from su3d_bench.reports.tables.attribution import MEANINGS
 from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
 

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from painted import colour_perception
 from places import SCENES
 
-import su3d_bench.reports.comparison_table
+import su3d_bench.reports.tables.comparison
 from su3d_bench import scene_run
 from su3d_bench.cli.main import main
 from su3d_bench.comparison import compare
@@ -27,7 +27,7 @@ from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.results.resampled_values import resampled_classes
 from su3d_bench.metrics.results.results import metric_values, resampled_metrics
 from su3d_bench.metrics.protocols import load_protocol
-from su3d_bench.reports.comparison_table import comparison_tables
+from su3d_bench.reports.tables.comparison import comparison_tables
 from su3d_bench.numerics.statistics import MAX_EXACT_PAIRS, SignFlipTest, resample_weights, sign_flip_test
 
 PAINTED = f"{SCENES}/painted.py:Painted"

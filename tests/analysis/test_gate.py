@@ -19,8 +19,8 @@ from su3d_bench import scene_run
 from su3d_bench.cli.main import main
 from su3d_bench.finished_run import read_run
 from su3d_bench.gate import Reference, check, learn, read_reference
-from su3d_bench.gate_findings import Finding, Verdict
-from su3d_bench.reports.gate_report import github_lines, junit_xml, markdown, plain_lines
+from su3d_bench.reports.gate_findings import Finding, Verdict
+from su3d_bench.reports.gate import github_lines, junit_xml, markdown, plain_lines
 
 PAINTED = f"{SCENES}/painted.py"
 WORDS = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--methods", f"{PAINTED}:Collector"]

@@ -12,7 +12,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.config import Setting, Settings
 from su3d_bench.core.interfaces import MethodAbout
 from su3d_bench.planning import make_plan
-from su3d_bench.reports.published import figures_of
+from su3d_bench.reports.tables.published import figures_of
 
 SYSTEMS = (
     "opensu3d",

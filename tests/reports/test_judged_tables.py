@@ -12,10 +12,10 @@ from simulated_annotators import RATES, SCHEMES, annotation_set, answered, reaso
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.reports.judged_tables import judged_table
-from su3d_bench.reports.latex import latex
-from su3d_bench.reports.measured import Measured
-from su3d_bench.reports.paper_tables import Shown
+from su3d_bench.reports.tables.judged import judged_table
+from su3d_bench.reports.tables.latex import latex
+from su3d_bench.reports.tables.measured import Measured
+from su3d_bench.reports.tables.paper import Shown
 from su3d_bench.sheets.score_file import write_scores
 from su3d_bench.sheets.scores import score
 from su3d_bench.sheets.validation import check_answers

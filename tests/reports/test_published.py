@@ -8,7 +8,7 @@ import pytest
 
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.metrics.protocols import load_protocol
-from su3d_bench.reports.published import Figure, figures_of, published, read_published
+from su3d_bench.reports.tables.published import Figure, figures_of, published, read_published
 
 WHOLE = """
 [[figure]]

@@ -15,8 +15,8 @@ from places import SCENES
 from su3d_bench import scene_run
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.reports.latex import latex
-from su3d_bench.reports.paper_tables import Shown, selection_tables
+from su3d_bench.reports.tables.latex import latex
+from su3d_bench.reports.tables.paper import Shown, selection_tables
 from su3d_bench.table_sources import check_paper, choose, measured_results
 
 

@@ -23,9 +23,9 @@ from su3d_bench.executors import run_processes
 from su3d_bench.finished_run import read_run
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.questions.model import new_question
-from su3d_bench.reports.frame_views import best_view, mask_in_frame, seen_in
-from su3d_bench.reports.heat_scales import SCALES, scale_stops, similarity_colours
-from su3d_bench.reports.item_picture import ItemParts, Panel, compose, png_bytes, zoomed
+from su3d_bench.reports.pictures.frame_views import best_view, mask_in_frame, seen_in
+from su3d_bench.reports.pictures.heat_scales import SCALES, scale_stops, similarity_colours
+from su3d_bench.reports.pictures.items import ItemParts, Panel, compose, png_bytes, zoomed
 from su3d_bench.sheets.drafts import annotation_drafts, retrieval_drafts
 from su3d_bench.sheets.drawing import Artist
 from su3d_bench.sheets.drawing_jobs import SceneDrafts, _lost, draw_all, draw_scene

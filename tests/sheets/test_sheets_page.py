@@ -11,7 +11,7 @@ import pytest
 from chromium import Chromium, find_chromium
 from made_sheets import HOSTILE, made
 
-from su3d_bench.reports.sheet_page import json_in_html
+from su3d_bench.reports.sheet.page import json_in_html
 from su3d_bench.sheets.items import ANSWER_COLUMNS, SheetKind
 from su3d_bench.sheets.making import MadeSheets, write_sheets
 

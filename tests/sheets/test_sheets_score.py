@@ -13,9 +13,9 @@ from simulated_annotators import RATES, SCHEMES, annotation_set, answered, as_cs
 
 from su3d_bench.cli.main import main
 from su3d_bench.questions.model import KINDS
-from su3d_bench.reports.second_looks import second_looks_csv, second_looks_page
-from su3d_bench.reports.sheet_tables import sheet_tables
-from su3d_bench.reports.table_formats import csv_text, html_page, markdown
+from su3d_bench.reports.sheet.second_looks import second_looks_csv, second_looks_page
+from su3d_bench.reports.tables.sheet_tables import sheet_tables
+from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
 from su3d_bench.sheets.items import Key, Sheet, write_key, write_sheet
 from su3d_bench.sheets.score_file import read_scores
 from su3d_bench.sheets.scores import ScoreCell, Scores, paired_p

@@ -243,7 +243,7 @@ def _protocol(folder: Path) -> Read:
 
 
 def _published(folder: Path) -> Read:
-    from su3d_bench.reports.published import FILE, read_published
+    from su3d_bench.reports.tables.published import FILE, read_published
 
     text = FILE.read_text(encoding="utf-8")
     (folder / "published.toml").write_text("[[figure]]".join(text.split("[[figure]]")[:4]))

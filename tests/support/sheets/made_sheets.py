@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from places import SCENES
 
-from su3d_bench.reports.item_picture import png_bytes
+from su3d_bench.reports.pictures.items import png_bytes
 from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import ASKS, SheetKind
 from su3d_bench.sheets.making import MadeSheets, Origin, make_sheets

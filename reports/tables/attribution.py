@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from su3d_bench.reports.comparison_table import signed
-from su3d_bench.reports.tables import aligned, percent
+from su3d_bench.reports.tables.comparison import signed
+from su3d_bench.reports.tables.run import aligned, percent
 
 MEANINGS: dict[str, dict[str, str]] = {
     "instance": {

@@ -9,9 +9,9 @@ import numpy as np
 
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.plain_text import printable
-from su3d_bench.reports.measured import Measured
-from su3d_bench.reports.published import Figure, PaperTable, published
-from su3d_bench.reports.table_model import NOT_MEASURED, Cell, Origin, Table, TableRow, is_count
+from su3d_bench.reports.tables.measured import Measured
+from su3d_bench.reports.tables.published import Figure, PaperTable, published
+from su3d_bench.reports.tables.model import NOT_MEASURED, Cell, Origin, Table, TableRow, is_count
 from su3d_bench.numerics.statistics import SignFlipTest, sign_flip_test
 
 LEVEL = 0.05

@@ -6,7 +6,7 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.reports.pictures import HEAT_STOPS
+from su3d_bench.reports.pictures.maps import HEAT_STOPS
 from su3d_bench.core.types import Float64Array, UInt8Array
 
 Scale = Literal["paper", "cividis"]

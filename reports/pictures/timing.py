@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from su3d_bench.core.plain_text import printable
-from su3d_bench.reports.timing_tables import AnytimePoint
+from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.numerics.statistics import growth_exponent
 from su3d_bench.store.run_folder import write_bytes
 from su3d_bench.core.types import Float64Array

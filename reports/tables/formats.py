@@ -8,8 +8,8 @@ import io
 from collections.abc import Sequence
 
 from su3d_bench.core.plain_text import printable
-from su3d_bench.reports.table_model import Cell, Table, blocks_of
-from su3d_bench.reports.tables import aligned
+from su3d_bench.reports.tables.model import Cell, Table, blocks_of
+from su3d_bench.reports.tables.run import aligned
 
 CSV_COLUMNS = (
     "table",

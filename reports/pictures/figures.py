@@ -11,8 +11,8 @@ from typing import Any
 
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.plain_text import printable
-from su3d_bench.reports.item_picture import Tag
-from su3d_bench.reports.scene_picture import drawable
+from su3d_bench.reports.pictures.items import Tag
+from su3d_bench.reports.pictures.scene import drawable
 from su3d_bench.store.run_folder import make_folder, write_bytes
 from su3d_bench.core.types import UInt8Array
 

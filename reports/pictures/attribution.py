@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.reports.attribution_table import n_text
-from su3d_bench.reports.comparison_table import signed
+from su3d_bench.reports.tables.attribution import n_text
+from su3d_bench.reports.tables.comparison import signed
 from su3d_bench.store.run_folder import make_folder, write_bytes
 
 DPI = 100

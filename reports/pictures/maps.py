@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.numerics.geometry import voxel_coordinates
-from su3d_bench.reports.render import Camera, View, colour, render, room_bounds, view_cameras
+from su3d_bench.reports.pictures.render import Camera, View, colour, render, room_bounds, view_cameras
 from su3d_bench.store.run_folder import make_folder, write_bytes
 from su3d_bench.core.types import DenseFeatures, Float32Array, Float64Array, GroundTruth, Instances, Int32Array, Int64Array, Prediction, UInt8Array
 

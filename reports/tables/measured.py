@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from su3d_bench.reports.table_model import Interval
+from su3d_bench.reports.tables.model import Interval
 
 BY_PEOPLE = "-people"  # ends the name of what stands in a protocol's place where people judged
 

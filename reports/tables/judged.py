@@ -6,10 +6,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.reports.measured import Measured
-from su3d_bench.reports.paper_tables import Shown, protocol_table, reported_rows
-from su3d_bench.reports.published import Figure, PaperTable, published
-from su3d_bench.reports.table_model import Cell, Table, TableRow
+from su3d_bench.reports.tables.measured import Measured
+from su3d_bench.reports.tables.paper import Shown, protocol_table, reported_rows
+from su3d_bench.reports.tables.published import Figure, PaperTable, published
+from su3d_bench.reports.tables.model import Cell, Table, TableRow
 
 OWN_NAMES = {"merge-accuracy": "well-merged"}  # the paper's name: ours
 

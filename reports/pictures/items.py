@@ -237,7 +237,7 @@ def _title_lines(title: tuple[str, ...]) -> list[tuple[str, int]]:
 
 
 def _write(draw: Any, at: tuple[int, int], text: str, size: int, shade: tuple[int, ...], is_bold: bool = False) -> None:
-    from su3d_bench.reports.scene_picture import drawable
+    from su3d_bench.reports.pictures.scene import drawable
 
     draw.text(at, drawable(text), font=_font(size, is_bold), fill=shade)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from su3d_bench.reports.tables import NOT_MEASURED, aligned, percent
+from su3d_bench.reports.tables.run import NOT_MEASURED, aligned, percent
 
 MANY_CLASSES = "p of single classes are not corrected for the number of classes: a few are small by chance"
 

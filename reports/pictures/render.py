@@ -149,7 +149,7 @@ def _shade(depth: Float64Array) -> Float32Array:
 
 def colour(view: View, colours: UInt8Array) -> UInt8Array:
     """The picture (h / 2, w / 2, 3) of a view, point i in ``colours[i]``, averaged down to size."""
-    from su3d_bench.reports.render_kernels import averaged_colours
+    from su3d_bench.reports.pictures.kernels import averaged_colours
 
     palette = np.concatenate([colours, np.array([BACKGROUND], np.uint8)]).astype(np.float32)
     averaged: UInt8Array = averaged_colours(view.point, view.shade, palette, OVERSAMPLING)

@@ -8,9 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
-from su3d_bench.reports.pictures import DRAWN_SPACING_M, NO_INSTANCE, Cloud, thinned
-from su3d_bench.reports.reasoning_picture import project
-from su3d_bench.reports.render import OVERSAMPLING, Camera, View, colour, render, room_bounds, view_cameras
+from su3d_bench.reports.pictures.maps import DRAWN_SPACING_M, NO_INSTANCE, Cloud, thinned
+from su3d_bench.reports.pictures.answers import project
+from su3d_bench.reports.pictures.render import OVERSAMPLING, Camera, View, colour, render, room_bounds, view_cameras
 from su3d_bench.core.types import BoolArray, Float64Array, Instances, Int32Array, Int64Array, UInt8Array
 
 PALE_GREY = 232
