@@ -25,7 +25,7 @@ from su3d_bench.opensu3d.voxel_map import VoxelMap
 from su3d_bench.core.types import Float64Array
 
 if TYPE_CHECKING:
-    from su3d_bench.opensu3d.device_kernels import DeviceVoxelMap
+    from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap
 
 EPS = 0.02
 SIZES = [100_000, 500_000, 1_000_000, 5_000_000]
@@ -77,7 +77,7 @@ def test_voxel_map_as_it_grows(benchmark: BenchmarkFixture, n_scene: int) -> Non
 
 @cache
 def filled_device_map(n_scene: int, device: str) -> DeviceVoxelMap:
-    from su3d_bench.opensu3d.device_kernels import DeviceVoxelMap
+    from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap
 
     device_map = DeviceVoxelMap(EPS, device)
     for part in np.array_split(case(n_scene).scene, max(1, n_scene // 1_000_000)):

@@ -46,7 +46,7 @@ def _cloud(
     frame: Frame, pixels: BoolArray, painted: IdImage, config: OpenSU3DConfig
 ) -> tuple[Float64Array, Int32Array, NDArray[np.int8]]:
     """Points, owners and ranks (0 inside a mask, 1 in a ring, 2 in no mask) of ``pixels`` in row-major order."""
-    from su3d_bench.opensu3d import image_kernels as kernels
+    from su3d_bench.opensu3d.kernels import image as kernels
 
     of_row, of_column = ray_parts(frame.intrinsics, frame.camera_to_world, *frame.depth_m.shape)
     n_pixels = int(np.count_nonzero(pixels))

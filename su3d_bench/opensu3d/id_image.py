@@ -30,7 +30,7 @@ def paint(masks: BoolArray, border_px: int, shape: Literal["disc", "square"]) ->
     Larger masks are painted first, equal ones in order, so that where masks overlap the smaller one shows. Each mask
     takes the ring of ``border_px`` around it from what was painted before.
     """
-    from su3d_bench.opensu3d import image_kernels as kernels
+    from su3d_bench.opensu3d.kernels import image as kernels
 
     ids = np.full(masks.shape[1:], NO_DETECTION, np.int32)
     owner = ids.copy()

@@ -24,7 +24,7 @@ from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Detections, Frame, Instances, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
 
 if TYPE_CHECKING:
-    from su3d_bench.opensu3d.device_kernels import DeviceVoxelMap
+    from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap
 
 
 class OpenSU3D:
@@ -152,7 +152,7 @@ class OpenSU3D:
 def _empty_map(eps: float, device: str) -> VoxelMap | DeviceVoxelMap:
     if device == CPU:
         return VoxelMap(eps)
-    from su3d_bench.opensu3d.device_kernels import DeviceVoxelMap
+    from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap
 
     return DeviceVoxelMap(eps, device)
 

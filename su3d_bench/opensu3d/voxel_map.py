@@ -71,7 +71,7 @@ class VoxelMap:
 
     def nearest_counted(self, queries: Float64Array) -> tuple[Int64Array, int]:
         """As ``nearest``, with the number of voxels that were looked into."""
-        from su3d_bench.opensu3d import _kernels
+        from su3d_bench.opensu3d.kernels import voxel_map as _kernels
 
         queries = checked_points(queries)
         found = np.empty(len(queries), np.int64)
@@ -91,7 +91,7 @@ class VoxelMap:
         self, lower: Float64Array, upper: Float64Array, wanted: Int32Array
     ) -> tuple[Int64Array, int]:
         """As ``count_inside``, with the number of blocks that were looked for."""
-        from su3d_bench.opensu3d import _kernels
+        from su3d_bench.opensu3d.kernels import voxel_map as _kernels
 
         found = np.zeros(len(wanted), np.int64)
         if len(wanted) == 0:
@@ -120,7 +120,7 @@ class VoxelMap:
         With ``keep_density`` a point whose voxel is taken is not added; with ``refill`` too, it takes the voxel over
         if it has an instance and the one that holds it has none.
         """
-        from su3d_bench.opensu3d import _kernels
+        from su3d_bench.opensu3d.kernels import voxel_map as _kernels
 
         points = checked_points(points)
         self._reserve_points(len(self) + len(points))
@@ -156,7 +156,7 @@ class VoxelMap:
         self._following = _grown(self._following, capacity, len(self))
 
     def _double_blocks(self) -> None:
-        from su3d_bench.opensu3d import _kernels
+        from su3d_bench.opensu3d.kernels import voxel_map as _kernels
 
         capacity = 2 * len(self._keys)
         self._keys = _grown(self._keys, capacity, self.n_blocks)

@@ -15,11 +15,11 @@ from su3d_bench.opensu3d.voxel_map import VoxelMap
 from su3d_bench.core.types import Float64Array
 
 if TYPE_CHECKING:
-    from su3d_bench.opensu3d.device_kernels import DeviceVoxelMap
+    from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap
 
 
 def maps(eps: float, device: str) -> tuple[VoxelMap, DeviceVoxelMap]:
-    from su3d_bench.opensu3d.device_kernels import DeviceVoxelMap
+    from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap
 
     return VoxelMap(eps), DeviceVoxelMap(eps, device)
 

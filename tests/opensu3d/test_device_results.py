@@ -112,7 +112,7 @@ def test_a_run_on_a_gpu_that_is_not_here_ends_before_any_work_in_one_line(
 def test_a_run_hands_its_device_to_the_method_and_writes_the_same_bytes(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from su3d_bench.opensu3d import device_kernels
+    from su3d_bench.opensu3d.kernels import voxel_map_torch as device_kernels
 
     monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
     words = ["run", "--scenes", "rooms/living0", "--profile", "oracle", "--limit", "2", "--no-pictures", "--quiet"]
