@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from su3d_bench.core import registry
-from su3d_bench.datasets.query_files import VARIANT as QUERY_OBJECTS
-from su3d_bench.datasets.query_files import query_truth, read_query_file
+from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
+from su3d_bench.questions.files.queries import query_truth, read_query_file
 from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError
 from su3d_bench.evaluation_openlex import (
     VARIANTS,

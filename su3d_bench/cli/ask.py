@@ -15,8 +15,8 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, Stor
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from su3d_bench.reasoning.answers import Answer
-    from su3d_bench.reasoning.scene_map import SceneMap
+    from su3d_bench.questions.reasoning.answers import Answer
+    from su3d_bench.questions.reasoning.scene_map import SceneMap
     from su3d_bench.store.run_folder import JobFolder, RunFolder
     from su3d_bench.core.types import Instances
 
@@ -62,7 +62,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.executors import limit_threads
 
     limit_threads()
-    from su3d_bench.reasoning.scene_map import map_of
+    from su3d_bench.questions.reasoning.scene_map import map_of
 
     if not arguments.question.strip():
         raise ConfigError(
@@ -113,7 +113,7 @@ def _map(run: RunFolder, arguments: argparse.Namespace) -> Instances:
 
 def _refined(job: JobFolder, wanted: str) -> tuple[Sequence[str] | None, str]:
     """Labels n' where they are wanted and there, and which names these are."""
-    from su3d_bench.perception.language.refined_names import read_records
+    from su3d_bench.questions.refined_names import read_records
 
     records = None if wanted == "label" else read_records(job)
     if records is None:
@@ -124,7 +124,7 @@ def _refined(job: JobFolder, wanted: str) -> tuple[Sequence[str] | None, str]:
 
 
 def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> int:
-    from su3d_bench.reasoning.language_solver import LanguageSolver
+    from su3d_bench.questions.reasoning.language_solver import LanguageSolver
 
     if arguments.solver != "llm":
         answer("the built-in solver asks no model: nothing to pay")
@@ -142,8 +142,8 @@ def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) ->
 def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> Answer:
     import numpy as np
 
-    from su3d_bench.reasoning.language_solver import LanguageSolver
-    from su3d_bench.reasoning.solver import Solver
+    from su3d_bench.questions.reasoning.language_solver import LanguageSolver
+    from su3d_bench.questions.reasoning.solver import Solver
 
     if arguments.solver == "llm":
         config = language_config(arguments)
@@ -157,7 +157,7 @@ def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> An
 def _nearest_name(noun: str, names: Sequence[str]) -> tuple[str, float]:
     """The embedded encoder's opinion, which is loaded for it only now."""
     from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
-    from su3d_bench.reasoning.named_objects import nearest_by
+    from su3d_bench.questions.reasoning.named_objects import nearest_by
 
     return nearest_by(EmbeddedEncoder())(noun, names)
 

@@ -54,7 +54,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _make(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.files import check_form, write_questions
+    from su3d_bench.questions.files.files import check_form, write_questions
 
     if arguments.file is not None:
         raise ConfigError("questions make: takes no file; name it with --out")
@@ -105,7 +105,7 @@ def _part(target: str, part_class: Any) -> Any:
 
 
 def _show(arguments: argparse.Namespace) -> int:
-    from su3d_bench.questions.files import paper_queries, read_questions
+    from su3d_bench.questions.files.files import paper_queries, read_questions
 
     if arguments.file is None:
         raise ConfigError("questions show: name a file, or 'paper' for the queries that the paper's page shows")

@@ -12,8 +12,8 @@ from su3d_bench.cli.language_flags import add_language_flags, chat_client, langu
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError, suggest
 
 if TYPE_CHECKING:
-    from su3d_bench.perception.language.refined_names import NameRecords
-    from su3d_bench.perception.language.refinement import RefinedName, TopNames
+    from su3d_bench.questions.refined_names import NameRecords
+    from su3d_bench.questions.refinement import RefinedName, TopNames
     from su3d_bench.store.run_folder import JobFolder, RunFolder
     from su3d_bench.core.types import Instances
 
@@ -48,8 +48,8 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.executors import limit_threads
 
     limit_threads()
-    from su3d_bench.perception.language.refined_names import records_of, write_records
-    from su3d_bench.perception.language.refinement import top_names
+    from su3d_bench.questions.refined_names import records_of, write_records
+    from su3d_bench.questions.refinement import top_names
 
     if arguments.top_m < 1:
         raise ConfigError(f"--top-m {arguments.top_m}: at least 1 view must have a say")
@@ -112,7 +112,7 @@ def _map(job: JobFolder) -> Instances:
 
 
 def _estimate(tops: dict[str, list[TopNames]], arguments: argparse.Namespace) -> int:
-    from su3d_bench.perception.language.refinement import ModelRefiner
+    from su3d_bench.questions.refinement import ModelRefiner
     from su3d_bench.store.run_folder import RunFolder
 
     if arguments.refiner != "model":
@@ -133,7 +133,7 @@ def _refine(
     tops: dict[str, list[TopNames]], arguments: argparse.Namespace
 ) -> tuple[dict[str, Sequence[RefinedName]], str]:
     """Labels n' of each scene, and the model that chose them."""
-    from su3d_bench.perception.language.refinement import ModelRefiner, vote
+    from su3d_bench.questions.refinement import ModelRefiner, vote
     from su3d_bench.store.run_folder import RunFolder
 
     if arguments.refiner == "vote":

@@ -210,7 +210,7 @@ def _estimate(source: RunSource, arguments: argparse.Namespace) -> int:
 
 def _given(source: RunSource, arguments: argparse.Namespace) -> Sequence[Question] | None:
     """The questions of a file or of the paper; None where they are made from the ground truth."""
-    from su3d_bench.questions.files import paper_queries, read_questions
+    from su3d_bench.questions.files.files import paper_queries, read_questions
 
     if arguments.questions == "generated":
         return None

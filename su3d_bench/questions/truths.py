@@ -13,10 +13,10 @@ from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.questions.generator import generate
 from su3d_bench.questions.known_objects import is_called, known_objects
 from su3d_bench.questions.model import Question, new_question
-from su3d_bench.reasoning.generated import generate_questions
-from su3d_bench.reasoning.named_objects import nearest_by
-from su3d_bench.reasoning.scene_map import map_of
-from su3d_bench.reasoning.solver import Solver
+from su3d_bench.questions.reasoning.generated import generate_questions
+from su3d_bench.questions.reasoning.named_objects import nearest_by
+from su3d_bench.questions.reasoning.scene_map import map_of
+from su3d_bench.questions.reasoning.solver import Solver
 from su3d_bench.metrics.scoring import QuestionTruth
 from su3d_bench.core.types import GroundTruth, Instances
 
@@ -89,7 +89,7 @@ def _given(answer: Any, row_of: dict[int, int]) -> GivenAnswer:
 
 def voted_names(instances: Instances) -> RefinedNames | None:
     """Label n' by vote: of the names that the best views gave, the one with the greatest sum of prediction scores."""
-    from su3d_bench.perception.language.refinement import top_names, vote
+    from su3d_bench.questions.refinement import top_names, vote
 
     if instances.view_names is None or instances.view_scores is None:
         return None

@@ -13,9 +13,9 @@ from su3d_bench.metrics.questions.score import labels_n
 from su3d_bench.opensu3d.retrieval import rank_all
 from su3d_bench.core.plain_text import printable
 from su3d_bench.questions.refined import refined_names
-from su3d_bench.reasoning.named_objects import nearest_by
-from su3d_bench.reasoning.scene_map import map_of
-from su3d_bench.reasoning.solver import Solver
+from su3d_bench.questions.reasoning.named_objects import nearest_by
+from su3d_bench.questions.reasoning.scene_map import map_of
+from su3d_bench.questions.reasoning.solver import Solver
 from su3d_bench.reports.pictures.figures import Cell, GridRow
 from su3d_bench.reports.pictures.frame_views import seen_in
 from su3d_bench.reports.pictures.heat_scales import Scale, similarity_colours

@@ -20,12 +20,12 @@ from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.questions.model import REASONING, Question, question_id
 from su3d_bench.questions.refined import refined_names
 from su3d_bench.questions.truths import question_truth
-from su3d_bench.reasoning.answers import Answer, unsettled
-from su3d_bench.reasoning.judging import said_value
-from su3d_bench.reasoning.language_solver import LanguageSolver
-from su3d_bench.reasoning.named_objects import nearest_by
-from su3d_bench.reasoning.scene_map import SceneMap, map_of
-from su3d_bench.reasoning.solver import Solver
+from su3d_bench.questions.reasoning.answers import Answer, unsettled
+from su3d_bench.questions.reasoning.judging import said_value
+from su3d_bench.questions.reasoning.language_solver import LanguageSolver
+from su3d_bench.questions.reasoning.named_objects import nearest_by
+from su3d_bench.questions.reasoning.scene_map import SceneMap, map_of
+from su3d_bench.questions.reasoning.solver import Solver
 from su3d_bench.sheets.drafts import MOST_TEXT, Draft, also, id_of, judged
 from su3d_bench.sheets.run_source import RunSource, mask_digest
 from su3d_bench.core.types import Instances

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from su3d_bench.cli.main import main
 from su3d_bench.comparison_sides import Side, rules_of
 from su3d_bench.core.config import parse_value, read_file
-from su3d_bench.datasets.query_files import read_query_file
+from su3d_bench.questions.files.queries import read_query_file
 from su3d_bench.core.errors import MOST_CHARACTERS, ConfigError, DataError, PredictionError, StoreError, Su3dError
 from su3d_bench.estimate import recent_update_s
 from su3d_bench.finished_run import read_run

@@ -12,7 +12,7 @@ from places import SCENES
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
-from su3d_bench.questions.files import csv_text, paper_queries, read_questions, toml_text, write_questions
+from su3d_bench.questions.files.files import csv_text, paper_queries, read_questions, toml_text, write_questions
 from su3d_bench.questions.model import KINDS, new_question
 
 HOSTILE = ("<script>alert(1)</script>", '=HYPERLINK("x","y")', "\u202eright to left", '😀, "chair"', "x" * 10_000)

@@ -15,13 +15,11 @@ from scored_room import instances
 
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.reasoning.generated import generate_questions
-from su3d_bench.reasoning.question_words import Phrase, read_phrase
-from su3d_bench.reasoning.relations import (
-    relations_of,
-)
-from su3d_bench.reasoning.scene_map import MapObject, SceneMap, map_of
-from su3d_bench.reasoning.solver import Solver
+from su3d_bench.questions.reasoning.generated import generate_questions
+from su3d_bench.questions.reasoning.question_words import Phrase, read_phrase
+from su3d_bench.questions.reasoning.relations import relations_of
+from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap, map_of
+from su3d_bench.questions.reasoning.solver import Solver
 
 
 @pytest.fixture(scope="module")

@@ -19,8 +19,8 @@ from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.perception.language.client import ChatClient
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.language.parsing import Described, answered, chosen_name, described
-from su3d_bench.perception.language.refined_names import read_records, records_of, write_records
-from su3d_bench.perception.language.refinement import ModelRefiner, TopNames, top_names, vote
+from su3d_bench.questions.refined_names import read_records, records_of, write_records
+from su3d_bench.questions.refinement import ModelRefiner, TopNames, top_names, vote
 from su3d_bench.perception.language.reply_store import ReplyStore
 from su3d_bench.store.run_folder import JobFolder, prediction_arrays, prediction_from_arrays, write_prediction
 from su3d_bench.core.types import Instances

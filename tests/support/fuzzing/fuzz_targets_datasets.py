@@ -230,7 +230,7 @@ def _queries(suffix: str) -> Make:
     def make(folder: Path) -> Read:
         from test_query_files import CSV, TOML
 
-        from su3d_bench.datasets.query_files import read_query_file
+        from su3d_bench.questions.files.queries import read_query_file
 
         path = folder / f"q{suffix}"
         path.write_text(CSV if suffix == ".csv" else TOML)
@@ -243,7 +243,7 @@ def _questions(name: str, text_of: Callable[[Any], str]) -> Make:
     def make(folder: Path) -> Read:
         import test_question_files
 
-        from su3d_bench.questions.files import read_questions
+        from su3d_bench.questions.files.files import read_questions
 
         path = folder / name
         path.write_text(text_of(test_question_files))

@@ -129,7 +129,7 @@ def _completion(folder: Path) -> Read:
 
 def _refined_names(folder: Path) -> Read:
     from su3d_bench.core.digests import digest_file
-    from su3d_bench.perception.language.refined_names import FILE_NAME, read_records
+    from su3d_bench.questions.refined_names import FILE_NAME, read_records
     from su3d_bench.store.run_folder import RunFolder
 
     job = RunFolder(folder).job("rooms/living0", "opensu3d")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
 from su3d_bench.core.types import Float64Array
 
 

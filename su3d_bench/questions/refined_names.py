@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import StoreError
-from su3d_bench.perception.language.refinement import RefinedName, TopNames
+from su3d_bench.questions.refinement import RefinedName, TopNames
 from su3d_bench.store.run_folder import JobFolder, read_json, write_json
 
 FILE_NAME = "refined_names.json"

@@ -11,10 +11,10 @@ import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
-from su3d_bench.datasets.query_files import COLUMNS, MORE_COLUMNS, read_query_rows
+from su3d_bench.questions.files.queries import COLUMNS, MORE_COLUMNS, read_query_rows
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.plain_text import printable
-from su3d_bench.questions.foreign_files import is_foreign, read_foreign
+from su3d_bench.questions.files.datasets import is_foreign, read_foreign
 from su3d_bench.questions.model import ALL_KINDS, KINDS, Question, new_question
 from su3d_bench.store.run_folder import write_text
 from su3d_bench.core.toml_text import toml_value

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from su3d_bench.reasoning.answers import Answer
-from su3d_bench.reasoning.generated import GeneratedQuestion
-from su3d_bench.reasoning.scene_map import SceneMap
+from su3d_bench.questions.reasoning.answers import Answer
+from su3d_bench.questions.reasoning.generated import GeneratedQuestion
+from su3d_bench.questions.reasoning.scene_map import SceneMap
 from su3d_bench.core.types import Float64Array
 
 LEAST_IOU = 0.25  # the loosest overlap at which ScanNet's benchmark takes two instances for one

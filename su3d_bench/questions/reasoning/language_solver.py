@@ -10,9 +10,9 @@ from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.language.parsing import answered, is_refusal
-from su3d_bench.reasoning.answers import Answer, unsettled
-from su3d_bench.reasoning.prompting import Context, ask_request, context_for
-from su3d_bench.reasoning.scene_map import SceneMap
+from su3d_bench.questions.reasoning.answers import Answer, unsettled
+from su3d_bench.questions.reasoning.prompting import Context, ask_request, context_for
+from su3d_bench.questions.reasoning.scene_map import SceneMap
 
 
 class LanguageSolver:
