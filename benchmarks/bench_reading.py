@@ -30,7 +30,7 @@ from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 from su3d_bench.datasets.scannet.sens.read import FRAME_RECORD, SensFile
 from su3d_bench.datasets.scannet.sens.header import SensHeader, header_bytes
 from su3d_bench.datasets.scannet.sens.write import SensFrame, colour_content, depth_content, write_sens
-from su3d_bench.read_ahead import ReadAhead
+from su3d_bench.runs.read_ahead import ReadAhead
 from su3d_bench.core.timing import calibration_ms
 from su3d_bench.core.types import Float32Array, Frame, UInt8Array
 

@@ -105,7 +105,7 @@ def false_seals(folder: Path, expected: dict[str, Any]) -> list[str]:
     """Files that a seal vouches for, or a reader takes for a finished run, though they are not those of a whole run."""
     from su3d_bench.core.digests import digest_file
     from su3d_bench.core.errors import Su3dError
-    from su3d_bench.finished_run import read_run
+    from su3d_bench.runs.finished import read_run
     from su3d_bench.store.run_folder import JobFolder
 
     wrong = []
@@ -128,13 +128,13 @@ def false_seals(folder: Path, expected: dict[str, Any]) -> list[str]:
 
 def load_modules(subject: str) -> None:
     """What a run imports, in this one process, which must stay without threads of its own."""
-    from su3d_bench.executors import limit_threads
+    from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()
     import su3d_bench.cli.main
-    import su3d_bench.planning
+    import su3d_bench.runs.plan
     import su3d_bench.reports.tables.run
-    import su3d_bench.runner
+    import su3d_bench.runs.runner
 
     if subject == "opensu3d":
         import sklearn.cluster  # noqa: F401

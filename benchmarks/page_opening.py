@@ -23,7 +23,7 @@ import numpy as np
 from measured import write_measured
 
 from su3d_bench.cli.query import encoder_of
-from su3d_bench.executors import limit_threads
+from su3d_bench.runs.executors.local import limit_threads
 from su3d_bench.page_maps import QUERIES, page_scenes, points_of_each
 from su3d_bench.page_sources import page_numbers, scored_maps
 from su3d_bench.reports.page.page import page_html

@@ -25,7 +25,7 @@ from su3d_bench.perception.models.pretrained import sam_config
 from su3d_bench.perception.models.masks.sam import Sam
 from su3d_bench.perception.models.masks.sam_networks import TorchSam
 from su3d_bench.perception.models.encoders.towers_transformers import TransformersTowers
-from su3d_bench.planning import data_root
+from su3d_bench.runs.plan import data_root
 from su3d_bench.core.types import Float32Array, UInt8Array
 
 N_BOXES, N_RATIOS = 15, 3  # named things in an image of a room, and the paper's crops of each

@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.finished_run import read_run
-from su3d_bench.finished_updates import read_update_times
+from su3d_bench.runs.finished import read_run
+from su3d_bench.runs.finished_updates import read_update_times
 from su3d_bench.reports.tables.run import aligned
 from su3d_bench.reports.pictures.timing import draw_update_cost
 from su3d_bench.numerics.statistics import Growth

@@ -24,7 +24,7 @@ from su3d_bench.comparison_sides import (
 )
 from su3d_bench.core.config import MOVES_NO_NUMBER
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.finished_run import FinishedRun
+from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.metrics.results.resampled_values import resampled_classes
 from su3d_bench.metrics.results.results import Counts, ProtocolResult, resampled_metrics
 from su3d_bench.core.plain_text import printable

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from su3d_bench.core.errors import ConfigError, suggest
-from su3d_bench.finished_run import FinishedRun, read_run
+from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.metrics.count_shapes import check_against
 from su3d_bench.core.plain_text import printable
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol

@@ -48,7 +48,7 @@ from su3d_bench.evaluation_truth import (
 )
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
-from su3d_bench.planning import data_root, why_not_fitting
+from su3d_bench.runs.plan import data_root, why_not_fitting
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexMasks, shown
 from su3d_bench.predictions.scannet_text import ScannetText
 from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules, load_protocol, protocol_names

@@ -15,7 +15,7 @@ from su3d_bench.core import registry
 from su3d_bench.core.errors import DataError, PredictionError, suggest
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
 from su3d_bench.core.plain_text import printable
-from su3d_bench.planning import data_root
+from su3d_bench.runs.plan import data_root
 from su3d_bench.predictions.base import MOST_POINTS, shown
 from su3d_bench.predictions.mask_arrays import scene_files
 from su3d_bench.formats.text_integers import integer_lines

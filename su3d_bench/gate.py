@@ -16,8 +16,8 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core.config import MOVES_NO_NUMBER
 from su3d_bench.core.errors import ConfigError, StoreError
-from su3d_bench.finished_run import FinishedRun
-from su3d_bench.finished_updates import read_update_times
+from su3d_bench.runs.finished import FinishedRun
+from su3d_bench.runs.finished_updates import read_update_times
 from su3d_bench.reports.gate_findings import Finding, Verdict
 from su3d_bench.core.plain_text import printable
 from su3d_bench.store.run_folder import read_json

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from su3d_bench.core.errors import ConfigError, Su3dError
-from su3d_bench.finished_run import FinishedRun, read_run
+from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.core.plain_text import printable
 from su3d_bench.metrics.protocols import load_protocol, protocol_names
 from su3d_bench.reports.tables.model import NOT_MEASURED, Cell, Origin, Table, TableRow

@@ -13,8 +13,8 @@ from su3d_bench.attribution import EncoderOf, attribute
 from su3d_bench.comparison import SideNumbers, compare
 from su3d_bench.core.config import KeyPath
 from su3d_bench.core.errors import StoreError, Su3dError
-from su3d_bench.finished_run import FinishedRun, read_run
-from su3d_bench.finished_updates import read_update_times
+from su3d_bench.runs.finished import FinishedRun, read_run
+from su3d_bench.runs.finished_updates import read_update_times
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
 from su3d_bench.core.plain_text import printable, printable_json
 from su3d_bench.metrics.protocols import load_protocol

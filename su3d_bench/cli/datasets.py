@@ -164,7 +164,7 @@ def _lines(row: dict[str, Any]) -> list[str]:
 
 
 def call_check(arguments: argparse.Namespace) -> int:
-    from su3d_bench.executors import limit_threads
+    from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()  # before numerical libraries are loaded
     from su3d_bench.cli.datasets_check import check
@@ -173,7 +173,7 @@ def call_check(arguments: argparse.Namespace) -> int:
 
 
 def call_show(arguments: argparse.Namespace) -> int:
-    from su3d_bench.executors import limit_threads
+    from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()
     from su3d_bench.cli.datasets_show import show
@@ -182,7 +182,7 @@ def call_show(arguments: argparse.Namespace) -> int:
 
 
 def call_make(arguments: argparse.Namespace) -> int:
-    from su3d_bench.executors import limit_threads
+    from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()  # before numerical libraries are loaded
     from su3d_bench.cli.datasets_make import make

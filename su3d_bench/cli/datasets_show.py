@@ -10,7 +10,7 @@ from su3d_bench.cli.datasets_check import chosen_scenes
 from su3d_bench.cli.flags import answer, answer_json
 from su3d_bench.cli.progress import progress
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
-from su3d_bench.executors import Event
+from su3d_bench.runs.executors.local import Event
 from su3d_bench.core.plain_text import printable, printable_json
 from su3d_bench.reports.pictures.scene_look import look_at
 from su3d_bench.reports.pictures.scene import draw_scene_picture, facts_line

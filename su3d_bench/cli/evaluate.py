@@ -71,7 +71,7 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.executors import limit_threads
+    from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()  # before numerical libraries are loaded
     from su3d_bench.evaluation import NOT_MEANT, Request, evaluate

@@ -73,7 +73,7 @@ class Source:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.executors import limit_threads
+    from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()
     from su3d_bench.predictions.export import whole_folder, write_openlex, write_scannet
@@ -150,7 +150,7 @@ def sources_of(path: Path, format: str | None, method: str | None) -> list[Sourc
 def _only_method(found: Mapping[str, Sequence[Path]]) -> str | None:
     """The one method that a run was asked for; the ceiling that comes with it is not meant."""
     from su3d_bench.core.config import RunConfig, read_file, resolve
-    from su3d_bench.scene_job import CEILING_METHOD
+    from su3d_bench.runs.job import CEILING_METHOD
 
     run = _run_of(next(iter(found.values()))[0])
     is_single = run is not None and len(resolve(read_file(run / "run.toml"), (), RunConfig).methods) == 1
@@ -175,7 +175,7 @@ def _maps_of_run(path: Path) -> dict[str, list[Path]]:
 
 def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> list[Source]:
     """The sources that a pattern matches, all without patterns; a scene without a dataset takes that of its pattern."""
-    from su3d_bench.planning import split_address
+    from su3d_bench.runs.plan import split_address
 
     if not patterns:
         return list(sources)
@@ -197,7 +197,7 @@ def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> li
 
 def _names(addresses: Sequence[str], *, is_flat: bool) -> list[str]:
     """The name of each scene's files: its address, or in a flat folder its last part, which must tell scenes apart."""
-    from su3d_bench.planning import split_address
+    from su3d_bench.runs.plan import split_address
     from su3d_bench.predictions.export import file_name
 
     names = []
@@ -232,8 +232,8 @@ def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
     from su3d_bench.core import registry
     from su3d_bench.cli.datasets_check import chosen_scenes
     from su3d_bench.core.config import RunConfig, read_file, resolve
-    from su3d_bench.planning import data_root, dataset_targets
-    from su3d_bench.scene_job import Part, build_dataset
+    from su3d_bench.runs.plan import data_root, dataset_targets
+    from su3d_bench.runs.job import Part, build_dataset
 
     if source.run is None:
         return chosen_scenes([source.address], [], is_quiet=is_quiet)[0]
@@ -249,7 +249,7 @@ def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
 
 def _rules(name: str | None, dataset: Any) -> ProtocolRules:
     """The protocol of ``name``, or the dataset's only one of instances with classes."""
-    from su3d_bench.planning import why_not_fitting
+    from su3d_bench.runs.plan import why_not_fitting
     from su3d_bench.metrics.protocols import load_protocol, protocols_for
 
     fitting = {rules.name: rules for rules in map(load_protocol, protocols_for(dataset.name)) if _has_masks(rules)}

@@ -201,7 +201,7 @@ def call_export(arguments: argparse.Namespace) -> int:
 
 
 def call_warm(arguments: argparse.Namespace) -> int:
-    from su3d_bench.executors import limit_threads
+    from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()  # before numerical libraries are loaded
     result = _warm(arguments)

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
-from su3d_bench.executors import SCENE_DONE, Event, Report
+from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
 
 
 @contextmanager

@@ -38,7 +38,7 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.executors import limit_threads
+    from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()
     from su3d_bench.opensu3d.retrieval import rank
@@ -127,7 +127,7 @@ def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
     from su3d_bench.perception.models.catalogue import encoder_known_as
     from su3d_bench.perception.models.encoders.encoder import FoundationEncoder
     from su3d_bench.perception.models.loading import load_encoder
-    from su3d_bench.planning import cache_root
+    from su3d_bench.runs.plan import cache_root
     from su3d_bench.store.run_folder import read_json
 
     record = read_json(run.path / "run.json")

@@ -79,7 +79,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _tables(arguments: argparse.Namespace) -> list[Table]:
-    from su3d_bench.ablation import read_rows
+    from su3d_bench.runs.ablation import read_rows
     from su3d_bench.reports.tables.ablation_table import SweepRow, ablation_table
     from su3d_bench.reports.tables.judged import JUDGED, judged_table
     from su3d_bench.reports.tables.paper import Shown, paper_table, selection_tables

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
 
 if TYPE_CHECKING:
-    from su3d_bench.finished_run import FinishedRun
+    from su3d_bench.runs.finished import FinishedRun
     from su3d_bench.metrics.costs import UpdateTimes
 
 NAME = "timing"
@@ -40,7 +40,7 @@ def call(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from su3d_bench.core.errors import ConfigError
-    from su3d_bench.finished_run import read_run
+    from su3d_bench.runs.finished import read_run
     from su3d_bench.reports.tables.timing import csv_text, markdown, methods_csv
     from su3d_bench.metrics.costs import summarise
 
@@ -73,7 +73,7 @@ def _methods(run: FinishedRun, asked: list[str] | None) -> list[str]:
 
 
 def _times(run: FinishedRun, method: str) -> list[UpdateTimes]:
-    from su3d_bench.finished_updates import read_update_times
+    from su3d_bench.runs.finished_updates import read_update_times
 
     return read_update_times(run, method)
 

@@ -28,7 +28,7 @@ def add_parser(actions: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.executors import limit_threads
+    from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()
     from su3d_bench.table_sources import check_paper

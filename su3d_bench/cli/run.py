@@ -12,8 +12,8 @@ from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE
 
 if TYPE_CHECKING:
     from su3d_bench.core.config import KeyPath, Settings
-    from su3d_bench.planning import Plan
-    from su3d_bench.runner import RunResult
+    from su3d_bench.runs.plan import Plan
+    from su3d_bench.runs.runner import RunResult
 
 FLAGS_OF_KEYS = (
     "scenes",
@@ -119,10 +119,10 @@ def call(arguments: argparse.Namespace) -> int:
 
 def plan_of(arguments: argparse.Namespace) -> Plan:
     """The plan of what was asked for, in a process that leaves the cores to the scenes side by side."""
-    from su3d_bench.executors import limit_threads
+    from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()  # before numerical libraries are loaded
-    from su3d_bench.planning import make_plan
+    from su3d_bench.runs.plan import make_plan
 
     return make_plan(settings_of(arguments), arguments.set, arguments.out)
 
@@ -141,7 +141,7 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
 
 def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
     from su3d_bench.cli.progress import progress
-    from su3d_bench.runner import run_plan
+    from su3d_bench.runs.runner import run_plan
 
     with progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
         result = run_plan(plan, report)
@@ -171,7 +171,7 @@ def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
 
 
 def show_plan(plan: Plan, arguments: argparse.Namespace) -> int:
-    from su3d_bench.estimate import estimate
+    from su3d_bench.runs.estimate import estimate
 
     rows = estimate(plan)
     if arguments.json:

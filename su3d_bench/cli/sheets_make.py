@@ -79,10 +79,10 @@ def add_parser(actions: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.executors import limit_threads
+    from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()
-    from su3d_bench.finished_run import read_run
+    from su3d_bench.runs.finished import read_run
     from su3d_bench.sheets.run_source import RunSource
 
     _check(arguments)
@@ -229,7 +229,7 @@ def _drawn(
 ) -> dict[SheetKind, list[bytes]]:
     """The pictures of all drafts."""
     from su3d_bench.cli.progress import progress
-    from su3d_bench.executors import Event
+    from su3d_bench.runs.executors.local import Event
     from su3d_bench.sheets.drawing_jobs import draw_all
 
     flat = [one for of_kind in drafts.values() for one in of_kind]

@@ -38,11 +38,11 @@ def add_parser(actions: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.executors import limit_threads
+    from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()
     from su3d_bench.cli.query import encoder_of
-    from su3d_bench.finished_run import read_run
+    from su3d_bench.runs.finished import read_run
     from su3d_bench.reports.pictures.figures import draw_grid
     from su3d_bench.reports.pictures.heat_scales import scale_stops
     from su3d_bench.sheets.figures import Figures

@@ -16,7 +16,7 @@ from places import SCENES
 from scored_room import ENCODER, NAMES, instances, noisy, room, truth_as_prediction
 
 import su3d_bench.reports.tables.attribution
-from su3d_bench import scene_run
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.attribution import KINDS, attribute
 from su3d_bench.cli import attribute as verb
 from su3d_bench.cli.main import main

@@ -18,7 +18,7 @@ from painted import colour_perception
 from places import SCENES
 
 import su3d_bench.reports.tables.comparison
-from su3d_bench import scene_run
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli.main import main
 from su3d_bench.comparison import compare
 from su3d_bench.core.errors import ConfigError, StoreError

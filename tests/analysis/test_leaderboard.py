@@ -12,7 +12,7 @@ import pytest
 from painted import colour_perception
 from places import SCENES
 
-from su3d_bench import scene_run
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli.main import main
 from su3d_bench.leaderboard import leaderboard
 

@@ -21,7 +21,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import SceneTools
 from su3d_bench.metrics.matching.labelling import most_similar
 from su3d_bench.perception.regions import region_under
-from su3d_bench.scene_tools import no_detections
+from su3d_bench.runs.scene_tools import no_detections
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, Instances, Int64Array, Proposals, SceneInfo, Surface
 

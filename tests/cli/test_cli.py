@@ -12,7 +12,7 @@ import pytest
 from painted import colour_perception
 from places import SCENES
 
-from su3d_bench import scene_run
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli import query
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.core.errors import EXIT_INTERNAL
@@ -22,7 +22,7 @@ COLLECTOR = f"{SCENES}/painted.py:Collector"
 RUN = ["run", "--scenes", f"{PAINTED}/*", "--methods", COLLECTOR, "--protocols", "rooms-semantic", "--no-pictures"]
 HEAVY = (
     "torch", "open3d", "open3d.cpu.pybind", "numba", "sklearn", "pandas", "matplotlib", "onnxruntime", "cv2", "scipy",
-    "transformers", "openai", "openpyxl", "psutil", "su3d_bench.predictions.formats", "su3d_bench.planning",
+    "transformers", "openai", "openpyxl", "psutil", "su3d_bench.predictions.formats", "su3d_bench.runs.plan",
 )  # fmt: skip
 
 
@@ -236,7 +236,7 @@ def test_a_dry_run_over_a_finished_run_knows_what_is_done(capsys: pytest.Capture
 
 def test_the_same_request_has_the_same_folder_and_another_one_another() -> None:
     from su3d_bench.cli.run import settings_of
-    from su3d_bench.planning import make_plan
+    from su3d_bench.runs.plan import make_plan
 
     def folder(*more: str) -> Path:
         arguments = build_parser().parse_args([*RUN, *more])

@@ -11,7 +11,7 @@ from painted import colour_perception
 from places import SCENES
 from prediction_files import TOY, write_open3dis, write_scannet_text
 
-from su3d_bench import scene_run
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli import query
 from su3d_bench.cli.main import main
 from su3d_bench.predictions.base import VertexMasks

@@ -355,7 +355,7 @@ def test_the_json_has_everything(at_root: Path, capsys: pytest.CaptureFixture[st
 def test_the_digest_is_the_one_that_a_run_records(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    from su3d_bench import scene_run
+    from su3d_bench.runs import scene as scene_run
 
     monkeypatch.setattr(scene_run, "build_perception", painted.colour_perception)
     monkeypatch.setenv("SU3D_DATA", str(tmp_path))

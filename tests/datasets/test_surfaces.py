@@ -19,7 +19,7 @@ from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 from su3d_bench.datasets.scannet.dataset import ScanNet, ScannetOptions
 from su3d_bench.datasets.tum.dataset import Tum
 from su3d_bench.core.errors import DataError
-from su3d_bench.scene_tools import surface_of
+from su3d_bench.runs.scene_tools import surface_of
 
 
 @pytest.fixture(scope="module")

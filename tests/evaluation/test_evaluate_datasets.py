@@ -28,7 +28,7 @@ PAINTED = f"{SCENES}/painted.py:Painted"
 def run_oracle(folder: Path, monkeypatch: pytest.MonkeyPatch, scenes: str, capsys: Any) -> Path:
     from painted import colour_perception
 
-    from su3d_bench import scene_run
+    from su3d_bench.runs import scene as scene_run
 
     monkeypatch.setattr(scene_run, "build_perception", colour_perception)
     words = ["run", "--scenes", f"{PAINTED}/{scenes}", "--methods", "oracle", "--protocols", "rooms-instance"]

@@ -20,8 +20,8 @@ from su3d_bench.comparison_sides import Side, rules_of
 from su3d_bench.core.config import parse_value, read_file
 from su3d_bench.questions.files.queries import read_query_file
 from su3d_bench.core.errors import MOST_CHARACTERS, ConfigError, DataError, PredictionError, StoreError, Su3dError
-from su3d_bench.estimate import recent_update_s
-from su3d_bench.finished_run import read_run
+from su3d_bench.runs.estimate import recent_update_s
+from su3d_bench.runs.finished import read_run
 from su3d_bench.store.atomic import DAMAGE, read_arrays
 from su3d_bench.leaderboard import leaderboard
 from su3d_bench.formats.numpy_files import read_npy

@@ -21,7 +21,7 @@ from su3d_bench.metrics.results.results import metric_values
 from su3d_bench.metrics.questions.score import are_objects_right, is_answer_right
 from su3d_bench.metrics.questions.shares import ShareCounts
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
-from su3d_bench.planning import protocols_of_run
+from su3d_bench.runs.plan import protocols_of_run
 from su3d_bench.predictions.base import VertexMasks
 from su3d_bench.metrics.protocols import load_protocol, protocols_for, read_protocol, rules_file
 from su3d_bench.questions.truths import question_truth

@@ -129,7 +129,7 @@ def test_a_run_hands_its_device_to_the_method_and_writes_the_same_bytes(
     monkeypatch.setattr(device_kernels, "DeviceVoxelMap", Counted)
     predictions = []
     for name in ("cpu", TORCH_ON_CPU):
-        monkeypatch.setattr("su3d_bench.scene_run.device_for", lambda device, index, name=name: name)
+        monkeypatch.setattr("su3d_bench.runs.scene.device_for", lambda device, index, name=name: name)
         assert main([*words, "--out", str(tmp_path / name)]) == 0
         predictions.append(next((tmp_path / name).glob("scenes/*/opensu3d/prediction.npz")).read_bytes())
         assert (n_made > 0) == (name == TORCH_ON_CPU)

@@ -19,7 +19,8 @@ import pytest
 from painted import WordEncoder, colour_perception
 from places import SCENES
 
-from su3d_bench import page_maps, scene_run
+from su3d_bench import page_maps
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli import query
 from su3d_bench.cli.main import main
 from su3d_bench.page_maps import points_of_each

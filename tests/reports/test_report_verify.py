@@ -12,7 +12,7 @@ import pytest
 from painted import ColourPerception, colour_perception
 from places import SCENES
 
-from su3d_bench import scene_run
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.reports.tables.latex import latex

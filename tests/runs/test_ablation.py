@@ -9,8 +9,8 @@ import pytest
 from painted import colour_perception
 
 from places import SCENES
-from su3d_bench import scene_run
-from su3d_bench.ablation import ablation_rows, read_rows
+from su3d_bench.runs import scene as scene_run
+from su3d_bench.runs.ablation import ablation_rows, read_rows
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, StoreError
 

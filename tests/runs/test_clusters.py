@@ -16,7 +16,7 @@ import pytest
 from painted import colour_perception
 
 from places import SCENES
-from su3d_bench import scene_run
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli.main import main
 
 pytest.importorskip("ray", reason="the ray extra is not installed")

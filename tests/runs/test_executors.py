@@ -8,7 +8,7 @@ import time
 import pytest
 
 from su3d_bench.core.errors import StoreError
-from su3d_bench.executors import ONE_THREAD, Event, Report, run_inline, run_processes
+from su3d_bench.runs.executors.local import ONE_THREAD, Event, Report, run_inline, run_processes
 
 
 def work(unit: str, report: Report) -> str:

@@ -11,11 +11,14 @@ import pytest
 from painted import colour_perception
 
 from places import SCENES
-from su3d_bench import finished_scenes, page_sources, runner, scene_run
+from su3d_bench import page_sources
+from su3d_bench.runs import resume as finished_scenes
+from su3d_bench.runs import runner
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.store import run_folder as store
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
-from su3d_bench.execution import run_units
+from su3d_bench.runs.executors.choose import run_units
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import precision_recall
 from su3d_bench.metrics.results import resampling

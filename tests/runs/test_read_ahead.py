@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.read_ahead import ReadAhead
+from su3d_bench.runs.read_ahead import ReadAhead
 from su3d_bench.core.types import Frame
 
 N_FRAMES = 40

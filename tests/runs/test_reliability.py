@@ -23,7 +23,8 @@ import pytest
 from painted import colour_perception
 
 from places import ROOT, SCENES
-from su3d_bench import scene_job, scene_run
+from su3d_bench.runs import job as scene_job
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import StoreError
 from su3d_bench.store.atomic import filling

@@ -4,7 +4,7 @@ from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
-from su3d_bench.job_inputs import caveat_of
+from su3d_bench.runs.job_inputs import caveat_of
 from su3d_bench.reports.tables.run import headline, markdown_table
 from su3d_bench.core.types import PerceptionNeeds, SceneInfo
 

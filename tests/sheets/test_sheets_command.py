@@ -14,7 +14,7 @@ from chat_server import KEY, Answered, ChatServer, chat_server, error
 from made_sheets import METHODS, RUN
 from painted import colour_perception
 
-from su3d_bench import scene_run
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli import query
 from su3d_bench.cli.main import main
 from su3d_bench.metrics.protocols import load_protocol

@@ -15,12 +15,12 @@ from made_sheets import HOSTILE, METHODS, RUN, drafts_of, made
 from painted import WordEncoder, colour_perception
 from PIL import Image
 
-from su3d_bench import scene_run
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli import query
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError
-from su3d_bench.executors import run_processes
-from su3d_bench.finished_run import read_run
+from su3d_bench.runs.executors.local import run_processes
+from su3d_bench.runs.finished import read_run
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.questions.model import new_question
 from su3d_bench.reports.pictures.frame_views import best_view, mask_in_frame, seen_in

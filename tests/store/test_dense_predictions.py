@@ -18,7 +18,7 @@ from box_room import INTRINSICS, images, pose
 from painted import colour_perception
 from places import ROOT, SCENES
 
-from su3d_bench import scene_run
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.store import run_folder as store
 from su3d_bench.baselines.conceptfusion import feature_table
 from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig

@@ -22,7 +22,7 @@ from conceptgraphs_scene import (
 from painted import colour_perception
 from places import SCENES
 
-from su3d_bench import scene_run
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
 from su3d_bench.baselines.conceptgraphs.config import MappingConfig
 from su3d_bench.cli.main import main

@@ -37,8 +37,8 @@ from su3d_bench.datasets.scannet.folders import PAPER_SCENES, find_scans, split_
 from su3d_bench.datasets.scannet.frames import read_walk
 from su3d_bench.datasets.scannet.labels import TABLE_NAME
 from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing
-from su3d_bench.planning import expand_scenes
-from su3d_bench.scene_job import Part
+from su3d_bench.runs.plan import expand_scenes
+from su3d_bench.runs.job import Part
 from su3d_bench.core.types import Float64Array, UInt8Array
 
 

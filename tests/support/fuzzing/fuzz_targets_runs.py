@@ -27,7 +27,7 @@ def _made_run() -> Path:
     import pytest
     from painted import colour_perception
 
-    from su3d_bench import scene_run
+    from su3d_bench.runs import scene as scene_run
 
     folder = Path(tempfile.mkdtemp(prefix="fuzzrun")).resolve()
     atexit.register(shutil.rmtree, folder, ignore_errors=True)
@@ -59,9 +59,9 @@ def _checked_counts(side: Any, protocol: str) -> None:
 def _run(folder: Path) -> Read:
     """Everything that is read of a finished run."""
     from su3d_bench.comparison_sides import Side
-    from su3d_bench.estimate import recent_update_s
-    from su3d_bench.finished_run import read_run
-    from su3d_bench.finished_updates import read_update_times
+    from su3d_bench.runs.estimate import recent_update_s
+    from su3d_bench.runs.finished import read_run
+    from su3d_bench.runs.finished_updates import read_update_times
     from su3d_bench.gate import check, learn, read_reference
     from su3d_bench.leaderboard import leaderboard
     from su3d_bench.table_sources import measured_results
@@ -120,7 +120,8 @@ def _resumed(folder: Path) -> Read:
     import pytest
     from painted import colour_perception
 
-    from su3d_bench import finished_scenes, scene_run
+    from su3d_bench.runs import resume as finished_scenes
+    from su3d_bench.runs import scene as scene_run
 
     words = _command(copied_run(folder))
 
@@ -251,7 +252,7 @@ def _published(folder: Path) -> Read:
 
 
 def _ablation(folder: Path) -> Read:
-    from su3d_bench.ablation import ablation_rows, read_rows, write_rows
+    from su3d_bench.runs.ablation import ablation_rows, read_rows, write_rows
 
     write_rows(folder, ablation_rows(COLLECTOR, ["noise_m=0.0,0.3", "drop=1"], is_grid=False))
     return lambda: read_rows(folder)
@@ -259,9 +260,9 @@ def _ablation(folder: Path) -> Read:
 
 def _assignments(folder: Path) -> Read:
     """Words of ``--set``, of variants and of ``--vary``, one a line of a file."""
-    from su3d_bench.ablation import ablation_rows
+    from su3d_bench.runs.ablation import ablation_rows
     from su3d_bench.core.config import parse_value, read_assignments
-    from su3d_bench.method_names import named_method
+    from su3d_bench.runs.method_names import named_method
 
     lines = ("opensu3d.top_m=10", "top_m=10,5", "perception.cache=false", "rooms.width=64", "opensu3d.a='x'")
     (folder / "words.txt").write_text("\n".join(lines))

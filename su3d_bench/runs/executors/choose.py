@@ -8,7 +8,7 @@ from typing import Any
 
 from su3d_bench.core.config import RunConfig, parse_value
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.executors import Outcome, Report, Unit, Work, run_inline, run_processes
+from su3d_bench.runs.executors.local import Outcome, Report, Unit, Work, run_inline, run_processes
 
 # The options of executors on other machines; a value other than the default is refused elsewhere.
 USED_BY = {
@@ -74,11 +74,11 @@ def run_units(
     if executor == "processes":
         return run_processes(work, units, report, jobs=n_workers, lost=lost)
     if executor == "ray":
-        from su3d_bench.executors_ray import RayOptions, run_ray
+        from su3d_bench.runs.executors.ray import RayOptions, run_ray
 
         options = RayOptions(config.ray_address, config.gpus_per_job, config.retries)
         return run_ray(work, units, report, jobs=n_workers, options=options, lost=lost)
-    from su3d_bench.executors_slurm import SlurmOptions, run_slurm
+    from su3d_bench.runs.executors.slurm import SlurmOptions, run_slurm
 
     at = SlurmOptions(folder.absolute() / "slurm", slurm_parameters(config), int(config.gpus_per_job), config.retries)
     return run_slurm(work, units, report, jobs=n_workers, options=at, lost=lost)

@@ -11,7 +11,7 @@ from su3d_bench.core.interfaces import Method
 from su3d_bench.perception.profiles import Perception
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.questions.refined import refined_digest
-from su3d_bench.scene_job import MethodOutcome, SceneJob
+from su3d_bench.runs.job import MethodOutcome, SceneJob
 from su3d_bench.store.run_folder import JobFolder
 from su3d_bench.core.types import SceneInfo
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import ConfigError, ModelMissing
-from su3d_bench.executors import Outcome, Report, Unit, Work, answer_of, limit_threads, unwrap
+from su3d_bench.runs.executors.local import Outcome, Report, Unit, Work, answer_of, limit_threads, unwrap
 
 CLUSTERS = ("slurm", "local")  # submitit takes this machine for a cluster in silence where there is no Slurm
 DEFAULTS = {"timeout_min": 240}  # submitit's own limit is 5 minutes, less than a long scene takes

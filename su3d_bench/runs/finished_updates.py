@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.finished_run import FinishedRun
+from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.core.plain_text import printable
 from su3d_bench.store.run_folder import is_file
 from su3d_bench.core.types import Float64Array

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.executors import Event, Report
+from su3d_bench.runs.executors.local import Event, Report
 from su3d_bench.core.interfaces import Method
 from su3d_bench.perception.profiles import Perception
-from su3d_bench.read_ahead import ReadAhead
-from su3d_bench.scene_tools import no_detections
+from su3d_bench.runs.read_ahead import ReadAhead
+from su3d_bench.runs.scene_tools import no_detections
 from su3d_bench.store.run_folder import write_prediction
 from su3d_bench.core.timing import Timer, calibration_ms, memory_bytes
 from su3d_bench.core.types import Detections, Frame

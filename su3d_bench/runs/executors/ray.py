@@ -15,7 +15,7 @@ from typing import Any
 
 from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, package_versions
 from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError
-from su3d_bench.executors import Outcome, Report, Unit, Work, answer_of, limit_threads, unwrap
+from su3d_bench.runs.executors.local import Outcome, Report, Unit, Work, answer_of, limit_threads, unwrap
 
 CONNECT_S = 5.0  # a machine of a cluster in one network answers within milliseconds
 MOST_AT_ONCE = 1000  # each pending task costs the driver memory, and each wait a look at all of them
