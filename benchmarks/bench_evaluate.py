@@ -15,7 +15,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from su3d_bench.evaluation import Request, evaluate
+from su3d_bench.evaluation.evaluate import Request, evaluate
 from su3d_bench.metrics.instance.average_precision import MIN_REGION_SIZE, THRESHOLDS, InstanceAP, InstanceCounts, combine, count_class, per_scene
 from su3d_bench.metrics.protocols import load_protocol
 

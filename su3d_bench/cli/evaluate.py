@@ -74,7 +74,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()  # before numerical libraries are loaded
-    from su3d_bench.evaluation import NOT_MEANT, Request, evaluate
+    from su3d_bench.evaluation.evaluate import NOT_MEANT, Request, evaluate
     from su3d_bench.reports.tables.evaluation import evaluation_text
     from su3d_bench.store.run_folder import make_folder, write_text
 

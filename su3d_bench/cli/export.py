@@ -272,8 +272,8 @@ def _has_masks(rules: ProtocolRules) -> bool:
 def _encoder(content: Content, source: Source, rules: ProtocolRules, texts: Path | None) -> Encoder | None:
     """What names the features; None where the prediction has classes or no features."""
     from su3d_bench.cli.query import encoder_of
-    from su3d_bench.evaluation_scoring import n_feature_dimensions
-    from su3d_bench.evaluation_texts import encoder_for, read_text_features
+    from su3d_bench.evaluation.scoring import n_feature_dimensions
+    from su3d_bench.evaluation.texts import encoder_for, read_text_features
     from su3d_bench.store.run_folder import RunFolder
 
     n_dimensions = n_feature_dimensions(rules, content)

@@ -16,7 +16,7 @@ from tiny_encoders import DIM, write_tiny_clip
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.cli.query import encoder_of
 from su3d_bench.core.errors import ModelMissing, PredictionError
-from su3d_bench.evaluation_texts import encoder_for
+from su3d_bench.evaluation.texts import encoder_for
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.perception.models.config import ModelsConfig

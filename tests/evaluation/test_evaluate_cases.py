@@ -13,7 +13,7 @@ import pytest
 from prediction_files import CASES, scenes_of, write_scannet_text
 
 from su3d_bench.cli.main import main
-from su3d_bench.evaluation import Confidences, Request, evaluate
+from su3d_bench.evaluation.evaluate import Confidences, Request, evaluate
 
 PROTOCOLS = {"inst": "scannet-instance", "replica": "replica-openmask3d", "scannet200": "scannet200-instance"}
 INSTANCE_CASES = sorted(path.stem for name in PROTOCOLS for path in CASES.glob(f"{name}*.json") if name != "scannet200")

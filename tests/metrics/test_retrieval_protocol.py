@@ -13,8 +13,8 @@ from scored_room import ENCODER, NAMES, OneHotEncoder, instances, nothing, room,
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, PredictionError
-from su3d_bench.evaluation_openlex import why_not_lex_content
-from su3d_bench.evaluation_questions import score_on_questions
+from su3d_bench.evaluation.openlex import why_not_lex_content
+from su3d_bench.evaluation.evaluation_questions import score_on_questions
 from su3d_bench.metrics.instance.covered_objects import covered_objects
 from su3d_bench.metrics.questions.truths import AskedText, GivenAnswer, ReasoningTruth, RetrievalTruth, TrueAnswer
 from su3d_bench.metrics.results.results import metric_values

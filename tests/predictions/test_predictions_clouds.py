@@ -32,7 +32,7 @@ from prediction_files import CASES, refused
 
 from su3d_bench.formats.pcd import write_pcd_points
 from su3d_bench.formats.ply import PlyElement, write_ply
-from su3d_bench.evaluation import Request, evaluate
+from su3d_bench.evaluation.evaluate import Request, evaluate
 from su3d_bench.predictions import clouds, gradslam
 from su3d_bench.predictions.base import ScenePrediction
 from su3d_bench.predictions.formats import READERS, recognise

@@ -13,7 +13,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.questions.files.queries import read_query_file
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.core.errors import ConfigError, DataError
-from su3d_bench.evaluation import Request, evaluate
+from su3d_bench.evaluation.evaluate import Request, evaluate
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
 
 TOML = """[[query]]

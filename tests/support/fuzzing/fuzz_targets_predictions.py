@@ -123,7 +123,7 @@ def _own_prediction(kind: str) -> Make:
 def _truth(folder: Path) -> Read:
     from evaluated_text import write_truth
 
-    from su3d_bench.evaluation_truth import read_text_truth
+    from su3d_bench.evaluation.truth import read_text_truth
 
     write_truth(folder, values=[0, 5001, 1163002, 39001, 7])
     return lambda: read_text_truth({"scene0001_00": folder / "scene0001_00.txt"})
@@ -132,7 +132,7 @@ def _truth(folder: Path) -> Read:
 def _texts(folder: Path) -> Read:
     from evaluated_text import write_texts
 
-    from su3d_bench.evaluation_texts import read_text_features
+    from su3d_bench.evaluation.texts import read_text_features
 
     write_texts(folder / "texts.npz", ["chair", "table"], {"chair": 1}, encoder="one")
     return lambda: read_text_features(folder / "texts.npz")

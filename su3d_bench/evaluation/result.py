@@ -10,8 +10,8 @@ from typing import Any, cast
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.evaluation_checks import MaskFacts
-from su3d_bench.evaluation_scoring import SceneOutcome
+from su3d_bench.evaluation.checks import MaskFacts
+from su3d_bench.evaluation.scoring import SceneOutcome
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.results.results import ProtocolResult, metric_values
 from su3d_bench.metrics.scene_score import SceneScore

@@ -21,8 +21,8 @@ from su3d_bench.datasets.openlex3d import (
 from su3d_bench.datasets.replica.folders import find_original_scene, original_name
 from su3d_bench.datasets.replica.mesh_truth import read_annotated_mesh
 from su3d_bench.core.errors import GroundTruthMissing
-from su3d_bench.evaluation_checks import check_cloud, empty_warnings, mask_facts
-from su3d_bench.evaluation_scoring import SceneOutcome
+from su3d_bench.evaluation.checks import check_cloud, empty_warnings, mask_facts
+from su3d_bench.evaluation.scoring import SceneOutcome
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth

@@ -9,16 +9,8 @@ import numpy as np
 from su3d_bench.core import registry
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.metrics.instance.evaluation_bound import every_class_counts
-from su3d_bench.evaluation_checks import (
-    MaskFacts,
-    check_cloud,
-    class_warnings,
-    duplicate_warnings,
-    empty_warnings,
-    label_warnings,
-    mask_facts,
-)
-from su3d_bench.evaluation_truth import MAX_NYU40_ID, TextTruth
+from su3d_bench.evaluation.checks import MaskFacts, check_cloud, class_warnings, duplicate_warnings, empty_warnings, label_warnings, mask_facts
+from su3d_bench.evaluation.truth import MAX_NYU40_ID, TextTruth
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.semantic import confusion as semantic
