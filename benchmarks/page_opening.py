@@ -24,8 +24,8 @@ from measured import write_measured
 
 from su3d_bench.cli.query import encoder_of
 from su3d_bench.runs.executors.local import limit_threads
-from su3d_bench.page_maps import QUERIES, page_scenes, points_of_each
-from su3d_bench.page_sources import page_numbers, scored_maps
+from su3d_bench.analysis.page_maps import QUERIES, page_scenes, points_of_each
+from su3d_bench.analysis.page_numbers import page_numbers, scored_maps
 from su3d_bench.reports.page.page import page_html
 
 N_SCENES, N_METHODS = 20, 8

@@ -42,7 +42,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()
-    from su3d_bench.attribution import attribute
+    from su3d_bench.analysis.attribution import attribute
     from su3d_bench.reports.pictures.attribution import draw_attribution
     from su3d_bench.reports.tables.attribution import attribution_tables
 

@@ -38,7 +38,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()
-    from su3d_bench.comparison import compare
+    from su3d_bench.analysis.comparison import compare
     from su3d_bench.reports.tables.comparison import comparison_tables
 
     found = compare(

@@ -34,7 +34,7 @@ def add_parser(actions: Any) -> None:
 def call(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from su3d_bench.leaderboard import leaderboard, tables
+    from su3d_bench.analysis.leaderboard import leaderboard, tables
     from su3d_bench.reports.tables.latex import latex
     from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
     from su3d_bench.store.run_folder import make_folder, write_text

@@ -31,7 +31,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()
-    from su3d_bench.table_sources import check_paper
+    from su3d_bench.analysis.tables import check_paper
 
     checks = [check for file in arguments.files for check in check_paper(file, arguments.root)]
     differing = [check for check in checks if check.fault is not None]

@@ -17,7 +17,7 @@ from scored_room import ENCODER, NAMES, instances, noisy, room, truth_as_predict
 
 import su3d_bench.reports.tables.attribution
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.attribution import KINDS, attribute
+from su3d_bench.analysis.attribution import KINDS, attribute
 from su3d_bench.cli import attribute as verb
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError

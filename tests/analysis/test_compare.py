@@ -20,7 +20,7 @@ from places import SCENES
 import su3d_bench.reports.tables.comparison
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli.main import main
-from su3d_bench.comparison import compare
+from su3d_bench.analysis.comparison import compare
 from su3d_bench.core.errors import ConfigError, StoreError
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.semantic import confusion as semantic

@@ -14,7 +14,7 @@ from places import SCENES
 
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli.main import main
-from su3d_bench.leaderboard import leaderboard
+from su3d_bench.analysis.leaderboard import leaderboard
 
 PAINTED = f"{SCENES}/painted.py"
 

@@ -19,7 +19,7 @@ from su3d_bench.reports.tables.paper import Shown
 from su3d_bench.sheets.score_file import write_scores
 from su3d_bench.sheets.scores import score
 from su3d_bench.sheets.validation import check_answers
-from su3d_bench.table_sources import check_paper, measured_results
+from su3d_bench.analysis.tables import check_paper, measured_results
 
 LABELS = [("right", "right", "well-merged"), ("wrong", "right", "well-merged"), ("wrong", "wrong", "over-merged")]
 

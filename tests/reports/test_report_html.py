@@ -19,11 +19,11 @@ import pytest
 from painted import WordEncoder, colour_perception
 from places import SCENES
 
-from su3d_bench import page_maps
+from su3d_bench.analysis import page_maps
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli import query
 from su3d_bench.cli.main import main
-from su3d_bench.page_maps import points_of_each
+from su3d_bench.analysis.page_maps import points_of_each
 from su3d_bench.reports.page import numbers as html_data
 from su3d_bench.reports.page import maps as html_map
 from su3d_bench.reports.page import page as html_page

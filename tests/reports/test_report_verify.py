@@ -17,7 +17,7 @@ from su3d_bench.cli.main import build_parser, main
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.reports.tables.latex import latex
 from su3d_bench.reports.tables.paper import Shown, selection_tables
-from su3d_bench.table_sources import check_paper, choose, measured_results
+from su3d_bench.analysis.tables import check_paper, choose, measured_results
 
 
 @pytest.fixture(scope="module")

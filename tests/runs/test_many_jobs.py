@@ -11,7 +11,7 @@ import pytest
 from painted import colour_perception
 
 from places import SCENES
-from su3d_bench import page_sources
+from su3d_bench.analysis import page_numbers as page_sources
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import runner
 from su3d_bench.runs import scene as scene_run

@@ -51,20 +51,20 @@ def copied_run(folder: Path) -> Path:
 
 
 def _checked_counts(side: Any, protocol: str) -> None:
-    from su3d_bench.comparison_sides import check_shapes, rules_of
+    from su3d_bench.analysis.sides import check_shapes, rules_of
 
     check_shapes(rules_of(side, protocol), side, side.run.scores(side.method).get(protocol, {}))
 
 
 def _run(folder: Path) -> Read:
     """Everything that is read of a finished run."""
-    from su3d_bench.comparison_sides import Side
+    from su3d_bench.analysis.sides import Side
     from su3d_bench.runs.estimate import recent_update_s
     from su3d_bench.runs.finished import read_run
     from su3d_bench.runs.finished_updates import read_update_times
-    from su3d_bench.gate import check, learn, read_reference
-    from su3d_bench.leaderboard import leaderboard
-    from su3d_bench.table_sources import measured_results
+    from su3d_bench.analysis.gate import check, learn, read_reference
+    from su3d_bench.analysis.leaderboard import leaderboard
+    from su3d_bench.analysis.tables import measured_results
 
     path, reference = copied_run(folder), folder / "reference.json"
     reference.write_text(json.dumps(learn([read_run(path)]).model_dump(mode="json")))

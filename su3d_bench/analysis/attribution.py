@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core import registry
-from su3d_bench.comparison_sides import Side, refuse_unlike
+from su3d_bench.analysis.sides import Side, refuse_unlike
 from su3d_bench.core.config import Setting, Settings, resolve
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, suggest
 from su3d_bench.runs.finished import FinishedRun, read_run

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core import registry
-from su3d_bench.attribution import EncoderOf
+from su3d_bench.analysis.attribution import EncoderOf
 from su3d_bench.core.config import Setting, Settings, resolve
 from su3d_bench.core.errors import Su3dError
 from su3d_bench.runs.finished import FinishedRun

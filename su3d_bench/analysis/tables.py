@@ -11,7 +11,7 @@ from typing import Annotated
 
 from pydantic import BaseModel, Field, ValidationError
 
-from su3d_bench.comparison_sides import Side, refuse_unlike, rules_of
+from su3d_bench.analysis.sides import Side, refuse_unlike, rules_of
 from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, suggest
 from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.metrics.results.results import ProtocolResult

@@ -9,8 +9,8 @@ from typing import Annotated, Any, TypeVar
 
 from pydantic import BaseModel, Field, ValidationError
 
-from su3d_bench.attribution import EncoderOf, attribute
-from su3d_bench.comparison import SideNumbers, compare
+from su3d_bench.analysis.attribution import EncoderOf, attribute
+from su3d_bench.analysis.comparison import SideNumbers, compare
 from su3d_bench.core.config import KeyPath
 from su3d_bench.core.errors import StoreError, Su3dError
 from su3d_bench.runs.finished import FinishedRun, read_run

@@ -13,15 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.comparison_sides import (
-    Side,
-    check_shapes,
-    pair_methods,
-    parse_side,
-    protocols_in_both,
-    refuse_unlike,
-    rules_of,
-)
+from su3d_bench.analysis.sides import Side, check_shapes, pair_methods, parse_side, protocols_in_both, refuse_unlike, rules_of
 from su3d_bench.core.config import MOVES_NO_NUMBER
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.runs.finished import FinishedRun
