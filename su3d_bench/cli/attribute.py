@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.cli.common import add_verb, answer, answer_json, remark
 from su3d_bench.cli.query import encoder_of
 from su3d_bench.core.errors import EXIT_DONE
 

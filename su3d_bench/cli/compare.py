@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from su3d_bench.cli.flags import add_verb, answer, answer_json
+from su3d_bench.cli.common import add_verb, answer, answer_json
 from su3d_bench.core.errors import EXIT_DONE
 
 

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.flags import add_verb, answer, remark
+from su3d_bench.cli.common import add_verb, answer, remark
 from su3d_bench.core.errors import EXIT_DONE
 
 

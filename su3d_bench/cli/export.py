@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.cli.common import add_verb, answer, answer_json, remark
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, suggest
 from su3d_bench.core.plain_text import printable
 
@@ -230,7 +230,7 @@ def _labelled(content: Content, source: Source, arguments: argparse.Namespace) -
 def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
     """The dataset and the scene of a prediction, with the options of the run that it lies in."""
     from su3d_bench.core import registry
-    from su3d_bench.cli.datasets_check import chosen_scenes
+    from su3d_bench.cli.datasets.check import chosen_scenes
     from su3d_bench.core.config import RunConfig, read_file, resolve
     from su3d_bench.runs.plan import data_root, dataset_targets
     from su3d_bench.runs.job import Part, build_dataset

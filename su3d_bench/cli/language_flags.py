@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from su3d_bench.cli.flags import add_settings
+from su3d_bench.cli.common import add_settings
 
 if TYPE_CHECKING:
     from su3d_bench.perception.language.client import ChatClient

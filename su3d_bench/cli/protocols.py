@@ -7,7 +7,7 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.flags import add_verb, answer, answer_json
+from su3d_bench.cli.common import add_verb, answer, answer_json
 from su3d_bench.core.errors import ConfigError, suggest
 
 if TYPE_CHECKING:

@@ -8,7 +8,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.flags import add_verb, add_whose_map, answer, answer_json, remark
+from su3d_bench.cli.common import add_verb, add_whose_map, answer, answer_json, remark
 from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, suggest
 
 if TYPE_CHECKING:

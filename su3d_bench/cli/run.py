@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.flags import add_settings, add_verb, answer, answer_json, remark
+from su3d_bench.cli.common import add_settings, add_verb, answer, answer_json, remark
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE
 
 if TYPE_CHECKING:

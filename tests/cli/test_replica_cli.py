@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from su3d_bench.cli import datasets
+from su3d_bench.cli.datasets import list as datasets
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.runs.plan import data_root

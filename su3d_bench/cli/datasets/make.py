@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any, NoReturn
 
 from su3d_bench.core import registry
-from su3d_bench.cli.flags import answer, answer_json, remark
+from su3d_bench.cli.common import answer, answer_json, remark
 from su3d_bench.core.config import read_assignments, resolve
 from su3d_bench.datasets.layouts import LAYOUTS
 from su3d_bench.datasets.writing import SceneTarget, finish_scene, plan_scenes, write_frames

@@ -6,8 +6,8 @@ import argparse
 import re
 from pathlib import Path
 
-from su3d_bench.cli.datasets_check import chosen_scenes
-from su3d_bench.cli.flags import answer, answer_json
+from su3d_bench.cli.datasets.check import chosen_scenes
+from su3d_bench.cli.common import answer, answer_json
 from su3d_bench.cli.progress import progress
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
 from su3d_bench.runs.executors.local import Event

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.flags import add_group, add_settings, add_verb, answer, answer_json
+from su3d_bench.cli.common import add_group, add_settings, add_verb, answer, answer_json
 from su3d_bench.core.errors import EXIT_DONE, DataError, Su3dError
 
 LAYOUTS = ("native", "replica", "scannet", "scannet-python", "scannet-cpp", "tum")
@@ -167,7 +167,7 @@ def call_check(arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()  # before numerical libraries are loaded
-    from su3d_bench.cli.datasets_check import check
+    from su3d_bench.cli.datasets.check import check
 
     return check(arguments)
 
@@ -176,7 +176,7 @@ def call_show(arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()
-    from su3d_bench.cli.datasets_show import show
+    from su3d_bench.cli.datasets.show import show
 
     return show(arguments)
 
@@ -185,6 +185,6 @@ def call_make(arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()  # before numerical libraries are loaded
-    from su3d_bench.cli.datasets_make import make
+    from su3d_bench.cli.datasets.make import make
 
     return make(arguments)

@@ -7,7 +7,7 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.cli.common import add_verb, answer, answer_json, remark
 from su3d_bench.cli.language_flags import add_language_flags, chat_client, language_config
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
 

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.flags import add_verb, answer, remark
+from su3d_bench.cli.common import add_verb, answer, remark
 from su3d_bench.core.errors import EXIT_DONE
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from itertools import groupby
 from typing import Any
 
 from su3d_bench.core import registry
-from su3d_bench.cli.flags import answer, answer_json, remark
+from su3d_bench.cli.common import answer, answer_json, remark
 from su3d_bench.cli.progress import progress
 from su3d_bench.core.config import read_assignments, resolve
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.cli.common import add_verb, answer, answer_json, remark
 
 if TYPE_CHECKING:
     from su3d_bench.runs.finished import FinishedRun

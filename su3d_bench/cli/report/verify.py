@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.flags import add_verb, answer, answer_json
+from su3d_bench.cli.common import add_verb, answer, answer_json
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE
 
 NAME = "verify"

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.flags import add_verb, answer, answer_json, remark
+from su3d_bench.cli.common import add_verb, answer, answer_json, remark
 from su3d_bench.core.errors import EXIT_DONE, DataError
 
 if TYPE_CHECKING:
