@@ -20,9 +20,9 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 from torch_devices import TORCH_ON_CPU, on_each_device
 
-from su3d_bench.runs.executors.local import one_thread
-from su3d_bench.opensu3d.voxel_map import VoxelMap
 from su3d_bench.core.types import Float64Array
+from su3d_bench.opensu3d.voxel_map import VoxelMap
+from su3d_bench.runs.executors.local import one_thread
 
 if TYPE_CHECKING:
     from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap

@@ -17,11 +17,11 @@ from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusi
 from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
 from su3d_bench.baselines.conceptgraphs.objects import MapObject, Sighting
 from su3d_bench.baselines.conceptgraphs.regions import box_of
-from su3d_bench.baselines.sam3d.overlap import GroupedCloud, voxelise
 from su3d_bench.baselines.sam3d.method import SAM3D, SAM3DConfig
-from su3d_bench.opensu3d.pipeline import OpenSU3D
+from su3d_bench.baselines.sam3d.overlap import GroupedCloud, voxelise
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Detections, Float64Array, Frame, Int64Array, SceneInfo
+from su3d_bench.opensu3d.pipeline import OpenSU3D
 
 WIDTH, HEIGHT, FOCAL = 1200, 680, 600.0
 DISTANCE_M = 2.5

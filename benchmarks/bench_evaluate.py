@@ -16,7 +16,15 @@ import pytest
 from numpy.typing import NDArray
 
 from su3d_bench.evaluation.evaluate import Request, evaluate
-from su3d_bench.metrics.instance.average_precision import MIN_REGION_SIZE, THRESHOLDS, InstanceAP, InstanceCounts, combine, count_class, per_scene
+from su3d_bench.metrics.instance.average_precision import (
+    MIN_REGION_SIZE,
+    THRESHOLDS,
+    InstanceAP,
+    InstanceCounts,
+    combine,
+    count_class,
+    per_scene,
+)
 from su3d_bench.metrics.protocols import load_protocol
 
 N_SCENES, N_POINTS, N_MASKS, N_INSTANCES = 8, 200_000, 150, 90

@@ -14,15 +14,15 @@ import pytest
 from pytest_benchmark.fixture import BenchmarkFixture
 from replica_files import write_replica
 
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import Frame
 from su3d_bench.datasets.replica.frames import ReplicaFrames
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
-from su3d_bench.runs.executors.local import one_thread
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.perception.embedded.encoder import IMAGE_SIZE, EmbeddedEncoder
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
+from su3d_bench.runs.executors.local import one_thread
 from su3d_bench.runs.read_ahead import ReadAhead
-from su3d_bench.core.timing import Timer
-from su3d_bench.core.types import Frame
 
 N_FRAMES = 8
 NEEDS = OpenSU3D(OpenSU3D.Config()).needs

@@ -13,10 +13,10 @@ from functools import cache
 import numpy as np
 from pytest_benchmark.fixture import BenchmarkFixture
 
+from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.opensu3d.postprocess import cluster
 from su3d_bench.opensu3d.tracking import ImageRecord, View
-from su3d_bench.core.types import Float64Array, Int64Array
 
 N_INSTANCES = 200
 N_POINTS = 10_000  # of an instance

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.core.types import Float32Array
+from su3d_bench.metrics.matching.nearest import nearest
 
 GROUP = "nearest neighbours: 4 million candidates, 1 million questions"
 

@@ -23,13 +23,13 @@ from dense_memory import RandomDirections
 from measured import write_measured
 from wall import view
 
-from su3d_bench.opensu3d.pipeline import OpenSU3D
-from su3d_bench.opensu3d.tracking import View, record_of
-from su3d_bench.metrics.protocols import load_protocol
-from su3d_bench.metrics.scoring import combine, score_scene
-from su3d_bench.store.run_folder import read_prediction, write_prediction
 from su3d_bench.core.timing import Timer, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Detections, Float32Array, Float64Array, GroundTruth, Int32Array, LabelSet, SceneInfo
+from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.scoring import combine, score_scene
+from su3d_bench.opensu3d.pipeline import OpenSU3D
+from su3d_bench.opensu3d.tracking import View, record_of
+from su3d_bench.store.run_folder import read_prediction, write_prediction
 
 RULES = load_protocol("rooms-semantic")
 CLASSES = [entry for entry in RULES.classes if not RULES.is_ignored(entry.name)]

@@ -22,7 +22,17 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.core.types import Float32Array, Float64Array, Frame, GroundTruth, InstanceMesh, Int32Array, LabelSet, SceneInfo, Surface
+from su3d_bench.core.types import (
+    Float32Array,
+    Float64Array,
+    Frame,
+    GroundTruth,
+    InstanceMesh,
+    Int32Array,
+    LabelSet,
+    SceneInfo,
+    Surface,
+)
 
 WIDTH_M, HEIGHT_M = 2.4, 2.6
 MAX_LENGTH_M = 100_000

@@ -26,11 +26,20 @@ import numpy as np
 from measured import write_measured
 
 from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig
+from su3d_bench.core.timing import Timer, peak_memory_bytes, start_memory_watch
+from su3d_bench.core.types import (
+    DenseFeatures,
+    Detections,
+    Float32Array,
+    Frame,
+    GroundTruth,
+    LabelSet,
+    SceneInfo,
+    UInt8Array,
+)
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.store.run_folder import read_prediction, write_prediction
-from su3d_bench.core.timing import Timer, peak_memory_bytes, start_memory_watch
-from su3d_bench.core.types import DenseFeatures, Detections, Float32Array, Frame, GroundTruth, LabelSet, SceneInfo, UInt8Array
 
 SIDE_PX = 500
 FOCAL_PX = 500.0

@@ -18,10 +18,10 @@ from pathlib import Path
 
 from measured import write_measured
 
-from su3d_bench.cli.main import main as su3d_bench
-from su3d_bench.runs.finished import read_run
 from su3d_bench.analysis.gate import COST_LIMIT, Reference, check, learn, update_costs
+from su3d_bench.cli.main import main as su3d_bench
 from su3d_bench.reports.gate import plain_lines
+from su3d_bench.runs.finished import read_run
 
 TAUGHT, N_UPDATES, SLOWER = 5, 40, 1.5
 

@@ -14,13 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
+from su3d_bench.core.types import GroundTruth, Instances
 from su3d_bench.datasets.rooms.dataset import Rooms
-from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
-from su3d_bench.runs.plan import data_root
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
+from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
+from su3d_bench.runs.plan import data_root
 from su3d_bench.store.run_folder import RunFolder, read_prediction
-from su3d_bench.core.types import GroundTruth, Instances
 
 PROTOCOLS = ("rooms-semantic", "rooms-instance")
 N_DRAWS = 3

@@ -33,20 +33,20 @@ from tiny_models import DINO_PX, SAM_PX, blocks, tiny_dino, tiny_sam, tiny_token
 from torch_devices import TORCH_ON_CPU
 
 from su3d_bench.cli.main import main as command_line
+from su3d_bench.core.devices import device_for, make_deterministic
 from su3d_bench.core.errors import ConfigError, ModelMissing
+from su3d_bench.core.timing import Timer, synchronise_device
 from su3d_bench.metrics.matching.labelling import cosines, most_similar
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.perception.models.config import ModelsConfig
-from su3d_bench.core.devices import device_for, make_deterministic
+from su3d_bench.perception.models.encoders.towers_onnx import export_encoder
 from su3d_bench.perception.models.files import locate
-from su3d_bench.perception.models.masks.grounding_dino import GroundingDino
 from su3d_bench.perception.models.loading import load_encoder
+from su3d_bench.perception.models.masks.grounding_dino import GroundingDino
 from su3d_bench.perception.models.masks.sam import Sam
 from su3d_bench.perception.models.masks.sam_networks import TorchSam
-from su3d_bench.perception.models.encoders.towers_onnx import export_encoder
-from su3d_bench.core.timing import Timer, synchronise_device
 
 REPEATS = 5
 CLIP = "clip-vit-h-14"

@@ -22,11 +22,11 @@ from typing import Any
 import numpy as np
 from measured import write_measured
 
-from su3d_bench.cli.query import encoder_of
-from su3d_bench.runs.executors.local import limit_threads
 from su3d_bench.analysis.page_maps import QUERIES, page_scenes, points_of_each
 from su3d_bench.analysis.page_numbers import page_numbers, scored_maps
+from su3d_bench.cli.query import encoder_of
 from su3d_bench.reports.page.page import page_html
+from su3d_bench.runs.executors.local import limit_threads
 
 N_SCENES, N_METHODS = 20, 8
 MOST_BYTES, MOST_MS = 30_000_000, 3000.0

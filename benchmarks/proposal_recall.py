@@ -17,14 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core import registry
 from su3d_bench.baselines.openmask3d.method import OpenMask3DConfig
 from su3d_bench.baselines.openmask3d.openmask3d_segment3d import OpenMask3DSegment3DConfig
 from su3d_bench.baselines.openmask3d.proposals import ProposalConfig, make_proposals
-from su3d_bench.metrics.matching.nearest import Masks, transfer_masks
-from su3d_bench.runs.plan import data_root
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.core import registry
 from su3d_bench.core.types import Float64Array, GroundTruth, Proposals
+from su3d_bench.metrics.matching.nearest import Masks, transfer_masks
+from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.runs.plan import data_root
 
 LIMITS = (0.25, 0.5, 0.75)
 

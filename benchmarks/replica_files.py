@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from su3d_bench.datasets.replica.frames import Camera, ReplicaFrames, colour_name, depth_name
 from su3d_bench.core.types import Frame
+from su3d_bench.datasets.replica.frames import Camera, ReplicaFrames, colour_name, depth_name
 
 SCALE = 6553.5  # depth units in a metre of Replica's render
 

@@ -15,13 +15,23 @@ from typing import Any
 
 import numpy as np
 
+from su3d_bench.core.timing import hardware_line
+from su3d_bench.metrics.costs import (
+    MAP,
+    NOT_MAP,
+    TOTAL,
+    WARM_UP,
+    MethodSummary,
+    StageSummary,
+    UpdateTimes,
+    pooled,
+    summarise,
+)
+from su3d_bench.numerics.statistics import Growth
+from su3d_bench.reports.pictures.timing import draw_update_cost
+from su3d_bench.reports.tables.run import aligned
 from su3d_bench.runs.finished import read_run
 from su3d_bench.runs.finished_updates import read_update_times
-from su3d_bench.reports.tables.run import aligned
-from su3d_bench.reports.pictures.timing import draw_update_cost
-from su3d_bench.numerics.statistics import Growth
-from su3d_bench.core.timing import hardware_line
-from su3d_bench.metrics.costs import MAP, NOT_MAP, TOTAL, WARM_UP, MethodSummary, StageSummary, UpdateTimes, pooled, summarise
 
 HEAD = """# Performance
 

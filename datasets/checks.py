@@ -18,13 +18,21 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.formats.images import decode_colour, decode_depth, read_bytes
-from su3d_bench.datasets.recordings.pose_convention import check_convention
 from su3d_bench.core.errors import DataError, GroundTruthMissing, Su3dError
-from su3d_bench.datasets.checks_of_frames import Finding, FrameFacts, Meeting, Severity, check_frames, check_truth, facts_of
 from su3d_bench.core.interfaces import Dataset
 from su3d_bench.core.plain_text import printable
 from su3d_bench.core.types import Float32Array, Frame, InstanceMesh
+from su3d_bench.datasets.checks_of_frames import (
+    Finding,
+    FrameFacts,
+    Meeting,
+    Severity,
+    check_frames,
+    check_truth,
+    facts_of,
+)
+from su3d_bench.datasets.recordings.pose_convention import check_convention
+from su3d_bench.formats.images import decode_colour, decode_depth, read_bytes
 
 SAMPLED_FRAMES = 20
 IMAGE_SUFFIXES = {".jpg", ".jpeg", ".png", ".ppm", ".pgm"}

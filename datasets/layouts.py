@@ -7,8 +7,8 @@ from collections.abc import Mapping
 from su3d_bench.datasets.replica.writing import ReplicaLayout
 from su3d_bench.datasets.scannet.writing.exports import CppRecording, PythonRecording
 from su3d_bench.datasets.scannet.writing.layout import ScannetLayout, SensRecording
-from su3d_bench.datasets.writing import Layout
 from su3d_bench.datasets.tum.writing import TumLayout
+from su3d_bench.datasets.writing import Layout
 
 _ALL: tuple[Layout, ...] = (
     ReplicaLayout(),

@@ -15,14 +15,14 @@ from typing import Any, Literal
 
 import numpy as np
 
-from su3d_bench.formats.pcd import read_pcd_points
-from su3d_bench.datasets.replica.mesh_truth import MESH_NAME, AnnotatedMesh
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels, OpenLexTruth
-from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
-from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.core.plain_text import printable
 from su3d_bench.core.types import Float32Array, Int64Array
+from su3d_bench.datasets.replica.mesh_truth import MESH_NAME, AnnotatedMesh
+from su3d_bench.formats.pcd import read_pcd_points
+from su3d_bench.metrics.matching.nearest import nearest
+from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels, OpenLexTruth
+from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
 
 PROMPTS_NAME = "prompt_list.txt"
 CATEGORIES_NAME = "gt_categories.json"

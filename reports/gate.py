@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from xml.etree import ElementTree
 
-from su3d_bench.reports.gate_findings import Finding, Verdict
 from su3d_bench.core.plain_text import printable
+from su3d_bench.reports.gate_findings import Finding, Verdict
 from su3d_bench.reports.tables.run import NOT_MEASURED
 
 MAX_ROWS = 60  # a comment on a pull request may hold 65,536 characters

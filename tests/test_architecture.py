@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import ast
 import re
+import subprocess
 import tomllib
+from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
@@ -19,96 +21,86 @@ CODE = sorted(
     if not any((PACKAGE / name) in path.parents for name in LINKED)
 )
 
-# The direction of imports: a layer may import itself and every layer left of it.
-LAYERS = (
-    {"plain_text"},
-    {"errors"},
-    {"types"},
-    {"interfaces"},
-    {"compiled_open3d", "geometry", "statistics", "timing"},
-    {"update_times", "gate_findings"},
-    {"digests", "toml_text", "row_blocks", "kept_files", "scratch", "temporary_folders"},
-    {"kernels"},
-    {"cell_kernels"},
-    {"config", "protocols", "rules"},
-    {"metrics"},
-    {"registry", "store", "scoring"},
-    {"remote_folder"},
-    {"plain_pickles"},
-    {"perception"},
-    {"opensu3d", "datasets", "reasoning"},
+# The floors of the house, the lowest first: a folder imports from lower floors only.
+FLOORS = (
+    {"core"},
+    {"numerics", "store"},
+    {"formats", "metrics", "opensu3d"},
+    {"datasets", "perception", "reports"},
     {"predictions", "questions"},
-    {"baselines", "reports"},
-    {"executors"},
-    {"executors_ray", "executors_slurm"},
-    {"execution"},
-    {"scene_job"},
-    {"scene_tools", "read_ahead", "scene_log"},
-    {"scene_feeding"},
-    {"job_inputs"},
-    {"finished_scenes", "scene_run"},
-    {"distant_scene", "remote_data"},
-    {"method_names", "ablation"},
-    {"planning"},
-    {"evaluation_truth", "evaluation_scenes", "evaluation_texts", "evaluation_checks", "evaluation_bound"},
-    {"evaluation_scoring"},
-    {"evaluation_result", "evaluation_openlex"},
-    {"evaluation_questions"},
-    {"evaluation"},
-    {"estimate"},
-    {"runner"},
-    {"finished_run"},
-    {"comparison_sides", "finished_updates", "sheets"},
-    {"comparison", "attribution", "gate", "leaderboard", "table_sources"},
-    {"page_sources", "page_maps"},
-    {"inspection_checks"},
-    {"inspection"},
+    {"baselines", "runs"},
+    {"evaluation", "sheets"},
+    {"analysis"},
     {"cli"},
 )
 HEAVY = {"open3d", "torch", "onnxruntime", "sklearn", "pandas", "matplotlib", "numba"}
+LATE = ("compiled.py", "training_model.py")  # they are imported late as a whole, as kernels are
 
 
-def part_of(path: Path) -> str:
-    """The part of the package that a file belongs to: its folder, or its own name at the top."""
+def room_of(path: Path) -> str | None:
+    """The folder of the house that a file stands in; None for the few at the door."""
     relative = path.relative_to(PACKAGE if PACKAGE in path.parents else ROOT)
-    return relative.parts[0] if len(relative.parts) > 1 else relative.stem
+    return relative.parts[0] if len(relative.parts) > 1 else None
 
 
-def layer_of(part: str) -> int:
-    for index, layer in enumerate(LAYERS):
-        if part in layer:
-            return index
-    raise AssertionError(f"'{part}' stands in no layer of LAYERS")
+def floor_of(room: str) -> int:
+    return next(index for index, rooms in enumerate(FLOORS) if room in rooms)
 
 
-def imported_parts(path: Path) -> list[tuple[int, str]]:
+def imported_rooms(source: str) -> list[tuple[int, str]]:
+    """(line, room) of every import of the package in ``source``, those inside functions included."""
     found = []
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and node.module and node.module.startswith("su3d_bench"):
-            parts = node.module.split(".")
-            if len(parts) > 1:
-                found.append((node.lineno, parts[1]))
-            else:
-                found += [(node.lineno, alias.name) for alias in node.names if alias.name != "__version__"]
-        elif isinstance(node, ast.Import):
-            found += [(node.lineno, a.name.split(".")[1]) for a in node.names if a.name.startswith("su3d_bench.")]
+    for node in ast.walk(ast.parse(source)):
+        modules = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.ImportFrom) and node.module == "su3d_bench":
+            modules = [f"su3d_bench.{a.name}" for a in node.names if a.name != "__version__"]
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            modules = [node.module]
+        found += [(node.lineno, name.split(".")[1]) for name in modules if name.startswith("su3d_bench.")]
     return found
 
 
+def climbs(source: str, room: str) -> list[str]:
+    """The imports of ``source``, a file in ``room``, that do not lead to a lower floor or stay in the room."""
+    return [
+        f"line {line}: {room} imports {other}"
+        for line, other in imported_rooms(source)
+        if other != room and floor_of(other) >= floor_of(room)
+    ]
+
+
 @pytest.mark.parametrize("path", CODE, ids=lambda path: str(path.relative_to(ROOT)))
-def test_imports_follow_the_direction(path: Path) -> None:
-    part = part_of(path)
-    if part in {"__init__", "__main__"}:
-        return
-    for line, other in imported_parts(path):
-        if other == part:
-            continue
-        assert layer_of(other) < layer_of(part), f"{path.relative_to(ROOT)}:{line}: {part} imports {other}"
+def test_imports_lead_downstairs(path: Path) -> None:
+    room = room_of(path)
+    if room is not None:
+        assert climbs(path.read_text(), room) == []
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "from su3d_bench.cli.main import main",
+        "from su3d_bench import analysis",
+        "import su3d_bench.baselines.oracle",
+        "def f():\n    from su3d_bench.reports.tables import run",
+    ],
+)
+def test_an_import_in_the_wrong_direction_is_found(line: str) -> None:
+    assert climbs(line, "metrics") != []
+    assert (
+        climbs("from su3d_bench.core.errors import DataError\nfrom su3d_bench.metrics import protocols", "metrics")
+        == []
+    )
+
+
+def test_every_folder_stands_on_one_floor() -> None:
+    rooms = [room for floor in FLOORS for room in floor]
+    assert sorted(rooms) == sorted({room for path in CODE if (room := room_of(path)) is not None})
 
 
 @pytest.mark.parametrize("path", CODE, ids=lambda path: str(path.relative_to(ROOT)))
 def test_open3d_and_torch_are_imported_where_they_are_used(path: Path) -> None:
-    if path.stem.startswith(("training", "_kernels")) or "kernels" in path.stem:
+    if "training" in path.parts or "kernels" in (path.stem, path.parent.name) or path.name in LATE:
         return
     for node in ast.parse(path.read_text()).body:
         names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
@@ -122,21 +114,27 @@ def test_root_folders_are_reached_through_links_only(name: str) -> None:
     link = PACKAGE / name
     assert link.is_symlink()
     assert link.readlink() == Path("..") / name
-    assert not (ROOT / name / "__init__.py").exists()
-    assert not any(child.is_dir() and child.name != "__pycache__" for child in (ROOT / name).iterdir())
+    assert list((ROOT / name).rglob("__init__.py")) == []
 
 
-def test_every_folder_with_code_is_packaged() -> None:
+def test_every_folder_with_code_or_data_is_packaged() -> None:
     configured = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]
-    folders = {path.parent for path in CODE if PACKAGE in path.parents}
-    expected = {".".join(("su3d_bench", *folder.relative_to(PACKAGE).parts)) for folder in folders}
-    expected |= {f"su3d_bench.{name}" for name in LINKED}
-    assert expected <= set(configured["packages"])
+    listing = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, check=True).stdout
+    files = [Path(name) for name in listing.split("\0") if name.startswith(("su3d_bench/", *(f"{n}/" for n in LINKED)))]
+    folders = {path.parent for path in files if (ROOT / path).is_file()}
+    expected = {
+        ".".join(folder.parts if folder.parts[0] == "su3d_bench" else ("su3d_bench", *folder.parts))
+        for folder in folders
+    }
+    assert expected == set(configured["packages"])
     assert configured["package-dir"] == {f"su3d_bench.{name}": name for name in LINKED}
+    patterns = configured["package-data"]["*"]
+    data = [path.name for path in files if path.suffix != ".py" and (ROOT / path).is_file()]
+    assert [name for name in data if not any(fnmatch(name, pattern) for pattern in patterns)] == []
 
 
-def test_the_core_names_no_dataset_and_no_baseline() -> None:
+def test_the_harness_names_no_dataset_and_no_baseline() -> None:
     names = re.compile(r"scannet|conceptfusion|openmask3d|sam3d", re.IGNORECASE)
     for path in CODE:
-        if part_of(path) in {"geometry", "timing", "store", "executors", "types", "statistics"}:
+        if room_of(path) in {"numerics", "store"} or path.name in {"types.py", "timing.py", "executors.py"}:
             assert not names.search(path.read_text()), path

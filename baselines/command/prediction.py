@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.metrics.matching.nearest import masks_of_partition
 from su3d_bench.core.plain_text import printable
-from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
-from su3d_bench.metrics.protocols import load_protocol, protocols_for
 from su3d_bench.core.types import Instances, Prediction, Surface
+from su3d_bench.metrics.matching.nearest import masks_of_partition
+from su3d_bench.metrics.protocols import load_protocol, protocols_for
+from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
 
 
 def read_output(folder: Path, scene: str, format: str | None) -> ScenePrediction:

@@ -9,7 +9,15 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.baselines.conceptfusion.feature_table import FeatureTable, Place, has_any_channel, has_no_zero_channel
-from su3d_bench.baselines.conceptfusion.pixel_features import Overlaps, PixelFeatures, Weights, mixed_features, mixing_weights, paint, picked
+from su3d_bench.baselines.conceptfusion.pixel_features import (
+    Overlaps,
+    PixelFeatures,
+    Weights,
+    mixed_features,
+    mixing_weights,
+    paint,
+    picked,
+)
 from su3d_bench.baselines.conceptfusion.point_fusion import ABSENT, PointFusion, View, view_of
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import MethodAbout, StageTimer

@@ -9,7 +9,14 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from su3d_bench.baselines.conceptgraphs.boxes import are_coplanar, axis_aligned_iou, extents_of_boxes, extents_of_clouds, grown, oriented_iou
+from su3d_bench.baselines.conceptgraphs.boxes import (
+    are_coplanar,
+    axis_aligned_iou,
+    extents_of_boxes,
+    extents_of_clouds,
+    grown,
+    oriented_iou,
+)
 from su3d_bench.baselines.conceptgraphs.config import MappingConfig
 from su3d_bench.baselines.conceptgraphs.objects import MapObject
 from su3d_bench.core.types import Float64Array, Int64Array

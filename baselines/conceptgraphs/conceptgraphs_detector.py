@@ -6,9 +6,9 @@ from typing import Annotated
 
 from pydantic import Field
 
-from su3d_bench.baselines.conceptgraphs.method import CROP_PADDING_PX, ConceptGraphs
 from su3d_bench.baselines.conceptgraphs.config import Cosine, Fraction, Interval, MappingConfig
 from su3d_bench.baselines.conceptgraphs.map import ObjectMap, warm_up
+from su3d_bench.baselines.conceptgraphs.method import CROP_PADDING_PX, ConceptGraphs
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.types import Detections, Frame, Instances, PerceptionNeeds, SceneInfo
 

@@ -14,13 +14,21 @@ import numpy as np
 
 from su3d_bench.baselines.conceptgraphs.association import NEW_OBJECT, assign, total_similarity
 from su3d_bench.baselines.conceptgraphs.config import InstanceScore, MappingConfig
-from su3d_bench.baselines.conceptgraphs.objects import MapObject, Sighting, denoised, merge_overlapping, merged, seen_enough, unit
+from su3d_bench.baselines.conceptgraphs.objects import (
+    MapObject,
+    Sighting,
+    denoised,
+    merge_overlapping,
+    merged,
+    seen_enough,
+    unit,
+)
 from su3d_bench.baselines.conceptgraphs.regions import LiftedRegion, kept_regions, lift, subtract_contained
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import StageTimer
-from su3d_bench.predictions.clouds import instances_of
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Detections, Float32Array, Frame, Instances
+from su3d_bench.predictions.clouds import instances_of
 
 
 class ObjectMap:

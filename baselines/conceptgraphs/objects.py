@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.baselines.conceptgraphs.boxes import extents_of_boxes, shared_volume
+from su3d_bench.baselines.conceptgraphs.clouds import voxel_average
 from su3d_bench.baselines.conceptgraphs.config import MappingConfig
 from su3d_bench.baselines.conceptgraphs.regions import box_of, cleaned
-from su3d_bench.baselines.conceptgraphs.clouds import voxel_average
 from su3d_bench.core.types import Float64Array, OrientedBox
 
 LEAST_AFTER_DENOISING = 4  # points; with fewer the object stays as it was

@@ -9,8 +9,15 @@ import numpy as np
 from pydantic import Field
 
 from su3d_bench.baselines.openmask3d.features import FeatureMeans, Looking, crop_boxes, prompted_mask
-from su3d_bench.baselines.openmask3d.views import NO_VIEW, MaskViews, as_openmask3d, count_pixels, pixels_of_mask, visible_pixels
 from su3d_bench.baselines.openmask3d.proposals import ProposalConfig, make_proposals
+from su3d_bench.baselines.openmask3d.views import (
+    NO_VIEW,
+    MaskViews,
+    as_openmask3d,
+    count_pixels,
+    pixels_of_mask,
+    visible_pixels,
+)
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import SceneTools, StageTimer
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, Instances, Int64Array, SceneInfo

@@ -8,8 +8,9 @@ from pathlib import Path
 
 from su3d_bench.core.digests import digest_file, digest_json
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.predictions.base import VertexMasks, shown
+from su3d_bench.core.plain_text import shown
 from su3d_bench.core.types import Proposals, Surface
+from su3d_bench.predictions.base import VertexMasks
 
 
 def read_proposals(folder: Path, scene: str, surface: Surface) -> Proposals:

@@ -16,12 +16,37 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.baselines.sam3d.overlap import NO_GROUP, GroupedCloud, MergeRules, ensemble, groups_on_surface, match_pairs, merge, merge_regions, numbered, renumber, voxelise, without_small_groups
+from su3d_bench.baselines.sam3d.overlap import (
+    NO_GROUP,
+    GroupedCloud,
+    MergeRules,
+    ensemble,
+    groups_on_surface,
+    match_pairs,
+    merge,
+    merge_regions,
+    numbered,
+    renumber,
+    voxelise,
+    without_small_groups,
+)
 from su3d_bench.core.errors import DataError
-from su3d_bench.numerics.geometry import back_project, valid_depth
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
 from su3d_bench.core.timing import Timer
-from su3d_bench.core.types import BoolArray, Detections, Float32Array, Float64Array, Frame, Instances, Int32Array, Int64Array, PerceptionNeeds, SceneInfo, Surface
+from su3d_bench.core.types import (
+    BoolArray,
+    Detections,
+    Float32Array,
+    Float64Array,
+    Frame,
+    Instances,
+    Int32Array,
+    Int64Array,
+    PerceptionNeeds,
+    SceneInfo,
+    Surface,
+)
+from su3d_bench.numerics.geometry import back_project, valid_depth
 
 logger = logging.getLogger(__name__)
 Metres = Annotated[float, Field(gt=0, allow_inf_nan=False)]

@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.formats.images import UInt16Array, image_size, read_bytes, sized_colour, sized_depth
-from su3d_bench.datasets.recordings.recorded_frames import numbers, read_text
-from su3d_bench.datasets.recordings.source import SensorPair, Size
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, UInt8Array
+from su3d_bench.datasets.recordings.recorded_frames import numbers, read_text
+from su3d_bench.datasets.recordings.source import SensorPair, Size
+from su3d_bench.formats.images import UInt16Array, image_size, read_bytes, sized_colour, sized_depth
 
 FRAMES_PER_SECOND = 30.0  # of ScanNet's recordings; the exports have no times
 MOST_MISSING = 1000  # named; a stray file with a huge number makes all those before it missing

@@ -11,10 +11,10 @@ from pathlib import Path, PurePosixPath
 
 import numpy as np
 
-from su3d_bench.formats.images import UInt16Array, decode_colour, decode_depth, read_bytes
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
+from su3d_bench.formats.images import UInt16Array, decode_colour, decode_depth, read_bytes
 
 MAX_TEXT_BYTES = 64 << 20  # a trajectory of 100 poses a second for an hour has 30 MB
 MAX_NAME_LENGTH = 255  # of one part of a path, in every file system of today

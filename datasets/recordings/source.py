@@ -13,9 +13,9 @@ from typing import Protocol
 
 import numpy as np
 
-from su3d_bench.formats.images import MAX_PIXELS, UInt16Array
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, UInt8Array
+from su3d_bench.formats.images import MAX_PIXELS, UInt16Array
 
 Size = tuple[int, int]  # width, height in pixels
 

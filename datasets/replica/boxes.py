@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, AnnotatedMesh, read_objects, shown, whole_number
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, OrientedBox
+from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, AnnotatedMesh, read_objects, shown, whole_number
 
 SLACK_M = 0.05
 UNIT_TOLERANCE = 1e-2  # the release writes unit quaternions in single precision

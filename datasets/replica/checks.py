@@ -8,11 +8,19 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from su3d_bench.formats.images import JPEG_END, JPEG_END_WITHIN, PNG_SIGNATURE, image_size
-from su3d_bench.datasets.replica.boxes import SLACK_M, objects_outside_boxes, read_boxes
-from su3d_bench.datasets.replica.frames import Camera, check_frames_complete, colour_name, depth_name, poses_of_lines, read_camera, trajectory_lines
-from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, MESH_NAME, read_annotated_mesh
 from su3d_bench.core.errors import DataError
+from su3d_bench.datasets.replica.boxes import SLACK_M, objects_outside_boxes, read_boxes
+from su3d_bench.datasets.replica.frames import (
+    Camera,
+    check_frames_complete,
+    colour_name,
+    depth_name,
+    poses_of_lines,
+    read_camera,
+    trajectory_lines,
+)
+from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, MESH_NAME, read_annotated_mesh
+from su3d_bench.formats.images import JPEG_END, JPEG_END_WITHIN, PNG_SIGNATURE, image_size
 
 MOST_LINES = 20  # of one kind of fault; the rest is counted
 HEAD_BYTES = (4096, 1 << 18)  # a JPEG may carry its size behind the blocks of its camera, each below 64 KB

@@ -8,16 +8,50 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from su3d_bench.datasets.replica.boxes import read_boxes
-from su3d_bench.datasets.replica.cloud_truth import cloud_files, conceptgraphs_truth
-from su3d_bench.datasets.replica.replica_digest import digest_of
-from su3d_bench.datasets.replica.folders import CLOUDS_URL, FUSED_CLOUD, HOW_TO_GET_LABELS, INSTANCE_FOLDERS, ORIGINAL_URL, REFERENCE_CLOUD, RENDER_FOLDERS, SEMANTIC_FOLDERS, SEMANTIC_LABEL_FOLDERS, RenderTree, find_label_file, find_original_scene, find_render_tree, find_semantic_sequence, no_render_tree, original_name, read_marker
-from su3d_bench.datasets.replica.frames import ReplicaFrames, check_frames_complete, colour_name, depth_name, read_camera, read_trajectory
-from su3d_bench.datasets.replica.label_file_truth import LabelledMesh, class_file_truth, instance_file_truth
-from su3d_bench.datasets.replica.checks import original_problems, render_problems
-from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, MESH_NAME, AnnotatedMesh, corner_truth, read_annotated_mesh, read_surface, triangle_mesh, vertex_truth
 from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
 from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, SceneInfo, Surface
+from su3d_bench.datasets.replica.boxes import read_boxes
+from su3d_bench.datasets.replica.checks import original_problems, render_problems
+from su3d_bench.datasets.replica.cloud_truth import cloud_files, conceptgraphs_truth
+from su3d_bench.datasets.replica.folders import (
+    CLOUDS_URL,
+    FUSED_CLOUD,
+    HOW_TO_GET_LABELS,
+    INSTANCE_FOLDERS,
+    ORIGINAL_URL,
+    REFERENCE_CLOUD,
+    RENDER_FOLDERS,
+    SEMANTIC_FOLDERS,
+    SEMANTIC_LABEL_FOLDERS,
+    RenderTree,
+    find_label_file,
+    find_original_scene,
+    find_render_tree,
+    find_semantic_sequence,
+    no_render_tree,
+    original_name,
+    read_marker,
+)
+from su3d_bench.datasets.replica.frames import (
+    ReplicaFrames,
+    check_frames_complete,
+    colour_name,
+    depth_name,
+    read_camera,
+    read_trajectory,
+)
+from su3d_bench.datasets.replica.label_file_truth import LabelledMesh, class_file_truth, instance_file_truth
+from su3d_bench.datasets.replica.mesh_truth import (
+    INFO_NAME,
+    MESH_NAME,
+    AnnotatedMesh,
+    corner_truth,
+    read_annotated_mesh,
+    read_surface,
+    triangle_mesh,
+    vertex_truth,
+)
+from su3d_bench.datasets.replica.replica_digest import digest_of
 
 READER_VERSION = 2  # raise it whenever the same files come out as other frames or another truth
 

@@ -17,11 +17,11 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.formats.images import decode_colour, decode_depth, read_bytes
-from su3d_bench.datasets.replica.mesh_truth import shown
 from su3d_bench.core.errors import DataError
-from su3d_bench.numerics.geometry import are_rigid
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
+from su3d_bench.datasets.replica.mesh_truth import shown
+from su3d_bench.formats.images import decode_colour, decode_depth, read_bytes
+from su3d_bench.numerics.geometry import are_rigid
 
 CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
 FRAMES_PER_SECOND = 30.0  # the release has no timestamps

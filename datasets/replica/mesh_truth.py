@@ -19,10 +19,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.formats.ply import ListColumn, PlyElement, PlyFile, read_ply
-from su3d_bench.datasets.replica.replica_labels import replica_label_set
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, GroundTruth, InstanceMesh, Int32Array, Int64Array, Surface
+from su3d_bench.datasets.replica.replica_labels import replica_label_set
+from su3d_bench.formats.ply import ListColumn, PlyElement, PlyFile, read_ply
 
 MESH_NAME = "habitat/mesh_semantic.ply"
 INFO_NAME = "habitat/info_semantic.json"

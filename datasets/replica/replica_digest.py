@@ -6,9 +6,9 @@ import hashlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from su3d_bench.formats.images import PNG_SIGNATURE
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError
+from su3d_bench.formats.images import PNG_SIGNATURE
 
 PNG_HEAD_BYTES = 64  # signature, and the chunk with the size
 PNG_TAIL_BYTES = 1024  # the end of the pixels, and what little writers put behind it

@@ -9,16 +9,23 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.formats.layout_files import JPEG_QUALITY, depth_in_units, jpeg_bytes, list_column, png_bytes, triangles_of
-from su3d_bench.formats.ply import Column, PlyElement, write_ply
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Float64Array, Frame
 from su3d_bench.datasets.replica.folders import original_name
 from su3d_bench.datasets.replica.frames import colour_name, depth_name
-from su3d_bench.datasets.replica.replica_labels import replica_label_set
 from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, MESH_NAME
+from su3d_bench.datasets.replica.replica_labels import replica_label_set
 from su3d_bench.datasets.writing import Scan, ScannedDataset, ScannedObject, SceneTarget, write_shared_text
-from su3d_bench.core.errors import DataError
+from su3d_bench.formats.layout_files import (
+    JPEG_QUALITY,
+    depth_in_units,
+    jpeg_bytes,
+    list_column,
+    png_bytes,
+    triangles_of,
+)
+from su3d_bench.formats.ply import Column, PlyElement, write_ply
 from su3d_bench.store.run_folder import json_text, make_folder, write_json, write_text
-from su3d_bench.core.types import Float64Array, Frame
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
 DEPTH_SCALE = 6553.5  # of NICE-SLAM's render: 65535 is 10 m

@@ -16,13 +16,28 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, field_validator
 
-from su3d_bench.datasets.recordings.pose_convention import ROTATED, judge_convention
-from su3d_bench.datasets.recordings.recorded_frames import N_DEPTH_VALUES, Folder, RecordedFrame, RecordedFrames, Recording, left_out, pinhole
-from su3d_bench.datasets.replica.mesh_truth import read_surface
-from su3d_bench.datasets.rgbd.description import FILE_NAME, INDEX, RgbdDescription, read_description
-from su3d_bench.datasets.rgbd.files import Pose, camera_to_world, files_of, read_intrinsics, read_pose_file, read_trajectory_file
 from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, GroundTruth, InstanceMesh, SceneInfo, Surface
+from su3d_bench.datasets.recordings.pose_convention import ROTATED, judge_convention
+from su3d_bench.datasets.recordings.recorded_frames import (
+    N_DEPTH_VALUES,
+    Folder,
+    RecordedFrame,
+    RecordedFrames,
+    Recording,
+    left_out,
+    pinhole,
+)
+from su3d_bench.datasets.replica.mesh_truth import read_surface
+from su3d_bench.datasets.rgbd.description import FILE_NAME, INDEX, RgbdDescription, read_description
+from su3d_bench.datasets.rgbd.files import (
+    Pose,
+    camera_to_world,
+    files_of,
+    read_intrinsics,
+    read_pose_file,
+    read_trajectory_file,
+)
 
 logger = logging.getLogger(__name__)
 OTHER = {"camera_to_world": "world_to_camera", "world_to_camera": "camera_to_world"}

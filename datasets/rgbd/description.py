@@ -10,8 +10,8 @@ from typing import Annotated, Any, Literal
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from su3d_bench.core.config import Setting, Settings, flatten, resolve
-from su3d_bench.datasets.recordings.recorded_frames import read_text
 from su3d_bench.core.errors import ConfigError, DataError, suggest
+from su3d_bench.datasets.recordings.recorded_frames import read_text
 
 FILE_NAME = "rgbd.toml"
 INDEX = "{index}"

@@ -14,10 +14,20 @@ from typing import TYPE_CHECKING
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
+from su3d_bench.core.types import (
+    Float64Array,
+    Frame,
+    GroundTruth,
+    ImageDomain,
+    InstanceMesh,
+    Int32Array,
+    LabelSet,
+    SceneInfo,
+    Surface,
+)
 from su3d_bench.datasets.rooms.classes import CLASSES
 from su3d_bench.datasets.rooms.rendering.rooms_noise import LEVELS, add_noise
-from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
-from su3d_bench.core.types import Float64Array, Frame, GroundTruth, ImageDomain, InstanceMesh, Int32Array, LabelSet, SceneInfo, Surface
 
 if TYPE_CHECKING:  # what makes a room is imported where one is made: a list of scenes needs none of it
     from su3d_bench.datasets.rooms.plan import Plan
@@ -26,6 +36,7 @@ if TYPE_CHECKING:  # what makes a room is imported where one is made: a list of 
     from su3d_bench.datasets.rooms.scan import RoomScan
     from su3d_bench.datasets.rooms.truth import Query, RoomObject, RoomTruth
 
+SOURCES = ("datasets/rooms", "numerics")  # what moves a room: what is kept of one is keyed by it
 GENERATOR_VERSION = 3  # raise it whenever a scene of the same name comes out different
 DEFAULT_SCENES = ("living0", "bedroom0", "kitchen0", "office0", "bathroom0", "studio0", "living1", "office1")
 KIND_NAMES = ("living", "bedroom", "kitchen", "office", "bathroom", "studio")  # the keys of rooms_kinds.KINDS
@@ -217,7 +228,7 @@ class Rooms:
 
         scene_name_parts(scene)
         options = self.options
-        words = package_digest("datasets"), options.n_frames, options.mesh_spacing_m, options.seed_offset
+        words = package_digest(*SOURCES), options.n_frames, options.mesh_spacing_m, options.seed_offset
         return hashlib.sha256("/".join(str(word) for word in words).encode()).hexdigest()[:16]
 
     def _baked_folder(self, scene: str) -> Path | None:
@@ -228,7 +239,7 @@ class Rooms:
         if number >= TRAINING_FROM or not self.root.is_dir():
             return None
         packages = package_versions(NUMERIC_PACKAGES)  # another Open3D may bake another last bit
-        words = package_digest("datasets"), self.options.n_frames, self.options.seed_offset, sorted(packages.items())
+        words = package_digest(*SOURCES), self.options.n_frames, self.options.seed_offset, sorted(packages.items())
         return self.root / "rooms" / digest_json(words)[:16]
 
     def visible_vertices(self, scene: str) -> dict[int, int]:

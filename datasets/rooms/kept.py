@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh
-from su3d_bench.store.atomic import DAMAGE, filling, read_arrays
+from su3d_bench.core.damage import DAMAGE
 from su3d_bench.core.types import Float64Array
+from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh
+from su3d_bench.store.atomic import filling, read_arrays
 
 Arrays = dict[str, Any]
 # Of every array of a mesh: its type, and its shape by what it counts; a number stands for itself.

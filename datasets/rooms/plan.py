@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.rooms.objects.catalog import make
 from su3d_bench.datasets.rooms.objects.items import Item, Part, Spot
 from su3d_bench.datasets.rooms.objects.materials import Material, Texture, mix, shade, tone
-from su3d_bench.datasets.rooms.rendering.mesh import Light, Placed
 from su3d_bench.datasets.rooms.objects.shapes import Shape, rotation
-from su3d_bench.core.types import Float64Array
+from su3d_bench.datasets.rooms.rendering.mesh import Light, Placed
 
 GAP_M = 0.002  # between touching faces, so that neither flickers through the other
 WALL_YAW = (0.0, -90.0, 180.0, 90.0)  # of an item with its back to the wall at y = depth, x = width, y = 0, x = 0

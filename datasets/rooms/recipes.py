@@ -7,8 +7,25 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from su3d_bench.datasets.rooms.groups import (
+    SMALL_DECOR,
+    bath_shelf,
+    choose,
+    cushioned_bench,
+    desk_place,
+    dining_table,
+    filled_basket,
+    floor_things,
+    hang_ceiling_lamp,
+    long_walls,
+    plant_on_stand,
+    seating,
+    stock,
+    stocked_shelf,
+    television,
+    wall_things,
+)
 from su3d_bench.datasets.rooms.objects.counter import counter_run
-from su3d_bench.datasets.rooms.groups import SMALL_DECOR, bath_shelf, choose, cushioned_bench, desk_place, dining_table, filled_basket, floor_things, hang_ceiling_lamp, long_walls, plant_on_stand, seating, stock, stocked_shelf, television, wall_things
 from su3d_bench.datasets.rooms.plan import Plan, add_openings, add_shell
 
 

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.numerics.open3d_core import compiled_open3d
+from su3d_bench.core.damage import DAMAGE
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
 from su3d_bench.datasets.rooms.rendering.mesh import Grid, Patches, RoomMesh, at_rows, caster, cut, merge_equal
 from su3d_bench.datasets.rooms.rendering.render import Renderer, camera_intrinsics
-from su3d_bench.core.errors import DataError
-from su3d_bench.store.atomic import DAMAGE, filling, read_arrays
-from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
+from su3d_bench.numerics.open3d_core import compiled_open3d
+from su3d_bench.store.atomic import filling, read_arrays
 
 VIEW_WIDTH, VIEW_HEIGHT = 160, 120  # of the depth images that decide what is visible: 1 cm a pixel at 1 m
 TOUR = 40  # frames are visited at this stride first, so that most faces are settled by the first few

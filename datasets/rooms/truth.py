@@ -8,9 +8,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.rooms.classes import AFFORDANCES, CLASS_ID
 from su3d_bench.datasets.rooms.plan import FLAT, Box, Plan, box_of
-from su3d_bench.core.types import Float64Array
 
 RELATIONS = ("on", "under", "next to", "in", "above")
 STRUCTURE = frozenset(("wall", "floor", "ceiling"))

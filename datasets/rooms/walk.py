@@ -7,10 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.numerics.open3d_core import compiled_open3d
+from su3d_bench.core.types import BoolArray, Float64Array
 from su3d_bench.datasets.rooms.plan import Box
 from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh, caster
-from su3d_bench.core.types import BoolArray, Float64Array
+from su3d_bench.numerics.open3d_core import compiled_open3d
 
 CELL_M = 0.1
 CLEAR_M = 0.32  # between the camera and anything at its height

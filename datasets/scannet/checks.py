@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
+from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.recordings.exported_frames import EXPORT_AGAIN, IncompleteExport
-from su3d_bench.formats.ply import read_ply
 from su3d_bench.datasets.recordings.registration import Grid, make_registration
 from su3d_bench.datasets.recordings.source import RgbdSource
 from su3d_bench.datasets.scannet.annotations import aggregation_name, read_objects, read_segments, segments_name
@@ -19,7 +19,7 @@ from su3d_bench.datasets.scannet.frames import classify_poses, faulty_pose, read
 from su3d_bench.datasets.scannet.labels import TABLE_NAME, read_label_table
 from su3d_bench.datasets.scannet.scannet_meta import meta_name, read_axis_alignment
 from su3d_bench.datasets.scannet.truth import labels_name, mesh_name, read_annotated_scan, truth_names
-from su3d_bench.core.errors import DataError
+from su3d_bench.formats.ply import read_ply
 
 MOST_POSES = 20  # named one by one; the rest is counted
 

@@ -11,20 +11,31 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from su3d_bench.datasets.recordings.registration import Grid, make_registration
-from su3d_bench.datasets.recordings.source import RgbdSource
-from su3d_bench.datasets.scannet.annotations import segments_name
-from su3d_bench.datasets.scannet.recordings import SourceKind, find_source
-from su3d_bench.datasets.scannet.folders import PAPER_SCENES, SPLITS, ScanFolders, find_scans, no_scans, split_scenes
-from su3d_bench.datasets.scannet.frames import ScannetFrames, Walk, read_walk
-from su3d_bench.datasets.scannet.labels import TABLE_NAME, LabelTable, read_label_table
-from su3d_bench.datasets.scannet.scannet_meta import meta_name, read_axis_alignment
-from su3d_bench.datasets.scannet.checks import annotation_problems, recording_problems
-from su3d_bench.datasets.scannet.scannet_recordings import describe_recording, digest_recording, folder_of_recording
-from su3d_bench.datasets.scannet.truth import AnnotatedScan, aligned, instance_mesh, mesh_name, moved, nyu40_truth, read_annotated_scan, read_surface, scannet200_truth, truth_names
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
 from su3d_bench.core.types import Float64Array, Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo, Surface
+from su3d_bench.datasets.recordings.registration import Grid, make_registration
+from su3d_bench.datasets.recordings.source import RgbdSource
+from su3d_bench.datasets.scannet.annotations import segments_name
+from su3d_bench.datasets.scannet.checks import annotation_problems, recording_problems
+from su3d_bench.datasets.scannet.folders import PAPER_SCENES, SPLITS, ScanFolders, find_scans, no_scans, split_scenes
+from su3d_bench.datasets.scannet.frames import ScannetFrames, Walk, read_walk
+from su3d_bench.datasets.scannet.labels import TABLE_NAME, LabelTable, read_label_table
+from su3d_bench.datasets.scannet.recordings import SourceKind, find_source
+from su3d_bench.datasets.scannet.scannet_meta import meta_name, read_axis_alignment
+from su3d_bench.datasets.scannet.scannet_recordings import describe_recording, digest_recording, folder_of_recording
+from su3d_bench.datasets.scannet.truth import (
+    AnnotatedScan,
+    aligned,
+    instance_mesh,
+    mesh_name,
+    moved,
+    nyu40_truth,
+    read_annotated_scan,
+    read_surface,
+    scannet200_truth,
+    truth_names,
+)
 
 READER_VERSION = 1  # raise it whenever the same files come out as other frames or another truth
 logger = logging.getLogger(__name__)

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
+from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.replica.folders import read_marker
 from su3d_bench.datasets.scannet.labels import TABLE_NAME
-from su3d_bench.core.errors import DataError
 
 # The scenes of OpenSU3D's evaluation, in the order of its section IV-A.
 PAPER_SCENES = ("scene0000_00", "scene0034_00", "scene0164_03", "scene0525_01", "scene0549_00")
@@ -101,7 +101,7 @@ def _is_scan(folder: Path, rooms: Mapping[str, str]) -> bool:
 @cache
 def split_scenes(split: str) -> tuple[str, ...]:
     """The scans of an official split in the order of its list: Tasks/Benchmark/scannetv2_<split>.txt of ScanNet."""
-    return tuple(Path(__file__).with_name(f"scannetv2_{split}.txt").read_text(encoding="utf-8").split())
+    return tuple((Path(__file__).parent / "splits" / f"scannetv2_{split}.txt").read_text(encoding="utf-8").split())
 
 
 def no_scans(root: Path) -> DataError:

@@ -13,9 +13,9 @@ from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
-from su3d_bench.formats.images import read_bytes
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import LabelSet
+from su3d_bench.formats.images import read_bytes
 
 LABEL_SPACE = "scannet"
 TABLE_NAME = "scannetv2-labels.combined.tsv"
@@ -35,7 +35,7 @@ class LabelTable:
 @cache
 def _known_classes() -> dict[str, dict[int, str]]:
     """NYU40 by the names of nyu40class, those of the benchmark's 20 classes as the benchmark has them; ScanNet200."""
-    tables = json.loads(Path(__file__).with_name("scannet_labels.json").read_text(encoding="utf-8"))
+    tables = json.loads(Path(__file__).with_name("labels.json").read_text(encoding="utf-8"))
     return {name: {int(row["id"]): str(row["name"]) for row in rows} for name, rows in tables.items()}
 
 

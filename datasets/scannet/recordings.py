@@ -14,12 +14,23 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.datasets.recordings.exported_frames import EXPORT_AGAIN, ExportedFrames, FrameFiles, by_number, check_complete, every_kth, list_folder, read_matrix, read_size, square
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Float64Array
+from su3d_bench.datasets.recordings.exported_frames import (
+    EXPORT_AGAIN,
+    ExportedFrames,
+    FrameFiles,
+    by_number,
+    check_complete,
+    every_kth,
+    list_folder,
+    read_matrix,
+    read_size,
+    square,
+)
 from su3d_bench.datasets.recordings.recorded_frames import numbers, read_text
 from su3d_bench.datasets.recordings.source import RgbdSource, SensorPair, Size
 from su3d_bench.datasets.scannet.sens.read import SensSource
-from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import Float64Array
 
 SourceKind = Literal["auto", "sens", "python", "cpp"]
 DEPTH_SHIFT = 1000.0  # of every recording of ScanNet; the Python reader does not export it

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.formats.images import read_bytes
 from su3d_bench.core.errors import DataError
-from su3d_bench.numerics.geometry import are_rigid
 from su3d_bench.core.types import Float64Array
+from su3d_bench.formats.images import read_bytes
+from su3d_bench.numerics.geometry import are_rigid
 
 ALIGNMENT = "axisAlignment"
 

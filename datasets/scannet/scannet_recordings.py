@@ -9,13 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.datasets.recordings.source import RgbdSource
-from su3d_bench.datasets.scannet.recordings import INFO, SourceKind, python_layout, read_info
-from su3d_bench.datasets.scannet.sens.read import SensSource
-from su3d_bench.datasets.scannet.sens.header import MAX_HEADER_BYTES, header_bytes, parse_header
 from su3d_bench.core.digests import digest_bytes, digest_file
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array
+from su3d_bench.datasets.recordings.source import RgbdSource
+from su3d_bench.datasets.scannet.recordings import INFO, SourceKind, python_layout, read_info
+from su3d_bench.datasets.scannet.sens.header import MAX_HEADER_BYTES, header_bytes, parse_header
+from su3d_bench.datasets.scannet.sens.read import SensSource
 
 TEXT = ".txt"
 

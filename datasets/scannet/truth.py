@@ -18,11 +18,18 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.formats.ply import ListColumn, PlyFile, read_ply
-from su3d_bench.datasets.scannet.annotations import AnnotatedObject, aggregation_name, object_of_vertex, read_objects, read_segments, segments_name
-from su3d_bench.datasets.scannet.labels import MAX_NYU40_ID, TABLE_NAME, LabelTable, nyu40_label_set, raw_label_set
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, InstanceMesh, Int32Array, Int64Array, Surface
+from su3d_bench.datasets.scannet.annotations import (
+    AnnotatedObject,
+    aggregation_name,
+    object_of_vertex,
+    read_objects,
+    read_segments,
+    segments_name,
+)
+from su3d_bench.datasets.scannet.labels import MAX_NYU40_ID, TABLE_NAME, LabelTable, nyu40_label_set, raw_label_set
+from su3d_bench.formats.ply import ListColumn, PlyFile, read_ply
 
 CORNER_NAMES = ("vertex_indices", "vertex_index")
 SAME_PLACE_M = 1e-3  # both files hold one mesh; text formats round its coordinates

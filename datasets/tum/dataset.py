@@ -23,10 +23,20 @@ from typing import Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.datasets.recordings.recorded_frames import N_DEPTH_VALUES, Folder, RecordedFrame, RecordedFrames, Recording, left_out, numbers, pinhole, read_text
-from su3d_bench.datasets.tum.timed_poses import pose_at, read_trajectory, rows_of, seconds
 from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
 from su3d_bench.core.types import Float64Array, Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo
+from su3d_bench.datasets.recordings.recorded_frames import (
+    N_DEPTH_VALUES,
+    Folder,
+    RecordedFrame,
+    RecordedFrames,
+    Recording,
+    left_out,
+    numbers,
+    pinhole,
+    read_text,
+)
+from su3d_bench.datasets.tum.timed_poses import pose_at, read_trajectory, rows_of, seconds
 
 logger = logging.getLogger(__name__)
 READER_VERSION = 1  # raise it whenever the same files come out as other frames

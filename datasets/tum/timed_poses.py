@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.datasets.recordings.recorded_frames import numbers, read_text
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array
+from su3d_bench.datasets.recordings.recorded_frames import numbers, read_text
 
 
 def rows_of(path: Path, where: str, n_words: int, form: str) -> list[tuple[int, list[str]]]:

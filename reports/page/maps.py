@@ -17,9 +17,18 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.numerics.geometry import voxel_coordinates
+from su3d_bench.core.types import (
+    DenseFeatures,
+    Float32Array,
+    Float64Array,
+    Instances,
+    Int32Array,
+    Int64Array,
+    Prediction,
+    UInt8Array,
+)
 from su3d_bench.metrics.matching.nearest import nearest, row_ids
-from su3d_bench.core.types import DenseFeatures, Float32Array, Float64Array, Instances, Int32Array, Int64Array, Prediction, UInt8Array
+from su3d_bench.numerics.geometry import voxel_coordinates
 
 LEAST_SPACING_M = 0.015  # of the drawn points; a finer one shows nothing more on a screen
 COARSER = 1.15  # from one spacing that is tried to the next

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.numerics.statistics import Growth
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.metrics.costs import MAP, TOTAL, MethodSummary, StageSummary, UpdateTimes
+from su3d_bench.numerics.statistics import Growth
 
 MOST_BINS = 160  # points of a line: more than a plot has room for
 DIGITS = 4  # of a time

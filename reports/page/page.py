@@ -11,15 +11,15 @@ from typing import Any
 
 HERE = Path(__file__).parent
 SCRIPTS = (  # in the order in which they run
-    "page_elements.js",
-    "page_map.js",
-    "page_sections.js",
-    "page_paint.js",
-    "page_scene.js",
-    "page_errors.js",
-    "page_timing.js",
-    "page_compare.js",
-    "page.js",
+    "scripts/elements.js",
+    "scripts/map.js",
+    "scripts/sections.js",
+    "scripts/paint.js",
+    "scripts/scene.js",
+    "scripts/errors.js",
+    "scripts/timing.js",
+    "scripts/compare.js",
+    "scripts/page.js",
 )
 STYLE = "page.css"
 TEMPLATE = "page.html.j2"

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.numerics.geometry import back_project, valid_depth
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame
+from su3d_bench.numerics.geometry import back_project, valid_depth
 
 PROBES = 300  # points of an instance that are looked for in every frame
 NEAR_M, NEAR_SHARE = 0.05, 0.03  # a point is seen where the depth image agrees with it within this much

@@ -6,8 +6,8 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.reports.pictures.maps import HEAT_STOPS
 from su3d_bench.core.types import Float64Array, UInt8Array
+from su3d_bench.reports.pictures.maps import HEAT_STOPS
 
 Scale = Literal["paper", "cividis"]
 SCALES: tuple[Scale, ...] = ("paper", "cividis")

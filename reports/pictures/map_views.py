@@ -8,10 +8,10 @@ from functools import cached_property
 
 import numpy as np
 
-from su3d_bench.reports.pictures.maps import DRAWN_SPACING_M, NO_INSTANCE, Cloud, thinned
-from su3d_bench.reports.pictures.answers import project
-from su3d_bench.reports.pictures.render import OVERSAMPLING, Camera, View, colour, render, room_bounds, view_cameras
 from su3d_bench.core.types import BoolArray, Float64Array, Instances, Int32Array, Int64Array, UInt8Array
+from su3d_bench.reports.pictures.answers import project
+from su3d_bench.reports.pictures.maps import DRAWN_SPACING_M, NO_INSTANCE, Cloud, thinned
+from su3d_bench.reports.pictures.render import OVERSAMPLING, Camera, View, colour, render, room_bounds, view_cameras
 
 PALE_GREY = 232
 RENDERED = 1.5  # times the size of the picture, for the room fills only a part of a view from a corner

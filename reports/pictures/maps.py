@@ -9,10 +9,20 @@ from pathlib import Path
 
 import numpy as np
 
+from su3d_bench.core.types import (
+    DenseFeatures,
+    Float32Array,
+    Float64Array,
+    GroundTruth,
+    Instances,
+    Int32Array,
+    Int64Array,
+    Prediction,
+    UInt8Array,
+)
 from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.reports.pictures.render import Camera, View, colour, render, room_bounds, view_cameras
 from su3d_bench.store.run_folder import make_folder, write_bytes
-from su3d_bench.core.types import DenseFeatures, Float32Array, Float64Array, GroundTruth, Instances, Int32Array, Int64Array, Prediction, UInt8Array
 
 VIEW_WIDTH, VIEW_HEIGHT = 640, 560
 DRAWN_SPACING_M = 0.015  # one point a cell of this size is drawn

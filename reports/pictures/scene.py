@@ -10,11 +10,19 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.plain_text import printable
-from su3d_bench.reports.pictures.maps import NO_INSTANCE, Cloud, Colour, class_colours, instance_colours, thinned, truth_owner
+from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, UInt8Array
+from su3d_bench.reports.pictures.maps import (
+    NO_INSTANCE,
+    Cloud,
+    Colour,
+    class_colours,
+    instance_colours,
+    thinned,
+    truth_owner,
+)
 from su3d_bench.reports.pictures.render import OVERSAMPLING, Camera, colour, render, room_bounds, view_cameras
 from su3d_bench.reports.pictures.scene_look import SceneLook
 from su3d_bench.store.run_folder import make_folder, write_bytes
-from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, UInt8Array
 
 WIDTH, DPI = 1920, 100
 MARGIN, HEADER, CAPTION = 16, 76, 26

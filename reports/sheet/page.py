@@ -57,8 +57,8 @@ Sheet {sheet}, {annotator}.</footer>
 
 def page_html(title: str, data: Mapping[str, Any]) -> str:
     """The page of one annotator; ``data``: id, annotator, columns, asks and items, pictures in base 64."""
-    style = (HERE / "sheet_page.css").read_text(encoding="utf-8")
-    script = (HERE / "sheet_page.js").read_text(encoding="utf-8")
+    style = (HERE / "page.css").read_text(encoding="utf-8")
+    script = (HERE / "page.js").read_text(encoding="utf-8")
     policy = (
         f"default-src 'none'; img-src data:; style-src '{_hash(style)}'; script-src '{_hash(script)}'; "
         "base-uri 'none'; form-action 'none'"

@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.reports.tables.measured import Measured
+from su3d_bench.reports.tables.model import Cell, Table, TableRow
 from su3d_bench.reports.tables.paper import LAYOUTS, Layout, Shown, best_rows, cells_of, reported_rows, run_notes, units
 from su3d_bench.reports.tables.published import published
-from su3d_bench.reports.tables.model import Cell, Table, TableRow
 
 SIDES = (LAYOUTS["II"], LAYOUTS["III"])  # its columns are those of Tables II and III together
 METRICS = tuple(name for side in SIDES for name in side.metrics)

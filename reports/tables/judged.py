@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.reports.tables.measured import Measured
+from su3d_bench.reports.tables.model import Cell, Table, TableRow
 from su3d_bench.reports.tables.paper import Shown, protocol_table, reported_rows
 from su3d_bench.reports.tables.published import Figure, PaperTable, published
-from su3d_bench.reports.tables.model import Cell, Table, TableRow
 
 OWN_NAMES = {"merge-accuracy": "well-merged"}  # the paper's name: ours
 

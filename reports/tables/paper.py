@@ -9,10 +9,10 @@ import numpy as np
 
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.plain_text import printable
-from su3d_bench.reports.tables.measured import Measured
-from su3d_bench.reports.tables.published import Figure, PaperTable, published
-from su3d_bench.reports.tables.model import NOT_MEASURED, Cell, Origin, Table, TableRow, is_count
 from su3d_bench.numerics.statistics import SignFlipTest, sign_flip_test
+from su3d_bench.reports.tables.measured import Measured
+from su3d_bench.reports.tables.model import NOT_MEASURED, Cell, Origin, Table, TableRow, is_count
+from su3d_bench.reports.tables.published import Figure, PaperTable, published
 
 LEVEL = 0.05
 PAPER_DATA = "replica"  # of Tables II and III

@@ -7,8 +7,8 @@ from typing import Any
 
 from su3d_bench.core.plain_text import printable
 from su3d_bench.reports.tables.comparison import signed
-from su3d_bench.reports.tables.paper import percent
 from su3d_bench.reports.tables.model import NOT_MEASURED, Cell, Table, TableRow
+from su3d_bench.reports.tables.paper import percent
 
 SUBJECTS = {
     "retrieval": ("Retrieval by text", "is the instance ranked first right?"),

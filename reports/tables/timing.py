@@ -7,9 +7,9 @@ import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from su3d_bench.reports.tables.run import NOT_MEASURED, aligned, percent
-from su3d_bench.numerics.statistics import Growth
 from su3d_bench.metrics.costs import MethodSummary, StageSummary
+from su3d_bench.numerics.statistics import Growth
+from su3d_bench.reports.tables.run import NOT_MEASURED, aligned, percent
 
 MIB = 2**20
 CACHE = "cache"

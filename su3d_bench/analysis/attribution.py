@@ -13,25 +13,25 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core import registry
 from su3d_bench.analysis.sides import Side, refuse_unlike
+from su3d_bench.core import registry
 from su3d_bench.core.config import Setting, Settings, resolve
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, suggest
-from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.plain_text import printable
+from su3d_bench.core.types import DenseFeatures, GroundTruth, Prediction
 from su3d_bench.metrics.attribution import masks as instances
 from su3d_bench.metrics.attribution import points as semantic
-from su3d_bench.metrics.attribution.overlaps import measure_overlaps
-from su3d_bench.metrics.results.results import Counts, metric_values
 from su3d_bench.metrics.attribution.arrays import scored_masks, scored_points
-from su3d_bench.metrics.semantic.confusion import nan_mean
-from su3d_bench.core.plain_text import printable
-from su3d_bench.runs.plan import data_root, dataset_targets
+from su3d_bench.metrics.attribution.overlaps import measure_overlaps
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.runs.job import Part, build_dataset
+from su3d_bench.metrics.results.results import Counts, metric_values
 from su3d_bench.metrics.scoring import SceneScore
+from su3d_bench.metrics.semantic.confusion import nan_mean
+from su3d_bench.runs.finished import FinishedRun, read_run
+from su3d_bench.runs.job import Part, build_dataset
+from su3d_bench.runs.plan import data_root, dataset_targets
 from su3d_bench.store.run_folder import RunFolder, read_prediction
-from su3d_bench.core.types import DenseFeatures, GroundTruth, Prediction
 
 SCHEMA = 1
 KINDS = {"instance": instances.KINDS, "semantic": semantic.CAUSES}

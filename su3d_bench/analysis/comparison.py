@@ -13,17 +13,25 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.analysis.sides import Side, check_shapes, pair_methods, parse_side, protocols_in_both, refuse_unlike, rules_of
+from su3d_bench.analysis.sides import (
+    Side,
+    check_shapes,
+    pair_methods,
+    parse_side,
+    protocols_in_both,
+    refuse_unlike,
+    rules_of,
+)
 from su3d_bench.core.config import MOVES_NO_NUMBER
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.runs.finished import FinishedRun
+from su3d_bench.core.plain_text import printable
+from su3d_bench.core.types import Float64Array
+from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.results.resampled_values import resampled_classes
 from su3d_bench.metrics.results.results import Counts, ProtocolResult, resampled_metrics
-from su3d_bench.core.plain_text import printable
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import SceneScore, combine
 from su3d_bench.numerics.statistics import SignFlipTest, percentile_interval, resample_weights, sign_flip_test
-from su3d_bench.core.types import Float64Array
+from su3d_bench.runs.finished import FinishedRun
 
 SCHEMA = 1
 # They move no number of a common scene.

@@ -13,11 +13,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from su3d_bench.core.errors import ConfigError, Su3dError
-from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.core.plain_text import printable
 from su3d_bench.metrics.protocols import load_protocol, protocol_names
-from su3d_bench.reports.tables.model import NOT_MEASURED, Cell, Origin, Table, TableRow
 from su3d_bench.metrics.scoring import combine
+from su3d_bench.reports.tables.model import NOT_MEASURED, Cell, Origin, Table, TableRow
+from su3d_bench.runs.finished import FinishedRun, read_run
 
 MOST_RUNS = 10_000
 MOST_NAMED = 4  # methods of what is left out

@@ -11,23 +11,40 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core import registry
 from su3d_bench.analysis.attribution import EncoderOf
+from su3d_bench.core import registry
 from su3d_bench.core.config import Setting, Settings, resolve
 from su3d_bench.core.errors import Su3dError
-from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.metrics.matching.labelling import candidate_classes, class_index_of_ids, classes_of_prediction, cosines, scored_classes
+from su3d_bench.core.plain_text import printable, printable_json
+from su3d_bench.core.types import DenseFeatures, Frame, GroundTruth, Instances, Int64Array, Prediction
+from su3d_bench.metrics.matching.labelling import (
+    candidate_classes,
+    class_index_of_ids,
+    classes_of_prediction,
+    cosines,
+    scored_classes,
+)
+from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scene_score import present
 from su3d_bench.metrics.semantic.score import has_feature
-from su3d_bench.core.plain_text import printable, printable_json
-from su3d_bench.runs.plan import data_root, dataset_targets
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.reports.page.maps import Cloud, box_in_view, colour_plane, frame_cover, index_plane, nearest_classes, nearest_colours, pack_map, point_owners, thinned
+from su3d_bench.reports.page.maps import (
+    Cloud,
+    box_in_view,
+    colour_plane,
+    frame_cover,
+    index_plane,
+    nearest_classes,
+    nearest_colours,
+    pack_map,
+    point_owners,
+    thinned,
+)
 from su3d_bench.reports.pictures.scene_look import SceneLook, look_at
+from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.runs.job import Part, build_dataset
+from su3d_bench.runs.plan import data_root, dataset_targets
 from su3d_bench.store.run_folder import read_prediction
-from su3d_bench.core.types import DenseFeatures, Frame, GroundTruth, Instances, Int64Array, Prediction
 
 QUERIES = (
     "somewhere to sit",

@@ -15,10 +15,10 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, Stor
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
+    from su3d_bench.core.types import Instances
     from su3d_bench.questions.reasoning.answers import Answer
     from su3d_bench.questions.reasoning.scene_map import SceneMap
     from su3d_bench.store.run_folder import JobFolder, RunFolder
-    from su3d_bench.core.types import Instances
 
 SOLVERS = ("built-in", "llm")
 NAMES = ("auto", "label", "refined")
@@ -99,8 +99,8 @@ def _run_of(arguments: argparse.Namespace) -> RunFolder:
 
 
 def _map(run: RunFolder, arguments: argparse.Namespace) -> Instances:
-    from su3d_bench.store.run_folder import read_prediction
     from su3d_bench.core.types import Instances
+    from su3d_bench.store.run_folder import read_prediction
 
     job = run.job(arguments.scene, arguments.method)
     if not job.prediction.is_file():

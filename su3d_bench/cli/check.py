@@ -56,8 +56,8 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _learn(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.finished import read_run
     from su3d_bench.analysis.gate import ACROSS_MACHINES, COST_LIMIT, learn
+    from su3d_bench.runs.finished import read_run
     from su3d_bench.store.run_folder import make_folder, write_json
 
     if arguments.runs or arguments.against or arguments.out is None:
@@ -80,9 +80,9 @@ def _learn(arguments: argparse.Namespace) -> int:
 def _check(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from su3d_bench.runs.finished import read_run
     from su3d_bench.analysis.gate import check, read_reference
     from su3d_bench.reports.gate import github_lines, plain_lines
+    from su3d_bench.runs.finished import read_run
 
     verdict = check(read_run(arguments.runs[0]), read_reference(arguments.against))
     _write(verdict, arguments)

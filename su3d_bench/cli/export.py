@@ -16,9 +16,9 @@ from su3d_bench.core.plain_text import printable
 
 if TYPE_CHECKING:
     from su3d_bench.core.interfaces import Encoder
+    from su3d_bench.metrics.protocols import ProtocolRules
     from su3d_bench.predictions.base import Content, Reader
     from su3d_bench.predictions.export import LabelledMasks
-    from su3d_bench.metrics.protocols import ProtocolRules
 
 TARGETS = ("openlex3d", "scannet")
 
@@ -197,8 +197,8 @@ def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> li
 
 def _names(addresses: Sequence[str], *, is_flat: bool) -> list[str]:
     """The name of each scene's files: its address, or in a flat folder its last part, which must tell scenes apart."""
-    from su3d_bench.runs.plan import split_address
     from su3d_bench.predictions.export import file_name
+    from su3d_bench.runs.plan import split_address
 
     names = []
     for address in addresses:
@@ -229,11 +229,11 @@ def _labelled(content: Content, source: Source, arguments: argparse.Namespace) -
 
 def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
     """The dataset and the scene of a prediction, with the options of the run that it lies in."""
-    from su3d_bench.core import registry
     from su3d_bench.cli.datasets.check import chosen_scenes
+    from su3d_bench.core import registry
     from su3d_bench.core.config import RunConfig, read_file, resolve
-    from su3d_bench.runs.plan import data_root, dataset_targets
     from su3d_bench.runs.job import Part, build_dataset
+    from su3d_bench.runs.plan import data_root, dataset_targets
 
     if source.run is None:
         return chosen_scenes([source.address], [], is_quiet=is_quiet)[0]
@@ -249,8 +249,8 @@ def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
 
 def _rules(name: str | None, dataset: Any) -> ProtocolRules:
     """The protocol of ``name``, or the dataset's only one of instances with classes."""
-    from su3d_bench.runs.plan import why_not_fitting
     from su3d_bench.metrics.protocols import load_protocol, protocols_for
+    from su3d_bench.runs.plan import why_not_fitting
 
     fitting = {rules.name: rules for rules in map(load_protocol, protocols_for(dataset.name)) if _has_masks(rules)}
     if name is None:

@@ -9,10 +9,25 @@ from collections.abc import Sequence
 from typing import Any
 
 from su3d_bench import __version__
-from su3d_bench.cli import ablate, ask, attribute, check, compare, evaluate, export, methods, models, protocols, query, questions, refine, run
+from su3d_bench.cli import (
+    ablate,
+    ask,
+    attribute,
+    check,
+    compare,
+    evaluate,
+    export,
+    methods,
+    models,
+    protocols,
+    query,
+    questions,
+    refine,
+    report,
+    run,
+    sheets,
+)
 from su3d_bench.cli.datasets import list as datasets
-from su3d_bench.cli import report
-from su3d_bench.cli import sheets
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_WRONG_INPUT, ConfigError, Su3dError, suggest
 from su3d_bench.core.plain_text import printable
 

@@ -13,9 +13,9 @@ from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, sug
 
 if TYPE_CHECKING:
     from su3d_bench.core.interfaces import Encoder
+    from su3d_bench.core.types import Instances
     from su3d_bench.opensu3d.retrieval import Ranking
     from su3d_bench.store.run_folder import RunFolder
-    from su3d_bench.core.types import Instances
 
 
 def add_parser(verbs: Any) -> None:
@@ -41,10 +41,10 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()
+    from su3d_bench.core.types import DenseFeatures, Instances
     from su3d_bench.opensu3d.retrieval import rank
     from su3d_bench.reports.pictures.maps import draw_heat_map
     from su3d_bench.store.run_folder import RunFolder, read_prediction
-    from su3d_bench.core.types import DenseFeatures, Instances
 
     if arguments.top < 1:
         raise ConfigError(f"--top {arguments.top}: at least 1 instance must be listed")

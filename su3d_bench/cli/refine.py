@@ -12,10 +12,10 @@ from su3d_bench.cli.language_flags import add_language_flags, chat_client, langu
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError, suggest
 
 if TYPE_CHECKING:
+    from su3d_bench.core.types import Instances
     from su3d_bench.questions.refined_names import NameRecords
     from su3d_bench.questions.refinement import RefinedName, TopNames
     from su3d_bench.store.run_folder import JobFolder, RunFolder
-    from su3d_bench.core.types import Instances
 
 REFINERS = ("vote", "model")
 
@@ -100,8 +100,8 @@ def _scenes(run: RunFolder) -> list[str]:
 
 
 def _map(job: JobFolder) -> Instances:
-    from su3d_bench.store.run_folder import read_prediction
     from su3d_bench.core.types import Instances
+    from su3d_bench.store.run_folder import read_prediction
 
     prediction = read_prediction(job.prediction)
     if not isinstance(prediction, Instances) or prediction.view_names is None:

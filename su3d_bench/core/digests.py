@@ -17,9 +17,9 @@ from importlib.util import cache_from_source
 from pathlib import Path
 from typing import Any, Self
 
-PACKAGE_ROOT = Path(__file__).resolve().parent
+PACKAGE_ROOT = Path(__file__).resolve().parents[1]
 # What shows numbers and moves none; everything else of the package counts, in whatever folder it stands.
-ONLY_SHOWN = ("cli", "reports", "sheets")
+ONLY_SHOWN = ("analysis", "cli", "reports", "sheets")
 # No part of the program: what Python and file managers leave, texts for people, what type checkers read.
 NO_CODE = ("__pycache__", ".", ".pyc", ".md", "py.typed")
 NUMERIC_PACKAGES = ("numpy", "scipy", "scikit-learn", "opencv-python-headless", "onnxruntime", "open3d", "numba")
@@ -87,7 +87,7 @@ class _KeptDigests:
     """
 
     def __init__(self) -> None:
-        self._place = Path(cache_from_source(str(PACKAGE_ROOT / "digests.py"))).with_suffix(".json")
+        self._place = Path(cache_from_source(str(PACKAGE_ROOT / "code.py"))).with_suffix(".json")
         self._is_changed = False
         self._kept: dict[str, list[Any]] = {}
 

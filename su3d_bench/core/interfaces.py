@@ -7,7 +7,22 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
-from su3d_bench.core.types import BoolArray, Detections, Float32Array, Frame, GroundTruth, InstanceMesh, Int64Array, PerceptionNeeds, Prediction, Proposals, Regions, SceneInfo, Surface, UInt8Array
+from su3d_bench.core.types import (
+    BoolArray,
+    Detections,
+    Float32Array,
+    Frame,
+    GroundTruth,
+    InstanceMesh,
+    Int64Array,
+    PerceptionNeeds,
+    Prediction,
+    Proposals,
+    Regions,
+    SceneInfo,
+    Surface,
+    UInt8Array,
+)
 
 
 class RegionPerception(Protocol):

@@ -15,8 +15,13 @@ def printable(text: str, limit: int = MOST_CHARACTERS) -> str:
     'room\\\\x1b[31m 0'
     """
     line = " ".join(text.split())
-    shown = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
-    return shown if len(shown) <= limit else shown[: limit - 3] + "..."
+    plain = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
+    return plain if len(plain) <= limit else plain[: limit - 3] + "..."
+
+
+def shown(path: Path) -> str:
+    """A path as messages show it."""
+    return printable(str(path), 300)
 
 
 def printable_json(value: Any) -> Any:

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.metrics.matching.nearest import Masks
 from su3d_bench.core.plain_text import printable
-from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array
+from su3d_bench.metrics.matching.nearest import Masks
+from su3d_bench.metrics.protocols import ProtocolRules
 
 NEAR_IOU = 0.9  # pairs above it are the same object twice
 MOST_SHARED = 300_000_000  # products while pairs are sought; 600 masks of a large scene take some ten million

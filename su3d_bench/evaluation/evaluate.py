@@ -12,23 +12,42 @@ from pathlib import Path
 from typing import Any, Literal
 
 from su3d_bench.core import registry
-from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
-from su3d_bench.questions.files.queries import query_truth, read_query_file
 from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError
-from su3d_bench.evaluation.openlex import VARIANTS, OpenLexRelease, holds_release, score_on_objects, why_not_lex_content
+from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.plain_text import shown
+from su3d_bench.core.types import GroundTruth, Instances
 from su3d_bench.evaluation.evaluation_questions import score_on_questions
+from su3d_bench.evaluation.openlex import VARIANTS, OpenLexRelease, holds_release, score_on_objects, why_not_lex_content
 from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation, SceneOutcomes, form_evaluation
 from su3d_bench.evaluation.scenes import OWN_FORMAT, Match, Source, match_scenes, open_sources, planned_scenes
-from su3d_bench.evaluation.scoring import SceneOutcome, check_length, n_feature_dimensions, nothing_like, score_on_truth, score_on_vertices, why_not_content, why_not_numbers
+from su3d_bench.evaluation.scoring import (
+    SceneOutcome,
+    check_length,
+    n_feature_dimensions,
+    nothing_like,
+    score_on_truth,
+    score_on_vertices,
+    why_not_content,
+    why_not_numbers,
+)
 from su3d_bench.evaluation.texts import TextFeatures, encoder_for, read_text_features
-from su3d_bench.evaluation.truth import TextTruth, choose_scenes, dataset_of_names, doubts, open_dataset, read_text_truth, text_scenes, text_variant
-from su3d_bench.core.interfaces import Encoder
+from su3d_bench.evaluation.truth import (
+    TextTruth,
+    choose_scenes,
+    dataset_of_names,
+    doubts,
+    open_dataset,
+    read_text_truth,
+    text_scenes,
+    text_variant,
+)
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
-from su3d_bench.runs.plan import data_root, why_not_fitting
-from su3d_bench.predictions.base import Content, ScenePrediction, VertexMasks, shown
-from su3d_bench.predictions.scannet_text import ScannetText
 from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules, load_protocol, protocol_names
-from su3d_bench.core.types import GroundTruth, Instances
+from su3d_bench.predictions.base import Content, ScenePrediction, VertexMasks
+from su3d_bench.predictions.scannet_text import ScannetText
+from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
+from su3d_bench.questions.files.queries import query_truth, read_query_file
+from su3d_bench.runs.plan import data_root, why_not_fitting
 
 __all__ = ["Evaluation", "ProtocolEvaluation", "Request", "evaluate"]
 

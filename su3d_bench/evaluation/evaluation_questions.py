@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import Any
 
+from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.types import GroundTruth
 from su3d_bench.evaluation.openlex import score_on_objects
 from su3d_bench.evaluation.scoring import SceneOutcome
-from su3d_bench.core.interfaces import Encoder
-from su3d_bench.predictions.base import Content
 from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.predictions.base import Content
 from su3d_bench.questions.truths import question_truth
-from su3d_bench.core.types import GroundTruth
 
 
 def score_on_questions(

@@ -8,6 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from su3d_bench.core.errors import GroundTruthMissing
+from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.types import Instances, Prediction
 from su3d_bench.datasets.openlex3d import (
     CATEGORIES_NAME,
     PROMPTS_NAME,
@@ -20,17 +23,14 @@ from su3d_bench.datasets.openlex3d import (
 )
 from su3d_bench.datasets.replica.folders import find_original_scene, original_name
 from su3d_bench.datasets.replica.mesh_truth import read_annotated_mesh
-from su3d_bench.core.errors import GroundTruthMissing
 from su3d_bench.evaluation.checks import check_cloud, empty_warnings, mask_facts
 from su3d_bench.evaluation.scoring import SceneOutcome
-from su3d_bench.core.interfaces import Encoder
+from su3d_bench.metrics.matching.nearest import masks_of
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
-from su3d_bench.metrics.matching.nearest import masks_of
-from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
 from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.metrics.scoring import QuestionTruth, score_scene, why_not_scorable
-from su3d_bench.core.types import Instances, Prediction
+from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
 
 DATASET = "replica"  # of those that OpenLex3D labels, the one whose mesh can be read here
 QUERY_LEVEL: Level = "l0"  # the level that the release evaluates unless another is asked for

@@ -13,9 +13,9 @@ from su3d_bench.core.errors import PredictionError
 from su3d_bench.evaluation.checks import MaskFacts
 from su3d_bench.evaluation.scoring import SceneOutcome
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
+from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules
 from su3d_bench.metrics.results.results import ProtocolResult, metric_values
 from su3d_bench.metrics.scene_score import SceneScore
-from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules
 from su3d_bench.metrics.scoring import combine
 
 SCHEMA = 1

@@ -8,20 +8,35 @@ import numpy as np
 
 from su3d_bench.core import registry
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.metrics.instance.evaluation_bound import every_class_counts
-from su3d_bench.evaluation.checks import MaskFacts, check_cloud, class_warnings, duplicate_warnings, empty_warnings, label_warnings, mask_facts
-from su3d_bench.evaluation.truth import MAX_NYU40_ID, TextTruth
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.semantic import confusion as semantic
-from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.matching.labelling import candidate_classes, class_index_of_ids, classes_of_prediction, encoder_warning, has_every_label, scored_classes
-from su3d_bench.metrics.scene_score import SceneScore, present
-from su3d_bench.metrics.instance.score import OBJECT, encode_without_classes
-from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
-from su3d_bench.metrics.protocols import ProtocolRules
-from su3d_bench.metrics.scoring import score_scene, why_not_scorable
 from su3d_bench.core.types import DenseFeatures, Float32Array, GroundTruth, Instances, Int64Array, Partition, Prediction
+from su3d_bench.evaluation.checks import (
+    MaskFacts,
+    check_cloud,
+    class_warnings,
+    duplicate_warnings,
+    empty_warnings,
+    label_warnings,
+    mask_facts,
+)
+from su3d_bench.evaluation.truth import MAX_NYU40_ID, TextTruth
+from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance.evaluation_bound import every_class_counts
+from su3d_bench.metrics.instance.score import OBJECT, encode_without_classes
+from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching.labelling import (
+    candidate_classes,
+    class_index_of_ids,
+    classes_of_prediction,
+    encoder_warning,
+    has_every_label,
+    scored_classes,
+)
+from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.scene_score import SceneScore, present
+from su3d_bench.metrics.scoring import score_scene, why_not_scorable
+from su3d_bench.metrics.semantic import confusion as semantic
+from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
 
 NAMED_KINDS = ("annotation", "reasoning")  # go by names alone
 # Ground truths of ScanNet and whose class ids they hold.

@@ -12,11 +12,10 @@ import numpy as np
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.plain_text import printable
-from su3d_bench.predictions.base import shown
+from su3d_bench.core.plain_text import printable, shown
+from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.formats.numpy_files import read_npz
 from su3d_bench.metrics.protocols import ProtocolRules
-from su3d_bench.core.types import Float32Array, UInt8Array
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,14 @@ import numpy as np
 
 from su3d_bench.core import registry
 from su3d_bench.core.errors import DataError, PredictionError, suggest
-from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
-from su3d_bench.core.plain_text import printable
-from su3d_bench.runs.plan import data_root
-from su3d_bench.predictions.base import MOST_POINTS, shown
-from su3d_bench.predictions.mask_arrays import scene_files
-from su3d_bench.formats.text_integers import integer_lines
-from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.core.plain_text import printable, shown
 from su3d_bench.core.types import Int64Array
+from su3d_bench.formats.text_integers import integer_lines
+from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
+from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.predictions.base import MOST_POINTS
+from su3d_bench.predictions.mask_arrays import scene_files
+from su3d_bench.runs.plan import data_root
 
 LARGEST_LABEL = 1357  # of scannetv2-labels.combined.tsv; values above it are label * 1000 + instance
 MAX_NYU40_ID = 40

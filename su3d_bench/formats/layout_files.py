@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from su3d_bench.core.types import Float32Array, Int32Array, UInt8Array
 from su3d_bench.formats.images import UInt16Array
 from su3d_bench.formats.ply import ListColumn
-from su3d_bench.core.types import Float32Array, Int32Array, UInt8Array
 
 JPEG_QUALITY = 95
 PNG_COMPRESSION = 3

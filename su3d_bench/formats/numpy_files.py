@@ -14,10 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.plain_text import printable, shown
 from su3d_bench.formats.pickles.pickle_constructors import MOST_DIMENSIONS, SIMPLE_TYPE, RefusedError, check_texts
 from su3d_bench.formats.pickles.pickles import read_pickle
-from su3d_bench.core.plain_text import printable
-from su3d_bench.predictions.base import shown
 from su3d_bench.formats.zip_files import opened_zip, read_member
 
 MAGIC = b"\x93NUMPY"

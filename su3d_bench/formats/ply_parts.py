@@ -7,9 +7,9 @@ from typing import Any, Literal, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.formats.ply_header import BYTE_ORDERS, Header, clip
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, Int64Array
+from su3d_bench.formats.ply_header import BYTE_ORDERS, Header, clip
 
 AnyArray = NDArray[Any]
 

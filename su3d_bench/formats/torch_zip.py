@@ -14,9 +14,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.formats.pickles.pickle_constructors import CONSTRUCTORS, Budget, Constructor, Constructors, Named, RefusedError, checked_shape, clip, inert, is_word, named
+from su3d_bench.core.plain_text import shown
+from su3d_bench.formats.pickles.pickle_constructors import (
+    CONSTRUCTORS,
+    Budget,
+    Constructor,
+    Constructors,
+    Named,
+    RefusedError,
+    checked_shape,
+    clip,
+    inert,
+    is_word,
+    named,
+)
 from su3d_bench.formats.pickles.pickles import read_pickle
-from su3d_bench.predictions.base import shown
 from su3d_bench.formats.zip_files import opened_zip, read_member
 
 Kind = Literal["tensor", "sparse", "array", "dict", "tuple", "other"]

@@ -11,8 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import printable
-from su3d_bench.predictions.base import shown
+from su3d_bench.core.plain_text import printable, shown
 
 MOST_MEMBER = 4 << 30  # bytes; masks of a scene are some hundred MiB
 MOST_RATIO = 1032  # deflate cannot do better

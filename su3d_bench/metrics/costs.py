@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.numerics.statistics import Growth, growth_exponent
 from su3d_bench.core.types import Float64Array
+from su3d_bench.numerics.statistics import Growth, growth_exponent
 
 # Stages that are no part of keeping the map: reading the frame, and perception.
 NOT_MAP = ("decode", "cache", "segment", "encode", "caption")

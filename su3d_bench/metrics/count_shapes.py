@@ -11,10 +11,10 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import DataError
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts
+from su3d_bench.metrics.protocols import VALUES_OF_METRIC, ProtocolRules
+from su3d_bench.metrics.questions.shares import ShareCounts
 from su3d_bench.metrics.results.results import Counts
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
-from su3d_bench.metrics.questions.shares import ShareCounts
-from su3d_bench.metrics.protocols import VALUES_OF_METRIC, ProtocolRules
 
 # Of each array: the kind of its numbers and its axes; axes of one name are equally long.
 ARRAYS: dict[type[Counts], dict[str, tuple[str, tuple[str, ...]]]] = {

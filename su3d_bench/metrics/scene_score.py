@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.metrics.results.results import Counts
 from su3d_bench.core.types import BoolArray, Instances, Int64Array, Prediction
+from su3d_bench.metrics.results.results import Counts
 
 
 @dataclass(frozen=True)

@@ -15,26 +15,27 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from su3d_bench.core.damage import DAMAGE
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.store.atomic import DAMAGE, read_arrays
-from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.open_vocabulary import object_means
-from su3d_bench.metrics.semantic import confusion as semantic
-from su3d_bench.metrics.questions import shares
-from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
 from su3d_bench.metrics.count_shapes import check_against, checked_counts
+from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance.score import score_instances
+from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.open_vocabulary import object_means
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
+from su3d_bench.metrics.open_vocabulary.score import NEEDS_FEATURES, score_categories, score_queries
+from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.questions import shares
+from su3d_bench.metrics.questions.score import labels_n, score_annotation, score_reasoning, score_retrieval
 from su3d_bench.metrics.questions.truths import AnnotationTruth, ReasoningTruth, RetrievalTruth
 from su3d_bench.metrics.results.results import Counts, ProtocolResult, form_result, reported_values
 from su3d_bench.metrics.scene_score import SceneScore
-from su3d_bench.metrics.instance.score import score_instances
-from su3d_bench.metrics.open_vocabulary.score import NEEDS_FEATURES, score_categories, score_queries
-from su3d_bench.metrics.questions.score import labels_n, score_annotation, score_reasoning, score_retrieval
+from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.score import score_semantic
-from su3d_bench.metrics.protocols import ProtocolRules
-from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
+from su3d_bench.store.atomic import read_arrays
 
 __all__ = ["SceneScore", "Truth", "combine", "pack_scores", "score_scene", "unpack_scores", "why_not_scorable"]
 

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.opensu3d.config import OverlapRule
 from su3d_bench.core.types import Float64Array, Int32Array, Int64Array
+from su3d_bench.opensu3d.config import OverlapRule
 
 
 @dataclass(frozen=True)

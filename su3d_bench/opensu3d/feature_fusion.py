@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.opensu3d.config import BEST_FIT_RATIO, MultiScale, MultiView
 from su3d_bench.core.types import Float32Array, Float64Array
+from su3d_bench.opensu3d.config import BEST_FIT_RATIO, MultiScale, MultiView
 
 EPSILON = 1e-8  # the paper's: keeps the cosine of a zero vector at 0
 

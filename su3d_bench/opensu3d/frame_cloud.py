@@ -8,10 +8,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int32Array
 from su3d_bench.numerics.geometry import ray_parts, valid_depth
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.id_image import IdImage, paint
-from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int32Array
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,11 @@ from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
+from su3d_bench.core.devices import CPU
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import Detections, Frame, Instances, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
 from su3d_bench.opensu3d.association import assign_ids, count_overlaps, overlap_ratios
 from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig, crop_levels
 from su3d_bench.opensu3d.frame_cloud import FrameCloud, frame_cloud
@@ -18,10 +21,7 @@ from su3d_bench.opensu3d.id_image import NO_DETECTION
 from su3d_bench.opensu3d.postprocess import segments_of, to_instances
 from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View, record_of
 from su3d_bench.opensu3d.voxel_map import NO_INSTANCE, VoxelMap
-from su3d_bench.core.devices import CPU
 from su3d_bench.store.scratch import Scratch
-from su3d_bench.core.timing import Timer
-from su3d_bench.core.types import Detections, Frame, Instances, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
 
 if TYPE_CHECKING:
     from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap

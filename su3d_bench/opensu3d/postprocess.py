@@ -7,10 +7,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from su3d_bench.core.types import Float32Array, Float64Array, Instances, Int32Array, Int64Array
 from su3d_bench.opensu3d.config import InstanceScore, OpenSU3DConfig
 from su3d_bench.opensu3d.feature_fusion import fuse_views
 from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View
-from su3d_bench.core.types import Float32Array, Float64Array, Instances, Int32Array, Int64Array
 
 NOISE = -1
 # Spelt with a vowel but spoken with a consonant, and the other way round.

@@ -9,8 +9,8 @@ import numpy as np
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.opensu3d.feature_fusion import cosine
 from su3d_bench.core.types import Float64Array, Instances, Int64Array
+from su3d_bench.opensu3d.feature_fusion import cosine
 
 
 @dataclass(frozen=True)

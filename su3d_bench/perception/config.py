@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict
 
+from su3d_bench.perception.embedded.naming import NamingConfig
+from su3d_bench.perception.embedded.segmenter.segmenter import SegmenterConfig
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.paper_config import PaperConfig
-from su3d_bench.perception.embedded.naming import NamingConfig
 from su3d_bench.perception.oracle.segmenter import OracleConfig
-from su3d_bench.perception.embedded.segmenter.segmenter import SegmenterConfig
 from su3d_bench.perception.stored.npz_files import StoredConfig
 
 

@@ -9,9 +9,9 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.digests import package_digest
 from su3d_bench.core.interfaces import Encoder, StageTimer
+from su3d_bench.core.types import Float32Array, Frame, PerceptionNeeds
 from su3d_bench.perception.cache import CachedRows, FrameCache, array_digest, content_key
 from su3d_bench.perception.crops import crop_images
-from su3d_bench.core.types import Float32Array, Frame, PerceptionNeeds
 
 
 def regions_to_keep(
@@ -53,7 +53,7 @@ class CropEncoder:
     def __init__(self, encoder: Encoder, cache: FrameCache) -> None:
         self._encoder = encoder
         self._cache = cache
-        self._source = package_digest("perception")
+        self._source = package_digest("perception/crops.py", "perception/features.py")
         self._rows = CachedRows(cache, encoder.dim)
 
     def crops(

@@ -8,16 +8,23 @@ import numpy as np
 
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.interfaces import Encoder, RegionPerception, Segmenter, StageTimer
+from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, Regions
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.config import PerceptionConfig
 from su3d_bench.perception.crops import crop_images
+from su3d_bench.perception.embedded.naming import scene_caption
 from su3d_bench.perception.features import CropEncoder, NameEncoder, grown_boxes, regions_to_keep
 from su3d_bench.perception.language.captioner import Captioner
 from su3d_bench.perception.models.masks.automatic_masks import AUTOMATIC_MASKS, AutomaticMaskConfig
-from su3d_bench.perception.models.masks.grounded_sam import GROUNDED_MASKS, AutomaticSam, GroundedConfig, GroundedSam, Networks, SamRegions
-from su3d_bench.perception.embedded.naming import scene_caption
+from su3d_bench.perception.models.masks.grounded_sam import (
+    GROUNDED_MASKS,
+    AutomaticSam,
+    GroundedConfig,
+    GroundedSam,
+    Networks,
+    SamRegions,
+)
 from su3d_bench.perception.regions import cached_regions
-from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, Regions
 
 # What of the language model's settings moves a caption; times, prices and limits do not.
 MOVES_CAPTIONS = {"vision_model", "temperature", "seed", "max_answer_tokens", "image_detail", "max_image_px"}

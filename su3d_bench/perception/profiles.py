@@ -7,13 +7,13 @@ from typing import Protocol
 
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
+from su3d_bench.core.types import Detections, Frame, ImageDomain, InstanceMesh, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.config import PerceptionConfig
-from su3d_bench.perception.models.config import EMBEDDED
 from su3d_bench.perception.embedded.perception import CAMERA_CAVEAT, EmbeddedPerception
+from su3d_bench.perception.models.config import EMBEDDED
 from su3d_bench.perception.oracle.perception import ORACLE_CAVEAT, OraclePerception
 from su3d_bench.perception.stored.perception import STORED_CAVEAT, LabelImagePerception, StoredPerception
-from su3d_bench.core.types import Detections, Frame, ImageDomain, InstanceMesh, PerceptionNeeds, SceneInfo
 
 __all__ = [
     "CAMERA_CAVEAT",

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from su3d_bench.core.interfaces import Encoder, Segmenter, StageTimer
-from su3d_bench.perception.cache import FrameCache, content_key, pack_masks, unpack_masks
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, Int64Array, Regions
+from su3d_bench.perception.cache import FrameCache, content_key, pack_masks, unpack_masks
 
 
 def cached_regions(

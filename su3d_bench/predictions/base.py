@@ -10,8 +10,15 @@ from typing import Literal, Protocol
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import printable
-from su3d_bench.core.types import DenseFeatures, Float32Array, Float64Array, Instances, Int32Array, Int64Array, Partition
+from su3d_bench.core.types import (
+    DenseFeatures,
+    Float32Array,
+    Float64Array,
+    Instances,
+    Int32Array,
+    Int64Array,
+    Partition,
+)
 
 Numbering = Literal["id", "index"]
 MOST_POINTS = 100_000_000  # points of one scene; the largest scans of rooms have some millions
@@ -19,11 +26,6 @@ MOST_MASKS = 100_000  # of one scene; methods give some hundred
 MOST_MEMBERS = (
     200_000_000  # points of all masks of a scene together; 600 masks of a large ScanNet scene have 10 million
 )
-
-
-def shown(path: Path) -> str:
-    """A path as messages show it."""
-    return printable(str(path), 300)
 
 
 @dataclass(frozen=True)

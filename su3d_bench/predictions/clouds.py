@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import DataError, PredictionError
-from su3d_bench.core.plain_text import printable
-from su3d_bench.predictions.base import MOST_MASKS, MOST_POINTS, shown
-from su3d_bench.predictions.mask_arrays import kind_of
+from su3d_bench.core.plain_text import printable, shown
 from su3d_bench.core.types import Float32Array, Instances
+from su3d_bench.predictions.base import MOST_MASKS, MOST_POINTS
+from su3d_bench.predictions.mask_arrays import kind_of
 
 ONES = "the format has no scores: 1 for every object"
 

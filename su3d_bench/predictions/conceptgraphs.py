@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.plain_text import printable, shown
+from su3d_bench.core.types import Float32Array, Instances
 from su3d_bench.formats.pickles.pickles import read_pickle_file
-from su3d_bench.core.plain_text import printable
-from su3d_bench.predictions.base import MOST_MASKS, ScenePrediction, shown
+from su3d_bench.predictions.base import MOST_MASKS, ScenePrediction
 from su3d_bench.predictions.clouds import (
     ONES,
     checked_points,
@@ -25,7 +26,6 @@ from su3d_bench.predictions.clouds import (
     without_nonfinite,
 )
 from su3d_bench.predictions.mask_arrays import kind_of
-from su3d_bench.core.types import Float32Array, Instances
 
 SUFFIX = ".pkl.gz"
 POST = f"_post{SUFFIX}"

@@ -14,18 +14,32 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.formats.pcd import write_pcd_points
 from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.matching.labelling import candidate_classes, class_index_of_ids, classes_of_prediction, encoder_warning, scored_classes
-from su3d_bench.metrics.scene_score import present
 from su3d_bench.core.plain_text import printable
+from su3d_bench.core.types import (
+    DenseFeatures,
+    Float32Array,
+    Float64Array,
+    GroundTruth,
+    Instances,
+    Int64Array,
+    Partition,
+)
+from su3d_bench.formats.pcd import write_pcd_points
+from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching.labelling import (
+    candidate_classes,
+    class_index_of_ids,
+    classes_of_prediction,
+    encoder_warning,
+    scored_classes,
+)
+from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.scene_score import present
 from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
 from su3d_bench.predictions.openlex3d import CLOUD, EMBEDDINGS, INDEX
-from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.store.run_folder import make_folder, write_text
-from su3d_bench.core.types import DenseFeatures, Float32Array, Float64Array, GroundTruth, Instances, Int64Array, Partition
 
 MASKS_FOLDER = "pred_mask"
 ROWS_AT_ONCE = 1 << 14

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.formats.hdf5 import n_columns_of, read_rows, row_blocks
-from su3d_bench.datasets.replica.cloud_truth import moved, read_first_pose
 from su3d_bench.core.errors import PredictionError, StoreError
-from su3d_bench.core.plain_text import printable
-from su3d_bench.predictions.base import ScenePrediction, shown
-from su3d_bench.predictions.clouds import as_prediction_error, checked_points, folders_with, named_once
+from su3d_bench.core.plain_text import printable, shown
 from su3d_bench.core.types import DenseFeatures, Float32Array
+from su3d_bench.datasets.replica.cloud_truth import moved, read_first_pose
+from su3d_bench.formats.hdf5 import n_columns_of, read_rows, row_blocks
+from su3d_bench.predictions.base import ScenePrediction
+from su3d_bench.predictions.clouds import as_prediction_error, checked_points, folders_with, named_once
 
 POINTS, EMBEDDINGS = "pc_points.h5", "pc_embeddings.h5"
 POSE_FILES = ("first_pose.txt", "traj.txt", "traj_w_c.txt")

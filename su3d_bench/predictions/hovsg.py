@@ -12,11 +12,13 @@ from pathlib import Path
 
 import numpy as np
 
+from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.plain_text import printable, shown
+from su3d_bench.core.types import Float32Array
 from su3d_bench.formats.pcd import read_pcd_points
 from su3d_bench.formats.ply import read_ply
-from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import printable
-from su3d_bench.predictions.base import MOST_MASKS, ScenePrediction, shown
+from su3d_bench.formats.torch_zip import read_torch
+from su3d_bench.predictions.base import MOST_MASKS, ScenePrediction
 from su3d_bench.predictions.clouds import (
     ONES,
     as_prediction_error,
@@ -28,8 +30,6 @@ from su3d_bench.predictions.clouds import (
     without_nonfinite,
 )
 from su3d_bench.predictions.mask_arrays import kind_of
-from su3d_bench.formats.torch_zip import read_torch
-from su3d_bench.core.types import Float32Array
 
 FEATURES = "mask_feats.pt"
 OBJECTS = "objects"

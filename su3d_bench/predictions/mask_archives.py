@@ -11,7 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.predictions.base import ScenePrediction, VertexMasks, shown
+from su3d_bench.core.plain_text import shown
+from su3d_bench.core.types import Int32Array
+from su3d_bench.formats.numpy_files import npz_names, read_npz
+from su3d_bench.formats.torch_zip import Kind, SparseTensor, read_torch, torch_kind
+from su3d_bench.predictions.base import ScenePrediction, VertexMasks
 from su3d_bench.predictions.mask_arrays import (
     NO_SCORES,
     check_sizes,
@@ -25,9 +29,6 @@ from su3d_bench.predictions.mask_arrays import (
     scores_of,
     vertex_masks,
 )
-from su3d_bench.formats.numpy_files import npz_names, read_npz
-from su3d_bench.formats.torch_zip import Kind, SparseTensor, read_torch, torch_kind
-from su3d_bench.core.types import Int32Array
 
 
 def first_of_kind(path: Path, suffix: str, kinds: tuple[Kind, ...]) -> Path | None:

@@ -10,9 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import printable
-from su3d_bench.predictions.base import MOST_MASKS, MOST_MEMBERS, MOST_POINTS, Numbering, VertexMasks, shown
+from su3d_bench.core.plain_text import printable, shown
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array
+from su3d_bench.predictions.base import MOST_MASKS, MOST_MEMBERS, MOST_POINTS, Numbering, VertexMasks
 
 NO_SCORES = "the file has no scores: 1 for every mask"
 ROWS_AT_ONCE = 1 << 16

@@ -11,13 +11,13 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import printable
-from su3d_bench.predictions.base import ScenePrediction, shown
+from su3d_bench.core.plain_text import printable, shown
+from su3d_bench.core.types import Float32Array, Int32Array, Partition
+from su3d_bench.formats.numpy_files import read_npy
+from su3d_bench.predictions.base import ScenePrediction
 from su3d_bench.predictions.clouds import checked_points, folders_with, named_once, without_nonfinite
 from su3d_bench.predictions.hovsg import read_cloud
 from su3d_bench.predictions.mask_arrays import kind_of
-from su3d_bench.formats.numpy_files import read_npy
-from su3d_bench.core.types import Float32Array, Int32Array, Partition
 
 CLOUD = "point_cloud.pcd"
 CLOUDS = (CLOUD, "point_cloud.ply", "input.ply")  # the order in which the original looks for them

@@ -8,7 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.predictions.base import ScenePrediction, shown
+from su3d_bench.core.plain_text import shown
+from su3d_bench.core.types import Float32Array
+from su3d_bench.formats.numpy_files import read_npy
+from su3d_bench.formats.torch_zip import read_torch
+from su3d_bench.predictions.base import ScenePrediction
 from su3d_bench.predictions.mask_archives import first_of_kind
 from su3d_bench.predictions.mask_arrays import (
     NO_SCORES,
@@ -19,9 +23,6 @@ from su3d_bench.predictions.mask_arrays import (
     scene_files,
     vertex_masks,
 )
-from su3d_bench.formats.numpy_files import read_npy
-from su3d_bench.formats.torch_zip import read_torch
-from su3d_bench.core.types import Float32Array
 
 MASKS_SUFFIXES = ("_masks.pt", ".pt")
 FEATURES_SUFFIXES = ("_openmask3d_features.npy", "_features.npy", ".npy")

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import printable
-from su3d_bench.predictions.base import ScenePrediction, shown
-from su3d_bench.predictions.mask_arrays import kind_of, scene_file
-from su3d_bench.formats.numpy_files import npy_header_of, npz_names, read_npz
-from su3d_bench.store.run_folder import features_beside, prediction_from_arrays
+from su3d_bench.core.plain_text import printable, shown
 from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
+from su3d_bench.formats.numpy_files import npy_header_of, npz_names, read_npz
+from su3d_bench.predictions.base import ScenePrediction
+from su3d_bench.predictions.mask_arrays import kind_of, scene_file
+from su3d_bench.store.run_folder import features_beside, prediction_from_arrays
 
 FILE = "prediction.npz"
 FLOATS = ("f2", "f4", "f8")

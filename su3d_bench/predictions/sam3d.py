@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.predictions.base import MOST_POINTS, ScenePrediction, shown
-from su3d_bench.predictions.mask_archives import first_of_kind
-from su3d_bench.predictions.mask_arrays import NO_SCORES, kind_of, scene_file, scene_files, vertex_masks
+from su3d_bench.core.plain_text import shown
 from su3d_bench.formats.numpy_files import npy_header_of, read_npy
 from su3d_bench.formats.torch_zip import read_torch
+from su3d_bench.predictions.base import MOST_POINTS, ScenePrediction
+from su3d_bench.predictions.mask_archives import first_of_kind
+from su3d_bench.predictions.mask_arrays import NO_SCORES, kind_of, scene_file, scene_files, vertex_masks
 
 SUFFIXES = (".pth", ".npy")
 

@@ -12,12 +12,12 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file
-from su3d_bench.core.plain_text import printable
-from su3d_bench.predictions.base import ScenePrediction, VertexLabels, shown
-from su3d_bench.predictions.mask_arrays import run_members, scene_file, scene_files, vertex_masks
-from su3d_bench.formats.text_integers import integer_lines
+from su3d_bench.core.plain_text import printable, shown
 from su3d_bench.core.types import Int32Array
+from su3d_bench.formats.text_integers import integer_lines
+from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file
+from su3d_bench.predictions.base import ScenePrediction, VertexLabels
+from su3d_bench.predictions.mask_arrays import run_members, scene_file, scene_files, vertex_masks
 
 OWN_OUTPUT = "semantic_instance_evaluation"  # the original evaluator's own answer, which it leaves out
 MASK3D_FOLDER = "decoder_-1"  # Mask3D and Segment3D write the lists of the last decoder here

@@ -17,7 +17,15 @@ from su3d_bench.perception.embedded.naming import with_article
 from su3d_bench.questions.known_objects import plain_name
 from su3d_bench.questions.model import KINDS, Question, new_question
 from su3d_bench.questions.reasoning.named_objects import meant_by
-from su3d_bench.questions.reasoning.relations import PairRelation, RelationFound, holds, is_between, is_container, is_next_to, relations_of
+from su3d_bench.questions.reasoning.relations import (
+    PairRelation,
+    RelationFound,
+    holds,
+    is_between,
+    is_container,
+    is_next_to,
+    relations_of,
+)
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
 
 SOURCE = "generated"

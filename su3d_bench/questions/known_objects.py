@@ -6,12 +6,12 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from su3d_bench.core.types import GroundTruth
 from su3d_bench.perception.embedded.lexicon import GROUPS
 from su3d_bench.perception.embedded.text import words
 from su3d_bench.questions.reasoning.named_objects import meant_by
 from su3d_bench.questions.reasoning.relations import is_room_surface
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
-from su3d_bench.core.types import GroundTruth
 
 STRAY_PERCENT = 1.0  # ours: of an object's vertices at either end of an axis, which in a scan are often a neighbour's
 

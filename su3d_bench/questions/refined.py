@@ -6,11 +6,11 @@ import logging
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import StoreError
+from su3d_bench.core.types import Instances
 from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.questions.refined_names import FILE_NAME, read_records
 from su3d_bench.questions.truths import voted_names
 from su3d_bench.store.run_folder import JobFolder
-from su3d_bench.core.types import Instances
 
 log = logging.getLogger(__name__)
 

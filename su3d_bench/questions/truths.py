@@ -8,8 +8,18 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.metrics.questions.truths import AnnotationTruth, AskedText, GivenAnswer, ReasoningTruth, RefinedNames, RetrievalTruth, TrueAnswer
+from su3d_bench.core.types import GroundTruth, Instances
 from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.questions.truths import (
+    AnnotationTruth,
+    AskedText,
+    GivenAnswer,
+    ReasoningTruth,
+    RefinedNames,
+    RetrievalTruth,
+    TrueAnswer,
+)
+from su3d_bench.metrics.scoring import QuestionTruth
 from su3d_bench.questions.generator import generate
 from su3d_bench.questions.known_objects import is_called, known_objects
 from su3d_bench.questions.model import Question, new_question
@@ -17,8 +27,6 @@ from su3d_bench.questions.reasoning.generated import generate_questions
 from su3d_bench.questions.reasoning.named_objects import nearest_by
 from su3d_bench.questions.reasoning.scene_map import map_of
 from su3d_bench.questions.reasoning.solver import Solver
-from su3d_bench.metrics.scoring import QuestionTruth
-from su3d_bench.core.types import GroundTruth, Instances
 
 Refine = Callable[[Instances], RefinedNames | None]
 MOST_NAMES = 5  # the paper's m: n' comes from the names of so many best views

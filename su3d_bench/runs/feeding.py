@@ -10,14 +10,14 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.runs.executors.local import Event, Report
 from su3d_bench.core.interfaces import Method
+from su3d_bench.core.timing import Timer, calibration_ms, memory_bytes
+from su3d_bench.core.types import Detections, Frame
 from su3d_bench.perception.profiles import Perception
+from su3d_bench.runs.executors.local import Event, Report
 from su3d_bench.runs.read_ahead import ReadAhead
 from su3d_bench.runs.scene_tools import no_detections
 from su3d_bench.store.run_folder import write_prediction
-from su3d_bench.core.timing import Timer, calibration_ms, memory_bytes
-from su3d_bench.core.types import Detections, Frame
 
 Row = dict[str, float | int]
 CALIBRATE_EVERY = 4  # about 5 ms each: a hundredth of the time of the updates

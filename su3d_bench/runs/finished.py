@@ -12,8 +12,8 @@ from pydantic import BaseModel, Field, ValidationError
 from su3d_bench.core.config import KeyPath, read_file
 from su3d_bench.core.errors import ConfigError, DataError, StoreError, suggest
 from su3d_bench.core.plain_text import printable
-from su3d_bench.runs.job import CEILING_METHOD
 from su3d_bench.metrics.scoring import SceneScore, unpack_scores
+from su3d_bench.runs.job import CEILING_METHOD
 from su3d_bench.store.run_folder import RunFolder, is_file, read_json
 
 Model = TypeVar("Model", bound=BaseModel)

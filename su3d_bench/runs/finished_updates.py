@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.core.plain_text import printable
-from su3d_bench.store.run_folder import is_file
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.costs import MapCost, UpdateTimes
+from su3d_bench.runs.finished import FinishedRun
+from su3d_bench.store.run_folder import is_file
 
 MAX_UPDATES = 10_000_000
 

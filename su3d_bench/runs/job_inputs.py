@@ -8,12 +8,12 @@ from typing import Any
 
 from su3d_bench.core.digests import digest_json, package_versions
 from su3d_bench.core.interfaces import Method
-from su3d_bench.perception.profiles import Perception
+from su3d_bench.core.types import SceneInfo
 from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.perception.profiles import Perception
 from su3d_bench.questions.refined import refined_digest
 from su3d_bench.runs.job import MethodOutcome, SceneJob
 from su3d_bench.store.run_folder import JobFolder
-from su3d_bench.core.types import SceneInfo
 
 LAYOUTS_OF_ROOMS = ("replica", "scannet", "tum")  # in which `datasets make rooms` writes files
 TRUE_PROPOSALS_CAVEAT = "proposals from the ground truth; a ceiling, not a result"

@@ -12,20 +12,37 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core import registry
-from su3d_bench.core.config import MOVES_NO_NUMBER, RunConfig, Settings, check_keys, check_names, read_assignments, resolve
-from su3d_bench.core.digests import code_digest, digest_json
-from su3d_bench.runs.remote.scene import CACHE_ROOT, fetch_seals, mirror_of
-from su3d_bench.core.errors import ConfigError, DataError, StoreError, suggest
-from su3d_bench.runs.executors.choose import ELSEWHERE, check_execution
-from su3d_bench.core.interfaces import Dataset
-from su3d_bench.runs.method_names import NamedMethod, named_method
+from su3d_bench.core.config import (
+    MOVES_NO_NUMBER,
+    RunConfig,
+    Settings,
+    check_keys,
+    check_names,
+    read_assignments,
+    resolve,
+)
 from su3d_bench.core.devices import device_for
-from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
+from su3d_bench.core.digests import code_digest, digest_json
+from su3d_bench.core.errors import ConfigError, DataError, StoreError, suggest
+from su3d_bench.core.interfaces import Dataset
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol, protocols_for
+from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
 from su3d_bench.questions.truths import has_own_queries
+from su3d_bench.runs.executors.choose import ELSEWHERE, check_execution
+from su3d_bench.runs.job import (
+    CEILING_METHOD,
+    FIELDS_KNOWN_LATER,
+    Part,
+    SceneJob,
+    build_dataset,
+    build_method,
+    config_key,
+    refuse_other_run,
+)
+from su3d_bench.runs.method_names import NamedMethod, named_method
 from su3d_bench.runs.remote.data import DataPlace, RemoteData, data_place
 from su3d_bench.runs.remote.folder import is_url
-from su3d_bench.runs.job import CEILING_METHOD, FIELDS_KNOWN_LATER, Part, SceneJob, build_dataset, build_method, config_key, refuse_other_run
+from su3d_bench.runs.remote.scene import CACHE_ROOT, fetch_seals, mirror_of
 from su3d_bench.store.run_folder import RunFolder
 
 DATA_ROOT = "~/.cache/su3d-bench/data"

@@ -17,21 +17,21 @@ from typing import Any
 
 from su3d_bench.core.config import KeyPath, flatten
 from su3d_bench.core.digests import code_digest, git_state, package_versions
-from su3d_bench.runs.remote.scene import DistantJob, failed_distant, fetch_results, run_distant_scene, send_records
 from su3d_bench.core.errors import StoreError
-from su3d_bench.runs.executors.choose import ELSEWHERE, run_units
-from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
-from su3d_bench.runs.resume import FinishedScenes
-from su3d_bench.metrics.results.results import plain_json
-from su3d_bench.perception.profiles import PerceptionConfig
-from su3d_bench.runs.plan import Plan, cache_root
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.runs.job import CEILING_METHOD, MethodOutcome, SceneJob
-from su3d_bench.runs.scene import failed_outcomes, run_scene
-from su3d_bench.metrics.scoring import SceneScore, combine, combined_metrics, unpack_scores
-from su3d_bench.store.run_folder import SCHEMA, JobFolder, remove_file, write_json, write_text
 from su3d_bench.core.timing import hardware_line, processor_digest
 from su3d_bench.core.toml_text import write_toml
+from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.results.results import plain_json
+from su3d_bench.metrics.scoring import SceneScore, combine, combined_metrics, unpack_scores
+from su3d_bench.perception.profiles import PerceptionConfig
+from su3d_bench.runs.executors.choose import ELSEWHERE, run_units
+from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
+from su3d_bench.runs.job import CEILING_METHOD, MethodOutcome, SceneJob
+from su3d_bench.runs.plan import Plan, cache_root
+from su3d_bench.runs.remote.scene import DistantJob, failed_distant, fetch_results, run_distant_scene, send_records
+from su3d_bench.runs.resume import FinishedScenes
+from su3d_bench.runs.scene import failed_outcomes, run_scene
+from su3d_bench.store.run_folder import SCHEMA, JobFolder, remove_file, write_json, write_text
 
 Scores = Mapping[tuple[str, str], SceneScore]
 

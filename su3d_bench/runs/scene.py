@@ -14,25 +14,34 @@ from dataclasses import replace
 from functools import cached_property, partial
 from typing import Any
 
-from su3d_bench.core.errors import GroundTruthMissing, StoreError, Su3dError
-from su3d_bench.runs.executors.local import Report
-from su3d_bench.core.interfaces import Method, SceneTools
-from su3d_bench.runs.job_inputs import JobInputs
 from su3d_bench.core.devices import device_for
-from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
-from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules, load_protocol
-from su3d_bench.questions.refined import refined_names
-from su3d_bench.questions.truths import question_truth
-from su3d_bench.runs.read_ahead import N_AHEAD, ReadAhead
-from su3d_bench.reports.pictures.maps import draw_scene
-from su3d_bench.runs.feeding import Feeding
-from su3d_bench.runs.job import MethodOutcome, Part, SceneJob, build_dataset, build_method, config_key, refuse_other_run, stride_of
-from su3d_bench.runs.scene_log import SceneLog
-from su3d_bench.runs.scene_tools import FirstFrames, surface_of, true_proposals
-from su3d_bench.metrics.scoring import SceneScore, Truth, pack_scores, score_scene, why_not_scorable
-from su3d_bench.store.run_folder import JobFolder, RunFolder, read_prediction, write_bytes, write_text
+from su3d_bench.core.errors import GroundTruthMissing, StoreError, Su3dError
+from su3d_bench.core.interfaces import Method, SceneTools
 from su3d_bench.core.timing import device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Prediction, Proposals, SceneInfo
+from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules, load_protocol
+from su3d_bench.metrics.scoring import SceneScore, Truth, pack_scores, score_scene, why_not_scorable
+from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
+from su3d_bench.questions.refined import refined_names
+from su3d_bench.questions.truths import question_truth
+from su3d_bench.reports.pictures.maps import draw_scene
+from su3d_bench.runs.executors.local import Report
+from su3d_bench.runs.feeding import Feeding
+from su3d_bench.runs.job import (
+    MethodOutcome,
+    Part,
+    SceneJob,
+    build_dataset,
+    build_method,
+    config_key,
+    refuse_other_run,
+    stride_of,
+)
+from su3d_bench.runs.job_inputs import JobInputs
+from su3d_bench.runs.read_ahead import N_AHEAD, ReadAhead
+from su3d_bench.runs.scene_log import SceneLog
+from su3d_bench.runs.scene_tools import FirstFrames, surface_of, true_proposals
+from su3d_bench.store.run_folder import JobFolder, RunFolder, read_prediction, write_bytes, write_text
 
 
 def run_scene(job: SceneJob, report: Report) -> tuple[MethodOutcome, ...]:

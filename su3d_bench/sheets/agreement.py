@@ -8,8 +8,8 @@ from itertools import combinations
 
 import numpy as np
 
-from su3d_bench.numerics.statistics import bootstrap_interval
 from su3d_bench.core.types import Float64Array, Int64Array
+from su3d_bench.numerics.statistics import bootstrap_interval
 
 Interval = tuple[float, float]
 Ratings = Mapping[str, Mapping[str, str]]  # item -> annotator -> answer

@@ -10,11 +10,12 @@ import numpy as np
 
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.metrics.questions.truths import AskedText
-from su3d_bench.metrics.questions.score import judge_merging, judge_retrieval, labels_n
-from su3d_bench.opensu3d.retrieval import rank_all
 from su3d_bench.core.plain_text import printable
+from su3d_bench.core.types import Float64Array, GroundTruth, Instances
 from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.questions.score import judge_merging, judge_retrieval, labels_n
+from su3d_bench.metrics.questions.truths import AskedText
+from su3d_bench.opensu3d.retrieval import rank_all
 from su3d_bench.questions.generator import chosen, generate
 from su3d_bench.questions.known_objects import known_objects
 from su3d_bench.questions.model import KINDS, Question
@@ -22,7 +23,6 @@ from su3d_bench.questions.refined import refined_names
 from su3d_bench.questions.truths import own_questions, question_truth
 from su3d_bench.sheets.items import RIGHT, WRONG, SheetKind
 from su3d_bench.sheets.run_source import RunSource, mask_digest
-from su3d_bench.core.types import Float64Array, GroundTruth, Instances
 
 MOST_TEXT = 1000  # characters of a query, a label or an answer that a sheet shows
 NO_LABEL = "(no label)"

@@ -8,15 +8,24 @@ from typing import Any
 
 import numpy as np
 
+from su3d_bench.core.types import BoolArray, Float64Array, Frame, Instances, UInt8Array
 from su3d_bench.reports.pictures.frame_views import best_view, mask_in_frame
 from su3d_bench.reports.pictures.heat_scales import Scale, scale_stops, similarity_colours
-from su3d_bench.reports.pictures.items import LOW_HEIGHT, PHOTO_WIDTH, ZOOM_WIDTH, ItemParts, Panel, Tag, compose, png_bytes
+from su3d_bench.reports.pictures.items import (
+    LOW_HEIGHT,
+    PHOTO_WIDTH,
+    ZOOM_WIDTH,
+    ItemParts,
+    Panel,
+    Tag,
+    compose,
+    png_bytes,
+)
 from su3d_bench.reports.pictures.map_views import DrawnMap, MapView, drawn_map, pale
 from su3d_bench.reports.pictures.maps import instance_colours
 from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import SheetKind
 from su3d_bench.sheets.run_source import RunSource, mask_digest
-from su3d_bench.core.types import BoolArray, Float64Array, Frame, Instances, UInt8Array
 
 ANSWER_COLOUR, OTHER_COLOUR = (222, 74, 22), (32, 98, 196)  # those of reasoning_picture
 PALE_SHARE = 0.3

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.reports.pictures.heat_scales import Scale
 from su3d_bench.runs.executors.local import Event, Report, run_inline, run_processes
 from su3d_bench.runs.finished import read_run
-from su3d_bench.reports.pictures.heat_scales import Scale
 from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.drawing import Artist
 from su3d_bench.sheets.run_source import RunSource

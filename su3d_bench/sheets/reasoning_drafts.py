@@ -9,26 +9,26 @@ import numpy as np
 
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.plain_text import printable
+from su3d_bench.core.types import Instances
 from su3d_bench.metrics.instance.covered_objects import Covered
-from su3d_bench.metrics.questions.truths import GivenAnswer, ReasoningTruth, TrueAnswer
+from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.metrics.questions.score import are_objects_right, is_answer_right
+from su3d_bench.metrics.questions.truths import GivenAnswer, ReasoningTruth, TrueAnswer
 from su3d_bench.perception.language.chat import ChatRequest
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.config import LanguageConfig
-from su3d_bench.core.plain_text import printable
-from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.questions.model import REASONING, Question, question_id
-from su3d_bench.questions.refined import refined_names
-from su3d_bench.questions.truths import question_truth
 from su3d_bench.questions.reasoning.answers import Answer, unsettled
 from su3d_bench.questions.reasoning.judging import said_value
 from su3d_bench.questions.reasoning.language_solver import LanguageSolver
 from su3d_bench.questions.reasoning.named_objects import nearest_by
 from su3d_bench.questions.reasoning.scene_map import SceneMap, map_of
 from su3d_bench.questions.reasoning.solver import Solver
+from su3d_bench.questions.refined import refined_names
+from su3d_bench.questions.truths import question_truth
 from su3d_bench.sheets.drafts import MOST_TEXT, Draft, also, id_of, judged
 from su3d_bench.sheets.run_source import RunSource, mask_digest
-from su3d_bench.core.types import Instances
 
 NO_ANSWER = "(no answer)"
 AskMap = Callable[[SceneMap, Sequence[str]], Sequence[Answer]]

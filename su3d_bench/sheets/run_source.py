@@ -13,14 +13,14 @@ import numpy as np
 from su3d_bench.core import registry
 from su3d_bench.core.config import Setting, Settings, resolve
 from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError, StoreError, suggest
-from su3d_bench.runs.finished import FinishedRun
-from su3d_bench.metrics.instance.covered_objects import Covered, covered_objects
 from su3d_bench.core.plain_text import printable
-from su3d_bench.runs.plan import data_root, dataset_targets, why_not_fitting
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol, protocol_names
-from su3d_bench.runs.job import Part, build_dataset
-from su3d_bench.store.run_folder import read_prediction
 from su3d_bench.core.types import Frame, GroundTruth, Instances
+from su3d_bench.metrics.instance.covered_objects import Covered, covered_objects
+from su3d_bench.metrics.protocols import ProtocolRules, load_protocol, protocol_names
+from su3d_bench.runs.finished import FinishedRun
+from su3d_bench.runs.job import Part, build_dataset
+from su3d_bench.runs.plan import data_root, dataset_targets, why_not_fitting
+from su3d_bench.store.run_folder import read_prediction
 
 MOST_FRAMES = 32  # of a scene, among which the best view of an object is looked for
 

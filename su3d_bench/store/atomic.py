@@ -11,7 +11,6 @@ import math
 import os
 import struct
 import sys
-import tokenize
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -25,11 +24,6 @@ from numpy.typing import NDArray
 
 MAGIC_1_0 = b"\x93NUMPY\x01\x00"
 SMALL_BYTES = 1 << 16  # of an array that is read whole before its header is looked at
-# What reading a damaged .npz raises; a compression that there is none of is a NotImplementedError, a RuntimeError.
-DAMAGE = (
-    OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, RuntimeError,
-    SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error, struct.error,
-)  # fmt: skip
 
 
 def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:

@@ -9,10 +9,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from su3d_bench.metrics.attribution import masks as attribution
-from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.attribution.masks import KINDS, LabelledMasks, ScoringRules, mend_scene
 from su3d_bench.core.types import Int32Array, Int64Array
+from su3d_bench.metrics.attribution import masks as attribution
+from su3d_bench.metrics.attribution.masks import KINDS, LabelledMasks, ScoringRules, mend_scene
+from su3d_bench.metrics.instance import average_precision as instance_ap
 
 SIZE = 200  # points an instance
 CLASSES = (3, 3, 3, 4, 4, 5)

@@ -16,20 +16,20 @@ from places import SCENES
 from scored_room import ENCODER, NAMES, instances, noisy, room, truth_as_prediction
 
 import su3d_bench.reports.tables.attribution
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.analysis.attribution import KINDS, attribute
 from su3d_bench.cli import attribute as verb
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError
+from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
 from su3d_bench.metrics.attribution import points as attribution_semantic
-from su3d_bench.metrics.semantic import confusion as semantic
+from su3d_bench.metrics.attribution.arrays import scored_masks, scored_points
 from su3d_bench.metrics.attribution.masks import count_masks
 from su3d_bench.metrics.attribution.points import CAUSES, causes_of, mend_points
-from su3d_bench.metrics.attribution.arrays import scored_masks, scored_points
 from su3d_bench.metrics.protocols import load_protocol, protocol_names
-from su3d_bench.reports.tables.attribution import MEANINGS
 from su3d_bench.metrics.scoring import score_scene
-from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
+from su3d_bench.metrics.semantic import confusion as semantic
+from su3d_bench.reports.tables.attribution import MEANINGS
+from su3d_bench.runs import scene as scene_run
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"
@@ -303,4 +303,4 @@ def test_the_table_says_what_every_kind_of_error_is() -> None:
 
 def test_the_examples_in_the_docstrings_run() -> None:
     assert doctest.testmod(attribution_semantic).failed == 0
-    assert doctest.testmod(su3d_bench.reports.attribution_table).failed == 0
+    assert doctest.testmod(su3d_bench.reports.tables.attribution).failed == 0

@@ -18,17 +18,17 @@ from painted import colour_perception
 from places import SCENES
 
 import su3d_bench.reports.tables.comparison
-from su3d_bench.runs import scene as scene_run
-from su3d_bench.cli.main import main
 from su3d_bench.analysis.comparison import compare
+from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, StoreError
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.semantic import confusion as semantic
+from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.results.resampled_values import resampled_classes
 from su3d_bench.metrics.results.results import metric_values, resampled_metrics
-from su3d_bench.metrics.protocols import load_protocol
-from su3d_bench.reports.tables.comparison import comparison_tables
+from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.numerics.statistics import MAX_EXACT_PAIRS, SignFlipTest, resample_weights, sign_flip_test
+from su3d_bench.reports.tables.comparison import comparison_tables
+from su3d_bench.runs import scene as scene_run
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"
@@ -327,4 +327,4 @@ def test_the_command_refuses_in_one_line(capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_the_examples_in_the_docstrings_run() -> None:
-    assert doctest.testmod(su3d_bench.reports.comparison_table).failed == 0
+    assert doctest.testmod(su3d_bench.reports.tables.comparison).failed == 0

@@ -12,9 +12,9 @@ import pytest
 from painted import colour_perception
 from places import SCENES
 
-from su3d_bench.runs import scene as scene_run
-from su3d_bench.cli.main import main
 from su3d_bench.analysis.leaderboard import leaderboard
+from su3d_bench.cli.main import main
+from su3d_bench.runs import scene as scene_run
 
 PAINTED = f"{SCENES}/painted.py"
 

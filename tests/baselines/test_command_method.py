@@ -17,18 +17,18 @@ from made_programs import MASKS, SCENE, SURFACE, fed, frames, method, program, r
 from painted import INTRINSICS, ColourPerception, colour_perception
 from places import SCENES
 
-from su3d_bench.runs import scene as scene_run
-from su3d_bench.baselines.command.method import Command, CommandConfig
 from su3d_bench.baselines.command.frames import FrameFolder, write_mesh
+from su3d_bench.baselines.command.method import Command, CommandConfig
 from su3d_bench.baselines.command.prediction import ClassNames, as_prediction, class_names
 from su3d_bench.cli.main import main
-from su3d_bench.datasets.replica.mesh_truth import read_surface
-from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.core.errors import ConfigError, PredictionError
-from su3d_bench.predictions.base import VertexLabels, VertexMasks
-from su3d_bench.runs.scene_tools import no_detections
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Instances, Surface
+from su3d_bench.datasets.replica.mesh_truth import read_surface
+from su3d_bench.datasets.rgbd.dataset import Rgbd
+from su3d_bench.predictions.base import VertexLabels, VertexMasks
+from su3d_bench.runs import scene as scene_run
+from su3d_bench.runs.scene_tools import no_detections
 
 
 def test_the_exported_folder_reads_back_as_the_frames_that_went_in(tmp_path: Path) -> None:

@@ -11,16 +11,16 @@ import pytest
 from box_room import SIZE, write_box_room
 from scannet_scan import SCAN, write_recording
 
-from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig
 from su3d_bench.baselines.conceptfusion.conceptfusion_sam import ConceptFusionSam
+from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig
 from su3d_bench.baselines.conceptfusion.pixel_features import mixed_features, mixing_weights, paint
-from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.datasets.scannet.dataset import ScanNet
 from su3d_bench.core.errors import DataError
-from su3d_bench.opensu3d.config import OpenSU3DConfig
-from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Detections, Float32Array, Frame, SceneInfo
+from su3d_bench.datasets.replica.dataset import Replica
+from su3d_bench.datasets.scannet.dataset import ScanNet
+from su3d_bench.opensu3d.config import OpenSU3DConfig
+from su3d_bench.opensu3d.pipeline import OpenSU3D
 
 E1, E2 = np.eye(2)
 BOX = np.array([0, 0, 2, 2], np.float32)

@@ -9,7 +9,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from places import CASES
 
-from su3d_bench.baselines.sam3d.overlap import GroupedCloud, MergeRules, Pairs, cal_group, drop_small_groups, ensemble, first_of_voxels, groups_on_surface, match_pairs, merge, merge_regions, nearest_points, next_level, numbered, renumber, voxelise, without_small_groups
+from su3d_bench.baselines.sam3d.overlap import (
+    GroupedCloud,
+    MergeRules,
+    Pairs,
+    cal_group,
+    drop_small_groups,
+    ensemble,
+    first_of_voxels,
+    groups_on_surface,
+    match_pairs,
+    merge,
+    merge_regions,
+    nearest_points,
+    next_level,
+    numbered,
+    renumber,
+    voxelise,
+    without_small_groups,
+)
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.timing import Timer
 

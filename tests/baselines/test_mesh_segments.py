@@ -7,8 +7,8 @@ import hashlib
 import numpy as np
 import pytest
 
-from su3d_bench.baselines.mesh_segments.segments import mesh_segments
 from su3d_bench.baselines.mesh_segments.kernels import _heap_sort, edges_of, sort_as_gnu, vertex_normals
+from su3d_bench.baselines.mesh_segments.segments import mesh_segments
 
 F = np.float32
 # std::sort of GNU's library (GCC 12) on 60 weights (k * 7919) % 5, and its make_heap with sort_heap on 37 of them

@@ -13,11 +13,23 @@ from prediction_files import TorchFile, write_openmask3d, write_openyolo3d, writ
 from pydantic import ValidationError
 from test_mesh_segments import sheet
 
-from su3d_bench.baselines.openmask3d.components import PartRules, density_clusters, linked_within, split_into_parts, voted_by_segments
+from su3d_bench.baselines.openmask3d.components import (
+    PartRules,
+    density_clusters,
+    linked_within,
+    split_into_parts,
+    voted_by_segments,
+)
 from su3d_bench.baselines.openmask3d.proposal_files import digest_of_folder, read_proposals
 from su3d_bench.baselines.openmask3d.proposals import ProposalConfig, make_proposals
 from su3d_bench.baselines.openmask3d.segment_tree import SegmentTree, contacts_of, is_within, merge_cost, merge_tree
-from su3d_bench.baselines.openmask3d.surface_proposals import NodeChoice, chosen_nodes, contrast, segments_of, surface_proposals
+from su3d_bench.baselines.openmask3d.surface_proposals import (
+    NodeChoice,
+    chosen_nodes,
+    contrast,
+    segments_of,
+    surface_proposals,
+)
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import SceneTools
 from su3d_bench.core.types import Proposals, Surface

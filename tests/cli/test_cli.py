@@ -12,10 +12,10 @@ import pytest
 from painted import colour_perception
 from places import SCENES
 
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli import query
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.core.errors import EXIT_INTERNAL
+from su3d_bench.runs import scene as scene_run
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"

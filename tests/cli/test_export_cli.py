@@ -11,13 +11,13 @@ from painted import colour_perception
 from places import SCENES
 from prediction_files import TOY, write_open3dis, write_scannet_text
 
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli import query
 from su3d_bench.cli.main import main
+from su3d_bench.core.types import Instances, Partition
+from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.predictions.base import VertexMasks
 from su3d_bench.predictions.formats import READERS, recognise
-from su3d_bench.metrics.protocols import load_protocol
-from su3d_bench.core.types import Instances, Partition
+from su3d_bench.runs import scene as scene_run
 
 PAINTED, COLLECTOR = f"{SCENES}/painted.py:Painted", f"{SCENES}/painted.py:Collector"
 RULES = load_protocol("rooms-instance")

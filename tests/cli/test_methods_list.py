@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 
-from su3d_bench.core import registry
 from su3d_bench.cli.main import main
+from su3d_bench.core import registry
 from su3d_bench.core.config import Setting, Settings
 from su3d_bench.core.interfaces import MethodAbout
-from su3d_bench.runs.plan import make_plan
 from su3d_bench.reports.tables.published import figures_of
+from su3d_bench.runs.plan import make_plan
 
 SYSTEMS = (
     "opensu3d",

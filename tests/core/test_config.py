@@ -6,7 +6,18 @@ from pathlib import Path
 import pytest
 from pydantic import BaseModel, ConfigDict
 
-from su3d_bench.core.config import RunConfig, Setting, Settings, check_keys, check_names, flatten, nest, read_assignments, read_file, resolve
+from su3d_bench.core.config import (
+    RunConfig,
+    Setting,
+    Settings,
+    check_keys,
+    check_names,
+    flatten,
+    nest,
+    read_assignments,
+    read_file,
+    resolve,
+)
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.toml_text import key_lines, toml_value, write_toml
 

@@ -18,13 +18,13 @@ from box_room import write_box_room, write_poses, write_truth
 from painted import Painted
 
 from su3d_bench.cli.main import main
-from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 from su3d_bench.core.errors import DataError
-from su3d_bench.datasets.checks import SAMPLED_FRAMES, Inspection, inspect
-from su3d_bench.datasets.checks_of_frames import Finding, check_frames, facts_of
 from su3d_bench.core.plain_text import printable, printable_json
 from su3d_bench.core.types import Frame
+from su3d_bench.datasets.checks import SAMPLED_FRAMES, Inspection, inspect
+from su3d_bench.datasets.checks_of_frames import Finding, check_frames, facts_of
+from su3d_bench.datasets.replica.dataset import Replica
+from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 
 N_FRAMES = 8
 TREE = Path("replica_v1/room_0/habitat")

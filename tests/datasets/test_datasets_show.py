@@ -16,11 +16,11 @@ from box_room import COLOURS, write_box_room
 from painted import LABELS, Painted
 
 from su3d_bench.cli.main import build_parser, main
-from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.core.errors import DataError
-from su3d_bench.reports.pictures.scene_look import CAMERAS, SceneLook, look_at
-from su3d_bench.reports.pictures.scene import WIDTH, draw_scene_picture, facts_line
 from su3d_bench.core.types import GroundTruth, LabelSet
+from su3d_bench.datasets.replica.dataset import Replica
+from su3d_bench.reports.pictures.scene import WIDTH, draw_scene_picture, facts_line
+from su3d_bench.reports.pictures.scene_look import CAMERAS, SceneLook, look_at
 
 
 @pytest.fixture(scope="module")

@@ -13,19 +13,19 @@ import cv2
 import numpy as np
 import pytest
 
-from su3d_bench.core import registry
 from su3d_bench.cli.main import main
-from su3d_bench.datasets.layouts import LAYOUTS
-from su3d_bench.formats.ply import read_ply
-from su3d_bench.datasets.rooms.dataset import Rooms
-from su3d_bench.datasets.rooms.classes import CLASSES
-from su3d_bench.datasets.scannet.recordings import open_cpp_export, open_python_export
-from su3d_bench.datasets.scannet.writing.truth import segment_of_vertex
-from su3d_bench.datasets.scannet.writing.categories import categories, room_of, scan_name
-from su3d_bench.datasets.writing import write_scene
-from su3d_bench.datasets.scannet.sens.read import SensFile
+from su3d_bench.core import registry
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Frame
+from su3d_bench.datasets.layouts import LAYOUTS
+from su3d_bench.datasets.rooms.classes import CLASSES
+from su3d_bench.datasets.rooms.dataset import Rooms
+from su3d_bench.datasets.scannet.recordings import open_cpp_export, open_python_export
+from su3d_bench.datasets.scannet.sens.read import SensFile
+from su3d_bench.datasets.scannet.writing.categories import categories, room_of, scan_name
+from su3d_bench.datasets.scannet.writing.truth import segment_of_vertex
+from su3d_bench.datasets.writing import write_scene
+from su3d_bench.formats.ply import read_ply
 
 ROOM, SCAN, N_FRAMES, SIZE = "bathroom0", "scene9400_00", 12, (80, 60)
 SCANNET = ("scannet", "scannet-python", "scannet-cpp")

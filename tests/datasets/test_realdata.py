@@ -12,13 +12,13 @@ from places import REAL_RECORDINGS
 from scipy.spatial import cKDTree
 
 from su3d_bench.cli.main import main
+from su3d_bench.core.toml_text import write_toml
+from su3d_bench.core.types import Instances
 from su3d_bench.datasets.recordings.pose_convention import check_convention
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.datasets.tum.dataset import Tum
 from su3d_bench.numerics.geometry import back_project
 from su3d_bench.store.run_folder import read_prediction
-from su3d_bench.core.toml_text import write_toml
-from su3d_bench.core.types import Instances
 
 pytestmark = pytest.mark.skipif(not REAL_RECORDINGS.is_dir(), reason="needs the real recordings in ../shared/realdata")
 FRAME_FILES = {

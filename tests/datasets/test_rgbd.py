@@ -16,13 +16,13 @@ import pytest
 from damage import damages, outcomes, truncations
 
 from su3d_bench.cli.main import main
+from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.core.toml_text import write_toml
 from su3d_bench.datasets.recordings.pose_convention import FLIP
 from su3d_bench.datasets.rgbd.dataset import Rgbd, RgbdOptions
 from su3d_bench.datasets.rgbd.description import RgbdDescription
 from su3d_bench.datasets.rgbd.files import camera_to_world, read_intrinsics, read_pose_file, read_trajectory_file
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
-from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.core.toml_text import write_toml
 
 WIDTH, HEIGHT = 12, 8
 CAMERA = {"width": WIDTH, "height": HEIGHT, "intrinsic_matrix": [6.0, 0, 0, 0, 6.5, 0, 5.5, 3.5, 1]}

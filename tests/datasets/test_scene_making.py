@@ -17,9 +17,9 @@ import pytest
 from scanned_stage import N_FRAMES, Stage, files_below
 
 from su3d_bench.core import registry
+from su3d_bench.core.errors import DataError, StoreError
 from su3d_bench.datasets.layouts import LAYOUTS
 from su3d_bench.datasets.writing import finish_scene, plan_scenes, write_frames, write_scene
-from su3d_bench.core.errors import DataError, StoreError
 
 ROOM = "living7"
 SCANNET = ("scannet", "scannet-python", "scannet-cpp")

@@ -12,13 +12,13 @@ from scannet_scan import SCAN, grid, write_mesh, write_recording
 from scannet_scan import write_truth as write_scan_truth
 from test_rgbd import write_scene
 
-from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
+from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 from su3d_bench.datasets.scannet.dataset import ScanNet, ScannetOptions
 from su3d_bench.datasets.tum.dataset import Tum
-from su3d_bench.core.errors import DataError
+from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 from su3d_bench.runs.scene_tools import surface_of
 
 

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 import pytest
-from prediction_files import CASES, scenes_of, write_scannet_text
+from places import CASES
+from prediction_files import scenes_of, write_scannet_text
 
 from su3d_bench.cli.main import main
 from su3d_bench.evaluation.evaluate import Confidences, Request, evaluate

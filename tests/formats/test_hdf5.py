@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 from damage import damages, outcomes, truncations
 
+from su3d_bench.core.errors import DataError
 from su3d_bench.formats import hdf5
 from su3d_bench.formats.hdf5 import largest_column, read_rows, row_blocks
-from su3d_bench.core.errors import DataError
 
 NAME = "pc_points"
 WHERE = f"replica/room0: {NAME}.h5"

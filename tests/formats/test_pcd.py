@@ -13,8 +13,8 @@ from damage import damages, outcomes, truncations
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from su3d_bench.formats.pcd import MOST_EXPANSION, read_pcd_points, write_pcd_points
 from su3d_bench.core.errors import DataError
+from su3d_bench.formats.pcd import MOST_EXPANSION, read_pcd_points, write_pcd_points
 
 POINTS = np.array([[1.5, -2.25, 0.0], [1.5, 3.0, 1e-3], [1.5, 3.0, 7.0]], np.float32)
 

@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from su3d_bench.formats.ply import Column, ListColumn, PlyElement, PlyFile, read_ply, write_ply
 from su3d_bench.core.errors import DataError, StoreError
+from su3d_bench.formats.ply import Column, ListColumn, PlyElement, PlyFile, read_ply, write_ply
 
 FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
 TYPES = ("i1", "u1", "i2", "u2", "i4", "u4", "f4", "f8")

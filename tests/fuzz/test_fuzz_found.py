@@ -15,20 +15,21 @@ import pytest
 from fuzz_targets_runs import copied_run
 from numpy.typing import NDArray
 
-from su3d_bench.cli.main import main
-from su3d_bench.analysis.sides import Side, rules_of
-from su3d_bench.core.config import parse_value, read_file
-from su3d_bench.questions.files.queries import read_query_file
-from su3d_bench.core.errors import MOST_CHARACTERS, ConfigError, DataError, PredictionError, StoreError, Su3dError
-from su3d_bench.runs.estimate import recent_update_s
-from su3d_bench.runs.finished import read_run
-from su3d_bench.store.atomic import DAMAGE, read_arrays
 from su3d_bench.analysis.leaderboard import leaderboard
+from su3d_bench.analysis.sides import Side, rules_of
+from su3d_bench.analysis.tables import check_paper
+from su3d_bench.cli.main import main
+from su3d_bench.core.config import parse_value, read_file
+from su3d_bench.core.damage import DAMAGE
+from su3d_bench.core.errors import MOST_CHARACTERS, ConfigError, DataError, PredictionError, StoreError, Su3dError
 from su3d_bench.formats.numpy_files import read_npy
 from su3d_bench.metrics.protocols import load_protocol, read_protocol
 from su3d_bench.metrics.scoring import combine, unpack_scores
+from su3d_bench.questions.files.queries import read_query_file
+from su3d_bench.runs.estimate import recent_update_s
+from su3d_bench.runs.finished import read_run
+from su3d_bench.store.atomic import read_arrays
 from su3d_bench.store.run_folder import is_file, read_json, read_prediction
-from su3d_bench.analysis.tables import check_paper
 
 DEEP, LONG = "[" * 100_000, "1" * 5000
 NO_TEXT = np.array([0x3F800000], np.uint32).tobytes()  # a float's bits where a character should be

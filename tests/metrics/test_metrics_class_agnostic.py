@@ -9,11 +9,11 @@ import pytest
 from scored_room import instances
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, LabelSet, Partition
 from su3d_bench.metrics.instance.average_precision import per_scene
 from su3d_bench.metrics.instance.score import encode_without_classes
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
-from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, LabelSet, Partition
 
 NAMES = ("class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d")
 CHAIR, WALL, OTHER = 2, 1, 1000  # 1000 is none of the 200

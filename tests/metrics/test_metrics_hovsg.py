@@ -13,11 +13,11 @@ from hypothesis import strategies as st
 from places import CASES
 from scored_room import ENCODER, ID, LABELS, OneHotEncoder, instances, noisy, nothing, room, truth_as_prediction
 
+from su3d_bench.core.types import DenseFeatures, Float32Array, GroundTruth, Instances, LabelSet, Partition, UInt8Array
 from su3d_bench.metrics.matching.labelling import text_features
-from su3d_bench.metrics.semantic.confusion import confusion_matrix, hovsg_metrics, per_scene
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import combine, pack_scores, score_scene, unpack_scores
-from su3d_bench.core.types import DenseFeatures, Float32Array, GroundTruth, Instances, LabelSet, Partition, UInt8Array
+from su3d_bench.metrics.semantic.confusion import confusion_matrix, hovsg_metrics, per_scene
 
 GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())["hovsg"]
 HOVSG, EXACT, OVO = (load_protocol(name) for name in ("replica-hovsg", "replica-hovsg-exact", "replica-ovo51"))

@@ -13,8 +13,17 @@ from hypothesis import strategies as st
 from places import CASES
 
 from su3d_bench.core.errors import DataError, PredictionError
+from su3d_bench.metrics.instance.average_precision import (
+    THRESHOLDS,
+    InstanceAP,
+    InstanceCounts,
+    combine,
+    concatenate,
+    encode_ground_truth,
+    last_line_of_each_mask_file,
+    per_scene,
+)
 from su3d_bench.metrics.instance.dot_product import dot
-from su3d_bench.metrics.instance.average_precision import THRESHOLDS, InstanceAP, InstanceCounts, combine, concatenate, encode_ground_truth, last_line_of_each_mask_file, per_scene
 from su3d_bench.metrics.protocols import load_protocol
 
 INSTANCE_CASES = sorted(p.stem for p in CASES.glob("inst*.json")) + sorted(p.stem for p in CASES.glob("replica*.json"))

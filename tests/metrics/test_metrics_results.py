@@ -27,9 +27,9 @@ from scored_room import (
 
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.types import LabelSet, Prediction
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import combine, pack_scores, score_scene, unpack_scores
-from su3d_bench.core.types import LabelSet, Prediction
 
 # ---- several scenes
 

@@ -12,7 +12,15 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from places import CASES
 
-from su3d_bench.metrics.semantic.confusion import SemanticCounts, SemanticMetrics, concatenate, conceptgraphs_metrics, confusion_matrix, per_scene, scannet_metrics
+from su3d_bench.metrics.semantic.confusion import (
+    SemanticCounts,
+    SemanticMetrics,
+    concatenate,
+    conceptgraphs_metrics,
+    confusion_matrix,
+    per_scene,
+    scannet_metrics,
+)
 
 GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())
 POOLING = GOLDEN["cg_pooling"]

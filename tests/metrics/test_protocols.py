@@ -10,10 +10,17 @@ from places import CASES
 
 from su3d_bench.cli.main import main
 from su3d_bench.cli.protocols import read_remarks
-from su3d_bench.datasets.rooms.classes import CLASSES
 from su3d_bench.core.errors import ConfigError
+from su3d_bench.datasets.rooms.classes import CLASSES
 from su3d_bench.metrics.instance.average_precision import MIN_REGION_SIZE, THRESHOLDS
-from su3d_bench.metrics.protocols import RULES, SHARE_KINDS, load_protocol, not_comparable_with, protocol_names, protocols_for
+from su3d_bench.metrics.protocols import (
+    RULES,
+    SHARE_KINDS,
+    load_protocol,
+    not_comparable_with,
+    protocol_names,
+    protocols_for,
+)
 
 NAMES = {
     "class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d", "openlex3d-queries",

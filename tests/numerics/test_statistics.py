@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 import su3d_bench.numerics.statistics
+from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.results import resampling
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.numerics.statistics import bootstrap_interval, percentile_interval, resample_weights
-from su3d_bench.core.types import Float64Array, Int64Array
 
 
 def test_the_examples_in_the_docstrings_run() -> None:
-    assert doctest.testmod(su3d_bench.statistics).failed == 0
+    assert doctest.testmod(su3d_bench.numerics.statistics).failed == 0
     assert doctest.testmod(resampling).failed == 0
 
 

@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from torch_devices import on_each_device
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.opensu3d.voxel_map import VoxelMap
 from su3d_bench.core.types import Float64Array
+from su3d_bench.opensu3d.voxel_map import VoxelMap
 
 if TYPE_CHECKING:
     from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap

@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sklearn.cluster import DBSCAN
 
+from su3d_bench.core.types import Float64Array
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.postprocess import NOISE, cluster
-from su3d_bench.core.types import Float64Array
 
 
 def assert_same_labels(points: Float64Array, eps: float, min_points: int) -> None:

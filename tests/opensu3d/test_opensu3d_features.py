@@ -9,11 +9,11 @@ import pytest
 from pydantic import ValidationError
 
 from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.types import Float32Array, Float64Array, Instances, UInt8Array
 from su3d_bench.opensu3d.config import Fusion, OpenSU3DConfig, Scheme
 from su3d_bench.opensu3d.feature_fusion import fuse_scales, fuse_views
 from su3d_bench.opensu3d.postprocess import article, caption_of
 from su3d_bench.opensu3d.retrieval import rank, rank_all
-from su3d_bench.core.types import Float32Array, Float64Array, Instances, UInt8Array
 
 CROPS = np.array([[[0.6, 0.8], [1.0, 0.0], [0.0, 1.0]]])  # one region, crops at ratios 0.8, 1.0, 1.2
 

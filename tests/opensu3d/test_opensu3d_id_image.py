@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from su3d_bench.core.types import BoolArray
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.id_image import NO_DETECTION, paint
-from su3d_bench.core.types import BoolArray
 
 
 def rectangle(rows: slice, columns: slice, height: int = 40, width: int = 60) -> BoolArray:

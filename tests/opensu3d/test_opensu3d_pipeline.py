@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.opensu3d.config import OpenSU3DConfig
-from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Detections, Frame, Instances, SceneInfo
+from su3d_bench.opensu3d.config import OpenSU3DConfig
+from su3d_bench.opensu3d.pipeline import OpenSU3D
 
 SCENE = SceneInfo("made", "wall", 4, 1, "rendered-rooms")
 WIDTH, HEIGHT, FOCAL = 160, 120, 120.0

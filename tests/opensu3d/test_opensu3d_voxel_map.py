@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.opensu3d.voxel_map import ROWS_OF_A_THREAD, VoxelMap
 from su3d_bench.core.types import Float64Array, Int64Array
+from su3d_bench.opensu3d.voxel_map import ROWS_OF_A_THREAD, VoxelMap
 
 EPS = 0.02
 

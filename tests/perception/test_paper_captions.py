@@ -14,9 +14,9 @@ from tiny_encoders import needs_models
 from tiny_models import paper_words, write_models
 
 from su3d_bench.cli.main import main
+from su3d_bench.core.types import Instances
 from su3d_bench.perception.language.prompts import DESCRIBE
 from su3d_bench.store.run_folder import read_json, read_prediction
-from su3d_bench.core.types import Instances
 
 pytestmark = needs_models
 TOTAL_S = 3.0  # after it a hung connection is given up; long enough for good answers on a busy machine

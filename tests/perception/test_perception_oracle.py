@@ -11,11 +11,11 @@ from perception_fakes import INTRINSICS, CountingEncoder, quad_mesh, still_life
 
 from su3d_bench.baselines.oracle import Oracle
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.perception.oracle.segmenter import MeshProjector, OracleConfig, OracleSegmenter
-from su3d_bench.perception.oracle.noise import OracleNoise, disturb
-from su3d_bench.perception.profiles import PerceptionConfig, build_perception
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Frame, GroundTruth, Int32Array, LabelSet, PerceptionNeeds, SceneInfo
+from su3d_bench.perception.oracle.noise import OracleNoise, disturb
+from su3d_bench.perception.oracle.segmenter import MeshProjector, OracleConfig, OracleSegmenter
+from su3d_bench.perception.profiles import PerceptionConfig, build_perception
 
 SCENE = SceneInfo("rooms", "living0", n_frames=1, stride=1, image_domain="rendered-rooms")
 # One pixel is 1 cm at 1 m: the square covers columns 30..69 and rows 20..49 of the image at depth 1.

@@ -10,11 +10,18 @@ from perception_fakes import CountingEncoder, still_life
 from pydantic import ValidationError
 
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.perception.features import regions_to_keep
-from su3d_bench.perception.embedded.naming import Namer, NamingConfig, colour_word, scene_caption, vocabulary, with_article
-from su3d_bench.perception.profiles import PerceptionConfig, build_perception, resolve_profile
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import ImageDomain, PerceptionNeeds, SceneInfo
+from su3d_bench.perception.embedded.naming import (
+    Namer,
+    NamingConfig,
+    colour_word,
+    scene_caption,
+    vocabulary,
+    with_article,
+)
+from su3d_bench.perception.features import regions_to_keep
+from su3d_bench.perception.profiles import PerceptionConfig, build_perception, resolve_profile
 
 
 def scene(domain: ImageDomain) -> SceneInfo:

@@ -11,9 +11,12 @@ import pytest
 from places import REAL_RECORDINGS
 from tiny_models import blocks, frame_of, paper_words, tiny_dino, tiny_sam, write_models
 
-from su3d_bench.core import registry
 from su3d_bench.cli.main import main
+from su3d_bench.core import registry
 from su3d_bench.core.errors import ConfigError, ModelMissing
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.toml_text import write_toml
+from su3d_bench.core.types import Instances, PerceptionNeeds, SceneInfo, UInt8Array
 from su3d_bench.perception import paper as profile_paper
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.config import PerceptionConfig
@@ -21,9 +24,6 @@ from su3d_bench.perception.language.captioner import CropCaption
 from su3d_bench.perception.models.masks.tagging import WORDS_CAVEAT
 from su3d_bench.perception.profiles import Perception, build_perception, check_models, resolve_profile
 from su3d_bench.store.run_folder import read_json, read_prediction
-from su3d_bench.core.timing import Timer
-from su3d_bench.core.toml_text import write_toml
-from su3d_bench.core.types import Instances, PerceptionNeeds, SceneInfo, UInt8Array
 
 SCENE = SceneInfo("rgbd", "wall", 1, 1, "camera")
 # Random weights are sure of nothing, so little is asked of them.

@@ -13,7 +13,10 @@ from hypothesis import strategies as st
 from scored_room import ENCODER, ID, room
 
 from su3d_bench.core.errors import PredictionError, StoreError
+from su3d_bench.core.types import DenseFeatures, Instances, Partition
 from su3d_bench.metrics.matching.nearest import masks_of, transfer_masks
+from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.predictions.base import VertexLabels, VertexMasks
 from su3d_bench.predictions.export import (
     file_name,
@@ -26,9 +29,6 @@ from su3d_bench.predictions.export import (
 )
 from su3d_bench.predictions.formats import READERS
 from su3d_bench.predictions.mask_arrays import vertex_masks
-from su3d_bench.metrics.protocols import load_protocol
-from su3d_bench.metrics.scoring import combine, score_scene
-from su3d_bench.core.types import DenseFeatures, Instances, Partition
 
 RULES = load_protocol("rooms-instance")
 RNG = np.random.default_rng(0)

@@ -12,6 +12,7 @@ import pytest
 from damage import damages, outcomes, truncations
 from open_scene import ENCODER, OBJECTS, PROMPTS, instances_with
 
+from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.datasets.openlex3d import (
     MOST_BYTES,
     Corners,
@@ -23,9 +24,8 @@ from su3d_bench.datasets.openlex3d import (
     read_queries,
     replica_corners,
 )
-from su3d_bench.formats.ply import ListColumn
 from su3d_bench.datasets.replica.mesh_truth import AnnotatedMesh
-from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.formats.ply import ListColumn
 from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
 from su3d_bench.metrics.protocols import load_protocol

@@ -27,17 +27,17 @@ from cloud_files import (
     write_tensor,
 )
 from painted import Painted, WordEncoder
-from places import SCENES
-from prediction_files import CASES, refused
+from places import CASES, SCENES
+from prediction_files import refused
 
+from su3d_bench.core.types import DenseFeatures, Instances, Partition
+from su3d_bench.evaluation.evaluate import Request, evaluate
 from su3d_bench.formats.pcd import write_pcd_points
 from su3d_bench.formats.ply import PlyElement, write_ply
-from su3d_bench.evaluation.evaluate import Request, evaluate
+from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.predictions import clouds, gradslam
 from su3d_bench.predictions.base import ScenePrediction
 from su3d_bench.predictions.formats import READERS, recognise
-from su3d_bench.metrics.protocols import load_protocol
-from su3d_bench.core.types import DenseFeatures, Instances, Partition
 
 
 def read(path: Path, scene: str = "room0", format: str | None = None) -> ScenePrediction:

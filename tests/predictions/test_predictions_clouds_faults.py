@@ -24,8 +24,7 @@ from damage import damages, outcomes, truncations
 from prediction_files import refused
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.formats.pickles import pickle_machine
-from su3d_bench.formats.pickles import pickles
+from su3d_bench.formats.pickles import pickle_machine, pickles
 from su3d_bench.formats.pickles.pickle_constructors import CONSTRUCTORS
 from su3d_bench.predictions.formats import READERS
 

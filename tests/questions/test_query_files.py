@@ -10,11 +10,11 @@ from damage import damages, outcomes, truncations
 from replica_scene import QUADS, TWO_OBJECTS, write_original, write_render
 
 from su3d_bench.cli.main import main
-from su3d_bench.questions.files.queries import read_query_file
-from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.core.errors import ConfigError, DataError
+from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.evaluation.evaluate import Request, evaluate
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
+from su3d_bench.questions.files.queries import read_query_file
 
 TOML = """[[query]]
 scene = "replica/room0"

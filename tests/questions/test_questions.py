@@ -9,12 +9,12 @@ import pytest
 from scored_room import ID, LABELS, room
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import GroundTruth
 from su3d_bench.questions.colours import colour_word
 from su3d_bench.questions.generator import chosen, generate
 from su3d_bench.questions.known_objects import is_called, known_objects
 from su3d_bench.questions.model import KINDS, Question, new_question, question_id
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
-from su3d_bench.core.types import GroundTruth
 
 HOSTILE = ("<script>alert(1)</script>", '=HYPERLINK("x","y")', "\u202eright to left", "😀 chair", "x" * 10_000)
 

@@ -13,8 +13,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scored_room import instances
 
-from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.core.errors import PredictionError
+from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.questions.reasoning.generated import generate_questions
 from su3d_bench.questions.reasoning.question_words import Phrase, read_phrase
 from su3d_bench.questions.reasoning.relations import relations_of

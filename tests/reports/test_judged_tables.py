@@ -10,6 +10,7 @@ import pytest
 from measured_rows import SCENES, measured
 from simulated_annotators import RATES, SCHEMES, annotation_set, answered, reasoning_set, retrieval_set
 
+from su3d_bench.analysis.tables import check_paper, measured_results
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.reports.tables.judged import judged_table
@@ -19,7 +20,6 @@ from su3d_bench.reports.tables.paper import Shown
 from su3d_bench.sheets.score_file import write_scores
 from su3d_bench.sheets.scores import score
 from su3d_bench.sheets.validation import check_answers
-from su3d_bench.analysis.tables import check_paper, measured_results
 
 LABELS = [("right", "right", "well-merged"), ("wrong", "right", "well-merged"), ("wrong", "wrong", "over-merged")]
 

@@ -15,11 +15,11 @@ import pytest
 from measured_rows import measured, measured_instances
 
 from su3d_bench.reports.tables.ablation_table import SweepRow, ablation_table
+from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
 from su3d_bench.reports.tables.latex import escape, latex, origin_comment, printed_cells
+from su3d_bench.reports.tables.model import Cell, Origin, Table, TableRow
 from su3d_bench.reports.tables.paper import Shown, paper_table, protocol_table
 from su3d_bench.reports.tables.published import Figure
-from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
-from su3d_bench.reports.tables.model import Cell, Origin, Table, TableRow
 
 HOSTILE = (
     "\\input{/etc/passwd}",

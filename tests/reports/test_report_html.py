@@ -20,17 +20,27 @@ from painted import WordEncoder, colour_perception
 from places import SCENES
 
 from su3d_bench.analysis import page_maps
-from su3d_bench.runs import scene as scene_run
+from su3d_bench.analysis.page_maps import points_of_each
 from su3d_bench.cli import query
 from su3d_bench.cli.main import main
-from su3d_bench.analysis.page_maps import points_of_each
-from su3d_bench.reports.page import numbers as html_data
-from su3d_bench.reports.page import maps as html_map
-from su3d_bench.reports.page import page as html_page
-from su3d_bench.reports.page.maps import NO_TRUTH_NEAR, NOT_SCORED, box_in_view, index_plane, nearest_classes, nearest_colours, pack_map, point_owners, thinned
-from su3d_bench.reports.page.page import page_html
-from su3d_bench.store.run_folder import read_prediction, write_prediction
 from su3d_bench.core.types import DenseFeatures, Instances
+from su3d_bench.reports.page import maps as html_map
+from su3d_bench.reports.page import numbers as html_data
+from su3d_bench.reports.page import page as html_page
+from su3d_bench.reports.page.maps import (
+    NO_TRUTH_NEAR,
+    NOT_SCORED,
+    box_in_view,
+    index_plane,
+    nearest_classes,
+    nearest_colours,
+    pack_map,
+    point_owners,
+    thinned,
+)
+from su3d_bench.reports.page.page import page_html
+from su3d_bench.runs import scene as scene_run
+from su3d_bench.store.run_folder import read_prediction, write_prediction
 
 PAINTED = f"{SCENES}/painted.py"
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(1)>&\"'<!--"

@@ -15,9 +15,9 @@ from chromium import Chromium, find_chromium
 from painted import WordEncoder, colour_perception
 from places import SCENES
 
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli import query
 from su3d_bench.cli.main import main
+from su3d_bench.runs import scene as scene_run
 
 pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
 PAINTED = f"{SCENES}/painted.py"

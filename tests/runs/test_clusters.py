@@ -14,10 +14,10 @@ from typing import Any
 import psutil
 import pytest
 from painted import colour_perception
-
 from places import SCENES
-from su3d_bench.runs import scene as scene_run
+
 from su3d_bench.cli.main import main
+from su3d_bench.runs import scene as scene_run
 
 pytest.importorskip("ray", reason="the ray extra is not installed")
 pytest.importorskip("submitit", reason="the slurm extra is not installed")

@@ -9,21 +9,21 @@ from typing import Any
 import numpy as np
 import pytest
 from painted import colour_perception
-
 from places import SCENES
+
 from su3d_bench.analysis import page_numbers as page_sources
-from su3d_bench.runs import resume as finished_scenes
-from su3d_bench.runs import runner
-from su3d_bench.runs import scene as scene_run
-from su3d_bench.store import run_folder as store
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
-from su3d_bench.runs.executors.choose import run_units
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import precision_recall
 from su3d_bench.metrics.results import resampling
 from su3d_bench.metrics.scoring import pack_scores, unpack_scores
 from su3d_bench.numerics.statistics import growth_exponent, resample_weights
+from su3d_bench.runs import resume as finished_scenes
+from su3d_bench.runs import runner
+from su3d_bench.runs import scene as scene_run
+from su3d_bench.runs.executors.choose import run_units
+from su3d_bench.store import run_folder as store
 
 WORDS = ["run", "--scenes", f"{SCENES}/painted.py:Painted/*", "--methods", f"{SCENES}/painted.py:Collector"]
 PROTOCOLS = ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures", "--out", "out"]

@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 from painted import colour_perception
-
 from places import SCENES
-from su3d_bench.runs import scene as scene_run
+
 from su3d_bench.cli.main import main
 from su3d_bench.core.config import Settings
 from su3d_bench.core.errors import ConfigError
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.method_names import named_method
 from su3d_bench.runs.plan import make_plan
 

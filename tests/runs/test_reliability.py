@@ -21,15 +21,15 @@ from typing import Any
 import numpy as np
 import pytest
 from painted import colour_perception
-
 from places import ROOT, SCENES
-from su3d_bench.runs import job as scene_job
-from su3d_bench.runs import scene as scene_run
+
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import StoreError
-from su3d_bench.store.atomic import filling
-from su3d_bench.perception.cache import FrameCache
 from su3d_bench.metrics.scoring import score_scene
+from su3d_bench.perception.cache import FrameCache
+from su3d_bench.runs import job as scene_job
+from su3d_bench.runs import scene as scene_run
+from su3d_bench.store.atomic import filling
 from su3d_bench.store.run_folder import RunFolder, npz_bytes, read_npz
 from su3d_bench.store.temporary_folders import TemporaryFolder
 

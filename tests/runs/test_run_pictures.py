@@ -5,9 +5,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from su3d_bench.reports.pictures.maps import NO_INSTANCE, ROOM_SURFACES, class_colours, draw_heat_map, draw_scene, heat_colours, instance_colours
-from su3d_bench.reports.pictures.render import BACKGROUND, Camera, colour, render, room_bounds, view_cameras
 from su3d_bench.core.types import DenseFeatures, Float32Array, GroundTruth, Instances, LabelSet, Partition
+from su3d_bench.reports.pictures.maps import (
+    NO_INSTANCE,
+    ROOM_SURFACES,
+    class_colours,
+    draw_heat_map,
+    draw_scene,
+    heat_colours,
+    instance_colours,
+)
+from su3d_bench.reports.pictures.render import BACKGROUND, Camera, colour, render, room_bounds, view_cameras
 
 
 def plate(z: float, half: float = 0.5) -> Float32Array:

@@ -17,12 +17,12 @@ from typing import Any
 
 import pytest
 from painted import ColourPerception, colour_perception
-
 from places import SCENES
-from su3d_bench.runs import resume as finished_scenes
-from su3d_bench.runs import feeding as scene_feeding
-from su3d_bench.runs import scene as scene_run
+
 from su3d_bench.cli.main import main
+from su3d_bench.runs import feeding as scene_feeding
+from su3d_bench.runs import resume as finished_scenes
+from su3d_bench.runs import scene as scene_run
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"

@@ -10,10 +10,10 @@ from painted import colour_perception
 from replica_scene import CHAIR, TABLE, write_original, write_render
 from test_clusters import COLLECTOR, PAINTED, assert_equal_runs, deterministic_files, run
 
-from su3d_bench.runs import feeding as scene_feeding
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, StoreError
+from su3d_bench.runs import feeding as scene_feeding
+from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.plan import data_root
 from su3d_bench.runs.remote.data import files_of_scenes
 from su3d_bench.runs.remote.folder import RemoteFolder

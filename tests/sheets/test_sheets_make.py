@@ -15,17 +15,18 @@ from made_sheets import HOSTILE, METHODS, RUN, drafts_of, made
 from painted import WordEncoder, colour_perception
 from PIL import Image
 
-from su3d_bench.runs import scene as scene_run
 from su3d_bench.cli import query
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError
-from su3d_bench.runs.executors.local import run_processes
-from su3d_bench.runs.finished import read_run
+from su3d_bench.core.types import Frame
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.questions.model import new_question
 from su3d_bench.reports.pictures.frame_views import best_view, mask_in_frame, seen_in
 from su3d_bench.reports.pictures.heat_scales import SCALES, scale_stops, similarity_colours
 from su3d_bench.reports.pictures.items import ItemParts, Panel, compose, png_bytes, zoomed
+from su3d_bench.runs import scene as scene_run
+from su3d_bench.runs.executors.local import run_processes
+from su3d_bench.runs.finished import read_run
 from su3d_bench.sheets.drafts import annotation_drafts, retrieval_drafts
 from su3d_bench.sheets.drawing import Artist
 from su3d_bench.sheets.drawing_jobs import SceneDrafts, _lost, draw_all, draw_scene
@@ -41,7 +42,6 @@ from su3d_bench.sheets.items import (
 from su3d_bench.sheets.making import table_csv, write_sheets
 from su3d_bench.sheets.reasoning_drafts import built_in, reasoning_drafts
 from su3d_bench.sheets.run_source import RunSource
-from su3d_bench.core.types import Frame
 
 TEXTS = tuple(f"thing {k}" for k in range(12))
 

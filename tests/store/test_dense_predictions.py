@@ -18,20 +18,20 @@ from box_room import INTRINSICS, images, pose
 from painted import colour_perception
 from places import ROOT, SCENES
 
-from su3d_bench.runs import scene as scene_run
-from su3d_bench.store import run_folder as store
 from su3d_bench.baselines.conceptfusion import feature_table
-from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig
 from su3d_bench.baselines.conceptfusion.feature_table import FeatureTable
+from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import PredictionError, StoreError
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import DenseFeatures, Detections, Frame, Partition, SceneInfo
 from su3d_bench.metrics.matching.labelling import most_similar
 from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.predictions.own_runs import OwnRuns
-from su3d_bench.store.scratch import scratch_folder
+from su3d_bench.runs import scene as scene_run
+from su3d_bench.store import run_folder as store
 from su3d_bench.store.run_folder import features_beside, npz_bytes, read_prediction, write_prediction
-from su3d_bench.core.timing import Timer
-from su3d_bench.core.types import DenseFeatures, Detections, Frame, Partition, SceneInfo
+from su3d_bench.store.scratch import scratch_folder
 
 POINTS = np.arange(12, dtype=np.float32).reshape(4, 3)
 ROWS = np.arange(20, dtype=np.float16).reshape(4, 5)

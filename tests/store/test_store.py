@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from numpy.typing import NDArray
 
-from su3d_bench.store import run_folder as store
 from su3d_bench.core.errors import PredictionError, StoreError
-from su3d_bench.store.run_folder import JobFolder, RunFolder, npz_bytes, read_npz, write_bytes, write_json, write_npz
 from su3d_bench.core.types import DenseFeatures, Instances, Partition
+from su3d_bench.store import run_folder as store
+from su3d_bench.store.run_folder import JobFolder, RunFolder, npz_bytes, read_npz, write_bytes, write_json, write_npz
 
 KEY = {"method": "collector", "stride": "40", "data": "abc"}
 

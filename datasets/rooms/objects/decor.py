@@ -8,8 +8,35 @@ from dataclasses import replace
 import numpy as np
 
 from su3d_bench.datasets.rooms.objects.items import Assembly, Builder, Look
-from su3d_bench.datasets.rooms.objects.materials import Material, Rgb, Texture, ceramic, chrome, glass, linear, metal, mix, paint, paper, plastic, shade, stone, tone, wood
-from su3d_bench.datasets.rooms.objects.shapes import Shape, block, cylinder, ellipsoid, join, lathe, sheet, soft_block, tube
+from su3d_bench.datasets.rooms.objects.materials import (
+    Material,
+    Rgb,
+    Texture,
+    ceramic,
+    chrome,
+    glass,
+    linear,
+    metal,
+    mix,
+    paint,
+    paper,
+    plastic,
+    shade,
+    stone,
+    tone,
+    wood,
+)
+from su3d_bench.datasets.rooms.objects.shapes import (
+    Shape,
+    block,
+    cylinder,
+    ellipsoid,
+    join,
+    lathe,
+    sheet,
+    soft_block,
+    tube,
+)
 
 
 def _shade(build: Assembly, radius: float, height: float, z: float) -> None:

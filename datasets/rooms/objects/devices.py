@@ -5,7 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from su3d_bench.datasets.rooms.objects.items import Assembly, Builder, Look
-from su3d_bench.datasets.rooms.objects.materials import Material, Texture, chrome, glass, linear, metal, paint, plastic, shade, tone
+from su3d_bench.datasets.rooms.objects.materials import (
+    Material,
+    Texture,
+    chrome,
+    glass,
+    linear,
+    metal,
+    paint,
+    plastic,
+    shade,
+    tone,
+)
 from su3d_bench.datasets.rooms.objects.shapes import block, cylinder, lathe, soft_block, tube
 
 

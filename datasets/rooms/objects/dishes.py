@@ -8,7 +8,21 @@ from dataclasses import replace
 import numpy as np
 
 from su3d_bench.datasets.rooms.objects.items import Assembly, Builder, Look
-from su3d_bench.datasets.rooms.objects.materials import Material, Texture, ceramic, chrome, glass, linear, metal, mix, paper, plastic, shade, tone, wood
+from su3d_bench.datasets.rooms.objects.materials import (
+    Material,
+    Texture,
+    ceramic,
+    chrome,
+    glass,
+    linear,
+    metal,
+    mix,
+    paper,
+    plastic,
+    shade,
+    tone,
+    wood,
+)
 from su3d_bench.datasets.rooms.objects.shapes import block, cylinder, ellipsoid, lathe, soft_block, tube
 
 

@@ -8,8 +8,30 @@ from dataclasses import replace
 import numpy as np
 
 from su3d_bench.datasets.rooms.objects.items import Assembly, Builder, Look
-from su3d_bench.datasets.rooms.objects.materials import Material, Texture, ceramic, chrome, linear, metal, paint, plain_cloth, plastic, shade, tone
-from su3d_bench.datasets.rooms.objects.shapes import Shape, block, box, cylinder, ellipsoid, lathe, sheet, soft_block, tube
+from su3d_bench.datasets.rooms.objects.materials import (
+    Material,
+    Texture,
+    ceramic,
+    chrome,
+    linear,
+    metal,
+    paint,
+    plain_cloth,
+    plastic,
+    shade,
+    tone,
+)
+from su3d_bench.datasets.rooms.objects.shapes import (
+    Shape,
+    block,
+    box,
+    cylinder,
+    ellipsoid,
+    lathe,
+    sheet,
+    soft_block,
+    tube,
+)
 
 
 def door(look: Look) -> Assembly:

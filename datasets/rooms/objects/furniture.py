@@ -5,7 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from su3d_bench.datasets.rooms.objects.items import Assembly, Builder, Look
-from su3d_bench.datasets.rooms.objects.materials import chrome, cloth, leather, mix, paint, plain_cloth, plastic, shade, tone, wood
+from su3d_bench.datasets.rooms.objects.materials import (
+    chrome,
+    cloth,
+    leather,
+    mix,
+    paint,
+    plain_cloth,
+    plastic,
+    shade,
+    tone,
+    wood,
+)
 from su3d_bench.datasets.rooms.objects.shapes import Shape, block, box, cylinder, lathe, soft_block, tube
 
 

@@ -7,7 +7,19 @@ from collections.abc import Mapping
 import numpy as np
 
 from su3d_bench.datasets.rooms.objects.items import Assembly, Builder, Look
-from su3d_bench.datasets.rooms.objects.materials import Material, Rgb, Texture, linear, metal, mix, paper, plastic, shade, tone, wicker
+from su3d_bench.datasets.rooms.objects.materials import (
+    Material,
+    Rgb,
+    Texture,
+    linear,
+    metal,
+    mix,
+    paper,
+    plastic,
+    shade,
+    tone,
+    wicker,
+)
 from su3d_bench.datasets.rooms.objects.shapes import block, cylinder, ellipsoid, lathe, soft_block, tube
 
 

@@ -8,11 +8,11 @@ from functools import cached_property
 
 import numpy as np
 
+from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.rooms.classes import CLASS_BY_NAME
 from su3d_bench.datasets.rooms.objects.materials import Material, Rgb, of_kind, tone
-from su3d_bench.datasets.rooms.objects.shapes import Shape, bounds
 from su3d_bench.datasets.rooms.objects.rooms_sizes import size_word
-from su3d_bench.core.types import Float64Array
+from su3d_bench.datasets.rooms.objects.shapes import Shape, bounds
 
 FOOT_HEIGHT_M = 0.025
 

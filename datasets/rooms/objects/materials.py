@@ -7,8 +7,8 @@ from enum import IntEnum
 
 import numpy as np
 
-from su3d_bench.datasets.rooms.classes import COLOUR_RGB
 from su3d_bench.core.types import Float32Array
+from su3d_bench.datasets.rooms.classes import COLOUR_RGB
 
 Rgb = tuple[float, float, float]  # linear light, 0..1
 

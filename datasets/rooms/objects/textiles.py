@@ -7,7 +7,18 @@ from collections.abc import Mapping
 import numpy as np
 
 from su3d_bench.datasets.rooms.objects.items import Assembly, Builder, Look
-from su3d_bench.datasets.rooms.objects.materials import Material, Texture, chrome, cloth, metal, mix, plain_cloth, shade, tone, wood
+from su3d_bench.datasets.rooms.objects.materials import (
+    Material,
+    Texture,
+    chrome,
+    cloth,
+    metal,
+    mix,
+    plain_cloth,
+    shade,
+    tone,
+    wood,
+)
 from su3d_bench.datasets.rooms.objects.shapes import block, cylinder, lathe, puff, sheet, soft_block, tube
 
 

@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.numerics.open3d_core import compiled_open3d
+from su3d_bench.core.types import Float32Array, Float64Array, Int32Array
 from su3d_bench.datasets.rooms.objects.items import Item
 from su3d_bench.datasets.rooms.objects.materials import Material
 from su3d_bench.datasets.rooms.objects.shapes import Shape, rotation
-from su3d_bench.core.types import Float32Array, Float64Array, Int32Array
+from su3d_bench.numerics.open3d_core import compiled_open3d
 
 LIGHT_SPACING_M = 0.13  # between the points at which light is computed
 AMBIENT = 0.42

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.numerics.open3d_core import compiled_open3d
-from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh, caster
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, UInt8Array
+from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh, caster
+from su3d_bench.numerics.open3d_core import compiled_open3d
 
 FOCAL_PER_WIDTH = 400.0 / 640.0  # a horizontal field of view of 77 degrees
 

@@ -12,9 +12,9 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.formats.images import MAX_PIXELS
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array
+from su3d_bench.formats.images import MAX_PIXELS
 
 ColourCompression = Literal["raw", "png", "jpeg"]
 DepthCompression = Literal["raw", "zlib"]

@@ -20,11 +20,11 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.formats.images import JPEG_START, PNG_SIGNATURE, UInt16Array, image_size, sized_colour
-from su3d_bench.datasets.recordings.source import SensorPair
-from su3d_bench.datasets.scannet.sens.header import COUNT, MAX_FRAMES, MAX_HEADER_BYTES, SensHeader, parse_header
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, Int64Array, UInt8Array
+from su3d_bench.datasets.recordings.source import SensorPair
+from su3d_bench.datasets.scannet.sens.header import COUNT, MAX_FRAMES, MAX_HEADER_BYTES, SensHeader, parse_header
+from su3d_bench.formats.images import JPEG_START, PNG_SIGNATURE, UInt16Array, image_size, sized_colour
 
 FRAME_RECORD = np.dtype(
     [

@@ -13,11 +13,11 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.formats.images import UInt16Array
-from su3d_bench.datasets.scannet.sens.read import FRAME_RECORD, MOTION_RECORD, SensFile
-from su3d_bench.datasets.scannet.sens.header import COUNT, ColourCompression, DepthCompression, SensHeader, header_bytes
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.types import Float64Array, UInt8Array
+from su3d_bench.datasets.scannet.sens.header import COUNT, ColourCompression, DepthCompression, SensHeader, header_bytes
+from su3d_bench.datasets.scannet.sens.read import FRAME_RECORD, MOTION_RECORD, SensFile
+from su3d_bench.formats.images import UInt16Array
 
 JPEG_QUALITY = 95  # OpenCV's own choice
 

@@ -33,7 +33,7 @@ class Category:
 
 @cache
 def _facts() -> Mapping[str, Any]:
-    return tomllib.loads(Path(__file__).with_name("scannet_rooms.toml").read_text(encoding="utf-8"))
+    return tomllib.loads(Path(__file__).with_name("categories.toml").read_text(encoding="utf-8"))
 
 
 @cache

@@ -13,15 +13,15 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn
 
-from su3d_bench.core import registry
 from su3d_bench.cli.common import answer, answer_json, remark
+from su3d_bench.core import registry
 from su3d_bench.core.config import read_assignments, resolve
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, suggest
 from su3d_bench.datasets.layouts import LAYOUTS
 from su3d_bench.datasets.writing import SceneTarget, finish_scene, plan_scenes, write_frames
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, suggest
 from su3d_bench.runs.executors.local import Event, Report, run_inline, run_processes
-from su3d_bench.runs.plan import data_root, expand_scenes
 from su3d_bench.runs.job import Part, build_dataset
+from su3d_bench.runs.plan import data_root, expand_scenes
 from su3d_bench.store.run_folder import RunFolder, make_folder
 
 FRAMES_A_UNIT = 400  # a quarter of a room: enough that building the room anew in each process does not matter

@@ -79,11 +79,11 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _tables(arguments: argparse.Namespace) -> list[Table]:
-    from su3d_bench.runs.ablation import read_rows
+    from su3d_bench.analysis.tables import choose, is_scores, measured_results
     from su3d_bench.reports.tables.ablation_table import SweepRow, ablation_table
     from su3d_bench.reports.tables.judged import JUDGED, judged_table
     from su3d_bench.reports.tables.paper import Shown, paper_table, selection_tables
-    from su3d_bench.analysis.tables import choose, is_scores, measured_results
+    from su3d_bench.runs.ablation import read_rows
 
     shown = Shown(
         metrics=tuple(arguments.metrics),
@@ -110,7 +110,7 @@ def _tables(arguments: argparse.Namespace) -> list[Table]:
 
 
 def _formatter(name: str) -> Callable[[Sequence[Table]], str]:
-    from su3d_bench.reports.tables.latex import latex
     from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
+    from su3d_bench.reports.tables.latex import latex
 
     return {"markdown": markdown, "latex": latex, "csv": csv_text, "html": html_page}[name]

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Any
 from su3d_bench.cli.common import add_verb, answer, answer_json, remark
 
 if TYPE_CHECKING:
-    from su3d_bench.runs.finished import FinishedRun
     from su3d_bench.metrics.costs import UpdateTimes
+    from su3d_bench.runs.finished import FinishedRun
 
 NAME = "timing"
 
@@ -40,9 +40,9 @@ def call(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from su3d_bench.core.errors import ConfigError
-    from su3d_bench.runs.finished import read_run
-    from su3d_bench.reports.tables.timing import csv_text, markdown, methods_csv
     from su3d_bench.metrics.costs import summarise
+    from su3d_bench.reports.tables.timing import csv_text, markdown, methods_csv
+    from su3d_bench.runs.finished import read_run
 
     if arguments.warm_up < 0 or not arguments.camera_rate > 0:
         raise ConfigError("--warm-up is a count from 0, --camera-rate a number above 0")

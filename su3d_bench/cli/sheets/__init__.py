@@ -5,10 +5,10 @@ from __future__ import annotations
 from types import ModuleType
 from typing import Any
 
+from su3d_bench.cli.common import add_group
 from su3d_bench.cli.sheets import make as sheets_make
 from su3d_bench.cli.sheets import pictures as sheets_pictures
 from su3d_bench.cli.sheets import score as sheets_score
-from su3d_bench.cli.common import add_group
 
 # Modules with ``NAME`` and ``add_parser(actions)``, imported for --help too, so with nothing heavy at their top.
 SUB_VERBS: tuple[ModuleType, ...] = (sheets_make, sheets_score, sheets_pictures)

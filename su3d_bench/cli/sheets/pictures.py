@@ -42,9 +42,9 @@ def call(arguments: argparse.Namespace) -> int:
 
     limit_threads()
     from su3d_bench.cli.query import encoder_of
-    from su3d_bench.runs.finished import read_run
     from su3d_bench.reports.pictures.figures import draw_grid
     from su3d_bench.reports.pictures.heat_scales import scale_stops
+    from su3d_bench.runs.finished import read_run
     from su3d_bench.sheets.figures import Figures
     from su3d_bench.sheets.run_source import RunSource
 

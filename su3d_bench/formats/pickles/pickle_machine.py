@@ -10,7 +10,16 @@ import struct
 from collections.abc import Callable, Iterable
 from typing import BinaryIO
 
-from su3d_bench.formats.pickles.pickle_constructors import Budget, Constructors, Forgotten, Inert, Named, RefusedError, Unbuilt, clip
+from su3d_bench.formats.pickles.pickle_constructors import (
+    Budget,
+    Constructors,
+    Forgotten,
+    Inert,
+    Named,
+    RefusedError,
+    Unbuilt,
+    clip,
+)
 
 NEWEST_PROTOCOL = 5
 MOST_OPERATIONS = 10_000_000  # a map of ConceptGraphs takes less than a million

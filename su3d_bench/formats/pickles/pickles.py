@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import BinaryIO, cast
 
 from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.plain_text import printable
 from su3d_bench.formats.pickles.pickle_constructors import CONSTRUCTORS, Constructors, Forgotten, Inert, RefusedError
 from su3d_bench.formats.pickles.pickle_machine import PickleMachine
-from su3d_bench.core.plain_text import printable
 
 __all__ = ["Forgotten", "Inert", "read_pickle", "read_pickle_file"]
 

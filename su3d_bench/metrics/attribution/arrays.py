@@ -10,16 +10,30 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.metrics.matching import votes as neighbours
-from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.attribution.points import LabelledPoints
-from su3d_bench.metrics.matching.labelling import candidate_classes, class_index_of_ids, classes_of_prediction, scored_classes
+from su3d_bench.core.types import (
+    BoolArray,
+    DenseFeatures,
+    Float64Array,
+    GroundTruth,
+    Instances,
+    Int64Array,
+    Partition,
+    Prediction,
+)
 from su3d_bench.metrics.attribution.overlaps import LabelledMasks, ScoringRules
-from su3d_bench.metrics.scene_score import present
+from su3d_bench.metrics.attribution.points import LabelledPoints
 from su3d_bench.metrics.instance.score import masks_and_scores, truth_and_labels
-from su3d_bench.metrics.semantic.score import counted_classes, point_owners, points_and_owners, taking_part
+from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching import votes as neighbours
+from su3d_bench.metrics.matching.labelling import (
+    candidate_classes,
+    class_index_of_ids,
+    classes_of_prediction,
+    scored_classes,
+)
 from su3d_bench.metrics.protocols import ProtocolRules
-from su3d_bench.core.types import BoolArray, DenseFeatures, Float64Array, GroundTruth, Instances, Int64Array, Partition, Prediction
+from su3d_bench.metrics.scene_score import present
+from su3d_bench.metrics.semantic.score import counted_classes, point_owners, points_and_owners, taking_part
 
 
 def scored_masks(

@@ -41,10 +41,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array
+from su3d_bench.metrics.attribution.overlaps import HALF, LabelledMasks, Overlaps, ScoringRules, measure_overlaps
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
-from su3d_bench.metrics.attribution.overlaps import HALF, LabelledMasks, Overlaps, ScoringRules, measure_overlaps
-from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array
 
 __all__ = ["KINDS", "LabelledMasks", "Mended", "ScoringRules", "count_masks", "mend_scene", "with_true_labels"]
 

@@ -7,10 +7,10 @@ from functools import cached_property
 
 import numpy as np
 
+from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
 from su3d_bench.metrics.matching.nearest import Masks
-from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array
 
 HALF = 0.5  # of a mask or an instance; also the IoU above which a mask can match one instance only
 

@@ -19,9 +19,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
-from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 
 CAUSES = ("geometry", "background", "association", "label")
 NEAR_M = 0.05  # the middle one of the radii at which coverage is reported

@@ -15,8 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, PredictionError
-from su3d_bench.metrics.instance.precision_recall import average_precisions
 from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array
+from su3d_bench.metrics.instance.precision_recall import average_precisions
 
 # arange(0.5, 0.95, 0.05) excludes its end: nine thresholds up to 0.90, as these doubles; then 0.25
 THRESHOLDS: tuple[float, ...] = (*(float(t) for t in np.arange(0.5, 0.95, 0.05)), 0.25)

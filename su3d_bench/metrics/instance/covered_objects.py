@@ -6,10 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from su3d_bench.core.types import GroundTruth, Instances, Int64Array, Partition
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.protocols import TransferRules
-from su3d_bench.core.types import GroundTruth, Instances, Int64Array, Partition
 
 NO_OBJECT = 0
 

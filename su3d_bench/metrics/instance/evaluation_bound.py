@@ -6,9 +6,15 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS, InstanceCounts, count_class, intersections, stacked
-from su3d_bench.metrics.matching.nearest import Masks
 from su3d_bench.core.types import Float64Array, Int64Array
+from su3d_bench.metrics.instance.average_precision import (
+    INSTANCES_PER_CLASS,
+    InstanceCounts,
+    count_class,
+    intersections,
+    stacked,
+)
+from su3d_bench.metrics.matching.nearest import Masks
 
 
 def every_class_counts(

@@ -6,8 +6,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from su3d_bench.metrics.instance.dot_product import dot
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
+from su3d_bench.metrics.instance.dot_product import dot
 
 MOST_REMEMBERED_ROWS = 12  # small curves repeat from scene to scene, longer ones hardly ever
 MANY_ROWS = 20_000  # from there on compiled loops win back the time that they take to load

@@ -10,13 +10,19 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Instances, Int64Array, Partition
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.matching.labelling import candidate_classes, class_index_of_ids, classes_of_prediction, encoder_warning, scored_classes
+from su3d_bench.metrics.matching.labelling import (
+    candidate_classes,
+    class_index_of_ids,
+    classes_of_prediction,
+    encoder_warning,
+    scored_classes,
+)
+from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.metrics.results.results import Counts
 from su3d_bench.metrics.scene_score import SceneScore, n_predictions, present
-from su3d_bench.metrics.protocols import ProtocolRules
-from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Instances, Int64Array, Partition
 
 IntArray = NDArray[np.integer[Any]]
 

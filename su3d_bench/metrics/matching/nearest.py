@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Instances, Int32Array, Int64Array
+from su3d_bench.numerics.geometry import voxel_coordinates
 
 IntArray = NDArray[np.integer[Any]]
 Points = Float32Array | Float64Array

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.metrics.matching.nearest import Masks, Points, row_ids
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
+from su3d_bench.metrics.matching.nearest import Masks, Points, row_ids
 
 _MAX_CELLS = 4_000_000  # neighbours held at once
 

@@ -12,10 +12,10 @@ from typing import Literal
 import numpy as np
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Float32Array, Float64Array, Int64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.matching.nearest import Masks
-from su3d_bench.core.types import Float32Array, Float64Array, Int64Array
 
 SPACE = "queries"
 _SMALLEST_RANGE = 1e-8  # openlex3d's floor of the range over which similarities are stretched

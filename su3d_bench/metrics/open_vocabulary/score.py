@@ -9,22 +9,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.metrics.open_vocabulary import object_means
-from su3d_bench.metrics.open_vocabulary import openlex3d
-from su3d_bench.metrics.open_vocabulary import query_ap
+from su3d_bench.core.types import (
+    DenseFeatures,
+    Float32Array,
+    Float64Array,
+    Instances,
+    Int64Array,
+    Partition,
+    Prediction,
+)
+from su3d_bench.metrics.instance.score import score_of_masks
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, has_every_label, text_features
 from su3d_bench.metrics.matching.votes import transfer_each_mask
+from su3d_bench.metrics.open_vocabulary import object_means, openlex3d, query_ap
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
-from su3d_bench.metrics.scene_score import SceneScore, n_predictions
-from su3d_bench.metrics.instance.score import score_of_masks
-from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.scene_score import SceneScore, n_predictions
+from su3d_bench.metrics.semantic.score import has_feature
+from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.store.row_blocks import release_pages
-from su3d_bench.core.types import DenseFeatures, Float32Array, Float64Array, Instances, Int64Array, Partition, Prediction
 
 NEEDS_FEATURES = "needs features to compare with texts, and the prediction has none"
 _BLOCK_UNITS = 2048  # 2048 units x 3407 prompts of float64 are 56 MB

@@ -8,15 +8,22 @@ import numpy as np
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.instance.covered_objects import NO_OBJECT, Covered, covered_objects
-from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, text_features
-from su3d_bench.metrics.questions.truths import AnnotationTruth, AskedText, GivenAnswer, ReasoningTruth, RetrievalTruth, TrueAnswer
-from su3d_bench.metrics.scene_score import SceneScore, n_predictions
-from su3d_bench.metrics.instance.score import score_of_masks
-from su3d_bench.metrics.questions.shares import ShareCounts
-from su3d_bench.metrics.protocols import VALUES_OF_METRIC, AnswerRules, MergeRules, ProtocolRules
 from su3d_bench.core.types import BoolArray, GroundTruth, Instances, Int64Array, Partition
+from su3d_bench.metrics.instance.covered_objects import NO_OBJECT, Covered, covered_objects
+from su3d_bench.metrics.instance.score import score_of_masks
+from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, text_features
+from su3d_bench.metrics.protocols import VALUES_OF_METRIC, AnswerRules, MergeRules, ProtocolRules
+from su3d_bench.metrics.questions.shares import ShareCounts
+from su3d_bench.metrics.questions.truths import (
+    AnnotationTruth,
+    AskedText,
+    GivenAnswer,
+    ReasoningTruth,
+    RetrievalTruth,
+    TrueAnswer,
+)
+from su3d_bench.metrics.scene_score import SceneScore, n_predictions
 
 WELL_MERGED, UNDER_MERGED, OVER_MERGED = "well-merged", "under-merged", "over-merged"
 

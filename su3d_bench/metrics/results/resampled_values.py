@@ -10,13 +10,13 @@ from typing import cast
 
 import numpy as np
 
-from su3d_bench.metrics.results import resampling
+from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.matching.labelling import scored_classes
+from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules
+from su3d_bench.metrics.results import resampling
 from su3d_bench.metrics.results.results import CURVE_KINDS, Counts
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
-from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules
-from su3d_bench.core.types import Float64Array, Int64Array
 
 
 def class_columns(rules: ProtocolRules) -> tuple[str, ...]:

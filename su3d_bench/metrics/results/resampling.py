@@ -9,10 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 from su3d_bench.metrics.instance.average_precision import THRESHOLDS, InstanceCounts, ap_columns
 from su3d_bench.metrics.instance.precision_recall import MANY_ROWS
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
-from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 
 AT_ONCE = 64  # resamples that go through the rows side by side: their counts stay in the nearest cache
 _MAX_CELLS = 4_000_000  # of a (resamples, rows) block: 32 MB of float64
@@ -23,7 +23,7 @@ def resampled_ap(
 ) -> dict[str, Float64Array]:
     """AP, AP50 and AP25 (R,) of the scenes drawn ``weights`` (R, S) times, equal to ``combine`` up to rounding.
 
-    >>> from su3d_bench.metrics.instance_ap import per_scene
+    >>> from su3d_bench.metrics.instance.average_precision import per_scene
     >>> hit = per_scene(np.full(120, 7004), np.array([0, 120]), np.arange(120), np.array([7]), np.ones(1), [7])
     >>> miss = per_scene(np.full(120, 7009), np.array([0]), np.arange(0), np.zeros(0, int), np.ones(0), [7])
     >>> resampled_ap([hit, miss], np.array([[2, 0], [1, 1], [0, 2]]))["AP"].tolist()

@@ -9,15 +9,15 @@ from typing import Any, cast
 
 import numpy as np
 
+from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.matching.labelling import scored_classes
 from su3d_bench.metrics.open_vocabulary import object_means
+from su3d_bench.metrics.protocols import AP_NAMES, SHARE_KINDS, VALUES_OF_METRIC, ProtocolRules
+from su3d_bench.metrics.questions import shares
 from su3d_bench.metrics.results import resampling
 from su3d_bench.metrics.semantic import confusion as semantic
-from su3d_bench.metrics.questions import shares
-from su3d_bench.metrics.matching.labelling import scored_classes
-from su3d_bench.metrics.protocols import AP_NAMES, SHARE_KINDS, VALUES_OF_METRIC, ProtocolRules
 from su3d_bench.numerics.statistics import percentile_interval, resample_weights
-from su3d_bench.core.types import Float64Array, Int64Array
 
 Counts = instance_ap.InstanceCounts | semantic.SemanticCounts | object_means.ObjectCounts | shares.ShareCounts
 CURVE_KINDS = ("instance", "queries")  # their counts are those of a precision-recall curve

@@ -5,14 +5,20 @@ from __future__ import annotations
 import numpy as np
 
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.metrics.matching import votes as neighbours
-from su3d_bench.metrics.semantic import confusion as semantic
-from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.matching.labelling import candidate_classes, class_index_of_ids, classes_of_prediction, encoder_warning, scored_classes
-from su3d_bench.metrics.scene_score import SceneScore, n_predictions, present
-from su3d_bench.metrics.protocols import ProtocolRules
-from su3d_bench.store.row_blocks import row_blocks
 from su3d_bench.core.types import BoolArray, DenseFeatures, Float64Array, GroundTruth, Int64Array, Partition, Prediction
+from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching import votes as neighbours
+from su3d_bench.metrics.matching.labelling import (
+    candidate_classes,
+    class_index_of_ids,
+    classes_of_prediction,
+    encoder_warning,
+    scored_classes,
+)
+from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.scene_score import SceneScore, n_predictions, present
+from su3d_bench.metrics.semantic import confusion as semantic
+from su3d_bench.store.row_blocks import row_blocks
 
 
 def score_semantic(

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.opensu3d.voxel_map import checked_points, doubled
 from su3d_bench.core.types import Float64Array, Int32Array, Int64Array
+from su3d_bench.opensu3d.voxel_map import checked_points, doubled
 
 ABSENT = -1
 VOXELS = 512  # of a block

@@ -12,7 +12,16 @@ from typing import TypeVar
 
 import numpy as np
 
-from su3d_bench.perception.embedded.lexicon import AFFORDANCES, COLOUR_WORDS, GROUPS, RELATION_WORDS, ROOM_NAMES, SIZE_WORDS, SURFACES, SYNONYMS
+from su3d_bench.perception.embedded.lexicon import (
+    AFFORDANCES,
+    COLOUR_WORDS,
+    GROUPS,
+    RELATION_WORDS,
+    ROOM_NAMES,
+    SIZE_WORDS,
+    SURFACES,
+    SYNONYMS,
+)
 from su3d_bench.perception.embedded.naming import with_article
 
 Word = TypeVar("Word")

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError, ModelMissing
-from su3d_bench.perception.embedded.text import TOKENIZER_VERSION, token_ids
 from su3d_bench.core.types import Float32Array, UInt8Array
+from su3d_bench.perception.embedded.text import TOKENIZER_VERSION, token_ids
 
 IMAGE_SIZE = 64
 DIM = 128
-IMAGE_FILE = "embedded_image.onnx"
-TEXT_FILE = "embedded_text.onnx"
+IMAGE_FILE = "image.onnx"
+TEXT_FILE = "text.onnx"
 PREPROCESSING_VERSION = "1"
 BATCH = 32  # images that run through the network together: 1.6 times as fast as one by one, and no gain beyond
 N_TRIED = 5  # images by which a machine shows that a batch moves no bit; odd, so that kernels meet a remainder
@@ -60,7 +60,7 @@ class EmbeddedEncoder:
     dim = DIM
 
     def __init__(self, folder: Path | None = None, device: str = "cpu") -> None:
-        self._folder = Path(__file__).parent if folder is None else folder
+        self._folder = Path(__file__).parent / "weights" if folder is None else folder
         self.device = device
 
     @cached_property
@@ -143,7 +143,7 @@ class EmbeddedEncoder:
         if not path.is_file():
             raise ModelMissing(
                 f"encoder '{self.name}': there is no {path}; reinstall the package, or train the towers anew with: "
-                f"python -m su3d_bench.perception.training --out {self._folder}"
+                f"python -m su3d_bench.perception.embedded.training.train --out {self._folder}"
             )
         return path
 

@@ -9,8 +9,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.perception.cache import content_key
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, UInt8Array
+from su3d_bench.perception.cache import content_key
 
 # Colour words with the sRGB value that each stands for; chosen to be far apart in CIELAB.
 COLOURS: tuple[tuple[str, tuple[int, int, int]], ...] = (
@@ -45,7 +45,7 @@ class NamingConfig(BaseModel):
 
 def vocabulary() -> tuple[str, ...]:
     """The class names that regions may be called, in the order of the list file."""
-    text = files("su3d_bench.perception").joinpath("vocabulary.txt").read_text(encoding="utf-8")
+    text = files("su3d_bench.perception.embedded.weights").joinpath("vocabulary.txt").read_text(encoding="utf-8")
     lines = (line.strip() for line in text.splitlines())
     return tuple(line for line in lines if line and not line.startswith("#"))
 

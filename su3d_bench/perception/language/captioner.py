@@ -7,13 +7,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
+from su3d_bench.core.types import UInt8Array
+from su3d_bench.perception.embedded.naming import scene_caption
 from su3d_bench.perception.language.chat import ChatRequest, Reply, fitted
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.language.parsing import described, is_refusal
 from su3d_bench.perception.language.prompts import DESCRIBE
-from su3d_bench.perception.embedded.naming import scene_caption
-from su3d_bench.core.types import UInt8Array
 
 logger = logging.getLogger(__name__)
 

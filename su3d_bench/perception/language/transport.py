@@ -22,9 +22,9 @@ from urllib.parse import urlsplit
 from pydantic import BaseModel, Field, ValidationError
 
 from su3d_bench.core.errors import ConfigError, ModelMissing
+from su3d_bench.core.plain_text import printable
 from su3d_bench.perception.language.chat import ChatRequest, Reply, n_tokens
 from su3d_bench.perception.language.config import LanguageConfig, check_address
-from su3d_bench.core.plain_text import printable
 
 HOSTED = "https://api.openai.com/v1"
 STATUS_TO_TRY_AGAIN = frozenset({408, 409, 425, 429})

@@ -7,8 +7,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.core.devices import DEVICE, EXPECTED_DEVICE
+from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.perception.models.onnx.session import Provider
 
 EMBEDDED = "embedded"

@@ -6,22 +6,30 @@ from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 
+from su3d_bench.core.devices import device_for, precision_for, require, require_installed
 from su3d_bench.core.errors import ConfigError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.models.catalogue import FormName
 from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig
-from su3d_bench.core.devices import device_for, precision_for, require, require_installed
 from su3d_bench.perception.models.files import ModelFiles, locate
+from su3d_bench.perception.models.loading import check_encoder
 from su3d_bench.perception.models.masks.grounded_sam import Networks
 from su3d_bench.perception.models.masks.grounding_dino import GroundingDino
-from su3d_bench.perception.models.loading import check_encoder
+from su3d_bench.perception.models.masks.sam import Sam
+from su3d_bench.perception.models.masks.sam_onnx import load_onnx_sam
+from su3d_bench.perception.models.masks.tagging import (
+    RAM_TAG_LIST,
+    OnnxRamTagger,
+    RamTagger,
+    Tagger,
+    WordTagger,
+    load_ram,
+    read_word_list,
+)
 from su3d_bench.perception.models.onnx.session import Provider, open_session
 from su3d_bench.perception.models.paper_config import PaperConfig
 from su3d_bench.perception.models.pretrained import kept, load_grounding_dino, load_sam
-from su3d_bench.perception.models.masks.sam import Sam
-from su3d_bench.perception.models.masks.sam_onnx import load_onnx_sam
-from su3d_bench.perception.models.masks.tagging import RAM_TAG_LIST, OnnxRamTagger, RamTagger, Tagger, WordTagger, load_ram, read_word_list
 
 PAPER_ENCODER, DETECTOR, TAGGER = "clip-vit-h-14", "grounding-dino", "ram-plus"
 PACKAGES = ("torch", "transformers")

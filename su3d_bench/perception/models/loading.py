@@ -6,19 +6,17 @@ from collections.abc import Callable, Mapping
 from functools import lru_cache, partial
 from typing import Any
 
+from su3d_bench.core.devices import CPU, device_for, precision_for, require, require_installed
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.cache import FrameCache
-from su3d_bench.perception.models.encoders import towers_onnx
-from su3d_bench.perception.models.encoders import towers_open_clip
-from su3d_bench.perception.models.encoders import towers_transformers
 from su3d_bench.perception.models.catalogue import FormName, model_entry
 from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, Runtime
-from su3d_bench.core.devices import CPU, device_for, precision_for, require, require_installed
+from su3d_bench.perception.models.encoders import towers_onnx, towers_open_clip, towers_transformers
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, FoundationEncoder, Towers
+from su3d_bench.perception.models.encoders.text_tokens import Tokeniser, read_tokeniser
 from su3d_bench.perception.models.files import ModelFiles, locate
 from su3d_bench.perception.models.onnx.session import Provider
-from su3d_bench.perception.models.encoders.text_tokens import Tokeniser, read_tokeniser
 
 FORM_OF_RUNTIME: Mapping[Runtime, FormName] = {"torch": "transformers", "open_clip": "open_clip", "onnx": "onnx"}
 PACKAGES_OF_RUNTIME: Mapping[Runtime, tuple[str, ...]] = {

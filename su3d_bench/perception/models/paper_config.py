@@ -7,8 +7,8 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from su3d_bench.perception.models.masks.automatic_masks import AutomaticMaskConfig
 from su3d_bench.perception.models.catalogue import MODELS
+from su3d_bench.perception.models.masks.automatic_masks import AutomaticMaskConfig
 from su3d_bench.perception.models.masks.grounded_sam import GroundedConfig
 
 TaggerName = Literal["auto", "ram", "ram-onnx", "words"]

@@ -7,8 +7,8 @@ import pickle
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.errors import DataError
 from su3d_bench.core.devices import require
+from su3d_bench.core.errors import DataError
 from su3d_bench.perception.models.files import ModelFiles
 
 LARGEST_SETTINGS = 2**24  # bytes; a tokenizer.json of 256,000 words has 2**23

@@ -7,15 +7,19 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.numerics.open3d_core import compiled_open3d
 from su3d_bench.core.digests import package_digest
+from su3d_bench.core.types import Float32Array, Frame, InstanceMesh, Int32Array, Regions
+from su3d_bench.numerics.open3d_core import compiled_open3d
 from su3d_bench.perception.cache import array_digest, content_key
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.oracle.noise import OracleNoise, disturb
-from su3d_bench.core.types import Float32Array, Frame, InstanceMesh, Int32Array, Regions
 
 if TYPE_CHECKING:
     import open3d
+
+
+# What moves the regions: their key follows it.
+SOURCES = ("perception/oracle", "perception/crops.py", "numerics")
 
 
 class OracleConfig(BaseModel):
@@ -111,7 +115,12 @@ class OracleSegmenter:
         names = [f"{key}={mesh.class_of_instance[key]}" for key in sorted(mesh.class_of_instance)]
         truth = array_digest(mesh.vertices, mesh.triangles, mesh.instance_of_triangle)
         self.digest = content_key(
-            "oracle", config.model_dump_json(), package_digest("perception"), truth, *mesh.labels.names, *names
+            "oracle",
+            config.model_dump_json(),
+            package_digest(*SOURCES),
+            truth,
+            *mesh.labels.names,
+            *names,
         )
 
     def segment(self, frame: Frame) -> Regions:

@@ -16,10 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.perception.stored.label_images import numbered_files
-from su3d_bench.formats.pickles.pickles import read_pickle_file
 from su3d_bench.core.plain_text import printable
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, Regions, SceneInfo
+from su3d_bench.formats.pickles.pickles import read_pickle_file
+from su3d_bench.perception.stored.label_images import numbered_files
 
 MAX_REGIONS = 2_000  # of one image; SAM gives some hundred
 MAX_NAME_LENGTH = 100

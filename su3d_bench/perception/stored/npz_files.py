@@ -23,11 +23,12 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, model_validator
 
+from su3d_bench.core.damage import DAMAGE
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.store.atomic import DAMAGE, read_arrays
-from su3d_bench.perception.embedded.naming import scene_caption
 from su3d_bench.core.types import Detections, Float32Array, Frame, Regions
+from su3d_bench.perception.embedded.naming import scene_caption
+from su3d_bench.store.atomic import read_arrays
 
 _REQUIRED = ("image_size", "masks", "boxes", "scores", "names")
 _FEATURES = ("crop_ratios", "crop_features", "global_feature", "encoder")

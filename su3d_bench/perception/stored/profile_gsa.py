@@ -7,12 +7,12 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
+from su3d_bench.core.types import Detections, Float32Array, Frame, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.cache import FrameCache, content_key
+from su3d_bench.perception.embedded.naming import scene_caption
 from su3d_bench.perception.features import CropEncoder, NameEncoder, grown_boxes, regions_to_keep
 from su3d_bench.perception.stored.gsa_files import GsaFiles, GsaFrame
-from su3d_bench.perception.embedded.naming import scene_caption
 from su3d_bench.perception.stored.perception import STORED_CAVEAT, StoredRegions, content_digest
-from su3d_bench.core.types import Detections, Float32Array, Frame, PerceptionNeeds, SceneInfo
 
 # Who made the features in the files, and of which crops: boxes and 20 px on every side.
 FEATURES_ENCODER, FEATURES_PADDING_PX = "clip-vit-h-14", 20

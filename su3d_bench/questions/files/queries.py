@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.datasets.recordings.recorded_frames import read_text
 from su3d_bench.core.errors import DataError
-from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
 from su3d_bench.core.plain_text import printable
 from su3d_bench.core.types import GroundTruth
+from su3d_bench.datasets.recordings.recorded_frames import read_text
+from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
 
 COLUMNS = ("scene", "text", "objects")
 MORE_COLUMNS = ("kind", "source")  # may be there, in any order behind the others

@@ -12,11 +12,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from su3d_bench.core.types import Float64Array
 from su3d_bench.questions.reasoning.answers import Answer
 from su3d_bench.questions.reasoning.relations import PairRelation, is_between, is_room_surface, relations_of
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
 from su3d_bench.questions.reasoning.solver import Solver
-from su3d_bench.core.types import Float64Array
 
 MARGIN_M = 0.25  # by which the closest leads
 SIZE_MARGIN = 1.3  # by which the largest leads

@@ -7,10 +7,10 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from su3d_bench.core.types import Float64Array
 from su3d_bench.questions.reasoning.answers import Answer
 from su3d_bench.questions.reasoning.generated import GeneratedQuestion
 from su3d_bench.questions.reasoning.scene_map import SceneMap
-from su3d_bench.core.types import Float64Array
 
 LEAST_IOU = 0.25  # the loosest overlap at which ScanNet's benchmark takes two instances for one
 DISTANCE_M, DISTANCE_SHARE = 0.1, 0.1  # ours: a distance is right within 0.1 m or a tenth

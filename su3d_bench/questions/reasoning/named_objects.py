@@ -13,8 +13,8 @@ import numpy as np
 
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.embedded.lexicon import GROUPS, SYNONYMS
-from su3d_bench.perception.embedded.text import words
 from su3d_bench.perception.embedded.naming import vocabulary
+from su3d_bench.perception.embedded.text import words
 from su3d_bench.questions.reasoning.relations import is_room_surface
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
 

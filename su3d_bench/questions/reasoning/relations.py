@@ -14,8 +14,8 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.perception.embedded.text import words
 from su3d_bench.core.types import Float64Array
+from su3d_bench.perception.embedded.text import words
 
 PairRelation = Literal["on", "under", "in", "above", "next to", "near"]
 PAIR_RELATIONS: tuple[PairRelation, ...] = ("on", "under", "in", "above", "next to", "near")

@@ -10,12 +10,19 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from su3d_bench.core.types import Float64Array
 from su3d_bench.questions.reasoning.answers import Answer, unsettled
 from su3d_bench.questions.reasoning.named_objects import Meant, NearestName, meant_by
 from su3d_bench.questions.reasoning.question_words import ANYTHING, Phrase, Question, Relation, Size, read_question
-from su3d_bench.questions.reasoning.relations import NEAR_M, holds, is_between, is_container, is_left_of, is_room_surface
+from su3d_bench.questions.reasoning.relations import (
+    NEAR_M,
+    holds,
+    is_between,
+    is_container,
+    is_left_of,
+    is_room_surface,
+)
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
-from su3d_bench.core.types import Float64Array
 
 CLOSE_CALL_M = 0.05  # a lead smaller than this is said
 MOST_LISTED = 12

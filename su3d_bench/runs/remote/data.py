@@ -14,8 +14,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.runs.remote.folder import RemoteFolder
 from su3d_bench.runs.job import Part, build_dataset
+from su3d_bench.runs.remote.folder import RemoteFolder
 from su3d_bench.store.run_folder import make_folder
 
 MOST_SHARED_BYTES = 1 << 26  # label tables and camera files; ScanNet's largest has 1 MB

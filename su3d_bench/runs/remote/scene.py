@@ -15,8 +15,8 @@ from pathlib import Path
 from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import StoreError
 from su3d_bench.runs.executors.local import Report
-from su3d_bench.runs.remote.folder import RemoteFolder
 from su3d_bench.runs.job import MethodOutcome, SceneJob
+from su3d_bench.runs.remote.folder import RemoteFolder
 from su3d_bench.runs.scene import failed_outcomes, run_scene
 from su3d_bench.store.run_folder import RunFolder, make_folder, write_bytes
 from su3d_bench.store.temporary_folders import TemporaryFolder

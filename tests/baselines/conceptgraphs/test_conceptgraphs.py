@@ -22,13 +22,13 @@ from conceptgraphs_scene import (
 from painted import colour_perception
 from places import SCENES
 
-from su3d_bench.runs import scene as scene_run
-from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
 from su3d_bench.baselines.conceptgraphs.config import MappingConfig
+from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
 from su3d_bench.cli.main import main
+from su3d_bench.core.timing import Timer
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
-from su3d_bench.core.timing import Timer
+from su3d_bench.runs import scene as scene_run
 
 LEFT, RIGHT = Plate((-0.5, 0.0)), Plate((0.0, 0.5))
 BARE = QUIET.model_copy(update={"obj_min_detections": 0})

@@ -9,10 +9,32 @@ import pytest
 from conceptgraphs_scene import QUIET, an_object, at_cosine, axis, block
 from scipy.spatial import ConvexHull, HalfspaceIntersection
 
-from su3d_bench.baselines.conceptgraphs.boxes import Extents, are_coplanar, axis_aligned_iou, extents_of_boxes, grown, oriented_iou
-from su3d_bench.baselines.conceptgraphs.association import NEW_OBJECT, assign, box_iou, geometric_similarity, overlap_similarity, semantic_similarity, total_similarity
-from su3d_bench.baselines.conceptgraphs.objects import MapObject, denoised, merge_overlapping, merged, overlap_ratios, seen_enough
+from su3d_bench.baselines.conceptgraphs.association import (
+    NEW_OBJECT,
+    assign,
+    box_iou,
+    geometric_similarity,
+    overlap_similarity,
+    semantic_similarity,
+    total_similarity,
+)
+from su3d_bench.baselines.conceptgraphs.boxes import (
+    Extents,
+    are_coplanar,
+    axis_aligned_iou,
+    extents_of_boxes,
+    grown,
+    oriented_iou,
+)
 from su3d_bench.baselines.conceptgraphs.clouds import voxel_average
+from su3d_bench.baselines.conceptgraphs.objects import (
+    MapObject,
+    denoised,
+    merge_overlapping,
+    merged,
+    overlap_ratios,
+    seen_enough,
+)
 from su3d_bench.core.types import OrientedBox
 
 PAPER = QUIET.model_copy(update={"association": "paper"})

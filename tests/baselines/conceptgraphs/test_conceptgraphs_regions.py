@@ -10,15 +10,15 @@ import pytest
 from conceptgraphs_scene import DIMENSION, HEIGHT, QUIET, SCENE, WIDTH, Plate, block, look
 from perception_fakes import CountingEncoder, still_life
 
-from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
-from su3d_bench.baselines.conceptgraphs.config import MappingConfig
-from su3d_bench.baselines.conceptgraphs.regions import LiftedRegion, kept_regions, lift, subtract_contained
 from su3d_bench.baselines.conceptgraphs.clouds import bounding_box, density_clusters, largest_cluster, voxel_average
+from su3d_bench.baselines.conceptgraphs.config import MappingConfig
+from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
+from su3d_bench.baselines.conceptgraphs.regions import LiftedRegion, kept_regions, lift, subtract_contained
 from su3d_bench.core.errors import DataError
-from su3d_bench.numerics.geometry import back_project
-from su3d_bench.perception.profiles import PerceptionConfig, build_perception
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Detections
+from su3d_bench.numerics.geometry import back_project
+from su3d_bench.perception.profiles import PerceptionConfig, build_perception
 
 RNG = np.random.default_rng(3)
 LEFT = Plate((-0.5, 0.0))

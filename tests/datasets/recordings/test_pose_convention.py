@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from su3d_bench.core.types import Float64Array, Frame
 from su3d_bench.datasets.recordings.pose_convention import FLIP, check_convention, judge_convention
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
-from su3d_bench.core.types import Float64Array, Frame
 
 Reading = Callable[[Float64Array], Float64Array]
 N_FRAMES = 45

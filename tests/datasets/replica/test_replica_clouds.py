@@ -13,12 +13,12 @@ from replica_clouds import CLOUDS, REFERENCE, SEQUENCE, first_pose, write_clouds
 from replica_scene import CHAIR, TABLE, WALL, write_render
 from scored_room import instances
 
-from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.datasets.replica.cloud_truth import N_EMBEDDING, read_first_pose
 from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.core.types import Float32Array, Instances
+from su3d_bench.datasets.replica.cloud_truth import N_EMBEDDING, read_first_pose
+from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
-from su3d_bench.core.types import Float32Array, Instances
 
 Change = Callable[[Path], object]
 RUG, FLOOR, DOOR, PICTURE = 98, 40, 37, 59

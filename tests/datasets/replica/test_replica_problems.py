@@ -14,9 +14,9 @@ import pytest
 from damage import damages, outcomes, truncations
 from replica_scene import QUADS, TWO_OBJECTS, info_table, write_original, write_render
 
+from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.datasets.replica import boxes as replica_boxes
 from su3d_bench.datasets.replica.dataset import Replica
-from su3d_bench.core.errors import DataError, GroundTruthMissing
 
 Change = Callable[[Path], object]
 

@@ -11,10 +11,10 @@ from replica_clouds import CLOUDS, REFERENCE, SEQUENCE, write_clouds
 from replica_scene import CHAIR, QUADS, TABLE, TWO_OBJECTS, write_original, write_render
 from scored_room import instances
 
-from su3d_bench.formats.ply import PlyElement, write_ply
+from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.datasets.replica.dataset import Replica
 from su3d_bench.datasets.replica.label_file_truth import OVO_CLASSES, read_whole_numbers
-from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.formats.ply import PlyElement, write_ply
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 

@@ -12,11 +12,11 @@ import pytest
 from pydantic import ValidationError
 from scipy.spatial import cKDTree
 
+from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.datasets.rooms.dataset import DEFAULT_SCENES, N_STRUCTURE, Rooms
 from su3d_bench.datasets.rooms.kept import MESH_ARRAYS, kept_mesh, kept_walk
 from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh
 from su3d_bench.datasets.rooms.scan import RoomScan
-from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.numerics.geometry import back_project
 
 SMALL = Rooms.Options(width=96, height=72, n_frames=80, mesh_spacing_m=0.03)

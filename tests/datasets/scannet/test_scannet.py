@@ -30,16 +30,16 @@ from scannet_scan import (
 from scannet_scans import WHERE, dataset, export, write_scan
 
 from su3d_bench.cli.main import main
-from su3d_bench.formats.images import UInt16Array
+from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing
+from su3d_bench.core.types import Float64Array, UInt8Array
 from su3d_bench.datasets.recordings.source import SensorPair
 from su3d_bench.datasets.scannet.dataset import ScanNet, ScannetOptions
 from su3d_bench.datasets.scannet.folders import PAPER_SCENES, find_scans, split_scenes
 from su3d_bench.datasets.scannet.frames import read_walk
 from su3d_bench.datasets.scannet.labels import TABLE_NAME
-from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing
-from su3d_bench.runs.plan import expand_scenes
+from su3d_bench.formats.images import UInt16Array
 from su3d_bench.runs.job import Part
-from su3d_bench.core.types import Float64Array, UInt8Array
+from su3d_bench.runs.plan import expand_scenes
 
 
 @pytest.mark.parametrize(
@@ -261,7 +261,9 @@ def expand(monkeypatch: pytest.MonkeyPatch, root: Path, *addresses: str) -> list
 
 
 def test_a_split_is_asked_for_by_name_and_must_be_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("su3d_bench.datasets.scannet.dataset.split_scenes", lambda split: (f"scene000{len(split)}_00", SCAN))
+    monkeypatch.setattr(
+        "su3d_bench.datasets.scannet.dataset.split_scenes", lambda split: (f"scene000{len(split)}_00", SCAN)
+    )
     write_scan(tmp_path)
     write_scan(tmp_path, "scene0003_00", n_frames=1)
     assert expand(monkeypatch, tmp_path, "scannet/val", f"scannet/{SCAN}") == ["scannet/scene0003_00", WHERE]

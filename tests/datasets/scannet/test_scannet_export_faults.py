@@ -13,10 +13,10 @@ import pytest
 from damage import damages, outcomes, truncations
 from scannet_toy import RECORDED, SCENE, TOY, WHERE, pgm_bytes, png_bytes, write_cpp_export, write_python_export
 
+from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.recordings.source import RgbdSource
 from su3d_bench.datasets.scannet.recordings import find_source, open_cpp_export, open_python_export
 from su3d_bench.datasets.scannet.sens.read import SensFile
-from su3d_bench.core.errors import DataError
 
 
 def remove(*names: str) -> Callable[[Path], None]:

@@ -12,11 +12,27 @@ import pytest
 from damage import damages, outcomes, truncations
 from scannet_scan import SCAN, TABLE_ROWS, grid, table_text, write_json, write_mesh, write_truth
 
-from su3d_bench.datasets.scannet.annotations import aggregation_name, object_of_vertex, read_objects, read_segments, segments_name
+from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.datasets.scannet.annotations import (
+    aggregation_name,
+    object_of_vertex,
+    read_objects,
+    read_segments,
+    segments_name,
+)
 from su3d_bench.datasets.scannet.labels import TABLE_NAME, LabelTable, nyu40_label_set, raw_label_set, read_label_table
 from su3d_bench.datasets.scannet.scannet_meta import read_axis_alignment
-from su3d_bench.datasets.scannet.truth import AnnotatedScan, aligned, instance_mesh, labels_name, mesh_name, nyu40_truth, read_annotated_scan, scannet200_truth, truth_names
-from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.datasets.scannet.truth import (
+    AnnotatedScan,
+    aligned,
+    instance_mesh,
+    labels_name,
+    mesh_name,
+    nyu40_truth,
+    read_annotated_scan,
+    scannet200_truth,
+    truth_names,
+)
 from su3d_bench.metrics.instance.average_precision import encode_ground_truth
 from su3d_bench.metrics.protocols import load_protocol
 

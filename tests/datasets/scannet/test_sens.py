@@ -22,10 +22,10 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from places import CASES
 
-from su3d_bench.datasets.scannet.sens.read import MOTION_RECORD, SensFile, SensSource
-from su3d_bench.datasets.scannet.sens.header import SensHeader
-from su3d_bench.datasets.scannet.sens.write import SensFrame, colour_content, depth_content, stored_frame, write_sens
 from su3d_bench.core.errors import DataError, StoreError
+from su3d_bench.datasets.scannet.sens.header import SensHeader
+from su3d_bench.datasets.scannet.sens.read import MOTION_RECORD, SensFile, SensSource
+from su3d_bench.datasets.scannet.sens.write import SensFrame, colour_content, depth_content, stored_frame, write_sens
 
 TOY, RAW_TOY = CASES / "sens01_toy.sens", CASES / "sens02_toy_raw.sens"
 WHERE = "scannet/scene0000_00"

@@ -15,9 +15,17 @@ import pytest
 
 from su3d_bench.core.errors import DataError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.perception.embedded import encoder as embedded_encoder
-from su3d_bench.perception.embedded.encoder import DIM, IMAGE_FILE, IMAGE_SIZE, TEXT_FILE, EmbeddedEncoder, log_size, shrink
 from su3d_bench.core.types import UInt8Array
+from su3d_bench.perception.embedded import encoder as embedded_encoder
+from su3d_bench.perception.embedded.encoder import (
+    DIM,
+    IMAGE_FILE,
+    IMAGE_SIZE,
+    TEXT_FILE,
+    EmbeddedEncoder,
+    log_size,
+    shrink,
+)
 
 FOLDER = Path(embedded_encoder.__file__).parent
 TEXTS = ("an image of a chair", "plant on table", "table on plant", "a green towel", "place to sit")

@@ -6,7 +6,16 @@ import numpy as np
 import pytest
 
 from su3d_bench.core import registry
-from su3d_bench.perception.embedded.captions import Caption, CropTruth, Neighbour, class_caption, class_words, draw_caption, fixed_captions, wrong_relation
+from su3d_bench.perception.embedded.captions import (
+    Caption,
+    CropTruth,
+    Neighbour,
+    class_caption,
+    class_words,
+    draw_caption,
+    fixed_captions,
+    wrong_relation,
+)
 from su3d_bench.perception.embedded.lexicon import AFFORDANCES, GROUPS, SYNONYMS
 from su3d_bench.perception.embedded.text import words
 from su3d_bench.perception.embedded.training.targets import TruthTable

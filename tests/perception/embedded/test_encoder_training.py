@@ -9,10 +9,17 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.errors import ModelMissing
-from su3d_bench.perception.embedded.training import train as training
 from su3d_bench.perception.embedded.captions import fill
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
-from su3d_bench.perception.embedded.training.crops import FIRST_HELD_OUT_NUMBER, FIRST_TRAINING_NUMBER, CropSet, make_crops, read_crops, room_names
+from su3d_bench.perception.embedded.training import train as training
+from su3d_bench.perception.embedded.training.crops import (
+    FIRST_HELD_OUT_NUMBER,
+    FIRST_TRAINING_NUMBER,
+    CropSet,
+    make_crops,
+    read_crops,
+    room_names,
+)
 
 CLASSES = tuple(json.loads((Path(training.__file__).parent / "model_card.json").read_text())["training"]["classes"])
 

@@ -14,16 +14,16 @@ from hypothesis import strategies as st
 from scored_room import instances
 
 from su3d_bench.core.errors import PredictionError, StoreError
+from su3d_bench.core.types import Instances
 from su3d_bench.perception.language.captioner import Captioner
 from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.perception.language.client import ChatClient
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.language.parsing import Described, answered, chosen_name, described
+from su3d_bench.perception.language.reply_store import ReplyStore
 from su3d_bench.questions.refined_names import read_records, records_of, write_records
 from su3d_bench.questions.refinement import ModelRefiner, TopNames, top_names, vote
-from su3d_bench.perception.language.reply_store import ReplyStore
 from su3d_bench.store.run_folder import JobFolder, prediction_arrays, prediction_from_arrays, write_prediction
-from su3d_bench.core.types import Instances
 
 NAMES = ("white sofa", "sofa", "couch", "trash can", "indoor-plant")
 

@@ -8,10 +8,20 @@ import numpy as np
 import pytest
 from tiny_models import blocks, tiny_sam
 
-from su3d_bench.perception.models.masks.automatic_masks import AUTOMATIC_MASKS, AutomaticMaskConfig, AutomaticMasks, Crop, crops_of, is_cut_by_crop, point_grid, stability, without_small_parts
+from su3d_bench.core.types import BoolArray, Float32Array
+from su3d_bench.perception.models.masks.automatic_masks import (
+    AUTOMATIC_MASKS,
+    AutomaticMaskConfig,
+    AutomaticMasks,
+    Crop,
+    crops_of,
+    is_cut_by_crop,
+    point_grid,
+    stability,
+    without_small_parts,
+)
 from su3d_bench.perception.models.masks.sam import Prompts, Sam
 from su3d_bench.perception.models.masks.sam_networks import TorchSam
-from su3d_bench.core.types import BoolArray, Float32Array
 
 
 def mask_of(rows: str) -> BoolArray:

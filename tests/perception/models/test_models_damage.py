@@ -10,12 +10,12 @@ from typing import Any
 import pytest
 from damage import damages, outcomes
 
-from su3d_bench.perception.models.encoders import towers_transformers
 from su3d_bench.perception.models.catalogue import model_entry
+from su3d_bench.perception.models.encoders import towers_transformers
+from su3d_bench.perception.models.encoders.towers_onnx import FORMAT, read_manifest
 from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.masks.sam_onnx import FORMAT as SAM_FORMAT
 from su3d_bench.perception.models.masks.sam_onnx import read_sam_manifest
-from su3d_bench.perception.models.encoders.towers_onnx import FORMAT, read_manifest
 
 PARITY = [{"output": "image", "n_values": 5, "max_abs_difference": 1e-6, "min_cosine": 1.0}]
 TRANSFORM = {

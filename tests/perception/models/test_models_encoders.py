@@ -15,13 +15,13 @@ from tiny_encoders import DIM, needs_models, noise_images, write_tiny_clip, writ
 
 from su3d_bench.core.errors import ConfigError, DataError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, FoundationEncoder, unit_rows
 from su3d_bench.perception.models.encoders.image_transform import ImageTransform
 from su3d_bench.perception.models.loading import load_encoder
 from su3d_bench.perception.models.weights import read_weights
-from su3d_bench.core.types import Float32Array, Int64Array
 
 TEXTS = ("chair", "a red cup on the table", "chair", "zebra")
 RAW = EncoderSpec(3, 4, 10, "clip", None, ImageTransform(4))

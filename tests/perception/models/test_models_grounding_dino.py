@@ -10,8 +10,15 @@ import numpy as np
 import pytest
 from tiny_models import DINO_PX, blocks, tiny_dino, tiny_tokenizer
 
-from su3d_bench.perception.models.masks.grounding_dino import CONCEPTGRAPHS_BOXES, BoxConfig, GroundingDino, is_in_phrase, tag_of, text_prompt
 from su3d_bench.core.types import Float32Array
+from su3d_bench.perception.models.masks.grounding_dino import (
+    CONCEPTGRAPHS_BOXES,
+    BoxConfig,
+    GroundingDino,
+    is_in_phrase,
+    tag_of,
+    text_prompt,
+)
 
 RGB = blocks(40, 60)
 TAGS = ("cat", "coffee table", "sofa")

@@ -13,13 +13,18 @@ import pytest
 from tiny_encoders import noise_images, write_tiny_clip, write_tiny_siglip
 
 from su3d_bench.core.errors import CheckFailed, ConfigError, DataError, ModelMissing
-from su3d_bench.perception.models.onnx import export as onnx_export
 from su3d_bench.perception.models.config import ModelsConfig
+from su3d_bench.perception.models.encoders.towers_onnx import (
+    LARGEST_DIFFERENCE,
+    check_parity,
+    export_encoder,
+    read_manifest,
+)
 from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.loading import load_encoder
+from su3d_bench.perception.models.onnx import export as onnx_export
 from su3d_bench.perception.models.onnx.export import Parity, compare_outputs, export_onnx, measure_parity
 from su3d_bench.perception.models.onnx.session import Provider, open_session
-from su3d_bench.perception.models.encoders.towers_onnx import LARGEST_DIFFERENCE, check_parity, export_encoder, read_manifest
 
 torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'su3d-bench[models]'")
 pytest.importorskip("transformers", reason="transformers is not installed: pip install 'su3d-bench[models]'")

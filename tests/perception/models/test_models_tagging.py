@@ -13,12 +13,21 @@ import pytest
 from tiny_models import blocks
 
 from su3d_bench.core.errors import DataError, ModelMissing
+from su3d_bench.core.types import Float32Array, UInt8Array
+from su3d_bench.perception.embedded.naming import vocabulary
 from su3d_bench.perception.models.catalogue import model_entry
 from su3d_bench.perception.models.files import ModelFiles
-from su3d_bench.perception.models.masks.tagging import RAM_PX, OnnxRamTagger, RamTagger, WordTagger, chosen_tags, load_ram, ram_pixels, read_word_list
-from su3d_bench.perception.embedded.naming import vocabulary
+from su3d_bench.perception.models.masks.tagging import (
+    RAM_PX,
+    OnnxRamTagger,
+    RamTagger,
+    WordTagger,
+    chosen_tags,
+    load_ram,
+    ram_pixels,
+    read_word_list,
+)
 from su3d_bench.perception.models.masks.tagging_words import ADDED_TAGS, BACKGROUND_TAGS, STOP_WORDS
-from su3d_bench.core.types import Float32Array, UInt8Array
 
 RGB = blocks(40, 60)
 

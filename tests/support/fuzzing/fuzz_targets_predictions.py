@@ -66,8 +66,8 @@ def _pickle(kind: str) -> Make:
     def make(folder: Path) -> Read:
         from test_predictions_pickles import written
 
-        from su3d_bench.formats.pickles.pickles import read_pickle_file
         from su3d_bench.formats.numpy_files import read_npy_value
+        from su3d_bench.formats.pickles.pickles import read_pickle_file
 
         path = folder / kind
         path.write_bytes(written(folder, kind))
@@ -104,8 +104,8 @@ def _own_prediction(kind: str) -> Make:
     def make(folder: Path) -> Read:
         from prediction_files import own_instances
 
-        from su3d_bench.store.run_folder import read_prediction, write_prediction
         from su3d_bench.core.types import DenseFeatures, Partition, Prediction
+        from su3d_bench.store.run_folder import read_prediction, write_prediction
 
         points = np.zeros((3, 3), np.float32)
         predictions: dict[str, Prediction] = {

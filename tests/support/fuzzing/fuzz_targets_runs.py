@@ -58,13 +58,13 @@ def _checked_counts(side: Any, protocol: str) -> None:
 
 def _run(folder: Path) -> Read:
     """Everything that is read of a finished run."""
+    from su3d_bench.analysis.gate import check, learn, read_reference
+    from su3d_bench.analysis.leaderboard import leaderboard
     from su3d_bench.analysis.sides import Side
+    from su3d_bench.analysis.tables import measured_results
     from su3d_bench.runs.estimate import recent_update_s
     from su3d_bench.runs.finished import read_run
     from su3d_bench.runs.finished_updates import read_update_times
-    from su3d_bench.analysis.gate import check, learn, read_reference
-    from su3d_bench.analysis.leaderboard import leaderboard
-    from su3d_bench.analysis.tables import measured_results
 
     path, reference = copied_run(folder), folder / "reference.json"
     reference.write_text(json.dumps(learn([read_run(path)]).model_dump(mode="json")))
@@ -208,9 +208,9 @@ def _config(name: str, *more: str) -> Make:
 def _method_config(folder: Path) -> Read:
     """The settings of all methods of our own in one file."""
     from su3d_bench.core.config import check_keys, read_file, resolve
-    from su3d_bench.perception.config import PerceptionConfig
     from su3d_bench.core.registry import METHODS, load
     from su3d_bench.core.toml_text import write_toml
+    from su3d_bench.perception.config import PerceptionConfig
 
     classes = {name: load("method", name).Config for name in METHODS}
     leaves: list[Any] = []
@@ -260,8 +260,8 @@ def _ablation(folder: Path) -> Read:
 
 def _assignments(folder: Path) -> Read:
     """Words of ``--set``, of variants and of ``--vary``, one a line of a file."""
-    from su3d_bench.runs.ablation import ablation_rows
     from su3d_bench.core.config import parse_value, read_assignments
+    from su3d_bench.runs.ablation import ablation_rows
     from su3d_bench.runs.method_names import named_method
 
     lines = ("opensu3d.top_m=10", "top_m=10,5", "perception.cache=false", "rooms.width=64", "opensu3d.a='x'")

@@ -9,8 +9,8 @@ from typing import Any
 import cv2
 import numpy as np
 
-from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 from su3d_bench.datasets.replica.replica_labels import replica_label_set
+from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 
 WIDTH, HEIGHT, SCALE = 12, 8, 6553.5
 CAMERA = {"w": WIDTH, "h": HEIGHT, "fx": 6.0, "fy": 6.5, "cx": 5.5, "cy": 3.5, "scale": SCALE}

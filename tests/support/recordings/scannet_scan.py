@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
+from su3d_bench.core.types import Float64Array, UInt8Array
 from su3d_bench.datasets.scannet.sens.header import SensHeader
 from su3d_bench.datasets.scannet.sens.write import SensFrame, colour_content, depth_content, write_sens
-from su3d_bench.core.types import Float64Array, UInt8Array
+from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 
 SCAN = "scene0000_00"
 COLUMNS, ROWS, SPACING_M = 6, 4, 0.5  # of the vertices of the small mesh

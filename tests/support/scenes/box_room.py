@@ -8,8 +8,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 from su3d_bench.datasets.replica.replica_labels import replica_label_set
+from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 
 WIDTH, HEIGHT, FOCAL, SCALE = 48, 36, 24.0, 6553.5
 SIZE = np.array([4.0, 3.0, 2.5])

@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from su3d_bench.baselines.conceptgraphs.clouds import bounding_box
 from su3d_bench.baselines.conceptgraphs.config import MappingConfig
 from su3d_bench.baselines.conceptgraphs.objects import MapObject, Sighting
-from su3d_bench.baselines.conceptgraphs.clouds import bounding_box
-from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Detections, Frame, Instances, SceneInfo
+from su3d_bench.perception.crops import mask_boxes
 
 SCENE = SceneInfo("made", "plates", 4, 1, "rendered-rooms", seed=7)
 WIDTH, HEIGHT, FOCAL = 96, 72, 72.0

@@ -9,9 +9,9 @@ import numpy as np
 from scored_room import instances
 
 from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.types import Float32Array, Instances, UInt8Array
 from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels, OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
-from su3d_bench.core.types import Float32Array, Instances, UInt8Array
 
 OBJECTS = {
     7: ObjectLabels(("chair", "seat"), ("flower",), ("stool",), (12,)),

@@ -12,7 +12,7 @@ if str(HERE) not in sys.path:
 
 from painted import Collector, Painted, colour_perception  # noqa: E402
 
-from su3d_bench.runs import scene as scene_run
+from su3d_bench.runs import scene as scene_run  # noqa: E402
 
 if "pytest" not in sys.modules:  # a test patches, and unpatches, its own process
     patch.object(scene_run, "build_perception", colour_perception).start()

@@ -5,9 +5,9 @@ from unittest.mock import patch
 
 from painted import colour_perception
 
+from su3d_bench.cli.main import main
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.cli.main import main
 
 # At import, so that spawned workers, which import this file too, have it as well.
 for module in (scene_run, finished_scenes):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.numerics.compiled import njit
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array
+from su3d_bench.numerics.compiled import njit
 
 
 @njit(cache=True)

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, UInt8Array
 from su3d_bench.perception.embedded.segmenter.config import SegmenterConfig
 from su3d_bench.perception.embedded.segmenter.graph import Graph, Pieces, measure_borders
-from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, UInt8Array
 
 
 def superpixels(frame: Frame, config: SegmenterConfig) -> tuple[Int32Array, Graph]:

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from su3d_bench.core.types import BoolArray, Float64Array
 from su3d_bench.perception.embedded.segmenter.config import JoinWeights, SegmenterConfig
 from su3d_bench.perception.embedded.segmenter.graph import Graph, IndexArray, Pieces, contract, merge_cheapest
-from su3d_bench.core.types import BoolArray, Float64Array
 
 
 def join_surfaces(graph: Graph, config: SegmenterConfig, is_apart: BoolArray | None = None) -> Graph:

@@ -7,15 +7,19 @@ from typing import Literal
 import numpy as np
 
 from su3d_bench.core.digests import package_digest
+from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int32Array, Regions
 from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.embedded.segmenter.config import SegmenterConfig
 from su3d_bench.perception.embedded.segmenter.graph import Graph
 from su3d_bench.perception.embedded.segmenter.pixels import superpixels
 from su3d_bench.perception.embedded.segmenter.rules import join_objects, region_quality, take_out_structure
-from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int32Array, Regions
 
 __all__ = ["RgbdSegmenter", "SegmenterConfig"]
+
+
+# What moves the regions: their key follows it.
+SOURCES = ("perception/embedded/segmenter", "perception/crops.py", "numerics")
 
 
 class RgbdSegmenter:
@@ -29,7 +33,7 @@ class RgbdSegmenter:
             weights = weights.model_copy(update={"bias": weights.bias - config.parts_caution})
         self._config = config.model_copy(update={"join": weights})
         self._level = level
-        self.digest = content_key("rgbd", level, config.model_dump_json(), package_digest("perception"))
+        self.digest = content_key("rgbd", level, config.model_dump_json(), package_digest(*SOURCES))
 
     def segment(self, frame: Frame) -> Regions:
         """Masks that do not overlap, largest first."""

@@ -10,10 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.types import BoolArray, Float32Array, Int64Array
 from su3d_bench.perception.embedded.captions import Caption, CropTruth, class_words, fill, fixed_captions
 from su3d_bench.perception.embedded.lexicon import ROOM_NAMES, SURFACES
 from su3d_bench.perception.embedded.training.crops import CropSet
-from su3d_bench.core.types import BoolArray, Float32Array, Int64Array
 
 PROMPTS = ("an image of {a}", "{a} in a scene", "{}")
 MIN_POSITIVES = 3

@@ -14,12 +14,19 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from su3d_bench.perception.embedded.captions import Caption, class_caption, draw_caption, fixed_captions, room_caption, wrong_relation
+from su3d_bench.core.types import Float32Array, Int64Array, UInt8Array
+from su3d_bench.perception.embedded.captions import (
+    Caption,
+    class_caption,
+    draw_caption,
+    fixed_captions,
+    room_caption,
+    wrong_relation,
+)
 from su3d_bench.perception.embedded.text import PADDING, token_ids
 from su3d_bench.perception.embedded.training.crops import CropSet
-from su3d_bench.perception.embedded.training_model import ImageTower, TextTower
 from su3d_bench.perception.embedded.training.targets import TruthTable
-from su3d_bench.core.types import Float32Array, Int64Array, UInt8Array
+from su3d_bench.perception.embedded.training_model import ImageTower, TextTower
 
 logger = logging.getLogger(__name__)
 

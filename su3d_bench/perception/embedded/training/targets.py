@@ -8,8 +8,8 @@ from operator import attrgetter
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.perception.embedded.captions import Caption, CropTruth
 from su3d_bench.core.types import BoolArray, Float32Array
+from su3d_bench.perception.embedded.captions import Caption, CropTruth
 
 Names = dict[str, int]
 

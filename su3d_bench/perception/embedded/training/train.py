@@ -1,6 +1,6 @@
 """Train the embedded encoder on rendered rooms that no benchmark uses, export it and measure it.
 
-    python -m su3d_bench.perception.training --out DIR --rooms 360 --minutes 30 --seed 0
+    python -m su3d_bench.perception.embedded.training.train --out DIR --rooms 360 --minutes 30 --seed 0
 
 Needs the models extra (torch, onnx). Time decides how many steps are made, so two trainings differ in their weights.
 """
@@ -20,7 +20,12 @@ from typing import TYPE_CHECKING
 
 from su3d_bench.core.errors import ModelMissing, Su3dError
 from su3d_bench.perception.embedded.encoder import DIM, IMAGE_FILE, TEXT_FILE, EmbeddedEncoder
-from su3d_bench.perception.embedded.training.crops import FIRST_HELD_OUT_NUMBER, FIRST_TRAINING_NUMBER, make_crops, room_names
+from su3d_bench.perception.embedded.training.crops import (
+    FIRST_HELD_OUT_NUMBER,
+    FIRST_TRAINING_NUMBER,
+    make_crops,
+    room_names,
+)
 from su3d_bench.perception.embedded.training.evaluation import Figure, measure
 
 if TYPE_CHECKING:
@@ -28,6 +33,7 @@ if TYPE_CHECKING:
 
 logger = logging.getLogger(__name__)
 
+PROGRAM = "su3d_bench.perception.embedded.training.train"
 CARD_JSON, CARD_TEXT = "model_card.json", "model_card.md"
 
 
@@ -52,8 +58,8 @@ def run(order: Order) -> tuple[Figure, ...]:
     for package in ("torch", "onnx"):
         if importlib.util.find_spec(package) is None:
             raise ModelMissing(f"training needs {package}: pip install 'su3d-bench[models]'")
-    from su3d_bench.perception.embedded.training.training_export import export, largest_difference
     from su3d_bench.perception.embedded.training.loop import TrainingPlan, train
+    from su3d_bench.perception.embedded.training.training_export import export, largest_difference
 
     names = room_names(order.rooms, FIRST_TRAINING_NUMBER)
     crops = make_crops(names, order.frames_per_room, order.seed, order.cache, order.jobs)
@@ -136,7 +142,7 @@ def _card_text(
     return f"""# Model card: {EmbeddedEncoder.name}
 
 Two small towers, image and text, into one space of {DIM} dimensions; {sizes}. Written by
-`python -m su3d_bench.perception.training`; the same facts for programs are in `{CARD_JSON}`.
+`python -m {PROGRAM}`; the same facts for programs are in `{CARD_JSON}`.
 
 ## What it is for
 Naming, describing and retrieving objects of the built-in rooms (dataset `rooms`, and the same rooms in Replica's
@@ -175,7 +181,7 @@ ONNX Runtime and torch differ by at most {difference:.1e} in any feature.
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """The command line; the answer is the table of figures."""
-    parser = argparse.ArgumentParser(prog="python -m su3d_bench.perception.training", description=__doc__)
+    parser = argparse.ArgumentParser(prog=f"python -m {PROGRAM}", description=__doc__)
     parser.add_argument("--out", type=Path, required=True, help="folder for the two ONNX files and the model card")
     parser.add_argument("--cache", type=Path, help="folder for rendered crops; default: OUT/crops")
     parser.add_argument("--rooms", type=int, default=360)

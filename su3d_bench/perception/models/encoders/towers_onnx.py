@@ -16,18 +16,18 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import CheckFailed, DataError, StoreError
-from su3d_bench.perception.models.encoders import towers_transformers
+from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
+from su3d_bench.perception.models.encoders import towers_transformers
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, check_spec, unit_rows
-from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.encoders.image_transform import Convention, ImageTransform
+from su3d_bench.perception.models.encoders.text_tokens import read_tokeniser
+from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.onnx.export import compare_outputs, export_onnx
 from su3d_bench.perception.models.onnx.manifest import OnnxManifest, common_fields, described, read_common, wrong_files
 from su3d_bench.perception.models.onnx.session import Provider, open_session
-from su3d_bench.perception.models.encoders.text_tokens import read_tokeniser
 from su3d_bench.perception.models.weights import bounded
 from su3d_bench.store.run_folder import make_folder, write_json
-from su3d_bench.core.types import Float32Array, Int64Array
 
 FORMAT = "su3d-bench onnx encoder 1"
 IMAGE_FILE, TEXT_FILE = "image.onnx", "text.onnx"

@@ -15,11 +15,18 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from su3d_bench.core.devices import Batches
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, Regions, UInt8Array
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.models.masks.box_suppression import suppress
-from su3d_bench.core.devices import Batches
-from su3d_bench.perception.models.masks.sam import FULL_SIZE_AT_ONCE, MASK_THRESHOLD, OBJECT_POINT, Prompts, Sam, SeenImage
-from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, Regions, UInt8Array
+from su3d_bench.perception.models.masks.sam import (
+    FULL_SIZE_AT_ONCE,
+    MASK_THRESHOLD,
+    OBJECT_POINT,
+    Prompts,
+    Sam,
+    SeenImage,
+)
 
 CROP_EDGE_PX = 20.0  # a box so near to a crop's edge is taken as cut by it
 Share = float

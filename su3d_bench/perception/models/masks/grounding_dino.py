@@ -12,9 +12,9 @@ from typing import Any, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.perception.models.masks.box_suppression import corners_of, suppress
-from su3d_bench.perception.models.encoders.model_images import normalised, resized, size_with_shortest_side
 from su3d_bench.core.types import BoolArray, Float32Array, Int64Array, UInt8Array
+from su3d_bench.perception.models.encoders.model_images import normalised, resized, size_with_shortest_side
+from su3d_bench.perception.models.masks.box_suppression import corners_of, suppress
 
 # The published network's images: T.RandomResize([800], max_size=1333).
 SHORTEST_PX, LONGEST_PX = 800, 1333

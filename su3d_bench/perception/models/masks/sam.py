@@ -13,8 +13,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from su3d_bench.core.devices import Batches
-from su3d_bench.perception.models.encoders.model_images import normalised, resized, size_with_longest_side
 from su3d_bench.core.types import BoolArray, Float32Array, Int64Array, UInt8Array
+from su3d_bench.perception.models.encoders.model_images import normalised, resized, size_with_longest_side
 
 MASK_THRESHOLD = 0.0  # on the network's logits
 BACKGROUND_POINT, OBJECT_POINT = 0, 1

@@ -6,8 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.perception.models.masks.sam import Prompts
 from su3d_bench.core.types import Float32Array
+from su3d_bench.perception.models.masks.sam import Prompts
 
 
 class TorchSam:

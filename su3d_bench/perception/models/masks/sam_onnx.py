@@ -14,15 +14,15 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import CheckFailed, DataError
+from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
 from su3d_bench.perception.models.files import ModelFiles
+from su3d_bench.perception.models.masks.sam import Prompts
 from su3d_bench.perception.models.onnx.export import Parity, compare_outputs, export_onnx
 from su3d_bench.perception.models.onnx.manifest import OnnxManifest, common_fields, described, read_common, wrong_files
 from su3d_bench.perception.models.onnx.session import Provider, open_session
 from su3d_bench.perception.models.pretrained import load_sam
-from su3d_bench.perception.models.masks.sam import Prompts
 from su3d_bench.store.run_folder import make_folder, write_json
-from su3d_bench.core.types import Float32Array, Int64Array
 
 FORMAT = "su3d-bench onnx segmenter 1"
 ENCODER_FILE, DECODER_FILE = "encoder.onnx", "decoder.onnx"

@@ -9,15 +9,15 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from su3d_bench.core.devices import make_deterministic, require
 from su3d_bench.core.errors import DataError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.perception.cache import content_key
-from su3d_bench.core.devices import make_deterministic, require
-from su3d_bench.perception.models.files import ModelFiles
-from su3d_bench.perception.models.encoders.model_images import normalised, resized
-from su3d_bench.perception.models.weights import bounded, read_weights
-from su3d_bench.perception.embedded.naming import vocabulary, with_article
 from su3d_bench.core.types import Float32Array, UInt8Array
+from su3d_bench.perception.cache import content_key
+from su3d_bench.perception.embedded.naming import vocabulary, with_article
+from su3d_bench.perception.models.encoders.model_images import normalised, resized
+from su3d_bench.perception.models.files import ModelFiles
+from su3d_bench.perception.models.weights import bounded, read_weights
 
 RAM_PX = 384
 RAM_TAG_LIST = "ram_tag_list.txt"

@@ -6,14 +6,14 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
+from su3d_bench.core.devices import require
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.perception.models.catalogue import MODELS, ModelEntry
-from su3d_bench.core.devices import require
-from su3d_bench.perception.models.files import locate
-from su3d_bench.perception.models.onnx.export import Parity
-from su3d_bench.perception.models.masks.sam_onnx import SamManifest, export_sam
 from su3d_bench.perception.models.encoders.towers_onnx import Manifest as EncoderManifest
 from su3d_bench.perception.models.encoders.towers_onnx import export_encoder
+from su3d_bench.perception.models.files import locate
+from su3d_bench.perception.models.masks.sam_onnx import SamManifest, export_sam
+from su3d_bench.perception.models.onnx.export import Parity
 
 EXPORTED_KINDS = ("encoder", "segmenter")
 
