@@ -22,7 +22,7 @@ from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.perception.embedded.encoder import IMAGE_SIZE, EmbeddedEncoder
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
 from su3d_bench.runs.executors.local import one_thread
-from su3d_bench.runs.read_ahead import ReadAhead
+from su3d_bench.runs.feeding import ReadAhead
 
 N_FRAMES = 8
 NEEDS = OpenSU3D(OpenSU3D.Config()).needs

@@ -32,7 +32,7 @@ from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 from su3d_bench.datasets.scannet.sens.header import SensHeader, header_bytes
 from su3d_bench.datasets.scannet.sens.read import FRAME_RECORD, SensFile
 from su3d_bench.datasets.scannet.sens.write import SensFrame, colour_content, depth_content, write_sens
-from su3d_bench.runs.read_ahead import ReadAhead
+from su3d_bench.runs.feeding import ReadAhead
 
 Images = tuple[UInt8Array, np.ndarray]  # colour (H, W, 3) and depth (H, W) of a frame
 N_REPLICA, N_SENS, N_DIFFERENT = 24, 48, 6  # frames that are read; images that they repeat

@@ -35,7 +35,8 @@ WINDOW = 4  # samples over which what is wanted is held to what the cores have: 
 COMMAND = """
 import json, sys
 from contextlib import contextmanager
-from su3d_bench.cli import main, progress
+from su3d_bench.cli import main
+from su3d_bench.cli import common as progress
 @contextmanager
 def lines(*_, **__):
     yield lambda one: print(json.dumps([one.unit, one.label, one.done, one.total]), file=sys.stderr, flush=True)

@@ -45,8 +45,7 @@ from su3d_bench.perception.models.encoders.towers_onnx import export_encoder
 from su3d_bench.perception.models.files import locate
 from su3d_bench.perception.models.loading import load_encoder
 from su3d_bench.perception.models.masks.grounding_dino import GroundingDino
-from su3d_bench.perception.models.masks.sam import Sam
-from su3d_bench.perception.models.masks.sam_networks import TorchSam
+from su3d_bench.perception.models.masks.sam import Sam, TorchSam
 
 REPEATS = 5
 CLIP = "clip-vit-h-14"

@@ -23,8 +23,7 @@ from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.perception.models.encoders.towers_transformers import TransformersTowers
 from su3d_bench.perception.models.masks.automatic_masks import AUTOMATIC_MASKS, AutomaticMasks
 from su3d_bench.perception.models.masks.grounding_dino import BoxConfig, GroundingDino
-from su3d_bench.perception.models.masks.sam import Sam
-from su3d_bench.perception.models.masks.sam_networks import TorchSam
+from su3d_bench.perception.models.masks.sam import Sam, TorchSam
 from su3d_bench.perception.models.pretrained import sam_config
 from su3d_bench.runs.plan import data_root
 

@@ -17,8 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.baselines.openmask3d.method import OpenMask3DConfig
-from su3d_bench.baselines.openmask3d.openmask3d_segment3d import OpenMask3DSegment3DConfig
+from su3d_bench.baselines.openmask3d.method import OpenMask3DConfig, OpenMask3DSegment3DConfig
 from su3d_bench.baselines.openmask3d.proposals import ProposalConfig, make_proposals
 from su3d_bench.core import registry
 from su3d_bench.core.types import Float64Array, GroundTruth, Proposals

@@ -18,9 +18,8 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError, GroundTruthMissing, Su3dError
+from su3d_bench.core.errors import DataError, GroundTruthMissing, Su3dError, printable
 from su3d_bench.core.interfaces import Dataset
-from su3d_bench.core.plain_text import printable
 from su3d_bench.core.types import Float32Array, Frame, InstanceMesh
 from su3d_bench.datasets.checks_of_frames import (
     Finding,

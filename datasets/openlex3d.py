@@ -15,8 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import DataError, GroundTruthMissing, printable
 from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.datasets.replica.mesh_truth import MESH_NAME, AnnotatedMesh
 from su3d_bench.formats.pcd import read_pcd_points

@@ -3,11 +3,47 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
 from xml.etree import ElementTree
 
-from su3d_bench.core.plain_text import printable
-from su3d_bench.reports.gate_findings import Finding, Verdict
+from su3d_bench.core.errors import printable
 from su3d_bench.reports.tables.run import NOT_MEASURED
+
+
+@dataclass(frozen=True)
+class Finding:
+    """A difference; every kind but ``better`` fails. ``reference`` and ``measured`` are fractions, or costs."""
+
+    kind: Literal["regression", "missing", "changed", "cost", "better"]
+    where: str
+    text: str
+    reference: float | None = None
+    measured: float | None = None
+    tolerance: float | None = None
+
+    @property
+    def is_failure(self) -> bool:
+        return self.kind != "better"
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """All findings of one run; ``n_compared`` headline values were looked at."""
+
+    run: str
+    findings: tuple[Finding, ...]
+    n_compared: int
+    remarks: tuple[str, ...]
+
+    @property
+    def failures(self) -> tuple[Finding, ...]:
+        return tuple(one for one in self.findings if one.is_failure)
+
+    @property
+    def is_passed(self) -> bool:
+        return not self.failures
+
 
 MAX_ROWS = 60  # a comment on a pull request may hold 65,536 characters
 

@@ -56,7 +56,9 @@ def imported_rooms(source: str) -> list[tuple[int, str]]:
             modules = [f"su3d_bench.{a.name}" for a in node.names if a.name != "__version__"]
         elif isinstance(node, ast.ImportFrom) and node.module:
             modules = [node.module]
-        found += [(node.lineno, name.split(".")[1]) for name in modules if name.startswith("su3d_bench.")]
+        found += [
+            (getattr(node, "lineno", 0), name.split(".")[1]) for name in modules if name.startswith("su3d_bench.")
+        ]
     return found
 
 

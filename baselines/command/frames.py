@@ -8,9 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError
-from su3d_bench.core.plain_text import printable
-from su3d_bench.core.toml_text import write_toml
+from su3d_bench.core.config import write_toml
+from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.types import Float64Array, Frame, SceneInfo, Surface
 from su3d_bench.store.run_folder import make_folder, write_bytes, write_text
 

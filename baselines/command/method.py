@@ -18,11 +18,10 @@ from su3d_bench.baselines.command.frames import ColourFormat, FrameFolder
 from su3d_bench.baselines.command.prediction import as_prediction, class_names, needs_classes, read_output
 from su3d_bench.baselines.command.process import ContainerWatch, Finished, TreeWatch, Watch, run_program
 from su3d_bench.core.digests import digest_file
-from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError
+from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError, printable
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
-from su3d_bench.core.plain_text import printable
 from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, Prediction, SceneInfo, Surface
-from su3d_bench.store.temporary_folders import TemporaryFolder
+from su3d_bench.store.scratch import TemporaryFolder
 
 logger = logging.getLogger(__name__)
 logger.setLevel(logging.INFO)  # what a program prints goes to the log of its scene

@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.types import Instances, Prediction, Surface
 from su3d_bench.metrics.matching.nearest import masks_of_partition
 from su3d_bench.metrics.protocols import load_protocol, protocols_for

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
-from su3d_bench.store.row_blocks import release_pages
-from su3d_bench.store.scratch import scratch_folder
+from su3d_bench.store.scratch import release_pages, scratch_folder
 
 Place = Literal["memory", "disk"]
 HalfArray = NDArray[np.float16]

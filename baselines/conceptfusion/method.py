@@ -180,3 +180,28 @@ def _warm_up() -> None:
     for _ in range(2):
         view = view_of(frame, picked(2, 2), picked(2, 2), 0.6)
         scratch.insert(view, scratch.associate(view))
+
+
+class ConceptFusionSamConfig(ConceptFusionConfig):
+    """ConceptFusion's, without the uniqueness term: its README says that SAM's masks do without it."""
+
+    weights: Weights = "softmax"
+
+
+class ConceptFusionSam(ConceptFusion):
+    """Pixel features from class-agnostic masks of every region, fused into one feature a point; it has no instances."""
+
+    name = "conceptfusion-sam"
+    Config = ConceptFusionSamConfig
+    about = MethodAbout(
+        paper=f"{PAPER}; with SAM's masks: Gu et al.: ConceptGraphs, ICRA 2024, Table II",
+        source=SOURCE,
+        licence=LICENCE,
+        needs=("class-agnostic masks",),
+        status=STATUS,
+    )
+
+    @property
+    def needs(self) -> PerceptionNeeds:
+        """Every region of an image, of objects and of their parts, which may overlap."""
+        return PerceptionNeeds(masks="class-agnostic", automatic="conceptfusion")

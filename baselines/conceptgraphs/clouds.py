@@ -23,7 +23,7 @@ def voxel_average(points: Float64Array, voxel_m: float) -> Float64Array:
     """
     if not len(points):
         return points
-    from su3d_bench.baselines.conceptgraphs import object_clouds_kernels as kernels
+    from su3d_bench.baselines.conceptgraphs import kernels as kernels
 
     grid = _grid(points, points.min(axis=0) - voxel_m / 2, voxel_m)
     averaged: Float64Array = kernels.means(points, grid.cell_of_point, grid.n_cells)
@@ -85,7 +85,7 @@ class _Grid:
 
 
 def _grid(points: Float64Array, origin: Float64Array, side_m: float) -> _Grid:
-    from su3d_bench.baselines.conceptgraphs import object_clouds_kernels as kernels
+    from su3d_bench.baselines.conceptgraphs import kernels as kernels
     from su3d_bench.numerics.cells import ABSENT
 
     n = len(points)

@@ -5,11 +5,165 @@ It is bound to its proposals: what no proposal covers is never found, what one m
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping
+from typing import Annotated, Literal
 
-from su3d_bench.baselines.openmask3d.mask_pipeline import MaskPipeline, MaskPipelineConfig
+import numpy as np
+from pydantic import Field
+
+from su3d_bench.baselines.openmask3d.features import FeatureMeans, Looking, crop_boxes, prompted_mask
+from su3d_bench.baselines.openmask3d.proposals import ProposalConfig, make_proposals
+from su3d_bench.baselines.openmask3d.views import (
+    NO_VIEW,
+    MaskViews,
+    as_openmask3d,
+    count_pixels,
+    pixels_of_mask,
+    visible_pixels,
+)
+from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
-from su3d_bench.core.types import Detections, Frame, Instances, PerceptionNeeds, SceneInfo
+from su3d_bench.core.types import (
+    Detections,
+    Float32Array,
+    Float64Array,
+    Frame,
+    Instances,
+    Int64Array,
+    PerceptionNeeds,
+    SceneInfo,
+)
+
+Pixels = Annotated[int, Field(ge=2, le=65536)]
+
+
+class MaskPipelineConfig(ProposalConfig):
+    """Hyper-parameters of views, prompts and crops with the names and values of OpenMask3D's configuration.
+
+    ``intrinsics``: ``as-is`` projects with the frame's own; ``openmask3d`` with what the original's scaling would make
+    of them, had the frames been reduced from ``intrinsic_resolution`` (height, width): its centre is about a pixel off.
+    ``confidence``: 1 for every mask, as the original is evaluated, or the score of its ``proposal``.
+    """
+
+    stride: int = Field(default=10, ge=1)  # openmask3d.frequency
+    top_k: int = Field(default=5, ge=1, le=1000)
+    vis_threshold: Annotated[float, Field(ge=0, allow_inf_nan=False)] = 0.2  # m
+    num_random_rounds: int = Field(default=10, ge=1, le=1000)
+    num_selected_points: int = Field(default=5, ge=1, le=1000)
+    num_of_levels: int = Field(default=3, ge=1, le=100)
+    multi_level_expansion_ratio: Annotated[float, Field(ge=0, le=10)] = 0.1
+    intrinsics: Literal["as-is", "openmask3d"] = "as-is"
+    intrinsic_resolution: Annotated[tuple[Pixels, Pixels], Field(strict=False)] = (968, 1296)
+    confidence: Literal["ones", "proposal"] = "ones"
+
+    @property
+    def looking(self) -> Looking:
+        """How a view is looked at."""
+        return Looking(
+            self.num_random_rounds, self.num_selected_points, self.num_of_levels, self.multi_level_expansion_ratio
+        )
+
+
+class MaskPipeline:
+    """Counts in each update what each mask shows; ``finish`` reads the chosen frames again, once each and in order."""
+
+    def __init__(self, config: MaskPipelineConfig, tools: SceneTools, scene: SceneInfo) -> None:
+        self.proposals = make_proposals(config, tools, scene.dataset, scene.scene)
+        self.finish_costs: dict[str, float | int] = {}
+        self._config, self._tools, self._scene = config, tools, scene
+        self._views = MaskViews(len(self.proposals), config.top_k)
+        self._frame_indices: list[int] = []
+
+    def update(self, frame: Frame, timer: StageTimer) -> None:
+        """Projects all vertices into the frame and enters it among each mask's views."""
+        with timer.stage("project"):
+            pixels = self._visible(frame)
+        with timer.stage("select"):
+            counts = count_pixels(pixels, self.proposals, frame.depth_m.size)
+            self._views.add(len(self._frame_indices), counts)
+        self._frame_indices.append(frame.index)
+
+    def _visible(self, frame: Frame) -> np.ndarray:
+        config = self._config
+        exact = config.intrinsics == "as-is"
+        intrinsics = frame.intrinsics if exact else as_openmask3d(frame, config.intrinsic_resolution)
+        return visible_pixels(self.proposals.points, frame, intrinsics, config.vis_threshold)
+
+    def finish(self) -> Instances:
+        """The proposals with the mean feature of their views so far; changes nothing."""
+        start = time.perf_counter()
+        means = FeatureMeans(len(self.proposals), self._tools.regions.dim)
+        chosen = np.unique(self._views.positions[self._views.positions != NO_VIEW])
+        n_views = 0
+        for position in chosen.tolist():
+            frame = self._frame_again(position)
+            pixels = self._visible(frame)
+            for mask in np.flatnonzero((self._views.positions == position).any(axis=1)).tolist():
+                n_views += self._look(mask, frame, pixels, means)
+        self.finish_costs = {
+            "n_frames_again": len(chosen),
+            "n_views": n_views,
+            "look_ms": round((time.perf_counter() - start) * 1e3, 3),
+        }
+        return self._instances(means.means)
+
+    def _frame_again(self, position: int) -> Frame:
+        frame = self._tools.frames[position]
+        if frame.index != self._frame_indices[position]:
+            raise DataError(
+                f"{self._scene.dataset}/{self._scene.scene}: update {position} was frame "
+                f"{self._frame_indices[position]}, read again it is frame {frame.index}; the scene has changed"
+            )
+        return frame
+
+    def _look(self, mask: int, frame: Frame, visible: np.ndarray, means: FeatureMeans) -> int:
+        """Adds the features of the crops of one view of ``mask``; 0 where its prompts find nothing."""
+        config, regions = self._config, self._tools.regions
+        pixels = pixels_of_mask(visible, self.proposals.mask(mask), frame.depth_m.shape[1])
+        # Each view has a generator of its own, so that neither other masks nor an earlier finish move its prompts.
+        rng = np.random.default_rng([self._scene.seed, mask, frame.index])
+        seen = prompted_mask(regions, frame, pixels, config.looking, rng)
+        if seen is None:
+            return 0
+        means.add(mask, regions.encode_regions(frame, seen, crop_boxes(seen, config.looking)))
+        return 1
+
+    def _instances(self, features: Float64Array) -> Instances:
+        proposals, views = self.proposals, self._views
+        k = len(proposals)
+        is_view = views.positions != NO_VIEW
+        frame_of = np.append(np.array(self._frame_indices, np.int32), np.int32(-1))
+        # In the order of their number of pixels; of a view no detection is known but the mask itself.
+        rows = np.stack([frame_of[views.positions], np.broadcast_to(np.arange(k)[:, None], is_view.shape)], axis=-1)
+        boxes, centroids = _extents(proposals.points, proposals.indptr, proposals.indices)
+        return Instances(
+            points=proposals.points,
+            indptr=proposals.indptr,
+            indices=proposals.indices,
+            scores=np.ones(k) if self._config.confidence == "ones" else proposals.scores,
+            features=features.astype(np.float32),
+            labels=None,
+            names=("",) * k,
+            captions=("",) * k,
+            boxes=boxes,
+            centroids=centroids,
+            view_indptr=np.concatenate([[0], np.cumsum(is_view.sum(axis=1))]).astype(np.int64),
+            views=rows[is_view].astype(np.int32).reshape(-1, 2),
+            ids=np.arange(1, k + 1, dtype=np.int32),
+        )
+
+
+def _extents(points: Float32Array, indptr: Int64Array, indices: np.ndarray) -> tuple[Float32Array, Float32Array]:
+    """Corners (K, 2, 3) and centroids (K, 3) of masks; zeros for an empty one."""
+    k = len(indptr) - 1
+    boxes, centroids = np.zeros((k, 2, 3), np.float32), np.zeros((k, 3), np.float32)
+    for mask in range(k):
+        members = points[indices[indptr[mask] : indptr[mask + 1]]]
+        if len(members):
+            boxes[mask] = members.min(axis=0), members.max(axis=0)
+            centroids[mask] = members.mean(axis=0, dtype=np.float64)
+    return boxes, centroids
 
 
 class OpenMask3DConfig(MaskPipelineConfig):
@@ -91,3 +245,38 @@ class OpenMask3D:
     def finish(self) -> Instances:
         """The proposals with features from their best views so far."""
         return self._started.finish()
+
+
+# Views, prompts, crops and features are OpenMask3D's. Source of what differs: Segment3D's evaluation script at commit
+# 1861478.
+class OpenMask3DSegment3DConfig(MaskPipelineConfig):
+    """OpenMask3D's settings with Segment3D's for proposals: 400 queries, and parts by density instead of by gaps."""
+
+    part_eps_m: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.05  # general.dbscan_eps
+    part_min_points: int = Field(default=5, ge=1)  # general.dbscan_min_points
+    part_most_dropped: int = Field(default=15, ge=0)
+    part_kept_share: Annotated[float, Field(gt=0, le=1)] = 0.8  # general.topk_per_image
+    surface_most: int = Field(default=400, ge=1, le=100_000)  # queries of the evaluation script
+    surface_min_points: int = Field(default=16, ge=1)  # more than what part_most_dropped drops
+    # SAM cuts objects into parts and parts of parts; so of two nested proposals more stay beside each other.
+    surface_same_iou: Annotated[float, Field(gt=0, le=1)] = 0.8
+
+
+class OpenMask3DSegment3D(OpenMask3D):
+    """OpenMask3D with Segment3D's proposals: many fine parts, small and weak ones dropped."""
+
+    name = "openmask3d-segment3d"
+    Config: type[MaskPipelineConfig] = OpenMask3DSegment3DConfig
+    about = MethodAbout(
+        paper="Huang et al.: Segment3D: Learning Fine-Grained Class-Agnostic 3D Segmentation without Manual Labels, "
+        "ECCV 2024, with the features of OpenMask3D (NeurIPS 2023)",
+        source="https://github.com/LeapLabTHU/Segment3D, commit 1861478; "
+        "https://github.com/OpenMask3D/openmask3d, commit 3bc3fc5",
+        licence="none stated (Segment3D); MIT (OpenMask3D)",
+        needs=("a mesh of the scan", "Segment3D's exported masks; without them weight-free proposals from the mesh"),
+        status="as openmask3d; connected parts, dropped ones and the kept share are tested on hand-worked values; no "
+        "public file of these proposals was found, and no figure has been reproduced",
+    )
+
+    def __init__(self, config: MaskPipelineConfig | None = None) -> None:
+        super().__init__(config or OpenMask3DSegment3DConfig())

@@ -7,8 +7,7 @@ from functools import cache
 from pathlib import Path
 
 from su3d_bench.core.digests import digest_file, digest_json
-from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import shown
+from su3d_bench.core.errors import PredictionError, shown
 from su3d_bench.core.types import Proposals, Surface
 from su3d_bench.predictions.base import VertexMasks
 

@@ -16,9 +16,8 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, GroundTruth
-from su3d_bench.datasets.replica.folders import FUSED_CLOUD
+from su3d_bench.datasets.replica.folders import FUSED_CLOUD, replica_label_set
 from su3d_bench.datasets.replica.frames import poses_of_lines
-from su3d_bench.datasets.replica.replica_labels import replica_label_set
 from su3d_bench.formats.hdf5 import largest_column, read_rows
 
 N_EMBEDDING = 102  # channel i is Replica's class i, 0 is 'other'

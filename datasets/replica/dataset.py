@@ -11,7 +11,7 @@ from pydantic import BaseModel, ConfigDict
 from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
 from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, SceneInfo, Surface
 from su3d_bench.datasets.replica.boxes import read_boxes
-from su3d_bench.datasets.replica.checks import original_problems, render_problems
+from su3d_bench.datasets.replica.checks import digest_of, original_problems, render_problems
 from su3d_bench.datasets.replica.cloud_truth import cloud_files, conceptgraphs_truth
 from su3d_bench.datasets.replica.folders import (
     CLOUDS_URL,
@@ -51,7 +51,6 @@ from su3d_bench.datasets.replica.mesh_truth import (
     triangle_mesh,
     vertex_truth,
 )
-from su3d_bench.datasets.replica.replica_digest import digest_of
 
 READER_VERSION = 2  # raise it whenever the same files come out as other frames or another truth
 

@@ -9,9 +9,11 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import LabelSet
 
 OFFICIAL_SCENES = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")
 RENDER_FOLDERS = ("Replica", "replica", ".")
@@ -154,3 +156,13 @@ def read_marker(folder: Path) -> dict[str, str]:
             f"{path}: not the marker that `su3d-bench datasets make` writes ({error}); delete it if the scenes were "
             "not made by it, otherwise make them again"
         ) from error
+
+
+LABEL_SPACE = "replica"
+
+
+@cache
+def replica_label_set() -> LabelSet:
+    """The 101 classes, ids 1 to 101; 0 is void and no class."""
+    rows = json.loads(Path(__file__).with_name("labels.json").read_text(encoding="utf-8"))
+    return LabelSet(LABEL_SPACE, tuple(int(row["id"]) for row in rows), tuple(str(row["name"]) for row in rows))

@@ -20,10 +20,10 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, GroundTruth, Int32Array
+from su3d_bench.datasets.replica.folders import replica_label_set
 from su3d_bench.datasets.replica.mesh_truth import vertex_positions
-from su3d_bench.datasets.replica.replica_labels import replica_label_set
 from su3d_bench.formats.ply import read_ply
-from su3d_bench.formats.ply_header import MAX_HEADER_BYTES, read_header
+from su3d_bench.formats.ply_parts import MAX_HEADER_BYTES, read_header
 
 INSTANCES_PER_CLASS = 1000  # ScanNet's format
 BLOCK_BYTES = 1 << 20

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, GroundTruth, InstanceMesh, Int32Array, Int64Array, Surface
-from su3d_bench.datasets.replica.replica_labels import replica_label_set
+from su3d_bench.datasets.replica.folders import replica_label_set
 from su3d_bench.formats.ply import ListColumn, PlyElement, PlyFile, read_ply
 
 MESH_NAME = "habitat/mesh_semantic.ply"

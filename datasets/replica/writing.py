@@ -11,12 +11,11 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, Frame
-from su3d_bench.datasets.replica.folders import original_name
+from su3d_bench.datasets.replica.folders import original_name, replica_label_set
 from su3d_bench.datasets.replica.frames import colour_name, depth_name
 from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, MESH_NAME
-from su3d_bench.datasets.replica.replica_labels import replica_label_set
 from su3d_bench.datasets.writing import Scan, ScannedDataset, ScannedObject, SceneTarget, write_shared_text
-from su3d_bench.formats.layout_files import (
+from su3d_bench.formats.images import (
     JPEG_QUALITY,
     depth_in_units,
     jpeg_bytes,

@@ -27,7 +27,7 @@ from su3d_bench.core.types import (
     Surface,
 )
 from su3d_bench.datasets.rooms.classes import CLASSES
-from su3d_bench.datasets.rooms.rendering.rooms_noise import LEVELS, add_noise
+from su3d_bench.datasets.rooms.rendering.render import LEVELS, add_noise
 
 if TYPE_CHECKING:  # what makes a room is imported where one is made: a list of scenes needs none of it
     from su3d_bench.datasets.rooms.plan import Plan

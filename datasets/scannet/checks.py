@@ -17,8 +17,14 @@ from su3d_bench.datasets.recordings.source import RgbdSource
 from su3d_bench.datasets.scannet.annotations import aggregation_name, read_objects, read_segments, segments_name
 from su3d_bench.datasets.scannet.frames import classify_poses, faulty_pose, read_walk
 from su3d_bench.datasets.scannet.labels import TABLE_NAME, read_label_table
-from su3d_bench.datasets.scannet.scannet_meta import meta_name, read_axis_alignment
-from su3d_bench.datasets.scannet.truth import labels_name, mesh_name, read_annotated_scan, truth_names
+from su3d_bench.datasets.scannet.truth import (
+    labels_name,
+    mesh_name,
+    meta_name,
+    read_annotated_scan,
+    read_axis_alignment,
+    truth_names,
+)
 from su3d_bench.formats.ply import read_ply
 
 MOST_POSES = 20  # named one by one; the rest is counted

@@ -21,17 +21,23 @@ from su3d_bench.datasets.scannet.checks import annotation_problems, recording_pr
 from su3d_bench.datasets.scannet.folders import PAPER_SCENES, SPLITS, ScanFolders, find_scans, no_scans, split_scenes
 from su3d_bench.datasets.scannet.frames import ScannetFrames, Walk, read_walk
 from su3d_bench.datasets.scannet.labels import TABLE_NAME, LabelTable, read_label_table
-from su3d_bench.datasets.scannet.recordings import SourceKind, find_source
-from su3d_bench.datasets.scannet.scannet_meta import meta_name, read_axis_alignment
-from su3d_bench.datasets.scannet.scannet_recordings import describe_recording, digest_recording, folder_of_recording
+from su3d_bench.datasets.scannet.recordings import (
+    SourceKind,
+    describe_recording,
+    digest_recording,
+    find_source,
+    folder_of_recording,
+)
 from su3d_bench.datasets.scannet.truth import (
     AnnotatedScan,
     aligned,
     instance_mesh,
     mesh_name,
+    meta_name,
     moved,
     nyu40_truth,
     read_annotated_scan,
+    read_axis_alignment,
     read_surface,
     scannet200_truth,
     truth_names,

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import printable
 from su3d_bench.core.types import BoolArray, Float64Array, Instances, Int64Array, UInt8Array
 from su3d_bench.reports.pictures.maps import DRAWN_SPACING_M, NO_INSTANCE, Cloud, Colour, instance_colours, thinned
 from su3d_bench.reports.pictures.render import OVERSAMPLING, Camera, View, colour, render, room_bounds, view_cameras

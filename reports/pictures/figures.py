@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.errors import ConfigError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.types import UInt8Array
 from su3d_bench.reports.pictures.items import Tag
 from su3d_bench.reports.pictures.scene import drawable

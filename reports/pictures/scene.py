@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import printable
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, UInt8Array
 from su3d_bench.reports.pictures.maps import (
     NO_INSTANCE,

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import printable
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.costs import MAP, UpdateTimes, pooled
 from su3d_bench.numerics.statistics import growth_exponent

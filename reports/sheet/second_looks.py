@@ -9,7 +9,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 from urllib.parse import quote
 
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import printable
 from su3d_bench.reports.tables.formats import harmless
 
 COLUMNS = ("item_id", "question", "reason", "answers", "truth", "scene", "methods", "text", "pictures")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import printable
 from su3d_bench.reports.tables.run import NOT_MEASURED, aligned, percent
 
 NAMES = {"ap": "AP", "ap50": "AP50", "ap25": "AP25", "macc": "mAcc", "miou": "mIoU", "fmiou": "F-mIoU"}

@@ -7,7 +7,7 @@ import html
 import io
 from collections.abc import Sequence
 
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import printable
 from su3d_bench.reports.tables.model import Cell, Table, blocks_of
 from su3d_bench.reports.tables.run import aligned
 

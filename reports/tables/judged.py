@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
-from su3d_bench.core.errors import ConfigError
-from su3d_bench.reports.tables.measured import Measured
-from su3d_bench.reports.tables.model import Cell, Table, TableRow
-from su3d_bench.reports.tables.paper import Shown, protocol_table, reported_rows
+from su3d_bench.core.errors import ConfigError, printable
+from su3d_bench.reports.tables.comparison import signed
+from su3d_bench.reports.tables.model import NOT_MEASURED, Cell, Measured, Table, TableRow
+from su3d_bench.reports.tables.paper import Shown, percent, protocol_table, reported_rows
 from su3d_bench.reports.tables.published import Figure, PaperTable, published
 
 OWN_NAMES = {"merge-accuracy": "well-merged"}  # the paper's name: ours
@@ -132,3 +133,156 @@ def _own(cell: Cell, layout: JudgedLayout) -> Cell:
         return cell
     metric = layout.parts[part].get(cell.origin.metric, cell.origin.metric)
     return replace(cell, origin=replace(cell.origin, method=method, metric=metric))
+
+
+SUBJECTS = {
+    "retrieval": ("Retrieval by text", "is the instance ranked first right?"),
+    "annotation": ("Labels and merging of instances", "is the label right, how was the mask merged?"),
+    "reasoning": ("Spatial reasoning", "is the answer right, and are the objects that it names?"),
+}
+JUDGES = {"people": "people", "automatic": "ground truth"}
+SHOWN_TESTS = 60  # pairs of methods under one metric; scores.json has all
+
+
+def sheet_tables(scores: Mapping[str, Any]) -> list[Table]:
+    """Accuracies of each dataset, tests between methods, agreement, and people against the ground truth."""
+    datasets = dict.fromkeys(cell["dataset"] for cell in scores["cells"])
+    tables = [_accuracies(scores, dataset) for dataset in datasets]
+    tables += [_tests(scores["tests"])] if scores["tests"] else []
+    shared = [one for one in scores["agreements"] if one["agreement"]["n_items"]]
+    tables += [_agreements(shared)] if shared else []
+    pairs = [(one["ask"], pair) for one in shared for pair in one["agreement"]["pairs"]]
+    tables += [_pairs(pairs)] if pairs else []
+    return [*tables, *(_confusion(one, scores["automatic_rule"]) for one in scores["confusions"])]
+
+
+def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
+    cells = {(c["judge"], c["method"], c["metric"]): c for c in scores["cells"] if c["dataset"] == dataset}
+    metrics = list(dict.fromkeys(metric for _, _, metric in cells))
+    rows = []
+    for judge, what in JUDGES.items():
+        methods = dict.fromkeys(method for who, method, _ in cells if who == judge)
+        for method in methods:
+            row = tuple(_accuracy(cells.get((judge, method, metric))) for metric in metrics)
+            rows.append(TableRow(f"{method} ({what})", row, group=judge))
+    n_scenes = len({scene for cell in cells.values() for scene in cell["per_scene"]})
+    # methods share items, so that their sum would count a judgement several times
+    unclear = max((c["n_cannot_tell"] for c in cells.values() if c["judge"] == "people"), default=0)
+    subject, question = SUBJECTS[scores["kind"]]
+    people = ", ".join(f"{name} {n}" for name, n in scores["annotators"].items())
+    judged = f"{scores['n_judged']} of {scores['n_items']} items judged; judgements by {people}"
+    judged = judged if people else f"no person judged; {scores['n_items']} items"
+    return Table(
+        name=f"{scores['kind']}-{dataset}",
+        caption=f"{subject} on {dataset}, {n_scenes} scene{'s' if n_scenes != 1 else ''}: {question}",
+        head="method",
+        columns=tuple(metrics),
+        rows=tuple(rows),
+        notes=(
+            "Per cent; in brackets the 95 % interval over resampled items, then the number of items. An item that "
+            "several people judged counts once, with the share of them that said so. The ground truth judges the same "
+            "items, as far as it knows them",
+            f"set {scores['sheet_id']} of run {scores['run']}; {judged}",
+            *([f"answers by {printable(scores['answered_by'], 100)}"] if scores["answered_by"] else []),
+            *([f"'cannot tell' is left out: at most {unclear} judgements of a number"] if unclear else []),
+            *([f"no answers from {', '.join(scores['silent'])}"] if scores["silent"] else []),
+        ),
+    )
+
+
+def _accuracy(cell: Mapping[str, Any] | None) -> Cell:
+    if cell is None or cell["value"] is None:
+        return Cell(NOT_MEASURED)
+    return Cell(percent(cell["value"]), f"{_bracket(cell['interval'])}n={cell['n_items']}")
+
+
+def _bracket(interval: Sequence[float] | None) -> str:
+    return "" if interval is None else f"[{percent(interval[0])}, {percent(interval[1])}] "
+
+
+def _tests(tests: Sequence[Mapping[str, Any]]) -> Table:
+    rows = []
+    differing = [one for one in tests if one["n_differ"]]
+    for one in differing[:SHOWN_TESTS]:
+        low_high = one["interval"]
+        beside = "" if low_high is None else f"[{signed(low_high[0])}, {signed(low_high[1])}]"
+        texts = (one["metric"], str(one["n_items"]), str(one["n_differ"]))
+        p = f"{one['p']:.3g}" if one["is_exact"] else f"about {one['p']:.2g}"
+        cells = (*map(Cell, texts), Cell(signed(one["difference"]), beside), Cell(p), Cell(f"{one['smallest_p']:.2g}"))
+        rows.append(TableRow(f"{one['right']} - {one['left']} ({one['dataset']})", cells))
+    n_same, n_more = len(tests) - len(differing), len(differing) - len(rows)
+    return Table(
+        name="differences",
+        caption="Differences between methods, as people judged them.",
+        head="difference",
+        columns=("metric", "n", "differ", "points", "p", "smallest p"),
+        rows=tuple(rows),
+        notes=(
+            "p: two-sided sign-flip test over what differs (McNemar's exact test where each is judged once); smallest "
+            "p: the least that so many can give; not corrected for the number of tests",
+            *([f"{n_same} of {len(tests)} comparisons are left out: nothing differs"] if n_same else []),
+            *([f"{n_more} more differences are in scores.json"] if n_more else []),
+        ),
+    )
+
+
+def _agreements(found: Sequence[Mapping[str, Any]]) -> Table:
+    rows = []
+    for one in found:
+        of = one["agreement"]
+        share = f"{of['n_equal']}/{of['n_items']}"
+        low_high = of["interval"]
+        beside = "" if low_high is None else f"[{low_high[0]:.2f}, {low_high[1]:.2f}]"
+        fleiss = f"(n={of['n_fleiss']}, {of['n_raters']} each)" if of["fleiss"] is not None else ""
+        cells = (Cell(str(of["n_annotators"])), Cell(share), Cell(_coefficient(of["alpha"]), beside))
+        rows.append(TableRow(one["ask"], (*cells, Cell(_coefficient(of["fleiss"]), fleiss))))
+    return Table(
+        name="agreement",
+        caption="Agreement of annotators.",
+        head="question",
+        columns=("annotators", "all equal", "Krippendorff's alpha", "Fleiss' kappa"),
+        rows=tuple(rows),
+        notes=(
+            "1: they agree on all, 0: as chance would have it; over items with two answers or more; 'cannot tell' is "
+            "an answer; in brackets the 95 % interval over resampled items",
+        ),
+    )
+
+
+def _pairs(pairs: Sequence[tuple[str, Mapping[str, Any]]]) -> Table:
+    rows = [
+        TableRow(
+            f"{pair['left']}, {pair['right']}",
+            (Cell(ask), Cell(f"{pair['n_equal']}/{pair['n']}"), Cell(_coefficient(pair["kappa"]))),
+        )
+        for ask, pair in pairs
+    ]
+    return Table(
+        name="pairs",
+        caption="Agreement of each pair of annotators.",
+        head="annotators",
+        columns=("question", "equal", "Cohen's kappa"),
+        rows=tuple(rows),
+        notes=("over the items that both judged; -: undefined, for want of items or of a second answer",),
+    )
+
+
+def _coefficient(value: float | None) -> str:
+    return NOT_MEASURED if value is None else f"{value:.3f}"
+
+
+def _confusion(one: Mapping[str, Any], rule: str) -> Table:
+    columns = [k for k, _ in enumerate(one["choices"]) if any(row[k] for row in one["counts"])]
+    rows = [
+        TableRow(f"people: {choice}", tuple(Cell(str(one["counts"][k][column])) for column in columns))
+        for k, choice in enumerate(one["choices"])
+    ]
+    share = f"{one['n_equal']} of {one['n']} judgements are those of the ground truth" if one["n"] else "none is clear"
+    return Table(
+        name=f"confusion-{one['ask']}",
+        caption=f"People against the ground truth: {one['ask']}.",
+        head="judgements",
+        columns=tuple(f"truth: {one['choices'][k]}" for k in columns),
+        rows=tuple(rows),
+        notes=(f"{share}; Cohen's kappa {_coefficient(one['kappa'])}; truth: {rule}",),
+    )

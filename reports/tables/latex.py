@@ -9,7 +9,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from urllib.parse import quote, unquote
 
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import printable
 from su3d_bench.reports.tables.model import Cell, Interval, Origin, Table, TableRow, What, blocks_of
 
 HEADER = "% made by su3d-bench report tables; needs \\usepackage{booktabs}; su3d-bench report verify checks it"

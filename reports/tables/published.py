@@ -10,8 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from su3d_bench.core.errors import ConfigError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import ConfigError, printable
 
 FILE = Path(__file__).resolve().parent / "published.toml"
 MOST_BYTES = 1 << 20

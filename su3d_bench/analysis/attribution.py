@@ -16,9 +16,8 @@ import numpy as np
 from su3d_bench.analysis.sides import Side, refuse_unlike
 from su3d_bench.core import registry
 from su3d_bench.core.config import Setting, Settings, resolve
-from su3d_bench.core.errors import ConfigError, DataError, PredictionError, suggest
+from su3d_bench.core.errors import ConfigError, DataError, PredictionError, printable, suggest
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.plain_text import printable
 from su3d_bench.core.types import DenseFeatures, GroundTruth, Prediction
 from su3d_bench.metrics.attribution import masks as instances
 from su3d_bench.metrics.attribution import points as semantic

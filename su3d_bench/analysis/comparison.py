@@ -23,8 +23,7 @@ from su3d_bench.analysis.sides import (
     rules_of,
 )
 from su3d_bench.core.config import MOVES_NO_NUMBER
-from su3d_bench.core.errors import ConfigError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.results.resampled_values import resampled_classes

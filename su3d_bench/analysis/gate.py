@@ -15,12 +15,10 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core.config import MOVES_NO_NUMBER
-from su3d_bench.core.errors import ConfigError, StoreError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import ConfigError, StoreError, printable
 from su3d_bench.metrics.costs import MAP, WARM_UP, pooled
-from su3d_bench.reports.gate_findings import Finding, Verdict
-from su3d_bench.runs.finished import FinishedRun
-from su3d_bench.runs.finished_updates import read_update_times
+from su3d_bench.reports.gate import Finding, Verdict
+from su3d_bench.runs.finished import FinishedRun, read_update_times
 from su3d_bench.store.run_folder import read_json
 
 SPREADS = 2.0  # a value may leave the taught ones by this many times their range: 2 of 50 unchanged repeats would at 1

@@ -12,8 +12,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from su3d_bench.core.errors import ConfigError, Su3dError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import ConfigError, Su3dError, printable
 from su3d_bench.metrics.protocols import load_protocol, protocol_names
 from su3d_bench.metrics.scoring import combine
 from su3d_bench.reports.tables.model import NOT_MEASURED, Cell, Origin, Table, TableRow

@@ -14,9 +14,8 @@ import numpy as np
 from su3d_bench.analysis.attribution import EncoderOf
 from su3d_bench.core import registry
 from su3d_bench.core.config import Setting, Settings, resolve
-from su3d_bench.core.errors import Su3dError
+from su3d_bench.core.errors import Su3dError, printable, printable_json
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.plain_text import printable, printable_json
 from su3d_bench.core.types import DenseFeatures, Frame, GroundTruth, Instances, Int64Array, Prediction
 from su3d_bench.metrics.matching.labelling import (
     candidate_classes,

@@ -12,14 +12,12 @@ from pydantic import BaseModel, Field, ValidationError
 from su3d_bench.analysis.attribution import EncoderOf, attribute
 from su3d_bench.analysis.comparison import SideNumbers, compare
 from su3d_bench.core.config import KeyPath
-from su3d_bench.core.errors import StoreError, Su3dError
-from su3d_bench.core.plain_text import printable, printable_json
+from su3d_bench.core.errors import StoreError, Su3dError, printable, printable_json
 from su3d_bench.metrics.costs import summarise
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
 from su3d_bench.reports.page.numbers import confusion_cells, series_of, summary_data
-from su3d_bench.runs.finished import FinishedRun, read_run
-from su3d_bench.runs.finished_updates import read_update_times
+from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
 from su3d_bench.store.run_folder import read_json
 
 MOST_PAIRS = 40  # pairs of methods that are compared: all of nine methods, and a few seconds

@@ -6,11 +6,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from su3d_bench.core.errors import ConfigError, suggest
-from su3d_bench.core.plain_text import printable
-from su3d_bench.metrics.count_shapes import check_against
+from su3d_bench.core.errors import ConfigError, printable, suggest
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.metrics.scoring import SceneScore
+from su3d_bench.metrics.scoring import SceneScore, check_against
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 

@@ -12,13 +12,11 @@ from typing import Annotated
 from pydantic import BaseModel, Field, ValidationError
 
 from su3d_bench.analysis.sides import Side, refuse_unlike, rules_of
-from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, suggest
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, printable, suggest
 from su3d_bench.metrics.results.results import ProtocolResult
 from su3d_bench.metrics.scoring import combine
 from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
-from su3d_bench.reports.tables.measured import BY_PEOPLE, Measured
-from su3d_bench.reports.tables.model import Origin, is_count
+from su3d_bench.reports.tables.model import BY_PEOPLE, Measured, Origin, is_count
 from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.runs.job import CEILING_METHOD
 from su3d_bench.sheets.score_file import FILE as SCORES_FILE

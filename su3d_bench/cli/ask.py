@@ -7,8 +7,16 @@ import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, add_whose_map, answer, answer_json, remark
-from su3d_bench.cli.language_flags import add_language_flags, chat_client, language_config
+from su3d_bench.cli.common import (
+    add_language_flags,
+    add_verb,
+    add_whose_map,
+    answer,
+    answer_json,
+    chat_client,
+    language_config,
+    remark,
+)
 from su3d_bench.cli.query import latest_run, no_map
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError
 

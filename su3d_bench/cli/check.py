@@ -11,7 +11,7 @@ from su3d_bench.cli.common import add_verb, answer, answer_json, remark
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
-    from su3d_bench.reports.gate_findings import Verdict
+    from su3d_bench.reports.gate import Verdict
 
 
 def add_parser(verbs: Any) -> None:

@@ -7,7 +7,16 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from su3d_bench.perception.language.client import ChatClient
+    from su3d_bench.perception.language.config import LanguageConfig
+    from su3d_bench.store.run_folder import RunFolder
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
 
 
 def add_verb(
@@ -84,3 +93,106 @@ def remark(text: str, *, quiet: bool = False) -> None:
     """Print a remark to stderr."""
     if not quiet:
         print(text, file=sys.stderr)
+
+
+PREFIX = ("perception", "language")
+
+
+def add_language_flags(parser: argparse.ArgumentParser) -> None:
+    """``--model``, ``--base-url``, ``--config``, ``--set``, ``--offline``, ``--ask-failed-again``, ``--dry-run``."""
+    parser.add_argument("--model", metavar="NAME", help="language model (default: the paper's gpt-4-1106-preview)")
+    parser.add_argument(
+        "--base-url", metavar="URL", help="OpenAI-compatible server (default: $OPENAI_BASE_URL, else OpenAI's)"
+    )
+    parser.add_argument("--config", type=Path, metavar="FILE", help="a TOML file with [perception.language]")
+    add_settings(parser, "such as perception.language.budget_usd=0.5")
+    parser.add_argument("--offline", action="store_true", help="stored replies only; nobody is asked")
+    parser.add_argument(
+        "--ask-failed-again", action="store_true", help="ask again what an earlier command asked in vain"
+    )
+    parser.add_argument("--dry-run", action="store_true", help="say what asking would cost, and ask nothing")
+
+
+def language_config(arguments: argparse.Namespace) -> LanguageConfig:
+    """The settings of the file, then ``--set``, then the flags; keys of other sections are left to other verbs."""
+    from su3d_bench.core.config import Setting, Settings, read_assignments, read_file, resolve
+    from su3d_bench.core.errors import ConfigError
+    from su3d_bench.perception.language.config import LanguageConfig
+
+    settings = Settings() if arguments.config is None else read_file(arguments.config)
+    assigned = read_assignments(arguments.set, (), ())
+    for entry in assigned.entries:
+        if entry.path[:2] != PREFIX:
+            raise ConfigError(f"{entry.source}: only perception.language.KEY=VALUE is of use here")
+    flags = [("text_model", "--model", arguments.model), ("base_url", "--base-url", arguments.base_url)]
+    given = tuple(Setting((*PREFIX, key), value, flag) for key, flag, value in flags if value is not None)
+    return resolve(settings + assigned + Settings(given), PREFIX, LanguageConfig)
+
+
+def chat_client(arguments: argparse.Namespace, run: RunFolder, config: LanguageConfig) -> ChatClient:
+    """The client whose replies are kept in the folder ``language`` of the run."""
+    from su3d_bench.perception.language.client import ChatClient
+    from su3d_bench.perception.language.reply_store import ReplyStore
+
+    store = ReplyStore(run.path / "language")
+    return ChatClient(config, store, offline=arguments.offline, ask_failed_again=arguments.ask_failed_again)
+
+
+@contextmanager
+def progress(n_scenes: int, *, is_quiet: bool, last_step: str = "scoring") -> Iterator[Report]:
+    """A ``Report`` that draws bars while the block runs; it draws nothing where stderr is no terminal.
+
+    ``last_step`` is what a scene does after its last frame.
+    """
+    if is_quiet or not sys.stderr.isatty():
+        yield lambda event: None
+        return
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[remark]}"),
+        TimeElapsedColumn(),
+    )
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+        board = _Board(bars, n_scenes, last_step)
+        yield board.report
+
+
+class _Board:
+    """Turns events into bars: one for all scenes, one for the current method of each scene under way."""
+
+    def __init__(self, bars: object, n_scenes: int, last_step: str) -> None:
+        from rich.progress import Progress, TaskID
+
+        assert isinstance(bars, Progress)
+        self._bars = bars
+        self._last_step = last_step
+        self._scenes = bars.add_task("scenes", total=n_scenes, remark="")
+        self._tasks: dict[tuple[str, str], TaskID] = {}
+
+    def report(self, event: Event) -> None:
+        if event.label == SCENE_DONE:
+            self._bars.update(self._scenes, advance=1)
+            for key in [key for key in self._tasks if key[0] == event.unit]:
+                self._bars.remove_task(self._tasks.pop(key))
+            return
+        key = (event.unit, event.label)
+        if key not in self._tasks:
+            name = f"  {event.unit} {event.label}"
+            self._tasks[key] = self._bars.add_task(name, total=event.total, remark="")
+        task = self._tasks[key]
+        self._bars.update(task, completed=event.done, remark=self._remark(event))
+        if event.done == event.total:
+            self._bars.update(task, description=f"  {event.unit} {event.label}: {self._last_step}")
+
+    def _remark(self, event: Event) -> str:
+        speed = self._bars.tasks[0].speed
+        for task in self._bars.tasks:
+            if task.id == self._tasks[event.unit, event.label]:
+                speed = task.speed
+        rate = f"{speed:.1f} frames/s" if speed else ""
+        return rate if event.n_instances is None else f"{rate} {event.n_instances} instances"

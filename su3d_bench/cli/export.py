@@ -11,8 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.common import add_verb, answer, answer_json, remark
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, suggest
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, printable, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.core.interfaces import Encoder

@@ -28,8 +28,15 @@ from su3d_bench.cli import (
     sheets,
 )
 from su3d_bench.cli.datasets import list as datasets
-from su3d_bench.core.errors import EXIT_DONE, EXIT_INTERNAL, EXIT_WRONG_INPUT, ConfigError, Su3dError, suggest
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import (
+    EXIT_DONE,
+    EXIT_INTERNAL,
+    EXIT_WRONG_INPUT,
+    ConfigError,
+    Su3dError,
+    printable,
+    suggest,
+)
 
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 DESCRIPTION = "Evaluate and benchmark open-vocabulary, instance-level 3D scene understanding from RGB-D."

@@ -60,8 +60,7 @@ def _summary(method: Any) -> str:
 
 def _show(arguments: argparse.Namespace) -> int:
     from su3d_bench.core import registry
-    from su3d_bench.core.config import flatten
-    from su3d_bench.core.toml_text import write_toml
+    from su3d_bench.core.config import flatten, write_toml
     from su3d_bench.reports.tables.published import figures_of
 
     method = registry.load("method", arguments.name)

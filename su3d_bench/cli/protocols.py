@@ -60,8 +60,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 def _rules_text(rules: ProtocolRules, file: Path) -> str:
     """Every rule as a line, beneath it what the protocol's file says of it: its source, or that it is ours."""
-    from su3d_bench.core.config import flatten
-    from su3d_bench.core.toml_text import toml_value
+    from su3d_bench.core.config import flatten, toml_value
     from su3d_bench.metrics.protocols import not_comparable_with
 
     remarks = read_remarks(file)

@@ -135,7 +135,7 @@ def _row(one: Question) -> dict[str, Any]:
 
 
 def _printable_row(one: Question) -> tuple[str, ...]:
-    from su3d_bench.core.plain_text import printable
+    from su3d_bench.core.errors import printable
 
     ids = "unknown" if one.answers is None else " ".join(map(str, one.answers))
     return printable(one.scene, 60), one.kind, printable(one.text, MOST_CHARACTERS), f"-> {ids}"

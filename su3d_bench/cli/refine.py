@@ -7,8 +7,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_json, remark
-from su3d_bench.cli.language_flags import add_language_flags, chat_client, language_config
+from su3d_bench.cli.common import (
+    add_language_flags,
+    add_verb,
+    answer,
+    answer_json,
+    chat_client,
+    language_config,
+    remark,
+)
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError, suggest
 
 if TYPE_CHECKING:
@@ -89,7 +96,7 @@ def _jobs(arguments: argparse.Namespace) -> dict[str, JobFolder]:
 
 def _scenes(run: RunFolder) -> list[str]:
     """The scenes that the run was asked for."""
-    from su3d_bench.core.plain_text import printable
+    from su3d_bench.core.errors import printable
     from su3d_bench.store.run_folder import read_json
 
     record = read_json(run.path / "run.json")

@@ -140,7 +140,7 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
 
 
 def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
-    from su3d_bench.cli.progress import progress
+    from su3d_bench.cli.common import progress
     from su3d_bench.runs.runner import run_plan
 
     with progress(len(plan.jobs), is_quiet=arguments.quiet) as report:

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array
 from su3d_bench.metrics.matching.nearest import Masks
 from su3d_bench.metrics.protocols import ProtocolRules

@@ -12,12 +12,17 @@ from pathlib import Path
 from typing import Any, Literal
 
 from su3d_bench.core import registry
-from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError
+from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError, shown
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.plain_text import shown
 from su3d_bench.core.types import GroundTruth, Instances
-from su3d_bench.evaluation.evaluation_questions import score_on_questions
-from su3d_bench.evaluation.openlex import VARIANTS, OpenLexRelease, holds_release, score_on_objects, why_not_lex_content
+from su3d_bench.evaluation.openlex import (
+    VARIANTS,
+    OpenLexRelease,
+    holds_release,
+    score_on_objects,
+    score_on_questions,
+    why_not_lex_content,
+)
 from su3d_bench.evaluation.result import Evaluation, ProtocolEvaluation, SceneOutcomes, form_evaluation
 from su3d_bench.evaluation.scenes import OWN_FORMAT, Match, Source, match_scenes, open_sources, planned_scenes
 from su3d_bench.evaluation.scoring import (

@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from su3d_bench.core.errors import GroundTruthMissing
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import Instances, Prediction
+from su3d_bench.core.types import GroundTruth, Instances, Prediction
 from su3d_bench.datasets.openlex3d import (
     CATEGORIES_NAME,
     PROMPTS_NAME,
@@ -31,6 +32,7 @@ from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
 from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.metrics.scoring import QuestionTruth, score_scene, why_not_scorable
 from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
+from su3d_bench.questions.truths import question_truth
 
 DATASET = "replica"  # of those that OpenLex3D labels, the one whose mesh can be read here
 QUERY_LEVEL: Level = "l0"  # the level that the release evaluates unless another is asked for
@@ -116,3 +118,10 @@ def _nothing() -> Instances:
     starts = np.zeros(1, np.int64)
     boxes, views = np.zeros((0, 2, 3), np.float32), np.zeros((0, 2), np.int32)
     return Instances(empty, starts, none, np.zeros(0), None, (), (), (), boxes, empty, starts, views)
+
+
+def score_on_questions(
+    rules: ProtocolRules, dataset: Any, scene: str, truth: GroundTruth, content: Content, encoder: Encoder | None
+) -> SceneOutcome:
+    """The outcome; labels n' are those of the vote, for a file beside a run's map is not part of a prediction."""
+    return score_on_objects(rules, question_truth(rules, dataset, scene, truth), scene, content, encoder)

@@ -6,8 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, suggest
-from su3d_bench.core.plain_text import printable, shown
+from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, printable, shown, suggest
 from su3d_bench.predictions.base import Reader
 from su3d_bench.predictions.formats import recognise
 from su3d_bench.store.run_folder import read_json

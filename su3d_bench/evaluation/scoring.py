@@ -21,8 +21,7 @@ from su3d_bench.evaluation.checks import (
 )
 from su3d_bench.evaluation.truth import MAX_NYU40_ID, TextTruth
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance.evaluation_bound import every_class_counts
-from su3d_bench.metrics.instance.score import OBJECT, encode_without_classes
+from su3d_bench.metrics.instance.score import OBJECT, encode_without_classes, every_class_counts
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import (
     candidate_classes,

@@ -10,9 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.digests import digest_file
-from su3d_bench.core.errors import DataError, PredictionError
+from su3d_bench.core.errors import DataError, PredictionError, printable, shown
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.plain_text import printable, shown
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.formats.numpy_files import read_npz
 from su3d_bench.metrics.protocols import ProtocolRules

@@ -12,8 +12,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core import registry
-from su3d_bench.core.errors import DataError, PredictionError, suggest
-from su3d_bench.core.plain_text import printable, shown
+from su3d_bench.core.errors import DataError, PredictionError, printable, shown, suggest
 from su3d_bench.core.types import Int64Array
 from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS

@@ -14,10 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import DataError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
-from su3d_bench.formats.ply_header import clip
+from su3d_bench.formats.ply_parts import clip
 from su3d_bench.store.run_folder import write_bytes
 
 MOST_HEADER_BYTES = 1 << 16  # headers have some hundred

@@ -20,8 +20,19 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Int64Array
-from su3d_bench.formats.ply_header import BYTE_ORDERS, NAMES_OF_TYPES, ByteOrder, Promise, Property, clip, read_header
-from su3d_bench.formats.ply_parts import BinaryBody, Body, TextBody, UnfitValueError
+from su3d_bench.formats.ply_parts import (
+    BYTE_ORDERS,
+    NAMES_OF_TYPES,
+    BinaryBody,
+    Body,
+    ByteOrder,
+    Promise,
+    Property,
+    TextBody,
+    UnfitValueError,
+    clip,
+    read_header,
+)
 from su3d_bench.store.run_folder import write_bytes
 
 AnyArray = NDArray[Any]

@@ -7,8 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import PredictionError, printable
 
 IntegerArray = NDArray[np.integer[Any]]
 DIGIT_AND_NEWLINE = 0x0A30  # "0\n" as a little-endian pair

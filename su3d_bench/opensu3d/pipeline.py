@@ -16,8 +16,7 @@ from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Detections, Frame, Instances, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
 from su3d_bench.opensu3d.association import assign_ids, count_overlaps, overlap_ratios
 from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig, crop_levels
-from su3d_bench.opensu3d.frame_cloud import FrameCloud, frame_cloud
-from su3d_bench.opensu3d.id_image import NO_DETECTION
+from su3d_bench.opensu3d.frame_cloud import NO_DETECTION, FrameCloud, frame_cloud
 from su3d_bench.opensu3d.postprocess import segments_of, to_instances
 from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View, record_of
 from su3d_bench.opensu3d.voxel_map import NO_INSTANCE, VoxelMap

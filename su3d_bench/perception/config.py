@@ -7,8 +7,7 @@ from pydantic import BaseModel, ConfigDict
 from su3d_bench.perception.embedded.naming import NamingConfig
 from su3d_bench.perception.embedded.segmenter.segmenter import SegmenterConfig
 from su3d_bench.perception.language.config import LanguageConfig
-from su3d_bench.perception.models.config import ModelsConfig
-from su3d_bench.perception.models.paper_config import PaperConfig
+from su3d_bench.perception.models.config import ModelsConfig, PaperConfig
 from su3d_bench.perception.oracle.segmenter import OracleConfig
 from su3d_bench.perception.stored.npz_files import StoredConfig
 

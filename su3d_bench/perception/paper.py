@@ -13,7 +13,6 @@ from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.config import PerceptionConfig
 from su3d_bench.perception.crops import crop_images
 from su3d_bench.perception.embedded.naming import scene_caption
-from su3d_bench.perception.features import CropEncoder, NameEncoder, grown_boxes, regions_to_keep
 from su3d_bench.perception.language.captioner import Captioner
 from su3d_bench.perception.models.masks.automatic_masks import AUTOMATIC_MASKS, AutomaticMaskConfig
 from su3d_bench.perception.models.masks.grounded_sam import (
@@ -24,7 +23,7 @@ from su3d_bench.perception.models.masks.grounded_sam import (
     Networks,
     SamRegions,
 )
-from su3d_bench.perception.regions import cached_regions
+from su3d_bench.perception.regions import CropEncoder, NameEncoder, cached_regions, grown_boxes, regions_to_keep
 
 # What of the language model's settings moves a caption; times, prices and limits do not.
 MOVES_CAPTIONS = {"vision_model", "temperature", "seed", "max_answer_tokens", "image_detail", "max_image_px"}

@@ -117,7 +117,7 @@ def build_perception(
         if config.stored.images is not None:
             return LabelImagePerception(config, scene, encoder, cache)
         if config.stored.detections is not None:
-            from su3d_bench.perception.stored.profile_gsa import GsaPerception
+            from su3d_bench.perception.stored.gsa_files import GsaPerception
 
             return GsaPerception(config.stored.folder, config.stored.detections, scene, encoder, cache)
         return StoredPerception(config.stored.folder, scene, encoder, cache)

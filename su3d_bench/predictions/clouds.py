@@ -8,8 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError, PredictionError
-from su3d_bench.core.plain_text import printable, shown
+from su3d_bench.core.errors import DataError, PredictionError, printable, shown
 from su3d_bench.core.types import Float32Array, Instances
 from su3d_bench.predictions.base import MOST_MASKS, MOST_POINTS
 from su3d_bench.predictions.mask_arrays import kind_of

@@ -12,8 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import printable, shown
+from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.types import Float32Array, Instances
 from su3d_bench.formats.pickles.pickles import read_pickle_file
 from su3d_bench.predictions.base import MOST_MASKS, ScenePrediction

@@ -14,9 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import PredictionError, StoreError
+from su3d_bench.core.errors import PredictionError, StoreError, printable
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.plain_text import printable
 from su3d_bench.core.types import (
     DenseFeatures,
     Float32Array,

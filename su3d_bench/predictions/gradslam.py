@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import PredictionError, StoreError
-from su3d_bench.core.plain_text import printable, shown
+from su3d_bench.core.errors import PredictionError, StoreError, printable, shown
 from su3d_bench.core.types import DenseFeatures, Float32Array
 from su3d_bench.datasets.replica.cloud_truth import moved, read_first_pose
 from su3d_bench.formats.hdf5 import n_columns_of, read_rows, row_blocks

@@ -12,8 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import printable, shown
+from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.types import Float32Array
 from su3d_bench.formats.pcd import read_pcd_points
 from su3d_bench.formats.ply import read_ply

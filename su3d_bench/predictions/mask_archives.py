@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import shown
+from su3d_bench.core.errors import PredictionError, shown
 from su3d_bench.core.types import Int32Array
 from su3d_bench.formats.numpy_files import npz_names, read_npz
 from su3d_bench.formats.torch_zip import Kind, SparseTensor, read_torch, torch_kind

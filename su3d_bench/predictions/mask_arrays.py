@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import printable, shown
+from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array
 from su3d_bench.predictions.base import MOST_MASKS, MOST_MEMBERS, MOST_POINTS, Numbering, VertexMasks
 

@@ -10,8 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import printable, shown
+from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.types import Float32Array, Int32Array, Partition
 from su3d_bench.formats.numpy_files import read_npy
 from su3d_bench.predictions.base import ScenePrediction

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import shown
+from su3d_bench.core.errors import PredictionError, shown
 from su3d_bench.core.types import Float32Array
 from su3d_bench.formats.numpy_files import read_npy
 from su3d_bench.formats.torch_zip import read_torch

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import printable, shown
+from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.formats.numpy_files import npy_header_of, npz_names, read_npz
 from su3d_bench.predictions.base import ScenePrediction

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import shown
+from su3d_bench.core.errors import PredictionError, shown
 from su3d_bench.formats.numpy_files import npy_header_of, read_npy
 from su3d_bench.formats.torch_zip import read_torch
 from su3d_bench.predictions.base import MOST_POINTS, ScenePrediction

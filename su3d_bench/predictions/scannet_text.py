@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import printable, shown
+from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.types import Int32Array
 from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file

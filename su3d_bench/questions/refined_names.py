@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Literal
@@ -10,7 +11,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import StoreError
+from su3d_bench.core.types import Instances
+from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.questions.refinement import RefinedName, TopNames
+from su3d_bench.questions.truths import voted_names
 from su3d_bench.store.run_folder import JobFolder, read_json, write_json
 
 FILE_NAME = "refined_names.json"
@@ -100,3 +104,25 @@ def read_records(job: JobFolder) -> NameRecords | None:
     if records.schema_version != SCHEMA or records.prediction_sha256 != digest_file(job.prediction):
         raise StoreError(f"{path}: belongs to another map than {job.prediction.name}; give su3d-bench refine again")
     return records
+
+
+log = logging.getLogger(__name__)
+
+
+def refined_digest(job: JobFolder) -> dict[str, str]:
+    """What of the file moves numbers, for the key of the scores; nothing where there is none."""
+    path = job.path / FILE_NAME
+    return {"refined": digest_file(path)} if path.is_file() else {}
+
+
+def refined_names(job: JobFolder, instances: Instances) -> RefinedNames | None:
+    """Labels n' of the map in ``job``; a file that belongs to another map is passed over with a warning."""
+    try:
+        records = read_records(job)
+    except StoreError as error:
+        log.warning("%s; n' is the vote until then", error)
+        records = None
+    if records is None or len(records.names) != len(instances):
+        return voted_names(instances)
+    who = f"the model {records.model}" if records.refiner == "model" else "the vote"
+    return RefinedNames(records.refined, f"{who} of su3d-bench refine, names of {records.top_m} views")

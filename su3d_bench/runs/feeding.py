@@ -4,20 +4,123 @@ from __future__ import annotations
 
 import csv
 import io
+import logging
 import time
+from collections import deque
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
+from typing import Any, Generic, Self, TypeVar, overload
 
 import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Method
 from su3d_bench.core.timing import Timer, calibration_ms, memory_bytes
-from su3d_bench.core.types import Detections, Frame
+from su3d_bench.core.types import Detections, Frame, GroundTruth, PerceptionNeeds, Proposals, Surface
 from su3d_bench.perception.profiles import Perception
 from su3d_bench.runs.executors.local import Event, Report
-from su3d_bench.runs.read_ahead import ReadAhead
-from su3d_bench.runs.scene_tools import no_detections
 from su3d_bench.store.run_folder import write_prediction
+
+
+@dataclass(frozen=True)
+class FirstFrames(Sequence[Frame]):
+    """The first ``n`` of ``frames``, read anew at every access."""
+
+    frames: Sequence[Frame]
+    n: int
+
+    def __len__(self) -> int:
+        return self.n
+
+    @overload
+    def __getitem__(self, index: int) -> Frame: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Frame]: ...
+
+    def __getitem__(self, index: int | slice) -> Frame | list[Frame]:
+        if isinstance(index, slice):
+            return [self.frames[i] for i in range(self.n)[index]]
+        return self.frames[range(self.n)[index]]
+
+
+def no_detections(frame: Frame, needs: PerceptionNeeds) -> Detections:
+    """What a method that needs no masks gets."""
+    return Detections(
+        frame_index=frame.index,
+        masks=np.zeros((0, *frame.depth_m.shape), np.bool_),
+        boxes=np.zeros((0, 4), np.float32),
+        scores=np.zeros(0, np.float32),
+        names=(),
+        captions=(),
+        crop_ratios=needs.crop_ratios,
+        crop_features=np.zeros((0, len(needs.crop_ratios), 0), np.float32),
+        global_feature=np.zeros(0, np.float32),
+    )
+
+
+def surface_of(dataset: Any, scene: str) -> Surface:
+    """The mesh of a scene without labels; ``DataError`` where its dataset has none."""
+    if not hasattr(dataset, "surface"):
+        raise DataError(f"{dataset.name}/{scene}: the dataset has no mesh; this method works on one")
+    surface: Surface = dataset.surface(scene)
+    return surface
+
+
+def true_proposals(truth: GroundTruth) -> Proposals:
+    """Every annotated instance of ``truth`` as a class-agnostic mask, in the order of the instance ids."""
+    order = np.argsort(truth.instance, kind="stable").astype(np.int32)
+    order = order[truth.instance[order] > 0]
+    n_points = np.unique(truth.instance[order], return_counts=True)[1]
+    indptr = np.cumsum([0, *n_points]).astype(np.int64)
+    return Proposals(truth.points, indptr, order, np.ones(len(n_points)), "ground truth")
+
+
+Read = TypeVar("Read")
+N_THREADS = 2
+N_AHEAD = 2  # frames in memory besides the one in use
+
+
+class ReadAhead(Generic[Read]):
+    """The first ``n`` of ``frames`` one after another, at most ``n_ahead`` of them read before they are asked for.
+
+    What reading a frame raises is raised when that frame is asked for, not before. The first frame is read alone: what
+    a dataset makes at its first use is made once. Leaving the block, at whatever frame, ends the threads; reads that
+    have begun are waited for. ``n_ahead`` 0: each frame is read when it is asked for.
+    """
+
+    def __init__(self, frames: Sequence[Read], n: int, *, n_threads: int = N_THREADS, n_ahead: int = N_AHEAD) -> None:
+        self._frames, self._n = frames, n
+        self._n_ahead = n_ahead
+        self._n_begun = 0
+        self._reading: deque[Future[Read]] = deque()
+        self._threads = ThreadPoolExecutor(n_threads, thread_name_prefix="read-ahead")
+
+    def __enter__(self) -> Self:
+        self._begin_up_to(min(1, self._n_ahead))
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._threads.shutdown(cancel_futures=True)
+        self._reading.clear()
+
+    def next_frame(self) -> Read:
+        """The frame after the one that was taken last."""
+        self._begin_up_to(1)
+        frame = self._reading.popleft().result()
+        self._begin_up_to(self._n_ahead)
+        return frame
+
+    def _begin_up_to(self, n_waiting: int) -> None:
+        while self._n_begun < self._n and len(self._reading) < n_waiting:
+            self._reading.append(self._threads.submit(self._frames.__getitem__, self._n_begun))
+            self._n_begun += 1
+
 
 Row = dict[str, float | int]
 CALIBRATE_EVERY = 4  # about 5 ms each: a hundredth of the time of the updates
@@ -100,3 +203,29 @@ class Feeding:
         writer.writeheader()
         writer.writerows(self._rows)
         return text.getvalue()
+
+
+class SceneLog(logging.Handler):
+    """Keeps what the library says while a scene runs: all ``lines`` for its log, ``warnings`` for the record too."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.lines: list[str] = []
+        self.warnings: list[str] = []
+
+    def text(self, *last: str) -> str:
+        return "\n".join([*self.lines, *last]) + "\n"
+
+    def remarks(self) -> dict[str, list[str]]:
+        """What a seal keeps of it, for a run that goes on from there."""
+        return {"log": self.lines, "warnings": list(dict.fromkeys(self.warnings))}
+
+    def recall(self, remarks: Mapping[str, Any]) -> None:
+        """Begin with what an earlier process said."""
+        self.lines[:0] = remarks.get("log", [])
+        self.warnings[:0] = remarks.get("warnings", [])
+
+    def emit(self, record: logging.LogRecord) -> None:
+        self.lines.append(f"{record.levelname.lower()}: {record.getMessage()}")
+        if record.levelno >= logging.WARNING:
+            self.warnings.append(record.getMessage())

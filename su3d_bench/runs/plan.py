@@ -5,6 +5,7 @@ from __future__ import annotations
 import difflib
 import fnmatch
 import os
+import re
 from collections.abc import Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
@@ -15,9 +16,12 @@ from su3d_bench.core import registry
 from su3d_bench.core.config import (
     MOVES_NO_NUMBER,
     RunConfig,
+    Setting,
     Settings,
     check_keys,
     check_names,
+    flatten,
+    parse_value,
     read_assignments,
     resolve,
 )
@@ -39,11 +43,63 @@ from su3d_bench.runs.job import (
     config_key,
     refuse_other_run,
 )
-from su3d_bench.runs.method_names import NamedMethod, named_method
 from su3d_bench.runs.remote.data import DataPlace, RemoteData, data_place
 from su3d_bench.runs.remote.folder import is_url
 from su3d_bench.runs.remote.scene import CACHE_ROOT, fetch_seals, mirror_of
 from su3d_bench.store.run_folder import RunFolder
+
+MOST_CHARACTERS = 120  # the name is a folder's name too
+_COMMA_OUTSIDE_BRACKETS = re.compile(r",(?![^\[]*\])")
+
+
+@dataclass(frozen=True)
+class NamedMethod:
+    """``target`` finds the class, ``base`` is the name that it bears, ``name`` the one with the variant.
+
+    A variant is ``METHOD@PRESET`` where the method's class has ``presets`` (``opensu3d@scheme4``), or
+    ``METHOD@KEY=VALUE,KEY=VALUE`` with values in TOML (``opensu3d@top_m=1``). It counts as a method of its own.
+    """
+
+    target: str
+    base: str
+    name: str
+    settings: tuple[Setting, ...]
+
+
+def named_method(text: str) -> NamedMethod:
+    """What ``text`` asks for; ``ConfigError`` for an unknown method, preset or an unreadable variant."""
+    start = text.rfind(".py:") + 1
+    at = text.find("@", start)
+    target, variant = (text, "") if at < 0 else (text[:at], text[at + 1 :])
+    method = registry.load("method", target)
+    base = str(method.name)
+    if at < 0:
+        return NamedMethod(target, base, base, ())
+    name = f"{base}@{variant.replace(' ', '')}"
+    if not variant or "/" in variant or not variant.isprintable() or len(name) > MOST_CHARACTERS:
+        raise ConfigError(f"--methods {text}: expected METHOD@PRESET or METHOD@KEY=VALUE, such as opensu3d@top_m=1")
+    values = _assigned(text, variant) if "=" in variant else _preset(text, base, method, variant)
+    entries = tuple(Setting(("method", name, *path), value, f"--methods {text}") for path, value in flatten(values))
+    return NamedMethod(target, base, name, entries)
+
+
+def _preset(text: str, base: str, method: Any, variant: str) -> Mapping[str, Any]:
+    presets: Mapping[str, Mapping[str, Any]] = getattr(method, "presets", {})
+    if variant not in presets:
+        hint = suggest(variant, presets) or (f"; it has {', '.join(presets)}" if presets else "; it has none")
+        raise ConfigError(f"--methods {text}: {base} has no preset '{variant}'{hint}; or write {base}@KEY=VALUE")
+    return presets[variant]
+
+
+def _assigned(text: str, variant: str) -> Mapping[str, Any]:
+    values: dict[str, Any] = {}
+    for part in _COMMA_OUTSIDE_BRACKETS.split(variant):
+        key, equals, value = part.partition("=")
+        if not equals or not key.strip():
+            raise ConfigError(f"--methods {text}: '{part}' is no KEY=VALUE")
+        values[key.strip()] = parse_value(value)
+    return values
+
 
 DATA_ROOT = "~/.cache/su3d-bench/data"
 NO_SYSTEMS = (CEILING_METHOD, "command")  # what `--methods all` leaves out: the truth itself, and programs of others

@@ -8,8 +8,16 @@ from typing import Any
 
 from su3d_bench.core.types import SceneInfo
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
-from su3d_bench.runs.job import MethodOutcome, Part, SceneJob, build_dataset, build_method, config_key, stride_of
-from su3d_bench.runs.job_inputs import JobInputs
+from su3d_bench.runs.job import (
+    JobInputs,
+    MethodOutcome,
+    Part,
+    SceneJob,
+    build_dataset,
+    build_method,
+    config_key,
+    stride_of,
+)
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 SAME_EVERYWHERE = ("embedded", "paper")  # profiles whose digest does not depend on the scene

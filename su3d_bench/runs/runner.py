@@ -15,11 +15,10 @@ from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.config import KeyPath, flatten
+from su3d_bench.core.config import KeyPath, flatten, write_toml
 from su3d_bench.core.digests import code_digest, git_state, package_versions
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.timing import hardware_line, processor_digest
-from su3d_bench.core.toml_text import write_toml
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.results.results import plain_json
 from su3d_bench.metrics.scoring import SceneScore, combine, combined_metrics, unpack_scores

@@ -22,12 +22,13 @@ from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Prediction, 
 from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import SceneScore, Truth, pack_scores, score_scene, why_not_scorable
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
-from su3d_bench.questions.refined import refined_names
+from su3d_bench.questions.refined_names import refined_names
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.reports.pictures.maps import draw_scene
 from su3d_bench.runs.executors.local import Report
-from su3d_bench.runs.feeding import Feeding
+from su3d_bench.runs.feeding import N_AHEAD, Feeding, FirstFrames, ReadAhead, SceneLog, surface_of, true_proposals
 from su3d_bench.runs.job import (
+    JobInputs,
     MethodOutcome,
     Part,
     SceneJob,
@@ -37,10 +38,6 @@ from su3d_bench.runs.job import (
     refuse_other_run,
     stride_of,
 )
-from su3d_bench.runs.job_inputs import JobInputs
-from su3d_bench.runs.read_ahead import N_AHEAD, ReadAhead
-from su3d_bench.runs.scene_log import SceneLog
-from su3d_bench.runs.scene_tools import FirstFrames, surface_of, true_proposals
 from su3d_bench.store.run_folder import JobFolder, RunFolder, read_prediction, write_bytes, write_text
 
 

@@ -14,8 +14,7 @@ from typing import Any, Literal, TypeVar
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from su3d_bench.core.digests import digest_json
-from su3d_bench.core.errors import DataError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import DataError, printable
 from su3d_bench.store.run_folder import write_json
 
 SCHEMA = 1

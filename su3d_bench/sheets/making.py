@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.digests import digest_bytes
-from su3d_bench.core.errors import ConfigError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.reports.sheet.page import page_html
 from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import (

@@ -12,10 +12,17 @@ import numpy as np
 
 from su3d_bench.core import registry
 from su3d_bench.core.config import Setting, Settings, resolve
-from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError, StoreError, suggest
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import (
+    ConfigError,
+    DataError,
+    GroundTruthMissing,
+    PredictionError,
+    StoreError,
+    printable,
+    suggest,
+)
 from su3d_bench.core.types import Frame, GroundTruth, Instances
-from su3d_bench.metrics.instance.covered_objects import Covered, covered_objects
+from su3d_bench.metrics.instance.score import Covered, covered_objects
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol, protocol_names
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.runs.job import Part, build_dataset

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from pydantic import TypeAdapter, ValidationError
 
-from su3d_bench.core.errors import DataError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import DataError, printable
 from su3d_bench.sheets.scores import METRICS, SCHEMA, ScoreCell, Scores
 from su3d_bench.store.run_folder import write_json
 

@@ -15,8 +15,8 @@ from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.numerics.statistics import percentile_interval, resample_weights, sign_flip_test
 from su3d_bench.questions.model import ALL_KINDS
 from su3d_bench.sheets.agreement import Agreement, Interval, agreement, cohen_kappa
+from su3d_bench.sheets.answers import LABELS, Judgement
 from su3d_bench.sheets.items import CANNOT_TELL, MERGES, RIGHT, Key, KeyItem, Sheet
-from su3d_bench.sheets.validation import LABELS, Judgement
 
 Judge = Literal["people", "automatic"]
 SCHEMA = 1

@@ -9,8 +9,7 @@ from collections.abc import Mapping
 from datetime import UTC, datetime
 from typing import Any
 
-from su3d_bench.core.errors import ModelMissing
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import ModelMissing, printable
 from su3d_bench.sheets.items import AnnotatorShare, Sheet
 from su3d_bench.store.run_folder import ZIP_EPOCH
 

@@ -28,7 +28,7 @@ from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.store.atomic import read_arrays
-from su3d_bench.store.row_blocks import row_blocks
+from su3d_bench.store.scratch import row_blocks
 
 SCHEMA = 1
 ROWS_AT_ONCE = 8192  # 16 MB of half precision at 1024 dimensions

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import fcntl
+import mmap
 import os
+import shutil
 import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 import numpy as np
@@ -75,3 +81,78 @@ class StoredRows:
         row_bytes = self.dtype.itemsize * int(np.prod(self.shape[1:], dtype=np.int64))
         content = self.scratch.read(self.offset + first * row_bytes, (last - first) * row_bytes)
         return np.frombuffer(content, self.dtype).reshape(last - first, *self.shape[1:])
+
+
+def row_blocks(table: NDArray[Any], n_rows: int) -> Iterator[tuple[slice, NDArray[Any]]]:
+    """``table`` in blocks of ``n_rows``, each with the slice that it is; a block is good until the next is asked for.
+
+    >>> [(rows.start, rows.stop, block.tolist()) for rows, block in row_blocks(np.arange(3), 2)]
+    [(0, 2, [0, 1]), (2, 3, [2])]
+    """
+    for start in range(0, len(table), n_rows):
+        rows = slice(start, min(start + n_rows, len(table)))
+        yield rows, table[rows]
+        release_pages(table)
+
+
+def release_pages(table: NDArray[Any]) -> None:
+    """Let go of what has been touched of a memory-mapped table; other arrays stay as they are.
+
+    What was touched counts as memory of the process until someone says so; it comes back when it is read, what was
+    written into the file included. Private maps (mode ``c``) hold changes that no file has, and are left alone.
+    """
+    if not isinstance(table, np.memmap) or table.mode == "c":
+        return
+    base: Any = table
+    while isinstance(base, np.ndarray):
+        base = base.base
+    if isinstance(base, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):
+        base.madvise(mmap.MADV_DONTNEED)
+
+
+HELD = ".held"  # a file in each folder that its process keeps locked; the lock ends with the process
+
+
+class TemporaryFolder:
+    """The folder ``path``, below the system's folder for temporary files, until ``close`` or the end of a block."""
+
+    def __init__(self, prefix: str) -> None:
+        try:
+            _remove_abandoned(prefix)
+            self.path = Path(tempfile.mkdtemp(prefix=prefix))
+            unheld = self.path / f"{HELD}.new"
+            self._lock = os.open(unheld, os.O_RDWR | os.O_CREAT, 0o600)
+            fcntl.flock(self._lock, fcntl.LOCK_EX)
+            unheld.rename(self.path / HELD)  # from here on others know the folder; until here they leave it alone
+        except OSError as error:
+            where = f" below {tempfile.tempdir}" if tempfile.tempdir else ""
+            reason = error.strerror or str(error)
+            raise StoreError(
+                f"cannot make a temporary folder{where}: {reason}; set TMPDIR to a folder that can be written"
+            ) from error
+
+    def close(self) -> None:
+        """Remove the folder; once is enough, twice is no fault."""
+        if self._lock >= 0:
+            shutil.rmtree(self.path, ignore_errors=True)
+            os.close(self._lock)
+            self._lock = -1
+
+    def __enter__(self) -> Path:
+        return self.path
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+def _remove_abandoned(prefix: str) -> None:
+    for held in Path(tempfile.gettempdir()).glob(f"{prefix}*/{HELD}"):
+        with suppress(OSError):  # in use, gone meanwhile, or somebody else's
+            lock = os.open(held, os.O_RDWR | os.O_NOFOLLOW)
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                shutil.rmtree(held.parent, ignore_errors=True)
+            finally:
+                os.close(lock)

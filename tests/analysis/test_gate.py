@@ -17,8 +17,7 @@ from places import SCENES
 
 from su3d_bench.analysis.gate import Reference, check, learn, read_reference
 from su3d_bench.cli.main import main
-from su3d_bench.reports.gate import github_lines, junit_xml, markdown, plain_lines
-from su3d_bench.reports.gate_findings import Finding, Verdict
+from su3d_bench.reports.gate import Finding, Verdict, github_lines, junit_xml, markdown, plain_lines
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run
 

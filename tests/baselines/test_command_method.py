@@ -28,7 +28,7 @@ from su3d_bench.datasets.replica.mesh_truth import read_surface
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.predictions.base import VertexLabels, VertexMasks
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.runs.scene_tools import no_detections
+from su3d_bench.runs.feeding import no_detections
 
 
 def test_the_exported_folder_reads_back_as_the_frames_that_went_in(tmp_path: Path) -> None:

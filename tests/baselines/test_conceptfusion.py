@@ -11,8 +11,7 @@ import pytest
 from box_room import SIZE, write_box_room
 from scannet_scan import SCAN, write_recording
 
-from su3d_bench.baselines.conceptfusion.conceptfusion_sam import ConceptFusionSam
-from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig
+from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig, ConceptFusionSam
 from su3d_bench.baselines.conceptfusion.pixel_features import mixed_features, mixing_weights, paint
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.timing import Timer

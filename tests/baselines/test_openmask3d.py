@@ -13,8 +13,12 @@ from prediction_files import write_openyolo3d
 from pydantic import ValidationError
 
 from su3d_bench.baselines.openmask3d.features import FeatureMeans, Looking, crop_boxes, prompted_mask
-from su3d_bench.baselines.openmask3d.method import OpenMask3D, OpenMask3DConfig
-from su3d_bench.baselines.openmask3d.openmask3d_segment3d import OpenMask3DSegment3D, OpenMask3DSegment3DConfig
+from su3d_bench.baselines.openmask3d.method import (
+    OpenMask3D,
+    OpenMask3DConfig,
+    OpenMask3DSegment3D,
+    OpenMask3DSegment3DConfig,
+)
 from su3d_bench.baselines.openmask3d.views import (
     MaskViews,
     as_openmask3d,
@@ -30,7 +34,7 @@ from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, Instances, Int64Array, Proposals, SceneInfo, Surface
 from su3d_bench.metrics.matching.labelling import most_similar
 from su3d_bench.perception.regions import region_under
-from su3d_bench.runs.scene_tools import no_detections
+from su3d_bench.runs.feeding import no_detections
 
 WIDTH, HEIGHT, FOCAL = 12, 8, 10.0
 INTRINSICS = np.array([[FOCAL, 0, 0], [0, FOCAL, 0], [0, 0, 1]])

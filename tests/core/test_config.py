@@ -13,13 +13,15 @@ from su3d_bench.core.config import (
     check_keys,
     check_names,
     flatten,
+    key_lines,
     nest,
     read_assignments,
     read_file,
     resolve,
+    toml_value,
+    write_toml,
 )
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.core.toml_text import key_lines, toml_value, write_toml
 
 
 class Inner(BaseModel):

@@ -18,8 +18,7 @@ from box_room import write_box_room, write_poses, write_truth
 from painted import Painted
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.errors import DataError
-from su3d_bench.core.plain_text import printable, printable_json
+from su3d_bench.core.errors import DataError, printable, printable_json
 from su3d_bench.core.types import Frame
 from su3d_bench.datasets.checks import SAMPLED_FRAMES, Inspection, inspect
 from su3d_bench.datasets.checks_of_frames import Finding, check_frames, facts_of

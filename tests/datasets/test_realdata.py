@@ -12,7 +12,7 @@ from places import REAL_RECORDINGS
 from scipy.spatial import cKDTree
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.toml_text import write_toml
+from su3d_bench.core.config import write_toml
 from su3d_bench.core.types import Instances
 from su3d_bench.datasets.recordings.pose_convention import check_convention
 from su3d_bench.datasets.rgbd.dataset import Rgbd

@@ -16,8 +16,8 @@ import pytest
 from damage import damages, outcomes, truncations
 
 from su3d_bench.cli.main import main
+from su3d_bench.core.config import write_toml
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.core.toml_text import write_toml
 from su3d_bench.datasets.recordings.pose_convention import FLIP
 from su3d_bench.datasets.rgbd.dataset import Rgbd, RgbdOptions
 from su3d_bench.datasets.rgbd.description import RgbdDescription

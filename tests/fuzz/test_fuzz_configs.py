@@ -18,10 +18,9 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 from test_fuzz_cli import EXAMPLES
 
-from su3d_bench.core.config import Setting, Settings, check_keys, flatten, read_file, resolve
+from su3d_bench.core.config import Setting, Settings, check_keys, flatten, read_file, resolve, write_toml
 from su3d_bench.core.errors import Su3dError
 from su3d_bench.core.registry import DATASETS, METHODS, load
-from su3d_bench.core.toml_text import write_toml
 from su3d_bench.perception.config import PerceptionConfig
 
 SECTIONS: dict[tuple[str, ...], type[BaseModel]] = {

@@ -23,7 +23,7 @@ from su3d_bench.metrics.instance.average_precision import (
     last_line_of_each_mask_file,
     per_scene,
 )
-from su3d_bench.metrics.instance.dot_product import dot
+from su3d_bench.metrics.instance.precision_recall import dot
 from su3d_bench.metrics.protocols import load_protocol
 
 INSTANCE_CASES = sorted(p.stem for p in CASES.glob("inst*.json")) + sorted(p.stem for p in CASES.glob("replica*.json"))

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from su3d_bench.metrics import scoring
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance import dot_product, precision_recall
+from su3d_bench.metrics.instance import precision_recall
+from su3d_bench.metrics.instance import precision_recall as dot_product
 from su3d_bench.metrics.matching import labelling
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import most_similar

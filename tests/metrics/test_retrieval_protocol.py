@@ -14,9 +14,8 @@ from scored_room import ENCODER, NAMES, OneHotEncoder, instances, nothing, room,
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.core.types import Partition
-from su3d_bench.evaluation.evaluation_questions import score_on_questions
-from su3d_bench.evaluation.openlex import why_not_lex_content
-from su3d_bench.metrics.instance.covered_objects import covered_objects
+from su3d_bench.evaluation.openlex import score_on_questions, why_not_lex_content
+from su3d_bench.metrics.instance.score import covered_objects
 from su3d_bench.metrics.protocols import load_protocol, protocols_for, read_protocol, rules_file
 from su3d_bench.metrics.questions.score import are_objects_right, is_answer_right
 from su3d_bench.metrics.questions.shares import ShareCounts

@@ -9,8 +9,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame
 from su3d_bench.numerics.geometry import back_project, valid_depth
 from su3d_bench.opensu3d.config import OpenSU3DConfig
-from su3d_bench.opensu3d.frame_cloud import frame_cloud
-from su3d_bench.opensu3d.id_image import NO_DETECTION
+from su3d_bench.opensu3d.frame_cloud import NO_DETECTION, frame_cloud
 
 INTRINSICS = np.array([[50.0, 0, 15.5], [0, 40.0, 11.5], [0, 0, 1]])
 

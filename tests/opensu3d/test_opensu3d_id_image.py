@@ -7,7 +7,7 @@ import pytest
 
 from su3d_bench.core.types import BoolArray
 from su3d_bench.opensu3d.config import OpenSU3DConfig
-from su3d_bench.opensu3d.id_image import NO_DETECTION, paint
+from su3d_bench.opensu3d.frame_cloud import NO_DETECTION, paint
 
 
 def rectangle(rows: slice, columns: slice, height: int = 40, width: int = 60) -> BoolArray:

@@ -15,7 +15,7 @@ from tiny_models import paper_words, write_models
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import Instances
-from su3d_bench.perception.language.prompts import DESCRIBE
+from su3d_bench.perception.language.captioner import DESCRIBE
 from su3d_bench.store.run_folder import read_json, read_prediction
 
 pytestmark = needs_models

@@ -20,8 +20,8 @@ from su3d_bench.perception.embedded.naming import (
     vocabulary,
     with_article,
 )
-from su3d_bench.perception.features import regions_to_keep
 from su3d_bench.perception.profiles import PerceptionConfig, build_perception, resolve_profile
+from su3d_bench.perception.regions import regions_to_keep
 
 
 def scene(domain: ImageDomain) -> SceneInfo:

@@ -13,9 +13,9 @@ from tiny_models import blocks, frame_of, paper_words, tiny_dino, tiny_sam, writ
 
 from su3d_bench.cli.main import main
 from su3d_bench.core import registry
+from su3d_bench.core.config import write_toml
 from su3d_bench.core.errors import ConfigError, ModelMissing
 from su3d_bench.core.timing import Timer
-from su3d_bench.core.toml_text import write_toml
 from su3d_bench.core.types import Instances, PerceptionNeeds, SceneInfo, UInt8Array
 from su3d_bench.perception import paper as profile_paper
 from su3d_bench.perception.cache import FrameCache
@@ -317,8 +317,7 @@ def test_the_networks_run_on_a_gpu(device: str) -> None:
         pytest.skip("needs a GPU that torch can use")
     import copy
 
-    from su3d_bench.perception.models.masks.sam import Sam
-    from su3d_bench.perception.models.masks.sam_networks import TorchSam
+    from su3d_bench.perception.models.masks.sam import Sam, TorchSam
 
     boxes = np.array([[5, 5, 60, 60], [0, 0, 128, 96]], np.float32)
     sams = [Sam(TorchSam(tiny_sam())), Sam(TorchSam(copy.deepcopy(tiny_sam()).to(device)))]

@@ -18,7 +18,7 @@ from damage import damages, outcomes, truncations
 from places import CASES
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.formats import zip_files
+from su3d_bench.formats import numpy_files as zip_files
 from su3d_bench.formats.numpy_files import read_npy, read_npz
 from su3d_bench.formats.torch_zip import SparseTensor, read_torch, torch_kind
 

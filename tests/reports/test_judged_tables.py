@@ -15,11 +15,11 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.reports.tables.judged import judged_table
 from su3d_bench.reports.tables.latex import latex
-from su3d_bench.reports.tables.measured import Measured
+from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.paper import Shown
+from su3d_bench.sheets.answers import check_answers
 from su3d_bench.sheets.score_file import write_scores
 from su3d_bench.sheets.scores import score
-from su3d_bench.sheets.validation import check_answers
 
 LABELS = [("right", "right", "well-merged"), ("wrong", "right", "well-merged"), ("wrong", "wrong", "over-merged")]
 

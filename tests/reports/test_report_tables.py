@@ -10,11 +10,17 @@ import pytest
 from measured_rows import SCENES, measured, measured_instances
 
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.reports.tables.ablation_table import SweepRow, ablation_table
 from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
 from su3d_bench.reports.tables.latex import latex
 from su3d_bench.reports.tables.model import Table
-from su3d_bench.reports.tables.paper import Shown, paper_table, protocol_table, selection_tables
+from su3d_bench.reports.tables.paper import (
+    Shown,
+    SweepRow,
+    ablation_table,
+    paper_table,
+    protocol_table,
+    selection_tables,
+)
 
 
 def texts(table: Table) -> list[list[str]]:

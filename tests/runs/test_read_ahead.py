@@ -9,7 +9,7 @@ import pytest
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Frame
-from su3d_bench.runs.read_ahead import ReadAhead
+from su3d_bench.runs.feeding import ReadAhead
 
 N_FRAMES = 40
 

@@ -31,7 +31,7 @@ from su3d_bench.runs import job as scene_job
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.atomic import filling
 from su3d_bench.store.run_folder import RunFolder, npz_bytes, read_npz
-from su3d_bench.store.temporary_folders import TemporaryFolder
+from su3d_bench.store.scratch import TemporaryFolder
 
 KILLS = ROOT / "benchmarks" / "kill_at_random.py"
 SUBJECT = f"{SCENES}/kill_subject.py"

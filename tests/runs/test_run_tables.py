@@ -6,7 +6,7 @@ from typing import Any
 
 from su3d_bench.core.types import PerceptionNeeds, SceneInfo
 from su3d_bench.reports.tables.run import headline, markdown_table
-from su3d_bench.runs.job_inputs import caveat_of
+from su3d_bench.runs.job import caveat_of
 
 
 def result(method: str = "opensu3d", **more: Any) -> dict[str, Any]:

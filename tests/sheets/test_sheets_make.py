@@ -21,15 +21,22 @@ from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.core.types import Frame
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.questions.model import new_question
-from su3d_bench.reports.pictures.frame_views import best_view, mask_in_frame, seen_in
 from su3d_bench.reports.pictures.heat_scales import SCALES, scale_stops, similarity_colours
-from su3d_bench.reports.pictures.items import ItemParts, Panel, compose, png_bytes, zoomed
+from su3d_bench.reports.pictures.items import (
+    ItemParts,
+    Panel,
+    best_view,
+    compose,
+    mask_in_frame,
+    png_bytes,
+    seen_in,
+    zoomed,
+)
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.executors.local import run_processes
 from su3d_bench.runs.finished import read_run
-from su3d_bench.sheets.drafts import annotation_drafts, retrieval_drafts
-from su3d_bench.sheets.drawing import Artist
-from su3d_bench.sheets.drawing_jobs import SceneDrafts, _lost, draw_all, draw_scene
+from su3d_bench.sheets.drafts import annotation_drafts, built_in, reasoning_drafts, retrieval_drafts
+from su3d_bench.sheets.drawing import Artist, SceneDrafts, _lost, draw_all, draw_scene
 from su3d_bench.sheets.items import (
     ANSWER_COLUMNS,
     Sheet,
@@ -40,7 +47,6 @@ from su3d_bench.sheets.items import (
     write_sheet,
 )
 from su3d_bench.sheets.making import table_csv, write_sheets
-from su3d_bench.sheets.reasoning_drafts import built_in, reasoning_drafts
 from su3d_bench.sheets.run_source import RunSource
 
 TEXTS = tuple(f"thing {k}" for k in range(12))

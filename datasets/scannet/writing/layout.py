@@ -15,16 +15,14 @@ import numpy as np
 
 from su3d_bench.core.types import Float64Array, Frame
 from su3d_bench.datasets.scannet.labels import TABLE_NAME
-from su3d_bench.datasets.scannet.scannet_meta import meta_name
 from su3d_bench.datasets.scannet.sens.header import SensHeader
 from su3d_bench.datasets.scannet.sens.read import FRAME_RECORD, MICROSECONDS, MOTION_RECORD
 from su3d_bench.datasets.scannet.sens.write import SensFrame, depth_content, write_sens
-from su3d_bench.datasets.scannet.truth import truth_names
+from su3d_bench.datasets.scannet.truth import meta_name, truth_names
 from su3d_bench.datasets.scannet.writing.categories import label_table_text, room_of, scan_name
 from su3d_bench.datasets.scannet.writing.truth import write_scan_truth
 from su3d_bench.datasets.writing import ScannedDataset, SceneTarget, write_shared_text
-from su3d_bench.formats.images import image_size
-from su3d_bench.formats.layout_files import JPEG_QUALITY, depth_in_units, jpeg_bytes
+from su3d_bench.formats.images import JPEG_QUALITY, depth_in_units, image_size, jpeg_bytes
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
 DEPTH_SHIFT = 1000.0  # units a metre, of every recording of the release

@@ -14,11 +14,10 @@ import numpy as np
 
 from su3d_bench.core.types import Float64Array, Int64Array, UInt8Array
 from su3d_bench.datasets.scannet.annotations import aggregation_name, segments_name
-from su3d_bench.datasets.scannet.scannet_meta import meta_name
-from su3d_bench.datasets.scannet.truth import labels_name, mesh_name
+from su3d_bench.datasets.scannet.truth import labels_name, mesh_name, meta_name
 from su3d_bench.datasets.scannet.writing.categories import categories, nyu40_colours, scene_type
 from su3d_bench.datasets.writing import Scan, ScannedDataset
-from su3d_bench.formats.layout_files import list_column, triangles_of
+from su3d_bench.formats.images import list_column, triangles_of
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
 from su3d_bench.store.run_folder import make_folder, write_text
 

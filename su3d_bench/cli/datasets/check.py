@@ -9,12 +9,10 @@ from dataclasses import asdict
 from itertools import groupby
 from typing import Any
 
-from su3d_bench.cli.common import answer, answer_json, remark
-from su3d_bench.cli.progress import progress
+from su3d_bench.cli.common import answer, answer_json, progress, remark
 from su3d_bench.core import registry
 from su3d_bench.core.config import read_assignments, resolve
-from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
-from su3d_bench.core.plain_text import printable, printable_json
+from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, printable, printable_json
 from su3d_bench.datasets.checks import Inspection, TruthVariant, inspect
 from su3d_bench.datasets.checks_of_frames import Finding
 from su3d_bench.runs.executors.local import Event

@@ -6,11 +6,9 @@ import argparse
 import re
 from pathlib import Path
 
-from su3d_bench.cli.common import answer, answer_json
+from su3d_bench.cli.common import answer, answer_json, progress
 from su3d_bench.cli.datasets.check import chosen_scenes
-from su3d_bench.cli.progress import progress
-from su3d_bench.core.errors import EXIT_DONE, ConfigError
-from su3d_bench.core.plain_text import printable, printable_json
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, printable, printable_json
 from su3d_bench.reports.pictures.scene import draw_scene_picture, facts_line
 from su3d_bench.reports.pictures.scene_look import look_at
 from su3d_bench.runs.executors.local import Event

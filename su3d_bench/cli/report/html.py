@@ -46,7 +46,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.page_maps import MOST_POINTS, QUERIES, page_scenes, points_of_each
     from su3d_bench.analysis.page_numbers import page_numbers, scored_maps
     from su3d_bench.cli.query import encoder_of
-    from su3d_bench.core.plain_text import printable
+    from su3d_bench.core.errors import printable
     from su3d_bench.reports.page.page import page_html
     from su3d_bench.store.run_folder import make_folder, write_text
 

@@ -80,9 +80,8 @@ def call(arguments: argparse.Namespace) -> int:
 
 def _tables(arguments: argparse.Namespace) -> list[Table]:
     from su3d_bench.analysis.tables import choose, is_scores, measured_results
-    from su3d_bench.reports.tables.ablation_table import SweepRow, ablation_table
     from su3d_bench.reports.tables.judged import JUDGED, judged_table
-    from su3d_bench.reports.tables.paper import Shown, paper_table, selection_tables
+    from su3d_bench.reports.tables.paper import Shown, SweepRow, ablation_table, paper_table, selection_tables
     from su3d_bench.runs.ablation import read_rows
 
     shown = Shown(

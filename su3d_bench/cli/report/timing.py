@@ -73,7 +73,7 @@ def _methods(run: FinishedRun, asked: list[str] | None) -> list[str]:
 
 
 def _times(run: FinishedRun, method: str) -> list[UpdateTimes]:
-    from su3d_bench.runs.finished_updates import read_update_times
+    from su3d_bench.runs.finished import read_update_times
 
     return read_update_times(run, method)
 

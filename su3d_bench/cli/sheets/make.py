@@ -7,8 +7,15 @@ from itertools import islice
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_json, remark
-from su3d_bench.cli.language_flags import add_language_flags, chat_client, language_config
+from su3d_bench.cli.common import (
+    add_language_flags,
+    add_verb,
+    answer,
+    answer_json,
+    chat_client,
+    language_config,
+    remark,
+)
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
@@ -17,9 +24,8 @@ if TYPE_CHECKING:
     from su3d_bench.core.interfaces import Encoder
     from su3d_bench.perception.language.chat import ChatRequest
     from su3d_bench.questions.model import Question
-    from su3d_bench.sheets.drafts import Draft
+    from su3d_bench.sheets.drafts import AskMap, Draft
     from su3d_bench.sheets.items import SheetKind
-    from su3d_bench.sheets.reasoning_drafts import AskMap
     from su3d_bench.sheets.run_source import RunSource
 
 NAME = "make"
@@ -150,9 +156,8 @@ def _drafts(
     import numpy as np
 
     from su3d_bench.cli.query import encoder_of
-    from su3d_bench.sheets.drafts import annotation_drafts, questions_of, retrieval_drafts
+    from su3d_bench.sheets.drafts import annotation_drafts, questions_of, reasoning_drafts, retrieval_drafts
     from su3d_bench.sheets.making import check_split
-    from su3d_bench.sheets.reasoning_drafts import reasoning_drafts
 
     source = next(iter(sources.values()))
     random = np.random.default_rng(arguments.seed)
@@ -181,7 +186,7 @@ def _drafts(
 
 def _ask_map(source: RunSource, encoder: Encoder | None, arguments: argparse.Namespace) -> tuple[AskMap, str]:
     """Who answers the questions of reasoning sheets, and how the key calls them."""
-    from su3d_bench.sheets.reasoning_drafts import built_in, by_language_model
+    from su3d_bench.sheets.drafts import built_in, by_language_model
 
     if arguments.solver != "llm":
         return built_in(encoder), "the built-in solver"
@@ -191,7 +196,7 @@ def _ask_map(source: RunSource, encoder: Encoder | None, arguments: argparse.Nam
 
 def _estimate(source: RunSource, arguments: argparse.Namespace) -> int:
     """Tell what asking the language model would cost at the most."""
-    from su3d_bench.sheets.reasoning_drafts import reasoning_drafts, requests_into
+    from su3d_bench.sheets.drafts import reasoning_drafts, requests_into
 
     config = language_config(arguments)
     client = chat_client(arguments, source.run.folder, config)
@@ -228,9 +233,9 @@ def _drawn(
     source: RunSource, drafts: Mapping[SheetKind, Sequence[Draft]], arguments: argparse.Namespace
 ) -> dict[SheetKind, list[bytes]]:
     """The pictures of all drafts."""
-    from su3d_bench.cli.progress import progress
+    from su3d_bench.cli.common import progress
     from su3d_bench.runs.executors.local import Event
-    from su3d_bench.sheets.drawing_jobs import draw_all
+    from su3d_bench.sheets.drawing import draw_all
 
     flat = [one for of_kind in drafts.values() for one in of_kind]
     name = source.run.name

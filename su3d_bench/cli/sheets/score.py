@@ -51,11 +51,10 @@ def call(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from su3d_bench.reports.tables.formats import markdown
-    from su3d_bench.reports.tables.sheet_tables import sheet_tables
-    from su3d_bench.sheets.answers import read_answers
+    from su3d_bench.reports.tables.judged import sheet_tables
+    from su3d_bench.sheets.answers import check_answers, check_key, read_answers
     from su3d_bench.sheets.items import KEY_FILE, read_key, read_sheet
     from su3d_bench.sheets.scores import score
-    from su3d_bench.sheets.validation import check_answers, check_key
 
     key_file = arguments.key / KEY_FILE if arguments.key.is_dir() else arguments.key
     key = read_key(key_file)
@@ -127,7 +126,7 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
 
     from su3d_bench.reports.sheet.second_looks import second_looks_csv, second_looks_page
     from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
-    from su3d_bench.reports.tables.sheet_tables import sheet_tables
+    from su3d_bench.reports.tables.judged import sheet_tables
     from su3d_bench.sheets.items import PICTURES
     from su3d_bench.sheets.score_file import write_scores
     from su3d_bench.store.run_folder import make_folder, write_text

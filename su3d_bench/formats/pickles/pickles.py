@@ -9,8 +9,7 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import BinaryIO, cast
 
-from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.formats.pickles.pickle_constructors import CONSTRUCTORS, Constructors, Forgotten, Inert, RefusedError
 from su3d_bench.formats.pickles.pickle_machine import PickleMachine
 

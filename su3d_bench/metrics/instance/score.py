@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
@@ -12,6 +13,13 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Instances, Int64Array, Partition
 from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance.average_precision import (
+    INSTANCES_PER_CLASS,
+    InstanceCounts,
+    count_class,
+    intersections,
+    stacked,
+)
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import (
     candidate_classes,
@@ -20,7 +28,8 @@ from su3d_bench.metrics.matching.labelling import (
     encoder_warning,
     scored_classes,
 )
-from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.matching.nearest import Masks
+from su3d_bench.metrics.protocols import ProtocolRules, TransferRules
 from su3d_bench.metrics.results.results import Counts
 from su3d_bench.metrics.scene_score import SceneScore, n_predictions, present
 
@@ -146,3 +155,89 @@ def _instance_warnings(
             f"{what} with IoU above {DUPLICATE_IOU} (first {first} and {second}); duplicates can raise or lower AP"
         )
     return tuple(warnings)
+
+
+NO_OBJECT = 0
+
+
+@dataclass(frozen=True)
+class Covered:
+    """``n_shared`` (K, O): truth vertices of object ``object_ids`` (O,) that instance k covers.
+
+    A vertex is covered by the instances that own the map point nearest to it, where that is within the cap.
+    """
+
+    object_ids: Int64Array
+    n_shared: Int64Array
+
+    @property
+    def main_object(self) -> Int64Array:
+        """The object (K,) that each instance covers most vertices of, the lowest id of equals, 0 where it covers none.
+
+        >>> Covered(np.array([3, 7]), np.array([[2, 5], [4, 4], [0, 0]])).main_object.tolist()
+        [7, 3, 0]
+        """
+        if not len(self.object_ids):
+            return np.full(len(self.n_shared), NO_OBJECT, np.int64)
+        best = self.n_shared.argmax(axis=1)
+        return np.where(self.n_shared.max(axis=1) > 0, self.object_ids[best], NO_OBJECT)
+
+
+def covered_objects(rules: TransferRules, truth: GroundTruth, prediction: Instances | Partition) -> Covered:
+    """What each instance, or row of features, covers of the truth's objects."""
+    if isinstance(prediction, Instances):
+        masks = transfer.masks_of(prediction)
+    else:
+        masks = transfer.masks_of_partition(prediction.instance, len(prediction.features))
+    moved = transfer.transfer_masks(prediction.points, masks, truth.points, rules.cap_m, rules.evaluation_voxel_m)
+    ids, column = np.unique(np.maximum(truth.instance, 0), return_inverse=True)
+    shared = instance_ap.intersections(column, len(ids), moved.indptr, moved.indices, np.arange(len(masks)))
+    is_object = ids > 0
+    return Covered(ids[is_object].astype(np.int64), shared[:, is_object])
+
+
+def every_class_counts(
+    values: Int64Array,
+    masks: Masks,
+    scores: Float64Array,
+    class_ids: Sequence[int],
+    min_region_size: int,
+    thresholds: Sequence[float],
+) -> InstanceCounts:
+    """The counts of one scene when every mask is listed once under each class; each mask is intersected once only.
+
+    ``values`` (N,) are class id * 1000 + instance of each point, as the metric takes them.
+
+    >>> truth = np.repeat([3001, 4001], 200)
+    >>> masks = Masks(np.array([0, 200, 400]), np.arange(400, dtype=np.int32))
+    >>> counts = every_class_counts(truth, masks, np.ones(2), [3, 4], 100, (0.5, 0.25))
+    >>> counts.n_predictions.tolist(), counts.is_true.tolist()
+    ([2, 2], [True, False, True, False, True, False, True, False])
+    """
+    n_of_value = np.bincount(values) if len(values) else np.zeros(0, np.int64)
+    distinct = np.flatnonzero(n_of_value)
+    size_of_segment = n_of_value[distinct]
+    row_of_value = np.zeros(len(n_of_value), np.int64)
+    row_of_value[distinct] = np.arange(len(distinct))
+    size = np.diff(masks.indptr)
+    kept = np.flatnonzero(size >= min_region_size)
+    shared = intersections(row_of_value[values], len(distinct), masks.indptr, masks.indices, kept)
+    label_of_segment = distinct // INSTANCES_PER_CLASS
+    n_void = shared[:, ~np.isin(label_of_segment, class_ids)].sum(axis=1)
+    n_points = size[kept]
+    parts = []
+    for index, class_id in enumerate(class_ids):
+        columns = np.flatnonzero(label_of_segment == class_id)
+        of_class, sizes = shared[:, columns], size_of_segment[columns]
+        is_small = sizes < min_region_size
+        parts.append(
+            count_class(
+                index,
+                iou=of_class / (sizes[None, :] + n_points[:, None] - of_class),
+                takes_part=~is_small,
+                scores=scores[kept],
+                ignored_share=(n_void + of_class[:, is_small].sum(axis=1)) / n_points,
+                thresholds=thresholds,
+            )
+        )
+    return stacked(parts)

@@ -13,7 +13,7 @@ from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, Prediction
 from su3d_bench.metrics.protocols import ProtocolRules
-from su3d_bench.store.row_blocks import row_blocks
+from su3d_bench.store.scratch import row_blocks
 
 CPU = "cpu"
 _BLOCK_ROWS = 8192  # 34 MB of float64 at 512 dimensions, whatever the size of the map

@@ -30,7 +30,7 @@ from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.metrics.scene_score import SceneScore, n_predictions
 from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.numerics.geometry import voxel_coordinates
-from su3d_bench.store.row_blocks import release_pages
+from su3d_bench.store.scratch import release_pages
 
 NEEDS_FEATURES = "needs features to compare with texts, and the prediction has none"
 _BLOCK_UNITS = 2048  # 2048 units x 3407 prompts of float64 are 56 MB

@@ -9,8 +9,7 @@ import numpy as np
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import BoolArray, GroundTruth, Instances, Int64Array, Partition
-from su3d_bench.metrics.instance.covered_objects import NO_OBJECT, Covered, covered_objects
-from su3d_bench.metrics.instance.score import score_of_masks
+from su3d_bench.metrics.instance.score import NO_OBJECT, Covered, covered_objects, score_of_masks
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, text_features
 from su3d_bench.metrics.protocols import VALUES_OF_METRIC, AnswerRules, MergeRules, ProtocolRules

@@ -18,7 +18,7 @@ from su3d_bench.metrics.matching.labelling import (
 from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.metrics.scene_score import SceneScore, n_predictions, present
 from su3d_bench.metrics.semantic import confusion as semantic
-from su3d_bench.store.row_blocks import row_blocks
+from su3d_bench.store.scratch import row_blocks
 
 
 def score_semantic(

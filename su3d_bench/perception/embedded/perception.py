@@ -11,8 +11,14 @@ from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.config import PerceptionConfig
 from su3d_bench.perception.embedded.naming import Namer, colour_word, scene_caption
 from su3d_bench.perception.embedded.segmenter.segmenter import RgbdSegmenter
-from su3d_bench.perception.features import CropEncoder, NameEncoder, grown_boxes, regions_to_keep
-from su3d_bench.perception.regions import SegmentedRegions, cached_regions
+from su3d_bench.perception.regions import (
+    CropEncoder,
+    NameEncoder,
+    SegmentedRegions,
+    cached_regions,
+    grown_boxes,
+    regions_to_keep,
+)
 
 CAMERA_CAVEAT = (
     "embedded perception on camera images: its encoder has seen rendered rooms only, so names and labels mean little "

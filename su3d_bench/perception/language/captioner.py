@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,7 +14,27 @@ from su3d_bench.perception.language.chat import ChatRequest, Reply, fitted
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.language.parsing import described, is_refusal
-from su3d_bench.perception.language.prompts import DESCRIBE
+
+# opensu3d.tex, section III-A.
+DESCRIBE = "Give name and description to the object. Output e.g. `name':`description'"
+# opensu3d.tex, section III-C. The paper prints no more; how to answer is ours, so that the reply can be read.
+REFINE = "assign a single name to the object based on a given list of names"
+REFINE_FORM = "Answer with that name alone."
+# opensu3d.tex, section III-E, the six points of the prompting strategy.
+STRATEGY = (
+    "Use `Name' & `Description' to understand object.",
+    "Use `ID' to refer object.",
+    "Use `Cartesian Coordinates'.",
+    "Get `Centroid' & `Bounding Box' information.",
+    "Compute `Euclidean Distance' if necessary.",
+    "Assume `Tolerance' if necessary.",
+)
+
+
+def list_of_names(names: Sequence[str]) -> str:
+    """The names as they are given to the model."""
+    return json.dumps(list(names), ensure_ascii=False)
+
 
 logger = logging.getLogger(__name__)
 

@@ -13,7 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import printable
 from su3d_bench.perception.embedded.text import words
 
 MOST_READ = 8000  # characters of an answer; a name, a caption or an answer stands within

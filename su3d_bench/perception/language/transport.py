@@ -21,8 +21,7 @@ from urllib.parse import urlsplit
 
 from pydantic import BaseModel, Field, ValidationError
 
-from su3d_bench.core.errors import ConfigError, ModelMissing
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import ConfigError, ModelMissing, printable
 from su3d_bench.perception.language.chat import ChatRequest, Reply, n_tokens
 from su3d_bench.perception.language.config import LanguageConfig, check_address
 

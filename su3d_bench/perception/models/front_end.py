@@ -11,7 +11,7 @@ from su3d_bench.core.errors import ConfigError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.models.catalogue import FormName
-from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig
+from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperConfig
 from su3d_bench.perception.models.files import ModelFiles, locate
 from su3d_bench.perception.models.loading import check_encoder
 from su3d_bench.perception.models.masks.grounded_sam import Networks
@@ -28,7 +28,6 @@ from su3d_bench.perception.models.masks.tagging import (
     read_word_list,
 )
 from su3d_bench.perception.models.onnx.session import Provider, open_session
-from su3d_bench.perception.models.paper_config import PaperConfig
 from su3d_bench.perception.models.pretrained import kept, load_grounding_dino, load_sam
 
 PAPER_ENCODER, DETECTOR, TAGGER = "clip-vit-h-14", "grounding-dino", "ram-plus"

@@ -17,10 +17,9 @@ from su3d_bench.core.types import Frame, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.models.catalogue import MODELS, PROFILE_MODELS, ModelEntry, model_entry
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.encoders import towers_onnx, towers_transformers
-from su3d_bench.perception.models.files import ModelFiles, locate
+from su3d_bench.perception.models.files import PICKLED, ModelFiles, locate, read_settings, read_weights
 from su3d_bench.perception.models.masks import sam_onnx
 from su3d_bench.perception.models.onnx.manifest import OnnxManifest, wrong_files
-from su3d_bench.perception.models.weights import PICKLED, read_settings, read_weights
 
 WARM_TEXT = "a chair in a scene"
 

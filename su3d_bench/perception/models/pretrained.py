@@ -9,10 +9,9 @@ from typing import Any, TypeVar, cast
 
 from su3d_bench.core.devices import make_deterministic, require, require_transformers
 from su3d_bench.core.errors import DataError
-from su3d_bench.perception.models.files import ModelFiles
+from su3d_bench.perception.models.files import ModelFiles, bounded, load_pretrained, read_settings, read_weights
 from su3d_bench.perception.models.masks.grounding_dino import GroundingDino
-from su3d_bench.perception.models.masks.sam_networks import TorchSam
-from su3d_bench.perception.models.weights import bounded, load_pretrained, read_settings, read_weights
+from su3d_bench.perception.models.masks.sam import TorchSam
 
 # Width, layers, heads and layers with global attention of the image towers, from segment_anything/build_sam.py.
 _SAM_TOWERS = {

@@ -20,9 +20,8 @@ from su3d_bench.core.types import (
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.config import PerceptionConfig
 from su3d_bench.perception.embedded.naming import scene_caption, with_article
-from su3d_bench.perception.features import NameEncoder, regions_to_keep
 from su3d_bench.perception.oracle.segmenter import OracleSegmenter
-from su3d_bench.perception.regions import cached_regions, region_under
+from su3d_bench.perception.regions import NameEncoder, cached_regions, region_under, regions_to_keep
 
 ORACLE_CAVEAT = "oracle perception: masks and names come from the ground truth; a ceiling, not a result"
 

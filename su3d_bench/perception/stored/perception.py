@@ -13,8 +13,14 @@ from su3d_bench.core.types import BoolArray, Detections, Float32Array, Frame, In
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.config import PerceptionConfig
 from su3d_bench.perception.embedded.naming import Namer, colour_word, scene_caption
-from su3d_bench.perception.features import CropEncoder, NameEncoder, grown_boxes, regions_to_keep
-from su3d_bench.perception.regions import encode_boxes, region_under
+from su3d_bench.perception.regions import (
+    CropEncoder,
+    NameEncoder,
+    encode_boxes,
+    grown_boxes,
+    region_under,
+    regions_to_keep,
+)
 from su3d_bench.perception.stored.label_images import LabelImages
 from su3d_bench.perception.stored.npz_files import StoredFrame, read_stored, stored_path
 

@@ -14,8 +14,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.errors import DataError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import DataError, printable
 from su3d_bench.questions.files.queries import MOST_OBJECTS_ID, is_text
 from su3d_bench.questions.model import REASONING, Question, new_question
 

@@ -11,9 +11,8 @@ import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 
-from su3d_bench.core.errors import DataError
-from su3d_bench.core.plain_text import printable
-from su3d_bench.core.toml_text import toml_value
+from su3d_bench.core.config import toml_value
+from su3d_bench.core.errors import DataError, printable
 from su3d_bench.questions.files.datasets import is_foreign, read_foreign
 from su3d_bench.questions.files.queries import COLUMNS, MORE_COLUMNS, read_query_rows
 from su3d_bench.questions.model import ALL_KINDS, KINDS, Question, new_question

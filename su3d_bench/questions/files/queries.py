@@ -18,8 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.datasets.recordings.recorded_frames import read_text
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery

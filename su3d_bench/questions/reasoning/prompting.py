@@ -12,9 +12,9 @@ import numpy as np
 
 from su3d_bench.core.types import Float64Array
 from su3d_bench.perception.embedded.text import words
+from su3d_bench.perception.language.captioner import STRATEGY
 from su3d_bench.perception.language.chat import ChatRequest, n_tokens
 from su3d_bench.perception.language.config import LanguageConfig
-from su3d_bench.perception.language.prompts import STRATEGY
 from su3d_bench.questions.reasoning.named_objects import meant_by
 from su3d_bench.questions.reasoning.question_words import Phrase, read_question
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap

@@ -8,8 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.types import Float64Array, Instances
 
 MOST_NAME, MOST_CAPTION = 80, 400  # characters; a hostile map may hold texts of any length

@@ -12,8 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError, printable
 from su3d_bench.store.run_folder import make_folder
 
 AT_ONCE = 256  # small files that one request to the driver asks for; it fetches them side by side

@@ -19,7 +19,7 @@ from su3d_bench.runs.job import MethodOutcome, SceneJob
 from su3d_bench.runs.remote.folder import RemoteFolder
 from su3d_bench.runs.scene import failed_outcomes, run_scene
 from su3d_bench.store.run_folder import RunFolder, make_folder, write_bytes
-from su3d_bench.store.temporary_folders import TemporaryFolder
+from su3d_bench.store.scratch import TemporaryFolder
 
 CACHE_ROOT = "~/.cache/su3d-bench/cache"
 SEAL = "done.json"

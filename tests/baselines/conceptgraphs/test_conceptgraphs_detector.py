@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from conceptgraphs_scene import SCENE, Plate, at_cosine, axis, contents, look, mapped
 
-from su3d_bench.baselines.conceptgraphs.conceptgraphs_detector import ConceptGraphsDetector, DetectorConfig
 from su3d_bench.baselines.conceptgraphs.config import MappingConfig
-from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
+from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs, ConceptGraphsDetector, DetectorConfig
 from su3d_bench.core import registry
 from su3d_bench.core.timing import Timer
 

@@ -11,7 +11,7 @@ import pytest
 from su3d_bench.datasets.rooms.classes import CLASS_ID, CLASSES, COLOURS, MATERIALS
 from su3d_bench.datasets.rooms.dataset import KIND_NAMES, Rooms
 from su3d_bench.datasets.rooms.objects.catalog import BUILDERS, make
-from su3d_bench.datasets.rooms.objects.rooms_sizes import USUAL_VOLUME_L, size_word
+from su3d_bench.datasets.rooms.objects.items import USUAL_VOLUME_L, size_word
 from su3d_bench.datasets.rooms.plan import FLAT
 from su3d_bench.datasets.rooms.recipes import KINDS
 from su3d_bench.datasets.rooms.truth import Relation, RoomObject, RoomTruth, queries

@@ -21,7 +21,6 @@ from su3d_bench.datasets.scannet.annotations import (
     segments_name,
 )
 from su3d_bench.datasets.scannet.labels import TABLE_NAME, LabelTable, nyu40_label_set, raw_label_set, read_label_table
-from su3d_bench.datasets.scannet.scannet_meta import read_axis_alignment
 from su3d_bench.datasets.scannet.truth import (
     AnnotatedScan,
     aligned,
@@ -30,6 +29,7 @@ from su3d_bench.datasets.scannet.truth import (
     mesh_name,
     nyu40_truth,
     read_annotated_scan,
+    read_axis_alignment,
     scannet200_truth,
     truth_names,
 )

@@ -7,7 +7,7 @@ import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from su3d_bench.perception.embedded.segmenter.segmenter_graph_kernels import border_pairs, connected, sum_rows
+from su3d_bench.perception.embedded.segmenter.kernels import border_pairs, connected, sum_rows
 
 
 @pytest.mark.parametrize(("n", "n_links"), [(1, 0), (5, 0), (40, 12), (40, 60), (300, 900)])

@@ -20,8 +20,7 @@ from su3d_bench.perception.models.masks.automatic_masks import (
     stability,
     without_small_parts,
 )
-from su3d_bench.perception.models.masks.sam import Prompts, Sam
-from su3d_bench.perception.models.masks.sam_networks import TorchSam
+from su3d_bench.perception.models.masks.sam import Prompts, Sam, TorchSam
 
 
 def mask_of(rows: str) -> BoolArray:

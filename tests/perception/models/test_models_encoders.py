@@ -20,8 +20,8 @@ from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, FoundationEncoder, unit_rows
 from su3d_bench.perception.models.encoders.image_transform import ImageTransform
+from su3d_bench.perception.models.files import read_weights
 from su3d_bench.perception.models.loading import load_encoder
-from su3d_bench.perception.models.weights import read_weights
 
 TEXTS = ("chair", "a red cup on the table", "chair", "zebra")
 RAW = EncoderSpec(3, 4, 10, "clip", None, ImageTransform(4))
@@ -257,7 +257,7 @@ def test_a_configuration_without_sense_is_refused_before_anything_is_made(
 def test_settings_of_a_size_that_no_model_has_are_not_read(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr("su3d_bench.perception.models.weights.LARGEST_SETTINGS", 3000)
+    monkeypatch.setattr("su3d_bench.perception.models.files.LARGEST_SETTINGS", 3000)
     for name in ("config.json", "preprocessor_config.json", "merges.txt"):
         target = Path(shutil.copytree(folder / "clip-vit-h-14", tmp_path / name / "clip-vit-h-14"))
         (target / name).write_text((target / name).read_text() + " " * 3000)

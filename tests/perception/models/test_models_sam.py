@@ -16,8 +16,7 @@ from su3d_bench.perception.models.catalogue import model_entry
 from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.masks import sam_onnx
 from su3d_bench.perception.models.masks.grounded_sam import Networks, SamRegions
-from su3d_bench.perception.models.masks.sam import Prompts, Sam
-from su3d_bench.perception.models.masks.sam_networks import TorchSam
+from su3d_bench.perception.models.masks.sam import Prompts, Sam, TorchSam
 from su3d_bench.perception.models.masks.tagging import WordTagger
 from su3d_bench.perception.models.pretrained import fill_sam, sam_config, sam_names
 

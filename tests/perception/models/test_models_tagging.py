@@ -18,7 +18,10 @@ from su3d_bench.perception.embedded.naming import vocabulary
 from su3d_bench.perception.models.catalogue import model_entry
 from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.masks.tagging import (
+    ADDED_TAGS,
+    BACKGROUND_TAGS,
     RAM_PX,
+    STOP_WORDS,
     OnnxRamTagger,
     RamTagger,
     WordTagger,
@@ -27,7 +30,6 @@ from su3d_bench.perception.models.masks.tagging import (
     ram_pixels,
     read_word_list,
 )
-from su3d_bench.perception.models.masks.tagging_words import ADDED_TAGS, BACKGROUND_TAGS, STOP_WORDS
 
 RGB = blocks(40, 60)
 

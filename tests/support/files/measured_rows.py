@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
-from su3d_bench.reports.tables.measured import Measured
+from su3d_bench.reports.tables.model import Measured
 
 SCENES = tuple(f"replica/room{k}" for k in range(8))
 

@@ -63,8 +63,7 @@ def _run(folder: Path) -> Read:
     from su3d_bench.analysis.sides import Side
     from su3d_bench.analysis.tables import measured_results
     from su3d_bench.runs.estimate import recent_update_s
-    from su3d_bench.runs.finished import read_run
-    from su3d_bench.runs.finished_updates import read_update_times
+    from su3d_bench.runs.finished import read_run, read_update_times
 
     path, reference = copied_run(folder), folder / "reference.json"
     reference.write_text(json.dumps(learn([read_run(path)]).model_dump(mode="json")))
@@ -154,8 +153,7 @@ def _answers(name: str) -> Make:
         from counted_sheets import workbook
         from simulated_annotators import answered, as_csv, retrieval_set
 
-        from su3d_bench.sheets.answers import read_answers
-        from su3d_bench.sheets.validation import check_answers
+        from su3d_bench.sheets.answers import check_answers, read_answers
 
         sheet, key = retrieval_set(4)
         rows = answered(sheet, key, {"ann": 0.0})
@@ -207,9 +205,8 @@ def _config(name: str, *more: str) -> Make:
 
 def _method_config(folder: Path) -> Read:
     """The settings of all methods of our own in one file."""
-    from su3d_bench.core.config import check_keys, read_file, resolve
+    from su3d_bench.core.config import check_keys, read_file, resolve, write_toml
     from su3d_bench.core.registry import METHODS, load
-    from su3d_bench.core.toml_text import write_toml
     from su3d_bench.perception.config import PerceptionConfig
 
     classes = {name: load("method", name).Config for name in METHODS}
@@ -262,7 +259,7 @@ def _assignments(folder: Path) -> Read:
     """Words of ``--set``, of variants and of ``--vary``, one a line of a file."""
     from su3d_bench.core.config import parse_value, read_assignments
     from su3d_bench.runs.ablation import ablation_rows
-    from su3d_bench.runs.method_names import named_method
+    from su3d_bench.runs.plan import named_method
 
     lines = ("opensu3d.top_m=10", "top_m=10,5", "perception.cache=false", "rooms.width=64", "opensu3d.a='x'")
     (folder / "words.txt").write_text("\n".join(lines))

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from su3d_bench.datasets.replica.replica_labels import replica_label_set
+from su3d_bench.datasets.replica.folders import replica_label_set
 from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 
 WIDTH, HEIGHT, SCALE = 12, 8, 6553.5

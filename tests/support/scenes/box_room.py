@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from su3d_bench.datasets.replica.replica_labels import replica_label_set
+from su3d_bench.datasets.replica.folders import replica_label_set
 from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 
 WIDTH, HEIGHT, FOCAL, SCALE = 48, 36, 24.0, 6553.5

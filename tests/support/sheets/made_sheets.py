@@ -66,7 +66,7 @@ def made(
     kind: SheetKind, texts: Sequence[str], *, seed: int = 0, annotators: int = 1, overlap: float = 0.5
 ) -> MadeSheets:
     """A set of sheets of one item a text."""
-    from su3d_bench.core.plain_text import printable
+    from su3d_bench.core.errors import printable
 
     safe = [replace(one, text=printable(one.text, 1000)) for one in drafts_of(kind, texts)]
     origin = Origin("runs/secret-run", "secret-code", ("opensu3d@scheme1", "opensu3d@scheme4"), "secret-rule")

@@ -123,7 +123,7 @@ class Graph:
 
 
 def _sum_by(label: IndexArray, values: Float64Array, n: int) -> Float64Array:
-    from su3d_bench.perception.embedded.segmenter.segmenter_graph_kernels import sum_rows
+    from su3d_bench.perception.embedded.segmenter.kernels import sum_rows
 
     if values.ndim == 1:
         return np.asarray(np.bincount(label, values, n), np.float64)
@@ -133,7 +133,7 @@ def _sum_by(label: IndexArray, values: Float64Array, n: int) -> Float64Array:
 
 def contract(graph: Graph, pairs: tuple[IndexArray, IndexArray]) -> Graph:
     """The graph with the two pieces of each pair joined, chains included."""
-    from su3d_bench.perception.embedded.segmenter.segmenter_graph_kernels import connected
+    from su3d_bench.perception.embedded.segmenter.kernels import connected
 
     label, n_joined = connected(*pairs, len(graph.pieces))
     pieces, borders = graph.pieces.joined(label, n_joined), graph.borders
@@ -186,7 +186,7 @@ def measure_borders(
 
     Depth differences are relative, in units of ``depth_unit``, from which on they are jumps; -1 where unknown.
     """
-    from su3d_bench.perception.embedded.segmenter.segmenter_graph_kernels import border_pairs
+    from su3d_bench.perception.embedded.segmenter.kernels import border_pairs
 
     n = len(pieces)
     low, high, contrasts, depth = border_pairs(labels, contrast, depth_cost)

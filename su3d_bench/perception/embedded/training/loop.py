@@ -24,9 +24,9 @@ from su3d_bench.perception.embedded.captions import (
     wrong_relation,
 )
 from su3d_bench.perception.embedded.text import PADDING, token_ids
+from su3d_bench.perception.embedded.torch_towers import ImageTower, TextTower
 from su3d_bench.perception.embedded.training.crops import CropSet
 from su3d_bench.perception.embedded.training.targets import TruthTable
-from su3d_bench.perception.embedded.training_model import ImageTower, TextTower
 
 logger = logging.getLogger(__name__)
 

@@ -12,8 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from su3d_bench.core.devices import CPU, Batches
-from su3d_bench.core.errors import DataError
-from su3d_bench.core.plain_text import printable
+from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.types import Float32Array, Int64Array, UInt8Array
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.models.encoders.image_transform import LARGEST_SIZE, ImageTransform

@@ -16,7 +16,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, UInt8Array
-from su3d_bench.perception.models.weights import read_settings
+from su3d_bench.perception.models.files import read_settings
 
 Convention = Literal["original", "transformers"]
 Triple = tuple[float, float, float]

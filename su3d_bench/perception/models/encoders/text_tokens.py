@@ -12,7 +12,7 @@ import numpy as np
 from su3d_bench.core.devices import require, require_transformers
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Int64Array
-from su3d_bench.perception.models.weights import bounded, check_settings_size, read_settings
+from su3d_bench.perception.models.files import bounded, check_settings_size, read_settings
 
 TokensKind = Literal["clip", "siglip"]
 Tokeniser = Callable[[Sequence[str]], Int64Array]

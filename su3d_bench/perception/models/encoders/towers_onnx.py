@@ -22,11 +22,10 @@ from su3d_bench.perception.models.encoders import towers_transformers
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, check_spec, unit_rows
 from su3d_bench.perception.models.encoders.image_transform import Convention, ImageTransform
 from su3d_bench.perception.models.encoders.text_tokens import read_tokeniser
-from su3d_bench.perception.models.files import ModelFiles
+from su3d_bench.perception.models.files import ModelFiles, bounded
 from su3d_bench.perception.models.onnx.export import compare_outputs, export_onnx
 from su3d_bench.perception.models.onnx.manifest import OnnxManifest, common_fields, described, read_common, wrong_files
 from su3d_bench.perception.models.onnx.session import Provider, open_session
-from su3d_bench.perception.models.weights import bounded
 from su3d_bench.store.run_folder import make_folder, write_json
 
 FORMAT = "su3d-bench onnx encoder 1"

@@ -14,8 +14,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec
 from su3d_bench.perception.models.encoders.image_transform import Convention, ImageTransform
-from su3d_bench.perception.models.files import ModelFiles
-from su3d_bench.perception.models.weights import bounded, read_weights
+from su3d_bench.perception.models.files import ModelFiles, bounded, read_weights
 
 N_TOKENS, N_WORDS = 77, 49408
 

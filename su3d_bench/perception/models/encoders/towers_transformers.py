@@ -12,8 +12,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, check_spec
 from su3d_bench.perception.models.encoders.image_transform import Convention, read_transform
-from su3d_bench.perception.models.files import ModelFiles
-from su3d_bench.perception.models.weights import load_pretrained, read_settings
+from su3d_bench.perception.models.files import ModelFiles, load_pretrained, read_settings
 
 # What transformers takes for a CLIP configuration that does not say it.
 _CLIP_DIM, _CLIP_TOKENS, _CLIP_WORDS = 512, 77, 49408

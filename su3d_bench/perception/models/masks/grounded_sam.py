@@ -17,8 +17,7 @@ from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.models.masks.automatic_masks import AutomaticMaskConfig, AutomaticMasks
 from su3d_bench.perception.models.masks.grounding_dino import CONCEPTGRAPHS_BOXES, BoxConfig, GroundingDino
 from su3d_bench.perception.models.masks.sam import Sam, SeenImage
-from su3d_bench.perception.models.masks.tagging import Tagger, chosen_tags
-from su3d_bench.perception.models.masks.tagging_words import ADDED_TAGS, BACKGROUND_TAGS, STOP_WORDS
+from su3d_bench.perception.models.masks.tagging import ADDED_TAGS, BACKGROUND_TAGS, STOP_WORDS, Tagger, chosen_tags
 from su3d_bench.perception.regions import encode_boxes
 
 # Moves the digest when what lies between the networks changes.

@@ -140,3 +140,36 @@ def _at_seen_size(prompts: Prompts, image: SeenImage) -> Prompts:
         return Prompts(boxes=(prompts.boxes.astype(np.float64) * np.tile(scale, 2)).astype(np.float32))
     assert prompts.points is not None
     return Prompts((prompts.points.astype(np.float64) * scale).astype(np.float32), prompts.labels)
+
+
+class TorchSam:
+    """``transformers``' SamModel on its device, in its precision; embeddings stay on the device."""
+
+    def __init__(self, model: Any) -> None:
+        self.model = model.eval()
+        self.image_px: int = model.config.vision_config.image_size
+
+    def embed(self, pixels: Float32Array) -> Any:
+        import torch
+
+        with torch.inference_mode():
+            return self.model.get_image_embeddings(self._tensor(pixels[None]).to(self.model.dtype))
+
+    def decode(self, embedding: Any, prompts: Prompts, is_single: bool) -> tuple[Any, Any]:
+        import torch
+
+        given: dict[str, Any] = {}
+        if prompts.boxes is not None:
+            given["input_boxes"] = self._tensor(prompts.boxes[None])
+        else:
+            assert prompts.points is not None and prompts.labels is not None
+            given["input_points"] = self._tensor(prompts.points[None])
+            given["input_labels"] = self._tensor(prompts.labels[None])
+        with torch.inference_mode():
+            answer = self.model(image_embeddings=embedding, multimask_output=not is_single, **given)
+        return answer.pred_masks[0].float(), answer.iou_scores[0].float()
+
+    def _tensor(self, array: np.typing.NDArray[Any]) -> Any:
+        import torch
+
+        return torch.from_numpy(np.ascontiguousarray(array)).to(self.model.device)

@@ -16,8 +16,7 @@ from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.embedded.naming import vocabulary, with_article
 from su3d_bench.perception.models.encoders.model_images import normalised, resized
-from su3d_bench.perception.models.files import ModelFiles
-from su3d_bench.perception.models.weights import bounded, read_weights
+from su3d_bench.perception.models.files import ModelFiles, bounded, read_weights
 
 RAM_PX = 384
 RAM_TAG_LIST = "ram_tag_list.txt"
@@ -211,3 +210,16 @@ def fill_ram(model: Any, tensors: dict[str, Any], files: ModelFiles) -> None:
             f"{files.weights}: lacks {len(missing)} tensors, such as {missing[0][:80]}; fetch it from "
             f"{files.form.source}"
         )
+
+
+# A tag that contains one of these is left out.
+# Words that taggers give and that name no object, as ConceptGraphs sorts them (generate_gsa_results.py, 5c4da70).
+STOP_WORDS = (
+    "room", "kitchen", "office", "house", "home", "building", "corner", "shadow", "carpet", "photo", "shade", "stall",
+    "space", "aquarium", "apartment", "image", "city", "blue", "skylight", "hallway", "bureau", "modern", "salon",
+    "doorway", "wall lamp", "wood floor",
+)  # fmt: skip
+# Asked for in every image besides its tags.
+ADDED_TAGS = ("other item",)
+# Added with --add_bg_classes.
+BACKGROUND_TAGS = ("wall", "floor", "ceiling")

@@ -9,9 +9,8 @@ from typing import Any, TypeVar
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError
-from su3d_bench.perception.models.files import ModelFiles, file_sha256
+from su3d_bench.perception.models.files import ModelFiles, bounded, file_sha256, read_settings
 from su3d_bench.perception.models.onnx.export import OPSET, Parity
-from su3d_bench.perception.models.weights import bounded, read_settings
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from su3d_bench.core.errors import DataError, ModelMissing
-from su3d_bench.perception.models.weights import bounded
+from su3d_bench.perception.models.files import bounded
 
 Provider = Literal["cpu", "cuda", "tensorrt"]
 PROVIDERS: dict[Provider, str] = {
