@@ -34,7 +34,7 @@ FLOORS = (
     {"cli"},
 )
 HEAVY = {"open3d", "torch", "onnxruntime", "sklearn", "pandas", "matplotlib", "numba"}
-LATE = ("compiled.py", "training_model.py")  # they are imported late as a whole, as kernels are
+LATE = ("compiled.py", "torch_towers.py")  # they are imported late as a whole, as kernels are
 
 
 def room_of(path: Path) -> str | None:
