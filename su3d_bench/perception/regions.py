@@ -129,7 +129,7 @@ class CropEncoder:
     def __init__(self, encoder: Encoder, cache: FrameCache) -> None:
         self._encoder = encoder
         self._cache = cache
-        self._source = package_digest("perception/crops.py", "perception/features.py")
+        self._source = package_digest("perception/crops.py", "perception/regions.py")
         self._rows = CachedRows(cache, encoder.dim)
 
     def crops(

@@ -13,9 +13,9 @@ _SPLITTER = 134217729.0  # 2**27 + 1: Veltkamp's constant, cuts a double into tw
 
 
 # numpy hands ``np.dot`` to the BLAS, whose order of additions differs between processors: the same curve ends in
-# another last bit on AVX2 than on AVX-512. The reference answers of the original evaluators come from OpenBLAS's AVX-512
-# kernel (kernel/x86_64/ddot_microk_skylakex-2.c, and the tail loop of ddot.c): we add in that order, in plain double
-# arithmetic.
+# another last bit on AVX2 than on AVX-512. The reference answers of the original evaluators come from OpenBLAS's
+# AVX-512 kernel (kernel/x86_64/ddot_microk_skylakex-2.c, and the tail loop of ddot.c): we add in that order,
+# in plain double arithmetic.
 def dot(left: Float64Array, right: Float64Array) -> float:
     """The sum of products, added as OpenBLAS's AVX-512 kernel adds them with fused multiply-adds.
 
