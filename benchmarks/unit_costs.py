@@ -58,7 +58,7 @@ def measure(folder: Path) -> Costs:
     environment = os.environ | {"SU3D_CACHE": str(folder / "cache")}
     words = ["run", "--scenes", *SCENES, "--methods", "opensu3d", "--profile", "embedded", "--no-pictures", "--quiet"]
     words += ["--jobs", "1", "--protocols", "rooms-semantic", "rooms-instance", "--out", str(folder / "run")]
-    start_s = min(_seconds(["-c", "import su3d_bench.scene_run, open3d"], environment) for _ in range(2))
+    start_s = min(_seconds(["-c", "import su3d_bench.runs.scene, open3d"], environment) for _ in range(2))
     run_s = _seconds(["-m", "su3d_bench", *words], environment)
     jobs = sorted((folder / "run" / "scenes").glob("*/opensu3d"))
     rows = [row for job in jobs for row in csv.DictReader((job / "updates.csv").open())]

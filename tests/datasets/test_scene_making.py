@@ -132,7 +132,7 @@ import os, signal, sys
 from pathlib import Path
 from scanned_stage import Stage, StageFrames
 from su3d_bench.datasets.layouts import LAYOUTS
-from su3d_bench.datasets.scene_making import write_scene
+from su3d_bench.datasets.writing import write_scene
 
 class Killed(StageFrames):
     def __getitem__(self, index):

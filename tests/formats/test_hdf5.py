@@ -195,8 +195,8 @@ def test_a_promise_without_data_is_refused_in_little_memory(tmp_path: Path) -> N
         "import resource, sys\n"
         "resource.setrlimit(resource.RLIMIT_AS, (600 << 20, 600 << 20))\n"
         "from pathlib import Path\n"
-        "from su3d_bench.datasets.hdf5 import read_rows\n"
-        "from su3d_bench.errors import DataError\n"
+        "from su3d_bench.formats.hdf5 import read_rows\n"
+        "from su3d_bench.core.errors import DataError\n"
         "try:\n    read_rows(Path(sys.argv[1]), 3, 'here')\n"
         "except DataError as error:\n    print(error)\n"
     )

@@ -14,7 +14,7 @@ assert abs(scene.cast_rays(rays)["t_hit"].numpy()[0] - 2) < 1e-5
 
 def test_the_compiled_module_casts_rays_and_the_package_may_follow() -> None:
     text = (
-        "import sys; import numpy as np; from su3d_bench.compiled_open3d import compiled_open3d\n"
+        "import sys; import numpy as np; from su3d_bench.numerics.open3d_core import compiled_open3d\n"
         f"o3d = compiled_open3d(){CAST}"
         "assert sys.platform != 'linux' or compiled_open3d() is o3d\n"
         f"import open3d as o3d{CAST}assert compiled_open3d() is o3d"
@@ -23,5 +23,7 @@ def test_the_compiled_module_casts_rays_and_the_package_may_follow() -> None:
 
 
 def test_where_the_package_is_imported_already_it_is_used() -> None:
-    text = "import open3d; from su3d_bench.compiled_open3d import compiled_open3d; assert compiled_open3d() is open3d"
+    text = (
+        "import open3d; from su3d_bench.numerics.open3d_core import compiled_open3d; assert compiled_open3d() is open3d"
+    )
     subprocess.run([sys.executable, "-c", text], check=True, timeout=300)

@@ -137,7 +137,7 @@ def test_reading_needs_no_torch(tmp_path: Path) -> None:
 
     code = (
         "import sys; sys.modules['torch'] = None\nfrom pathlib import Path\n"
-        "from su3d_bench.predictions.torch_zip import read_torch\n"
+        "from su3d_bench.formats.torch_zip import read_torch\n"
         f"assert read_torch(Path({str(FILES / 'tensor.pt')!r})).shape == (12, 3)\n"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=tmp_path, env={**os.environ, "PYTHONPATH": ""})

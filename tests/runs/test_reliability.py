@@ -296,7 +296,7 @@ def test_the_temporary_folder_of_a_killed_process_goes_when_the_next_is_made(
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
     code = (
-        "import os, signal; from su3d_bench.temporary_folders import TemporaryFolder\n"
+        "import os, signal; from su3d_bench.store.scratch import TemporaryFolder\n"
         "folder = TemporaryFolder('su3d-test-'); (folder.path / 'large').write_text('x')\n"
         "os.kill(os.getpid(), signal.SIGKILL)"
     )
@@ -312,7 +312,7 @@ def test_the_temporary_folder_of_a_killed_process_goes_when_the_next_is_made(
 KERNEL = """
 import sys
 from pathlib import Path
-from su3d_bench.kernels import njit
+from su3d_bench.numerics.compiled import njit
 
 @njit(cache=True)
 def double(x):
@@ -339,7 +339,7 @@ def test_a_compiled_kernel_whose_kept_form_is_damaged_is_compiled_again(tmp_path
 
 
 def test_a_compiled_kernel_is_compiled_again_when_a_function_that_it_imports_has_changed(tmp_path: Path) -> None:
-    head = "from su3d_bench.kernels import njit\n"
+    head = "from su3d_bench.numerics.compiled import njit\n"
     inner = head + "@njit(cache=True)\ndef factor():\n    return {}\n"
     middle = head + "from inner import factor\n@njit(cache=True)\ndef scaled(x):\n    return x * factor()\n"
     outer = head + "from middle import scaled\n@njit(cache=True)\ndef more(x):\n    return scaled(x) + 1\n"

@@ -109,7 +109,7 @@ def test_features_lie_in_a_file_without_a_name(tmp_path: Path, monkeypatch: pyte
 def test_a_killed_run_leaves_no_scratch_behind(tmp_path: Path) -> None:
     code = (
         "import os, signal, sys, numpy as np\n"
-        "from su3d_bench.baselines.feature_table import FeatureTable\n"
+        "from su3d_bench.baselines.conceptfusion.feature_table import FeatureTable\n"
         "table = FeatureTable(64, 'disk')\n"
         "table.append(np.ones((1, 64), np.float16), np.zeros(5000, np.int32), np.ones(5000))\n"
         "assert table.features().sum() == 5000 * 64\n"

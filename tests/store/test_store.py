@@ -209,7 +209,7 @@ def test_numbers_that_json_lacks_are_refused(tmp_path: Path) -> None:
 
 def test_two_runs_on_one_folder_are_refused_until_the_first_is_killed(tmp_path: Path) -> None:
     code = (
-        "import sys, time; from pathlib import Path; from su3d_bench.store import RunFolder\n"
+        "import sys, time; from pathlib import Path; from su3d_bench.store.run_folder import RunFolder\n"
         "with RunFolder(Path(sys.argv[1])).locked():\n    print('locked', flush=True); time.sleep(60)"
     )
     with subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], stdout=subprocess.PIPE, text=True) as other:

@@ -27,7 +27,7 @@ from su3d_bench.perception.embedded.encoder import (
     shrink,
 )
 
-FOLDER = Path(embedded_encoder.__file__).parent
+FOLDER = Path(embedded_encoder.__file__).parent / "weights"
 TEXTS = ("an image of a chair", "plant on table", "table on plant", "a green towel", "place to sit")
 
 
@@ -143,7 +143,7 @@ def test_weights_need_nothing_but_standard_operators() -> None:
 def test_the_encoder_leaves_no_file_behind_not_even_for_its_makers(tmp_path: Path) -> None:
     """ONNX Runtime tells its makers of every session, and for that keeps files in $TMPDIR and the user's cache."""
     code = (
-        "from su3d_bench.perception.embedded_encoder import EmbeddedEncoder\n"
+        "from su3d_bench.perception.embedded.encoder import EmbeddedEncoder\n"
         "print(EmbeddedEncoder().encode_texts(['chair']).shape)"
     )
     here = {"HOME": str(tmp_path), "TMPDIR": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path / "cache")}

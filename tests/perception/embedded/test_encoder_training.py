@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from places import ROOT
 
 from su3d_bench.core.errors import ModelMissing
 from su3d_bench.perception.embedded.captions import fill
@@ -21,7 +22,9 @@ from su3d_bench.perception.embedded.training.crops import (
     room_names,
 )
 
-CLASSES = tuple(json.loads((Path(training.__file__).parent / "model_card.json").read_text())["training"]["classes"])
+CLASSES = tuple(
+    json.loads((ROOT / "su3d_bench/perception/embedded/weights/model_card.json").read_text())["training"]["classes"]
+)
 
 
 @pytest.fixture(scope="module")
