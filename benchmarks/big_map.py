@@ -29,7 +29,7 @@ from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.opensu3d.tracking import View, record_of
-from su3d_bench.store.run_folder import read_prediction, write_prediction
+from su3d_bench.store.predictions import read_prediction, write_prediction
 
 RULES = load_protocol("rooms-semantic")
 CLASSES = [entry for entry in RULES.classes if not RULES.is_ignored(entry.name)]

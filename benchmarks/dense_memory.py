@@ -39,7 +39,7 @@ from su3d_bench.core.types import (
 )
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
-from su3d_bench.store.run_folder import read_prediction, write_prediction
+from su3d_bench.store.predictions import read_prediction, write_prediction
 
 SIDE_PX = 500
 FOCAL_PX = 500.0

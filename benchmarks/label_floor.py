@@ -20,7 +20,8 @@ from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.runs.plan import data_root
-from su3d_bench.store.run_folder import RunFolder, read_prediction
+from su3d_bench.store.predictions import read_prediction
+from su3d_bench.store.run_folder import RunFolder
 
 PROTOCOLS = ("rooms-semantic", "rooms-instance")
 N_DRAWS = 3

@@ -34,7 +34,8 @@ from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.runs.plan import Plan, make_plan
 from su3d_bench.runs.resume import FinishedScenes
 from su3d_bench.runs.runner import summarise
-from su3d_bench.store.run_folder import RunFolder, make_folder
+from su3d_bench.store.atomic import make_folder
+from su3d_bench.store.run_folder import RunFolder
 
 N_FRAMES = 20
 METHODS = (

@@ -18,7 +18,7 @@ from su3d_bench.core.digests import digest_json
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, UInt8Array
 from su3d_bench.datasets.replica.folders import MARKER, read_marker
-from su3d_bench.store.run_folder import make_folder, write_bytes, write_json, write_text
+from su3d_bench.store.atomic import make_folder, write_bytes, write_json, write_text
 
 FRAMES_PER_SECOND = 30.0
 

@@ -24,7 +24,7 @@ from su3d_bench.formats.images import (
     triangles_of,
 )
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
-from su3d_bench.store.run_folder import json_text, make_folder, write_json, write_text
+from su3d_bench.store.atomic import json_text, make_folder, write_json, write_text
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
 DEPTH_SCALE = 6553.5  # of NICE-SLAM's render: 65535 is 10 m

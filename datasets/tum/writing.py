@@ -11,7 +11,7 @@ from su3d_bench.core.types import Frame
 from su3d_bench.datasets.replica.folders import MARKER
 from su3d_bench.datasets.writing import FRAMES_PER_SECOND, ScannedDataset, SceneTarget
 from su3d_bench.formats.images import depth_in_units, png_bytes
-from su3d_bench.store.run_folder import make_folder, write_json, write_text
+from su3d_bench.store.atomic import make_folder, write_json, write_text
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
 UNITS_PER_METRE = 5000.0  # the benchmark's page "file formats"

@@ -16,7 +16,7 @@ from su3d_bench.core.types import BoolArray, Float64Array, Instances, Int64Array
 from su3d_bench.reports.pictures.maps import DRAWN_SPACING_M, NO_INSTANCE, Cloud, Colour, instance_colours, thinned
 from su3d_bench.reports.pictures.render import OVERSAMPLING, Camera, View, colour, render, room_bounds, view_cameras
 from su3d_bench.reports.pictures.scene import drawable
-from su3d_bench.store.run_folder import make_folder, write_bytes
+from su3d_bench.store.atomic import make_folder, write_bytes
 
 DPI, PANEL_WIDTH, PANEL_HEIGHT, MARGIN = 100, 760, 640, 14
 LINE_HEIGHT, CHARACTERS_A_LINE, MOST_LINES = 22, 165, 5

@@ -9,7 +9,7 @@ from typing import Any
 
 from su3d_bench.reports.tables.attribution import n_text
 from su3d_bench.reports.tables.comparison import signed
-from su3d_bench.store.run_folder import make_folder, write_bytes
+from su3d_bench.store.atomic import make_folder, write_bytes
 
 DPI = 100
 PANEL_WIDTH, ROW_HEIGHT, PANEL_EXTRA = 4.6, 0.34, 1.25  # inches

@@ -13,7 +13,7 @@ from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.types import UInt8Array
 from su3d_bench.reports.pictures.items import Tag
 from su3d_bench.reports.pictures.scene import drawable
-from su3d_bench.store.run_folder import make_folder, write_bytes
+from su3d_bench.store.atomic import make_folder, write_bytes
 
 FORMATS = ("pdf", "png", "svg")
 CELL_WIDTH_IN, TITLE_IN, ROW_IN, LEGEND_IN, GAP_IN = 2.4, 0.28, 0.26, 0.42, 0.08

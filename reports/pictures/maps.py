@@ -22,7 +22,7 @@ from su3d_bench.core.types import (
 )
 from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.reports.pictures.render import Camera, View, colour, render, room_bounds, view_cameras
-from su3d_bench.store.run_folder import make_folder, write_bytes
+from su3d_bench.store.atomic import make_folder, write_bytes
 
 VIEW_WIDTH, VIEW_HEIGHT = 640, 560
 DRAWN_SPACING_M = 0.015  # one point a cell of this size is drawn

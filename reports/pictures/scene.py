@@ -22,7 +22,7 @@ from su3d_bench.reports.pictures.maps import (
 )
 from su3d_bench.reports.pictures.render import OVERSAMPLING, Camera, colour, render, room_bounds, view_cameras
 from su3d_bench.reports.pictures.scene_look import SceneLook
-from su3d_bench.store.run_folder import make_folder, write_bytes
+from su3d_bench.store.atomic import make_folder, write_bytes
 
 WIDTH, DPI = 1920, 100
 MARGIN, HEADER, CAPTION = 16, 76, 26

@@ -14,7 +14,7 @@ from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.costs import MAP, UpdateTimes, pooled
 from su3d_bench.numerics.statistics import growth_exponent
 from su3d_bench.reports.tables.timing import AnytimePoint
-from su3d_bench.store.run_folder import write_bytes
+from su3d_bench.store.atomic import write_bytes
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -30,7 +30,8 @@ from su3d_bench.metrics.semantic.confusion import nan_mean
 from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.runs.job import Part, build_dataset
 from su3d_bench.runs.plan import data_root, dataset_targets
-from su3d_bench.store.run_folder import RunFolder, read_prediction
+from su3d_bench.store.predictions import read_prediction
+from su3d_bench.store.run_folder import RunFolder
 
 SCHEMA = 1
 KINDS = {"instance": instances.KINDS, "semantic": semantic.CAUSES}

@@ -19,7 +19,7 @@ from su3d_bench.core.errors import ConfigError, StoreError, printable
 from su3d_bench.metrics.costs import MAP, WARM_UP, pooled
 from su3d_bench.reports.gate import Finding, Verdict
 from su3d_bench.runs.finished import FinishedRun, read_update_times
-from su3d_bench.store.run_folder import read_json
+from su3d_bench.store.atomic import read_json
 
 SPREADS = 2.0  # a value may leave the taught ones by this many times their range: 2 of 50 unchanged repeats would at 1
 ACROSS_MACHINES = 0.02  # 2 points: what ONNX Runtime's and BLAS's kernels of other processors may move a headline value

@@ -43,7 +43,7 @@ from su3d_bench.reports.pictures.scene_look import SceneLook, look_at
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.runs.job import Part, build_dataset
 from su3d_bench.runs.plan import data_root, dataset_targets
-from su3d_bench.store.run_folder import read_prediction
+from su3d_bench.store.predictions import read_prediction
 
 QUERIES = (
     "somewhere to sit",

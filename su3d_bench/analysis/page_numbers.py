@@ -18,7 +18,7 @@ from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
 from su3d_bench.reports.page.numbers import confusion_cells, series_of, summary_data
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
-from su3d_bench.store.run_folder import read_json
+from su3d_bench.store.atomic import read_json
 
 MOST_PAIRS = 40  # pairs of methods that are compared: all of nine methods, and a few seconds
 # Jobs (a scene under a method) up to which each is read. The courses and comparisons of more take minutes to make and

@@ -22,7 +22,7 @@ from su3d_bench.runs.job import CEILING_METHOD
 from su3d_bench.sheets.score_file import FILE as SCORES_FILE
 from su3d_bench.sheets.score_file import read_scores
 from su3d_bench.sheets.scores import ScoreCell, Scores
-from su3d_bench.store.run_folder import is_file, read_json
+from su3d_bench.store.atomic import is_file, read_json
 
 Number = Annotated[float, Field(allow_inf_nan=False)]
 MOST_SOURCE_BYTES, MOST_SOURCES = 1 << 24, 500  # of a paper's LaTeX

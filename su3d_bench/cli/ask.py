@@ -108,7 +108,7 @@ def _run_of(arguments: argparse.Namespace) -> RunFolder:
 
 def _map(run: RunFolder, arguments: argparse.Namespace) -> Instances:
     from su3d_bench.core.types import Instances
-    from su3d_bench.store.run_folder import read_prediction
+    from su3d_bench.store.predictions import read_prediction
 
     job = run.job(arguments.scene, arguments.method)
     if not job.prediction.is_file():

@@ -58,7 +58,7 @@ def call(arguments: argparse.Namespace) -> int:
 def _learn(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.gate import ACROSS_MACHINES, COST_LIMIT, learn
     from su3d_bench.runs.finished import read_run
-    from su3d_bench.store.run_folder import make_folder, write_json
+    from su3d_bench.store.atomic import make_folder, write_json
 
     if arguments.runs or arguments.against or arguments.out is None:
         raise ConfigError("check: --learn takes the runs and needs --out FILE; it checks nothing")
@@ -100,7 +100,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
 def _write(verdict: Verdict, arguments: argparse.Namespace) -> None:
     from su3d_bench.reports.gate import junit_xml, markdown
-    from su3d_bench.store.run_folder import make_folder, write_text
+    from su3d_bench.store.atomic import make_folder, write_text
 
     for path, text in ((arguments.markdown, markdown), (arguments.junit, junit_xml)):
         if path is not None:

@@ -76,7 +76,7 @@ def call(arguments: argparse.Namespace) -> int:
     limit_threads()  # before numerical libraries are loaded
     from su3d_bench.evaluation.evaluate import NOT_MEANT, Request, evaluate
     from su3d_bench.reports.tables.evaluation import evaluation_text
-    from su3d_bench.store.run_folder import make_folder, write_text
+    from su3d_bench.store.atomic import make_folder, write_text
 
     result = evaluate(
         Request(

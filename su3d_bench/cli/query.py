@@ -44,7 +44,8 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.core.types import DenseFeatures, Instances
     from su3d_bench.opensu3d.retrieval import rank
     from su3d_bench.reports.pictures.maps import draw_heat_map
-    from su3d_bench.store.run_folder import RunFolder, read_prediction
+    from su3d_bench.store.predictions import read_prediction
+    from su3d_bench.store.run_folder import RunFolder
 
     if arguments.top < 1:
         raise ConfigError(f"--top {arguments.top}: at least 1 instance must be listed")
@@ -103,7 +104,7 @@ def latest_run(scene: str, method: str) -> RunFolder:
 
 def no_map(run: RunFolder, scene: str, method: str) -> StoreError:
     """The error of a run without such a map: the names that it has instead, else the command that would make it."""
-    from su3d_bench.store.run_folder import read_json
+    from su3d_bench.store.atomic import read_json
 
     record: Any = None
     with suppress(StoreError):
@@ -128,7 +129,7 @@ def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
     from su3d_bench.perception.models.encoders.encoder import FoundationEncoder
     from su3d_bench.perception.models.loading import load_encoder
     from su3d_bench.runs.plan import cache_root
-    from su3d_bench.store.run_folder import read_json
+    from su3d_bench.store.atomic import read_json
 
     record = read_json(run.path / "run.json")
     record = record if isinstance(record, dict) else {}

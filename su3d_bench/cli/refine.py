@@ -97,7 +97,7 @@ def _jobs(arguments: argparse.Namespace) -> dict[str, JobFolder]:
 def _scenes(run: RunFolder) -> list[str]:
     """The scenes that the run was asked for."""
     from su3d_bench.core.errors import printable
-    from su3d_bench.store.run_folder import read_json
+    from su3d_bench.store.atomic import read_json
 
     record = read_json(run.path / "run.json")
     scenes = record.get("scenes") if isinstance(record, dict) else None
@@ -108,7 +108,7 @@ def _scenes(run: RunFolder) -> list[str]:
 
 def _map(job: JobFolder) -> Instances:
     from su3d_bench.core.types import Instances
-    from su3d_bench.store.run_folder import read_prediction
+    from su3d_bench.store.predictions import read_prediction
 
     prediction = read_prediction(job.prediction)
     if not isinstance(prediction, Instances) or prediction.view_names is None:

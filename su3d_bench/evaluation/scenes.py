@@ -9,7 +9,7 @@ from pathlib import Path
 from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, printable, shown, suggest
 from su3d_bench.predictions.base import Reader
 from su3d_bench.predictions.formats import recognise
-from su3d_bench.store.run_folder import read_json
+from su3d_bench.store.atomic import read_json
 
 OWN_FORMAT = "su3d-bench"
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
 from su3d_bench.formats.ply_parts import clip
-from su3d_bench.store.run_folder import write_bytes
+from su3d_bench.store.atomic import write_bytes
 
 MOST_HEADER_BYTES = 1 << 16  # headers have some hundred
 MOST_FIELDS, MOST_VALUES = 256, 1 << 16  # of a point; histograms of features have some hundred values

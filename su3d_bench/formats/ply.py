@@ -33,7 +33,7 @@ from su3d_bench.formats.ply_parts import (
     clip,
     read_header,
 )
-from su3d_bench.store.run_folder import write_bytes
+from su3d_bench.store.atomic import write_bytes
 
 AnyArray = NDArray[Any]
 

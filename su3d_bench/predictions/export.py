@@ -38,7 +38,7 @@ from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.metrics.scene_score import present
 from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
 from su3d_bench.predictions.openlex3d import CLOUD, EMBEDDINGS, INDEX
-from su3d_bench.store.run_folder import make_folder, write_text
+from su3d_bench.store.atomic import make_folder, write_text
 
 MASKS_FOLDER = "pred_mask"
 ROWS_AT_ONCE = 1 << 14

@@ -14,7 +14,7 @@ from su3d_bench.core.types import DenseFeatures, Instances, Partition, Predictio
 from su3d_bench.formats.numpy_files import npy_header_of, npz_names, read_npz
 from su3d_bench.predictions.base import ScenePrediction
 from su3d_bench.predictions.mask_arrays import kind_of, scene_file
-from su3d_bench.store.run_folder import features_beside, prediction_from_arrays
+from su3d_bench.store.predictions import features_beside, prediction_from_arrays
 
 FILE = "prediction.npz"
 FLOATS = ("f2", "f4", "f8")

@@ -15,7 +15,8 @@ from su3d_bench.core.types import Instances
 from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.questions.refinement import RefinedName, TopNames
 from su3d_bench.questions.truths import voted_names
-from su3d_bench.store.run_folder import JobFolder, read_json, write_json
+from su3d_bench.store.atomic import read_json, write_json
+from su3d_bench.store.run_folder import JobFolder
 
 FILE_NAME = "refined_names.json"
 SCHEMA = 1

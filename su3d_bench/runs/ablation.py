@@ -15,7 +15,7 @@ from pydantic import BaseModel, ValidationError
 from su3d_bench.core import registry
 from su3d_bench.core.config import parse_value, toml_value
 from su3d_bench.core.errors import ConfigError, StoreError, suggest
-from su3d_bench.store.run_folder import read_json, write_json
+from su3d_bench.store.atomic import read_json, write_json
 
 FILE = "ablation.json"
 MOST_VARIANTS = 1000

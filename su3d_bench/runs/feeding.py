@@ -22,7 +22,7 @@ from su3d_bench.core.timing import Timer, calibration_ms, memory_bytes
 from su3d_bench.core.types import Detections, Frame, GroundTruth, PerceptionNeeds, Proposals, Surface
 from su3d_bench.perception.profiles import Perception
 from su3d_bench.runs.executors.local import Event, Report
-from su3d_bench.store.run_folder import write_prediction
+from su3d_bench.store.predictions import write_prediction
 
 
 @dataclass(frozen=True)

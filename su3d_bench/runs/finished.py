@@ -17,7 +17,8 @@ from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.costs import MapCost, UpdateTimes
 from su3d_bench.metrics.scoring import SceneScore, unpack_scores
 from su3d_bench.runs.job import CEILING_METHOD
-from su3d_bench.store.run_folder import RunFolder, is_file, read_json
+from su3d_bench.store.atomic import is_file, read_json
+from su3d_bench.store.run_folder import RunFolder
 
 Model = TypeVar("Model", bound=BaseModel)
 

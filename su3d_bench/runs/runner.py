@@ -30,7 +30,8 @@ from su3d_bench.runs.plan import Plan, cache_root
 from su3d_bench.runs.remote.scene import DistantJob, failed_distant, fetch_results, run_distant_scene, send_records
 from su3d_bench.runs.resume import FinishedScenes
 from su3d_bench.runs.scene import failed_outcomes, run_scene
-from su3d_bench.store.run_folder import SCHEMA, JobFolder, remove_file, write_json, write_text
+from su3d_bench.store.atomic import remove_file, write_json, write_text
+from su3d_bench.store.run_folder import SCHEMA, JobFolder
 
 Scores = Mapping[tuple[str, str], SceneScore]
 

@@ -38,7 +38,9 @@ from su3d_bench.runs.job import (
     refuse_other_run,
     stride_of,
 )
-from su3d_bench.store.run_folder import JobFolder, RunFolder, read_prediction, write_bytes, write_text
+from su3d_bench.store.atomic import write_bytes, write_text
+from su3d_bench.store.predictions import read_prediction
+from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 
 def run_scene(job: SceneJob, report: Report) -> tuple[MethodOutcome, ...]:

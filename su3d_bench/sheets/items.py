@@ -15,7 +15,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from su3d_bench.core.digests import digest_json
 from su3d_bench.core.errors import DataError, printable
-from su3d_bench.store.run_folder import write_json
+from su3d_bench.store.atomic import write_json
 
 SCHEMA = 1
 SHEET_FILE, KEY_FILE = "sheet.json", "key.json"

@@ -32,7 +32,7 @@ from su3d_bench.sheets.items import (
     write_sheet,
 )
 from su3d_bench.sheets.workbook import workbook_bytes
-from su3d_bench.store.run_folder import make_folder, remove_file, write_bytes, write_text
+from su3d_bench.store.atomic import make_folder, remove_file, write_bytes, write_text
 
 MOST_ANNOTATORS = 100
 PAGE, WORKBOOK, TABLE = "sheet.html", "sheet.xlsx", "sheet.csv"

@@ -27,7 +27,7 @@ from su3d_bench.metrics.protocols import ProtocolRules, load_protocol, protocol_
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.runs.job import Part, build_dataset
 from su3d_bench.runs.plan import data_root, dataset_targets, why_not_fitting
-from su3d_bench.store.run_folder import read_prediction
+from su3d_bench.store.predictions import read_prediction
 
 MOST_FRAMES = 32  # of a scene, among which the best view of an object is looked for
 

@@ -11,7 +11,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.sheets.scores import METRICS, SCHEMA, ScoreCell, Scores
-from su3d_bench.store.run_folder import write_json
+from su3d_bench.store.atomic import write_json
 
 FILE = "scores.json"
 MOST_BYTES = 64 << 20

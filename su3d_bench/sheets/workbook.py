@@ -11,7 +11,7 @@ from typing import Any
 
 from su3d_bench.core.errors import ModelMissing, printable
 from su3d_bench.sheets.items import AnnotatorShare, Sheet
-from su3d_bench.store.run_folder import ZIP_EPOCH
+from su3d_bench.store.atomic import ZIP_EPOCH
 
 # The columns of an answers file stand among these; what nobody needs to see is hidden.
 COLUMNS = ("item_id", "picture", "text", "asked", "answer", "question", "sheet_id", "annotator", "check")

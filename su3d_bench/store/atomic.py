@@ -1,19 +1,23 @@
-"""Files of caches that several processes fill at once: whole or absent, and nothing piles up beside them.
+"""Files that are whole or absent, however a process ends: written under a temporary name, then renamed.
 
-And arrays out of files that may be damaged, of which no more is believed than they hold.
+Those of a run, those of caches that several processes fill at once, and arrays out of files that may be damaged, of
+which no more is believed than they hold.
 """
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import io
+import json
 import math
 import os
+import secrets
 import struct
 import sys
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from pathlib import Path
@@ -22,8 +26,125 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from su3d_bench.core.damage import DAMAGE
+from su3d_bench.core.errors import StoreError
+
 MAGIC_1_0 = b"\x93NUMPY\x01\x00"
 SMALL_BYTES = 1 << 16  # of an array that is read whole before its header is looked at
+ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
+REASONS = {
+    errno.ENOSPC: "the disk is full; free some space and run the same command again",
+    errno.EDQUOT: "the disk quota is used up; free some space and run the same command again",
+    errno.EACCES: "the folder is read-only; choose another with --out",
+    errno.EPERM: "the folder is read-only; choose another with --out",
+    errno.EROFS: "the folder is read-only; choose another with --out",
+    errno.EFBIG: "the file grows beyond what this disk or account allows; raise the limit or choose another with --out",
+    errno.ENOLCK: "this disk has no locks to give; choose a folder on another disk with --out",
+    errno.ENOTDIR: "a file stands where a folder should be; choose another with --out",
+    errno.EEXIST: "a file stands where a folder should be; choose another with --out",
+}
+
+
+def write_error(path: Path, error: OSError) -> StoreError:
+    """What is said where the system refuses to write ``path``."""
+    reason = REASONS.get(error.errno or 0, error.strerror or str(error))
+    return StoreError(f"cannot write {path}: {reason}")
+
+
+def make_folder(path: Path) -> None:
+    """Make ``path`` and its parents."""
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise write_error(path, error) from error
+
+
+@contextmanager
+def replacing(path: Path) -> Iterator[IO[bytes]]:
+    """A stream whose bytes take the place of ``path`` at the end, whole or not at all."""
+    # Machines that share a disk may have processes of one number.
+    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    try:
+        with temporary.open("wb") as stream:
+            yield stream
+            stream.flush()
+            os.fsync(stream.fileno())
+        os.replace(temporary, path)
+    except BaseException as error:
+        with suppress(OSError):  # a read-only disk refuses even to remove what is not there
+            temporary.unlink(missing_ok=True)
+        if isinstance(error, OSError):
+            raise write_error(path, error) from error
+        raise
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Put ``content`` at ``path``, whole or not at all, even when the process or the machine dies meanwhile."""
+    with replacing(path) as stream:
+        stream.write(content)
+
+
+def remove_file(path: Path) -> None:
+    """Remove ``path`` where it exists."""
+    try:
+        path.unlink(missing_ok=True)
+    except OSError as error:
+        raise write_error(path, error) from error
+
+
+def write_text(path: Path, text: str) -> None:
+    write_bytes(path, text.encode())
+
+
+def json_text(value: Any) -> str:
+    """JSON as every file of a run has it: two spaces, full precision, no NaN."""
+    return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+
+
+def write_json(path: Path, value: Any) -> None:
+    write_text(path, json_text(value))
+
+
+def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+    """An .npz archive without pickle whose bytes depend on the arrays alone."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        for name, array in arrays.items():
+            member = io.BytesIO()
+            np.lib.format.write_array(member, np.asarray(array), version=(1, 0), allow_pickle=False)
+            entry = zipfile.ZipInfo(f"{name}.npy", date_time=ZIP_EPOCH)
+            archive.writestr(entry, member.getvalue())
+    return buffer.getvalue()
+
+
+def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
+    write_bytes(path, npz_bytes(arrays))
+
+
+def read_npz(path: Path) -> dict[str, NDArray[Any]]:
+    """The arrays of an .npz file; a damaged file is a ``StoreError``."""
+    try:
+        return read_arrays(path)
+    except DAMAGE as error:
+        raise StoreError(f"{path}: not a readable .npz file ({error}); delete it and run again") from error
+
+
+def is_file(path: Path) -> bool:
+    """Whether there is such a file; none has a name that no system could give, as a hostile record may say."""
+    try:
+        return path.is_file()
+    except OSError:
+        return False
+
+
+def read_json(path: Path) -> Any:
+    """The value of a JSON file; a missing or damaged file is a ``StoreError``."""
+    try:
+        return json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise StoreError(f"{path}: cannot be read: {error.strerror}") from error
+    except (ValueError, RecursionError) as error:
+        raise StoreError(f"{path}: not readable as JSON; run the same command again to mend it") from error
 
 
 def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:

@@ -1,4 +1,4 @@
-"""The run folder: atomic writes, content keys, one writer at a time.
+"""The run folder: where its files are, content keys, one writer at a time.
 
 A job is one scene under one method. It has two *steps*, ``predict`` and ``score``; ``done.json`` seals each with the
 key of all its inputs and the SHA-256 of the files that it vouches for. A file that is damaged or missing makes its
@@ -9,243 +9,23 @@ from __future__ import annotations
 
 import errno
 import fcntl
-import io
-import json
 import os
-import secrets
-import zipfile
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
-import numpy as np
-from numpy.typing import NDArray
-
-from su3d_bench.core.damage import DAMAGE
 from su3d_bench.core.digests import digest_file
-from su3d_bench.core.errors import PredictionError, StoreError
-from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
-from su3d_bench.store.atomic import read_arrays
-from su3d_bench.store.scratch import row_blocks
+from su3d_bench.core.errors import StoreError
+from su3d_bench.store.atomic import make_folder, read_json, remove_file, write_error, write_json
+from su3d_bench.store.predictions import features_beside
 
 SCHEMA = 1
-ROWS_AT_ONCE = 8192  # 16 MB of half precision at 1024 dimensions
-ZIP_EPOCH = (1980, 1, 1, 0, 0, 0)
-REASONS = {
-    errno.ENOSPC: "the disk is full; free some space and run the same command again",
-    errno.EDQUOT: "the disk quota is used up; free some space and run the same command again",
-    errno.EACCES: "the folder is read-only; choose another with --out",
-    errno.EPERM: "the folder is read-only; choose another with --out",
-    errno.EROFS: "the folder is read-only; choose another with --out",
-    errno.EFBIG: "the file grows beyond what this disk or account allows; raise the limit or choose another with --out",
-    errno.ENOLCK: "this disk has no locks to give; choose a folder on another disk with --out",
-    errno.ENOTDIR: "a file stands where a folder should be; choose another with --out",
-    errno.EEXIST: "a file stands where a folder should be; choose another with --out",
-}
 # What a lock on a folder itself gets from network disks, which lock files that are open for writing only: flock(2).
 NO_FOLDER_LOCKS = (errno.EBADF, errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)
 LOCK_FILE = ".lock"
-# Dimensions and kinds of values of each field of a stored prediction; see Instances, Partition and DenseFeatures.
-FIELDS = {
-    "points": (2, "f"),
-    "indptr": (1, "i"),
-    "indices": (1, "i"),
-    "scores": (1, "f"),
-    "features": (2, "f"),
-    "labels": (1, "U"),
-    "names": (1, "U"),
-    "captions": (1, "U"),
-    "boxes": (3, "f"),
-    "centroids": (2, "f"),
-    "view_indptr": (1, "i"),
-    "views": (2, "i"),
-    "view_names": (1, "U"),
-    "view_scores": (1, "f"),
-    "ids": (1, "i"),
-    "instance": (1, "i"),
-}
 WRITTEN_BY_ALL = ("language", "language/images")  # where all jobs of a run write; a job clears its own folders
-
-
-def _store_error(path: Path, error: OSError) -> StoreError:
-    reason = REASONS.get(error.errno or 0, error.strerror or str(error))
-    return StoreError(f"cannot write {path}: {reason}")
-
-
-def make_folder(path: Path) -> None:
-    """Make ``path`` and its parents."""
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise _store_error(path, error) from error
-
-
-@contextmanager
-def _replacing(path: Path) -> Iterator[IO[bytes]]:
-    """A stream whose bytes take the place of ``path`` at the end, whole or not at all."""
-    # Machines that share a disk may have processes of one number.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
-    try:
-        with temporary.open("wb") as stream:
-            yield stream
-            stream.flush()
-            os.fsync(stream.fileno())
-        os.replace(temporary, path)
-    except BaseException as error:
-        with suppress(OSError):  # a read-only disk refuses even to remove what is not there
-            temporary.unlink(missing_ok=True)
-        if isinstance(error, OSError):
-            raise _store_error(path, error) from error
-        raise
-
-
-def write_bytes(path: Path, content: bytes) -> None:
-    """Put ``content`` at ``path``, whole or not at all, even when the process or the machine dies meanwhile."""
-    with _replacing(path) as stream:
-        stream.write(content)
-
-
-def remove_file(path: Path) -> None:
-    """Remove ``path`` where it exists."""
-    try:
-        path.unlink(missing_ok=True)
-    except OSError as error:
-        raise _store_error(path, error) from error
-
-
-def write_text(path: Path, text: str) -> None:
-    write_bytes(path, text.encode())
-
-
-def json_text(value: Any) -> str:
-    """JSON as every file of a run has it: two spaces, full precision, no NaN."""
-    return json.dumps(value, indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-
-
-def write_json(path: Path, value: Any) -> None:
-    write_text(path, json_text(value))
-
-
-def npz_bytes(arrays: Mapping[str, NDArray[Any]]) -> bytes:
-    """An .npz archive without pickle whose bytes depend on the arrays alone."""
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for name, array in arrays.items():
-            member = io.BytesIO()
-            np.lib.format.write_array(member, np.asarray(array), version=(1, 0), allow_pickle=False)
-            entry = zipfile.ZipInfo(f"{name}.npy", date_time=ZIP_EPOCH)
-            archive.writestr(entry, member.getvalue())
-    return buffer.getvalue()
-
-
-def write_npz(path: Path, arrays: Mapping[str, NDArray[Any]]) -> None:
-    write_bytes(path, npz_bytes(arrays))
-
-
-def read_npz(path: Path) -> dict[str, NDArray[Any]]:
-    """The arrays of an .npz file; a damaged file is a ``StoreError``."""
-    try:
-        return read_arrays(path)
-    except DAMAGE as error:
-        raise StoreError(f"{path}: not a readable .npz file ({error}); delete it and run again") from error
-
-
-def is_file(path: Path) -> bool:
-    """Whether there is such a file; none has a name that no system could give, as a hostile record may say."""
-    try:
-        return path.is_file()
-    except OSError:
-        return False
-
-
-def read_json(path: Path) -> Any:
-    """The value of a JSON file; a missing or damaged file is a ``StoreError``."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise StoreError(f"{path}: cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise StoreError(f"{path}: not readable as JSON; run the same command again to mend it") from error
-
-
-def prediction_arrays(prediction: Prediction) -> dict[str, NDArray[Any]]:
-    """A prediction as named arrays, ``kind`` among them; absent fields are left out."""
-    arrays = {"kind": np.array(type(prediction).__name__)}
-    for name in prediction.__dataclass_fields__:
-        value = getattr(prediction, name)
-        if value is not None:
-            arrays[name] = np.array(value, dtype=np.str_) if isinstance(value, tuple) else value
-    return arrays
-
-
-def prediction_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Prediction:
-    """The reverse of ``prediction_arrays``; ``where`` begins the message when the arrays are no prediction."""
-    kinds = {kind.__name__: kind for kind in (Instances, Partition, DenseFeatures)}
-    kind = kinds.get(str(arrays.get("kind")))
-    if kind is None:
-        raise PredictionError(f"{where}: holds no 'kind' out of {', '.join(kinds)}; it is not a prediction")
-    for name in (name for name in FIELDS if name in arrays):
-        array, (n_dimensions, value_kind) = arrays[name], FIELDS[name]
-        if array.ndim != n_dimensions or array.dtype.kind != value_kind or (name == "indptr" and not array.size):
-            shape = f"of shape {array.shape} {array.dtype.name}"
-            raise PredictionError(f"{where}: '{name}' is an array {shape}; run the scene again")
-    values: dict[str, Any] = {}
-    for name in kind.__dataclass_fields__:
-        value = arrays.get(name)
-        values[name] = tuple(str(item) for item in value) if value is not None and value.dtype.kind == "U" else value
-    optional = {"features", "labels", "view_names", "view_scores"}
-    missing = [name for name, value in values.items() if value is None and name not in optional]
-    if missing:
-        raise PredictionError(f"{where}: lacks '{missing[0]}'; write it again with su3d-bench run")
-    prediction: Prediction = kind(**values)
-    return prediction
-
-
-def features_beside(path: Path) -> Path:
-    """Where the features of a dense prediction at ``path`` are: a file of their own, read without loading it."""
-    return path.with_name(f"{path.name.removesuffix('.npz')}.features.npy")
-
-
-def write_prediction(path: Path, prediction: Prediction) -> None:
-    """Store ``prediction`` at ``path``, the features of a dense one beside it."""
-    arrays, features_path = prediction_arrays(prediction), features_beside(path)
-    if isinstance(prediction, DenseFeatures):
-        _write_rows(features_path, arrays.pop("features"))
-    else:
-        remove_file(features_path)
-    write_npz(path, arrays)
-
-
-def _write_rows(path: Path, table: NDArray[Any]) -> None:
-    """Put ``table`` at ``path`` as a .npy file, a block at a time."""
-    descr = np.lib.format.dtype_to_descr(table.dtype)
-    with _replacing(path) as stream:
-        header = {"descr": descr, "fortran_order": False, "shape": table.shape}
-        np.lib.format.write_array_header_1_0(stream, header)
-        for _, block in row_blocks(table, ROWS_AT_ONCE):
-            stream.write(np.ascontiguousarray(block).data)
-
-
-def read_prediction(path: Path) -> Prediction:
-    """The prediction that a run stored at ``path``; features of a dense one are memory-mapped."""
-    arrays = read_npz(path)
-    if str(arrays.get("kind")) == DenseFeatures.__name__ and "features" not in arrays:
-        arrays["features"] = _mapped_rows(features_beside(path))
-        if "points" not in arrays or arrays["features"].shape[:1] != arrays["points"].shape[:1]:
-            raise StoreError(f"{features_beside(path)}: has other rows than {path.name}; delete both and run again")
-    return prediction_from_arrays(arrays, str(path))
-
-
-def _mapped_rows(path: Path) -> NDArray[Any]:
-    try:
-        table: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
-    except DAMAGE as error:
-        raise StoreError(f"{path}: not a readable .npy file ({error}); delete it and run again") from error
-    if table.ndim != 2 or table.dtype.kind != "f":
-        raise StoreError(f"{path}: holds {table.dtype} {table.shape}, no rows of features; delete it and run again")
-    return table
 
 
 @dataclass(frozen=True)
@@ -290,7 +70,7 @@ def _lock(folder: Path) -> int:
         if isinstance(error, BlockingIOError):
             message = f"{folder}: another run is writing here; wait for it or choose another folder with --out"
             raise StoreError(message) from error
-        raise _store_error(folder, error) from error
+        raise write_error(folder, error) from error
     return handle
 
 

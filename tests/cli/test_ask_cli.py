@@ -20,7 +20,9 @@ from su3d_bench.cli.main import build_parser, main
 from su3d_bench.core.types import Instances
 from su3d_bench.reports.pictures import answers as reasoning_picture
 from su3d_bench.reports.pictures.answers import SpokenOf, draw_reasoning
-from su3d_bench.store.run_folder import JobFolder, RunFolder, write_json, write_prediction
+from su3d_bench.store.atomic import write_json
+from su3d_bench.store.predictions import write_prediction
+from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 SCENE = "rooms/made"
 QUICK = ["backoff_s=0.001", "max_retries=1", "total_timeout_s=1.0", "max_failures_in_a_row=50"]

@@ -18,7 +18,7 @@ from su3d_bench.datasets.recordings.pose_convention import check_convention
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.datasets.tum.dataset import Tum
 from su3d_bench.numerics.geometry import back_project
-from su3d_bench.store.run_folder import read_prediction
+from su3d_bench.store.predictions import read_prediction
 
 pytestmark = pytest.mark.skipif(not REAL_RECORDINGS.is_dir(), reason="needs the real recordings in ../shared/realdata")
 FRAME_FILES = {

@@ -28,8 +28,8 @@ from su3d_bench.metrics.scoring import combine, unpack_scores
 from su3d_bench.questions.files.queries import read_query_file
 from su3d_bench.runs.estimate import recent_update_s
 from su3d_bench.runs.finished import read_run
-from su3d_bench.store.atomic import read_arrays
-from su3d_bench.store.run_folder import is_file, read_json, read_prediction
+from su3d_bench.store.atomic import is_file, read_arrays, read_json
+from su3d_bench.store.predictions import read_prediction
 
 DEEP, LONG = "[" * 100_000, "1" * 5000
 NO_TEXT = np.array([0x3F800000], np.uint32).tobytes()  # a float's bits where a character should be

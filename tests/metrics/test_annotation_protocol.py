@@ -20,7 +20,8 @@ from su3d_bench.metrics.scoring import score_scene, why_not_scorable
 from su3d_bench.questions.refined_names import FILE_NAME, records_of, refined_digest, refined_names, write_records
 from su3d_bench.questions.refinement import RefinedName, TopNames
 from su3d_bench.questions.truths import Refine, question_truth, voted_names
-from su3d_bench.store.run_folder import JobFolder, write_bytes
+from su3d_bench.store.atomic import write_bytes
+from su3d_bench.store.run_folder import JobFolder
 
 RULES = load_protocol("rooms-annotation")
 TRUTH = room()

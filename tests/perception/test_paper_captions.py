@@ -16,7 +16,8 @@ from tiny_models import paper_words, write_models
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import Instances
 from su3d_bench.perception.language.captioner import DESCRIBE
-from su3d_bench.store.run_folder import read_json, read_prediction
+from su3d_bench.store.atomic import read_json
+from su3d_bench.store.predictions import read_prediction
 
 pytestmark = needs_models
 TOTAL_S = 3.0  # after it a hung connection is given up; long enough for good answers on a busy machine

@@ -23,7 +23,8 @@ from su3d_bench.perception.config import PerceptionConfig
 from su3d_bench.perception.language.captioner import CropCaption
 from su3d_bench.perception.models.masks.tagging import WORDS_CAVEAT
 from su3d_bench.perception.profiles import Perception, build_perception, check_models, resolve_profile
-from su3d_bench.store.run_folder import read_json, read_prediction
+from su3d_bench.store.atomic import read_json
+from su3d_bench.store.predictions import read_prediction
 
 SCENE = SceneInfo("rgbd", "wall", 1, 1, "camera")
 # Random weights are sure of nothing, so little is asked of them.

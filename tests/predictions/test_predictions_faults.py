@@ -31,7 +31,8 @@ from prediction_files import (
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.types import DenseFeatures, Partition
 from su3d_bench.predictions.formats import READERS
-from su3d_bench.store.run_folder import prediction_arrays, write_npz, write_prediction
+from su3d_bench.store.atomic import write_npz
+from su3d_bench.store.predictions import prediction_arrays, write_prediction
 
 # ---- what is wrong in a text list
 

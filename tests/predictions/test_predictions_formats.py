@@ -40,7 +40,7 @@ from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask
 from su3d_bench.predictions.base import ScenePrediction, VertexLabels, VertexMasks
 from su3d_bench.predictions.formats import READERS, format_names, recognise
 from su3d_bench.predictions.mask_arrays import run_members
-from su3d_bench.store.run_folder import write_prediction
+from su3d_bench.store.predictions import write_prediction
 
 MASK_CASES = sorted(p.stem for kind in ("inst", "replica", "scannet200") for p in CASES.glob(f"{kind}*.npz"))
 LABEL_CASES = sorted(p.stem for p in CASES.glob("sem*.npz"))

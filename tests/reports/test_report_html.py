@@ -40,7 +40,7 @@ from su3d_bench.reports.page.maps import (
 )
 from su3d_bench.reports.page.page import page_html
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.store.run_folder import read_prediction, write_prediction
+from su3d_bench.store.predictions import read_prediction, write_prediction
 
 PAINTED = f"{SCENES}/painted.py"
 HOSTILE = "</script><script>alert(1)</script><img src=x onerror=alert(1)>&\"'<!--"

@@ -23,6 +23,7 @@ from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import runner
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.executors.choose import run_units
+from su3d_bench.store import atomic
 from su3d_bench.store import run_folder as store
 
 WORDS = ["run", "--scenes", f"{SCENES}/painted.py:Painted/*", "--methods", f"{SCENES}/painted.py:Collector"]
@@ -91,7 +92,7 @@ def test_listing_the_jobs_reads_each_seal_twice(finished: Path, monkeypatch: pyt
 def count_seals_read(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """Grows by the path of every ``done.json`` that is read."""
     reads: list[Path] = []
-    read_json = store.read_json
+    read_json = atomic.read_json
 
     def counted(path: Path) -> Any:
         reads.extend([path] if path.name == "done.json" else [])

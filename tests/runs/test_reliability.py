@@ -29,8 +29,8 @@ from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.runs import job as scene_job
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.store.atomic import filling
-from su3d_bench.store.run_folder import RunFolder, npz_bytes, read_npz
+from su3d_bench.store.atomic import filling, npz_bytes, read_npz
+from su3d_bench.store.run_folder import RunFolder
 from su3d_bench.store.scratch import TemporaryFolder
 
 KILLS = ROOT / "benchmarks" / "kill_at_random.py"

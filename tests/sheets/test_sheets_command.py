@@ -21,7 +21,8 @@ from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.sheets.items import read_key, read_sheet
 from su3d_bench.sheets.run_source import RunSource
-from su3d_bench.store.run_folder import RunFolder, read_prediction, write_prediction
+from su3d_bench.store.predictions import read_prediction, write_prediction
+from su3d_bench.store.run_folder import RunFolder
 
 QUESTION = "How many chairs are there?"
 ANSWER = '{"reasoning": "one is in the list", "answer": "There is 1 chair.", "object_ids": [0]}'

@@ -29,8 +29,10 @@ from su3d_bench.metrics.matching.labelling import most_similar
 from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.predictions.own_runs import OwnRuns
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.store import run_folder as store
-from su3d_bench.store.run_folder import features_beside, npz_bytes, read_prediction, write_prediction
+from su3d_bench.store import predictions
+from su3d_bench.store.atomic import npz_bytes
+from su3d_bench.store.predictions import features_beside, read_prediction, write_prediction
+from su3d_bench.store.run_folder import RunFolder
 from su3d_bench.store.scratch import scratch_folder
 
 POINTS = np.arange(12, dtype=np.float32).reshape(4, 3)
@@ -156,7 +158,7 @@ def test_the_features_of_a_dense_map_are_a_file_of_their_own_that_is_mapped_when
 def test_features_written_in_blocks_are_the_file_that_numpy_saves(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(store, "ROWS_AT_ONCE", 3)
+    monkeypatch.setattr(predictions, "ROWS_AT_ONCE", 3)
     write_prediction(tmp_path / "a.npz", DenseFeatures(POINTS, ROWS))
     np.save(tmp_path / "b.npy", ROWS)
     assert (tmp_path / "a.features.npy").read_bytes() == (tmp_path / "b.npy").read_bytes()
@@ -178,7 +180,7 @@ def test_another_kind_of_map_in_its_place_takes_the_features_away_and_is_stored_
     partition = Partition(POINTS, np.zeros(4, np.int32), ROWS[:1].astype(np.float32))
     write_prediction(path, partition)
     assert [child.name for child in tmp_path.iterdir()] == ["prediction.npz"]
-    assert path.read_bytes() == npz_bytes(store.prediction_arrays(partition))
+    assert path.read_bytes() == npz_bytes(predictions.prediction_arrays(partition))
 
 
 @pytest.mark.parametrize("damage", ["missing", "cut", "text", "rows", "integers"])
@@ -220,7 +222,7 @@ def test_hostile_features_are_refused(tmp_path: Path, header: bytes) -> None:
 
 
 def test_a_seal_vouches_for_the_features_too(tmp_path: Path) -> None:
-    job = store.RunFolder(tmp_path).job("rooms/living0", "dense")
+    job = RunFolder(tmp_path).job("rooms/living0", "dense")
     job.prepare()
     write_prediction(job.prediction, DenseFeatures(POINTS, ROWS))
     job.seal("predict", {"method": "dense"}, [job.prediction])

@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.core.types import DenseFeatures, Instances, Partition
-from su3d_bench.store import run_folder as store
-from su3d_bench.store.run_folder import JobFolder, RunFolder, npz_bytes, read_npz, write_bytes, write_json, write_npz
+from su3d_bench.store.atomic import npz_bytes, read_json, read_npz, write_bytes, write_json, write_npz
+from su3d_bench.store.predictions import read_prediction, write_prediction
+from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 KEY = {"method": "collector", "stride": "40", "data": "abc"}
 
@@ -85,8 +86,8 @@ def test_arrays_of_objects_are_refused() -> None:
     ids=lambda prediction: type(prediction).__name__,
 )
 def test_a_prediction_comes_back_as_it_was(tmp_path: Path, prediction: Instances | Partition | DenseFeatures) -> None:
-    store.write_prediction(tmp_path / "prediction.npz", prediction)
-    again = store.read_prediction(tmp_path / "prediction.npz")
+    write_prediction(tmp_path / "prediction.npz", prediction)
+    again = read_prediction(tmp_path / "prediction.npz")
     assert type(again) is type(prediction)
     for name in prediction.__dataclass_fields__:
         before, after = getattr(prediction, name), getattr(again, name)
@@ -101,8 +102,8 @@ def test_an_empty_map_comes_back_empty(tmp_path: Path) -> None:
         np.zeros((0, 2, 3), np.float32), np.zeros((0, 3), np.float32),
         np.zeros(1, np.int64), np.zeros((0, 2), np.int32),
     )  # fmt: skip
-    store.write_prediction(tmp_path / "prediction.npz", empty)
-    again = store.read_prediction(tmp_path / "prediction.npz")
+    write_prediction(tmp_path / "prediction.npz", empty)
+    again = read_prediction(tmp_path / "prediction.npz")
     assert isinstance(again, Instances)
     assert (len(again), again.names, again.labels, again.features) == (0, (), (), None)
 
@@ -110,10 +111,10 @@ def test_an_empty_map_comes_back_empty(tmp_path: Path) -> None:
 def test_a_file_that_is_no_prediction_is_refused(tmp_path: Path) -> None:
     write_npz(tmp_path / "other.npz", {"points": np.zeros(3)})
     with pytest.raises(PredictionError, match=r"other.npz: holds no 'kind' out of Instances, Partition, DenseFeatures"):
-        store.read_prediction(tmp_path / "other.npz")
+        read_prediction(tmp_path / "other.npz")
     write_npz(tmp_path / "short.npz", {"kind": np.array("Partition"), "points": np.zeros((0, 3), np.float32)})
     with pytest.raises(PredictionError, match=r"short.npz: lacks 'instance'"):
-        store.read_prediction(tmp_path / "short.npz")
+        read_prediction(tmp_path / "short.npz")
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 and no more", b"text", npz_bytes({"x": np.zeros(100)})[:300]])
@@ -192,7 +193,7 @@ def test_a_failed_write_is_one_line_and_leaves_the_old_file(
     monkeypatch.setattr(os, "fsync", fail)
     with pytest.raises(StoreError, match=f"cannot write {path}: {reason}"):
         write_json(path, {"new": 2})
-    assert store.read_json(path) == {"old": 1}
+    assert read_json(path) == {"old": 1}
     assert [child.name for child in tmp_path.iterdir()] == ["metrics.json"]
 
 

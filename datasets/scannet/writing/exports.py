@@ -16,7 +16,7 @@ from su3d_bench.core.types import Float64Array, Frame
 from su3d_bench.datasets.scannet.writing.layout import DEPTH_SHIFT, SENSOR_NAME, intrinsics_4x4, size_of
 from su3d_bench.datasets.writing import ScannedDataset, SceneTarget
 from su3d_bench.formats.images import UInt16Array, depth_in_units, jpeg_bytes, png_bytes
-from su3d_bench.store.run_folder import make_folder, write_text
+from su3d_bench.store.atomic import make_folder, write_text
 
 INFO = "_info.txt"
 

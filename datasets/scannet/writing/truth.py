@@ -19,7 +19,7 @@ from su3d_bench.datasets.scannet.writing.categories import categories, nyu40_col
 from su3d_bench.datasets.writing import Scan, ScannedDataset
 from su3d_bench.formats.images import list_column, triangles_of
 from su3d_bench.formats.ply import Column, PlyElement, write_ply
-from su3d_bench.store.run_folder import make_folder, write_text
+from su3d_bench.store.atomic import make_folder, write_text
 
 MIN_COSINE = 0.9  # faces that meet at more than 26 degrees belong to two segments
 

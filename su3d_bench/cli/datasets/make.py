@@ -22,7 +22,8 @@ from su3d_bench.datasets.writing import SceneTarget, finish_scene, plan_scenes, 
 from su3d_bench.runs.executors.local import Event, Report, run_inline, run_processes
 from su3d_bench.runs.job import Part, build_dataset
 from su3d_bench.runs.plan import data_root, expand_scenes
-from su3d_bench.store.run_folder import RunFolder, make_folder
+from su3d_bench.store.atomic import make_folder
+from su3d_bench.store.run_folder import RunFolder
 
 FRAMES_A_UNIT = 400  # a quarter of a room: enough that building the room anew in each process does not matter
 WHAT_A_LAYOUT_TAKES = ("scan", "objects", "trajectory", "intrinsics")

@@ -48,7 +48,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.cli.query import encoder_of
     from su3d_bench.core.errors import printable
     from su3d_bench.reports.page.page import page_html
-    from su3d_bench.store.run_folder import make_folder, write_text
+    from su3d_bench.store.atomic import make_folder, write_text
 
     if not 0 < arguments.most_megabytes <= 1000:
         raise ConfigError(f"--most-megabytes {arguments.most_megabytes:g}: must be above 0 and at most 1000")

@@ -37,7 +37,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.leaderboard import leaderboard, tables
     from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
     from su3d_bench.reports.tables.latex import latex
-    from su3d_bench.store.run_folder import make_folder, write_text
+    from su3d_bench.store.atomic import make_folder, write_text
 
     found = leaderboard(arguments.folder, arguments.protocols)
     if arguments.json:

@@ -65,7 +65,7 @@ def add_parser(actions: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.store.run_folder import json_text, make_folder, write_text
+    from su3d_bench.store.atomic import json_text, make_folder, write_text
 
     tables = _tables(arguments)
     text = json_text([asdict(one) for one in tables]) if arguments.json else _formatter(arguments.format)(tables)

@@ -107,7 +107,7 @@ def _write(
     arguments: argparse.Namespace, files: dict[str, str], times: list[list[UpdateTimes]], anytime: list[Any]
 ) -> None:
     from su3d_bench.reports.pictures.timing import draw_timing
-    from su3d_bench.store.run_folder import make_folder, write_text
+    from su3d_bench.store.atomic import make_folder, write_text
 
     make_folder(arguments.out)
     for name, text in files.items():

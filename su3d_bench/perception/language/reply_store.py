@@ -20,7 +20,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from su3d_bench.core.digests import digest_json
 from su3d_bench.core.errors import StoreError
 from su3d_bench.perception.language.chat import ChatRequest, Reply
-from su3d_bench.store.run_folder import json_text, make_folder, write_bytes, write_text
+from su3d_bench.store.atomic import json_text, make_folder, write_bytes, write_text
 
 SCHEMA = 1
 MOST_ENTRY_BYTES = 200_000_000  # twice the largest answer that a configuration can allow

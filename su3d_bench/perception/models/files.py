@@ -20,7 +20,7 @@ from su3d_bench.core.devices import require
 from su3d_bench.core.digests import digest_bytes, digest_file
 from su3d_bench.core.errors import ConfigError, DataError, ModelMissing, StoreError
 from su3d_bench.perception.models.catalogue import FormName, ModelEntry, ModelForm, model_entry
-from su3d_bench.store.run_folder import make_folder, read_json, write_json
+from su3d_bench.store.atomic import make_folder, read_json, write_json
 
 DEFAULT_FOLDER = "~/.cache/su3d-bench/models"
 DIGEST_FOLDER = "model-digests"

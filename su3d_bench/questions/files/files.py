@@ -16,7 +16,7 @@ from su3d_bench.core.errors import DataError, printable
 from su3d_bench.questions.files.datasets import is_foreign, read_foreign
 from su3d_bench.questions.files.queries import COLUMNS, MORE_COLUMNS, read_query_rows
 from su3d_bench.questions.model import ALL_KINDS, KINDS, Question, new_question
-from su3d_bench.store.run_folder import write_text
+from su3d_bench.store.atomic import write_text
 
 PAPER = Path(__file__).parent / "paper_queries.toml"
 

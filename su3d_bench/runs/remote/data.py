@@ -16,7 +16,7 @@ from pathlib import Path
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.runs.job import Part, build_dataset
 from su3d_bench.runs.remote.folder import RemoteFolder
-from su3d_bench.store.run_folder import make_folder
+from su3d_bench.store.atomic import make_folder
 
 MOST_SHARED_BYTES = 1 << 26  # label tables and camera files; ScanNet's largest has 1 MB
 

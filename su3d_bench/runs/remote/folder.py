@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError, printable
-from su3d_bench.store.run_folder import make_folder
+from su3d_bench.store.atomic import make_folder
 
 AT_ONCE = 256  # small files that one request to the driver asks for; it fetches them side by side
 BUCKETS = ("s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "oss")  # have no folders, and to make one makes a bucket

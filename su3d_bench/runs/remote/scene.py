@@ -18,7 +18,8 @@ from su3d_bench.runs.executors.local import Report
 from su3d_bench.runs.job import MethodOutcome, SceneJob
 from su3d_bench.runs.remote.folder import RemoteFolder
 from su3d_bench.runs.scene import failed_outcomes, run_scene
-from su3d_bench.store.run_folder import RunFolder, make_folder, write_bytes
+from su3d_bench.store.atomic import make_folder, write_bytes
+from su3d_bench.store.run_folder import RunFolder
 from su3d_bench.store.scratch import TemporaryFolder
 
 CACHE_ROOT = "~/.cache/su3d-bench/cache"

@@ -23,7 +23,8 @@ from su3d_bench.perception.language.parsing import Described, answered, chosen_n
 from su3d_bench.perception.language.reply_store import ReplyStore
 from su3d_bench.questions.refined_names import read_records, records_of, write_records
 from su3d_bench.questions.refinement import ModelRefiner, TopNames, top_names, vote
-from su3d_bench.store.run_folder import JobFolder, prediction_arrays, prediction_from_arrays, write_prediction
+from su3d_bench.store.predictions import prediction_arrays, prediction_from_arrays, write_prediction
+from su3d_bench.store.run_folder import JobFolder
 
 NAMES = ("white sofa", "sofa", "couch", "trash can", "indoor-plant")
 

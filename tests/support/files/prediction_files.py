@@ -16,7 +16,7 @@ from places import CASES
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.types import Instances
 from su3d_bench.predictions.formats import READERS
-from su3d_bench.store.run_folder import write_prediction
+from su3d_bench.store.predictions import write_prediction
 
 
 def scenes_of(case: str) -> list[dict[str, Any]]:

@@ -144,7 +144,8 @@ def _refined_names(folder: Path) -> Read:
 def _kept_files(folder: Path) -> Read:
     from test_store import small_map
 
-    from su3d_bench.store.run_folder import prediction_arrays, read_json, read_npz, write_npz
+    from su3d_bench.store.atomic import read_json, read_npz, write_npz
+    from su3d_bench.store.predictions import prediction_arrays
 
     write_npz(folder / "a.npz", prediction_arrays(small_map()))
     (folder / "a.json").write_text(json.dumps({"a": [1, 2.5, None], "b": {"c": "text"}}))

@@ -26,7 +26,7 @@ from su3d_bench.perception.models.files import ModelFiles, bounded
 from su3d_bench.perception.models.onnx.export import compare_outputs, export_onnx
 from su3d_bench.perception.models.onnx.manifest import OnnxManifest, common_fields, described, read_common, wrong_files
 from su3d_bench.perception.models.onnx.session import Provider, open_session
-from su3d_bench.store.run_folder import make_folder, write_json
+from su3d_bench.store.atomic import make_folder, write_json
 
 FORMAT = "su3d-bench onnx encoder 1"
 IMAGE_FILE, TEXT_FILE = "image.onnx", "text.onnx"

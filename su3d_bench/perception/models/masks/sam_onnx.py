@@ -22,7 +22,7 @@ from su3d_bench.perception.models.onnx.export import Parity, compare_outputs, ex
 from su3d_bench.perception.models.onnx.manifest import OnnxManifest, common_fields, described, read_common, wrong_files
 from su3d_bench.perception.models.onnx.session import Provider, open_session
 from su3d_bench.perception.models.pretrained import load_sam
-from su3d_bench.store.run_folder import make_folder, write_json
+from su3d_bench.store.atomic import make_folder, write_json
 
 FORMAT = "su3d-bench onnx segmenter 1"
 ENCODER_FILE, DECODER_FILE = "encoder.onnx", "decoder.onnx"

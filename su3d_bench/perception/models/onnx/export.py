@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import ModelMissing, StoreError
-from su3d_bench.store.run_folder import make_folder
+from su3d_bench.store.atomic import make_folder
 
 # 17 has LayerNormalization as one operator; newer ones bring nothing that our towers use.
 OPSET = 17

@@ -1,0 +1,115 @@
+"""The prediction of one scene as a file: the fields of its type as arrays, features of each point beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.core.damage import DAMAGE
+from su3d_bench.core.errors import PredictionError, StoreError
+from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
+from su3d_bench.store.atomic import read_npz, remove_file, replacing, write_npz
+from su3d_bench.store.scratch import row_blocks
+
+ROWS_AT_ONCE = 8192  # 16 MB of half precision at 1024 dimensions
+# Dimensions and kinds of values of each field of a stored prediction; see Instances, Partition and DenseFeatures.
+FIELDS = {
+    "points": (2, "f"),
+    "indptr": (1, "i"),
+    "indices": (1, "i"),
+    "scores": (1, "f"),
+    "features": (2, "f"),
+    "labels": (1, "U"),
+    "names": (1, "U"),
+    "captions": (1, "U"),
+    "boxes": (3, "f"),
+    "centroids": (2, "f"),
+    "view_indptr": (1, "i"),
+    "views": (2, "i"),
+    "view_names": (1, "U"),
+    "view_scores": (1, "f"),
+    "ids": (1, "i"),
+    "instance": (1, "i"),
+}
+
+
+def prediction_arrays(prediction: Prediction) -> dict[str, NDArray[Any]]:
+    """A prediction as named arrays, ``kind`` among them; absent fields are left out."""
+    arrays = {"kind": np.array(type(prediction).__name__)}
+    for name in prediction.__dataclass_fields__:
+        value = getattr(prediction, name)
+        if value is not None:
+            arrays[name] = np.array(value, dtype=np.str_) if isinstance(value, tuple) else value
+    return arrays
+
+
+def prediction_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Prediction:
+    """The reverse of ``prediction_arrays``; ``where`` begins the message when the arrays are no prediction."""
+    kinds = {kind.__name__: kind for kind in (Instances, Partition, DenseFeatures)}
+    kind = kinds.get(str(arrays.get("kind")))
+    if kind is None:
+        raise PredictionError(f"{where}: holds no 'kind' out of {', '.join(kinds)}; it is not a prediction")
+    for name in (name for name in FIELDS if name in arrays):
+        array, (n_dimensions, value_kind) = arrays[name], FIELDS[name]
+        if array.ndim != n_dimensions or array.dtype.kind != value_kind or (name == "indptr" and not array.size):
+            shape = f"of shape {array.shape} {array.dtype.name}"
+            raise PredictionError(f"{where}: '{name}' is an array {shape}; run the scene again")
+    values: dict[str, Any] = {}
+    for name in kind.__dataclass_fields__:
+        value = arrays.get(name)
+        values[name] = tuple(str(item) for item in value) if value is not None and value.dtype.kind == "U" else value
+    optional = {"features", "labels", "view_names", "view_scores"}
+    missing = [name for name, value in values.items() if value is None and name not in optional]
+    if missing:
+        raise PredictionError(f"{where}: lacks '{missing[0]}'; write it again with su3d-bench run")
+    prediction: Prediction = kind(**values)
+    return prediction
+
+
+def features_beside(path: Path) -> Path:
+    """Where the features of a dense prediction at ``path`` are: a file of their own, read without loading it."""
+    return path.with_name(f"{path.name.removesuffix('.npz')}.features.npy")
+
+
+def write_prediction(path: Path, prediction: Prediction) -> None:
+    """Store ``prediction`` at ``path``, the features of a dense one beside it."""
+    arrays, features_path = prediction_arrays(prediction), features_beside(path)
+    if isinstance(prediction, DenseFeatures):
+        _write_rows(features_path, arrays.pop("features"))
+    else:
+        remove_file(features_path)
+    write_npz(path, arrays)
+
+
+def _write_rows(path: Path, table: NDArray[Any]) -> None:
+    """Put ``table`` at ``path`` as a .npy file, a block at a time."""
+    descr = np.lib.format.dtype_to_descr(table.dtype)
+    with replacing(path) as stream:
+        header = {"descr": descr, "fortran_order": False, "shape": table.shape}
+        np.lib.format.write_array_header_1_0(stream, header)
+        for _, block in row_blocks(table, ROWS_AT_ONCE):
+            stream.write(np.ascontiguousarray(block).data)
+
+
+def read_prediction(path: Path) -> Prediction:
+    """The prediction that a run stored at ``path``; features of a dense one are memory-mapped."""
+    arrays = read_npz(path)
+    if str(arrays.get("kind")) == DenseFeatures.__name__ and "features" not in arrays:
+        arrays["features"] = _mapped_rows(features_beside(path))
+        if "points" not in arrays or arrays["features"].shape[:1] != arrays["points"].shape[:1]:
+            raise StoreError(f"{features_beside(path)}: has other rows than {path.name}; delete both and run again")
+    return prediction_from_arrays(arrays, str(path))
+
+
+def _mapped_rows(path: Path) -> NDArray[Any]:
+    try:
+        table: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
+    except DAMAGE as error:
+        raise StoreError(f"{path}: not a readable .npy file ({error}); delete it and run again") from error
+    if table.ndim != 2 or table.dtype.kind != "f":
+        raise StoreError(f"{path}: holds {table.dtype} {table.shape}, no rows of features; delete it and run again")
+    return table
