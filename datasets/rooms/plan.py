@@ -24,6 +24,11 @@ class Box:
     low: Float64Array
     high: Float64Array
 
+    @property
+    def corners(self) -> Float64Array:
+        """The lowest and the highest corner (2, 3)."""
+        return np.stack([self.low, self.high])
+
     def meets(self, other: Box, gap: float = 0.0) -> bool:
         """Overlap, with ``gap`` metres of horizontal air around."""
         pad = np.array([gap, gap, 0.0])

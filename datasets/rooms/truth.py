@@ -2,23 +2,29 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
-import numpy as np
-
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.rooms.classes import AFFORDANCES, CLASS_ID
-from su3d_bench.datasets.rooms.plan import FLAT, Box, Plan, box_of
+from su3d_bench.datasets.rooms.plan import FLAT, Plan, box_of
+from su3d_bench.numerics.boxes import (
+    ABOVE_M,
+    NEXT_TO_M,
+    NEXT_TO_SMALL_M,
+    UNDER_SHARE,
+    are_side_by_side,
+    is_left_of,
+    is_over,
+    shared_ground,
+)
 
 RELATIONS = ("on", "under", "next to", "in", "above")
 STRUCTURE = frozenset(("wall", "floor", "ceiling"))
 OPENINGS = frozenset(("door", "window"))
-NEXT_TO_M, NEXT_TO_ON_M = 0.3, 0.12  # on the floor and walls, and among things that share a support
+WALL_REACH_M = 1.0  # what hangs on a wall is above what stands no lower than this under it
 MIN_VISIBLE_VERTICES = 100  # ScanNet's smallest instance that counts
 MAX_ANSWER_SHARE = 1 / 3
-MIN_BEARING_RAD = 0.05  # two things nearer to one line of sight are neither left nor right of each other
 
 
 @dataclass(frozen=True)
@@ -72,7 +78,7 @@ class RoomTruth:
         return tuple(
             Relation(a, "left of", b)
             for a, b in sorted(pairs)
-            if _bearing(eye, self.by_id(a).centre, self.by_id(b).centre) > MIN_BEARING_RAD
+            if is_left_of(self.by_id(a).centre, self.by_id(b).centre, eye)
         )
 
 
@@ -83,13 +89,6 @@ class Query:
     text: str
     kind: str
     answers: tuple[int, ...]
-
-
-def _bearing(eye: tuple[float, ...], a: tuple[float, ...], b: tuple[float, ...]) -> float:
-    """Angle in radians, seen from above, by which ``a`` stands left of ``b`` for who looks at them from ``eye``."""
-    angle_a = math.atan2(a[1] - eye[1], a[0] - eye[0])
-    angle_b = math.atan2(b[1] - eye[1], b[0] - eye[0])
-    return math.remainder(angle_a - angle_b, math.tau)
 
 
 def truth_of(scene: str, kind: str, plan: Plan) -> RoomTruth:
@@ -126,30 +125,16 @@ def _relations(plan: Plan) -> Iterator[Relation]:
 
 def _between(plan: Plan, a: int, b: int) -> Iterator[Relation]:
     name_a, name_b = plan.placed[a - 1].item.class_name, plan.placed[b - 1].item.class_name
-    box_a, box_b = plan.boxes[a], plan.boxes[b]
-    if name_a in FLAT and plan.mount[b] == "floor" and name_b not in FLAT and _shared_ground(box_a, box_b) > 0.2:
+    box_a, box_b = plan.boxes[a].corners, plan.boxes[b].corners
+    stands_b = plan.mount[b] == "floor"
+    hangs_a = plan.mount[a] in ("wall", "ceiling") and name_a not in OPENINGS
+    reach_m = ABOVE_M if plan.mount[a] == "ceiling" else WALL_REACH_M
+    if name_a in FLAT and stands_b and name_b not in FLAT and shared_ground(box_a, box_b) > UNDER_SHARE:
         yield Relation(a, "under", b)
-    elif plan.mount[a] in ("wall", "ceiling") and plan.mount[b] == "floor" and name_a not in OPENINGS:
-        rise = float(box_a.low[2] - box_b.high[2])
-        if (
-            0 < rise < (2.2 if plan.mount[a] == "ceiling" else 1.0)
-            and _shared_ground(_wide(box_a), _wide(box_b)) > 0.15
-        ):
-            yield Relation(a, "above", b)
+    elif hangs_a and stands_b and is_over(box_a, box_b, 0.0, reach_m):
+        yield Relation(a, "above", b)
     if _are_neighbours(plan, a, b):
         yield Relation(a, "next to", b)
-
-
-def _wide(box: Box) -> Box:
-    pad = np.array([0.1, 0.1, 0.0])
-    return Box(box.low - pad, box.high + pad)
-
-
-def _shared_ground(a: Box, b: Box) -> float:
-    """Overlap of the two footprints as a share of the smaller one."""
-    sides = np.clip(np.minimum(a.high, b.high)[:2] - np.maximum(a.low, b.low)[:2], 0, None)
-    smaller = min(float(np.prod((a.high - a.low)[:2])), float(np.prod((b.high - b.low)[:2])))
-    return float(np.prod(sides)) / max(smaller, 1e-9)
 
 
 def _are_neighbours(plan: Plan, a: int, b: int) -> bool:
@@ -158,15 +143,11 @@ def _are_neighbours(plan: Plan, a: int, b: int) -> bool:
         return False
     if (plan.mount[a] == "object") != (plan.mount[b] == "object"):
         return False
-    limit = NEXT_TO_M
-    if plan.mount[a] == "object":
-        if plan.parent.get(a) != plan.parent.get(b):
-            return False
-        limit = NEXT_TO_ON_M
-    box_a, box_b = plan.boxes[a], plan.boxes[b]
-    apart = np.clip(np.maximum(box_a.low - box_b.high, box_b.low - box_a.high), 0, None)
-    overlap_z = min(box_a.high[2], box_b.high[2]) - max(box_a.low[2], box_b.low[2])
-    return float(np.hypot(apart[0], apart[1])) <= limit and float(overlap_z) > -0.15
+    is_on_a_support = plan.mount[a] == "object"
+    if is_on_a_support and plan.parent.get(a) != plan.parent.get(b):
+        return False
+    within_m = NEXT_TO_SMALL_M if is_on_a_support else NEXT_TO_M
+    return are_side_by_side(plan.boxes[a].corners, plan.boxes[b].corners, within_m)
 
 
 def queries(truth: RoomTruth, n_visible_vertices: Mapping[int, int] | None = None) -> tuple[Query, ...]:

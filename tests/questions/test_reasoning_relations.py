@@ -9,19 +9,16 @@ import pytest
 from bedroom_map import bedroom, box, thing
 
 from su3d_bench.core.types import Float64Array
+from su3d_bench.numerics.boxes import bearing_rad, gap_m, is_left_of, shared_ground
 from su3d_bench.questions.reasoning.answers import Answer
 from su3d_bench.questions.reasoning.generated import GeneratedQuestion
 from su3d_bench.questions.reasoning.judging import box_iou, is_right, same_objects
 from su3d_bench.questions.reasoning.relations import (
-    bearing_rad,
-    gap_m,
     holds,
     is_above,
     is_between,
-    is_left_of,
     is_next_to,
     is_under,
-    shared_ground,
 )
 from su3d_bench.questions.reasoning.scene_map import SceneMap
 from su3d_bench.questions.reasoning.solver import Solver

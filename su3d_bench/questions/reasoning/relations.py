@@ -1,13 +1,12 @@
 """Spatial relations between axis-aligned boxes (2, 3) in metres, z up: on, under, in, above, next to, near, between.
 
-The thresholds of "above" and "next to" are those by which the built-in rooms were labelled; the others are ours and
-stand below. Boxes say less than surfaces: what lies on an inner board of a shelf and what lies in a basket look alike,
-so "on" and "in" take whether the holder is a container.
+The thresholds of "above" and "next to" are those by which the built-in rooms are labelled, in ``numerics.boxes``; the
+others are ours and stand below. Boxes say less than surfaces: what lies on an inner board of a shelf and what lies in a
+basket look alike, so "on" and "in" take whether the holder is a container.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
@@ -15,24 +14,30 @@ from typing import Literal
 import numpy as np
 
 from su3d_bench.core.types import Float64Array
+from su3d_bench.numerics.boxes import (
+    ABOVE_M,
+    NEXT_TO_M,
+    NEXT_TO_SMALL_M,
+    UNDER_SHARE,
+    are_side_by_side,
+    gap_m,
+    ground_area,
+    is_over,
+    shared_area,
+    shared_ground,
+)
 from su3d_bench.perception.embedded.text import words
 
 PairRelation = Literal["on", "under", "in", "above", "next to", "near"]
 PAIR_RELATIONS: tuple[PairRelation, ...] = ("on", "under", "in", "above", "next to", "near")
 
-NEXT_TO_M = 0.3  # rooms_truth.NEXT_TO_M
-NEXT_TO_SMALL_M = 0.12  # rooms_truth.NEXT_TO_ON_M: things that share a support are small
-SMALL_M = 0.45  # longest side of such a thing
+SMALL_M = 0.45  # longest side of what is small: things that share a support
 FLAT_M, SPREAD_M = 0.03, 0.5  # so low and so wide is a rug, which lies under its neighbours, not beside them
-LEVEL_M = 0.15  # neighbours may miss one another in height by this much, as in rooms_truth
 NEAR_M = 1.0  # ours: an arm's length
 CONTACT_M = 0.08  # ours: twice the paper's voxel of 0.02 m on either side
 ON_SHARE = 0.3  # of the smaller footprint
 WITHIN_SHARE = 0.7  # of the footprint of what is inside
 INNER_FLOOR_M = 0.05  # an inner board lies above the holder's foot by this
-ABOVE_SHARE, ABOVE_PAD_M, ABOVE_M = 0.15, 0.1, 2.2  # rooms_truth: share of the padded footprints, reach of a ceiling
-UNDER_SHARE = 0.2  # rooms_truth: a rug and what stands on it
-MIN_BEARING_RAD = 0.05  # rooms_truth: two things nearer to one line of sight are neither left nor right
 BETWEEN_ENDS = 0.05  # ours: share of the way, at either end, that is not between
 BETWEEN_SLOPE, BETWEEN_ASIDE_M = 0.5, 0.3  # ours: 27 degrees off the way from either end, or aside by this much
 
@@ -61,37 +66,6 @@ def is_room_surface(name: str) -> bool:
     return bool(set(words(name)[-1:]) & ROOM_SURFACES)
 
 
-def gap_m(a: Float64Array, b: Float64Array) -> float:
-    """The shortest way between two boxes; 0 where they touch."""
-    return float(np.linalg.norm(_apart(a, b)))
-
-
-def ground_gap_m(a: Float64Array, b: Float64Array) -> float:
-    """The shortest way between two footprints."""
-    return float(np.linalg.norm(_apart(a, b)[:2]))
-
-
-def _apart(a: Float64Array, b: Float64Array) -> Float64Array:
-    apart: Float64Array = np.clip(np.maximum(a[0] - b[1], b[0] - a[1]), 0.0, None)
-    return apart
-
-
-def _area(a: Float64Array) -> float:
-    return max(float(np.prod((a[1] - a[0])[:2])), 1e-9)
-
-
-def _shared_area(a: Float64Array, b: Float64Array, pad_m: float = 0.0) -> float:
-    sides = np.clip(np.minimum(a[1], b[1])[:2] - np.maximum(a[0], b[0])[:2] + 2 * pad_m, 0.0, None)
-    return float(np.prod(sides))
-
-
-def shared_ground(a: Float64Array, b: Float64Array, pad_m: float = 0.0) -> float:
-    """Overlap of two footprints, each grown by ``pad_m``, as a share of the smaller one."""
-    pad = np.array([[-pad_m, -pad_m, 0.0], [pad_m, pad_m, 0.0]])
-    wide_a, wide_b = a + pad, b + pad
-    return _shared_area(wide_a, wide_b) / min(_area(wide_a), _area(wide_b))
-
-
 def _rests_on_top(a: Float64Array, b: Float64Array) -> bool:
     has_risen = a[1][2] > b[1][2]
     return has_risen and abs(float(a[0][2] - b[1][2])) <= CONTACT_M and shared_ground(a, b) >= ON_SHARE
@@ -99,7 +73,7 @@ def _rests_on_top(a: Float64Array, b: Float64Array) -> bool:
 
 def _rests_inside(a: Float64Array, b: Float64Array) -> bool:
     """``a`` begins inside the box of ``b``, within its footprint."""
-    is_within = _shared_area(a, b) / _area(a) >= WITHIN_SHARE and _area(a) < _area(b)
+    is_within = shared_area(a, b) / ground_area(a) >= WITHIN_SHARE and ground_area(a) < ground_area(b)
     return is_within and b[0][2] - CONTACT_M <= a[0][2] < b[1][2] - CONTACT_M
 
 
@@ -120,8 +94,7 @@ def is_in(a: Float64Array, b: Float64Array, *, b_is_container: bool = False) -> 
 
 def is_above(a: Float64Array, b: Float64Array) -> bool:
     """``a`` hangs or stands higher than ``b`` over its footprint, and does not touch it."""
-    rise = float(a[0][2] - b[1][2])
-    return CONTACT_M < rise < ABOVE_M and shared_ground(a, b, ABOVE_PAD_M) > ABOVE_SHARE
+    return is_over(a, b, CONTACT_M, ABOVE_M)
 
 
 def is_under(a: Float64Array, b: Float64Array, *, b_is_container: bool = False) -> bool:
@@ -129,7 +102,7 @@ def is_under(a: Float64Array, b: Float64Array, *, b_is_container: bool = False) 
     if is_above(b, a) or (_rests_on_top(b, a) and shared_ground(a, b) > UNDER_SHARE):
         return True
     is_low = abs(float(a[0][2] - b[0][2])) <= INNER_FLOOR_M and a[1][2] <= b[1][2]
-    is_covered = _shared_area(a, b) / _area(a) >= WITHIN_SHARE and _area(a) < _area(b)
+    is_covered = shared_area(a, b) / ground_area(a) >= WITHIN_SHARE and ground_area(a) < ground_area(b)
     return not b_is_container and is_low and is_covered
 
 
@@ -142,8 +115,7 @@ def is_next_to(a: Float64Array, b: Float64Array) -> bool:
     if _is_spread_out(a) or _is_spread_out(b):
         return False
     both_small = max(float((a[1] - a[0]).max()), float((b[1] - b[0]).max())) <= SMALL_M
-    overlap_z = float(min(a[1][2], b[1][2]) - max(a[0][2], b[0][2]))
-    if ground_gap_m(a, b) > (NEXT_TO_SMALL_M if both_small else NEXT_TO_M) or overlap_z <= -LEVEL_M:
+    if not are_side_by_side(a, b, NEXT_TO_SMALL_M if both_small else NEXT_TO_M):
         return False
     stacked = _rests_on_top(a, b) or _rests_on_top(b, a) or _rests_inside(a, b) or _rests_inside(b, a)
     return not stacked
@@ -177,18 +149,6 @@ def is_between(a: Float64Array, b: Float64Array, c: Float64Array) -> bool:
     aside = abs(float(way[0] * (a - b)[1] - way[1] * (a - b)[0])) / length
     is_on_the_way = BETWEEN_ENDS * length < along < (1 - BETWEEN_ENDS) * length
     return is_on_the_way and aside <= max(BETWEEN_SLOPE * min(along, length - along), BETWEEN_ASIDE_M)
-
-
-def bearing_rad(eye: Float64Array, a: Float64Array, b: Float64Array) -> float:
-    """The angle, seen from above, by which ``a`` stands left of ``b`` for who looks at them from ``eye``."""
-    angle_a = math.atan2(float(a[1] - eye[1]), float(a[0] - eye[0]))
-    angle_b = math.atan2(float(b[1] - eye[1]), float(b[0] - eye[0]))
-    return math.remainder(angle_a - angle_b, math.tau)
-
-
-def is_left_of(a: Float64Array, b: Float64Array, eye: Float64Array) -> bool:
-    """Whether ``a`` (3,) stands left of ``b`` for who looks at both from ``eye``."""
-    return bearing_rad(eye, a, b) > MIN_BEARING_RAD
 
 
 def relations_of(boxes: Float64Array, names: Sequence[str]) -> Iterator[RelationFound]:

@@ -11,6 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from su3d_bench.core.types import Float64Array
+from su3d_bench.numerics.boxes import is_left_of
 from su3d_bench.questions.reasoning.answers import Answer, unsettled
 from su3d_bench.questions.reasoning.named_objects import Meant, NearestName, meant_by
 from su3d_bench.questions.reasoning.question_words import ANYTHING, Phrase, Question, Relation, Size, read_question
@@ -19,7 +20,6 @@ from su3d_bench.questions.reasoning.relations import (
     holds,
     is_between,
     is_container,
-    is_left_of,
     is_room_surface,
 )
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
