@@ -248,8 +248,8 @@ def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
 
 def _rules(name: str | None, dataset: Any) -> ProtocolRules:
     """The protocol of ``name``, or the dataset's only one of instances with classes."""
+    from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
     from su3d_bench.metrics.protocols import load_protocol, protocols_for
-    from su3d_bench.runs.plan import why_not_fitting
 
     fitting = {rules.name: rules for rules in map(load_protocol, protocols_for(dataset.name)) if _has_masks(rules)}
     if name is None:
@@ -258,7 +258,7 @@ def _rules(name: str | None, dataset: Any) -> ProtocolRules:
             raise ConfigError(f"{dataset.name}: whose classes? name a protocol with --protocol ({known})")
         return next(iter(fitting.values()))
     rules = load_protocol(name)
-    reason = why_not_fitting(rules, dataset)
+    reason = why_not_truth(rules, TruthFacts.of_dataset(dataset))
     if reason is not None or not _has_masks(rules):
         raise ConfigError(f"--protocol {name}: {reason or 'has no classes of instances'}")
     return rules

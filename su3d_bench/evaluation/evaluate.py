@@ -46,13 +46,14 @@ from su3d_bench.evaluation.truth import (
     text_scenes,
     text_variant,
 )
+from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
 from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules, load_protocol, protocol_names
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexMasks
 from su3d_bench.predictions.scannet_text import ScannetText
 from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
 from su3d_bench.questions.files.queries import query_truth, read_query_file
-from su3d_bench.runs.plan import data_root, why_not_fitting
+from su3d_bench.runs.plan import data_root
 
 __all__ = ["Evaluation", "ProtocolEvaluation", "Request", "evaluate"]
 
@@ -259,7 +260,7 @@ def _why_not_truth(rules: ProtocolRules, ground: _Ground, *, is_named: bool) -> 
     if ground.dataset is not None:
         if not is_named and (ground.dataset_name not in rules.datasets or not rules.by_default):
             return f"{NOT_MEANT} {ground.dataset_name} unless it is named"
-        return why_not_fitting(rules, ground.dataset)
+        return why_not_truth(rules, TruthFacts.of_dataset(ground.dataset))
     assert ground.text is not None
     if rules.kind in SHARE_KINDS:
         return "needs the objects of a dataset; name one with --dataset" if is_named else f"{NOT_MEANT} texts"

@@ -26,11 +26,12 @@ from su3d_bench.datasets.replica.folders import find_original_scene, original_na
 from su3d_bench.datasets.replica.mesh_truth import read_annotated_mesh
 from su3d_bench.evaluation.checks import check_cloud, empty_warnings, mask_facts
 from su3d_bench.evaluation.scoring import SceneOutcome
+from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.matching.nearest import masks_of
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
 from su3d_bench.metrics.protocols import ProtocolRules
-from su3d_bench.metrics.scoring import QuestionTruth, score_scene, why_not_scorable
+from su3d_bench.metrics.scoring import QuestionTruth, score_scene
 from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
 from su3d_bench.questions.truths import question_truth
 

@@ -20,6 +20,7 @@ from su3d_bench.evaluation.checks import (
     mask_facts,
 )
 from su3d_bench.evaluation.truth import MAX_NYU40_ID, TextTruth
+from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.score import OBJECT, encode_without_classes, every_class_counts
 from su3d_bench.metrics.matching import nearest as transfer
@@ -33,7 +34,7 @@ from su3d_bench.metrics.matching.labelling import (
 )
 from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.metrics.scene_score import SceneScore, present
-from su3d_bench.metrics.scoring import score_scene, why_not_scorable
+from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
 

@@ -19,6 +19,7 @@ from su3d_bench.core.damage import DAMAGE
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
+from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.score import score_instances
@@ -27,10 +28,10 @@ from su3d_bench.metrics.open_vocabulary import object_means
 from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
-from su3d_bench.metrics.open_vocabulary.score import NEEDS_FEATURES, score_categories, score_queries
+from su3d_bench.metrics.open_vocabulary.score import score_categories, score_queries
 from su3d_bench.metrics.protocols import VALUES_OF_METRIC, ProtocolRules
 from su3d_bench.metrics.questions import shares
-from su3d_bench.metrics.questions.score import labels_n, score_annotation, score_reasoning, score_retrieval
+from su3d_bench.metrics.questions.score import score_annotation, score_reasoning, score_retrieval
 from su3d_bench.metrics.questions.shares import ShareCounts
 from su3d_bench.metrics.questions.truths import AnnotationTruth, ReasoningTruth, RetrievalTruth
 from su3d_bench.metrics.results.results import Counts, ProtocolResult, form_result, reported_values
@@ -97,7 +98,7 @@ def _sizes(rules: ProtocolRules, counts: Counts) -> tuple[dict[str, int], dict[s
     return {"values": n_values}, {"values": len(VALUES_OF_METRIC[rules.metric])}
 
 
-__all__ = ["SceneScore", "Truth", "combine", "pack_scores", "score_scene", "unpack_scores", "why_not_scorable"]
+__all__ = ["SceneScore", "Truth", "combine", "pack_scores", "score_scene", "unpack_scores"]
 
 QuestionTruth = RetrievalTruth | AnnotationTruth | ReasoningTruth
 Truth = GroundTruth | OpenLexTruth | QueryTruth | QuestionTruth
@@ -114,26 +115,6 @@ _COUNTS: dict[str, type[Counts]] = {
     "objects": object_means.ObjectCounts,
     "shares": shares.ShareCounts,
 }
-
-
-def why_not_scorable(rules: ProtocolRules, prediction: Prediction) -> str | None:
-    """A sentence where this kind of prediction cannot be scored under the protocol at all."""
-    if rules.kind not in ("semantic", "categories") and isinstance(prediction, DenseFeatures):
-        return f"{rules.name}: needs instances, and the method gives one feature a point"
-    if rules.kind in ("annotation", "reasoning"):
-        return _why_no_names(rules, prediction)
-    compares = rules.kind in ("queries", "retrieval") or rules.metric == "openlex3d-ranking"
-    if compares and isinstance(prediction, Instances) and prediction.features is None and len(prediction):
-        return f"{rules.name}: {NEEDS_FEATURES}"
-    return None
-
-
-def _why_no_names(rules: ProtocolRules, prediction: Prediction) -> str | None:
-    if not isinstance(prediction, Instances):
-        return f"{rules.name}: needs instances with names, and the method gives a partition"
-    if len(prediction) and not any(labels_n(prediction)):
-        return f"{rules.name}: needs names, and the method gives its instances none"
-    return None
 
 
 def score_scene(rules: ProtocolRules, truth: Truth, prediction: Prediction, encoder: Encoder | None) -> SceneScore:

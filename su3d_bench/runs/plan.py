@@ -29,9 +29,9 @@ from su3d_bench.core.devices import device_for
 from su3d_bench.core.digests import code_digest, digest_json
 from su3d_bench.core.errors import ConfigError, DataError, StoreError, suggest
 from su3d_bench.core.interfaces import Dataset
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol, protocols_for
+from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
+from su3d_bench.metrics.protocols import load_protocol, protocols_for
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
-from su3d_bench.questions.truths import has_own_queries
 from su3d_bench.runs.executors.choose import ELSEWHERE, check_execution
 from su3d_bench.runs.job import (
     CEILING_METHOD,
@@ -353,26 +353,15 @@ def protocols_of_run(asked: Sequence[str], targets: Sequence[str]) -> dict[str, 
     if not asked:
         return {target: tuple(protocols_for(registry.load("dataset", target).name)) for target in targets}
     rules = [load_protocol(name) for name in dict.fromkeys(asked)]
-    classes = {target: registry.load("dataset", target) for target in targets}
+    truths = {target: TruthFacts.of_dataset(registry.load("dataset", target)) for target in targets}
     for one in rules:
-        reasons = [reason for cls in classes.values() if (reason := why_not_fitting(one, cls)) is not None]
-        if len(reasons) == len(classes):
+        reasons = [reason for truth in truths.values() if (reason := why_not_truth(one, truth)) is not None]
+        if len(reasons) == len(truths):
             raise ConfigError(f"protocol '{one.name}' fits no scene of this run: {reasons[0]}")
     return {
-        target: tuple(name for name, one in zip(asked, rules, strict=True) if why_not_fitting(one, cls) is None)
-        for target, cls in classes.items()
+        target: tuple(name for name, one in zip(asked, rules, strict=True) if why_not_truth(one, truth) is None)
+        for target, truth in truths.items()
     }
-
-
-def why_not_fitting(rules: ProtocolRules, dataset: Any) -> str | None:
-    """Why a dataset (class or object) cannot serve a protocol; None where it can."""
-    if rules.label_space != dataset.label_space:
-        return f"it scores the labels of '{rules.label_space}', {dataset.name} has those of '{dataset.label_space}'"
-    if rules.ground_truth not in dataset.variants:
-        return f"it needs ground truth '{rules.ground_truth}', {dataset.name} has {', '.join(dataset.variants)}"
-    if rules.questions == "dataset" and not has_own_queries(dataset):
-        return f"it needs a dataset that knows questions and answers itself, which {dataset.name} does not"
-    return None
 
 
 def _folder(out: Path | str | None, config: RunConfig, parts: _Parts) -> Path:

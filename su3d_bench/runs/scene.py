@@ -19,8 +19,9 @@ from su3d_bench.core.errors import GroundTruthMissing, StoreError, Su3dError
 from su3d_bench.core.interfaces import Method, SceneTools
 from su3d_bench.core.timing import device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Prediction, Proposals, SceneInfo
+from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules, load_protocol
-from su3d_bench.metrics.scoring import SceneScore, Truth, pack_scores, score_scene, why_not_scorable
+from su3d_bench.metrics.scoring import SceneScore, Truth, pack_scores, score_scene
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
 from su3d_bench.questions.refined_names import refined_names
 from su3d_bench.questions.truths import question_truth

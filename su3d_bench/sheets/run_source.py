@@ -22,11 +22,12 @@ from su3d_bench.core.errors import (
     suggest,
 )
 from su3d_bench.core.types import Frame, GroundTruth, Instances
+from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.instance.score import Covered, covered_objects
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol, protocol_names
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.runs.job import Part, build_dataset
-from su3d_bench.runs.plan import data_root, dataset_targets, why_not_fitting
+from su3d_bench.runs.plan import data_root, dataset_targets
 from su3d_bench.store.predictions import read_prediction
 
 MOST_FRAMES = 32  # of a scene, among which the best view of an object is looked for
@@ -110,9 +111,9 @@ class RunSource:
     def rules(self, scene: str, kind: str) -> ProtocolRules | None:
         """The rules that judge a scene automatically, the first that fit; None where there are none."""
         name = scene.partition("/")[0]
-        for protocol in protocol_names():
-            rules = load_protocol(protocol)
-            if rules.kind == kind and name in rules.datasets and why_not_fitting(rules, self.dataset(scene)) is None:
+        for rules in map(load_protocol, protocol_names()):
+            is_meant = rules.kind == kind and name in rules.datasets
+            if is_meant and why_not_truth(rules, TruthFacts.of_dataset(self.dataset(scene))) is None:
                 return rules
         return None
 

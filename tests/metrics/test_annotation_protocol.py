@@ -11,12 +11,13 @@ import pytest
 from scored_room import NAMES, instances, room, truth_as_prediction
 
 from su3d_bench.core.types import Instances, Partition
+from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance.score import Covered
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.questions.score import judge_merging, labels_n
 from su3d_bench.metrics.questions.truths import AnnotationTruth, RefinedNames
 from su3d_bench.metrics.results.results import metric_values
-from su3d_bench.metrics.scoring import score_scene, why_not_scorable
+from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.questions.refined_names import FILE_NAME, records_of, refined_digest, refined_names, write_records
 from su3d_bench.questions.refinement import RefinedName, TopNames
 from su3d_bench.questions.truths import Refine, question_truth, voted_names

@@ -23,6 +23,7 @@ from places import CASES
 
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.types import DenseFeatures, Partition, Prediction
+from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.open_vocabulary import openlex3d
 from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts, combine, concatenate, resampled
@@ -39,7 +40,7 @@ from su3d_bench.metrics.open_vocabulary.openlex3d import (
 from su3d_bench.metrics.open_vocabulary.score import voxel_means
 from su3d_bench.metrics.protocols import CATEGORIES, load_protocol
 from su3d_bench.metrics.scoring import combine as combine_scenes
-from su3d_bench.metrics.scoring import pack_scores, score_scene, unpack_scores, why_not_scorable
+from su3d_bench.metrics.scoring import pack_scores, score_scene, unpack_scores
 
 GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())
 TOPN, RANKING = load_protocol("openlex3d-topn"), load_protocol("openlex3d-ranking")

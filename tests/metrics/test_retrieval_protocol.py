@@ -15,13 +15,14 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.core.types import Partition
 from su3d_bench.evaluation.openlex import score_on_questions, why_not_lex_content
+from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance.score import covered_objects
 from su3d_bench.metrics.protocols import load_protocol, protocols_for, read_protocol, rules_file
 from su3d_bench.metrics.questions.score import are_objects_right, is_answer_right
 from su3d_bench.metrics.questions.shares import ShareCounts
 from su3d_bench.metrics.questions.truths import AskedText, GivenAnswer, ReasoningTruth, RetrievalTruth, TrueAnswer
 from su3d_bench.metrics.results.results import metric_values
-from su3d_bench.metrics.scoring import combine, pack_scores, score_scene, unpack_scores, why_not_scorable
+from su3d_bench.metrics.scoring import combine, pack_scores, score_scene, unpack_scores
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.predictions.base import VertexMasks
 from su3d_bench.questions.truths import question_truth

@@ -1,0 +1,180 @@
+"""May a prediction be scored under a protocol, against a truth? Answered from plain facts, before any work.
+
+Each ``why_not_...`` gives the reason as a clause without the protocol's name, None where nothing stands against it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.core.types import Instances, Partition, Prediction
+from su3d_bench.metrics.matching.labelling import has_every_label
+from su3d_bench.metrics.open_vocabulary.score import NEEDS_FEATURES
+from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules
+from su3d_bench.metrics.questions.score import labels_n
+
+LARGEST_NYU40_ID = 40
+# Ground truths of ScanNet and whose class ids they hold.
+ID_LISTS = {"nyu40-vertices": "ids of NYU40 do", "scannet200-vertices": "ids of ScanNet200 do"}
+OBJECT_KINDS = ("queries", "categories", *SHARE_KINDS)  # they go by objects, found by the points of the map itself
+NAMED_KINDS = ("annotation", "reasoning")  # they go by names alone
+
+Form = Literal["instances", "partition", "dense", "vertex-masks", "vertex-labels"]
+
+
+@dataclass(frozen=True)
+class TruthFacts:
+    """What a truth offers.
+
+    ``label_space`` None: it does not say whose labels it has. ``has_points``: its points have coordinates;
+    ``knows_questions``: it has questions with all right answers.
+    """
+
+    name: str
+    label_space: str | None
+    variants: tuple[str, ...]
+    has_points: bool = True
+    has_instances: bool = True
+    knows_questions: bool = False
+
+    @classmethod
+    def of_dataset(cls, dataset: Any) -> TruthFacts:
+        """Those of a dataset, class or object."""
+        knows_questions = hasattr(dataset, "queries")
+        return cls(dataset.name, dataset.label_space, tuple(dataset.variants), knows_questions=knows_questions)
+
+
+@dataclass(frozen=True)
+class ContentFacts:
+    """What a prediction of a scene holds.
+
+    ``form``: ``vertex-masks`` and ``vertex-labels`` (one class a point) lie over the points of the truth, the others
+    bring their own. ``n``: how many masks or rows of features. ``n_dimensions`` of the features, None without any.
+    ``has_names``: some instance has a name or label. ``class_ids``: classes given as ids of the label space.
+    """
+
+    form: Form
+    n: int
+    n_dimensions: int | None = None
+    has_labels: bool = False
+    has_every_label: bool = False
+    has_names: bool = False
+    class_ids: NDArray[np.integer[Any]] | None = None
+
+    @classmethod
+    def of(cls, prediction: Prediction) -> ContentFacts:
+        """Those of a prediction with points of its own."""
+        features = prediction.features
+        n_dimensions = None if features is None else int(features.shape[-1])
+        if isinstance(prediction, Instances):
+            return cls(
+                form="instances",
+                n=len(prediction),
+                n_dimensions=n_dimensions,
+                has_labels=prediction.labels is not None,
+                has_every_label=has_every_label(prediction),
+                has_names=any(labels_n(prediction)),
+            )
+        return cls(
+            "partition" if isinstance(prediction, Partition) else "dense", len(prediction.features), n_dimensions
+        )
+
+    @property
+    def has_own_points(self) -> bool:
+        return self.form not in ("vertex-masks", "vertex-labels")
+
+
+def why_not_truth(rules: ProtocolRules, truth: TruthFacts) -> str | None:
+    """Why no prediction at all can be scored under a protocol against a truth."""
+    if rules.kind in SHARE_KINDS and not truth.has_points:
+        return "needs the objects of a dataset; name one with --dataset"
+    if rules.kind == "instance" and not truth.has_instances:
+        return "needs instances, the ground truth holds class ids alone (expected class id * 1000 + instance)"
+    if truth.label_space is None:
+        return None
+    if rules.label_space != truth.label_space:
+        return f"it scores the labels of '{rules.label_space}', {truth.name} has those of '{truth.label_space}'"
+    if rules.ground_truth not in truth.variants:
+        return f"it needs ground truth '{rules.ground_truth}', {truth.name} has {', '.join(truth.variants)}"
+    if rules.questions == "dataset" and not truth.knows_questions:
+        return f"it needs a dataset that knows questions and answers itself, which {truth.name} does not"
+    return None
+
+
+def why_not_content(rules: ProtocolRules, content: ContentFacts, *, has_points: bool = True) -> str | None:
+    """Why such a prediction cannot be scored under a protocol; ``has_points``: those of the truth have coordinates."""
+    if rules.kind in OBJECT_KINDS and not has_points:
+        return f"needs ground truth of the form '{rules.ground_truth}', which neither a dataset nor such texts give"
+    if rules.kind in OBJECT_KINDS and not content.has_own_points:
+        return "needs a map with points of its own, the prediction is over the points of another truth"
+    if content.has_own_points:
+        if not has_points:
+            return "the prediction has points of its own, the ground truth has no coordinates; name a --dataset"
+        return why_not_map(rules, content) or _why_not_named(rules, content)
+    if content.form == "vertex-labels":
+        if rules.kind == "instance":
+            return "needs instances, the prediction has one class a point"
+        can_count = has_points or rules.metric == "scannet"
+        return None if can_count else "needs the coordinates of the points; name a --dataset"
+    if rules.kind == "semantic" and not has_points:
+        return "needs a class for every point, the prediction has masks; name a --dataset to make them a map"
+    return _why_not_named(rules, content)
+
+
+def why_not_scorable(rules: ProtocolRules, prediction: Prediction) -> str | None:
+    """A sentence where this kind of prediction cannot be scored under the protocol at all."""
+    reason = why_not_map(rules, ContentFacts.of(prediction))
+    return f"{rules.name}: {reason}" if reason else None
+
+
+def why_not_map(rules: ProtocolRules, content: ContentFacts) -> str | None:
+    """Why a map with points of its own cannot be scored under a protocol at all."""
+    if rules.kind not in ("semantic", "categories") and content.form == "dense":
+        return "needs instances, and the method gives one feature a point"
+    if rules.kind in NAMED_KINDS:
+        if content.form != "instances":
+            return "needs instances with names, and the method gives a partition"
+        return "needs names, and the method gives its instances none" if content.n and not content.has_names else None
+    return NEEDS_FEATURES if _compares_texts(rules) and content.n_dimensions is None and content.n else None
+
+
+def _why_not_named(rules: ProtocolRules, content: ContentFacts) -> str | None:
+    """Why masks cannot get the classes that a protocol of classes asks for."""
+    if rules.class_agnostic is not None or rules.kind in OBJECT_KINDS or not content.n:
+        return None
+    if not content.has_labels and content.n_dimensions is None:
+        is_map = content.has_own_points
+        what = "the instances have neither labels" if is_map else "the masks have neither classes"
+        return f"needs classes, {what} nor features"
+    if content.form == "vertex-masks" and content.class_ids is not None and not content.class_ids.any():
+        return "needs classes, every mask has class 0"
+    return None
+
+
+def why_not_numbers(rules: ProtocolRules, content: ContentFacts) -> str | None:
+    """Why class ids cannot be those of a protocol, where its label space has two lists of ids."""
+    ids = content.class_ids
+    if rules.class_agnostic is not None or rules.ground_truth not in ID_LISTS or ids is None or not len(ids):
+        return None
+    largest = int(ids.max())
+    list_of_ids = "nyu40-vertices" if largest <= LARGEST_NYU40_ID else "scannet200-vertices"
+    if list_of_ids == rules.ground_truth:
+        return None
+    return f"the predicted classes go up to {largest}, as {ID_LISTS[list_of_ids]}"
+
+
+def n_feature_dimensions(rules: ProtocolRules, content: ContentFacts) -> int | None:
+    """The dimensions of the features that must be named; None where labels are there or the protocol needs none."""
+    if rules.class_agnostic is not None or rules.kind in NAMED_KINDS or not content.n:
+        return None
+    has_names = content.has_labels if content.form == "vertex-masks" else content.has_every_label
+    return None if has_names and not (content.has_own_points and _compares_texts(rules)) else content.n_dimensions
+
+
+def _compares_texts(rules: ProtocolRules) -> bool:
+    """Whether features are compared with texts whatever labels there are."""
+    return rules.kind in ("queries", "retrieval") or rules.metric == "openlex3d-ranking"
