@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check install -c constraints.txt
 DEMO_SCENES := rooms/living0 rooms/bedroom0 rooms/kitchen0 rooms/office0
 
-.PHONY: demo test bench bench-methods reference lint clean
+.PHONY: demo test bench bench-methods reference architecture lint clean
 
 demo: $(VENV)/core
 	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods opensu3d oracle --protocols rooms-semantic rooms-instance --out runs/demo
@@ -33,6 +33,10 @@ bench-methods: $(VENV)/test
 # limits where machines differ: CI runs on whatever there is, beside whatever else runs there.
 reference: demo
 	$(BIN)/su3d-bench check --learn runs/demo --out .ci/reference.json --across-machines 5 --cost-limit 3
+
+# Draws what docs/architecture.md says of the code from the code.
+architecture: $(VENV)/test
+	$(BIN)/python tests/support/house.py
 
 lint: $(VENV)/dev
 	$(BIN)/ruff check .

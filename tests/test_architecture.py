@@ -10,65 +10,12 @@ from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
+from house import FLOORS, LINKED, PACKAGE, PURPOSE, climbs, code_files, room_of
 from places import ROOT
 
-PACKAGE = ROOT / "su3d_bench"
-LINKED = ("datasets", "baselines", "reports")
-CODE = sorted(
-    path
-    for folder in (PACKAGE, *(ROOT / name for name in LINKED))
-    for path in folder.rglob("*.py")
-    if not any((PACKAGE / name) in path.parents for name in LINKED)
-)
-
-# The floors of the house, the lowest first: a folder imports from lower floors only.
-FLOORS = (
-    {"core"},
-    {"numerics", "store"},
-    {"formats", "metrics", "opensu3d"},
-    {"datasets", "perception", "reports"},
-    {"predictions", "questions"},
-    {"baselines", "runs"},
-    {"evaluation", "sheets"},
-    {"analysis"},
-    {"cli"},
-)
+CODE = code_files()
 HEAVY = {"open3d", "torch", "onnxruntime", "sklearn", "pandas", "matplotlib", "numba"}
 LATE = ("compiled.py", "torch_towers.py")  # they are imported late as a whole, as kernels are
-
-
-def room_of(path: Path) -> str | None:
-    """The folder of the house that a file stands in; None for the few at the door."""
-    relative = path.relative_to(PACKAGE if PACKAGE in path.parents else ROOT)
-    return relative.parts[0] if len(relative.parts) > 1 else None
-
-
-def floor_of(room: str) -> int:
-    return next(index for index, rooms in enumerate(FLOORS) if room in rooms)
-
-
-def imported_rooms(source: str) -> list[tuple[int, str]]:
-    """(line, room) of every import of the package in ``source``, those inside functions included."""
-    found = []
-    for node in ast.walk(ast.parse(source)):
-        modules = [a.name for a in node.names] if isinstance(node, ast.Import) else []
-        if isinstance(node, ast.ImportFrom) and node.module == "su3d_bench":
-            modules = [f"su3d_bench.{a.name}" for a in node.names if a.name != "__version__"]
-        elif isinstance(node, ast.ImportFrom) and node.module:
-            modules = [node.module]
-        found += [
-            (getattr(node, "lineno", 0), name.split(".")[1]) for name in modules if name.startswith("su3d_bench.")
-        ]
-    return found
-
-
-def climbs(source: str, room: str) -> list[str]:
-    """The imports of ``source``, a file in ``room``, that do not lead to a lower floor or stay in the room."""
-    return [
-        f"line {line}: {room} imports {other}"
-        for line, other in imported_rooms(source)
-        if other != room and floor_of(other) >= floor_of(room)
-    ]
 
 
 @pytest.mark.parametrize("path", CODE, ids=lambda path: str(path.relative_to(ROOT)))
@@ -98,6 +45,8 @@ def test_an_import_in_the_wrong_direction_is_found(line: str) -> None:
 def test_every_folder_stands_on_one_floor() -> None:
     rooms = [room for floor in FLOORS for room in floor]
     assert sorted(rooms) == sorted({room for path in CODE if (room := room_of(path)) is not None})
+    assert set(PURPOSE) == set(rooms)
+    assert len(FLOORS) <= 9 and len(rooms) <= 20
 
 
 @pytest.mark.parametrize("path", CODE, ids=lambda path: str(path.relative_to(ROOT)))

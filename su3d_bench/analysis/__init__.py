@@ -1,0 +1,1 @@
+"""Finished runs compared, gated, ranked and taken apart."""

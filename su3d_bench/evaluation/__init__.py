@@ -1,0 +1,1 @@
+"""``evaluate``: predictions made elsewhere to numbers."""
