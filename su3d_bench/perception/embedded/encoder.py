@@ -13,9 +13,12 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError, ModelMissing
+from su3d_bench.core.devices import require
+from su3d_bench.core.errors import ModelMissing
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.perception.embedded.text import TOKENIZER_VERSION, token_ids
+from su3d_bench.perception.models.encoders.image_transform import check_image
+from su3d_bench.perception.models.onnx.session import open_session
 
 IMAGE_SIZE = 64
 DIM = 128
@@ -82,15 +85,10 @@ class EmbeddedEncoder:
 
     def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
         """Features (N, 128) of RGB crops (h, w, 3) uint8 at their native size."""
-        for row, image in enumerate(images):
-            if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8 or not image.size:
-                raise DataError(
-                    f"image {row}: {image.shape} {image.dtype}; expected (height, width, 3) uint8, not empty"
-                )
         pixels = np.zeros((len(images), IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
         log_sizes = np.zeros((len(images), 2), np.float32)
         for row, image in enumerate(images):
-            pixels[row], log_sizes[row] = shrink(image), log_size(*image.shape[:2])
+            pixels[row], log_sizes[row] = shrink(check_image(image, row)), log_size(*image.shape[:2])
         return self.encode_shrunk(pixels, log_sizes)
 
     def encode_shrunk(self, pixels: UInt8Array, log_sizes: Float32Array) -> Float32Array:
@@ -133,7 +131,8 @@ class EmbeddedEncoder:
 
     def _tower(self, path: Path, *, is_image: bool) -> Any:
         if self.device == "cpu":
-            return _session(path)
+            return open_session(path)
+        require("torch", f"device '{self.device}'")
         from su3d_bench.perception.embedded.torch_towers import TorchTower
 
         return TorchTower(path, is_image=is_image, device=self.device)
@@ -146,14 +145,3 @@ class EmbeddedEncoder:
                 f"python -m su3d_bench.perception.embedded.training.train --out {self._folder}"
             )
         return path
-
-
-def _session(path: Path) -> Any:
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    options.inter_op_num_threads = 1
-    options.execution_mode = onnxruntime.ExecutionMode.ORT_SEQUENTIAL
-    options.log_severity_level = 3
-    return onnxruntime.InferenceSession(str(path), options, providers=["CPUExecutionProvider"])

@@ -18,27 +18,23 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
+
 from su3d_bench.core.errors import ModelMissing, Su3dError
-from su3d_bench.perception.embedded.encoder import DIM, IMAGE_FILE, TEXT_FILE, EmbeddedEncoder
+from su3d_bench.perception.embedded.encoder import DIM, IMAGE_FILE, IMAGE_SIZE, TEXT_FILE, EmbeddedEncoder
+from su3d_bench.perception.embedded.text import N_IDS, N_WORDS, token_ids
 from su3d_bench.perception.embedded.training.crops import (
     FIRST_HELD_OUT_NUMBER,
     FIRST_TRAINING_NUMBER,
+    CropSet,
     make_crops,
     room_names,
 )
 from su3d_bench.perception.embedded.training.evaluation import Figure, measure
+from su3d_bench.perception.models.onnx.export import export_onnx
 
 if TYPE_CHECKING:
     from su3d_bench.perception.embedded.training.loop import Towers, TrainingPlan
-import warnings
-
-import numpy as np
-import torch
-
-from su3d_bench.perception.embedded.encoder import IMAGE_SIZE
-from su3d_bench.perception.embedded.text import N_IDS, N_WORDS, token_ids
-from su3d_bench.perception.embedded.training.crops import CropSet
-from su3d_bench.perception.embedded.training.loop import Towers
 
 logger = logging.getLogger(__name__)
 
@@ -90,6 +86,32 @@ def run(order: Order) -> tuple[Figure, ...]:
     difference = largest_difference(towers, order.out, held_out.first(256), [*class_names, "plant on a shelf"])
     _write_card(order, plan, towers, (len(crops), len(held_out)), class_names, figures, difference)
     return figures
+
+
+def export(towers: Towers, folder: Path) -> None:
+    """The two ONNX files in ``folder``, each written beside its place first and then moved there."""
+    import torch
+
+    pixels = torch.zeros(1, IMAGE_SIZE, IMAGE_SIZE, 3, dtype=torch.uint8)
+    inputs_of_image = {"pixels": pixels, "log_size": torch.zeros(1, 2)}
+    inputs_of_text = {"ids": torch.zeros(1, N_WORDS, N_IDS, dtype=torch.int64)}
+    for tower, inputs, name in ((towers.image, inputs_of_image, IMAGE_FILE), (towers.text, inputs_of_text, TEXT_FILE)):
+        tower = tower.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+        axes = {axis: {0: "n"} for axis in (*inputs, "features")}
+        export_onnx(tower, inputs, folder / name, ["features"], axes)
+
+
+def largest_difference(towers: Towers, folder: Path, crops: CropSet, texts: list[str]) -> float:
+    """The largest absolute difference of any feature between torch and ONNX Runtime, over ``crops`` and ``texts``."""
+    import torch
+
+    encoder = EmbeddedEncoder(folder)
+    with torch.inference_mode():
+        images = towers.image(torch.from_numpy(crops.pixels), torch.from_numpy(crops.log_sizes)).numpy()
+        captions = towers.text(torch.from_numpy(token_ids(texts))).numpy()
+    of_images = np.abs(images - encoder.encode_shrunk(crops.pixels, crops.log_sizes)).max()
+    of_texts = np.abs(captions - encoder.encode_texts(texts)).max()
+    return float(max(of_images, of_texts))
 
 
 def _write_card(
@@ -155,7 +177,7 @@ Two small towers, image and text, into one space of {DIM} dimensions; {sizes}. W
 ## What it is for
 Naming, describing and retrieving objects of the built-in rooms (dataset `rooms`, and the same rooms in Replica's
 layout) without downloads and without a GPU. It has seen nothing else: **on camera images its answers mean little**;
-use the profile `stored` with features of a large model there. It knows the words of `captions_lexicon.py`; other words
+use the profile `stored` with features of a large model there. It knows the words of `lexicon.py`; other words
 reach it through shared 4-grams only, which is weak.
 
 ## How it was trained
@@ -217,44 +239,3 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 if __name__ == "__main__":
     sys.exit(main())
-
-
-OPSET = 17
-
-
-def export(towers: Towers, folder: Path) -> None:
-    """The two ONNX files in ``folder``, each written beside its place first and then moved there."""
-    folder.mkdir(parents=True, exist_ok=True)
-    pixels = torch.zeros(1, IMAGE_SIZE, IMAGE_SIZE, 3, dtype=torch.uint8)
-    ids = torch.zeros(1, N_WORDS, N_IDS, dtype=torch.int64)
-    _export(towers.image, (pixels, torch.zeros(1, 2)), ["pixels", "log_size"], folder / IMAGE_FILE)
-    _export(towers.text, (ids,), ["ids"], folder / TEXT_FILE)
-
-
-def _export(tower: torch.nn.Module, example: tuple[torch.Tensor, ...], inputs: list[str], path: Path) -> None:
-    draft = path.with_suffix(".draft")
-    with warnings.catch_warnings():
-        # The exporter that needs onnx alone is announced to go; the newer one needs onnxscript besides.
-        warnings.simplefilter("ignore", DeprecationWarning)
-        torch.onnx.export(
-            tower.to(memory_format=torch.contiguous_format),  # type: ignore[call-overload]
-            example,
-            str(draft),
-            dynamo=False,
-            opset_version=OPSET,
-            input_names=inputs,
-            output_names=["features"],
-            dynamic_axes={name: {0: "n"} for name in (*inputs, "features")},
-        )
-    draft.replace(path)
-
-
-def largest_difference(towers: Towers, folder: Path, crops: CropSet, texts: list[str]) -> float:
-    """The largest absolute difference of any feature between torch and ONNX Runtime, over ``crops`` and ``texts``."""
-    encoder = EmbeddedEncoder(folder)
-    with torch.inference_mode():
-        images = towers.image(torch.from_numpy(crops.pixels), torch.from_numpy(crops.log_sizes)).numpy()
-        captions = towers.text(torch.from_numpy(token_ids(texts))).numpy()
-    of_images = np.abs(images - encoder.encode_shrunk(crops.pixels, crops.log_sizes)).max()
-    of_texts = np.abs(captions - encoder.encode_texts(texts)).max()
-    return float(max(of_images, of_texts))
