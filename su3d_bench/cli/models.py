@@ -11,9 +11,9 @@ from su3d_bench.cli.common import add_group, add_settings, add_verb, answer, ans
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
-    from su3d_bench.perception.config import PerceptionConfig
     from su3d_bench.perception.models.files import ModelFiles
     from su3d_bench.perception.models.inspection import ModelState, WarmUp
+    from su3d_bench.perception.profiles import PerceptionConfig
 
 
 def add_parser(verbs: Any) -> None:
@@ -84,7 +84,7 @@ def _add_settings(parser: argparse.ArgumentParser) -> None:
 
 def _perception_config(arguments: argparse.Namespace) -> PerceptionConfig:
     from su3d_bench.core.config import Setting, Settings, read_assignments, resolve
-    from su3d_bench.perception.config import PerceptionConfig
+    from su3d_bench.perception.profiles import PerceptionConfig
 
     settings = read_assignments(arguments.set, (), ())
     if getattr(arguments, "device", None) is not None:

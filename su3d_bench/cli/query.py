@@ -123,11 +123,11 @@ def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
     """The text tower that the run's features go with, on ``device``; another one is an error, never a wrong ranking."""
     from su3d_bench.core.config import read_file, resolve
     from su3d_bench.perception.cache import FrameCache
-    from su3d_bench.perception.config import PerceptionConfig
     from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
     from su3d_bench.perception.models.catalogue import encoder_known_as
     from su3d_bench.perception.models.encoders.encoder import FoundationEncoder
     from su3d_bench.perception.models.loading import load_encoder
+    from su3d_bench.perception.profiles import PerceptionConfig
     from su3d_bench.runs.plan import cache_root
     from su3d_bench.store.atomic import read_json
 

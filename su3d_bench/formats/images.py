@@ -60,13 +60,13 @@ def decode_colour(content: bytes, where: str) -> UInt8Array:
     kind = "PNG" if content.startswith(PNG_SIGNATURE) else "PPM" if content.startswith(b"P6") else "JPEG"
     if kind == "PPM":
         return _portable_map(content, b"P6", where)
-    header = _whole_png_header(content) if kind == "PNG" else None
+    header = whole_png_header(content) if kind == "PNG" else None
     # Some decoders fill what a cut JPEG lacks with grey.
     is_whole = header is not None if kind == "PNG" else JPEG_END in content[-JPEG_END_WITHIN:]
     size = image_size(content)
     image = None
     if is_whole and size is not None and 0 < size[0] * size[1] <= MAX_PIXELS:
-        image = _decode(content, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
+        image = decoded(content, cv2.IMREAD_COLOR_RGB | cv2.IMREAD_IGNORE_ORIENTATION)
     if image is None or image.dtype != np.uint8:
         raise DataError(f"{where}: not a readable {kind} image; copy the file again")
     return np.asarray(image)
@@ -78,10 +78,10 @@ def decode_depth(content: bytes, where: str) -> UInt16Array:
 
     if content.startswith(b"P5"):
         return _portable_map(content, b"P5", where)
-    header = _whole_png_header(content)
+    header = whole_png_header(content)
     if header is None or not 0 < header[0] * header[1] <= MAX_PIXELS:
         raise DataError(f"{where}: not a readable PNG image; copy the file again")
-    values = _decode(content, cv2.IMREAD_UNCHANGED) if header[2:] == (16, 0) else None
+    values = decoded(content, cv2.IMREAD_UNCHANGED) if header[2:] == (16, 0) else None
     if values is None or values.dtype != np.uint16 or values.ndim != 2:
         raise DataError(f"{where}: not a depth image; expected one channel of 16 bits")
     return np.asarray(values)
@@ -128,7 +128,7 @@ def _portable_map(content: bytes, magic: bytes, where: str) -> NDArray[Any]:
     return pixels.reshape((height, width, 3) if n_channels == 3 else (height, width))
 
 
-def _decode(content: bytes, flags: int) -> Any:
+def decoded(content: bytes, flags: int) -> Any:
     """The image, or None where it cannot be decoded."""
     import cv2
 
@@ -138,7 +138,7 @@ def _decode(content: bytes, flags: int) -> Any:
         return None
 
 
-def _whole_png_header(content: bytes) -> tuple[int, int, int, int] | None:
+def whole_png_header(content: bytes) -> tuple[int, int, int, int] | None:
     """Width, height, bits and colour type of a PNG; None unless every chunk is there with its checksum right."""
     if not content.startswith(PNG_SIGNATURE) or len(content) < 33 or content[12:16] != b"IHDR":
         return None

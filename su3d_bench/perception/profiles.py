@@ -1,37 +1,46 @@
-"""Who supplies perception: the profiles that a run chooses among by name."""
+"""Who supplies perception: the profiles that a run chooses among by name, and all their parameters."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Protocol
 
+from pydantic import BaseModel, ConfigDict
+
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
 from su3d_bench.core.types import Detections, Frame, ImageDomain, InstanceMesh, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.cache import FrameCache
-from su3d_bench.perception.config import PerceptionConfig
-from su3d_bench.perception.embedded.perception import CAMERA_CAVEAT, EmbeddedPerception
-from su3d_bench.perception.models.config import EMBEDDED
-from su3d_bench.perception.oracle.perception import ORACLE_CAVEAT, OraclePerception
-from su3d_bench.perception.stored.perception import STORED_CAVEAT, LabelImagePerception, StoredPerception
-
-__all__ = [
-    "CAMERA_CAVEAT",
-    "ORACLE_CAVEAT",
-    "PROFILES",
-    "STORED_CAVEAT",
-    "EmbeddedPerception",
-    "OraclePerception",
-    "Perception",
-    "PerceptionConfig",
-    "build_perception",
-    "check_models",
-    "resolve_profile",
-]
+from su3d_bench.perception.embedded.naming import Namer, NamingConfig
+from su3d_bench.perception.embedded.perception import EmbeddedPerception
+from su3d_bench.perception.embedded.segmenter.segmenter import SegmenterConfig
+from su3d_bench.perception.language.config import LanguageConfig
+from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperConfig
+from su3d_bench.perception.oracle.perception import OraclePerception
+from su3d_bench.perception.oracle.segmenter import OracleConfig
+from su3d_bench.perception.stored.label_images import LabelImages
+from su3d_bench.perception.stored.npz_files import NpzFiles
+from su3d_bench.perception.stored.perception import StoredPerception
+from su3d_bench.perception.stored.source import StoredConfig
 
 PROFILES = ("auto", "embedded", "paper", "oracle", "stored")
 # Replies of vision models, below the cache's folder: a rerun asks nothing twice.
 REPLIES = "replies"
+
+
+class PerceptionConfig(BaseModel):
+    """All parameters of all profiles; ``cache`` off: nothing is read from or written to the cache."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    segmenter: SegmenterConfig = SegmenterConfig()
+    naming: NamingConfig = NamingConfig()
+    oracle: OracleConfig = OracleConfig()
+    stored: StoredConfig = StoredConfig()
+    models: ModelsConfig = ModelsConfig()
+    paper: PaperConfig = PaperConfig()
+    language: LanguageConfig = LanguageConfig()
+    cache: bool = True
 
 
 class Perception(Protocol):
@@ -109,21 +118,27 @@ def build_perception(
     if resolved == "oracle":
         if mesh is None:
             raise ConfigError(f"{scene.dataset}/{scene.scene}: profile 'oracle' needs an annotated mesh, there is none")
-        return OraclePerception(config, mesh, encoder, cache)
+        return OraclePerception(config.oracle, mesh, encoder, cache)
     assert mesh is None, "ground truth may reach the oracle only"
     if resolved == "stored":
-        if config.stored.folder is None:
-            raise ConfigError("profile 'stored': perception.stored.folder is not set; name the folder of detections")
-        if config.stored.images is not None:
-            return LabelImagePerception(config, scene, encoder, cache)
-        if config.stored.detections is not None:
-            from su3d_bench.perception.stored.gsa_files import GsaPerception
-
-            return GsaPerception(config.stored.folder, config.stored.detections, scene, encoder, cache)
-        return StoredPerception(config.stored.folder, scene, encoder, cache)
+        return _stored(config, scene, encoder, cache)
     if resolved == "paper":
         return _paper(config, encoder, cache, replies or cache_root / REPLIES, is_offline, job_index)
-    return EmbeddedPerception(config, scene, encoder, cache)
+    return EmbeddedPerception(config.segmenter, config.naming, scene, encoder, cache)
+
+
+def _stored(config: PerceptionConfig, scene: SceneInfo, encoder: Encoder, cache: FrameCache) -> Perception:
+    stored = config.stored
+    if stored.folder is None:
+        raise ConfigError("profile 'stored': perception.stored.folder is not set; name the folder of detections")
+    if stored.images is not None:
+        images = LabelImages(stored.folder, stored.images, stored.names, scene)
+        return StoredPerception(images, encoder, cache, Namer(config.naming, encoder))
+    if stored.detections is not None:
+        from su3d_bench.perception.stored.gsa_files import GsaFiles
+
+        return StoredPerception(GsaFiles(stored.folder, stored.detections, scene), encoder, cache)
+    return StoredPerception(NpzFiles(stored.folder, scene, encoder), encoder, cache)
 
 
 def _paper(
@@ -141,4 +156,4 @@ def _paper(
         client = ChatClient(config.language, ReplyStore(replies), offline=is_offline)
         captioner = Captioner(client, config.language)
     networks = load_networks(config.paper, config.models, encoder, job_index)
-    return PaperPerception(config, networks, encoder, cache, captioner)
+    return PaperPerception(config.paper, networks, encoder, cache, captioner)

@@ -21,7 +21,7 @@ from test_fuzz_cli import EXAMPLES
 from su3d_bench.core.config import Setting, Settings, check_keys, flatten, read_file, resolve, write_toml
 from su3d_bench.core.errors import Su3dError
 from su3d_bench.core.registry import DATASETS, METHODS, load
-from su3d_bench.perception.config import PerceptionConfig
+from su3d_bench.perception.profiles import PerceptionConfig
 
 SECTIONS: dict[tuple[str, ...], type[BaseModel]] = {
     **{("method", name): load("method", name).Config for name in METHODS},

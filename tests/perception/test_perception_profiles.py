@@ -12,6 +12,7 @@ from pydantic import ValidationError
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import ImageDomain, PerceptionNeeds, SceneInfo
+from su3d_bench.perception.detections import regions_to_keep
 from su3d_bench.perception.embedded.naming import (
     Namer,
     NamingConfig,
@@ -21,7 +22,6 @@ from su3d_bench.perception.embedded.naming import (
     with_article,
 )
 from su3d_bench.perception.profiles import PerceptionConfig, build_perception, resolve_profile
-from su3d_bench.perception.regions import regions_to_keep
 
 
 def scene(domain: ImageDomain) -> SceneInfo:

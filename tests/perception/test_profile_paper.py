@@ -19,10 +19,9 @@ from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Instances, PerceptionNeeds, SceneInfo, UInt8Array
 from su3d_bench.perception import paper as profile_paper
 from su3d_bench.perception.cache import FrameCache
-from su3d_bench.perception.config import PerceptionConfig
 from su3d_bench.perception.language.captioner import CropCaption
 from su3d_bench.perception.models.masks.tagging import WORDS_CAVEAT
-from su3d_bench.perception.profiles import Perception, build_perception, check_models, resolve_profile
+from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, check_models, resolve_profile
 from su3d_bench.store.atomic import read_json
 from su3d_bench.store.predictions import read_prediction
 
@@ -208,6 +207,8 @@ def test_a_vision_model_gives_names_and_captions_where_it_is_asked_for(models: P
     from su3d_bench.perception.paper import PaperPerception
 
     class Describing:
+        digest = "describing"
+
         def captions(self, crops: list[UInt8Array], names: tuple[str, ...]) -> list[CropCaption]:
             return [
                 CropCaption(f"{name} {crop.shape[1]} wide", "seen", "model", "", "")
@@ -217,7 +218,7 @@ def test_a_vision_model_gives_names_and_captions_where_it_is_asked_for(models: P
     config = config_of(models)
     plain = built(config, tmp_path)
     networks = load_networks(config.paper, config.models, plain.encoder)
-    asked = PaperPerception(config, networks, plain.encoder, FrameCache(None), Describing())  # type: ignore[arg-type]
+    asked = PaperPerception(config.paper, networks, plain.encoder, FrameCache(None), Describing())  # type: ignore[arg-type]
     without, described = (one.detect(FRAME, PerceptionNeeds(), Timer()) for one in (plain, asked))
     widths = (without.boxes[:, 2] - without.boxes[:, 0]).astype(int)
     assert described.names == tuple(f"{name} {width} wide" for name, width in zip(without.names, widths, strict=True))

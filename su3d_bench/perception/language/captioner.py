@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from su3d_bench.core.types import UInt8Array
+from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.embedded.naming import scene_caption
 from su3d_bench.perception.language.chat import ChatRequest, Reply, fitted
 from su3d_bench.perception.language.client import LanguageModel
@@ -30,13 +31,14 @@ STRATEGY = (
     "Assume `Tolerance' if necessary.",
 )
 
+# What of the language model's settings moves a caption; times, prices and limits do not.
+MOVES_CAPTIONS = {"vision_model", "temperature", "seed", "max_answer_tokens", "image_detail", "max_image_px"}
+logger = logging.getLogger(__name__)
+
 
 def list_of_names(names: Sequence[str]) -> str:
     """The names as they are given to the model."""
     return json.dumps(list(names), ensure_ascii=False)
-
-
-logger = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -51,11 +53,12 @@ class CropCaption:
 
 
 class Captioner:
-    """Asks the vision model for the name and description of each crop."""
+    """Asks the vision model for the name and description of each crop; ``digest`` moves with what moves an answer."""
 
     def __init__(self, model: LanguageModel, config: LanguageConfig) -> None:
         self._model = model
         self._config = config
+        self.digest = content_key("captioner", config.model_dump_json(include=MOVES_CAPTIONS))
 
     def requests(self, crops: Sequence[UInt8Array]) -> list[ChatRequest]:
         """What is asked of the crops (h, w, 3)."""

@@ -8,7 +8,6 @@ writes it.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -16,37 +15,28 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, printable
-from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
-from su3d_bench.core.types import BoolArray, Detections, Float32Array, Frame, PerceptionNeeds, Regions, SceneInfo
+from su3d_bench.core.types import BoolArray, Float32Array, Frame, Regions, SceneInfo
 from su3d_bench.formats.pickles.pickles import read_pickle_file
-from su3d_bench.perception.cache import FrameCache, content_key
-from su3d_bench.perception.embedded.naming import scene_caption
-from su3d_bench.perception.regions import CropEncoder, NameEncoder, grown_boxes, regions_to_keep
-from su3d_bench.perception.stored.label_images import numbered_files
-from su3d_bench.perception.stored.perception import STORED_CAVEAT, StoredRegions, content_digest
+from su3d_bench.perception.stored.source import StoredFrame, numbered_files
 
 MAX_REGIONS = 2_000  # of one image; SAM gives some hundred
 MAX_NAME_LENGTH = 100
 _SKIPPED = ("image_crops",)
-
-
-@dataclass(frozen=True)
-class GsaFrame:
-    """Named regions, and ``image_features`` (K, D) at length 1 where the file has them."""
-
-    regions: Regions
-    image_features: Float32Array | None
+# Who made the features in the files, and of which crops: boxes and 20 px on every side.
+FEATURES_ENCODER, FEATURES_PADDING_PX = "clip-vit-h-14", 20
 
 
 class GsaFiles:
     """The detections of a scene; ``files`` are those that a run may read."""
+
+    name = "gsa"
 
     def __init__(self, folder: Path, pattern: str, scene: SceneInfo) -> None:
         self._where = f"{scene.dataset}/{scene.scene}"
         self._paths = numbered_files(folder, pattern, scene, self._where, "file of detections", "detections")
         self.files = tuple(self._paths.values())
 
-    def frame(self, frame: Frame) -> GsaFrame:
+    def frame(self, frame: Frame) -> StoredFrame:
         """The detections of ``frame``; raises ``DataError`` or, for what is no plain pickle, ``PredictionError``."""
         path = self._paths.get(frame.index)
         if path is None:
@@ -61,7 +51,7 @@ class GsaFiles:
         return _frame(content, frame, where)
 
 
-def _frame(content: Mapping[object, object], frame: Frame, where: str) -> GsaFrame:
+def _frame(content: Mapping[object, object], frame: Frame, where: str) -> StoredFrame:
     height, width = frame.depth_m.shape
     scores = _numbers(content, "confidence", where).reshape(-1)
     n = len(scores)
@@ -80,7 +70,8 @@ def _frame(content: Mapping[object, object], frame: Frame, where: str) -> GsaFra
     kept = np.flatnonzero(masks.any(axis=(1, 2)) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1))
     scores = np.clip(scores[kept], 0, 1).astype(np.float32)
     regions = Regions(masks[kept], boxes[kept], scores, tuple(names[k] for k in kept))
-    return GsaFrame(regions, None if features is None else features[kept])
+    of_ratio = {} if features is None else {1.0: features[kept]}
+    return StoredFrame(regions, of_ratio, made_by=FEATURES_ENCODER, made_at_px=FEATURES_PADDING_PX)
 
 
 def _numbers(content: Mapping[object, object], key: str, where: str) -> NDArray[Any]:
@@ -128,53 +119,3 @@ def _features(content: Mapping[object, object], n: int, where: str) -> Float32Ar
     if len(features) != n or features.ndim != 2 or not (np.abs(lengths - 1) < 1e-2).all():
         raise DataError(f"{where}: image_feats are {features.shape}; expected {n} rows of length 1")
     return (features / lengths[:, None]).astype(np.float32)
-
-
-# Who made the features in the files, and of which crops: boxes and 20 px on every side.
-FEATURES_ENCODER, FEATURES_PADDING_PX = "clip-vit-h-14", 20
-
-
-class GsaPerception:
-    """Regions from files; their features too where the run has the encoder, and the crops, that made them."""
-
-    profile = "stored"
-    caveat: str | None = STORED_CAVEAT
-
-    def __init__(self, folder: Path, pattern: str, scene: SceneInfo, encoder: Encoder, cache: FrameCache) -> None:
-        self.encoder = encoder
-        self._files = GsaFiles(folder, pattern, scene)
-        self._crops = CropEncoder(encoder, cache)
-        self._names = NameEncoder(encoder)
-        self.digest = content_key(self.profile, "gsa", content_digest(self._files.files), encoder.digest)
-
-    def detect(self, frame: Frame, needs: PerceptionNeeds, timer: StageTimer) -> Detections:
-        with timer.stage("cache"):
-            found = self._files.frame(frame)
-        regions = found.regions
-        assert regions.names is not None
-        kept = regions_to_keep(regions.names, regions.boxes, frame.depth_m.shape, needs)
-        names = tuple(regions.names[k] for k in kept)
-        boxes = grown_boxes(regions.boxes, needs.crop_padding_px)
-        known = self._known(found, needs)
-        return Detections(
-            frame_index=frame.index,
-            masks=regions.masks[kept],
-            boxes=regions.boxes[kept],
-            scores=regions.scores[kept],
-            names=names,
-            captions=tuple(scene_caption(name) for name in names),
-            crop_ratios=needs.crop_ratios,
-            crop_features=self._crops.crops(frame, boxes, np.asarray(kept), needs.crop_ratios, timer, known),
-            global_feature=self._crops.whole(frame, timer),
-            name_features=self._names.features(names, needs),
-            score_scale="published",
-        )
-
-    def regions(self) -> RegionPerception:
-        return StoredRegions(lambda frame: self._files.frame(frame).regions.masks, self.encoder)
-
-    def _known(self, found: GsaFrame, needs: PerceptionNeeds) -> dict[float, Float32Array] | None:
-        features = found.image_features
-        if features is None or needs.crop_padding_px != FEATURES_PADDING_PX or self.encoder.name != FEATURES_ENCODER:
-            return None
-        return {1.0: features} if features.shape[1] == self.encoder.dim else None

@@ -10,19 +10,19 @@ from __future__ import annotations
 import json
 import re
 import tomllib
-import zlib
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import ConfigError, DataError
-from su3d_bench.core.types import BoolArray, Float32Array, Frame, SceneInfo
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import BoolArray, Float32Array, Frame, Regions, SceneInfo
+from su3d_bench.formats.images import decoded, whole_png_header
+from su3d_bench.perception.crops import mask_boxes
+from su3d_bench.perception.stored.source import StoredFrame, numbered_files
 
-INDEX = "{index}"
-PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_NAMES_BYTES = 1 << 20
 MAX_NAME_LENGTH = 100
 MAX_REGIONS = 1_000  # masks take an image of memory each; no image has more things in it
@@ -40,6 +40,8 @@ class LabelledRegions:
 
 class LabelImages:
     """The label images of a scene; ``files`` are those that a run reads, the names' file first."""
+
+    name = "label images"
 
     def __init__(self, folder: Path, pattern: str, names: Path | None, scene: SceneInfo) -> None:
         self._where = f"{scene.dataset}/{scene.scene}"
@@ -61,57 +63,15 @@ class LabelImages:
         if len(values) > MAX_REGIONS:
             raise DataError(f"{self._where}: {path.name} holds {len(values)} values; expected one a region")
         masks = np.array([labels == value for value in values], bool).reshape(-1, *labels.shape)
-        boxes = np.array([_box(mask) for mask in masks], np.float32).reshape(-1, 4)
-        return LabelledRegions(tuple(values), masks, boxes, tuple(self._name_of.get(value) for value in values))
-
-
-def _box(mask: BoolArray) -> tuple[int, int, int, int]:
-    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
-    return int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1
-
-
-def _inside(folder: Path, name: str, where: str, key: str) -> Path:
-    """``folder / name``, unless that leads out of the folder."""
-    path = folder / name
-    is_plain = name.isprintable() and bool(name) and not name.startswith("/") and ".." not in PurePosixPath(name).parts
-    try:
-        if is_plain and path.resolve().is_relative_to(folder.resolve()):
-            return path
-    except (OSError, RuntimeError):  # a name too long for the file system, or links in a circle
-        pass
-    raise ConfigError(f"{where}: {key}: {name[:80]!r} leads out of {folder}; name files inside it")
-
-
-def numbered_files(
-    folder: Path, pattern: str, scene: SceneInfo, where: str, what: str = "label image", key: str = "images"
-) -> dict[int, Path]:
-    """Frame number -> file; ``what`` such a file is, and the ``key`` of the configuration that holds ``pattern``."""
-    key = f"perception.stored.{key}"
-    filled = pattern.replace("{dataset}", scene.dataset).replace("{scene}", scene.scene)
-    directory, _, name_pattern = filled.rpartition("/")
-    if INDEX not in name_pattern or filled.count(INDEX) > 1 or "{" in filled.replace(INDEX, ""):
-        raise ConfigError(
-            f"{key} = {pattern[:80]!r}: expected one {{index}} in the file's name, such as 'frame{{index}}.png', and "
-            "no other braces but {dataset} and {scene}"
+        return LabelledRegions(
+            tuple(values), masks, mask_boxes(masks), tuple(self._name_of.get(value) for value in values)
         )
-    parent = _inside(folder, directory or ".", where, key)
-    before, _, behind = name_pattern.partition(INDEX)
-    form = re.compile(re.escape(before) + r"(\d{1,18})" + re.escape(behind), re.ASCII)
-    found: dict[int, Path] = {}
-    try:
-        for path in sorted(parent.iterdir()):
-            if match := form.fullmatch(path.name):
-                number = int(match[1])
-                if number in found:
-                    raise DataError(
-                        f"{where}: {found[number].name} and {path.name} are of one frame; expected one file"
-                    )
-                found[number] = _inside(folder, path.relative_to(folder).as_posix(), where, key)
-    except OSError as error:
-        raise DataError(f"{where}: {parent}: cannot be read: {error.strerror}; it should hold {what}s") from error
-    if not found:
-        raise DataError(f"{where}: no {what} in {parent} matches {pattern!r}")
-    return dict(sorted(found.items()))
+
+    def frame(self, frame: Frame) -> StoredFrame:
+        """The same with "" for a name that is not given, and no score below another."""
+        labelled = self.regions(frame)
+        names = tuple(name or "" for name in labelled.names)
+        return StoredFrame(Regions(labelled.masks, labelled.boxes, np.ones(len(names), np.float32), names))
 
 
 def decode_labels(path: Path, shape: tuple[int, ...], where: str) -> NDArray[Any]:
@@ -122,10 +82,10 @@ def decode_labels(path: Path, shape: tuple[int, ...], where: str) -> NDArray[Any
         content = path.read_bytes()
     except OSError as error:
         raise DataError(f"{where} cannot be read: {error.strerror}") from error
-    if not _is_whole_png(content):
+    header = whole_png_header(content)
+    if header is None:
         raise DataError(f"{where}: not a readable PNG image; write it again")
-    width, height = int.from_bytes(content[16:20], "big"), int.from_bytes(content[20:24], "big")
-    bits, colour_type = content[24], content[25]
+    width, height, bits, colour_type = header
     if bits not in (8, 16) or colour_type != 0:
         raise DataError(
             f"{where}: not a label image: {bits} bits, PNG colour type {colour_type}; expected one grey channel of 8 "
@@ -133,27 +93,10 @@ def decode_labels(path: Path, shape: tuple[int, ...], where: str) -> NDArray[Any
         )
     if (height, width) != tuple(shape):
         raise DataError(f"{where} is {width}x{height}, the frame has width {shape[1]} and height {shape[0]}")
-    try:
-        labels = cv2.imdecode(np.frombuffer(content, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        labels = None
+    labels = decoded(content, cv2.IMREAD_UNCHANGED)
     if labels is None or labels.shape != (height, width):
         raise DataError(f"{where}: not a readable PNG image; write it again")
     return np.asarray(labels)
-
-
-def _is_whole_png(content: bytes) -> bool:
-    """Whether every chunk is there with its checksum right; decoders pass over damage."""
-    if not content.startswith(PNG_SIGNATURE) or len(content) < 33 or content[12:16] != b"IHDR":
-        return False
-    at, kind = len(PNG_SIGNATURE), b""
-    while kind != b"IEND":
-        length, kind = int.from_bytes(content[at : at + 4], "big"), content[at + 4 : at + 8]
-        end = at + 8 + length
-        if end + 4 > len(content) or zlib.crc32(content[at + 4 : end]) != int.from_bytes(content[end : end + 4], "big"):
-            return False
-        at = end + 4
-    return True
 
 
 def read_names(path: Path, where: str) -> dict[int, str]:

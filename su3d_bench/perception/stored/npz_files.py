@@ -1,4 +1,4 @@
-"""Detections made elsewhere, read from one npz file a frame (from label images: ``stored_images.py``).
+"""Detections made elsewhere, read from one npz file a frame (from label images: ``label_images.py``).
 
 ``<folder>/<dataset>.<scene>/frame000040.npz`` holds the K regions of the frame with index 40:
 
@@ -15,19 +15,17 @@ Files are plain arrays: nothing in them is unpickled. ``write_stored`` writes th
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from pydantic import BaseModel, ConfigDict, model_validator
 
 from su3d_bench.core.damage import DAMAGE
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import Detections, Float32Array, Frame, Regions
-from su3d_bench.perception.embedded.naming import scene_caption
+from su3d_bench.core.types import Detections, Float32Array, Frame, Regions, SceneInfo
+from su3d_bench.perception.stored.source import StoredFrame
 from su3d_bench.store.atomic import read_arrays
 
 _REQUIRED = ("image_size", "masks", "boxes", "scores", "names")
@@ -35,50 +33,26 @@ _FEATURES = ("crop_ratios", "crop_features", "global_feature", "encoder")
 _OPTIONAL = ("captions", *_FEATURES)
 
 
-class StoredConfig(BaseModel):
-    """Where the detections of the profile ``stored`` lie: npz files, unless one of the two patterns is set.
-
-    ``images`` (``frame-{index}.segm.png``) names label images, ``detections``
-    (``{scene}/gsa_detections_none/frame{index}.pkl.gz``) ConceptGraphs' files, both relative to ``folder``; ``names``
-    is a TOML or JSON file of names for the values of label images.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    folder: Path | None = None
-    images: str | None = None
-    detections: str | None = None
-    names: Path | None = None
-
-    @model_validator(mode="after")
-    def _names_are_of_images(self) -> StoredConfig:
-        if self.names is not None and self.images is None:
-            raise ValueError("names are given to the values of label images; set stored.images too")
-        if self.images is not None and self.detections is not None:
-            raise ValueError("stored.images and stored.detections name two makers of masks; set one of them")
-        return self
-
-
-@dataclass(frozen=True)
-class StoredFeatures:
-    """Features that came with the detections, as in ``Detections``."""
-
-    crop_ratios: tuple[float, ...]
-    crop_features: Float32Array
-    global_feature: Float32Array
-
-
-@dataclass(frozen=True)
-class StoredFrame:
-    """One file: named and captioned regions, and features where the file has them."""
-
-    regions: Regions
-    features: StoredFeatures | None
-
-
 def stored_path(folder: Path, dataset: str, scene: str, frame_index: int) -> Path:
     """The file that holds the detections of a frame."""
     return folder / f"{dataset}.{scene}" / f"frame{frame_index:06d}.npz"
+
+
+class NpzFiles:
+    """The files of a scene, whose features must be of the run's ``encoder``."""
+
+    name = "npz"
+
+    def __init__(self, folder: Path, scene: SceneInfo, encoder: Encoder) -> None:
+        self._folder = folder
+        self._scene = scene
+        self._encoder = encoder
+        self.files = tuple(sorted((folder / f"{scene.dataset}.{scene.scene}").glob("*.npz")))
+
+    def frame(self, frame: Frame) -> StoredFrame:
+        """The detections of ``frame``; raises ``DataError``."""
+        path = stored_path(self._folder, self._scene.dataset, self._scene.scene, frame.index)
+        return read_stored(path, frame, self._encoder)
 
 
 def write_stored(path: Path, detections: Detections, encoder: Encoder | None) -> None:
@@ -112,9 +86,9 @@ def read_stored(path: Path, frame: Frame, encoder: Encoder) -> StoredFrame:
         boxes=_boxes(arrays, frame, where),
         scores=_scores(arrays, where),
         names=_texts(arrays, "names", where),
-        captions=_captions(arrays, where),
+        captions=_texts(arrays, "captions", where) if "captions" in arrays else None,
     )
-    return StoredFrame(regions, _features(arrays, encoder, n, where))
+    return StoredFrame(regions, *_features(arrays, encoder, n, where))
 
 
 def _load(path: Path, where: str) -> dict[str, NDArray[Any]]:
@@ -198,15 +172,12 @@ def _texts(arrays: Mapping[str, NDArray[Any]], key: str, where: str) -> tuple[st
     return texts
 
 
-def _captions(arrays: Mapping[str, NDArray[Any]], where: str) -> tuple[str, ...]:
-    if "captions" in arrays:
-        return _texts(arrays, "captions", where)
-    return tuple(scene_caption(name) for name in _texts(arrays, "names", where))
-
-
-def _features(arrays: Mapping[str, NDArray[Any]], encoder: Encoder, n: int, where: str) -> StoredFeatures | None:
+def _features(
+    arrays: Mapping[str, NDArray[Any]], encoder: Encoder, n: int, where: str
+) -> tuple[dict[float, Float32Array], Float32Array | None]:
+    """Features (K, D) of crops by their ratio, and that of the image."""
     if "encoder" not in arrays:
-        return None
+        return {}, None
     made_by = str(arrays["encoder"])
     if made_by != encoder.digest:
         raise DataError(
@@ -229,4 +200,5 @@ def _features(arrays: Mapping[str, NDArray[Any]], encoder: Encoder, n: int, wher
         )
     if not abs(float(np.linalg.norm(whole.astype(np.float64))) - 1) < 1e-3:
         raise DataError(f"{where}: global_feature is not of length 1")
-    return StoredFeatures(tuple(float(r) for r in ratios), crops.astype(np.float32), whole.astype(np.float32))
+    of_ratio = {float(ratio): crops[:, column].astype(np.float32) for column, ratio in enumerate(ratios)}
+    return of_ratio, whole.astype(np.float32)

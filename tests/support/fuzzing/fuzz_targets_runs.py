@@ -207,7 +207,7 @@ def _method_config(folder: Path) -> Read:
     """The settings of all methods of our own in one file."""
     from su3d_bench.core.config import check_keys, read_file, resolve, write_toml
     from su3d_bench.core.registry import METHODS, load
-    from su3d_bench.perception.config import PerceptionConfig
+    from su3d_bench.perception.profiles import PerceptionConfig
 
     classes = {name: load("method", name).Config for name in METHODS}
     leaves: list[Any] = []

@@ -11,14 +11,14 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import BoolArray, Float32Array, Frame, Int64Array, Regions
+from su3d_bench.core.types import BoolArray, Frame, Int64Array, Regions
 from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.models.masks.automatic_masks import AutomaticMaskConfig, AutomaticMasks
 from su3d_bench.perception.models.masks.grounding_dino import CONCEPTGRAPHS_BOXES, BoxConfig, GroundingDino
-from su3d_bench.perception.models.masks.sam import Sam, SeenImage
+from su3d_bench.perception.models.masks.sam import Sam
 from su3d_bench.perception.models.masks.tagging import ADDED_TAGS, BACKGROUND_TAGS, STOP_WORDS, Tagger, chosen_tags
-from su3d_bench.perception.regions import encode_boxes
+from su3d_bench.perception.regions import CropsOnDemand, OfLastFrame
 
 # Moves the digest when what lies between the networks changes.
 FRONT_END_VERSION = "1"
@@ -98,27 +98,19 @@ class GroundedSam:
         return Regions(masks, boxes, found.scores, found.names)
 
 
-class SamRegions:
+class SamRegions(CropsOnDemand):
     """``RegionPerception``: one mask at points that a method chooses; SAM looks at each frame once."""
 
     def __init__(self, networks: Networks, encoder: Encoder) -> None:
-        self.dim = encoder.dim
+        super().__init__(encoder)
         self._networks = networks
-        self._encoder = encoder
-        self._last: tuple[Frame, SeenImage] | None = None
+        self._seen = OfLastFrame(lambda frame: networks.load_sam().look(frame.rgb))
 
     def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
         """SAM's single mask (H, W) of what all ``points`` lie on and its predicted IoU; empty and 0 for no points."""
         if not len(points):
             return np.zeros(frame.depth_m.shape, np.bool_), 0.0
-        sam = self._networks.load_sam()
-        if self._last is None or self._last[0] is not frame:
-            self._last = frame, sam.look(frame.rgb)
-        return sam.from_points(self._last[1], points.astype(np.float32))
-
-    def encode_regions(self, frame: Frame, mask: BoolArray, boxes: Int64Array) -> Float32Array:
-        """Features of the crops, whatever the mask: what surrounds a region tells of it too."""
-        return encode_boxes(self._encoder, frame, boxes)
+        return self._networks.load_sam().from_points(self._seen(frame), points.astype(np.float32))
 
 
 class AutomaticSam:
