@@ -14,7 +14,7 @@ from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, sug
 if TYPE_CHECKING:
     from su3d_bench.core.interfaces import Encoder
     from su3d_bench.core.types import Instances
-    from su3d_bench.opensu3d.retrieval import Ranking
+    from su3d_bench.questions.retrieval import Ranking
     from su3d_bench.store.run_folder import RunFolder
 
 
@@ -42,7 +42,7 @@ def call(arguments: argparse.Namespace) -> int:
 
     limit_threads()
     from su3d_bench.core.types import DenseFeatures, Instances
-    from su3d_bench.opensu3d.retrieval import rank
+    from su3d_bench.questions.retrieval import rank
     from su3d_bench.reports.pictures.maps import draw_heat_map
     from su3d_bench.store.predictions import read_prediction
     from su3d_bench.store.run_folder import RunFolder

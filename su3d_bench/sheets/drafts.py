@@ -21,7 +21,6 @@ from su3d_bench.metrics.questions.score import (
     labels_n,
 )
 from su3d_bench.metrics.questions.truths import AskedText, GivenAnswer, ReasoningTruth, TrueAnswer
-from su3d_bench.opensu3d.retrieval import rank_all
 from su3d_bench.perception.language.chat import ChatRequest
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.config import LanguageConfig
@@ -35,6 +34,7 @@ from su3d_bench.questions.reasoning.named_objects import nearest_by
 from su3d_bench.questions.reasoning.scene_map import SceneMap, map_of
 from su3d_bench.questions.reasoning.solver import Solver
 from su3d_bench.questions.refined_names import refined_names
+from su3d_bench.questions.retrieval import rank_all
 from su3d_bench.questions.truths import own_questions, question_truth
 from su3d_bench.sheets.items import RIGHT, WRONG, SheetKind
 from su3d_bench.sheets.run_source import RunSource, mask_digest

@@ -12,11 +12,11 @@ from su3d_bench.core.errors import printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float64Array, Frame, Instances, UInt8Array
 from su3d_bench.metrics.questions.score import labels_n
-from su3d_bench.opensu3d.retrieval import rank_all
 from su3d_bench.questions.reasoning.named_objects import nearest_by
 from su3d_bench.questions.reasoning.scene_map import map_of
 from su3d_bench.questions.reasoning.solver import Solver
 from su3d_bench.questions.refined_names import refined_names
+from su3d_bench.questions.retrieval import rank_all
 from su3d_bench.reports.pictures.figures import Cell, GridRow
 from su3d_bench.reports.pictures.heat_scales import Scale, similarity_colours
 from su3d_bench.reports.pictures.items import Tag, seen_in

@@ -10,7 +10,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from su3d_bench.core.digests import package_digest
 from su3d_bench.core.types import Float32Array, Frame, InstanceMesh, Int32Array, Regions
 from su3d_bench.numerics.open3d_core import compiled_open3d
-from su3d_bench.perception.cache import array_digest, content_key
+from su3d_bench.perception.cache import CACHE_SOURCES, array_digest, content_key
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.oracle.noise import OracleNoise, disturb
 
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 # What moves the regions: their key follows it.
-SOURCES = ("perception/oracle", "perception/crops.py", "numerics")
+SOURCES = ("perception/oracle/noise.py", "perception/oracle/segmenter.py", "numerics/open3d_core.py", *CACHE_SOURCES)
 
 
 class OracleConfig(BaseModel):

@@ -8,7 +8,7 @@ import numpy as np
 
 from su3d_bench.core.digests import package_digest
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int32Array, Regions
-from su3d_bench.perception.cache import content_key
+from su3d_bench.perception.cache import CACHE_SOURCES, content_key
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.perception.embedded.segmenter.config import SegmenterConfig
 from su3d_bench.perception.embedded.segmenter.graph import Graph
@@ -19,7 +19,7 @@ __all__ = ["RgbdSegmenter", "SegmenterConfig"]
 
 
 # What moves the regions: their key follows it.
-SOURCES = ("perception/embedded/segmenter", "perception/crops.py", "numerics")
+SOURCES = ("perception/embedded/segmenter", "numerics/compiled.py", *CACHE_SOURCES)
 
 
 class RgbdSegmenter:

@@ -1,0 +1,63 @@
+"""Instances of a map ranked by their similarity to a text."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.types import Float32Array, Float64Array, Instances, UInt8Array
+from su3d_bench.questions.retrieval import rank, rank_all
+
+
+class TwoWords:
+    """An encoder of two texts."""
+
+    name = "two-words"
+    digest = "0"
+    dim = 2
+
+    def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:
+        return np.zeros((len(images), 2), np.float32)
+
+    def encode_texts(self, texts: Sequence[str]) -> Float32Array:
+        return np.array([[1, 0] if text == "east" else [0, 1] for text in texts], np.float32).reshape(-1, 2)
+
+
+def instances_with(features: Float64Array | None) -> Instances:
+    n = 0 if features is None else len(features)
+    return Instances(
+        points=np.zeros((0, 3), np.float32),
+        indptr=np.zeros(n + 1, np.int64),
+        indices=np.zeros(0, np.int32),
+        scores=np.ones(n),
+        features=None if features is None else features.astype(np.float32),
+        labels=None,
+        names=("thing",) * n,
+        captions=("",) * n,
+        boxes=np.zeros((n, 2, 3), np.float32),
+        centroids=np.zeros((n, 3), np.float32),
+        view_indptr=np.zeros(n + 1, np.int64),
+        views=np.zeros((0, 2), np.int32),
+    )
+
+
+def test_retrieval_ranks_by_cosine_whatever_the_length_of_the_features() -> None:
+    found = instances_with(np.array([[0.1, 0.1], [9.0, 1.0], [0.0, 0.0], [0.5, 0.0]]))
+    east, north = rank_all(found, ["east", "north"], TwoWords())
+    assert east.order.tolist() == [3, 1, 0, 2]
+    np.testing.assert_allclose(east.similarity, [np.sqrt(0.5), 9 / np.sqrt(82), 0, 1], atol=1e-7)
+    assert north.order.tolist() == [0, 1, 2, 3]  # 2 and 3 are equal: the order of the map
+
+
+def test_retrieval_from_an_empty_map_is_an_empty_ranking() -> None:
+    assert rank(instances_with(np.zeros((0, 2))), "east", TwoWords()).order.shape == (0,)
+
+
+def test_retrieval_without_comparable_features_is_refused() -> None:
+    with pytest.raises(PredictionError, match="no features"):
+        rank(instances_with(None), "east", TwoWords())
+    with pytest.raises(PredictionError, match="3 dimensions and encoder 'two-words' gives 2"):
+        rank(instances_with(np.ones((1, 3))), "east", TwoWords())
