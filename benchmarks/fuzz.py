@@ -65,7 +65,8 @@ class Tally:
 def work() -> None:
     """For each order on stdin, meet a reader with damage and say a line of JSON on each input."""
     from fuzz_targets import TARGETS
-    from fuzzing import Sample, bounded_addresses
+    from fuzzing import MOST_ADDRESSES_BYTES, Sample
+    from memory import bounded_addresses
 
     said, null = os.fdopen(os.dup(1), "w"), os.open(os.devnull, os.O_WRONLY)
     os.dup2(null, 1)
@@ -77,7 +78,7 @@ def work() -> None:
             os.chdir(folder)  # a reader that writes where it stands does no harm
             os.environ["SU3D_DATA"] = folder
             sample = Sample(TARGETS[order["name"]], Path(folder, "sample").resolve())
-            with bounded_addresses():
+            with bounded_addresses(MOST_ADDRESSES_BYTES):
                 sample.read()
                 for index in range(order["first"], order["end"]):
                     one = sample.input(order["seed"], index)

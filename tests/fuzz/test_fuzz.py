@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 from fuzz_mutations import MOST_BYTES, _json, _text, mutated
 from fuzz_targets import TARGETS
-from fuzzing import BadMessage, Input, Read, Sample, Target, bounded_addresses, every_one_of
+from fuzzing import MOST_ADDRESSES_BYTES, BadMessage, Input, Read, Sample, Target, every_one_of
+from memory import bounded_addresses
 
 from su3d_bench.core.errors import DataError
 
@@ -21,7 +22,7 @@ WEIGHT = sum(one.weight for one in TARGETS.values())
 
 def faults_of(target: Target, folder: Path, n: int) -> list[str | None]:
     sample = Sample(target, folder)
-    with bounded_addresses():
+    with bounded_addresses(MOST_ADDRESSES_BYTES):
         sample.read()  # the sample itself is fine
         return [sample.meet(sample.input(0, index)).fault for index in range(n)]
 
@@ -80,7 +81,7 @@ def test_the_harness_finds_loops_memory_and_untyped_errors(
     if text == "loop":
         monkeypatch.setattr("fuzzing.MOST_SECONDS", 0.2)
     sample = Sample(Target("numbers", number_reader, ("n.txt",)), tmp_path)
-    with bounded_addresses():
+    with bounded_addresses(MOST_ADDRESSES_BYTES):
         found = sample.meet(Input(0, "n.txt", text.encode(), None)).fault
     assert found is None if fault is None else found is not None and found.startswith(fault)
     assert (tmp_path / "n.txt").read_text() == "1"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import random
-import resource
 import shutil
 import signal
 import time
@@ -16,6 +15,7 @@ from pathlib import Path
 from types import FrameType
 
 from fuzz_mutations import mutated
+from memory import peak_bytes, reset_peak
 
 from su3d_bench.core.errors import GroundTruthMissing, Su3dError
 
@@ -113,7 +113,7 @@ class Sample:
             path.write_bytes(content)
 
     def _watched(self) -> Outcome:
-        before = _reset_peak()
+        before = reset_peak()
         started = time.monotonic()
         is_read, fault = False, None
         try:
@@ -128,7 +128,7 @@ class Sample:
         except Exception as error:  # noqa: BLE001 - what a reader must not raise
             fault = f"{type(error).__name__}: {error}"[:500]
         seconds = time.monotonic() - started
-        grown = max(0, _peak_bytes() - before)
+        grown = max(0, peak_bytes() - before)
         if fault is None and grown > MOST_GROWN_BYTES:
             fault = f"memory: grew by {grown >> 20} MiB"
         return Outcome(is_read and fault is None, fault, seconds, grown)
@@ -172,32 +172,3 @@ def alarm(seconds: float) -> Iterator[None]:
     finally:
         signal.setitimer(signal.ITIMER_REAL, 0)
         signal.signal(signal.SIGALRM, before)
-
-
-@contextmanager
-def bounded_addresses() -> Iterator[None]:
-    """No more than ``MOST_ADDRESSES_BYTES`` of address space beyond what is taken now."""
-    soft, hard = resource.getrlimit(resource.RLIMIT_AS)
-    taken = _status("VmSize")
-    resource.setrlimit(resource.RLIMIT_AS, (taken + MOST_ADDRESSES_BYTES, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_AS, (soft, hard))
-
-
-def _status(key: str) -> int:
-    for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith(f"{key}:"):
-            return int(line.split()[1]) * 1024
-    raise KeyError(key)
-
-
-def _reset_peak() -> int:
-    """The resident memory now, from which the peak is counted afresh."""
-    Path("/proc/self/clear_refs").write_text("5")  # proc(5): resets the peak of the resident set
-    return _status("VmRSS")
-
-
-def _peak_bytes() -> int:
-    return _status("VmHWM")

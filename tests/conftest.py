@@ -1,0 +1,14 @@
+"""Where the tests keep their files, what they share within a session, and what belongs to which round."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+MEMORY = Path("/dev/shm")
+MOST_KEPT_BYTES = 4 << 30
+
+# Every file of a run is brought to the disk before it counts; thousands of small runs would wait for nothing else.
+if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > MOST_KEPT_BYTES:
+    os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
