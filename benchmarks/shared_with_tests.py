@@ -5,5 +5,5 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-SUPPORT = Path(__file__).resolve().parents[1] / "tests" / "support"
-sys.path[:0] = [str(SUPPORT), *(str(folder) for folder in sorted(SUPPORT.iterdir()) if folder.is_dir())]
+TESTS = Path(__file__).resolve().parents[1] / "tests"
+sys.path[:0] = sorted({str(file.parent) for file in TESTS.rglob("*.py")})

@@ -4,7 +4,13 @@ from __future__ import annotations
 
 import os
 import shutil
+import sys
 from pathlib import Path
+
+TESTS = Path(__file__).resolve().parent
+sys.path += sorted(
+    {str(file.parent) for file in TESTS.rglob("*.py")} - {*sys.path}
+)  # readers' samples are their tests'
 
 MEMORY = Path("/dev/shm")
 MOST_KEPT_BYTES = 4 << 30

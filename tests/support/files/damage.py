@@ -65,14 +65,18 @@ def outcomes(
                 read(damaged)
                 n_read += 1
             except refusal as error:
-                message = str(error)
-                assert must_name in message, message
-                assert "\n" not in message and len(message) < 600, message
-                assert not lacked_memory(error), message
+                assert_fit(error, must_name)
                 n_refused += 1
             assert time.monotonic() - started < MOST_SECONDS
             assert peak_bytes() - before < MOST_BYTES
     return n_read, n_refused
+
+
+def assert_fit(error: Su3dError, must_name: str) -> None:
+    message = str(error)
+    assert must_name in message, message
+    assert "\n" not in message and len(message) < 600, message
+    assert not lacked_memory(error), message
 
 
 def lacked_memory(error: BaseException | None) -> bool:
