@@ -50,22 +50,13 @@ class Oracle:
         assert truth is not None
         masks = {key: mask for key, mask in _masks_of(truth).items() if truth.semantic[mask[0]] > 0}
         labels = tuple(truth.labels.name_of(int(truth.semantic[mask[0]])) for mask in masks.values())
-        parts = [truth.points[mask] for mask in masks.values()]
-        k = len(masks)
-        return Instances(
-            points=truth.points,
-            indptr=np.cumsum([0, *(len(mask) for mask in masks.values())]).astype(np.int64),
-            indices=np.concatenate(list(masks.values())) if k else np.zeros(0, np.int32),
-            scores=np.ones(k, np.float64),
-            features=None,
+        return Instances.of(
+            truth.points,
+            list(masks.values()),
             labels=labels,
             names=labels,
             captions=tuple(scene_caption(label) for label in labels),
-            boxes=np.array([[c.min(axis=0), c.max(axis=0)] for c in parts], np.float32).reshape(k, 2, 3),
-            centroids=np.array([c.mean(axis=0, dtype=np.float64) for c in parts], np.float32).reshape(k, 3),
-            view_indptr=np.zeros(k + 1, np.int64),
-            views=np.zeros((0, 2), np.int32),
-            ids=np.array(list(masks), np.int32),
+            ids=list(masks),
         )
 
 

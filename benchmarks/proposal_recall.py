@@ -21,7 +21,7 @@ from su3d_bench.baselines.openmask3d.method import OpenMask3DConfig, OpenMask3DS
 from su3d_bench.baselines.openmask3d.proposals import ProposalConfig, make_proposals
 from su3d_bench.core import registry
 from su3d_bench.core.types import Float64Array, GroundTruth, Proposals
-from su3d_bench.metrics.matching.nearest import Masks, transfer_masks
+from su3d_bench.metrics.matching.nearest import transfer_masks
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.runs.plan import data_root
 
@@ -34,10 +34,10 @@ def best_ious(rules: ProtocolRules, truth: GroundTruth, proposals: Proposals) ->
     ids, first, n = np.unique(truth.instance, return_index=True, return_counts=True)
     counts = (ids > 0) & np.isin(truth.semantic[first], scored) & (n >= (rules.min_region_size or 1))
     row = np.searchsorted(ids, truth.instance)
-    masks = transfer_masks(proposals.points, Masks(proposals.indptr, proposals.indices), truth.points)
+    masks = transfer_masks(proposals.points, proposals, truth.points)
     best = np.zeros(len(ids))
     for k in range(len(masks)):
-        members = masks.indices[masks.indptr[k] : masks.indptr[k + 1]]
+        members = masks.mask(k)
         shared = np.bincount(row[members], minlength=len(ids))
         best = np.maximum(best, shared / (n + len(members) - shared))
     return best[counts]

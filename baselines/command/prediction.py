@@ -10,7 +10,7 @@ import numpy as np
 
 from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.types import Instances, Prediction, Surface
-from su3d_bench.metrics.matching.nearest import masks_of_partition
+from su3d_bench.metrics.matching.nearest import masks_of_partition, select
 from su3d_bench.metrics.protocols import load_protocol, protocols_for
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
 
@@ -56,39 +56,28 @@ def as_prediction(content: Content, surface: Surface | None, names: ClassNames |
     if n_said not in {None, n}:
         raise PredictionError(f"its masks are over {n_said} points, the mesh has {n} vertices; they must be the same")
     masks = _masks_of_labels(content) if isinstance(content, VertexLabels) else content
-    k = len(masks)
-    return Instances(
-        points=surface.vertices,
-        indptr=masks.indptr,
-        indices=masks.indices,
-        scores=masks.scores,
-        features=masks.features,
+    return Instances.of(
+        surface.vertices,
+        masks,
+        masks.scores,
+        masks.features,
         labels=_labels(masks, names),
         names=tuple(printable(key, 200) for key in masks.keys),
-        captions=("",) * k,
-        boxes=np.array([_box(surface, masks, i) for i in range(k)], np.float32).reshape(k, 2, 3),
-        centroids=np.array([_centroid(surface, masks, i) for i in range(k)], np.float32).reshape(k, 3),
-        view_indptr=np.zeros(k + 1, np.int64),
-        views=np.zeros((0, 2), np.int32),
-        ids=np.arange(1, k + 1, dtype=np.int32),
+        ids=range(1, len(masks) + 1),
     )
 
 
 def _masks_of_labels(content: VertexLabels) -> VertexMasks:
     """One mask a class; ids of 0 and below are no class."""
     distinct, row = np.unique(content.class_ids, return_inverse=True)
-    masks = masks_of_partition(row, len(distinct))
-    is_class = distinct > 0
-    parts = [masks.indices[masks.indptr[i] : masks.indptr[i + 1]] for i in np.flatnonzero(is_class)]
-    kept = distinct[is_class].astype(np.int32)
+    masks = select(masks_of_partition(row, len(distinct)), np.flatnonzero(distinct > 0))
+    kept = distinct[distinct > 0].astype(np.int32)
     return VertexMasks(
+        masks.indptr,
+        masks.indices,
         n_points=len(content.class_ids),
-        indptr=np.cumsum([0, *(len(part) for part in parts)]).astype(np.int64),
-        indices=np.concatenate([np.zeros(0, np.int32), *parts]).astype(np.int32),
         scores=np.ones(len(kept)),
         class_numbers=kept,
-        numbering="id",
-        features=None,
         keys=tuple(f"class {one}" for one in kept),
     )
 
@@ -125,13 +114,3 @@ def class_names(content: Content, dataset: str, protocol: str | None) -> ClassNa
         known = ", ".join(rules.name for rules in own) or "any that has classes"
         raise PredictionError(f"whose are its class numbers? name a protocol in classes_of (known: {known})")
     return ClassNames(dict(pairs), {}) if numbering == "id" else ClassNames({}, dict(pairs))
-
-
-def _box(surface: Surface, masks: VertexMasks, k: int) -> np.ndarray:
-    points = surface.vertices[masks.mask(k)]
-    return np.zeros((2, 3)) if not len(points) else np.array([points.min(axis=0), points.max(axis=0)])
-
-
-def _centroid(surface: Surface, masks: VertexMasks, k: int) -> np.ndarray:
-    points = surface.vertices[masks.mask(k)]
-    return np.zeros(3) if not len(points) else points.mean(axis=0, dtype=np.float64)

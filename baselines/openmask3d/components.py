@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, Proposals
+from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, Masks, Proposals
 
 NOISE = -1
 
@@ -37,14 +37,8 @@ def split_into_parts(proposals: Proposals, rules: PartRules) -> Proposals:
                 parts.append(part)
                 scores.append(float(proposals.scores[k]))
     order = np.argsort(-np.array(scores), kind="stable")[: int(rules.kept_share * len(scores))]
-    kept = [parts[k] for k in order]
-    return Proposals(
-        points=proposals.points,
-        indptr=np.concatenate([[0], np.cumsum([len(part) for part in kept])]).astype(np.int64),
-        indices=np.concatenate([np.zeros(0, np.int64), *kept]).astype(np.int32),
-        scores=np.array(scores, np.float64)[order],
-        source=proposals.source,
-    )
+    masks = Masks.of_sets([parts[k] for k in order])
+    return replace(proposals, indptr=masks.indptr, indices=masks.indices, scores=np.array(scores, np.float64)[order])
 
 
 def voted_by_segments(proposals: Proposals, segments: Int64Array) -> Proposals:
@@ -52,7 +46,8 @@ def voted_by_segments(proposals: Proposals, segments: Int64Array) -> Proposals:
 
     ``segments`` (N,) are numbered from 0 on, one a point; masks that hold no segment by more than half become empty.
 
-    >>> masks = Proposals(np.zeros((5, 3), np.float32), np.array([0, 3]), np.array([0, 1, 3]), np.ones(1), "made")
+    >>> points = np.zeros((5, 3), np.float32)
+    >>> masks = Proposals(np.array([0, 3]), np.array([0, 1, 3]), points=points, scores=np.ones(1), source="made")
     >>> voted_by_segments(masks, np.array([0, 0, 0, 1, 1])).indices.tolist()
     [0, 1, 2]
     """
@@ -64,13 +59,8 @@ def voted_by_segments(proposals: Proposals, segments: Int64Array) -> Proposals:
         held = np.bincount(segments[proposals.mask(k)], minlength=len(size))
         whole = np.flatnonzero(2 * held > size)
         kept.append(np.sort(np.concatenate([order[:0], *(order[start[s] : start[s] + size[s]] for s in whole)])))
-    return Proposals(
-        points=proposals.points,
-        indptr=np.concatenate([[0], np.cumsum([len(mask) for mask in kept])]).astype(np.int64),
-        indices=np.concatenate([np.zeros(0, np.int64), *kept]).astype(np.int32),
-        scores=proposals.scores,
-        source=proposals.source,
-    )
+    masks = Masks.of_sets(kept)
+    return replace(proposals, indptr=masks.indptr, indices=masks.indices)
 
 
 def density_clusters(points: Float32Array, eps_m: float, min_points: int) -> Int64Array:

@@ -26,11 +26,9 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
 from su3d_bench.core.types import (
     Detections,
-    Float32Array,
     Float64Array,
     Frame,
     Instances,
-    Int64Array,
     PerceptionNeeds,
     SceneInfo,
 )
@@ -136,34 +134,14 @@ class MaskPipeline:
         frame_of = np.append(np.array(self._frame_indices, np.int32), np.int32(-1))
         # In the order of their number of pixels; of a view no detection is known but the mask itself.
         rows = np.stack([frame_of[views.positions], np.broadcast_to(np.arange(k)[:, None], is_view.shape)], axis=-1)
-        boxes, centroids = _extents(proposals.points, proposals.indptr, proposals.indices)
-        return Instances(
-            points=proposals.points,
-            indptr=proposals.indptr,
-            indices=proposals.indices,
-            scores=np.ones(k) if self._config.confidence == "ones" else proposals.scores,
-            features=features.astype(np.float32),
-            labels=None,
-            names=("",) * k,
-            captions=("",) * k,
-            boxes=boxes,
-            centroids=centroids,
-            view_indptr=np.concatenate([[0], np.cumsum(is_view.sum(axis=1))]).astype(np.int64),
-            views=rows[is_view].astype(np.int32).reshape(-1, 2),
-            ids=np.arange(1, k + 1, dtype=np.int32),
+        return Instances.of(
+            proposals.points,
+            proposals,
+            None if self._config.confidence == "ones" else proposals.scores,
+            features.astype(np.float32),
+            views=[rows[mask, is_view[mask]].tolist() for mask in range(k)],
+            ids=range(1, k + 1),
         )
-
-
-def _extents(points: Float32Array, indptr: Int64Array, indices: np.ndarray) -> tuple[Float32Array, Float32Array]:
-    """Corners (K, 2, 3) and centroids (K, 3) of masks; zeros for an empty one."""
-    k = len(indptr) - 1
-    boxes, centroids = np.zeros((k, 2, 3), np.float32), np.zeros((k, 3), np.float32)
-    for mask in range(k):
-        members = points[indices[indptr[mask] : indptr[mask + 1]]]
-        if len(members):
-            boxes[mask] = members.min(axis=0), members.max(axis=0)
-            centroids[mask] = members.mean(axis=0, dtype=np.float64)
-    return boxes, centroids
 
 
 class OpenMask3DConfig(MaskPipelineConfig):

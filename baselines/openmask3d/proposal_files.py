@@ -30,7 +30,8 @@ def read_proposals(folder: Path, scene: str, surface: Surface) -> Proposals:
             f"{where}: proposals of {masks.n_points} points, but the mesh of '{scene}' has {n_vertices} vertices; take "
             "proposals that were made on this mesh"
         )
-    return Proposals(surface.vertices, masks.indptr, masks.indices, masks.scores, f"{reader.name} in {where}")
+    source = f"{reader.name} in {where}"
+    return Proposals(masks.indptr, masks.indices, points=surface.vertices, scores=masks.scores, source=source)
 
 
 def digest_of_folder(folder: Path) -> str:

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from su3d_bench.baselines.mesh_segments.segments import MIN_VERTICES, THRESHOLD
@@ -15,7 +15,7 @@ from su3d_bench.baselines.openmask3d.surface_proposals import SOURCE, NodeChoice
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import SceneTools
 from su3d_bench.core.types import Int64Array, Proposals, Surface
-from su3d_bench.metrics.matching.nearest import Masks, transfer_masks
+from su3d_bench.metrics.matching.nearest import transfer_masks
 
 Kind = Literal["auto", "files", "surface", "oracle"]
 Metres = Annotated[float, Field(gt=0, allow_inf_nan=False)]
@@ -115,5 +115,5 @@ def _true_proposals(tools: SceneTools, surface: Surface) -> Proposals:
     """The truth's instances on the vertices of ``surface``: a vertex is in the masks of its nearest labelled point."""
     assert tools.true_proposals is not None, "the runner hands over true proposals to a method that needs them"
     truth = tools.true_proposals()
-    masks = transfer_masks(truth.points, Masks(truth.indptr, truth.indices), surface.vertices)
-    return Proposals(surface.vertices, masks.indptr, masks.indices, np.asarray(truth.scores, np.float64), truth.source)
+    masks = transfer_masks(truth.points, truth, surface.vertices)
+    return replace(truth, points=surface.vertices, indptr=masks.indptr, indices=masks.indices)

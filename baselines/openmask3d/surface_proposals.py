@@ -12,7 +12,7 @@ import numpy as np
 
 from su3d_bench.baselines.mesh_segments.segments import MIN_VERTICES, THRESHOLD, mesh_segments
 from su3d_bench.baselines.openmask3d.segment_tree import SegmentTree, contacts_of, is_within, merge_tree
-from su3d_bench.core.types import Float64Array, Int64Array, Proposals, Surface
+from su3d_bench.core.types import Float64Array, Int64Array, Masks, Proposals, Surface
 
 SOURCE = "weight-free proposals from the mesh's shape, not a network's"
 # Square metres of surface from which on size no longer speaks for a part. Chosen on rooms/living0 and rooms/office0.
@@ -53,14 +53,8 @@ def surface_proposals(surface: Surface, row: Int64Array, choice: NodeChoice) -> 
     rank[tree.leaves] = np.arange(len(tree.leaves))
     order = np.argsort(rank[row], kind="stable")  # vertices in the order of the leaves
     first = np.concatenate([[0], np.cumsum(n_points[tree.leaves])]).astype(np.int64)
-    masks = [np.sort(order[first[tree.start[k]] : first[tree.end[k]]]) for k in nodes]
-    return Proposals(
-        points=surface.vertices,
-        indptr=np.concatenate([[0], np.cumsum([len(mask) for mask in masks])]).astype(np.int64),
-        indices=np.concatenate([order[:0], *masks]).astype(np.int32),
-        scores=scores[nodes],
-        source=SOURCE,
-    )
+    masks = Masks.of_sets([np.sort(order[first[tree.start[k]] : first[tree.end[k]]]) for k in nodes])
+    return Proposals(masks.indptr, masks.indices, points=surface.vertices, scores=scores[nodes], source=SOURCE)
 
 
 def contrast(tree: SegmentTree) -> Float64Array:

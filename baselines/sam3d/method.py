@@ -259,26 +259,18 @@ class SAM3D:
         masks = _members(group, ids)
         views = [np.sort(cloud.views[cloud.view_group == key]) for key in ids]
         largest = [max((self._views[v] for v in of), key=lambda view: view.n_pixels) for of in views]
-        k = len(ids)
-        seen = [self._views[v] for of in views for v in of]
-        return Instances(
-            points=points,
-            indptr=_indptr(masks),
-            indices=np.concatenate([np.zeros(0, np.int32), *masks]),
-            scores=np.ones(k),  # the original has none
-            features=self._features(views, largest),
-            labels=None,
+        seen = [[self._views[v] for v in of] for of in views]
+        return Instances.of(
+            points,
+            masks,
+            None,  # the original has no scores
+            self._features(views, largest),
             names=tuple(view.name for view in largest),
             captions=tuple(view.caption for view in largest),
-            boxes=np.array([[points[m].min(axis=0), points[m].max(axis=0)] for m in masks], np.float32).reshape(
-                k, 2, 3
-            ),
-            centroids=np.array([points[m].mean(axis=0, dtype=np.float64) for m in masks], np.float32).reshape(k, 3),
-            view_indptr=_indptr(views),
-            views=np.array([(view.frame_index, view.detection) for view in seen], np.int32).reshape(-1, 2),
-            ids=ids.astype(np.int32),
-            view_names=tuple(view.name for view in seen),
-            view_scores=np.array([view.score for view in seen], np.float64),
+            views=[[(view.frame_index, view.detection) for view in each] for each in seen],
+            view_names=tuple(view.name for each in seen for view in each),
+            view_scores=np.array([view.score for each in seen for view in each], np.float64),
+            ids=ids,
         )
 
     def _features(self, views: Sequence[Int64Array], largest: Sequence[_View]) -> Float32Array:
@@ -309,10 +301,6 @@ def _members(group: Int64Array, ids: Int64Array) -> list[Int32Array]:
     order = np.argsort(group, kind="stable")
     first, last = (np.searchsorted(group[order], ids, side=side) for side in ("left", "right"))
     return [order[a:b].astype(np.int32) for a, b in zip(first, last, strict=True)]
-
-
-def _indptr(parts: Sequence[Int32Array] | Sequence[Int64Array]) -> Int64Array:
-    return np.cumsum([0, *(len(part) for part in parts)]).astype(np.int64)
 
 
 _NO_IDS = np.zeros(0, np.int64)

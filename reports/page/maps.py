@@ -89,7 +89,7 @@ def point_owners(prediction: Prediction, rows: Int64Array) -> Int32Array:
     if not isinstance(prediction, Instances):
         return prediction.instance[rows]
     owner = np.full(len(prediction.points), -1, np.int32)
-    sizes: Int64Array = np.diff(prediction.indptr)
+    sizes = prediction.sizes
     for k in np.argsort(-sizes, kind="stable"):
         owner[prediction.mask(int(k))] = k
     return owner[rows]

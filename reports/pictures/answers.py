@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import printable
-from su3d_bench.core.types import BoolArray, Float64Array, Instances, Int64Array, UInt8Array
+from su3d_bench.core.types import BoolArray, Float64Array, Instances, UInt8Array
 from su3d_bench.reports.pictures.maps import DRAWN_SPACING_M, NO_INSTANCE, Cloud, Colour, instance_colours, thinned
 from su3d_bench.reports.pictures.render import OVERSAMPLING, Camera, View, colour, render, room_bounds, view_cameras
 from su3d_bench.reports.pictures.scene import drawable
@@ -86,7 +86,7 @@ def _write(figure: Any, x: float, y: float, text: str, size: float, shade: str, 
 def _cloud(instances: Instances) -> Cloud:
     """Of masks that overlap, the smaller one is seen."""
     owner = np.full(len(instances.points), -1, np.int32)
-    sizes: Int64Array = np.diff(instances.indptr)
+    sizes = instances.sizes
     for k in np.argsort(-sizes, kind="stable"):
         owner[instances.mask(int(k))] = k
     return Cloud(instances.points, owner)

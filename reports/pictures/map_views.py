@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 
-from su3d_bench.core.types import BoolArray, Float64Array, Instances, Int32Array, Int64Array, UInt8Array
+from su3d_bench.core.types import BoolArray, Float64Array, Instances, Int32Array, UInt8Array
 from su3d_bench.reports.pictures.answers import project
 from su3d_bench.reports.pictures.maps import DRAWN_SPACING_M, NO_INSTANCE, Cloud, thinned
 from su3d_bench.reports.pictures.render import OVERSAMPLING, Camera, View, colour, render, room_bounds, view_cameras
@@ -87,7 +87,7 @@ class DrawnMap:
 def drawn_map(instances: Instances) -> DrawnMap:
     """The map of ``instances`` thinned to what a picture shows; of masks that overlap, the smaller one is seen."""
     owner = np.full(len(instances.points), -1, np.int32)
-    sizes: Int64Array = np.diff(instances.indptr)
+    sizes = instances.sizes
     for k in np.argsort(-sizes, kind="stable"):
         owner[instances.mask(int(k))] = k
     rows = thinned(Cloud(instances.points, np.arange(len(instances.points), dtype=np.int32))).owner

@@ -16,7 +16,6 @@ from su3d_bench.core.types import (
     GroundTruth,
     Instances,
     Int32Array,
-    Int64Array,
     Prediction,
     UInt8Array,
 )
@@ -138,7 +137,7 @@ def _cloud_of(prediction: Prediction) -> Cloud:
         assert not isinstance(prediction, DenseFeatures)
         return Cloud(prediction.points, prediction.instance)
     owner = np.full(len(prediction.points), -1, np.int32)
-    sizes: Int64Array = np.diff(prediction.indptr)
+    sizes = prediction.sizes
     for k in np.argsort(-sizes, kind="stable"):
         owner[prediction.mask(int(k))] = k
     return Cloud(prediction.points, owner)

@@ -6,7 +6,7 @@ Coordinates are metres in the world frame unless a name says otherwise; camera a
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -21,6 +21,7 @@ Int32Array = NDArray[np.int32]
 Int64Array = NDArray[np.int64]
 Float32Array = NDArray[np.float32]
 Float64Array = NDArray[np.float64]
+IntArray = NDArray[np.integer[Any]]
 
 ImageDomain = Literal["rendered-rooms", "camera"]
 
@@ -230,42 +231,90 @@ class Surface:
     segments: Int32Array | None = None
 
 
-@dataclass(frozen=True)
-class Proposals:
-    """K class-agnostic masks over N points, which may overlap: mask k is ``indices[indptr[k]:indptr[k + 1]]``.
+def starts_of(sizes: Iterable[int]) -> Int64Array:
+    """Where parts of these sizes begin in a list of all, and where the last ends.
 
-    ``points`` (N, 3) float32 m; ``scores`` (K,) float64, the best first is not implied; ``source`` says who made them.
+    >>> starts_of([2, 0, 3]).tolist()
+    [0, 2, 2, 5]
+    """
+    return np.cumsum([0, *sizes]).astype(np.int64)
+
+
+@dataclass(frozen=True)
+class Masks:
+    """K sets of points, which may overlap: mask k is ``indices[indptr[k]:indptr[k + 1]]``, ascending.
+
+    >>> masks = Masks.of_sets([np.array([4, 5]), np.array([6])])
+    >>> masks.indptr.tolist(), masks.mask(1).tolist()
+    ([0, 2, 3], [6])
     """
 
-    points: Float32Array
     indptr: Int64Array
     indices: Int32Array
-    scores: Float64Array
-    source: str
+
+    @staticmethod
+    def of_sets(sets: Sequence[IntArray]) -> Masks:
+        """The masks that hold these points, each list ascending."""
+        indices = np.concatenate([np.zeros(0, np.int32), *sets]).astype(np.int32, copy=False)
+        return Masks(starts_of(map(len, sets)), indices)
 
     def __len__(self) -> int:
-        return len(self.scores)
+        return len(self.indptr) - 1
+
+    @property
+    def sizes(self) -> Int64Array:
+        """The number of points (K,) of each mask."""
+        return np.diff(self.indptr)
+
+    @property
+    def owners(self) -> Int64Array:
+        """The mask of each entry of ``indices``."""
+        return np.repeat(np.arange(len(self.sizes)), self.sizes)
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether ``indptr`` describes a list of the length of ``indices``."""
+        ends = self.indptr[0] == 0 and self.indptr[-1] == len(self.indices)
+        return bool(ends and (self.sizes >= 0).all())
 
     def mask(self, k: int) -> Int32Array:
         """Point indices of mask ``k``."""
         return self.indices[self.indptr[k] : self.indptr[k + 1]]
 
+    def sets(self) -> list[Int32Array]:
+        """The point indices of each mask."""
+        return np.split(self.indices, self.indptr[1:-1]) if len(self) else []
 
-@dataclass(frozen=True)
-class Instances:
-    """A map of K instances over M shared points; masks may overlap.
+    def owner_at(self, entry: int) -> int:
+        """The mask to which entry ``entry`` of ``indices`` belongs."""
+        return int(np.searchsorted(self.indptr, entry, side="right") - 1)
 
-    ``points`` (M, 3) float32 m; instance k owns points ``indices[indptr[k]:indptr[k + 1]]`` (sorted int32);
-    ``scores`` (K,) float64; ``features`` (K, D) float32 where the method has features, ``labels`` one class name each
-    where the method itself decides, '' for what it leaves to the feature; ``boxes`` (K, 2, 3) float32 axis-aligned
-    minimum and maximum corners; ``centroids`` (K, 3) float32; ``views`` (V, 2) int32 rows (frame index, detection
-    index), those of instance k at ``view_indptr[k]:view_indptr[k + 1]``; where the method keeps them, ``view_names``
-    and ``view_scores`` (V,) float64 are the names and prediction scores that perception gave in those views.
+
+@dataclass(frozen=True, kw_only=True)
+class Proposals(Masks):
+    """Class-agnostic masks over N points.
+
+    ``points`` (N, 3) float32 m; ``scores`` (K,) float64, the best first is not implied; ``source`` says who made them.
     """
 
     points: Float32Array
-    indptr: Int64Array
-    indices: Int32Array
+    scores: Float64Array
+    source: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class Instances(Masks):
+    """A map of K instances over M shared points, one mask an instance.
+
+    ``points`` (M, 3) float32 m; ``scores`` (K,) float64; ``features`` (K, D) float32 where the method has features,
+    ``labels`` one class name each where the method itself decides, '' for what it leaves to the feature; ``boxes``
+    (K, 2, 3) float32 axis-aligned minimum and maximum corners; ``centroids`` (K, 3) float32; ``views`` (V, 2) int32
+    rows (frame index, detection index), those of instance k at ``view_indptr[k]:view_indptr[k + 1]``; where the method
+    keeps them, ``view_names`` and ``view_scores`` (V,) float64 are the names and prediction scores that perception
+    gave in those views.
+    """
+
+    points: Float32Array
     scores: Float64Array
     features: Float32Array | None
     labels: tuple[str, ...] | None
@@ -283,15 +332,7 @@ class Instances:
         k = len(self.scores)
         if len(self.indptr) != k + 1 or len(self.names) != k or len(self.captions) != k:
             raise PredictionError(f"instances: {k} scores, {len(self.indptr) - 1} masks, {len(self.names)} names")
-        if self.indptr[0] != 0 or self.indptr[-1] != len(self.indices) or (np.diff(self.indptr) < 0).any():
-            raise PredictionError("instances: indptr does not describe the list of point indices")
-        if len(self.indices) and (self.indices.min() < 0 or self.indices.max() >= len(self.points)):
-            worst = int(np.flatnonzero((self.indices < 0) | (self.indices >= len(self.points)))[0])
-            owner = int(np.searchsorted(self.indptr, worst, side="right") - 1)
-            raise PredictionError(
-                f"instance {owner}: mask holds index {int(self.indices[worst])}, the map has {len(self.points)} points "
-                f"(0..{len(self.points) - 1})"
-            )
+        _check_masks(self, len(self.points))
         if self.features is not None and len(self.features) != k:
             raise PredictionError(f"instances: {k} masks and {len(self.features)} features")
         if self.labels is not None and len(self.labels) != k:
@@ -300,12 +341,66 @@ class Instances:
             if told is not None and len(told) != len(self.views):
                 raise PredictionError(f"instances: {len(self.views)} views and {len(told)} names or scores of views")
 
-    def __len__(self) -> int:
-        return len(self.scores)
+    @classmethod
+    def of(
+        cls,
+        points: Float32Array,
+        masks: Masks | Sequence[IntArray],
+        scores: Float64Array | None = None,
+        features: Float32Array | None = None,
+        *,
+        labels: tuple[str, ...] | None = None,
+        names: tuple[str, ...] | None = None,
+        captions: tuple[str, ...] | None = None,
+        centroids: Float32Array | None = None,
+        views: Sequence[Sequence[tuple[int, int]]] | None = None,
+        view_names: tuple[str, ...] | None = None,
+        view_scores: Float64Array | None = None,
+        ids: Sequence[int] | IntArray = (),
+    ) -> Instances:
+        """The map of ``masks`` over ``points``; ``views`` are those of each instance.
 
-    def mask(self, k: int) -> Int32Array:
-        """Point indices of instance ``k``."""
-        return self.indices[self.indptr[k] : self.indptr[k + 1]]
+        Scores are 1, names and captions empty where none are given; boxes and centroids are those of the points, zeros
+        for an empty mask.
+        """
+        masks = masks if isinstance(masks, Masks) else Masks.of_sets(masks)
+        _check_masks(masks, len(points))
+        k = len(masks)
+        boxes, means = np.zeros((k, 2, 3), np.float32), np.zeros((k, 3), np.float32)
+        for row in np.flatnonzero(masks.sizes).tolist():
+            members = points[masks.mask(row)]
+            boxes[row] = members.min(axis=0), members.max(axis=0)
+            means[row] = members.mean(axis=0, dtype=np.float64)
+        rows = [view for of_instance in views or () for view in of_instance]
+        return cls(
+            masks.indptr,
+            masks.indices,
+            points=points,
+            scores=np.ones(k) if scores is None else scores,
+            features=features,
+            labels=labels,
+            names=("",) * k if names is None else names,
+            captions=("",) * k if captions is None else captions,
+            boxes=boxes,
+            centroids=means if centroids is None else centroids,
+            view_indptr=np.zeros(k + 1, np.int64) if views is None else starts_of(map(len, views)),
+            views=np.array(rows, np.int32).reshape(-1, 2),
+            ids=np.array(ids, np.int32),
+            view_names=view_names,
+            view_scores=view_scores,
+        )
+
+
+def _check_masks(masks: Masks, n_points: int) -> None:
+    if not masks.is_whole:
+        raise PredictionError("instances: indptr does not describe the list of point indices")
+    indices = masks.indices
+    if len(indices) and (indices.min() < 0 or indices.max() >= n_points):
+        worst = int(np.flatnonzero((indices < 0) | (indices >= n_points))[0])
+        raise PredictionError(
+            f"instance {masks.owner_at(worst)}: mask holds index {int(indices[worst])}, the map has {n_points} points "
+            f"(0..{n_points - 1})"
+        )
 
 
 @dataclass(frozen=True)

@@ -8,8 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError, printable
-from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array
-from su3d_bench.metrics.matching.nearest import Masks
+from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array, Masks
 from su3d_bench.metrics.protocols import ProtocolRules
 
 NEAR_IOU = 0.9  # pairs above it are the same object twice
@@ -44,7 +43,7 @@ def mask_facts(masks: Masks, scores: Float64Array, n_points: int) -> MaskFacts:
     near, identical = _pairs(masks, n_owners)
     return MaskFacts(
         n_masks=len(masks),
-        n_empty=int((np.diff(masks.indptr) == 0).sum()),
+        n_empty=int((masks.sizes == 0).sum()),
         near=near,
         identical=identical,
         lowest_score=float(scores.min()) if len(scores) else None,
@@ -68,7 +67,7 @@ def _pairs(
     chosen = masks.indices[is_shared]
     member = csr_array((np.ones(len(chosen), np.int32), chosen, starts), shape=(len(masks), len(n_owners)))
     shared = (member @ member.T).tocoo()
-    size = np.diff(masks.indptr)
+    size = masks.sizes
     union = size[shared.row] + size[shared.col] - shared.data
     is_near = (shared.row < shared.col) & (shared.data > NEAR_IOU * union)
     near = sorted(zip(shared.row[is_near].tolist(), shared.col[is_near].tolist(), strict=True))
@@ -81,7 +80,7 @@ def empty_warnings(scene: str, facts: MaskFacts, masks: Masks, keys: Sequence[st
     """A sentence on empty masks, with their number and the first of them."""
     if not facts.n_empty:
         return []
-    first = int(np.flatnonzero(np.diff(masks.indptr) == 0)[0])
+    first = int(np.flatnonzero(masks.sizes == 0)[0])
     return [f"{scene}: {_number(facts.n_empty, 'empty mask')}, the first is mask {first}{_key(keys, first)}"]
 
 

@@ -27,7 +27,6 @@ from su3d_bench.datasets.replica.mesh_truth import read_annotated_mesh
 from su3d_bench.evaluation.checks import check_cloud, empty_warnings, mask_facts
 from su3d_bench.evaluation.scoring import SceneOutcome
 from su3d_bench.metrics.fitness import why_not_scorable
-from su3d_bench.metrics.matching.nearest import masks_of
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
 from su3d_bench.metrics.protocols import ProtocolRules
@@ -43,6 +42,7 @@ NO_CEILING = (
     "confidence 1, so that perfect masks with perfect features need not reach 1"
 )
 
+NOTHING = Instances.of(np.zeros((0, 3), np.float32), [], labels=())
 NO_QUERY_CEILING = "no ceiling is known: how well perfect masks are ranked is up to the encoder"
 
 
@@ -100,25 +100,16 @@ def score_on_objects(
     encoder: Encoder | None,
 ) -> SceneOutcome:
     """The outcome against objects with labels or queries; an empty prediction where ``content`` has no points."""
-    prediction: Prediction = _nothing() if isinstance(content, VertexMasks | VertexLabels) else content
+    prediction: Prediction = NOTHING if isinstance(content, VertexMasks | VertexLabels) else content
     base = truth.scene if isinstance(truth, QuestionTruth) else truth
     told = check_cloud(scene, prediction.points, base.points)
     facts = None
     if isinstance(prediction, Instances):
-        masks = masks_of(prediction)
-        facts = mask_facts(masks, np.asarray(prediction.scores, np.float64), len(prediction.points))
-        told += empty_warnings(scene, facts, masks, prediction.names)
+        facts = mask_facts(prediction, np.asarray(prediction.scores, np.float64), len(prediction.points))
+        told += empty_warnings(scene, facts, prediction, prediction.names)
     if rules.kind == "queries":
         told.append(NO_CEILING if base.variant in VARIANTS else NO_QUERY_CEILING)
     return SceneOutcome(score_scene(rules, truth, prediction, encoder), None, None, facts, tuple(told))
-
-
-def _nothing() -> Instances:
-    none = np.zeros(0, np.int32)
-    empty = np.zeros((0, 3), np.float32)
-    starts = np.zeros(1, np.int64)
-    boxes, views = np.zeros((0, 2, 3), np.float32), np.zeros((0, 2), np.int32)
-    return Instances(empty, starts, none, np.zeros(0), None, (), (), (), boxes, empty, starts, views)
 
 
 def score_on_questions(

@@ -9,7 +9,16 @@ import numpy as np
 from su3d_bench.core import registry
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import DenseFeatures, Float32Array, GroundTruth, Instances, Int64Array, Partition, Prediction
+from su3d_bench.core.types import (
+    DenseFeatures,
+    Float32Array,
+    Float64Array,
+    GroundTruth,
+    Instances,
+    Int64Array,
+    Masks,
+    Prediction,
+)
 from su3d_bench.evaluation.checks import (
     MaskFacts,
     check_cloud,
@@ -22,7 +31,7 @@ from su3d_bench.evaluation.checks import (
 from su3d_bench.evaluation.truth import MAX_NYU40_ID, TextTruth
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance.score import OBJECT, encode_without_classes, every_class_counts
+from su3d_bench.metrics.instance.score import OBJECT, encode_without_classes, every_class_counts, masks_and_scores
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import (
     candidate_classes,
@@ -143,7 +152,7 @@ def nothing_like(content: Content | None) -> Content:
     if isinstance(content, VertexLabels):
         return VertexLabels(np.zeros(0, np.int32))
     none = np.zeros(0, np.int32)
-    return VertexMasks(None, np.zeros(1, np.int64), none, np.zeros(0), none, "id", None, ())
+    return VertexMasks(np.zeros(1, np.int64), none, n_points=None, scores=np.zeros(0), class_numbers=none, keys=())
 
 
 def score_on_vertices(
@@ -162,19 +171,18 @@ def score_on_vertices(
         is_scored = np.isin(labels, [entry.id for entry in rules.scored])
         values = encode_without_classes(rules.class_agnostic, values % instance_ap.INSTANCES_PER_CLASS, is_scored)
     ids = _ids_of_masks(rules, content, labels, encoder)
-    masks = transfer.Masks(content.indptr, content.indices)
-    facts = mask_facts(masks, content.scores, len(values))
+    facts = mask_facts(content, content.scores, len(values))
     told = [
-        *empty_warnings(scene, facts, masks, content.keys),
+        *empty_warnings(scene, facts, content, content.keys),
         *duplicate_warnings(scene, facts, content.keys),
         *class_warnings(scene, rules, content.class_numbers, ids),
     ]
     if (named := encoder_warning(rules, _instances(rules, content, np.zeros((0, 3), np.float32)), encoder)) is not None:
         told.append(named)
     return SceneOutcome(
-        _instance_score(rules, values, content, ids),
+        _instance_score(rules, values, content, content.scores, ids),
         _instance_ceiling(rules, truth, scene, values),
-        _bound(rules, values, masks, content.scores),
+        _bound(rules, values, content, content.scores),
         facts,
         tuple(told),
     )
@@ -187,9 +195,11 @@ def _semantic_score(rules: ProtocolRules, labels: Int64Array, class_ids: np.ndar
     return _score(rules, counts, len(np.unique(class_ids)), int((true_class >= 0).sum()))
 
 
-def _instance_score(rules: ProtocolRules, values: Int64Array, masks: VertexMasks, ids: Int64Array) -> SceneScore:
+def _instance_score(
+    rules: ProtocolRules, values: Int64Array, masks: Masks, scores: Float64Array, ids: Int64Array
+) -> SceneScore:
     assert rules.min_region_size is not None
-    scores = np.ones(len(masks)) if rules.confidence == "ones" else masks.scores
+    scores = np.ones(len(masks)) if rules.confidence == "ones" else scores
     class_ids = _class_ids(rules)
     counts = instance_ap.per_scene(
         values, masks.indptr, masks.indices, ids, scores, class_ids, rules.min_region_size, rules.thresholds
@@ -246,13 +256,11 @@ def _instance_ceiling(rules: ProtocolRules, truth: TextTruth, scene: str, values
     masks = transfer.masks_of_partition(row_of_value[own], len(distinct))
     labels = distinct // instance_ap.INSTANCES_PER_CLASS
     ids = np.full(len(distinct), OBJECT) if rules.class_agnostic is not None else labels
-    ones, keys = np.ones(len(distinct)), ("",) * len(distinct)
-    perfect = VertexMasks(len(own), masks.indptr, masks.indices, ones, None, "id", None, keys)
-    return _instance_score(rules, values, perfect, ids.astype(np.int64))
+    return _instance_score(rules, values, masks, np.ones(len(distinct)), ids.astype(np.int64))
 
 
 def _bound(
-    rules: ProtocolRules, values: Int64Array, masks: transfer.Masks, scores: np.ndarray
+    rules: ProtocolRules, values: Int64Array, masks: Masks, scores: np.ndarray
 ) -> instance_ap.InstanceCounts | None:
     if rules.class_agnostic is not None:
         return None
@@ -271,21 +279,8 @@ def _instances(rules: ProtocolRules, masks: VertexMasks, points: Float32Array) -
         labels = tuple(name_of.get(int(one), f"class {one}") for one in ids)
     elif not k:
         labels = ()
-    has_points = len(points) > 0
-    return Instances(
-        points=points,
-        indptr=masks.indptr if has_points else np.zeros(k + 1, np.int64),
-        indices=masks.indices if has_points else np.zeros(0, np.int32),
-        scores=masks.scores,
-        features=masks.features,
-        labels=labels,
-        names=masks.keys,
-        captions=("",) * k,
-        boxes=np.zeros((k, 2, 3), np.float32),
-        centroids=np.zeros((k, 3), np.float32),
-        view_indptr=np.zeros(k + 1, np.int64),
-        views=np.zeros((0, 2), np.int32),
-    )
+    shown = masks if len(points) else Masks.of_sets([masks.indices[:0]] * k)
+    return Instances.of(points, shown, masks.scores, masks.features, labels=labels, names=masks.keys)
 
 
 def _map_of_labels(rules: ProtocolRules, content: VertexLabels, points: Float32Array) -> Instances:
@@ -293,9 +288,13 @@ def _map_of_labels(rules: ProtocolRules, content: VertexLabels, points: Float32A
     distinct, row = np.unique(content.class_ids, return_inverse=True)
     masks = transfer.masks_of_partition(row, len(distinct))
     keys = tuple(f"class {one}" for one in distinct)
-    n = len(content.class_ids)
     of_classes = VertexMasks(
-        n, masks.indptr, masks.indices, np.ones(len(distinct)), distinct.astype(np.int32), "id", None, keys
+        masks.indptr,
+        masks.indices,
+        n_points=len(content.class_ids),
+        scores=np.ones(len(distinct)),
+        class_numbers=distinct.astype(np.int32),
+        keys=keys,
     )
     return _instances(rules, of_classes, points)
 
@@ -329,18 +328,12 @@ def score_on_truth(
     )
 
 
-def _masks_and_scores(prediction: Prediction) -> tuple[transfer.Masks | None, np.ndarray]:
-    if isinstance(prediction, Instances):
-        return transfer.masks_of(prediction), np.asarray(prediction.scores, np.float64)
-    if isinstance(prediction, Partition):
-        n = len(prediction.features)
-        return transfer.masks_of_partition(prediction.instance, n), np.ones(n)
-    assert isinstance(prediction, DenseFeatures)
-    return None, np.zeros(0)
+def _masks_and_scores(prediction: Prediction) -> tuple[Masks | None, np.ndarray]:
+    return (None, np.zeros(0)) if isinstance(prediction, DenseFeatures) else masks_and_scores(prediction)
 
 
 def _bound_on_truth(
-    rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, masks: transfer.Masks, scores: np.ndarray
+    rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, masks: Masks, scores: np.ndarray
 ) -> instance_ap.InstanceCounts | None:
     if rules.kind != "instance" or rules.class_agnostic is not None:
         return None

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.core.types import Float32Array, Float64Array, Instances, Int32Array, Int64Array
+from su3d_bench.core.types import Float64Array, Instances, Int32Array, Int64Array, Masks, starts_of
 from su3d_bench.opensu3d.config import InstanceScore, OpenSU3DConfig
 from su3d_bench.opensu3d.feature_fusion import fuse_views
 from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View
@@ -132,24 +132,18 @@ def to_instances(
     is_kept[of_segments] = True
     row = np.cumsum(is_kept) - 1
     described = [_described(segment, images, config) for segment in segments]
-    boxes = [_box(points[segment.points]) for segment in segments]
-    n_views = [len(segment.views) for segment in segments]
     views = [(images[view.position], view.detection) for segment in segments for view in segment.views]
     dimension = images[0].n_dimensions if images else 0
-    return Instances(
-        points=points[is_kept].astype(np.float32),
-        indptr=_indptr(len(segment.points) for segment in segments),
-        indices=row[of_segments].astype(np.int32),
+    return Instances.of(
+        points[is_kept].astype(np.float32),
+        Masks(starts_of(len(segment.points) for segment in segments), row[of_segments].astype(np.int32)),
         scores=np.array([each.score for each in described], np.float64),
         features=np.array([each.feature for each in described], np.float32).reshape(len(segments), dimension),
-        labels=None,
         names=tuple(each.name for each in described),
         captions=tuple(each.caption for each in described),
-        boxes=np.array(boxes, np.float32).reshape(len(segments), 2, 3),
         centroids=np.array([points[s.points].mean(axis=0) for s in segments], np.float32).reshape(len(segments), 3),
-        view_indptr=_indptr(n_views),
-        views=np.array([(image.frame_index, row) for image, row in views], np.int32).reshape(sum(n_views), 2),
-        ids=np.array([segment.scene_id for segment in segments], np.int32),
+        views=[[(images[view.position].frame_index, view.detection) for view in s.views] for s in segments],
+        ids=[segment.scene_id for segment in segments],
         view_names=tuple(image.names[row] for image, row in views),
         view_scores=np.array([image.scores[row] for image, row in views], np.float64),
     )
@@ -175,14 +169,6 @@ def _described(segment: Segment, images: Sequence[ImageRecord], config: OpenSU3D
     )
     caption = best.captions[top[0].detection].strip() or caption_of(name)
     return _Description(name, caption, instance_score(scores, config.instance_score, config.top_m), feature)
-
-
-def _box(points: Float64Array) -> Float32Array:
-    return np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float32)
-
-
-def _indptr(lengths: Iterable[int]) -> Int64Array:
-    return np.concatenate([[0], np.cumsum(list(lengths))]).astype(np.int64)
 
 
 def _concatenated(arrays: Sequence[Int64Array]) -> Int64Array:

@@ -16,7 +16,7 @@ from su3d_bench.core.types import (
     Float64Array,
     Instances,
     Int32Array,
-    Int64Array,
+    Masks,
     Partition,
 )
 
@@ -28,31 +28,28 @@ MOST_MEMBERS = (
 )
 
 
-@dataclass(frozen=True)
-class VertexMasks:
-    """K masks over the points of the ground truth, in its order; the file has no coordinates.
+@dataclass(frozen=True, kw_only=True)
+class VertexMasks(Masks):
+    """Masks over the points of the ground truth, in its order; the file has no coordinates.
 
-    ``n_points`` is None where the file does not say it (a list without masks). Mask k holds the points
-    ``indices[indptr[k]:indptr[k + 1]]``, strictly ascending. ``scores`` (K,) are finite. ``class_numbers`` (K,) are as
-    the file has them, None where it has no classes: with ``numbering`` "id" class ids of the label space, with "index"
-    positions in the protocol's list of classes. ``features`` (K, D), all-zero rows have none. ``keys`` name the
-    masks in messages.
+    ``n_points`` is None where the file does not say it (a list without masks). ``scores`` (K,) are finite.
+    ``class_numbers`` (K,) are as the file has them, None where it has no classes: with ``numbering`` "id" class ids of
+    the label space, with "index" positions in the protocol's list of classes. ``features`` (K, D), all-zero rows have
+    none. ``keys`` name the masks in messages.
     """
 
     n_points: int | None
-    indptr: Int64Array
-    indices: Int32Array
     scores: Float64Array
-    class_numbers: Int32Array | None
-    numbering: Numbering
-    features: Float32Array | None
+    class_numbers: Int32Array | None = None
+    numbering: Numbering = "id"
+    features: Float32Array | None = None
     keys: tuple[str, ...]
 
     def __post_init__(self) -> None:
         k = len(self.keys)
-        if self.indptr.shape != (k + 1,) or self.indptr[0] != 0 or (np.diff(self.indptr) < 0).any():
+        if self.indptr.shape != (k + 1,) or self.indptr[0] != 0 or (self.sizes < 0).any():
             raise PredictionError(f"{k} masks: indptr of {self.indptr.shape} does not describe them")
-        if self.indptr[-1] != len(self.indices) or (self.n_points is None and k):
+        if not self.is_whole or (self.n_points is None and k):
             raise PredictionError(f"{k} masks: {len(self.indices)} indices, {self.n_points} points")
         if self.scores.shape != (k,) or (self.class_numbers is not None and self.class_numbers.shape != (k,)):
             raise PredictionError(f"{k} masks, but scores of {self.scores.shape} or classes of another number")
@@ -67,23 +64,15 @@ class VertexMasks:
         if not len(self.indices):
             return
         is_start = np.zeros(len(self.indices), np.bool_)
-        is_start[self.indptr[:-1][np.diff(self.indptr) > 0]] = True
+        is_start[self.indptr[:-1][self.sizes > 0]] = True
         is_wrong = (self.indices < 0) | (self.indices >= (self.n_points or 0))
         is_wrong[1:] |= (np.diff(self.indices) <= 0) & ~is_start[1:]
         if is_wrong.any():
             worst = int(np.argmax(is_wrong))
-            owner = int(np.searchsorted(self.indptr, worst, side="right") - 1)
             raise PredictionError(
-                f"mask '{self.keys[owner]}': point {int(self.indices[worst])} is out of range or out of order, the "
-                f"scene has {self.n_points} points"
+                f"mask '{self.keys[self.owner_at(worst)]}': point {int(self.indices[worst])} is out of range or out of "
+                f"order, the scene has {self.n_points} points"
             )
-
-    def __len__(self) -> int:
-        return len(self.keys)
-
-    def mask(self, k: int) -> Int32Array:
-        """Point indices of mask ``k``."""
-        return self.indices[self.indptr[k] : self.indptr[k + 1]]
 
 
 @dataclass(frozen=True)

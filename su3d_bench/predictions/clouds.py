@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import DataError, PredictionError, printable, shown
-from su3d_bench.core.types import Float32Array, Instances
+from su3d_bench.core.types import Float32Array, Instances, Masks, starts_of
 from su3d_bench.predictions.base import MOST_MASKS, MOST_POINTS
 from su3d_bench.predictions.mask_arrays import kind_of
 
@@ -86,27 +86,9 @@ def instances_of(
     n = int(sizes.sum())
     if n > MOST_POINTS or len(clouds) > MOST_MASKS:
         raise PredictionError(f"{where}: {len(clouds)} objects of {n} points; is it damaged?")
-    k = len(clouds)
-    boxes, centroids = np.zeros((k, 2, 3), np.float32), np.zeros((k, 3), np.float32)
-    for row, cloud in enumerate(clouds):
-        if len(cloud):
-            boxes[row] = cloud.min(axis=0), cloud.max(axis=0)
-            centroids[row] = cloud.mean(axis=0, dtype=np.float64)
-    return Instances(
-        points=np.concatenate([np.zeros((0, 3), np.float32), *clouds]),
-        indptr=np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
-        indices=np.arange(n, dtype=np.int32),
-        scores=np.ones(k),
-        features=features,
-        labels=labels,
-        names=names,
-        captions=captions,
-        boxes=boxes,
-        centroids=centroids,
-        view_indptr=np.zeros(k + 1, np.int64),
-        views=np.zeros((0, 2), np.int32),
-        ids=np.array(ids, np.int32),
-    )
+    points = np.concatenate([np.zeros((0, 3), np.float32), *clouds])
+    masks = Masks(starts_of(sizes), np.arange(n, dtype=np.int32))
+    return Instances.of(points, masks, None, features, labels=labels, names=names, captions=captions, ids=ids)
 
 
 def some(numbers: Sequence[int]) -> str:

@@ -23,9 +23,11 @@ from su3d_bench.core.types import (
     GroundTruth,
     Instances,
     Int64Array,
+    Masks,
     Partition,
 )
 from su3d_bench.formats.pcd import write_pcd_points
+from su3d_bench.metrics.instance.score import masks_and_scores
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import (
     candidate_classes,
@@ -98,7 +100,7 @@ def openlex_parts(content: Content) -> OpenLexParts:
     if isinstance(content, DenseFeatures):
         return _dense_parts(content)
     if isinstance(content, Instances):
-        owner = transfer.first_owner(transfer.masks_of(content), len(content.points))
+        owner = transfer.first_owner(content, len(content.points))
         n_shared = int((np.bincount(content.indices, minlength=1) > 1).sum())
         if n_shared:
             remarks.append(f"{n_shared} points are in several objects and went to the first of them")
@@ -162,7 +164,7 @@ def write_openlex(content: Content, folder: Path) -> tuple[str, ...]:
 class LabelledMasks:
     """K masks over ``n_points`` points of the truth, a class id (K,), 0 for none, and a score (K,) for each."""
 
-    masks: transfer.Masks
+    masks: Masks
     n_points: int
     class_ids: Int64Array
     scores: Float64Array
@@ -177,8 +179,7 @@ def needs_truth(content: Content) -> bool:
 def masks_as_they_are(content: VertexMasks) -> LabelledMasks:
     """Masks over the truth's points with class ids of their own."""
     assert content.class_numbers is not None and content.numbering == "id"
-    masks = transfer.Masks(content.indptr, content.indices)
-    return LabelledMasks(masks, content.n_points or 0, content.class_numbers.astype(np.int64), content.scores)
+    return LabelledMasks(content, content.n_points or 0, content.class_numbers.astype(np.int64), content.scores)
 
 
 def masks_on_truth(
@@ -206,16 +207,13 @@ def masks_on_truth(
     return LabelledMasks(moved, len(truth.points), class_ids, scores, remarks)
 
 
-def _masks_and_scores(named: Instances | Partition) -> tuple[transfer.Masks, Float64Array, tuple[str, ...]]:
+def _masks_and_scores(named: Instances | Partition) -> tuple[Masks, Float64Array, tuple[str, ...]]:
     """The masks on the points of the map, a finite score for each, and what a reader of the scores must know."""
     remarks: tuple[str, ...] = ()
-    if isinstance(named, Instances):
-        masks, scores = transfer.masks_of(named), np.asarray(named.scores, np.float64)
-    else:
+    if isinstance(named, Partition):
         _check_partition(named)
-        n = len(named.features)
-        masks, scores = transfer.masks_of_partition(named.instance, n), np.ones(n)
         remarks = ("a partition has no scores: 1 for every mask",)
+    masks, scores = masks_and_scores(named)
     if not np.isfinite(named.points).all() or not np.isfinite(scores).all():
         raise PredictionError("has points or scores that are NaN or infinite; make it again")
     return masks, scores, remarks
@@ -238,21 +236,7 @@ def _instances(content: VertexMasks, truth: GroundTruth) -> Instances:
         raise PredictionError(
             f"is of {content.n_points} points, the ground truth of {len(truth.points)}; both must be of one mesh"
         )
-    k = len(content)
-    return Instances(
-        truth.points,
-        content.indptr,
-        content.indices,
-        content.scores,
-        content.features,
-        None,
-        content.keys,
-        ("",) * k,
-        np.zeros((k, 2, 3), np.float32),
-        np.zeros((k, 3), np.float32),
-        np.zeros(k + 1, np.int64),
-        np.zeros((0, 2), np.int32),
-    )
+    return Instances.of(truth.points, content, content.scores, content.features, names=content.keys)
 
 
 def write_scannet(labelled: LabelledMasks, scene: str, folder: Path) -> tuple[str, ...]:
@@ -262,7 +246,7 @@ def write_scannet(labelled: LabelledMasks, scene: str, folder: Path) -> tuple[st
     """
     scene = file_name(scene)
     make_folder(folder / MASKS_FOLDER)
-    sizes = np.diff(labelled.masks.indptr)
+    sizes = labelled.masks.sizes
     lines, n_empty, n_unnamed = [], 0, 0
     for k, (class_id, score) in enumerate(zip(labelled.class_ids.tolist(), labelled.scores.tolist(), strict=True)):
         if not sizes[k]:
@@ -271,9 +255,8 @@ def write_scannet(labelled: LabelledMasks, scene: str, folder: Path) -> tuple[st
             n_unnamed += 1
         else:
             name = f"{MASKS_FOLDER}/{scene}_{k:03d}.txt"
-            start, end = labelled.masks.indptr[k : k + 2]
             digits = np.full((labelled.n_points, 2), (ord("0"), ord("\n")), np.uint8)
-            digits[labelled.masks.indices[start:end], 0] = ord("1")
+            digits[labelled.masks.mask(k), 0] = ord("1")
             (folder / name).write_bytes(digits.tobytes())
             lines.append(f"{name} {class_id} {score!r}\n")
     write_text(folder / f"{scene}.txt", "".join(lines))

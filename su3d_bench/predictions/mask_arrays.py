@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, printable, shown
-from su3d_bench.core.types import Float32Array, Float64Array, Int32Array
+from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Masks
 from su3d_bench.predictions.base import MOST_MASKS, MOST_MEMBERS, MOST_POINTS, Numbering, VertexMasks
 
 NO_SCORES = "the file has no scores: 1 for every mask"
@@ -57,12 +57,18 @@ def vertex_masks(
         if n > MOST_MEMBERS:
             raise PredictionError(f"{where}: the masks hold more than {MOST_MEMBERS} points together; is it damaged?")
         parts.append(part)
-    indptr = np.concatenate([[0], np.cumsum([len(part) for part in parts], dtype=np.int64)]).astype(np.int64)
-    indices = np.concatenate([np.zeros(0, np.int32), *parts]).astype(np.int32, copy=False)
-    names = tuple(keys) if keys is not None else tuple(f"mask {k}" for k in range(len(parts)))
-    ones = np.ones(len(parts)) if scores is None else scores
+    masks = Masks.of_sets(parts)
     try:
-        return VertexMasks(n_points, indptr, indices, ones, class_numbers, numbering, features, names)
+        return VertexMasks(
+            masks.indptr,
+            masks.indices,
+            n_points=n_points,
+            scores=np.ones(len(parts)) if scores is None else scores,
+            class_numbers=class_numbers,
+            numbering=numbering,
+            features=features,
+            keys=tuple(keys) if keys is not None else tuple(f"mask {k}" for k in range(len(parts))),
+        )
     except PredictionError as error:
         raise PredictionError(f"{where}: {error}") from error
 

@@ -19,7 +19,7 @@ import numpy as np
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Method
 from su3d_bench.core.timing import Timer, calibration_ms, memory_bytes
-from su3d_bench.core.types import Detections, Frame, GroundTruth, PerceptionNeeds, Proposals, Surface
+from su3d_bench.core.types import Detections, Frame, GroundTruth, PerceptionNeeds, Proposals, Surface, starts_of
 from su3d_bench.perception.profiles import Perception
 from su3d_bench.runs.executors.local import Event, Report
 from su3d_bench.store.predictions import write_prediction
@@ -74,9 +74,9 @@ def true_proposals(truth: GroundTruth) -> Proposals:
     """Every annotated instance of ``truth`` as a class-agnostic mask, in the order of the instance ids."""
     order = np.argsort(truth.instance, kind="stable").astype(np.int32)
     order = order[truth.instance[order] > 0]
-    n_points = np.unique(truth.instance[order], return_counts=True)[1]
-    indptr = np.cumsum([0, *n_points]).astype(np.int64)
-    return Proposals(truth.points, indptr, order, np.ones(len(n_points)), "ground truth")
+    sizes = np.unique(truth.instance[order], return_counts=True)[1]
+    ones = np.ones(len(sizes))
+    return Proposals(starts_of(sizes), order, points=truth.points, scores=ones, source="ground truth")
 
 
 Read = TypeVar("Read")

@@ -150,7 +150,7 @@ def _answer_cell(shown: DrawnMap, view: MapView, rows_of: Sequence[Sequence[int]
 
 def _name_tags(shown: DrawnMap, view: MapView, names: Labels, colours: UInt8Array) -> tuple[Tag, ...]:
     """The names of the largest things that are seen; surfaces of the room go without."""
-    sizes = np.diff(shown.instances.indptr)
+    sizes = shown.instances.sizes
     seen = set(shown.owner[view.view.point[view.view.point >= 0]].tolist())
     largest = [int(k) for k in np.argsort(-sizes, kind="stable") if int(k) in seen]
     rows = [k for k in largest if names[k] and names[k] not in ROOM_SURFACES]

@@ -16,12 +16,13 @@ from su3d_bench.store.atomic import read_npz, remove_file, replacing, write_npz
 from su3d_bench.store.scratch import row_blocks
 
 ROWS_AT_ONCE = 8192  # 16 MB of half precision at 1024 dimensions
-# Dimensions and kinds of values of each field of a stored prediction; see Instances, Partition and DenseFeatures.
+# Dimensions and kinds of values of each field of a stored prediction, in the order of the file.
 FIELDS = {
     "points": (2, "f"),
     "indptr": (1, "i"),
     "indices": (1, "i"),
     "scores": (1, "f"),
+    "instance": (1, "i"),
     "features": (2, "f"),
     "labels": (1, "U"),
     "names": (1, "U"),
@@ -30,17 +31,20 @@ FIELDS = {
     "centroids": (2, "f"),
     "view_indptr": (1, "i"),
     "views": (2, "i"),
+    "ids": (1, "i"),
     "view_names": (1, "U"),
     "view_scores": (1, "f"),
-    "ids": (1, "i"),
-    "instance": (1, "i"),
 }
+
+
+def _fields_of(kind: type[Prediction]) -> list[str]:
+    return [name for name in FIELDS if name in kind.__dataclass_fields__]
 
 
 def prediction_arrays(prediction: Prediction) -> dict[str, NDArray[Any]]:
     """A prediction as named arrays, ``kind`` among them; absent fields are left out."""
     arrays = {"kind": np.array(type(prediction).__name__)}
-    for name in prediction.__dataclass_fields__:
+    for name in _fields_of(type(prediction)):
         value = getattr(prediction, name)
         if value is not None:
             arrays[name] = np.array(value, dtype=np.str_) if isinstance(value, tuple) else value
@@ -59,7 +63,7 @@ def prediction_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Pr
             shape = f"of shape {array.shape} {array.dtype.name}"
             raise PredictionError(f"{where}: '{name}' is an array {shape}; run the scene again")
     values: dict[str, Any] = {}
-    for name in kind.__dataclass_fields__:
+    for name in _fields_of(kind):
         value = arrays.get(name)
         values[name] = tuple(str(item) for item in value) if value is not None and value.dtype.kind == "U" else value
     optional = {"features", "labels", "view_names", "view_scores"}

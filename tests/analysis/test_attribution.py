@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from su3d_bench.core.types import Int32Array, Int64Array
+from su3d_bench.core.types import Int32Array, Int64Array, Masks
 from su3d_bench.metrics.attribution import masks as attribution
 from su3d_bench.metrics.attribution.masks import KINDS, LabelledMasks, ScoringRules, mend_scene
 from su3d_bench.metrics.instance import average_precision as instance_ap
@@ -36,7 +36,7 @@ def perfect() -> tuple[list[Int32Array], list[int], list[float]]:
 
 
 def labelled(masks: list[Int32Array], classes: list[int], scores: list[float]) -> LabelledMasks:
-    return LabelledMasks(tuple(np.unique(mask) for mask in masks), np.array(classes), np.array(scores))
+    return LabelledMasks(Masks.of_sets([np.unique(mask) for mask in masks]), np.array(classes), np.array(scores))
 
 
 def gains(masks: list[Int32Array], classes: list[int], scores: list[float]) -> tuple[dict[str, float], dict[str, int]]:
@@ -106,7 +106,7 @@ def test_a_merge_across_classes_is_a_merge_and_no_wrong_label() -> None:
 
 def test_a_small_thing_swallowed_by_a_mask_that_fits_a_large_one_is_merged() -> None:
     values = np.concatenate([np.full(2000, 3001), np.full(120, 4002)])
-    both = LabelledMasks((np.arange(2120, dtype=np.int32),), np.array([3]), np.ones(1))
+    both = LabelledMasks(Masks.of_sets([np.arange(2120)]), np.array([3]), np.ones(1))
     mended = mend_scene(values, both, ScoringRules((3, 4)))
     assert mended.n == dict.fromkeys(KINDS, 0) | {"merged": 1}
     assert instance_ap.combine([mended.as_is]).ap50 == 0.5
@@ -195,7 +195,7 @@ def predictions(draw: st.DrawFn) -> LabelledMasks:
     masks = [np.arange(start, min(1500, start + draw(st.integers(20, 700)))) for start in starts]
     classes = [draw(st.sampled_from([0, 3, 4, 5])) for _ in range(n)]
     scores = [draw(st.sampled_from([0.2, 0.5, 0.5, 0.9])) for _ in range(n)]
-    return LabelledMasks(tuple(m.astype(np.int32) for m in masks), np.array(classes, np.int64), np.array(scores))
+    return LabelledMasks(Masks.of_sets(masks), np.array(classes, np.int64), np.array(scores))
 
 
 @settings(max_examples=150, deadline=None)
@@ -215,7 +215,7 @@ def test_single_mendings_never_lower_ap50_and_change_nothing_where_there_is_no_e
 def test_the_order_of_the_masks_changes_no_number_of_errors(predicted: LabelledMasks) -> None:
     order = np.argsort(np.random.default_rng(1).random(len(predicted.masks)))
     shuffled = LabelledMasks(
-        tuple(predicted.masks[k] for k in order), predicted.class_ids[order], predicted.scores[order]
+        Masks.of_sets([predicted.masks.mask(k) for k in order]), predicted.class_ids[order], predicted.scores[order]
     )
     first, second = (mend_scene(truth(), one, RULES) for one in (predicted, shuffled))
     assert first.n == second.n

@@ -26,7 +26,8 @@ from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Instances, Surface
 from su3d_bench.datasets.replica.mesh_truth import read_surface
 from su3d_bench.datasets.rgbd.dataset import Rgbd
-from su3d_bench.predictions.base import VertexLabels, VertexMasks
+from su3d_bench.predictions.base import VertexLabels
+from su3d_bench.predictions.mask_arrays import vertex_masks
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.feeding import no_detections
 
@@ -142,8 +143,7 @@ def test_labels_of_vertices_become_one_mask_a_class_and_none_where_there_is_no_c
 
 
 def test_class_numbers_that_two_lists_read_differently_ask_for_a_protocol() -> None:
-    none = np.zeros(0, np.int32)
-    content = VertexMasks(5, np.zeros(2, np.int64), none, np.ones(1), np.array([3], np.int32), "id", None, ("m",))
+    content = vertex_masks("m", [np.zeros(0, np.int32)], 5, class_numbers=np.array([3], np.int32))
     with pytest.raises(PredictionError, match="whose are its class numbers"):
         class_names(content, "scannet", None)
     assert class_names(content, "scannet", "scannet-instance").by_id[3] == "cabinet"

@@ -27,11 +27,11 @@ from prediction_files import (
 )
 
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError
+from su3d_bench.core.types import Masks
 from su3d_bench.evaluation.evaluate import Request, evaluate
 from su3d_bench.evaluation.scenes import Source, match_scenes
 from su3d_bench.metrics.instance.average_precision import THRESHOLDS, combine, per_scene
 from su3d_bench.metrics.instance.score import every_class_counts
-from su3d_bench.metrics.matching.nearest import Masks
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.predictions.formats import READERS
 

@@ -14,10 +14,10 @@ from prediction_files import (
 )
 
 from su3d_bench.core.errors import DataError, PredictionError
+from su3d_bench.core.types import Masks
 from su3d_bench.evaluation.checks import check_cloud, mask_facts
 from su3d_bench.evaluation.texts import read_text_features
 from su3d_bench.evaluation.truth import read_text_truth
-from su3d_bench.metrics.matching.nearest import Masks
 
 # ---- checks
 

@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from su3d_bench.core.types import Masks
 from su3d_bench.metrics.instance import score as score_instances
 from su3d_bench.metrics.matching import votes as neighbours
-from su3d_bench.metrics.matching.nearest import Masks
 from su3d_bench.metrics.matching.votes import transfer_each_mask, transfer_votes
 from su3d_bench.metrics.open_vocabulary import object_means, openlex3d, query_ap
 from su3d_bench.metrics.open_vocabulary import score as score_open_vocabulary

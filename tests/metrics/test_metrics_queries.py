@@ -14,11 +14,10 @@ from open_scene import ENCODER, OBJECTS, WordEncoder, instances_with, nothing_at
 from places import CASES
 
 from su3d_bench.core.errors import DataError, PredictionError
-from su3d_bench.core.types import DenseFeatures, Instances
+from su3d_bench.core.types import DenseFeatures, Instances, Masks
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.precision_recall import average_precision
-from su3d_bench.metrics.matching.nearest import Masks
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery, confidences, per_scene
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import combine, pack_scores, score_scene, unpack_scores

@@ -24,7 +24,7 @@ from su3d_bench.metrics.questions.truths import AskedText, GivenAnswer, Reasonin
 from su3d_bench.metrics.results.results import metric_values
 from su3d_bench.metrics.scoring import combine, pack_scores, score_scene, unpack_scores
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
-from su3d_bench.predictions.base import VertexMasks
+from su3d_bench.predictions.mask_arrays import vertex_masks
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.runs.plan import protocols_of_run
 
@@ -231,5 +231,5 @@ def test_predictions_from_elsewhere_are_scored_as_a_run_is() -> None:
     assert isinstance(outcome.score.counts, ShareCounts)
     assert isinstance(score.counts, ShareCounts)
     assert outcome.score.counts.n_right.tolist() == score.counts.n_right.tolist()
-    masks = VertexMasks(None, np.zeros(1, np.int64), np.zeros(0, np.int32), np.zeros(0), None, "id", None, ())
+    masks = vertex_masks("none", [], None)
     assert "needs a map with points of its own" in str(why_not_lex_content(rules, masks))

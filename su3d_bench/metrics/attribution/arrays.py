@@ -42,13 +42,13 @@ def scored_masks(
     """The truth (N,) as label * 1000 + instance, and the masks on its points, under a protocol of kind ``instance``."""
     assert rules.min_region_size is not None
     values, scored_ids, labels = truth_and_labels(rules, truth, prediction, encoder)
-    masks, scores = masks_and_scores(prediction, len(labels))
+    masks, scores = masks_and_scores(prediction)
     moved = transfer.transfer_masks(
         prediction.points, masks, truth.points, rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
     )
     scores = np.ones(len(scores)) if rules.confidence == "ones" else scores
     scoring = ScoringRules(tuple(scored_ids), rules.min_region_size, rules.thresholds)
-    return values, LabelledMasks.of(moved, labels.astype(np.int64), scores), scoring
+    return values, LabelledMasks(moved, labels.astype(np.int64), scores), scoring
 
 
 @dataclass(frozen=True)

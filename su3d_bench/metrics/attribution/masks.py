@@ -41,7 +41,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array
+from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array, Masks
 from su3d_bench.metrics.attribution.overlaps import HALF, LabelledMasks, Overlaps, ScoringRules, measure_overlaps
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
@@ -100,12 +100,10 @@ def with_true_labels(overlaps: Overlaps) -> LabelledMasks:
 
 def count_masks(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules) -> InstanceCounts:
     """The additive counts of one scene, as the evaluator has them."""
-    indptr = np.cumsum([0, *(len(mask) for mask in predicted.masks)])
-    indices = np.concatenate([np.zeros(0, np.int32), *predicted.masks])
     return instance_ap.per_scene(
         truth,
-        indptr,
-        indices,
+        predicted.masks.indptr,
+        predicted.masks.indices,
         predicted.class_ids,
         predicted.scores,
         rules.class_ids,
@@ -118,7 +116,7 @@ def _mend_merged(overlaps: Overlaps) -> Mending:
     predicted = overlaps.predicted
     merged = np.flatnonzero(overlaps.is_merged)
     is_found = [overlaps.is_found(g) for g in range(overlaps.n_instances)]
-    masks, class_ids, scores = list(predicted.masks), predicted.class_ids.tolist(), predicted.scores.tolist()
+    masks, class_ids, scores = predicted.masks.sets(), predicted.class_ids.tolist(), predicted.scores.tolist()
     is_kept = np.ones(len(masks), bool)
     for k in merged[np.argsort(-predicted.scores[merged], kind="stable")].tolist():
         home = int(overlaps.shared[k].argmax())
@@ -127,7 +125,7 @@ def _mend_merged(overlaps: Overlaps) -> Mending:
             masks[k] = np.setdiff1d(masks[k], overlaps.members[g], assume_unique=True)
             if not is_found[g]:
                 is_found[g] = True
-                masks.append(np.intersect1d(predicted.masks[k], overlaps.members[g], assume_unique=True))
+                masks.append(np.intersect1d(predicted.masks.mask(k), overlaps.members[g], assume_unique=True))
                 class_ids.append(int(overlaps.class_of_instance[g]))
                 scores.append(scores[k])
         if overlaps.finds(k, home):
@@ -143,14 +141,14 @@ def _mend_merged(overlaps: Overlaps) -> Mending:
 
 def _mend_split(overlaps: Overlaps) -> Mending:
     predicted = overlaps.predicted
-    masks, scores, is_kept = list(predicted.masks), predicted.scores.copy(), np.ones(len(predicted.masks), bool)
+    masks, scores, is_kept = predicted.masks.sets(), predicted.scores.copy(), np.ones(len(predicted.masks), bool)
     class_ids = predicted.class_ids.copy()
     split = [g for g in range(overlaps.n_instances) if overlaps.is_split(g)]
     for g in split:
         members = np.array(overlaps.parts[g].parts)
         has_class = predicted.class_ids[members] == overlaps.class_of_instance[g]
         first = int(members[0])
-        masks[first] = np.unique(np.concatenate([predicted.masks[k] for k in members]))
+        masks[first] = np.unique(np.concatenate([predicted.masks.mask(k) for k in members]))
         scores[first] = predicted.scores[members[has_class]].max()
         class_ids[first] = overlaps.class_of_instance[g]
         is_kept[members[1:]] = False
@@ -168,7 +166,7 @@ def _mend_duplicate(overlaps: Overlaps) -> Mending:
             first = parts.parts[0]
             if predicted.class_ids[k] == predicted.class_ids[first]:
                 scores[first] = max(scores[first], predicted.scores[k])
-    return _kept(list(predicted.masks), predicted.class_ids, scores, is_kept), int((~is_kept).sum())
+    return _kept(predicted.masks.sets(), predicted.class_ids, scores, is_kept), int((~is_kept).sum())
 
 
 def _mend_mislabelled(overlaps: Overlaps) -> Mending:
@@ -184,7 +182,7 @@ def _mend_background(overlaps: Overlaps) -> Mending:
     predicted = overlaps.predicted
     belongs = (overlaps.inside > HALF).any(axis=1) | (overlaps.cover > HALF).any(axis=1)
     is_wrong = overlaps.is_counted & ~overlaps.is_ignored & ~belongs
-    return _kept(list(predicted.masks), predicted.class_ids, predicted.scores, ~is_wrong), int(is_wrong.sum())
+    return _kept(predicted.masks.sets(), predicted.class_ids, predicted.scores, ~is_wrong), int(is_wrong.sum())
 
 
 def _mend_missed(overlaps: Overlaps) -> Mending:
@@ -195,7 +193,7 @@ def _mend_missed(overlaps: Overlaps) -> Mending:
     best = float(predicted.scores.max()) if len(predicted.scores) else 1.0
     return (
         LabelledMasks(
-            (*predicted.masks, *(overlaps.members[g] for g in missed)),
+            Masks.of_sets([*predicted.masks.sets(), *(overlaps.members[g] for g in missed)]),
             np.concatenate([predicted.class_ids, overlaps.class_of_instance[missed]]),
             np.concatenate([predicted.scores, np.full(len(missed), best)]),
         ),
@@ -215,4 +213,4 @@ _MENDINGS: dict[str, Callable[[Overlaps], Mending]] = {
 
 def _kept(masks: list[Int32Array], class_ids: Int64Array, scores: Float64Array, is_kept: BoolArray) -> LabelledMasks:
     kept = np.flatnonzero(is_kept)
-    return LabelledMasks(tuple(masks[k] for k in kept), class_ids[kept], scores[kept])
+    return LabelledMasks(Masks.of_sets([masks[k] for k in kept]), class_ids[kept], scores[kept])

@@ -7,26 +7,20 @@ from functools import cached_property
 
 import numpy as np
 
-from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array
+from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array, Masks
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
-from su3d_bench.metrics.matching.nearest import Masks
 
 HALF = 0.5  # of a mask or an instance; also the IoU above which a mask can match one instance only
 
 
 @dataclass(frozen=True)
 class LabelledMasks:
-    """K masks on the truth's points, each ascending, with a class id (0 for none that is scored) and a confidence."""
+    """K masks on the truth's points, with a class id (0 for none that is scored) and a confidence each."""
 
-    masks: tuple[Int32Array, ...]
+    masks: Masks
     class_ids: Int64Array
     scores: Float64Array
-
-    @classmethod
-    def of(cls, masks: Masks, class_ids: Int64Array, scores: Float64Array) -> LabelledMasks:
-        """The masks of a CSR list."""
-        return cls(tuple(np.split(masks.indices, masks.indptr[1:-1])) if len(masks) else (), class_ids, scores)
 
 
 @dataclass(frozen=True)
@@ -96,7 +90,7 @@ class Overlaps:
         if self.iou[parts[0], g] <= HALF:
             distinct = np.unique(labels)
             label = distinct[np.argmax([self.shared[members[labels == each], g].sum() for each in distinct])]
-        union = np.unique(np.concatenate([self.predicted.masks[k] for k in parts]))
+        union = np.unique(np.concatenate([self.predicted.masks.mask(k) for k in parts]))
         n_common = len(np.intersect1d(union, self.members[g], assume_unique=True))
         matches = n_common > HALF * (len(union) + len(self.members[g]) - n_common)
         return bool(matches and label == self.class_of_instance[g])
@@ -106,10 +100,10 @@ class Overlaps:
         order = sorted(inside, key=lambda k: self._rank(k, g))
         parts, duplicates = order[:1], []
         size = len(self.members[g])
-        union = self.predicted.masks[order[0]] if order else np.zeros(0, np.int32)
+        union = self.predicted.masks.mask(order[0]) if order else np.zeros(0, np.int32)
         n_common = int(self.shared[order[0], g]) if order else 0
         for k in order[1:]:
-            mask = self.predicted.masks[k]
+            mask = self.predicted.masks.mask(k)
             joined = np.union1d(union, mask)
             n_repeated = len(union) + len(mask) - len(joined)
             if 2 * n_repeated >= len(mask):
@@ -134,10 +128,8 @@ def measure_overlaps(truth: Int64Array, predicted: LabelledMasks, rules: Scoring
     is_instance = np.isin(values // INSTANCES_PER_CLASS, rules.class_ids) & (sizes >= rules.min_region_size)
     instances = np.flatnonzero(is_instance)
     class_of_instance = (values[instances] // INSTANCES_PER_CLASS).astype(np.int64)
-    size = np.array([len(mask) for mask in predicted.masks], np.int64)
-    indptr = np.cumsum([0, *size])
-    indices = np.concatenate([np.zeros(0, np.int32), *predicted.masks])
-    shared = instance_ap.intersections(segment_of_point, len(values), indptr, indices, np.arange(len(size)))
+    masks, size = predicted.masks, predicted.masks.sizes
+    shared = instance_ap.intersections(segment_of_point, len(values), masks.indptr, masks.indices, np.arange(len(size)))
     n_ignored = shared[:, ~is_instance].sum(axis=1)
     shared = shared[:, instances]
     size_of_instance = sizes[instances][None, :]

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Instances, Int64Array, Partition
+from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Instances, Int64Array, Masks, Partition
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import (
     INSTANCES_PER_CLASS,
@@ -28,7 +28,6 @@ from su3d_bench.metrics.matching.labelling import (
     encoder_warning,
     scored_classes,
 )
-from su3d_bench.metrics.matching.nearest import Masks
 from su3d_bench.metrics.protocols import ProtocolRules, TransferRules
 from su3d_bench.metrics.results.results import Counts
 from su3d_bench.metrics.scene_score import SceneScore, n_predictions, present
@@ -47,7 +46,7 @@ def score_instances(
     if truth.evaluation_points is not None:
         raise DataError(f"{rules.name}: the truth '{truth.variant}' has no instances on its evaluation points")
     values, scored_ids, labels = truth_and_labels(rules, truth, prediction, encoder)
-    masks, scores = masks_and_scores(prediction, len(labels))
+    masks, scores = masks_and_scores(prediction)
     moved = transfer.transfer_masks(
         prediction.points, masks, truth.points, rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
     )
@@ -83,11 +82,12 @@ def truth_and_labels(
     return values, scored_ids, np.where(classes >= 0, ids[classes], 0)
 
 
-def masks_and_scores(prediction: Instances | Partition, n_masks: int) -> tuple[transfer.Masks, Float64Array]:
+def masks_and_scores(prediction: Instances | Partition) -> tuple[Masks, Float64Array]:
     """The masks on the prediction's own points and their confidences, 1 for those of a partition."""
+    masks = transfer.masks_of(prediction)
     if isinstance(prediction, Instances):
-        return transfer.masks_of(prediction), np.asarray(prediction.scores, np.float64)
-    return transfer.masks_of_partition(prediction.instance, n_masks), np.ones(n_masks)
+        return masks, np.asarray(prediction.scores, np.float64)
+    return masks, np.ones(len(masks))
 
 
 def encode_without_classes(
@@ -118,7 +118,7 @@ def score_of_masks(
     rules: ProtocolRules,
     counts: Counts,
     prediction: Instances | Partition,
-    masks: transfer.Masks,
+    masks: Masks,
     targets: transfer.Points,
     wanted: BoolArray,
     warnings: Sequence[str],
@@ -140,13 +140,13 @@ def score_of_masks(
 
 
 def _instance_warnings(
-    rules: ProtocolRules, truth: GroundTruth, moved: transfer.Masks, scores: Float64Array, encoder: str | None
+    rules: ProtocolRules, truth: GroundTruth, moved: Masks, scores: Float64Array, encoder: str | None
 ) -> tuple[str, ...]:
     assert rules.min_region_size is not None
     warnings = [encoder] if encoder else []
     if rules.confidence == "prediction" and len(scores) > 1 and (scores == scores[0]).all():
         warnings.append(f"every confidence is {scores[0]:g}: AP of a class is then recall (1 + precision) / 2")
-    large = np.flatnonzero(np.diff(moved.indptr) >= rules.min_region_size)
+    large = np.flatnonzero(moved.sizes >= rules.min_region_size)
     pairs = transfer.duplicate_pairs(transfer.select(moved, large), len(truth.points), DUPLICATE_IOU)
     if pairs:
         first, second = large[list(pairs[0])]
@@ -185,10 +185,7 @@ class Covered:
 
 def covered_objects(rules: TransferRules, truth: GroundTruth, prediction: Instances | Partition) -> Covered:
     """What each instance, or row of features, covers of the truth's objects."""
-    if isinstance(prediction, Instances):
-        masks = transfer.masks_of(prediction)
-    else:
-        masks = transfer.masks_of_partition(prediction.instance, len(prediction.features))
+    masks = transfer.masks_of(prediction)
     moved = transfer.transfer_masks(prediction.points, masks, truth.points, rules.cap_m, rules.evaluation_voxel_m)
     ids, column = np.unique(np.maximum(truth.instance, 0), return_inverse=True)
     shared = instance_ap.intersections(column, len(ids), moved.indptr, moved.indices, np.arange(len(masks)))
@@ -219,7 +216,7 @@ def every_class_counts(
     size_of_segment = n_of_value[distinct]
     row_of_value = np.zeros(len(n_of_value), np.int64)
     row_of_value[distinct] = np.arange(len(distinct))
-    size = np.diff(masks.indptr)
+    size = masks.sizes
     kept = np.flatnonzero(size >= min_region_size)
     shared = intersections(row_of_value[values], len(distinct), masks.indptr, masks.indices, kept)
     label_of_segment = distinct // INSTANCES_PER_CLASS

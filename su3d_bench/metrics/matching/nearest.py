@@ -2,32 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Instances, Int32Array, Int64Array
+from su3d_bench.core.types import (
+    BoolArray,
+    Float32Array,
+    Float64Array,
+    Instances,
+    Int64Array,
+    IntArray,
+    Masks,
+    Partition,
+    starts_of,
+)
 from su3d_bench.numerics.geometry import voxel_coordinates
 
-IntArray = NDArray[np.integer[Any]]
 Points = Float32Array | Float64Array
 
 COVERAGE_RADII_M = (0.025, 0.05, 0.1)
 _MAX_NEIGHBOURS = 4_000_000  # candidates held at once while ties are broken
 WORTH_ORDERING = 100_000  # points, below which sorting takes longer than it saves
-
-
-@dataclass(frozen=True)
-class Masks:
-    """K sets of points in CSR form: set k is ``indices[indptr[k]:indptr[k + 1]]``, ascending."""
-
-    indptr: Int64Array
-    indices: Int32Array
-
-    def __len__(self) -> int:
-        return len(self.indptr) - 1
 
 
 def nearest(candidates: Points, queries: Points, cap_m: float = np.inf) -> tuple[Float64Array, Int64Array]:
@@ -119,7 +115,7 @@ def reduce_to_voxels(points: Points, masks: Masks, voxel_m: float) -> Int64Array
     background[masks.indices] = False
     outside = np.flatnonzero(background)
     members = np.concatenate([masks.indices.astype(np.int64), outside])
-    owner = np.concatenate([owners(masks), np.full(len(outside), len(masks), np.int64)])
+    owner = np.concatenate([masks.owners, np.full(len(outside), len(masks), np.int64)])
     _, first = np.unique(owner * n_voxels + voxel[members], return_index=True)
     return np.unique(members[first])
 
@@ -133,11 +129,6 @@ def row_ids(rows: Int64Array | Float64Array) -> Int64Array:
     ids = np.empty(len(rows), np.int64)
     ids[order] = np.concatenate([[0], np.cumsum(is_new)])
     return ids
-
-
-def owners(masks: Masks) -> Int64Array:
-    """The mask of each entry of ``masks.indices``."""
-    return np.repeat(np.arange(len(masks)), np.diff(masks.indptr))
 
 
 def transfer_masks(
@@ -176,7 +167,7 @@ def first_owner(masks: Masks, n_points: int) -> Int64Array:
     [0, 0, 1, -1]
     """
     owner = np.full(n_points, -1, np.int64)
-    owner[masks.indices[::-1]] = owners(masks)[::-1]
+    owner[masks.indices[::-1]] = masks.owners[::-1]
     return owner
 
 
@@ -227,15 +218,10 @@ def duplicate_pairs(masks: Masks, n_points: int, iou: float) -> list[tuple[int, 
         (np.ones(len(masks.indices), np.int32), masks.indices, masks.indptr), shape=(len(masks), n_points)
     )
     shared = (member @ member.T).tocoo()
-    size = np.diff(masks.indptr)
+    size = masks.sizes
     union = size[shared.row] + size[shared.col] - shared.data
     found = (shared.row < shared.col) & (shared.data > iou * union)
     return sorted(zip(shared.row[found].tolist(), shared.col[found].tolist(), strict=True))
-
-
-def masks_of(instances: Instances) -> Masks:
-    """The masks of a map, in its order."""
-    return Masks(instances.indptr, instances.indices)
 
 
 def select(masks: Masks, keep: IntArray) -> Masks:
@@ -244,12 +230,14 @@ def select(masks: Masks, keep: IntArray) -> Masks:
     >>> select(Masks(np.array([0, 2, 3]), np.array([4, 5, 6])), np.array([1])).indices.tolist()
     [6]
     """
-    sizes = np.diff(masks.indptr)[keep]
-    indices = [masks.indices[masks.indptr[k] : masks.indptr[k + 1]] for k in keep]
-    return Masks(
-        np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64),
-        np.concatenate([masks.indices[:0], *indices]),
-    )
+    return Masks.of_sets([masks.mask(k) for k in keep.tolist()])
+
+
+def masks_of(prediction: Instances | Partition) -> Masks:
+    """The masks of a map on its own points, one a row of features of a partition."""
+    if isinstance(prediction, Instances):
+        return prediction
+    return masks_of_partition(prediction.instance, len(prediction.features))
 
 
 def masks_of_partition(instance: IntArray, n_instances: int) -> Masks:
@@ -262,4 +250,4 @@ def masks_of_partition(instance: IntArray, n_instances: int) -> Masks:
     order = np.argsort(instance, kind="stable")
     order = order[instance[order] >= 0]
     sizes = np.bincount(instance[order], minlength=n_instances)
-    return Masks(np.concatenate([[0], np.cumsum(sizes)]).astype(np.int64), order.astype(np.int32))
+    return Masks(starts_of(sizes), order.astype(np.int32))

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
-from su3d_bench.metrics.matching.nearest import Masks, Points, row_ids
+from su3d_bench.core.types import BoolArray, Float64Array, Int64Array, Masks
+from su3d_bench.metrics.matching.nearest import Points, row_ids
 
 _MAX_CELLS = 4_000_000  # neighbours held at once
 
@@ -131,7 +131,7 @@ def transfer_each_mask(points: Points, masks: Masks, targets: Points, cap_m: flo
     held = np.asarray(points, np.float64)
     reached = []
     for k in range(len(masks)):
-        own = held[masks.indices[masks.indptr[k] : masks.indptr[k + 1]]]
+        own = held[masks.mask(k)]
         reached.append(_within(own, places, along_x, x, cap_m) if len(own) else along_x[:0])
     indptr = np.concatenate([[0], np.cumsum([len(rows) for rows in reached])])
     indices = np.concatenate([along_x[:0], *reached])

@@ -12,10 +12,9 @@ from typing import Literal
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import Float32Array, Float64Array, Int64Array
+from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, Masks
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
-from su3d_bench.metrics.matching.nearest import Masks
 
 SPACE = "queries"
 _SMALLEST_RANGE = 1e-8  # openlex3d's floor of the range over which similarities are stretched
@@ -96,7 +95,7 @@ def per_scene(
     """
     ids, segment_of_point, size_of_object = np.unique(object_of_point, return_inverse=True, return_counts=True)
     n_masks = len(masks)
-    size = np.diff(masks.indptr)
+    size = masks.sizes
     shared = instance_ap.intersections(segment_of_point, len(ids), masks.indptr, masks.indices, np.arange(n_masks))
     iou = shared / (size_of_object[None, :] + size[:, None] - shared)
     column_of = {int(one): column for column, one in enumerate(ids) if one >= 0}

@@ -16,6 +16,7 @@ from su3d_bench.core.types import (
     Float64Array,
     Instances,
     Int64Array,
+    Masks,
     Partition,
     Prediction,
 )
@@ -79,7 +80,7 @@ def _units(prediction: Prediction, voxel_m: float) -> _Units:
     elif isinstance(prediction, Partition):
         unit = prediction.instance.astype(np.int64)
     else:
-        unit = transfer.first_owner(transfer.masks_of(prediction), len(prediction.points))
+        unit = transfer.first_owner(prediction, len(prediction.points))
     points, unit = np.asarray(prediction.points[unit >= 0], np.float64), unit[unit >= 0]
     if not len(points) or voxel_m <= 0:
         return _Units(points, unit)
@@ -209,10 +210,7 @@ def score_queries(
     """The additive counts of one scene: its masks ranked by their similarity to each text."""
     assert rules.min_region_size is not None
     assert rules.confidence in ("similarity", "similarity-min-max")
-    if isinstance(prediction, Instances):
-        masks = transfer.masks_of(prediction)
-    else:
-        masks = transfer.masks_of_partition(prediction.instance, len(prediction.features))
+    masks = transfer.masks_of(prediction)
     similarity = np.zeros((len(masks), len(truth.queries)))
     if len(masks) and truth.queries:
         features, known = _features(rules, prediction, encoder)
@@ -234,7 +232,7 @@ def score_queries(
     return score_of_masks(rules, counts, prediction, masks, truth.points, wanted, (told,) if told else ())
 
 
-def _moved(rules: ProtocolRules, points: Float32Array, masks: transfer.Masks, targets: Float32Array) -> transfer.Masks:
+def _moved(rules: ProtocolRules, points: Float32Array, masks: Masks, targets: Float32Array) -> Masks:
     cap_m = rules.transfer.cap_m
     if rules.transfer.candidates == "each-mask":
         assert cap_m is not None

@@ -181,9 +181,6 @@ def _scored(
     warnings: Sequence[str],
 ) -> SceneScore:
     """The score, with the coverage of the objects ``object_ids``, on which the counts rest."""
-    if isinstance(prediction, Instances):
-        masks = transfer.masks_of(prediction)
-    else:
-        masks = transfer.masks_of_partition(prediction.instance, len(prediction.features))
+    masks = transfer.masks_of(prediction)
     wanted = np.isin(truth.instance, np.array([*object_ids], np.int64))
     return score_of_masks(rules, counts, prediction, masks, truth.points, wanted, warnings)

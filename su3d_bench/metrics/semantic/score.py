@@ -97,8 +97,7 @@ def points_and_owners(prediction: Prediction) -> tuple[Int64Array, Int64Array]:
     if isinstance(prediction, Partition):
         point = np.flatnonzero(prediction.instance >= 0)
         return point, prediction.instance[point].astype(np.int64)
-    masks = transfer.masks_of(prediction)
-    return masks.indices.astype(np.int64), transfer.owners(masks)
+    return prediction.indices.astype(np.int64), prediction.owners
 
 
 def taking_part(rules: ProtocolRules, classes: Int64Array, is_scored: BoolArray) -> BoolArray:
@@ -122,7 +121,7 @@ def point_owners(prediction: Prediction, takes_part: BoolArray) -> tuple[Int64Ar
         owner[(owner >= 0) & ~takes_part[owner]] = -1
         return owner, owner
     kept = np.flatnonzero(takes_part)
-    first = transfer.first_owner(transfer.select(transfer.masks_of(prediction), kept), len(prediction.points))
+    first = transfer.first_owner(transfer.select(prediction, kept), len(prediction.points))
     owner = np.where(first >= 0, kept[first], -1) if len(kept) else first
     return owner, owner
 

@@ -197,20 +197,8 @@ OURS = (
 
 def own_instances() -> Instances:
     points = np.arange(18, dtype=np.float32).reshape(6, 3)
-    return Instances(
-        points,
-        np.array([0, 2, 5]),
-        np.array([0, 1, 2, 3, 5], np.int32),
-        np.array([0.5, 1.0]),
-        np.ones((2, 4), np.float32),
-        None,
-        ("a", "b"),
-        ("", ""),
-        np.zeros((2, 2, 3), np.float32),
-        np.zeros((2, 3), np.float32),
-        np.array([0, 0, 0]),
-        np.zeros((0, 2), np.int32),
-    )
+    masks = [np.array([0, 1]), np.array([2, 3, 5])]
+    return Instances.of(points, masks, np.array([0.5, 1.0]), np.ones((2, 4), np.float32), names=("a", "b"))
 
 
 def written_in(tmp_path: Path, format: str) -> Path:
