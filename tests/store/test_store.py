@@ -97,7 +97,7 @@ def test_a_prediction_comes_back_as_it_was(tmp_path: Path, prediction: Instances
 
 
 def test_an_empty_map_comes_back_empty(tmp_path: Path) -> None:
-    empty = Instances.of(np.zeros((0, 3), np.float32), [])
+    empty = Instances.of(np.zeros((0, 3), np.float32), [], labels=())
     write_prediction(tmp_path / "prediction.npz", empty)
     again = read_prediction(tmp_path / "prediction.npz")
     assert isinstance(again, Instances)

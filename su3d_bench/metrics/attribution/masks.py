@@ -66,7 +66,7 @@ def mend_scene(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules)
     """The counts of one scene with its errors mended; ``truth`` (N,) is label * 1000 + instance, 0 where void.
 
     >>> truth = np.repeat([3001, 3002], 200)
-    >>> both = LabelledMasks((np.arange(400, dtype=np.int32),), np.array([3]), np.ones(1))
+    >>> both = LabelledMasks(Masks.of_sets([np.arange(400)]), np.array([3]), np.ones(1))
     >>> mended = mend_scene(truth, both, ScoringRules((3,)))
     >>> [instance_ap.combine([counts]).ap50 for counts in (mended.as_is, mended.alone["merged"], mended.all)]
     [0.0, 1.0, 1.0]
