@@ -29,7 +29,7 @@ from su3d_bench.metrics.costs import (
 )
 from su3d_bench.numerics.statistics import Growth
 from su3d_bench.reports.pictures.timing import draw_update_cost
-from su3d_bench.reports.tables.run import aligned
+from su3d_bench.reports.tables.formats import aligned
 from su3d_bench.runs.finished import read_run, read_update_times
 
 HEAD = """# Performance

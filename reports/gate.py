@@ -8,7 +8,7 @@ from typing import Literal
 from xml.etree import ElementTree
 
 from su3d_bench.core.errors import printable
-from su3d_bench.reports.tables.run import NOT_MEASURED
+from su3d_bench.reports.tables.model import NOT_MEASURED
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.reports.tables.attribution import n_text
-from su3d_bench.reports.tables.comparison import signed
+from su3d_bench.reports.tables.model import signed
 from su3d_bench.store.atomic import make_folder, write_bytes
 
 DPI = 100

@@ -1,12 +1,12 @@
-"""What each kind of error costs, as tables, from the JSON form of an attribution: Markdown, plain text too."""
+"""What each kind of error costs, as tables, from the JSON form of an attribution."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from typing import Any
 
-from su3d_bench.reports.tables.comparison import signed
-from su3d_bench.reports.tables.run import aligned, percent
+from su3d_bench.core.errors import counted
+from su3d_bench.reports.tables.model import Prose, Table, percent, signed, text_table
 
 MEANINGS: dict[str, dict[str, str]] = {
     "instance": {
@@ -36,18 +36,18 @@ STAGES: dict[str, str] = {
 }
 
 
-def attribution_tables(attribution: Mapping[str, Any]) -> str:
+def attribution_tables(attribution: Mapping[str, Any]) -> list[Table | Prose]:
     """One table a protocol; gains are in percentage points, each for one kind of error mended alone."""
-    blocks = [f"{attribution['run']}: {attribution['method']}"]
-    blocks += [_protocol_block(one) for one in attribution["protocols"]]
-    blocks.append("\n".join(f"- {line}" for line in (SUM, *attribution["remarks"])))
-    return "\n\n".join(blocks) + "\n"
+    return [
+        Prose((f"{attribution['run']}: {attribution['method']}",)),
+        *map(_protocol_table, attribution["protocols"]),
+        Prose((SUM, *attribution["remarks"]), is_list=True),
+    ]
 
 
-def _protocol_block(one: Mapping[str, Any]) -> str:
+def _protocol_table(one: Mapping[str, Any]) -> Table:
     names, n_scored = list(one["values"]), one["n_scored"]
-    n = len(one["scenes"])
-    title = f"**{one['protocol']} (version {one['version']}): {n} scene{'s' if n != 1 else ''}**"
+    title = f"{one['protocol']} (version {one['version']}): {counted(len(one['scenes']), 'scene')}"
     header = ["", "errors" if n_scored is None else "points", *names, "what it is"]
     rows = [["as it is", "", *(percent(one["values"][name]) for name in names), ""]]
     for kind, cause in one["causes"].items():
@@ -57,7 +57,7 @@ def _protocol_block(one: Mapping[str, Any]) -> str:
     rows.append(["rest", "", *(signed(one["rest"][name]) for name in names), REST[one["kind"]]])
     for stage, values in one["stages"].items():
         rows.append([f"with true {stage}", "", *(percent(values[name]) for name in names), STAGES[stage]])
-    return "\n".join([title, "", *aligned([header, *rows])])
+    return text_table(one["protocol"], [header, *rows], heading=title)
 
 
 def n_text(n: int, n_scored: int | None) -> str:

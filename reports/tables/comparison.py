@@ -1,48 +1,45 @@
-"""The tables of a comparison, from the value of its JSON form: Markdown that reads well as plain text too."""
+"""The tables of a comparison, from the value of its JSON form."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from su3d_bench.reports.tables.run import NOT_MEASURED, aligned, percent
+from su3d_bench.core.errors import counted
+from su3d_bench.reports.tables.model import NOT_MEASURED, Prose, Table, bracketed, percent, signed, text_table
 
 MANY_CLASSES = "p of single classes are not corrected for the number of classes: a few are small by chance"
 
 
-def comparison_tables(comparison: Mapping[str, Any]) -> str:
-    """One table a protocol and pair of methods, with remarks beneath; numbers are percentages."""
-    blocks = [f"A: {comparison['left']}\nB: {comparison['right']}"]
-    blocks += [_protocol_block(one) for one in comparison["protocols"]]
-    if comparison["remarks"]:
-        blocks.append("\n".join(f"- {line}" for line in comparison["remarks"]))
-    return "\n\n".join(blocks) + "\n"
+def comparison_tables(comparison: Mapping[str, Any]) -> list[Table | Prose]:
+    """One table a protocol and pair of methods, and one of its classes; numbers are percentages."""
+    parts: list[Table | Prose] = [Prose((f"A: {comparison['left']}", f"B: {comparison['right']}"))]
+    for compared in comparison["protocols"]:
+        parts += _protocol_parts(compared)
+    return [*parts, *([Prose(tuple(comparison["remarks"]), is_list=True)] if comparison["remarks"] else [])]
 
 
-def _protocol_block(one: Mapping[str, Any]) -> str:
-    pair = one["left"] if one["left"] == one["right"] else f"{one['left']} (A), {one['right']} (B)"
-    n = len(one["scenes"])
-    title = f"**{one['protocol']} (version {one['version']}): {pair}, {n} scene{'s' if n != 1 else ''}**"
+def _protocol_parts(compared: Mapping[str, Any]) -> list[Table | Prose]:
+    left, right, name = compared["left"], compared["right"], compared["protocol"]
+    pair = left if left == right else f"{left} (A), {right} (B)"
+    title = f"{name} (version {compared['version']}): {pair}, {counted(len(compared['scenes']), 'scene')}"
     header = ["metric", "A", "B", "B - A", "mean over scenes", "p", "smallest p", "better / equal / worse"]
-    body = [[name, *_cells(value)] for name, value in one["metrics"].items()]
-    lines = [title, "", *aligned([header, *body])]
-    if one["classes"]:
-        rows = [
-            [name, column, *_cells(value)]
-            for name, columns in one["classes"].items()
-            for column, value in columns.items()
-            if any(value["per_scene"].values())
-        ]
-        lines += ["", *aligned([["class", *header], *rows])] if rows else []
-    notes = [*one["remarks"], *_notes(one)]
-    return "\n".join([*lines, *([""] if notes else []), *(f"- {line}" for line in notes)])
+    rows = [[metric, *_cells(value)] for metric, value in compared["metrics"].items()]
+    class_rows = [
+        [class_name, column, *_cells(value)]
+        for class_name, columns in compared["classes"].items()
+        for column, value in columns.items()
+        if any(value["per_scene"].values())
+    ]
+    parts: list[Table | Prose] = [text_table(f"{name}-{left}-{right}", [header, *rows], heading=title)]
+    if class_rows:
+        parts.append(text_table(f"{name}-{left}-{right}-classes", [["class", *header], *class_rows]))
+    notes = (*compared["remarks"], *_notes(compared))
+    return [*parts, *([Prose(notes, is_list=True)] if notes else [])]
 
 
 def _cells(value: Mapping[str, Any]) -> list[str]:
-    difference = signed(value["difference"])
-    if value["interval"] is not None:
-        low, high = value["interval"]
-        difference += f" [{signed(low)}, {signed(high)}]"
+    difference = f"{signed(value['difference'])} {bracketed(value['interval'], signed)}".rstrip()
     changes = list(value["per_scene"].values())
     counts = (sum(d > 0 for d in changes), sum(d == 0 for d in changes), sum(d < 0 for d in changes))
     return [
@@ -54,18 +51,6 @@ def _cells(value: Mapping[str, Any]) -> list[str]:
         _probability(value["smallest_p"]),
         " / ".join(map(str, counts)),
     ]
-
-
-def signed(value: float | None) -> str:
-    """A difference of fractions in percentage points, with its sign; ``-`` where there is none.
-
-    >>> signed(0.0123), signed(-0.00001), signed(None)
-    ('+1.2', '0.0', '-')
-    """
-    if value is None:
-        return NOT_MEASURED
-    text = f"{100 * value:+.1f}"
-    return "0.0" if float(text) == 0 else text
 
 
 def _probability(value: float | None) -> str:

@@ -1,15 +1,15 @@
-"""Tables as Markdown, CSV and HTML."""
+"""Tables, and what stands between them, as Markdown, CSV and HTML; ``FORMATS`` has LaTeX too."""
 
 from __future__ import annotations
 
 import csv
 import html
 import io
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from su3d_bench.core.errors import printable
-from su3d_bench.reports.tables.model import Cell, Table, blocks_of
-from su3d_bench.reports.tables.run import aligned
+from su3d_bench.reports.tables.latex import latex
+from su3d_bench.reports.tables.model import Cell, Prose, Table, blocks_of
 
 CSV_COLUMNS = (
     "table",
@@ -31,6 +31,7 @@ CSV_COLUMNS = (
 )
 # A spreadsheet takes what begins so for a formula; an apostrophe before it makes it text.
 FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
+MOST_OF_A_NOTE = 7_000  # characters: it may name every scene of a data set
 STYLE = (
     "body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:70rem;padding:0 1rem;color-scheme:light dark}"
     "table{border-collapse:collapse;margin:1rem 0}caption{text-align:left;padding:.3rem 0}"
@@ -40,33 +41,49 @@ STYLE = (
 )
 
 
-def markdown(tables: Sequence[Table]) -> str:
-    """All ``tables``, each with its caption above and its notes beneath; the best is between two asterisks a side."""
-    return "\n\n".join(_markdown(table) for table in tables) + "\n"
+def markdown(parts: Sequence[Table | Prose]) -> str:
+    """All ``parts``, each table with its caption above and its notes beneath; the best is in two asterisks a side."""
+    return "\n\n".join(_markdown(part) for part in parts) + "\n"
 
 
-def _markdown(table: Table) -> str:
-    rows = [[row.title, *(_marked(cell) for cell in row.cells)] for row in table.rows]
-    lines = aligned([[_pipes(text) for text in row] for row in [[table.head, *table.columns], *rows]]) if rows else []
-    notes = [f"- {_pipes(note)}" for note in table.notes]
-    return "\n\n".join("\n".join(part) for part in ([_pipes(table.caption)], lines, notes) if part)
+def _markdown(part: Table | Prose) -> str:
+    if isinstance(part, Prose):
+        return "\n".join(f"{'- ' if part.is_list else ''}{_pipes(line, MOST_OF_A_NOTE)}" for line in part.lines)
+    rows = [[row.title, *(_marked(cell) for cell in row.cells)] for row in part.rows]
+    lines = aligned([[_pipes(text) for text in row] for row in [[part.head, *part.columns], *rows]]) if rows else []
+    caption = _pipes(f"**{part.heading}**{part.caption}" if part.heading else part.caption)
+    notes = [f"- {_pipes(note, MOST_OF_A_NOTE)}" for note in part.notes]
+    return "\n\n".join(block for block in (caption, "\n".join(lines), "\n".join(notes)) if block)
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a Markdown table, the first row its header, with columns of one width."""
+    widths = [max(len(row[column]) for row in rows) for column in range(len(rows[0]))]
+    lines = [
+        "| " + " | ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)) + " |" for row in rows
+    ]
+    rule = "|" + "|".join("-" * (width + 2) for width in widths) + "|"
+    return [lines[0], rule, *lines[1:]]
 
 
 def _marked(cell: Cell) -> str:
     return f"**{cell.text}** {cell.beside}".rstrip() if cell.is_best else cell.whole
 
 
-def _pipes(text: str) -> str:
+def _pipes(text: str, most: int = 2000) -> str:
     """``text`` without what would end a cell or begin HTML."""
-    return printable(text, 2000).replace("|", "\\|").replace("<", "&lt;")
+    return printable(text, most).replace("|", "\\|").replace("<", "&lt;")
 
 
-def csv_text(tables: Sequence[Table]) -> str:
+def csv_text(parts: Sequence[Table | Prose]) -> str:
     """One line a cell, then one a note; measured values also in full precision, as fractions."""
     text = io.StringIO()
     writer = csv.DictWriter(text, CSV_COLUMNS, restval="", lineterminator="\n")
     writer.writeheader()
-    for table in tables:
+    for table in parts:
+        if isinstance(table, Prose):
+            writer.writerows({"kind": "note", "text": harmless(line)} for line in table.lines)
+            continue
         for row in table.rows:
             for column, cell in zip(table.columns, row.cells, strict=True):
                 values: dict[str, str | int | float] = {
@@ -101,9 +118,9 @@ def harmless(value: str | int | float) -> str | int | float:
     return f"'{line}" if line.startswith(FORMULA_STARTS) and line != "-" else line
 
 
-def html_page(tables: Sequence[Table]) -> str:
+def html_page(parts: Sequence[Table | Prose]) -> str:
     """A page of its own without scripts, for light and dark."""
-    body = "\n".join(_html(table) for table in tables)
+    body = "\n".join(_html(part) for part in parts)
     return (
         '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>su3d-bench tables</title>\n'
@@ -111,7 +128,9 @@ def html_page(tables: Sequence[Table]) -> str:
     )
 
 
-def _html(table: Table) -> str:
+def _html(table: Table | Prose) -> str:
+    if isinstance(table, Prose):
+        return _list(table.lines) if table.is_list else "<p>" + "<br>\n".join(map(_text, table.lines)) + "</p>"
     head = "".join(f'<th scope="col">{_text(name)}</th>' for name in (table.head, *table.columns))
     bodies = []
     for block in blocks_of(table.rows):
@@ -121,12 +140,16 @@ def _html(table: Table) -> str:
             kind = ' class="reported"' if row.is_reported else ""
             lines.append(f'<tr{kind}><th scope="row">{_text(row.title)}</th>{cells}</tr>')
         bodies.append("<tbody>" + "\n".join(lines) + "</tbody>")
-    notes = "".join(f"<li>{_text(note)}</li>" for note in table.notes)
+    caption = _text(table.heading + table.caption)
     return (
-        f'<section><div class="wide"><table><caption>{_text(table.caption)}</caption>\n<thead><tr>{head}</tr></thead>\n'
-        + "\n".join(bodies)
-        + f"</table></div>{f'<ul>{notes}</ul>' if notes else ''}</section>"
+        f'<section><div class="wide"><table><caption>{caption}</caption>\n'
+        f"<thead><tr>{head}</tr></thead>\n" + "\n".join(bodies) + f"</table></div>{_list(table.notes)}</section>"
     )
+
+
+def _list(lines: Sequence[str]) -> str:
+    items = "".join(f"<li>{_text(line)}</li>" for line in lines)
+    return f"<ul>{items}</ul>" if items else ""
 
 
 def _strong(cell: Cell) -> str:
@@ -135,3 +158,11 @@ def _strong(cell: Cell) -> str:
 
 def _text(text: str) -> str:
     return html.escape(printable(text, 2000))
+
+
+FORMATS: Mapping[str, Callable[[Sequence[Table | Prose]], str]] = {
+    "markdown": markdown,
+    "latex": latex,
+    "csv": csv_text,
+    "html": html_page,
+}

@@ -6,10 +6,19 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
-from su3d_bench.core.errors import ConfigError, printable
-from su3d_bench.reports.tables.comparison import signed
-from su3d_bench.reports.tables.model import NOT_MEASURED, Cell, Measured, Table, TableRow
-from su3d_bench.reports.tables.paper import Shown, percent, protocol_table, reported_rows
+from su3d_bench.core.errors import ConfigError, counted, printable
+from su3d_bench.reports.tables.model import (
+    NOT_MEASURED,
+    Cell,
+    Measured,
+    Table,
+    TableRow,
+    bracketed,
+    percent,
+    signed,
+    text_table,
+)
+from su3d_bench.reports.tables.paper import Shown, protocol_table, reported_rows
 from su3d_bench.reports.tables.published import Figure, PaperTable, published
 
 OWN_NAMES = {"merge-accuracy": "well-merged"}  # the paper's name: ours
@@ -174,7 +183,7 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
     judged = judged if people else f"no person judged; {scores['n_items']} items"
     return Table(
         name=f"{scores['kind']}-{dataset}",
-        caption=f"{subject} on {dataset}, {n_scenes} scene{'s' if n_scenes != 1 else ''}: {question}",
+        caption=f"{subject} on {dataset}, {counted(n_scenes, 'scene')}: {question}",
         head="method",
         columns=tuple(metrics),
         rows=tuple(rows),
@@ -193,22 +202,21 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
 def _accuracy(cell: Mapping[str, Any] | None) -> Cell:
     if cell is None or cell["value"] is None:
         return Cell(NOT_MEASURED)
-    return Cell(percent(cell["value"]), f"{_bracket(cell['interval'])}n={cell['n_items']}")
-
-
-def _bracket(interval: Sequence[float] | None) -> str:
-    return "" if interval is None else f"[{percent(interval[0])}, {percent(interval[1])}] "
+    return Cell(percent(cell["value"]), f"{bracketed(cell['interval'])} n={cell['n_items']}".lstrip())
 
 
 def _tests(tests: Sequence[Mapping[str, Any]]) -> Table:
     rows = []
     differing = [one for one in tests if one["n_differ"]]
     for one in differing[:SHOWN_TESTS]:
-        low_high = one["interval"]
-        beside = "" if low_high is None else f"[{signed(low_high[0])}, {signed(low_high[1])}]"
         texts = (one["metric"], str(one["n_items"]), str(one["n_differ"]))
         p = f"{one['p']:.3g}" if one["is_exact"] else f"about {one['p']:.2g}"
-        cells = (*map(Cell, texts), Cell(signed(one["difference"]), beside), Cell(p), Cell(f"{one['smallest_p']:.2g}"))
+        cells = (
+            *map(Cell, texts),
+            Cell(signed(one["difference"]), bracketed(one["interval"], signed)),
+            Cell(p),
+            Cell(f"{one['smallest_p']:.2g}"),
+        )
         rows.append(TableRow(f"{one['right']} - {one['left']} ({one['dataset']})", cells))
     n_same, n_more = len(tests) - len(differing), len(differing) - len(rows)
     return Table(
@@ -231,8 +239,7 @@ def _agreements(found: Sequence[Mapping[str, Any]]) -> Table:
     for one in found:
         of = one["agreement"]
         share = f"{of['n_equal']}/{of['n_items']}"
-        low_high = of["interval"]
-        beside = "" if low_high is None else f"[{low_high[0]:.2f}, {low_high[1]:.2f}]"
+        beside = bracketed(of["interval"], "{:.2f}".format)
         fleiss = f"(n={of['n_fleiss']}, {of['n_raters']} each)" if of["fleiss"] is not None else ""
         cells = (Cell(str(of["n_annotators"])), Cell(share), Cell(_coefficient(of["alpha"]), beside))
         rows.append(TableRow(one["ask"], (*cells, Cell(_coefficient(of["fleiss"]), fleiss))))
@@ -251,18 +258,13 @@ def _agreements(found: Sequence[Mapping[str, Any]]) -> Table:
 
 def _pairs(pairs: Sequence[tuple[str, Mapping[str, Any]]]) -> Table:
     rows = [
-        TableRow(
-            f"{pair['left']}, {pair['right']}",
-            (Cell(ask), Cell(f"{pair['n_equal']}/{pair['n']}"), Cell(_coefficient(pair["kappa"]))),
-        )
+        (f"{pair['left']}, {pair['right']}", ask, f"{pair['n_equal']}/{pair['n']}", _coefficient(pair["kappa"]))
         for ask, pair in pairs
     ]
-    return Table(
-        name="pairs",
+    return text_table(
+        "pairs",
+        [("annotators", "question", "equal", "Cohen's kappa"), *rows],
         caption="Agreement of each pair of annotators.",
-        head="annotators",
-        columns=("question", "equal", "Cohen's kappa"),
-        rows=tuple(rows),
         notes=("over the items that both judged; -: undefined, for want of items or of a second answer",),
     )
 
@@ -273,16 +275,15 @@ def _coefficient(value: float | None) -> str:
 
 def _confusion(one: Mapping[str, Any], rule: str) -> Table:
     columns = [k for k, _ in enumerate(one["choices"]) if any(row[k] for row in one["counts"])]
+    header = ["judgements", *(f"truth: {one['choices'][k]}" for k in columns)]
     rows = [
-        TableRow(f"people: {choice}", tuple(Cell(str(one["counts"][k][column])) for column in columns))
-        for k, choice in enumerate(one["choices"])
+        [f"people: {choice}", *(str(counts[k]) for k in columns)]
+        for choice, counts in zip(one["choices"], one["counts"], strict=True)
     ]
     share = f"{one['n_equal']} of {one['n']} judgements are those of the ground truth" if one["n"] else "none is clear"
-    return Table(
-        name=f"confusion-{one['ask']}",
+    return text_table(
+        f"confusion-{one['ask']}",
+        [header, *rows],
         caption=f"People against the ground truth: {one['ask']}.",
-        head="judgements",
-        columns=tuple(f"truth: {one['choices'][k]}" for k in columns),
-        rows=tuple(rows),
         notes=(f"{share}; Cohen's kappa {_coefficient(one['kappa'])}; truth: {rule}",),
     )

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from urllib.parse import quote, unquote
 
 from su3d_bench.core.errors import printable
-from su3d_bench.reports.tables.model import Cell, Interval, Origin, Table, TableRow, What, blocks_of
+from su3d_bench.reports.tables.model import Cell, Interval, Origin, Prose, Table, TableRow, What, blocks_of
 
 HEADER = "% made by su3d-bench report tables; needs \\usepackage{booktabs}; su3d-bench report verify checks it"
 _ESCAPES = {
@@ -80,9 +80,16 @@ def _letter(character: str) -> str:
     return f"U+{ord(character):04X}"
 
 
-def latex(tables: Sequence[Table]) -> str:
-    """All ``tables`` as floats of their own, several where one would be too high; notes beneath in small type."""
-    return "\n\n".join([HEADER, *(each for table in tables for each in _floats(table))]) + "\n"
+def latex(parts: Sequence[Table | Prose]) -> str:
+    """All tables as floats of their own, several where one would be too high; notes beneath in small type."""
+    blocks = [HEADER]
+    for part in parts:
+        blocks += [_paragraphs(part.lines)] if isinstance(part, Prose) else _floats(part)
+    return "\n\n".join(blocks) + "\n"
+
+
+def _paragraphs(lines: Sequence[str]) -> str:
+    return "\n".join(f"\\noindent {escape(line)}\\par" for line in lines)
 
 
 @dataclass(frozen=True)
@@ -142,11 +149,12 @@ def _floats(table: Table) -> Iterator[str]:
 
 def _float(table: Table, place: _Place, pieces: Sequence[_Piece], *, is_first: bool, is_last: bool) -> str:
     label = f"  \\label{{tab:{re.sub(r'[^A-Za-z0-9]+', '-', table.name).strip('-')}}}"
+    caption = table.heading + table.caption
     lines = [
         f"\\begin{{{place.kind}}}[t]",
         r"  \centering\hbadness=10000",  # a caption of few words in a narrow column
         *([] if is_first else [r"  \addtocounter{table}{-1}"]),
-        f"  \\caption{{{escape(table.caption if is_first else f'{table.caption} (continued)')}}}",
+        f"  \\caption{{{escape(caption if is_first else f'{caption} (continued)')}}}",
         *([label] if is_first else []),
         f"  {place.size}\\setlength{{\\tabcolsep}}{{{place.gap_pt}pt}}",
     ]

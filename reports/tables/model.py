@@ -1,14 +1,50 @@
-"""A table for a paper before it has a format: rows of cells that know the run or the print that they come from."""
+"""A table before it has a format: rows of cells that know the run or the print that they come from."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
 NOT_MEASURED = "-"
 Interval = tuple[float, float]
 What = Literal["value", "ceiling", "scenes"]
+
+
+def percent(value: float | None) -> str:
+    """A fraction in per cent with one decimal, as papers of this field print it; ``-`` where there is none."""
+    return NOT_MEASURED if value is None else f"{100.0 * value:.1f}"
+
+
+def signed(value: float | None) -> str:
+    """A difference of fractions in percentage points, with its sign; ``-`` where there is none.
+
+    >>> signed(0.0123), signed(-0.00001), signed(None)
+    ('+1.2', '0.0', '-')
+    """
+    if value is None:
+        return NOT_MEASURED
+    text = f"{100 * value:+.1f}"
+    return "0.0" if float(text) == 0 else text
+
+
+def bracketed(interval: Sequence[float] | None, show: Callable[[float], str] = percent) -> str:
+    """The ends of an interval as ``show`` has them; nothing where there is none.
+
+    >>> bracketed((0.1, 0.25)), bracketed(None)
+    ('[10.0, 25.0]', '')
+    """
+    return "" if interval is None else f"[{show(interval[0])}, {show(interval[1])}]"
+
+
+def with_interval(value: float | None, interval: Sequence[float] | None) -> str:
+    """A fraction in per cent, its interval behind it."""
+    return f"{percent(value)} {bracketed(interval)}".rstrip()
+
+
+def some(names: Sequence[str], most: int) -> str:
+    """The first ``most`` of ``names``, and how many more there are."""
+    return ", ".join(names[:most]) + (f" and {len(names) - most} more" if len(names) > most else "")
 
 
 def is_count(metric: str) -> bool:
@@ -65,7 +101,10 @@ class TableRow:
 
 @dataclass(frozen=True)
 class Table:
-    """``name`` is short and for references; ``head`` titles the first column, ``columns`` those of the cells."""
+    """``name`` is short and for references; ``head`` titles the first column, ``columns`` those of the cells.
+
+    ``heading`` begins the caption, and stands out where the format has bold type.
+    """
 
     name: str
     caption: str
@@ -73,6 +112,24 @@ class Table:
     columns: tuple[str, ...]
     rows: tuple[TableRow, ...]
     notes: tuple[str, ...]
+    heading: str = ""
+
+
+@dataclass(frozen=True)
+class Prose:
+    """What stands above, between or beneath tables: the lines of a paragraph, or of a list."""
+
+    lines: tuple[str, ...]
+    is_list: bool = False
+
+
+def text_table(
+    name: str, rows: Sequence[Sequence[str]], *, heading: str = "", caption: str = "", notes: Iterable[str] = ()
+) -> Table:
+    """A table of texts that stand for no number of a run alone; the first of ``rows`` is the header."""
+    (head, *columns), *body = rows
+    table_rows = tuple(TableRow(label, tuple(map(Cell, cells))) for label, *cells in body)
+    return Table(name, caption, head, tuple(columns), table_rows, tuple(notes), heading)
 
 
 def blocks_of(rows: Sequence[TableRow]) -> list[list[TableRow]]:

@@ -4,12 +4,24 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from su3d_bench.core.errors import ConfigError, printable, suggest
 from su3d_bench.numerics.statistics import SignFlipTest, sign_flip_test
-from su3d_bench.reports.tables.model import NOT_MEASURED, Cell, Measured, Origin, Table, TableRow, is_count
+from su3d_bench.reports.tables.model import (
+    NOT_MEASURED,
+    Cell,
+    Measured,
+    Origin,
+    Table,
+    TableRow,
+    bracketed,
+    is_count,
+    percent,
+    some,
+)
 from su3d_bench.reports.tables.published import Figure, PaperTable, published
 
 LEVEL = 0.05
@@ -161,7 +173,7 @@ def cells_of(row: Measured, shown: Shown, best: set[str]) -> list[Cell]:
     for name in shown.metrics:
         interval = row.intervals.get(name) if shown.intervals else None
         value = row.metrics[name]
-        beside = "" if interval is None else f"[{shown_as(name, interval[0])}, {shown_as(name, interval[1])}]"
+        beside = bracketed(interval, partial(shown_as, name))
         origin = None if value is None else _origin(row, name, value, interval=interval)
         cells.append(Cell(shown_as(name, value), beside, name in best, origin))
     for name in shown.metrics if shown.ceilings else ():
@@ -181,11 +193,6 @@ def _origin(row: Measured, metric: str, value: float, interval: tuple[float, flo
 def shown_as(metric: str, value: float | None) -> str:
     """``value`` as a table shows it: a share in per cent, a count as it is."""
     return percent(value) if value is None or not is_count(metric) else f"{value:.1f}".removesuffix(".0")
-
-
-def percent(value: float | None) -> str:
-    """A fraction in per cent with one decimal, as papers of this field print it."""
-    return NOT_MEASURED if value is None else f"{100.0 * value:.1f}"
 
 
 def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int]], str | None]:
@@ -234,9 +241,9 @@ def run_notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
         if row.limit:
             notes.setdefault(f"PARTIAL: only the first {row.limit} frames of each scene", []).append(label)
         if row.failed:
-            notes.setdefault(f"INCOMPLETE: failed on {_some(row.failed)}", []).append(label)
+            notes.setdefault(f"INCOMPLETE: failed on {some(row.failed, 4)}", []).append(label)
         if row.unscored:
-            notes.setdefault(f"unscored on {_some(row.unscored)}", []).append(label)
+            notes.setdefault(f"unscored on {some(row.unscored, 4)}", []).append(label)
         if row.caveat:
             notes.setdefault(row.caveat, []).append(label)
         if row.profile:
@@ -246,10 +253,6 @@ def run_notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
     return [
         f"{'all measured rows' if len(who) == everyone > 1 else ', '.join(who)}: {what}" for what, who in notes.items()
     ]
-
-
-def _some(scenes: Sequence[str]) -> str:
-    return ", ".join(scenes[:4]) + (f" and {len(scenes) - 4} more" if len(scenes) > 4 else "")
 
 
 def reported_rows(

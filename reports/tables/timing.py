@@ -7,9 +7,10 @@ import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
+from su3d_bench.core.errors import counted
 from su3d_bench.metrics.costs import MethodSummary, StageSummary
 from su3d_bench.numerics.statistics import Growth
-from su3d_bench.reports.tables.run import NOT_MEASURED, aligned, percent
+from su3d_bench.reports.tables.model import NOT_MEASURED, Prose, Table, percent, text_table
 
 MIB = 2**20
 CACHE = "cache"
@@ -27,24 +28,27 @@ class AnytimePoint:
     metrics: Mapping[str, float | None]
 
 
-def markdown(
+def timing_tables(
     summaries: Sequence[MethodSummary], anytime: Sequence[AnytimePoint], hardware: Mapping[str, str], camera_rate: float
-) -> str:
+) -> list[Table | Prose]:
     """All tables; ``hardware`` names the machine of each run, ``camera_rate`` is in frames a second."""
-    runs = list(dict.fromkeys(one.run for one in summaries))
-    blocks = [f"{run}: {hardware[run]}" for run in runs]
-    blocks.append("\n".join(aligned(list(_methods_table(summaries, camera_rate)))))
-    if any(stage.name == CACHE and stage.share > 0 for one in summaries for stage in one.stages):
-        blocks.append(
-            f"Stage {CACHE}: what perception found was read from disk there; the speeds are those of the rest."
+    runs = dict.fromkeys(summary.run for summary in summaries)
+    parts: list[Table | Prose] = [Prose((f"{run}: {hardware[run]}",)) for run in runs]
+    parts.append(text_table("timing", list(_methods_table(summaries, camera_rate))))
+    if any(stage.name == CACHE and stage.share > 0 for summary in summaries for stage in summary.stages):
+        parts.append(
+            Prose(
+                (f"Stage {CACHE}: what perception found was read from disk there; the speeds are those of the rest.",)
+            )
         )
-    for one in summaries:
-        blocks.append(f"**{one.method}**, ms per update ({_updates_text(one)})")
-        blocks.append("\n".join(aligned(list(_stages_table(one)))))
+    for summary in summaries:
+        updates = f"{summary.n_updates} updates of {counted(len(summary.scenes), 'scene')}"
+        caption = f", ms per update ({updates})"
+        name = f"timing-{summary.run}-{summary.method}"
+        parts.append(text_table(name, list(_stages_table(summary)), heading=summary.method, caption=caption))
     if anytime:
-        blocks.append("**Maps midway**")
-        blocks.append("\n".join(aligned(list(_anytime_table(anytime)))))
-    return "\n\n".join(blocks) + "\n"
+        parts.append(text_table("timing-midway", list(_anytime_table(anytime)), heading="Maps midway"))
+    return parts
 
 
 def csv_text(summaries: Sequence[MethodSummary], hardware: Mapping[str, str]) -> str:
@@ -128,11 +132,6 @@ def _anytime_table(points: Sequence[AnytimePoint]) -> Iterator[list[str]]:
     for one in points:
         values = [percent(one.metrics[name]) if name in one.metrics else "" for name in names]
         yield [one.run, one.method, one.protocol, f"{100 * one.share:g} %", f"{one.seconds:.1f}", *values]
-
-
-def _updates_text(summary: MethodSummary) -> str:
-    scenes = len(summary.scenes)
-    return f"{summary.n_updates} updates of {scenes} scene{'s' if scenes > 1 else ''}"
 
 
 def _ms(value: float) -> str:

@@ -9,13 +9,13 @@ from __future__ import annotations
 import os
 from collections import Counter
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
-from su3d_bench.core.errors import ConfigError, Su3dError, printable
+from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable
 from su3d_bench.metrics.protocols import load_protocol, protocol_names
 from su3d_bench.metrics.scoring import combine
-from su3d_bench.reports.tables.model import NOT_MEASURED, Cell, Origin, Table, TableRow
+from su3d_bench.reports.tables.model import NOT_MEASURED, Cell, Origin, Table, TableRow, bracketed, percent
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 MOST_RUNS = 10_000
@@ -175,9 +175,7 @@ def tables(found: Leaderboard, *, intervals: bool) -> list[Table]:
     notes = tuple(_left_out(found.refused))
     if not made:
         return [Table("leaderboard", "Leaderboard: no run may stand in a ranking.", "method", (), (), notes)]
-    last = made[-1]
-    made[-1] = Table(last.name, last.caption, last.head, last.columns, last.rows, (*last.notes, *notes))
-    return made
+    return [*made[:-1], replace(made[-1], notes=(*made[-1].notes, *notes))]
 
 
 def _left_out(refused: Sequence[Refused]) -> Iterator[str]:
@@ -195,14 +193,14 @@ def _table(board: Sequence[Entry], index: int, intervals: bool) -> Table:
     first = board[0]
     rivals = [one for one in board if not one.is_ceiling]
     best = [
-        max((f"{100 * value:.1f}" for one in rivals if (value := one.values[k]) is not None), key=float, default="")
+        max((percent(value) for one in rivals if (value := one.values[k]) is not None), key=float, default="")
         for k in range(len(first.headline))
     ]
     rows = []
     for one in board:
         cells = [_cell(one, k, best[k], intervals) for k in range(len(first.headline))]
         rows.append(TableRow(one.method, (*cells, Cell(one.profile), Cell(one.run)), group=str(one.is_ceiling)))
-    scenes = f"{len(first.scenes)} scene{'s' if len(first.scenes) > 1 else ''}"
+    scenes = counted(len(first.scenes), "scene")
     notes = [f"Scenes: {', '.join(first.scenes)}."]
     if any(one.is_ceiling for one in board):
         notes.append("Rows that were told the truth stand last and compete with none.")
@@ -220,7 +218,6 @@ def _cell(entry: Entry, k: int, best: str, intervals: bool) -> Cell:
     value, interval = entry.values[k], entry.intervals[k]
     if value is None:
         return Cell(NOT_MEASURED)
-    text = f"{100 * value:.1f}"
-    beside = f"[{100 * interval[0]:.1f}, {100 * interval[1]:.1f}]" if intervals and interval is not None else ""
+    text, beside = percent(value), bracketed(interval) if intervals else ""
     origin = Origin(entry.run, entry.method, entry.protocol, entry.version, entry.headline[k], "value", value, interval)
     return Cell(text, beside, is_best=text == best and not entry.is_ceiling, origin=origin)

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_json, remark
+from su3d_bench.cli.common import add_table_format, add_verb, answer, answer_json, formatted, remark
 from su3d_bench.cli.query import encoder_of
 from su3d_bench.core.errors import EXIT_DONE
 
@@ -36,6 +36,7 @@ def add_parser(verbs: Any) -> None:
         "--oracle", type=Path, metavar="RUN", help="the same run with --profile oracle: what perfect 2D masks give"
     )
     parser.add_argument("--out", type=Path, metavar="PNG", help="draw the plot to this file")
+    add_table_format(parser)
 
 
 def call(arguments: argparse.Namespace) -> int:
@@ -59,5 +60,5 @@ def call(arguments: argparse.Namespace) -> int:
     if arguments.json:
         answer_json(found)
     else:
-        answer(attribution_tables(found))
+        answer(formatted(attribution_tables(found), arguments))
     return EXIT_DONE

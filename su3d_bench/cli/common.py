@@ -5,18 +5,20 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+
+from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
 
 if TYPE_CHECKING:
     from su3d_bench.perception.language.client import ChatClient
     from su3d_bench.perception.language.config import LanguageConfig
+    from su3d_bench.reports.tables.model import Prose, Table
     from su3d_bench.store.run_folder import RunFolder
-from collections.abc import Iterator
-from contextlib import contextmanager
 
-from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
+TABLE_FORMATS = ("markdown", "latex", "csv", "html")
 
 
 def add_verb(
@@ -77,6 +79,20 @@ def add_whose_map(parser: argparse.ArgumentParser) -> None:
         "--run", type=Path, metavar="DIR", help="run folder (default: the latest in runs/ with the scene)"
     )
     parser.add_argument("--method", default="opensu3d", help="whose map (default: opensu3d)")
+
+
+def add_table_format(parser: argparse.ArgumentParser, flag: str = "--format") -> None:
+    """The form in which a verb gives its tables; the flag has another name where ``--format`` means the input's."""
+    parser.add_argument(
+        flag, dest="table_format", choices=TABLE_FORMATS, default="markdown", help="of tables (default: markdown)"
+    )
+
+
+def formatted(parts: Sequence[Table | Prose], arguments: argparse.Namespace) -> str:
+    """The tables in the form of ``add_table_format``."""
+    from su3d_bench.reports.tables.formats import FORMATS
+
+    return FORMATS[arguments.table_format](parts)
 
 
 def answer(text: str) -> None:

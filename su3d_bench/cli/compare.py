@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_json
+from su3d_bench.cli.common import add_table_format, add_verb, answer, answer_json, formatted
 from su3d_bench.core.errors import EXIT_DONE
 
 
@@ -32,6 +32,7 @@ def add_parser(verbs: Any) -> None:
         help="under these protocols alone (default: all that scored both)",
     )
     parser.add_argument("--per-class", action="store_true", help="each class too")
+    add_table_format(parser)
 
 
 def call(arguments: argparse.Namespace) -> int:
@@ -51,5 +52,5 @@ def call(arguments: argparse.Namespace) -> int:
     if arguments.json:
         answer_json(found)
     else:
-        answer(comparison_tables(found))
+        answer(formatted(comparison_tables(found), arguments))
     return EXIT_DONE

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_verb, answer, remark
+from su3d_bench.cli.common import add_table_format, add_verb, answer, formatted, remark
 from su3d_bench.core.errors import EXIT_DONE
 
 
@@ -68,6 +68,7 @@ def add_parser(verbs: Any) -> None:
         help="texts and the objects that they speak of, for query-ap: TOML or CSV with scene, text and objects",
     )
     parser.add_argument("--per-class", action="store_true", help="print the table of every class too")
+    add_table_format(parser, "--table-format")
 
 
 def call(arguments: argparse.Namespace) -> int:
@@ -75,7 +76,7 @@ def call(arguments: argparse.Namespace) -> int:
 
     limit_threads()  # before numerical libraries are loaded
     from su3d_bench.evaluation.evaluate import NOT_MEANT, Request, evaluate
-    from su3d_bench.reports.tables.evaluation import evaluation_text
+    from su3d_bench.reports.tables.evaluation import evaluation_tables
     from su3d_bench.store.atomic import make_folder, write_text
 
     result = evaluate(
@@ -95,7 +96,7 @@ def call(arguments: argparse.Namespace) -> int:
     if arguments.json is not None:
         make_folder(arguments.json.parent)
         write_text(arguments.json, json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
-    answer(evaluation_text(document, per_class=arguments.per_class))
+    answer(formatted(evaluation_tables(document, per_class=arguments.per_class), arguments))
     remark(f"format: {', '.join(result.formats)}; ground truth: {result.ground_truth}", quiet=arguments.quiet)
     for line in result.remarks:
         remark(line, quiet=arguments.quiet)

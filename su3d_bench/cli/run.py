@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_settings, add_verb, answer, answer_json, remark
+from su3d_bench.cli.common import add_settings, add_table_format, add_verb, answer, answer_json, formatted, remark
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE
 
 if TYPE_CHECKING:
@@ -90,6 +90,7 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
         help="run folder, or URL of one such as s3://bucket/run (default: runs/<name made from the request>)",
     )
     parser.add_argument("--dry-run", action="store_true", help="print what would be done, with a time estimate")
+    add_table_format(parser)
 
 
 def run_place(text: str) -> Path | str:
@@ -157,12 +158,12 @@ def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
 
 
 def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
-    from su3d_bench.reports.tables.run import markdown_table
+    from su3d_bench.reports.tables.run import run_tables
 
     if arguments.json:
         answer_json(result.metrics)
     else:
-        answer(markdown_table(result.metrics))
+        answer(formatted(run_tables(result.metrics), arguments))
     for line in result.remarks:
         remark(line, quiet=arguments.quiet)
     plan = result.plan

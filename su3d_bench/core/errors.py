@@ -25,6 +25,15 @@ def printable(text: str, limit: int = MESSAGE_CHARACTERS) -> str:
     return plain if len(plain) <= limit else plain[: limit - 3] + "..."
 
 
+def counted(n: int, noun: str) -> str:
+    """A number of things.
+
+    >>> counted(1, "scene"), counted(2, "scene")
+    ('1 scene', '2 scenes')
+    """
+    return f"{n} {noun}{'' if n == 1 else 's'}"
+
+
 def shown(path: Path) -> str:
     """A path as messages show it."""
     return printable(str(path), 300)

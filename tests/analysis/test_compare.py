@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from painted import colour_perception
 from places import SCENES
 
-import su3d_bench.reports.tables.comparison
+import su3d_bench.reports.tables.model
 from su3d_bench.analysis.comparison import compare
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, StoreError
@@ -28,6 +28,7 @@ from su3d_bench.metrics.results.results import metric_values, resampled_metrics
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.numerics.statistics import MAX_EXACT_PAIRS, SignFlipTest, resample_weights, sign_flip_test
 from su3d_bench.reports.tables.comparison import comparison_tables
+from su3d_bench.reports.tables.formats import markdown
 from su3d_bench.runs import scene as scene_run
 
 PAINTED = f"{SCENES}/painted.py:Painted"
@@ -222,7 +223,7 @@ def test_only_common_scenes_are_compared_and_said() -> None:
     assert found.metrics["AP"].interval is None
     assert found.metrics["AP"].test == SignFlipTest(1.0, 1.0, 1, True)
     assert "only the scenes in common are compared; a:collector alone has painted/a, painted/c" in found.remarks
-    text = comparison_tables(compare("a", "few").to_json())
+    text = markdown(comparison_tables(compare("a", "few").to_json()))
     assert "few:collector alone has painted/d" in text
     assert "a single scene says nothing of other scenes" in text
 
@@ -327,4 +328,4 @@ def test_the_command_refuses_in_one_line(capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_the_examples_in_the_docstrings_run() -> None:
-    assert doctest.testmod(su3d_bench.reports.tables.comparison).failed == 0
+    assert doctest.testmod(su3d_bench.reports.tables.model).failed == 0

@@ -15,6 +15,7 @@ from places import SCENES
 from su3d_bench.cli import query
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.core.errors import EXIT_INTERNAL
+from su3d_bench.reports.tables.formats import FORMATS
 from su3d_bench.runs import scene as scene_run
 
 PAINTED = f"{SCENES}/painted.py:Painted"
@@ -36,6 +37,22 @@ def _elsewhere(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def verbs() -> dict[str, argparse.ArgumentParser]:
     actions = build_parser()._actions
     return next(dict(action.choices) for action in actions if isinstance(action, argparse._SubParsersAction))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ("run",), ("ablate",), ("evaluate",), ("compare",), ("attribute",), ("report", "tables"), ("report", "timing"),
+        ("report", "leaderboard"), ("sheets", "score"),
+    ],
+)  # fmt: skip
+def test_every_verb_that_prints_tables_gives_them_in_every_format(words: tuple[str, ...]) -> None:
+    parser: argparse.ArgumentParser = build_parser()
+    for word in words:
+        groups = [action for action in parser._actions if isinstance(action, argparse._SubParsersAction)]
+        parser = groups[0].choices[word]
+    flag = next(action for action in parser._actions if action.dest == "table_format")
+    assert flag.choices == tuple(FORMATS)
 
 
 def examples(parser: argparse.ArgumentParser) -> list[str]:

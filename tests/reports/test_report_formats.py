@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 from measured_rows import measured, measured_instances
 
-from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
+from su3d_bench.reports.tables.formats import FORMATS, csv_text, html_page, markdown
 from su3d_bench.reports.tables.latex import escape, latex, origin_comment, printed_cells
-from su3d_bench.reports.tables.model import Cell, Origin, Table, TableRow
+from su3d_bench.reports.tables.model import Cell, Origin, Prose, Table, TableRow, text_table
 from su3d_bench.reports.tables.paper import Shown, SweepRow, ablation_table, paper_table, protocol_table
 from su3d_bench.reports.tables.published import Figure
 
@@ -185,3 +185,24 @@ def test_the_tables_compile_without_a_warning(tmp_path: Path) -> None:
         assert done.returncode == 0, done.stdout[-2000:]
     faults = re.findall(r".*(?:Warning|Overfull|Underfull).*", done.stdout)
     assert not faults, faults
+
+
+PARTS = (
+    Prose(("A: <b>", "B: run|2")),
+    text_table("t", [("metric", "A"), ("AP", "1.0")], heading="rules", caption=", 2 scenes", notes=("mind this",)),
+    Prose(("first", "second"), is_list=True),
+)
+
+
+def test_prose_and_headings_stand_between_tables_as_markdown_has_them() -> None:
+    assert markdown(PARTS) == (
+        "A: &lt;b>\nB: run\\|2\n\n**rules**, 2 scenes\n\n| metric | A   |\n|--------|-----|\n| AP     | 1.0 |\n\n"
+        "- mind this\n\n- first\n- second\n"
+    )
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_prose_stands_in_every_format_as_text(name: str) -> None:
+    text = FORMATS[name](PARTS)
+    assert text.index("run") < text.index("mind this") < text.index("second")
+    assert "<b>" not in text or name == "csv"

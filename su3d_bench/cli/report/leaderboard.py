@@ -6,11 +6,10 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_json, remark
+from su3d_bench.cli.common import add_table_format, add_verb, answer, answer_json, formatted, remark
 from su3d_bench.core.errors import EXIT_DONE
 
 NAME = "leaderboard"
-FORMATS = ("markdown", "latex", "csv", "html")
 
 
 def add_parser(actions: Any) -> None:
@@ -27,7 +26,7 @@ def add_parser(actions: Any) -> None:
     parser.add_argument("folder", type=Path, metavar="DIR", help="a folder with runs anywhere below it")
     parser.add_argument("--protocols", nargs="+", default=[], metavar="PROTOCOL", help="only these (default: all)")
     parser.add_argument("--intervals", action="store_true", help="show the 95 %% interval over scenes")
-    parser.add_argument("--format", choices=FORMATS, default="markdown", help="(default: markdown)")
+    add_table_format(parser)
     parser.add_argument("--out", type=Path, metavar="FILE", help="write there instead of printing")
 
 
@@ -35,16 +34,13 @@ def call(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from su3d_bench.analysis.leaderboard import leaderboard, tables
-    from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
-    from su3d_bench.reports.tables.latex import latex
     from su3d_bench.store.atomic import make_folder, write_text
 
     found = leaderboard(arguments.folder, arguments.protocols)
     if arguments.json:
         answer_json(asdict(found))
         return EXIT_DONE
-    formats = {"markdown": markdown, "latex": latex, "csv": csv_text, "html": html_page}
-    text = formats[arguments.format](tables(found, intervals=arguments.intervals))
+    text = formatted(tables(found, intervals=arguments.intervals), arguments)
     if arguments.out is None:
         answer(text)
     else:

@@ -3,19 +3,17 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer, remark
+from su3d_bench.cli.common import add_table_format, add_verb, answer, formatted, remark
 from su3d_bench.core.errors import EXIT_DONE
 
 if TYPE_CHECKING:
     from su3d_bench.reports.tables.model import Table
 
 NAME = "tables"
-FORMATS = ("markdown", "latex", "csv", "html")
 PAPER_TABLES = ("I", "II", "III", "IV", "V", "reasoning")
 
 
@@ -33,7 +31,7 @@ def add_parser(actions: Any) -> None:
     parser.add_argument(
         "runs", nargs="+", type=Path, metavar="RUN", help="folders of finished runs, or of what sheets score wrote"
     )
-    parser.add_argument("--format", choices=FORMATS, default="markdown", help="(default: markdown)")
+    add_table_format(parser)
     parser.add_argument(
         "--table",
         nargs="+",
@@ -68,7 +66,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.store.atomic import json_text, make_folder, write_text
 
     tables = _tables(arguments)
-    text = json_text([asdict(one) for one in tables]) if arguments.json else _formatter(arguments.format)(tables)
+    text = json_text([asdict(one) for one in tables]) if arguments.json else formatted(tables, arguments)
     if arguments.out is None:
         answer(text)
         return EXIT_DONE
@@ -106,10 +104,3 @@ def _tables(arguments: argparse.Namespace) -> list[Table]:
         else:
             tables += paper_table(number, found, shown, with_published=with_published)
     return tables
-
-
-def _formatter(name: str) -> Callable[[Sequence[Table]], str]:
-    from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
-    from su3d_bench.reports.tables.latex import latex
-
-    return {"markdown": markdown, "latex": latex, "csv": csv_text, "html": html_page}[name]

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_json, remark
+from su3d_bench.cli.common import add_table_format, add_verb, answer, answer_json, formatted, remark
 
 if TYPE_CHECKING:
     from su3d_bench.metrics.costs import UpdateTimes
@@ -34,6 +34,7 @@ def add_parser(actions: Any) -> None:
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="write timing.md, timing.csv, methods.csv and the plots there"
     )
+    add_table_format(parser)
 
 
 def call(arguments: argparse.Namespace) -> int:
@@ -41,7 +42,8 @@ def call(arguments: argparse.Namespace) -> int:
 
     from su3d_bench.core.errors import ConfigError
     from su3d_bench.metrics.costs import summarise
-    from su3d_bench.reports.tables.timing import csv_text, markdown, methods_csv
+    from su3d_bench.reports.tables.formats import markdown
+    from su3d_bench.reports.tables.timing import csv_text, methods_csv, timing_tables
     from su3d_bench.runs.finished import read_run
 
     if arguments.warm_up < 0 or not arguments.camera_rate > 0:
@@ -53,14 +55,14 @@ def call(arguments: argparse.Namespace) -> int:
     summaries = [summarise(each, arguments.warm_up) for each in times]
     anytime = [point for each in times for point in _anytime(next(r for r in runs if r.name == each[0].run), each)]
     hardware = {run.name: run.hardware for run in runs}
-    text = markdown(summaries, anytime, hardware, arguments.camera_rate)
+    tables = timing_tables(summaries, anytime, hardware, arguments.camera_rate)
     if arguments.json:
         answer_json({"hardware": hardware, "methods": [asdict(one) for one in summaries]})
     else:
-        answer(text.rstrip("\n"))
+        answer(formatted(tables, arguments))
     if arguments.out is not None:
         files = {
-            "timing.md": text,
+            "timing.md": markdown(tables),
             "timing.csv": csv_text(summaries, hardware),
             "methods.csv": methods_csv(summaries, hardware, arguments.camera_rate),
         }

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_json, remark
+from su3d_bench.cli.common import add_table_format, add_verb, answer, answer_json, formatted, remark
 from su3d_bench.core.errors import EXIT_DONE, DataError
 
 if TYPE_CHECKING:
@@ -45,13 +45,14 @@ def add_parser(actions: Any) -> None:
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="write scores.json, tables and a list of what to look at again there"
     )
+    add_table_format(parser)
 
 
 def call(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from su3d_bench.reports.tables.formats import markdown
     from su3d_bench.reports.tables.judged import sheet_tables
+    from su3d_bench.reports.tables.model import Prose
     from su3d_bench.sheets.answers import check_answers, check_key, read_answers
     from su3d_bench.sheets.items import KEY_FILE, read_key, read_sheet
     from su3d_bench.sheets.scores import score
@@ -85,7 +86,7 @@ def call(arguments: argparse.Namespace) -> int:
     if arguments.json:
         answer_json(content)
     else:
-        answer(markdown(sheet_tables(content)) + _looks_line(scores))
+        answer(formatted([*sheet_tables(content), Prose((_looks_line(scores),))], arguments))
     return EXIT_DONE
 
 
@@ -149,4 +150,4 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
 def _looks_line(scores: Scores) -> str:
     n_disagree = sum(one.reason == "annotators disagree" for one in scores.second_looks)
     n_against = len(scores.second_looks) - n_disagree
-    return f"\nTo look at again: {n_disagree} where annotators disagree, {n_against} against the ground truth.\n"
+    return f"To look at again: {n_disagree} where annotators disagree, {n_against} against the ground truth."
