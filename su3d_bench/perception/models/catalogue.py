@@ -100,6 +100,38 @@ _SAM_SOURCE = "https://dl.fbaipublicfiles.com/segment_anything"
 _SAM_FILES = (_HUB_WEIGHTS, "config.json", "preprocessor_config.json")
 _DINO_FILES = (*_SAM_FILES, "tokenizer.json | vocab.txt")
 
+
+def _openai_clip(
+    name: str, summary: str, n_million: int, size_mb: int, repository: str, architecture: str, timm: str
+) -> ModelEntry:
+    forms = (
+        _hub(f"openai/{repository}", size_mb),
+        _open_clip(f"{architecture}-quickgelu", f"timm/{timm}.openai", size_mb),
+        _exported(name, size_mb + 1),
+    )
+    return ModelEntry(name, "encoder", summary, "MIT", n_million, forms, _TORCHSCRIPT, f"{architecture}/openai")
+
+
+def _siglip(name: str, summary: str, n_million: int, size_mb: int, repository: str, architecture: str) -> ModelEntry:
+    hub = _hub(f"google/{repository}", size_mb, (*_CLIP_FILES[:3], "tokenizer.json"))
+    forms = (hub, _exported(name, size_mb + 1))
+    return ModelEntry(name, "encoder", summary, "Apache-2.0", n_million, forms, known_as=f"{architecture}/webli")
+
+
+def _sam(
+    letter: str, use: str, n_million: int, sizes_mb: tuple[int, int, int], repository: str, file: str, sha256: str
+) -> ModelEntry:
+    """``sizes_mb``: as on the hub, as published first, as exported."""
+    name, (hub_mb, original_mb, exported_mb) = f"sam-vit-{letter}", sizes_mb
+    forms = (
+        _hub(f"facebook/{repository}", hub_mb, _SAM_FILES),
+        _original(file, f"{_SAM_SOURCE}/{file}", original_mb, sha256),
+        _exported(name, exported_mb),
+    )
+    summary = f"Segment Anything, ViT-{letter.upper()}{use}"
+    return ModelEntry(name, "segmenter", summary, "Apache-2.0", n_million, forms)
+
+
 _ENTRIES = (
     ModelEntry(
         "clip-vit-h-14",
@@ -120,122 +152,75 @@ _ENTRIES = (
         ),
         known_as="ViT-H-14/laion2b_s32b_b79k",
     ),
-    ModelEntry(
+    _openai_clip(
         "clip-vit-l-14",
-        "encoder",
         "CLIP ViT-L/14 of OpenAI, 768-d, 224 px",
-        "MIT",
         428,
-        (
-            _hub("openai/clip-vit-large-patch14", 1711),
-            _open_clip("ViT-L-14-quickgelu", "timm/vit_large_patch14_clip_224.openai", 1711),
-            _exported("clip-vit-l-14", 1712),
-        ),
-        _TORCHSCRIPT,
-        known_as="ViT-L-14/openai",
+        1711,
+        "clip-vit-large-patch14",
+        "ViT-L-14",
+        "vit_large_patch14_clip_224",
     ),
-    ModelEntry(
+    _openai_clip(
         "clip-vit-l-14-336",
-        "encoder",
         "CLIP ViT-L/14@336px of OpenAI, 768-d, 336 px: OpenMask3D's",
-        "MIT",
         428,
-        (
-            _hub("openai/clip-vit-large-patch14-336", 1712),
-            _open_clip("ViT-L-14-336-quickgelu", "timm/vit_large_patch14_clip_336.openai", 1712),
-            _exported("clip-vit-l-14-336", 1713),
-        ),
-        _TORCHSCRIPT,
-        known_as="ViT-L-14-336/openai",
+        1712,
+        "clip-vit-large-patch14-336",
+        "ViT-L-14-336",
+        "vit_large_patch14_clip_336",
     ),
-    ModelEntry(
+    _openai_clip(
         "clip-vit-b-32",
-        "encoder",
         "CLIP ViT-B/32 of OpenAI, 512-d, 224 px",
-        "MIT",
         151,
-        (
-            _hub("openai/clip-vit-base-patch32", 605),
-            _open_clip("ViT-B-32-quickgelu", "timm/vit_base_patch32_clip_224.openai", 605),
-            _exported("clip-vit-b-32", 606),
-        ),
-        _TORCHSCRIPT,
-        known_as="ViT-B-32/openai",
+        605,
+        "clip-vit-base-patch32",
+        "ViT-B-32",
+        "vit_base_patch32_clip_224",
     ),
-    ModelEntry(
+    _siglip(
         "siglip-base-224",
-        "encoder",
         "SigLIP ViT-B/16, 768-d, 224 px",
-        "Apache-2.0",
         203,
-        (
-            _hub("google/siglip-base-patch16-224", 813, (*_CLIP_FILES[:3], "tokenizer.json")),
-            _exported("siglip-base-224", 814),
-        ),
-        known_as="ViT-B-16-SigLIP/webli",
+        813,
+        "siglip-base-patch16-224",
+        "ViT-B-16-SigLIP",
     ),
-    ModelEntry(
+    _siglip(
         "siglip-so400m-384",
-        "encoder",
         "SigLIP SoViT-400m/14, 1152-d, 384 px",
-        "Apache-2.0",
         878,
-        (
-            _hub("google/siglip-so400m-patch14-384", 3512, (*_CLIP_FILES[:3], "tokenizer.json")),
-            _exported("siglip-so400m-384", 3513),
-        ),
-        known_as="ViT-SO400M-14-SigLIP-384/webli",
+        3512,
+        "siglip-so400m-patch14-384",
+        "ViT-SO400M-14-SigLIP-384",
     ),
-    ModelEntry(
-        "sam-vit-h",
-        "segmenter",
-        "Segment Anything, ViT-H: masks of the paper and of all baselines",
-        "Apache-2.0",
+    _sam(
+        "h",
+        ": masks of the paper and of all baselines",
         641,
-        (
-            _hub("facebook/sam-vit-huge", 2564, _SAM_FILES),
-            _original(
-                "sam_vit_h_4b8939.pth",
-                f"{_SAM_SOURCE}/sam_vit_h_4b8939.pth",
-                2565,
-                "a7bf3b02f3ebf1267aba913ff637d9a2d5c33d3173bb679e46d9f338c26f262e",
-            ),
-            _exported("sam-vit-h", 2570),
-        ),
+        (2564, 2565, 2570),
+        "sam-vit-huge",
+        "sam_vit_h_4b8939.pth",
+        "a7bf3b02f3ebf1267aba913ff637d9a2d5c33d3173bb679e46d9f338c26f262e",
     ),
-    ModelEntry(
-        "sam-vit-l",
-        "segmenter",
-        "Segment Anything, ViT-L",
-        "Apache-2.0",
+    _sam(
+        "l",
+        "",
         312,
-        (
-            _hub("facebook/sam-vit-large", 1250, _SAM_FILES),
-            _original(
-                "sam_vit_l_0b3195.pth",
-                f"{_SAM_SOURCE}/sam_vit_l_0b3195.pth",
-                1250,
-                "3adcc4315b642a4d2101128f611684e8734c41232a17c648ed1693702a49a622",
-            ),
-            _exported("sam-vit-l", 1256),
-        ),
+        (1250, 1250, 1256),
+        "sam-vit-large",
+        "sam_vit_l_0b3195.pth",
+        "3adcc4315b642a4d2101128f611684e8734c41232a17c648ed1693702a49a622",
     ),
-    ModelEntry(
-        "sam-vit-b",
-        "segmenter",
-        "Segment Anything, ViT-B",
-        "Apache-2.0",
+    _sam(
+        "b",
+        "",
         94,
-        (
-            _hub("facebook/sam-vit-base", 375, _SAM_FILES),
-            _original(
-                "sam_vit_b_01ec64.pth",
-                f"{_SAM_SOURCE}/sam_vit_b_01ec64.pth",
-                375,
-                "ec2df62732614e57411cdcf32a23ffdf28910380d03139ee0f4fcbe91eb8c912",
-            ),
-            _exported("sam-vit-b", 380),
-        ),
+        (375, 375, 380),
+        "sam-vit-base",
+        "sam_vit_b_01ec64.pth",
+        "ec2df62732614e57411cdcf32a23ffdf28910380d03139ee0f4fcbe91eb8c912",
     ),
     ModelEntry(
         "grounding-dino",
