@@ -14,7 +14,7 @@ from su3d_bench.core.errors import ConfigError, DataError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Frame, PerceptionNeeds, SceneInfo
-from su3d_bench.perception.models.catalogue import MODELS, PROFILE_MODELS, ModelEntry, model_entry
+from su3d_bench.perception.models.catalogue import PROFILE_MODELS, ModelEntry, model_entry
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.encoders import towers_onnx, towers_transformers
 from su3d_bench.perception.models.files import PICKLED, ModelFiles, locate, read_settings, read_weights
@@ -57,11 +57,6 @@ def model_state(entry: ModelEntry, path: Path | None = None, folder: Path | None
     raise AssertionError("a model of which no form is found cannot be located")
 
 
-def model_states(folder: Path | None = None) -> list[ModelState]:
-    """The state of every model of the catalogue."""
-    return [model_state(entry, folder=folder) for entry in MODELS.values()]
-
-
 def problems_of(files: ModelFiles) -> list[str]:
     """Everything that is wrong with the files of a model, a line each; of the weights the names alone are read."""
     problems = files.wrong_digests()
@@ -83,11 +78,8 @@ def problems_of(files: ModelFiles) -> list[str]:
 def _problems_of_export(files: ModelFiles) -> list[str]:
     if files.entry.kind == "tagger":
         return []  # the package's own export has no manifest
-    manifest: OnnxManifest
-    if files.entry.kind == "encoder":
-        manifest = towers_onnx.read_manifest(files.weights)
-    else:
-        manifest = sam_onnx.read_sam_manifest(files.weights)
+    read = towers_onnx.read_manifest if files.entry.kind == "encoder" else sam_onnx.read_sam_manifest
+    manifest: OnnxManifest = read(files.weights)
     wrong = wrong_files(manifest, files.folder)
     if manifest.name != files.entry.name:
         wrong.append(f"{files.folder}: holds '{manifest.name}', not '{files.entry.name}'; mend models.paths")

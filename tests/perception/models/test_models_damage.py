@@ -12,10 +12,9 @@ from damage import damages, outcomes
 
 from su3d_bench.perception.models.catalogue import model_entry
 from su3d_bench.perception.models.encoders import towers_transformers
-from su3d_bench.perception.models.encoders.towers_onnx import FORMAT, read_manifest
+from su3d_bench.perception.models.encoders.towers_onnx import Manifest, read_manifest
 from su3d_bench.perception.models.files import ModelFiles
-from su3d_bench.perception.models.masks.sam_onnx import FORMAT as SAM_FORMAT
-from su3d_bench.perception.models.masks.sam_onnx import read_sam_manifest
+from su3d_bench.perception.models.masks.sam_onnx import SamManifest, read_sam_manifest
 
 PARITY = [{"output": "image", "n_values": 5, "max_abs_difference": 1e-6, "min_cosine": 1.0}]
 TRANSFORM = {
@@ -23,12 +22,12 @@ TRANSFORM = {
     "convention": "original",
 }  # fmt: skip
 ENCODER = {
-    "format": FORMAT, "name": "clip-vit-h-14", "opset": 18, "source": {"torch": "2"}, "parity": PARITY,
+    "format": Manifest.FORMAT, "name": "clip-vit-h-14", "opset": 18, "source": {"torch": "2"}, "parity": PARITY,
     "spec": {"dim": 24, "n_tokens": 16, "n_words": 90, "tokens": "clip", "pad_id": None, "transform": TRANSFORM},
     "files": {"image.onnx": "0" * 64, "text.onnx": "1" * 64},
 }  # fmt: skip
 SEGMENTER = {
-    "format": SAM_FORMAT, "name": "sam-vit-h", "image_px": 64, "opset": 18, "source": {},
+    "format": SamManifest.FORMAT, "name": "sam-vit-h", "image_px": 64, "opset": 18, "source": {},
     "parity": PARITY, "files": {"encoder.onnx": "0" * 64, "decoder.onnx": "1" * 64},
 }  # fmt: skip
 CONFIG = {

@@ -10,6 +10,7 @@ from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
+from pydantic import ConfigDict
 
 from su3d_bench.core.devices import CPU, Batches
 from su3d_bench.core.errors import DataError, printable
@@ -27,6 +28,8 @@ LARGEST_MEMORY_OF_TEXTS = 65_536
 @dataclass(frozen=True)
 class EncoderSpec:
     """What is known of an encoder without its weights: ``dim`` of the space, and what its towers take."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
 
     dim: int
     n_tokens: int

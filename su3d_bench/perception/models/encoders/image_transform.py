@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeGuard
 
 import numpy as np
+from pydantic import ConfigDict
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, UInt8Array
@@ -37,6 +38,8 @@ class ImageTransform:
     ``fit`` ``shortest``: the shorter side becomes ``size`` and the middle square is cut out; ``squash``: both sides
     become ``size``, whatever the aspect. ``resample`` is PIL's number of the filter.
     """
+
+    __pydantic_config__ = ConfigDict(extra="forbid")
 
     size: int
     fit: Literal["shortest", "squash"] = "shortest"

@@ -7,8 +7,8 @@ A folder holds ``image.onnx``, ``text.onnx`` (and ``.data`` files beside large o
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Callable
+from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,18 +17,16 @@ import numpy as np
 
 from su3d_bench.core.errors import CheckFailed, DataError, StoreError
 from su3d_bench.core.types import Float32Array, Int64Array
-from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
 from su3d_bench.perception.models.encoders import towers_transformers
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, check_spec, unit_rows
-from su3d_bench.perception.models.encoders.image_transform import Convention, ImageTransform
+from su3d_bench.perception.models.encoders.image_transform import Convention
 from su3d_bench.perception.models.encoders.text_tokens import read_tokeniser
 from su3d_bench.perception.models.files import ModelFiles, bounded
 from su3d_bench.perception.models.onnx.export import compare_outputs, export_onnx
-from su3d_bench.perception.models.onnx.manifest import OnnxManifest, common_fields, described, read_common, wrong_files
+from su3d_bench.perception.models.onnx.manifest import OnnxManifest, wrong_files
 from su3d_bench.perception.models.onnx.session import Provider, open_session
-from su3d_bench.store.atomic import make_folder, write_json
+from su3d_bench.store.atomic import make_folder
 
-FORMAT = "su3d-bench onnx encoder 1"
 IMAGE_FILE, TEXT_FILE = "image.onnx", "text.onnx"
 TOKENIZER_FILES = ("tokenizer.json", "tokenizer_config.json", "special_tokens_map.json", "vocab.json", "merges.txt")
 # Of features at length 1. ViT-H-14 in float32 agrees to 2e-7; a wrong operator shows in the second decimal.
@@ -38,9 +36,12 @@ PROBES = ("chair", "an image of a tv-screen", "a red cup on the table in a scene
 GPU_BATCH = 32
 
 
-@dataclass(frozen=True)
 class Manifest(OnnxManifest):
     """The manifest of an exported encoder."""
+
+    FORMAT = "su3d-bench onnx encoder 1"
+    IS_OF = "an encoder"
+    REQUIRES = (IMAGE_FILE, TEXT_FILE)
 
     spec: EncoderSpec
 
@@ -70,8 +71,7 @@ def export_encoder(files: ModelFiles, folder: Path) -> Manifest:
         other = open_session(folder / name).run(["features"], {key: value.numpy() for key, value in inputs.items()})[0]
         parity.append(compare_outputs(kind, unit_rows(mine, kind), unit_rows(other, kind)))
     written += _copy_tokenizer(files.folder, folder)
-    manifest = Manifest(**vars(described(files, written, parity, str(torch.__version__))), spec=spec)
-    write_json(folder / ONNX_MANIFEST, {"format": FORMAT, **common_fields(manifest), "spec": asdict(spec)})
+    manifest = Manifest.of_export(files, written, parity, str(torch.__version__), spec=spec)
     check_parity(manifest)
     return manifest
 
@@ -128,19 +128,9 @@ def _copy_tokenizer(source: Path, folder: Path) -> list[Path]:
 
 def read_manifest(path: Path) -> Manifest:
     """The manifest of an exported encoder; raises ``DataError`` for anything else."""
-    known = read_common(path, FORMAT, (IMAGE_FILE, TEXT_FILE), "an encoder", _with_spec)
-    check_spec(known.spec, path)
-    return known
-
-
-def _with_spec(known: OnnxManifest, content: Mapping[str, Any]) -> Manifest:
-    spec = content["spec"]
-    transform = ImageTransform(**{**spec["transform"], "mean": _numbers(spec, "mean"), "std": _numbers(spec, "std")})
-    return Manifest(**vars(known), spec=EncoderSpec(**{**spec, "transform": transform}))
-
-
-def _numbers(spec: Mapping[str, Any], key: str) -> tuple[float, ...]:
-    return tuple(float(value) for value in spec["transform"][key])
+    manifest = Manifest.read(path)
+    check_spec(manifest.spec, path)
+    return manifest
 
 
 def read_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:

@@ -6,8 +6,6 @@ size of the network's image, the SHA-256 of every file, the digests of the weigh
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,16 +13,14 @@ import numpy as np
 
 from su3d_bench.core.errors import CheckFailed, DataError
 from su3d_bench.core.types import Float32Array, Int64Array
-from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
 from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.masks.sam import Prompts
 from su3d_bench.perception.models.onnx.export import Parity, compare_outputs, export_onnx
-from su3d_bench.perception.models.onnx.manifest import OnnxManifest, common_fields, described, read_common, wrong_files
+from su3d_bench.perception.models.onnx.manifest import OnnxManifest, wrong_files
 from su3d_bench.perception.models.onnx.session import Provider, open_session
 from su3d_bench.perception.models.pretrained import load_sam
-from su3d_bench.store.atomic import make_folder, write_json
+from su3d_bench.store.atomic import make_folder
 
-FORMAT = "su3d-bench onnx segmenter 1"
 ENCODER_FILE, DECODER_FILE = "encoder.onnx", "decoder.onnx"
 # Labels of points in the exported decoder, those of the original's own export: 0 background, 1 object, and these.
 NO_POINT, TOP_LEFT, BOTTOM_RIGHT = -1, 2, 3
@@ -32,9 +28,12 @@ NO_POINT, TOP_LEFT, BOTTOM_RIGHT = -1, 2, 3
 LARGEST_DIFFERENCE = 1e-3
 
 
-@dataclass(frozen=True)
 class SamManifest(OnnxManifest):
     """The manifest of an exported SAM; ``image_px`` is the side of its network's image."""
+
+    FORMAT = "su3d-bench onnx segmenter 1"
+    IS_OF = "a segmenter"
+    REQUIRES = (ENCODER_FILE, DECODER_FILE)
 
     image_px: int
 
@@ -100,9 +99,7 @@ def export_sam(files: ModelFiles, folder: Path) -> SamManifest:
         mine = decoder(*compared.values())
     other = session.run(["logits", "iou"], {name: value.numpy() for name, value in compared.items()})
     parity += [compare_outputs(name, a.numpy(), b) for name, a, b in zip(("logits", "iou"), mine, other, strict=True)]
-    manifest = SamManifest(**vars(described(files, written, parity, str(torch.__version__))), image_px=side)
-    content = {"format": FORMAT, **common_fields(manifest), "image_px": side}
-    write_json(folder / ONNX_MANIFEST, content)
+    manifest = SamManifest.of_export(files, written, parity, str(torch.__version__), image_px=side)
     for one, values in zip(parity, (embedding, *mine), strict=True):
         _check(manifest.name, one, float(values.abs().max()))
     return manifest
@@ -127,14 +124,10 @@ def _check(name: str, one: Parity, largest: float) -> None:
 
 def read_sam_manifest(path: Path) -> SamManifest:
     """The manifest of an exported SAM; raises ``DataError`` for anything else."""
-    known = read_common(path, FORMAT, (ENCODER_FILE, DECODER_FILE), "a segmenter", _with_size)
-    if not 16 <= known.image_px <= 4096:
-        raise DataError(f"{path}: image_px is {known.image_px}; expected 16 to 4096")
-    return known
-
-
-def _with_size(known: OnnxManifest, content: Mapping[str, Any]) -> SamManifest:
-    return SamManifest(**vars(known), image_px=int(content["image_px"]))
+    manifest = SamManifest.read(path)
+    if not 16 <= manifest.image_px <= 4096:
+        raise DataError(f"{path}: image_px is {manifest.image_px}; expected 16 to 4096")
+    return manifest
 
 
 def load_onnx_sam(files: ModelFiles, provider: Provider = "cpu", device_index: int = 0) -> OnnxSam:

@@ -2,79 +2,69 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+import json
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, ClassVar, Self
+
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError
+from su3d_bench.perception.models.catalogue import ONNX_MANIFEST
 from su3d_bench.perception.models.files import ModelFiles, bounded, file_sha256, read_settings
 from su3d_bench.perception.models.onnx.export import OPSET, Parity
+from su3d_bench.store.atomic import write_json
 
 
-@dataclass(frozen=True)
-class OnnxManifest:
-    """What every manifest says: ``files`` name -> SHA-256, ``source`` what the export was made from."""
+class OnnxManifest(BaseModel):
+    """What every manifest says: ``files`` name -> SHA-256, ``source`` what the export was made from.
+
+    Of each kind: ``FORMAT`` of its file, what it ``IS_OF``, and the files that it ``REQUIRES``.
+    """
+
+    model_config = ConfigDict(strict=True, frozen=True)
+    FORMAT: ClassVar[str]
+    IS_OF: ClassVar[str]
+    REQUIRES: ClassVar[tuple[str, ...]]
 
     name: str
-    files: Mapping[str, str]
-    source: Mapping[str, Any]
+    files: dict[str, str]
+    source: dict[str, Any]
     opset: int
     parity: tuple[Parity, ...]
 
-
-M = TypeVar("M", bound=OnnxManifest)
-
-
-def described(files: ModelFiles, written: Sequence[Path], parity: Sequence[Parity], torch_version: str) -> OnnxManifest:
-    """The manifest of the files ``written`` from ``files``."""
-    return OnnxManifest(
-        name=files.entry.name,
-        files={path.name: digest_file(path) for path in written},
-        source={"form": files.form.form, "files": files.digests(), "torch": torch_version},
-        opset=OPSET,
-        parity=tuple(parity),
-    )
-
-
-def common_fields(manifest: OnnxManifest) -> dict[str, Any]:
-    """What every manifest says, as the JSON holds it."""
-    return {
-        "name": manifest.name,
-        "files": dict(manifest.files),
-        "source": dict(manifest.source),
-        "opset": manifest.opset,
-        "parity": [asdict(one) for one in manifest.parity],
-    }
-
-
-def read_common(
-    path: Path, layout: str, required: Sequence[str], what: str, own: Callable[[OnnxManifest, Mapping[str, Any]], M]
-) -> M:
-    """The manifest at ``path``, of ``what`` in the format ``layout``; ``own`` adds the fields of its kind.
-
-    Raises ``DataError`` for anything else, and where a file of ``required`` is not among its files.
-    """
-    content = read_settings(path)
-    if content.get("format") != layout:
-        raise DataError(f"{path}: format is {str(content.get('format'))[:60]!r}; expected {layout!r}; export it anew")
-    try:
-        known = OnnxManifest(
-            name=str(content["name"]),
-            files={str(name): str(digest) for name, digest in content["files"].items()},
-            source=content["source"],
-            opset=int(content["opset"]),
-            parity=tuple(Parity(**one) for one in content["parity"]),
+    @classmethod
+    def of_export(
+        cls, files: ModelFiles, written: Sequence[Path], parity: Sequence[Parity], torch_version: str, **own: Any
+    ) -> Self:
+        """The manifest of the files ``written`` from ``files``, put beside them, with the fields of its kind."""
+        manifest = cls(
+            name=files.entry.name,
+            files={path.name: digest_file(path) for path in written},
+            source={"form": files.form.form, "files": files.digests(), "torch": torch_version},
+            opset=OPSET,
+            parity=tuple(parity),
+            **own,
         )
-        manifest = own(known, content)
-    except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
-        raise DataError(f"{path}: is no manifest of {what} ({bounded(error, 80)}); export it anew") from error
-    if any(Path(name).name != name for name in known.files) or not {*required} <= set(known.files):
-        raise DataError(
-            f"{path}: files must be names inside the folder, {' and '.join(required)} among them; export it anew"
-        )
-    return manifest
+        write_json(written[0].parent / ONNX_MANIFEST, {"format": cls.FORMAT, **manifest.model_dump(mode="json")})
+        return manifest
+
+    @classmethod
+    def read(cls, path: Path) -> Self:
+        """The manifest at ``path``; raises ``DataError`` for anything else, and where a required file is not named."""
+        content = read_settings(path)
+        found = content.get("format")
+        if found != cls.FORMAT:
+            raise DataError(f"{path}: format is {str(found)[:60]!r}; expected {cls.FORMAT!r}; export it anew")
+        try:
+            manifest = cls.model_validate_json(json.dumps(content))
+        except ValidationError as error:
+            raise DataError(f"{path}: is no manifest of {cls.IS_OF} ({bounded(error, 80)}); export it anew") from error
+        if any(Path(name).name != name for name in manifest.files) or not {*cls.REQUIRES} <= set(manifest.files):
+            needed = " and ".join(cls.REQUIRES)
+            raise DataError(f"{path}: files must be names inside the folder, {needed} among them; export it anew")
+        return manifest
 
 
 def wrong_files(manifest: OnnxManifest, folder: Path) -> list[str]:
