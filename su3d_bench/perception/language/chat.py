@@ -5,9 +5,10 @@ from __future__ import annotations
 import base64
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
+from pydantic import ConfigDict, Field
 
 from su3d_bench.core.digests import digest_bytes, digest_json
 from su3d_bench.core.types import UInt8Array
@@ -128,11 +129,13 @@ class Reply:
     ``dropped`` names the parameters that the server would not take; ``was_stored``: nobody was asked.
     """
 
+    __pydantic_config__ = ConfigDict(extra="forbid")
+
     text: str
     finish_reason: str = ""
     model: str = ""
-    input_tokens: int = 0
-    output_tokens: int = 0
+    input_tokens: Annotated[int, Field(ge=0)] = 0
+    output_tokens: Annotated[int, Field(ge=0)] = 0
     dropped: tuple[str, ...] = ()
     failure: str = ""
     was_stored: bool = field(default=False, compare=False)

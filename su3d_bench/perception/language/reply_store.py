@@ -15,7 +15,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import TypeAdapter
 
 from su3d_bench.core.digests import digest_json
 from su3d_bench.core.errors import StoreError
@@ -26,16 +26,7 @@ SCHEMA = 1
 MOST_ENTRY_BYTES = 200_000_000  # twice the largest answer that a configuration can allow
 
 
-class _StoredReply(BaseModel):
-    model_config = ConfigDict(extra="forbid")
-
-    text: str
-    finish_reason: str
-    model: str
-    input_tokens: int = Field(ge=0)
-    output_tokens: int = Field(ge=0)
-    dropped: tuple[str, ...]
-    failure: str
+_REPLY = TypeAdapter(Reply)
 
 
 class ReplyStore:
@@ -58,10 +49,9 @@ class ReplyStore:
                 return None
             if digest_json(entry["reply"]) != entry["reply_sha256"]:
                 return None
-            stored = _StoredReply.model_validate(entry["reply"])
-        except (OSError, ValueError, KeyError, TypeError, RecursionError, ValidationError):
+            return _REPLY.validate_python(entry["reply"]).from_store()
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return None
-        return Reply(**stored.model_dump(), was_stored=True)
 
     def save(self, request: ChatRequest, reply: Reply, server: str, *, replace: bool = False) -> Reply:
         """The reply that is kept: ``reply``, or the one that another process stored meanwhile unless ``replace``."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import partial
 from importlib.util import find_spec
 
@@ -15,8 +14,7 @@ from su3d_bench.perception.models.config import EMBEDDED, ModelsConfig, PaperCon
 from su3d_bench.perception.models.files import ModelFiles, locate
 from su3d_bench.perception.models.loading import check_encoder
 from su3d_bench.perception.models.masks.grounded_sam import Networks
-from su3d_bench.perception.models.masks.grounding_dino import GroundingDino
-from su3d_bench.perception.models.masks.sam import Sam
+from su3d_bench.perception.models.masks.sam import Sam, SamNetwork
 from su3d_bench.perception.models.masks.sam_onnx import load_onnx_sam
 from su3d_bench.perception.models.masks.tagging import (
     RAM_TAG_LIST,
@@ -35,19 +33,6 @@ PACKAGES = ("torch", "transformers")
 _SAM_FORMS: tuple[FormName, ...] = ("transformers", "original")
 
 
-@dataclass(frozen=True)
-class _Place:
-    """Where a network runs and how precisely."""
-
-    device: str
-    precision: str
-
-    @property
-    def digest(self) -> str:
-        """Moves with what moves a number: the kind of device, not which of several."""
-        return content_key(self.device.partition(":")[0], self.precision)
-
-
 def load_networks(config: PaperConfig, models: ModelsConfig, encoder: Encoder, job_index: int = 0) -> Networks:
     """Tagger, detector and segmenter as configured.
 
@@ -58,17 +43,28 @@ def load_networks(config: PaperConfig, models: ModelsConfig, encoder: Encoder, j
     sam = _locate_sam(config, models)
     detector = _locate(models, DETECTOR, ("transformers",))
     device = device_for(models.device, job_index)
-    place = _Place(device, precision_for(models.precision, device))
-    tagger = _tagger(config, models, encoder, place)
-    digests = [text for files in (sam, detector) for pair in sorted(files.digests().items()) for text in pair]
+    precision = precision_for(models.precision, device)
+    # What moves a number is the kind of device, not which of several.
+    digests = [content_key(device.partition(":")[0], precision)]
+    digests += [text for files in (sam, detector) for pair in sorted(files.digests().items()) for text in pair]
     if config.sam_runtime == "onnx":
         provider: Provider = models.provider or ("cpu" if device == "cpu" else "cuda")
         index = 0 if provider == "cpu" else int(device.partition(":")[2] or 0)
-        load = partial(_onnx_sam, sam, provider, index)
         digests.append(provider)
+
+        def network() -> SamNetwork:
+            return kept(sam, (provider, str(index)), lambda: load_onnx_sam(sam, provider, index))
     else:
-        load = partial(_torch_sam, sam, place)
-    return Networks(tagger, partial(_detector, detector, place), load, content_key(place.digest, *digests))
+
+        def network() -> SamNetwork:
+            return load_sam(sam, device, precision)
+
+    return Networks(
+        _tagger(config, models, encoder, device),
+        lambda: load_grounding_dino(detector, device, precision),
+        lambda: Sam(network()),
+        content_key(*digests),
+    )
 
 
 def is_front_end_here(config: PaperConfig, models: ModelsConfig) -> bool:
@@ -107,19 +103,7 @@ def _locate_sam(config: PaperConfig, models: ModelsConfig) -> ModelFiles:
     return _locate(models, config.segmenter, ("onnx",) if config.sam_runtime == "onnx" else _SAM_FORMS)
 
 
-def _torch_sam(files: ModelFiles, place: _Place) -> Sam:
-    return Sam(load_sam(files, place.device, place.precision))
-
-
-def _onnx_sam(files: ModelFiles, provider: Provider, device_index: int) -> Sam:
-    return Sam(kept(files, (provider, str(device_index)), lambda: load_onnx_sam(files, provider, device_index)))
-
-
-def _detector(files: ModelFiles, place: _Place) -> GroundingDino:
-    return load_grounding_dino(files, place.device, place.precision)
-
-
-def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, place: _Place) -> Tagger:
+def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device: str) -> Tagger:
     """The tagger that is asked for, or with ``auto`` the first that is here."""
     if config.tagger == "ram" or (config.tagger == "auto" and find_spec("ram") is not None):
         try:
@@ -131,8 +115,8 @@ def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, place: 
         else:
             digests = [text for pair in sorted(files.digests().items()) for text in pair]
             # RAM++'s own code mixes float32 in, so it runs in float32 wherever it runs.
-            load = partial(kept, files, (place.device,), partial(load_ram, files, place.device))
-            return RamTagger(load, place.device, content_key(*digests))
+            load = partial(kept, files, (device,), partial(load_ram, files, device))
+            return RamTagger(load, device, content_key(*digests))
     if config.tagger in ("ram-onnx", "auto"):
         try:
             files = _locate(models, TAGGER, ("onnx",))

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,19 +43,14 @@ def model_state(entry: ModelEntry, path: Path | None = None, folder: Path | None
     """Which forms of ``entry`` are here, at ``path`` or where models are looked for."""
     found = []
     for form in entry.forms:
-        if not form.is_read:
-            continue
-        try:
-            found.append(locate(entry.name, (form.form,), path=path, folder=folder))
-        except (ModelMissing, ConfigError):
-            continue
-    if found:
-        return ModelState(entry, tuple(found), None)
+        with suppress(ModelMissing, ConfigError):
+            if form.is_read:
+                found.append(locate(entry.name, (form.form,), path=path, folder=folder))
     try:
-        locate(entry.name, path=path, folder=folder)
+        missing = None if found else str(locate(entry.name, path=path, folder=folder))
     except (ModelMissing, ConfigError) as error:
-        return ModelState(entry, (), str(error))
-    raise AssertionError("a model of which no form is found cannot be located")
+        missing = str(error)
+    return ModelState(entry, tuple(found), missing)
 
 
 def problems_of(files: ModelFiles) -> list[str]:
@@ -110,32 +106,42 @@ class WarmUp:
 
 def warm_encoder(encoder: Encoder, device: str) -> WarmUp:
     """Load the towers of ``encoder`` and run them on one image and one text."""
-    _reset_memory(device)
-    image = warm_frame().rgb
-    start = time.perf_counter()
-    encoder.encode_images([image])
-    encoder.encode_texts([WARM_TEXT])
-    loaded = time.perf_counter()
-    encoder.encode_images([image])
-    run_s = time.perf_counter() - loaded
-    memory_mb, memory_of = _peak_memory(device)
-    return WarmUp(encoder.name, loaded - start, run_s, {}, memory_mb, memory_of, encoder.digest)
+    images = [warm_frame().rgb]
+
+    def load() -> None:
+        encoder.encode_images(images)
+        encoder.encode_texts([WARM_TEXT])
+
+    return _warmed(encoder.name, device, load, lambda _: encoder.encode_images(images), lambda: encoder.digest)
 
 
 def warm_perception(perception: Any, device: str) -> WarmUp:
     """Let ``perception``, a profile that was built, detect in one made frame twice: loading, then running."""
-    _reset_memory(device)
     needs = PerceptionNeeds(crop_ratios=(0.8, 1.0, 1.2))  # S_r of the paper
     frame = warm_frame()
+
+    def run(timer: Timer) -> None:
+        perception.detect(frame, needs, timer)
+
+    return _warmed(perception.profile, device, lambda: run(Timer()), run, lambda: perception.digest)
+
+
+def _warmed(
+    what: str, device: str, load: Callable[[], object], run: Callable[[Timer], object], digest: Callable[[], str]
+) -> WarmUp:
+    if device != "cpu":
+        import torch
+
+        torch.cuda.reset_peak_memory_stats(device)
     start = time.perf_counter()
-    perception.detect(frame, needs, Timer())
+    load()
     loaded = time.perf_counter()
     timer = Timer()
-    perception.detect(frame, needs, timer)
+    run(timer)
     run_s = time.perf_counter() - loaded
     memory_mb, memory_of = _peak_memory(device)
     stages = {name: round(ms, 3) for name, ms in timer.take().items()}
-    return WarmUp(perception.profile, loaded - start, run_s, stages, memory_mb, memory_of, perception.digest)
+    return WarmUp(what, loaded - start, run_s, stages, memory_mb, memory_of, digest())
 
 
 def warm_scene() -> SceneInfo:
@@ -152,13 +158,6 @@ def warm_frame() -> Frame:
         depth_m[180:380, left : left + 120] = distance_m
     intrinsics = np.array([[525.0, 0, 319.5], [0, 525.0, 239.5], [0, 0, 1]])
     return Frame(0, 0.0, rgb, depth_m, np.eye(4), intrinsics)
-
-
-def _reset_memory(device: str) -> None:
-    if device != "cpu":
-        import torch
-
-        torch.cuda.reset_peak_memory_stats(device)
 
 
 def _peak_memory(device: str) -> tuple[float, str]:

@@ -77,17 +77,17 @@ def load_sam(files: ModelFiles, device: str, precision: str) -> TorchSam:
 
 def load_grounding_dino(files: ModelFiles, device: str, precision: str) -> GroundingDino:
     """GroundingDINO with its tokenizer ready to run."""
-    return kept(files, (device, precision), lambda: _grounding_dino(files, device, precision))
 
+    def load() -> GroundingDino:
+        model = _pretrained(files, "GroundingDinoForObjectDetection")
+        transformers = require_transformers(f"detector '{files.entry.name}'")
+        try:
+            tokenizer = transformers.BertTokenizer.from_pretrained(str(files.folder), local_files_only=True)
+        except (OSError, ValueError, KeyError, TypeError) as error:
+            raise DataError(f"{files.folder}: its tokenizer cannot be read: {bounded(error)}; fetch it anew") from error
+        return GroundingDino(_on_device(model, device, precision), tokenizer)
 
-def _grounding_dino(files: ModelFiles, device: str, precision: str) -> GroundingDino:
-    model = _pretrained(files, "GroundingDinoForObjectDetection")
-    transformers = require_transformers(f"detector '{files.entry.name}'")
-    try:
-        tokenizer = transformers.BertTokenizer.from_pretrained(str(files.folder), local_files_only=True)
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise DataError(f"{files.folder}: its tokenizer cannot be read: {bounded(error)}; fetch it anew") from error
-    return GroundingDino(_on_device(model, device, precision), tokenizer)
+    return kept(files, (device, precision), load)
 
 
 def sam_names(tensors: dict[str, Any]) -> dict[str, Any]:

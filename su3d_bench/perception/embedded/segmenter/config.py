@@ -9,7 +9,7 @@ class JoinWeights(BaseModel):
     """What speaks for (positive) and against (negative) two touching surfaces being parts of one object.
 
     Log-odds for each unit of a cue, by logistic regression over the borders in rooms that no benchmark uses; a lower
-    ``bias`` leaves more regions apart. The cues are those of ``segmenter_rules.join_cues``.
+    ``bias`` leaves more regions apart. The cues are those of ``rules.join_cues``.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)

@@ -17,16 +17,14 @@ IndexArray = NDArray[np.intp]
 class Pieces:
     """Sums over the pixels of N pieces; of points and normals only where depth is known.
 
-    ``n_pixels``, ``n_points`` (N,); ``colour`` (N, 3) sum of Lab; ``colour_square`` (N,) sum of its squared length;
-    ``point`` (N, 3) sum of camera-frame points m; ``scatter`` (N, 6) sums of xx, xy, xz, yy, yz, zz; ``normal`` (N, 3)
-    sum of unit normals towards the camera; ``n_pairs``, ``contrast`` (N,) neighbouring pixels inside and the sum of
-    their colour differences.
+    ``n_pixels``, ``n_points`` (N,); ``colour`` (N, 3) sum of Lab; ``point`` (N, 3) sum of camera-frame points m;
+    ``scatter`` (N, 6) sums of xx, xy, xz, yy, yz, zz; ``normal`` (N, 3) sum of unit normals towards the camera;
+    ``n_pairs``, ``contrast`` (N,) neighbouring pixels inside and the sum of their colour differences.
     """
 
     n_pixels: Float64Array
     n_points: Float64Array
     colour: Float64Array
-    colour_square: Float64Array
     point: Float64Array
     scatter: Float64Array
     normal: Float64Array
@@ -35,17 +33,16 @@ class Pieces:
 
     @classmethod
     def from_sums(cls, sums: Float64Array) -> Pieces:
-        """Pieces out of the columns of ``segmenter_kernels.sum_pixels``."""
+        """Pieces out of the columns of ``kernels.sum_pixels``."""
         return cls(
             n_pixels=sums[:, 0],
             n_points=sums[:, 1],
             colour=sums[:, 2:5],
-            colour_square=sums[:, 5],
-            point=sums[:, 6:9],
-            scatter=sums[:, 9:15],
-            normal=sums[:, 15:18],
-            n_pairs=sums[:, 18],
-            contrast=sums[:, 19],
+            point=sums[:, 5:8],
+            scatter=sums[:, 8:14],
+            normal=sums[:, 14:17],
+            n_pairs=sums[:, 17],
+            contrast=sums[:, 18],
         )
 
     def __len__(self) -> int:
@@ -57,12 +54,6 @@ class Pieces:
 
     def mean_colour(self) -> Float64Array:
         return self.colour / np.maximum(self.n_pixels, 1)[:, None]
-
-    def colour_spread(self) -> Float64Array:
-        """Root mean square distance (N,) of the pixels' colours from their mean."""
-        square = self.colour_square / np.maximum(self.n_pixels, 1) - (self.mean_colour() ** 2).sum(axis=1)
-        spread: Float64Array = np.sqrt(np.maximum(square, 0))
-        return spread
 
     def centroid(self) -> Float64Array:
         return self.point / np.maximum(self.n_points, 1)[:, None]

@@ -350,48 +350,46 @@ def sum_pixels(
     x: Float64Array,
     y: Float64Array,
 ) -> Float64Array:
-    """Sums (N, 20) over each label's pixels.
+    """Sums (N, 19) over each label's pixels.
 
-    Columns: pixels, pixels with depth, colour (3), squared length of the colour, camera-frame point (3) m, its products
+    Columns: pixels, pixels with depth, colour (3), camera-frame point (3) m, its products
     xx xy xz yy yz zz, unit normal towards the camera (3), pairs of neighbours inside, their ``contrast`` (2, H, W).
     """
     height, width = labels.shape
-    sums = np.zeros((n_labels, 20), np.float64)
+    sums = np.zeros((n_labels, 19), np.float64)
     for v in range(height):
         for u in range(width):
             label = labels[v, u]
             row = sums[label]
             row[0] += 1.0
             for k in range(3):
-                value = np.float64(lab[v, u, k])
-                row[2 + k] += value
-                row[5] += value * value
+                row[2 + k] += np.float64(lab[v, u, k])
             if u + 1 < width and labels[v, u + 1] == label:
-                row[18] += 1.0
-                row[19] += contrast[0, v, u]
+                row[17] += 1.0
+                row[18] += contrast[0, v, u]
             if v + 1 < height and labels[v + 1, u] == label:
-                row[18] += 1.0
-                row[19] += contrast[1, v, u]
+                row[17] += 1.0
+                row[18] += contrast[1, v, u]
             if disparity[v, u] <= 0:
                 continue
             pz = 1.0 / disparity[v, u]
             px, py = x[u] * pz, y[v] * pz
             row[1] += 1.0
-            row[6] += px
-            row[7] += py
-            row[8] += pz
-            row[9] += px * px
-            row[10] += px * py
-            row[11] += px * pz
-            row[12] += py * py
-            row[13] += py * pz
-            row[14] += pz * pz
+            row[5] += px
+            row[6] += py
+            row[7] += pz
+            row[8] += px * px
+            row[9] += px * py
+            row[10] += px * pz
+            row[11] += py * py
+            row[12] += py * pz
+            row[13] += pz * pz
             a, b, c = planes[v, u, 0], planes[v, u, 1], planes[v, u, 2]
             length = np.sqrt(a * a + b * b + c * c)
             if length > 0:
-                row[15] -= a / length
-                row[16] -= b / length
-                row[17] -= c / length
+                row[14] -= a / length
+                row[15] -= b / length
+                row[16] -= c / length
     return sums
 
 

@@ -66,12 +66,17 @@ def _class_figures(
     rank = _ranks(features[rows] @ texts.T, truth)
     by_class = [float((rank[truth == name] == 0).mean()) for name in np.unique(truth)]
     what = f"class of {len(class_names)}, prompt '{prompt.replace('{a}', 'a {}')}', {label}"
-    chance = 1.0 / len(class_names)
+    mean = f"mean over classes of top-1: {what}"
     return [
-        Figure(f"top-1: {what}", _mean(rank == 0), chance, len(rows)),
-        Figure(f"top-5: {what}", _mean(rank < 5), 5 * chance, len(rows)),
-        Figure(f"mean over classes of top-1: {what}", float(np.mean(by_class or [0.0])), chance, len(rows)),
+        *_tops(what, rank, len(class_names), (1, 5)),
+        Figure(mean, float(np.mean(by_class or [0.0])), 1.0 / len(class_names), len(rows)),
     ]
+
+
+def _tops(what: str, rank: Int64Array, n_candidates: int, places: Sequence[int] = (1,)) -> list[Figure]:
+    """How often the true one of ``n_candidates`` is among the first of each of ``places``."""
+    n_candidates = max(1, n_candidates)
+    return [Figure(f"top-{k}: {what}", _mean(rank < k), k / n_candidates, len(rank)) for k in places]
 
 
 def _colour_figures(
@@ -87,21 +92,11 @@ def _colour_figures(
     of_own_class = similarity.reshape(len(rows), len(class_names), len(colours))[np.arange(len(rows)), name]
     rank = _ranks(similarity, name * len(colours) + colour)
     anything = encoder.encode_texts([f"a {word} object" for word in colours])
+    what = f"colour of {len(colours)}, 'a {{colour}} "
     return [
-        Figure(
-            f"top-1: colour of {len(colours)}, 'a {{colour}} {{class}}' with the true class, exact boxes",
-            _mean(_ranks(of_own_class, colour) == 0),
-            1.0 / len(colours),
-            len(rows),
-        ),
-        Figure(
-            f"top-1: colour of {len(colours)}, 'a {{colour}} object', exact boxes",
-            _mean(_ranks(features[rows] @ anything.T, colour) == 0),
-            1.0 / len(colours),
-            len(rows),
-        ),
-        Figure(f"top-1: colour and class of {len(pairs)}, exact boxes", _mean(rank == 0), 1.0 / len(pairs), len(rows)),
-        Figure(f"top-5: colour and class of {len(pairs)}, exact boxes", _mean(rank < 5), 5.0 / len(pairs), len(rows)),
+        *_tops(f"{what}{{class}}' with the true class, exact boxes", _ranks(of_own_class, colour), len(colours)),
+        *_tops(f"{what}object', exact boxes", _ranks(features[rows] @ anything.T, colour), len(colours)),
+        *_tops(f"colour and class of {len(pairs)}, exact boxes", rank, len(pairs), (1, 5)),
     ]
 
 
@@ -191,7 +186,7 @@ def _room_figure(encoder: Encoder, crops: CropSet, features: Float32Array) -> Fi
     texts = encoder.encode_texts([fill("an image of {a}", ROOM_NAMES.get(kind, (kind,))[0]) for kind in kinds])
     truth = np.array([kinds.index(crops.truths[row].room) for row in rows], np.int64)
     rank = _ranks(features[rows] @ texts.T, truth)
-    return Figure(f"top-1: room of {len(kinds)}, whole image", _mean(rank == 0), 1.0 / max(1, len(kinds)), len(rows))
+    return _tops(f"room of {len(kinds)}, whole image", rank, len(kinds))[0]
 
 
 def _ranks(similarity: Float32Array, truth: Int64Array) -> Int64Array:

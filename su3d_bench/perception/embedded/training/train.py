@@ -18,6 +18,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import jinja2
 import numpy as np
 
 from su3d_bench.core.errors import ModelMissing, Su3dError
@@ -155,58 +156,10 @@ def _write_card(
         "largest_difference_from_torch": difference,
     }
     (order.out / CARD_JSON).write_text(json.dumps(card, indent=1) + "\n")
-    (order.out / CARD_TEXT).write_text(_card_text(order, towers, n_crops, len(class_names), files, figures, difference))
-
-
-def _card_text(
-    order: Order,
-    towers: Towers,
-    n_crops: tuple[int, int],
-    n_classes: int,
-    files: dict[str, bytes],
-    figures: Sequence[Figure],
-    difference: float,
-) -> str:
-    sizes = ", ".join(f"`{name}` {len(data) / 1e6:.2f} MB" for name, data in files.items())
-    rows = "\n".join(f"| {f.name} | {100 * f.value:.1f} % | {100 * f.chance:.2f} % | {f.n} |" for f in figures)
-    return f"""# Model card: {EmbeddedEncoder.name}
-
-Two small towers, image and text, into one space of {DIM} dimensions; {sizes}. Written by
-`python -m {PROGRAM}`; the same facts for programs are in `{CARD_JSON}`.
-
-## What it is for
-Naming, describing and retrieving objects of the built-in rooms (dataset `rooms`, and the same rooms in Replica's
-layout) without downloads and without a GPU. It has seen nothing else: **on camera images its answers mean little**;
-use the profile `stored` with features of a large model there. It knows the words of `lexicon.py`; other words
-reach it through shared 4-grams only, which is weak.
-
-## How it was trained
-- Data: {n_crops[0]} crops of {order.rooms} rooms, `<kind>{FIRST_TRAINING_NUMBER}` and on, {order.frames_per_room}
-  images a room from its trajectory, rendered by the project's own generator; benchmark rooms have numbers below
-  {FIRST_TRAINING_NUMBER}. {n_classes} classes.
-- Crops: the object's box, a careless box, a part of the object, the built-in segmenter's boxes, at ratios 0.8, 1, 1.2,
-  2 and 4, and whole images. A wide crop's captions tell the neighbours that it shows ("cushion on sofa"), a whole
-  image's the kind of room.
-- Augmentation: mirroring, light, contrast, tint, noise, shifts, hidden patches, other apparent sizes.
-- Loss: cross-entropy over one caption a class, and a contrastive loss with every true crop-caption pair of the batch
-  as a positive, at the fixed temperature 0.05.
-- Seed {order.seed}, {towers.n_steps} steps of 256 crops in {towers.minutes:.1f} minutes on the CPU.
-
-## What it can tell
-Measured with the exported files on {n_crops[1]} crops of {order.held_out_rooms} rooms that took no part in training
-(`<kind>{FIRST_HELD_OUT_NUMBER}` and on).
-
-| figure | value | chance | trials |
-| --- | --- | --- | --- |
-{rows}
-
-ONNX Runtime and torch differ by at most {difference:.1e} in any feature.
-
-## Known limits
-- Objects of a few pixels, and parts without the rest (a chair's leg, a lamp's foot), are often misnamed.
-- Words that the lexicon lacks, sentences of more than 16 words and negation are not understood.
-- Sizes ("large") are judged from pixels: a crop does not tell the distance.
-"""
+    template = (Path(__file__).parent / "model_card.md.j2").read_text()
+    environment = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True)
+    text = environment.from_string(template).render(card, program=PROGRAM, card_json=CARD_JSON)
+    (order.out / CARD_TEXT).write_text(text)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

@@ -10,9 +10,10 @@ from functools import cached_property
 from typing import Any, Protocol
 
 import numpy as np
+from numpy.typing import NDArray
 from pydantic import ConfigDict
 
-from su3d_bench.core.devices import CPU, Batches
+from su3d_bench.core.devices import CPU, Batches, first_batch, make_deterministic, require
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.types import Float32Array, Int64Array, UInt8Array
 from su3d_bench.perception.cache import FrameCache, content_key
@@ -71,6 +72,37 @@ class Towers(Protocol):
     def image_features(self, pixels: Float32Array) -> Float32Array: ...
 
     def text_features(self, tokens: Int64Array) -> Float32Array: ...
+
+
+class TorchTowers:
+    """``Towers`` of a torch model on one device in one precision; a subclass says what encodes images and texts.
+
+    ``n_values``: about how many numbers an image takes on its way, which rules the first batch on a GPU.
+    """
+
+    encode_image: Callable[[Any], Any]
+    encode_text: Callable[[Any], Any]
+
+    def __init__(self, model: Any, device: str, precision: str, batch: int, n_values: int) -> None:
+        dtype = getattr(require("torch", f"device '{device}'"), precision)
+        make_deterministic(device)
+        self._device, self._dtype = device, dtype
+        model.to(device=device, dtype=dtype)
+        n_bytes = sum(p.numel() * p.element_size() for p in model.parameters())
+        self.batch = batch or first_batch(device, n_values * dtype.itemsize, n_bytes)
+
+    def image_features(self, pixels: Float32Array) -> Float32Array:
+        return self._features(self.encode_image, pixels, self._dtype)
+
+    def text_features(self, tokens: Int64Array) -> Float32Array:
+        return self._features(self.encode_text, tokens, None)
+
+    def _features(self, encode: Callable[[Any], Any], values: NDArray[Any], dtype: Any) -> Float32Array:
+        import torch
+
+        with torch.inference_mode():
+            features = encode(torch.from_numpy(values).to(device=self._device, dtype=dtype))
+            return np.asarray(features.float().cpu().numpy(), np.float32)
 
 
 class FoundationEncoder:

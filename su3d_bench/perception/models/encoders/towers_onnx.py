@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from su3d_bench.core.devices import CPU
 from su3d_bench.core.errors import CheckFailed, DataError, StoreError
 from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.perception.models.encoders import towers_transformers
@@ -52,13 +53,14 @@ def export_encoder(files: ModelFiles, folder: Path) -> Manifest:
 
     spec = towers_transformers.read_spec(files, "original")
     model = towers_transformers.load_model(files)
+    towers = towers_transformers.TransformersTowers(model, CPU, "float32", 1)
     make_folder(folder)
     pixels, tokens = _probes(files, spec)
     written = []
     parity = []
     for name, tower, values in (
-        (IMAGE_FILE, _image_tower(model), torch.from_numpy(pixels)),
-        (TEXT_FILE, _text_tower(model), torch.from_numpy(tokens)),
+        (IMAGE_FILE, _tower(towers.encode_image, model), torch.from_numpy(pixels)),
+        (TEXT_FILE, _tower(towers.encode_text, model), torch.from_numpy(tokens)),
     ):
         kind = name.partition(".")[0]
         inputs = {"pixels" if kind == "image" else "tokens": values}
@@ -94,16 +96,8 @@ def _probes(files: ModelFiles, spec: EncoderSpec) -> tuple[Float32Array, Int64Ar
     return spec.transform.pixels(images), tokenise(PROBES)
 
 
-def _image_tower(model: Any) -> Any:
-    return _tower(lambda pixels: model.get_image_features(pixel_values=pixels).pooler_output, model)
-
-
-def _text_tower(model: Any) -> Any:
-    return _tower(lambda tokens: model.get_text_features(input_ids=tokens).pooler_output, model)
-
-
-def _tower(run: Callable[[Any], Any], model: Any) -> Any:
-    """``run`` as a module, which is what the exporter takes."""
+def _tower(encode: Callable[[Any], Any], model: Any) -> Any:
+    """``encode`` as a module, which is what the exporter takes."""
     import torch
 
     class Tower(torch.nn.Module):
@@ -112,7 +106,7 @@ def _tower(run: Callable[[Any], Any], model: Any) -> Any:
             self.model = model
 
         def forward(self, values: Any) -> Any:
-            return run(values)
+            return encode(values)
 
     return Tower().eval()
 

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.devices import first_batch, make_deterministic, require
+from su3d_bench.core.devices import require
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import Float32Array, Int64Array
-from su3d_bench.perception.models.encoders.encoder import EncoderSpec
+from su3d_bench.core.types import Int64Array
+from su3d_bench.perception.models.encoders.encoder import EncoderSpec, TorchTowers
 from su3d_bench.perception.models.encoders.image_transform import Convention, ImageTransform
 from su3d_bench.perception.models.files import ModelFiles, bounded, read_weights
 
@@ -76,30 +76,10 @@ def read_tokeniser(files: ModelFiles) -> Callable[[Sequence[str]], Int64Array]:
     return tokens
 
 
-class OpenClipTowers:
+class OpenClipTowers(TorchTowers):
     """The towers of an open_clip model on one device in one precision."""
 
     def __init__(self, model: Any, device: str, precision: str, batch: int) -> None:
-        import torch
-
-        make_deterministic(device)
-        self._dtype = getattr(torch, precision)
-        self._device = device
-        self._model = model.to(device=device, dtype=self._dtype)
-        n_bytes = sum(p.numel() * p.element_size() for p in model.parameters())
         # 30 MB an image in float32: about ViT-H-14's widest layer four times over
-        self.batch = batch or first_batch(device, 7_500_000 * self._dtype.itemsize, n_bytes)
-
-    def image_features(self, pixels: Float32Array) -> Float32Array:
-        import torch
-
-        with torch.inference_mode():
-            values = torch.from_numpy(pixels).to(self._device, self._dtype)
-            return np.asarray(self._model.encode_image(values).float().cpu().numpy(), np.float32)
-
-    def text_features(self, tokens: Int64Array) -> Float32Array:
-        import torch
-
-        with torch.inference_mode():
-            ids = torch.from_numpy(tokens).to(self._device)
-            return np.asarray(self._model.encode_text(ids).float().cpu().numpy(), np.float32)
+        super().__init__(model, device, precision, batch, 7_500_000)
+        self.encode_image, self.encode_text = model.encode_image, model.encode_text

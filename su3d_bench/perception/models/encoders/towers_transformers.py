@@ -5,12 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
-from su3d_bench.core.devices import first_batch, make_deterministic, require_transformers
+from su3d_bench.core.devices import require_transformers
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import Float32Array, Int64Array
-from su3d_bench.perception.models.encoders.encoder import EncoderSpec, check_spec
+from su3d_bench.perception.models.encoders.encoder import EncoderSpec, TorchTowers, check_spec
 from su3d_bench.perception.models.encoders.image_transform import Convention, read_transform
 from su3d_bench.perception.models.files import ModelFiles, load_pretrained, read_settings
 
@@ -84,42 +81,18 @@ def load_model(files: ModelFiles) -> Any:
     return load_pretrained(files, model_class, attn_implementation="sdpa").eval()
 
 
-class TransformersTowers:
+class TransformersTowers(TorchTowers):
     """The towers of a transformers model on one device in one precision."""
 
     def __init__(self, model: Any, device: str, precision: str, batch: int) -> None:
-        import torch
-
-        make_deterministic(device)
-        self._dtype = getattr(torch, precision)
-        self._device = device
-        self._model = model.to(device=device, dtype=self._dtype)
-        n_bytes = sum(p.numel() * p.element_size() for p in self._model.parameters())
-        self.batch = batch or first_batch(device, _image_bytes(self._model, self._dtype.itemsize), n_bytes)
-
-    def image_features(self, pixels: Float32Array) -> Float32Array:
-        import torch
-
-        with torch.inference_mode():
-            values = torch.from_numpy(pixels).to(self._device, self._dtype)
-            return _array(self._model.get_image_features(pixel_values=values).pooler_output)
-
-    def text_features(self, tokens: Int64Array) -> Float32Array:
-        import torch
-
-        with torch.inference_mode():
-            # No mask: in CLIP a token sees those before it alone, and SigLIP was trained without one.
-            ids = torch.from_numpy(tokens).to(self._device)
-            return _array(self._model.get_text_features(input_ids=ids).pooler_output)
+        super().__init__(model, device, precision, batch, _image_values(model))
+        self.encode_image = lambda pixels: model.get_image_features(pixel_values=pixels).pooler_output
+        # No mask: in CLIP a token sees those before it alone, and SigLIP was trained without one.
+        self.encode_text = lambda ids: model.get_text_features(input_ids=ids).pooler_output
 
 
-def _array(features: Any) -> Float32Array:
-    return np.asarray(features.float().cpu().numpy(), np.float32)
-
-
-def _image_bytes(model: Any, itemsize: int) -> int:
-    """About what one image takes on its way: the widest layer's values four times over, and the attention's."""
+def _image_values(model: Any) -> int:
+    """About how many numbers one image takes on its way: the widest layer's four times over, and the attention's."""
     vision = model.config.vision_config
     n_tokens = (vision.image_size // vision.patch_size) ** 2 + 1
-    values = 4 * n_tokens * vision.intermediate_size + vision.num_attention_heads * n_tokens**2
-    return int(values * itemsize)
+    return int(4 * n_tokens * vision.intermediate_size + vision.num_attention_heads * n_tokens**2)
