@@ -6,25 +6,19 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from su3d_bench.datasets.rooms.objects.decor import DECOR
-from su3d_bench.datasets.rooms.objects.devices import DEVICES
-from su3d_bench.datasets.rooms.objects.dishes import DISHES
-from su3d_bench.datasets.rooms.objects.fixtures import FIXTURES
-from su3d_bench.datasets.rooms.objects.furniture import FURNITURE
-from su3d_bench.datasets.rooms.objects.household import HOUSEHOLD
-from su3d_bench.datasets.rooms.objects.items import Builder, Item, choose_look
-from su3d_bench.datasets.rooms.objects.textiles import TEXTILES
+from su3d_bench.datasets.rooms.classes import CLASSES
+from su3d_bench.datasets.rooms.objects import decor, devices, dishes, fixtures, furniture, household, textiles
+from su3d_bench.datasets.rooms.objects.items import Builder, Item, begin
 
-
-def _builders() -> Mapping[str, tuple[Builder, ...]]:
-    table: dict[str, tuple[Builder, ...]] = {}
-    for part in (FURNITURE, FIXTURES, DEVICES, DECOR, HOUSEHOLD, TEXTILES, DISHES):
-        for name, builders in part.items():
-            table[name] = table.get(name, ()) + builders
-    return table
-
-
-BUILDERS = _builders()
+_BUILDER_OF_MODEL: Mapping[str, Builder] = {
+    name: builder
+    for module in (furniture, fixtures, devices, decor, household, textiles, dishes)
+    for name, builder in vars(module).items()
+    if getattr(builder, "__module__", None) == module.__name__ and not name.startswith("_")
+}
+BUILDERS: Mapping[str, tuple[Builder, ...]] = {
+    known.name: tuple(_BUILDER_OF_MODEL[model] for model in known.models) for known in CLASSES if known.models
+}
 
 
 def make(
@@ -35,13 +29,9 @@ def make(
     avoid: frozenset[str] = frozenset(),
 ) -> Item:
     """A new instance of a class; ``model`` names one of its builders (``coffee_table``), else any of them."""
-    look = choose_look(class_name, rng, colour, avoid)
-    builder = _pick(class_name, rng, model)
-    return builder(look).item(builder.__name__)
-
-
-def _pick(class_name: str, rng: np.random.Generator, model: str | None) -> Builder:
+    assembly = begin(class_name, rng, colour, avoid)
     builders = BUILDERS[class_name]
     if model is None:
-        return builders[int(rng.integers(len(builders)))]
-    return next(builder for builder in builders if builder.__name__ == model)
+        model = builders[int(rng.integers(len(builders)))].__name__
+    _BUILDER_OF_MODEL[model](assembly)
+    return assembly.item(model)

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from su3d_bench.datasets.rooms.objects.items import Assembly, Builder, Look
+from su3d_bench.datasets.rooms.objects.items import Assembly
 from su3d_bench.datasets.rooms.objects.materials import (
     Material,
     Rgb,
@@ -41,20 +40,18 @@ from su3d_bench.datasets.rooms.objects.shapes import (
 
 def _shade(build: Assembly, radius: float, height: float, z: float) -> None:
     """A lit lampshade, open below and above."""
-    look = build.look
-    glowing = Material(Texture.PLAIN, look.rgb, shade(look.rgb, 0.9), glow=0.35)
-    top = radius * look.rng.uniform(0.55, 0.85)
+    glowing = Material(Texture.PLAIN, build.rgb, shade(build.rgb, 0.9), glow=0.35)
+    top = radius * build.rng.uniform(0.55, 0.85)
     wall = [(radius, 0), (top, height), (top - 0.008, height), (radius - 0.008, 0), (radius, 0)]
     build.add(glowing, lathe(wall, 26).moved(z=z))
     bulb = Material(Texture.PLAIN, linear((255, 244, 214)), linear((255, 244, 214)), glow=1.0)
     build.add(bulb, ellipsoid(0.03, 0.03, 0.04).moved(z=z + height * 0.4))
 
 
-def table_lamp(look: Look) -> Assembly:
-    build = Assembly(look)
-    foot, tall = look.size(0.075, 0.1), look.size(0.2, 0.3)
-    body = ceramic(look.other(str(look.rng.choice(["white", "blue", "green", "brown", "black"]))))
-    if look.chance(0.5):
+def table_lamp(build: Assembly) -> None:
+    foot, tall = build.size(0.075, 0.1), build.size(0.2, 0.3)
+    body = ceramic(build.other("white", "blue", "green", "brown", "black"))
+    if build.chance(0.5):
         build.add(
             body,
             lathe(
@@ -72,27 +69,23 @@ def table_lamp(look: Look) -> Assembly:
         )
     else:
         build.add(
-            metal(tone("black"), look.rng),
+            metal(tone("black"), build.rng),
             lathe([(0, 0), (foot, 0), (foot, 0.015), (0.014, 0.025), (0.014, tall), (0, tall)], 20),
         )
-    build.add(chrome(look.rng), cylinder(0.009, 0.12, z=tall - 0.005))
-    _shade(build, look.size(0.13, 0.17), look.size(0.15, 0.2), tall + 0.02)
-    return build
+    build.add(chrome(build.rng), cylinder(0.009, 0.12, z=tall - 0.005))
+    _shade(build, build.size(0.13, 0.17), build.size(0.15, 0.2), tall + 0.02)
 
 
-def floor_lamp(look: Look) -> Assembly:
-    build = Assembly(look)
-    tall = look.rng.uniform(1.25, 1.45)
-    pole = metal(tone(str(look.rng.choice(["black", "grey", "brown"]))), look.rng)
+def floor_lamp(build: Assembly) -> None:
+    tall = build.rng.uniform(1.25, 1.45)
+    pole = metal(tone(str(build.rng.choice(["black", "grey", "brown"]))), build.rng)
     build.add(pole, lathe([(0, 0), (0.15, 0), (0.15, 0.02), (0.03, 0.035), (0, 0.035)], 24))
     build.add(pole, cylinder(0.014, tall - 0.03, z=0.03))
-    _shade(build, look.size(0.18, 0.23), look.size(0.23, 0.29), tall - 0.05)
-    return build
+    _shade(build, build.size(0.18, 0.23), build.size(0.23, 0.29), tall - 0.05)
 
 
-def desk_lamp(look: Look) -> Assembly:
-    build = Assembly(look)
-    body = metal(look.rgb, look.rng) if look.material == "metal" else plastic(look.rgb)
+def desk_lamp(build: Assembly) -> None:
+    body = metal(build.rgb, build.rng) if build.material == "metal" else plastic(build.rgb)
     build.add(body, lathe([(0, 0), (0.085, 0), (0.085, 0.018), (0.02, 0.028), (0, 0.028)], 20))
     build.add(body, tube([(0, 0, 0.02), (0, 0.1, 0.22), (0, -0.06, 0.4)], 0.011))
     build.add(body, ellipsoid(0.02, 0.02, 0.02).moved(0, 0.1, 0.22))
@@ -100,19 +93,16 @@ def desk_lamp(look: Look) -> Assembly:
     build.add(body, hood.turned("x", -28).moved(0, -0.09, 0.33))
     bulb = Material(Texture.PLAIN, linear((255, 244, 214)), linear((255, 244, 214)), glow=1.0)
     build.add(bulb, ellipsoid(0.028, 0.028, 0.028).moved(0, -0.085, 0.36))
-    return build
 
 
-def ceiling_lamp(look: Look) -> Assembly:
+def ceiling_lamp(build: Assembly) -> None:
     """Hangs from the ceiling: canopy, cord, shade."""
-    build = Assembly(look)
-    cord = look.rng.uniform(0.12, 0.25)
-    radius, height = look.size(0.2, 0.27), look.size(0.16, 0.22)
+    cord = build.rng.uniform(0.12, 0.25)
+    radius, height = build.size(0.2, 0.27), build.size(0.16, 0.22)
     _shade(build, radius, height, 0.0)
     black = plastic(tone("black"))
     build.add(black, cylinder(0.008, cord, z=height * 0.5), cylinder(0.05, 0.03, z=height * 0.5 + cord))
     build.add(black, *[block(radius * 0.9, 0.008, 0.006, 0, 0, height * 0.8).turned("z", turn) for turn in (0, 90)])
-    return build
 
 
 def _leaf(length: float, width: float, droop: float) -> Shape:
@@ -125,12 +115,11 @@ def _leaf(length: float, width: float, droop: float) -> Shape:
     return sheet(np.stack([x, y, z], axis=-1), 0.004)
 
 
-def indoor_plant(look: Look) -> Assembly:
+def indoor_plant(build: Assembly) -> None:
     """A pot with soil and one of three habits: broad leaves, a bushy crown, upright blades."""
-    build = Assembly(look)
-    r = look.size(0.08, 0.12)
-    pot_height = r * look.rng.uniform(1.4, 1.9)
-    pot_colour = look.other(str(look.rng.choice(["white", "orange", "brown", "blue", "grey", "black", "yellow"])))
+    r = build.size(0.08, 0.12)
+    pot_height = r * build.rng.uniform(1.4, 1.9)
+    pot_colour = build.other("white", "orange", "brown", "blue", "grey", "black", "yellow")
     rim = [
         (0, 0),
         (r * 0.72, 0),
@@ -146,117 +135,108 @@ def indoor_plant(look: Look) -> Assembly:
         Material(Texture.CARPET, linear((62, 42, 28)), linear((30, 20, 14)), 0.01),
         cylinder(r * 0.92, 0.006, z=pot_height * 0.9),
     )
-    habit = int(look.rng.integers(0, 3))
-    tall = look.size(0.28, 0.5)
+    habit = int(build.rng.integers(0, 3))
+    tall = build.size(0.28, 0.5)
     base = pot_height * 0.9
-    green = look.rgb
+    green = build.rgb
     if habit == 0:
         _broad_leaves(build, green, base, tall)
     elif habit == 1:
         _bush(build, green, base, tall, r)
     else:
         _blades(build, green, base, tall, r)
-    return build
 
 
-def _leaf_material(green: Rgb, look: Look) -> Material:
-    tinted = mix(green, linear((150, 180, 60)), float(look.rng.uniform(0, 0.35)))
-    return Material(Texture.LEAF, shade(tinted, float(look.rng.uniform(0.7, 1.15))), shade(tinted, 1.7), 0.02, 0.15)
+def _leaf_material(green: Rgb, build: Assembly) -> Material:
+    tinted = mix(green, linear((150, 180, 60)), float(build.rng.uniform(0, 0.35)))
+    return Material(Texture.LEAF, shade(tinted, float(build.rng.uniform(0.7, 1.15))), shade(tinted, 1.7), 0.02, 0.15)
 
 
 def _broad_leaves(build: Assembly, green: Rgb, base: float, tall: float) -> None:
-    look = build.look
-    n = int(look.rng.integers(9, 14))
+    n = int(build.rng.integers(9, 14))
     for i in range(n):
-        turn = 360 * i * 0.381966 + look.rng.uniform(-12, 12)  # the golden angle spreads leaves evenly
+        turn = 360 * i * 0.381966 + build.rng.uniform(-12, 12)  # the golden angle spreads leaves evenly
         lift = tall * (0.25 + 0.6 * i / n)
         stem_end = (0.0, 0.045, base + lift)
         stem = tube([(0, 0, base), (0, 0.02, base + lift * 0.6), stem_end], 0.005, 5)
         leaf = _leaf(
-            tall * look.rng.uniform(0.42, 0.6), tall * look.rng.uniform(0.24, 0.34), look.rng.uniform(0.5, 0.95)
+            tall * build.rng.uniform(0.42, 0.6), tall * build.rng.uniform(0.24, 0.34), build.rng.uniform(0.5, 0.95)
         )
-        build.add(_leaf_material(green, look), join([stem, leaf.moved(*stem_end)]).turned("z", turn))
+        build.add(_leaf_material(green, build), join([stem, leaf.moved(*stem_end)]).turned("z", turn))
 
 
 def _bush(build: Assembly, green: Rgb, base: float, tall: float, r: float) -> None:
-    look = build.look
-    trunk = wood(tone("brown"), look.rng, 2)
+    trunk = wood(tone("brown"), build.rng, 2)
     build.add(trunk, tube([(0, 0, base), (0.01, 0, base + tall * 0.35), (0, 0.01, base + tall * 0.6)], 0.012, 6))
     for i in range(26):
-        turn, rise = 360 * i * 0.381966, look.rng.uniform(0.3, 0.95)
-        out = r * 0.5 * np.sin(np.pi * rise) * look.rng.uniform(0.4, 1.0)
-        leaf = _leaf(look.rng.uniform(0.13, 0.18), look.rng.uniform(0.07, 0.1), look.rng.uniform(-0.2, 0.8))
-        build.add(_leaf_material(green, look), leaf.moved(0, float(out), base + tall * float(rise)).turned("z", turn))
+        turn, rise = 360 * i * 0.381966, build.rng.uniform(0.3, 0.95)
+        out = r * 0.5 * np.sin(np.pi * rise) * build.rng.uniform(0.4, 1.0)
+        leaf = _leaf(build.rng.uniform(0.13, 0.18), build.rng.uniform(0.07, 0.1), build.rng.uniform(-0.2, 0.8))
+        build.add(_leaf_material(green, build), leaf.moved(0, float(out), base + tall * float(rise)).turned("z", turn))
 
 
 def _blades(build: Assembly, green: Rgb, base: float, tall: float, r: float) -> None:
-    look = build.look
-    for i in range(int(look.rng.integers(10, 15))):
-        length, turn = tall * look.rng.uniform(0.7, 1.15), 360 * i * 0.381966
+    for i in range(int(build.rng.integers(10, 15))):
+        length, turn = tall * build.rng.uniform(0.7, 1.15), 360 * i * 0.381966
         t = np.linspace(0, 1, 6)
-        half = 0.5 * look.rng.uniform(0.035, 0.05) * (1 - t**2.5) + 0.002
-        lean = look.rng.uniform(0.05, 0.3)
+        half = 0.5 * build.rng.uniform(0.035, 0.05) * (1 - t**2.5) + 0.002
+        lean = build.rng.uniform(0.05, 0.3)
         y, z = r * 0.3 + lean * length * t**2, length * t * (1 - 0.2 * lean)
         grid = np.stack([np.stack([half * side, y, z], axis=-1) for side in (-1, 0, 1)], axis=1)
-        build.add(_leaf_material(green, look), sheet(grid, 0.005).moved(z=base - 0.01).turned("z", turn))
+        build.add(_leaf_material(green, build), sheet(grid, 0.005).moved(z=base - 0.01).turned("z", turn))
 
 
-def vase(look: Look) -> Assembly:
-    build = Assembly(look)
-    r, h = look.size(0.065, 0.1), look.size(0.24, 0.36)
+def vase(build: Assembly) -> None:
+    r, h = build.size(0.065, 0.1), build.size(0.24, 0.36)
     shapes = [
         [(r * 0.6, 0), (r, h * 0.3), (r * 0.85, h * 0.55), (r * 0.38, h * 0.8), (r * 0.55, h)],
         [(r * 0.5, 0), (r * 0.7, h * 0.2), (r, h * 0.65), (r * 0.9, h * 0.82), (r * 0.5, h * 0.9), (r * 0.6, h)],
         [(r * 0.45, 0), (r * 0.5, h * 0.1), (r * 0.62, h * 0.5), (r * 0.95, h)],
     ]
-    outer = shapes[int(look.rng.integers(0, 3))]
+    outer = shapes[int(build.rng.integers(0, 3))]
     inner = [(radius * 0.86, z) for radius, z in reversed(outer[1:])]
-    wall = ceramic(look.rgb) if look.material == "ceramic" else glass(look.rgb)
-    if look.chance(0.4):
+    wall = ceramic(build.rgb) if build.material == "ceramic" else glass(build.rgb)
+    if build.chance(0.4):
         wall = replace(
             wall,
-            texture=Texture(int(look.rng.choice([Texture.STRIPES, Texture.ZIGZAG]))),
-            b=mix(look.rgb, (0.85, 0.85, 0.85), 0.7),
+            texture=Texture(int(build.rng.choice([Texture.STRIPES, Texture.ZIGZAG]))),
+            b=mix(build.rgb, (0.85, 0.85, 0.85), 0.7),
             scale=0.05,
             axis=1,
         )
     build.add(wall, lathe([(0, 0), *outer, *inner, (0, h * 0.12)], 24))
-    if look.chance(0.5):
+    if build.chance(0.5):
         for i in range(5):
-            bend = look.rng.uniform(0.02, 0.07)
-            top = (0.0, float(bend), h + look.rng.uniform(0.08, 0.18))
+            bend = build.rng.uniform(0.02, 0.07)
+            top = (0.0, float(bend), h + build.rng.uniform(0.08, 0.18))
             stem = tube([(0, 0, h * 0.3), (0, bend * 0.4, h), top], 0.004, 5).turned("z", 72 * i)
             build.add(paint(tone("green")), stem)
-            bloom = look.other(str(look.rng.choice(["red", "yellow", "pink", "purple", "white"])))
+            bloom = build.other("red", "yellow", "pink", "purple", "white")
             build.add(paint(bloom), ellipsoid(0.028, 0.028, 0.022).moved(*top).turned("z", 72 * i))
-    return build
 
 
-def picture(look: Look) -> Assembly:
-    build = Assembly(look)
-    width, height = look.size(0.42, 0.7), look.size(0.38, 0.56)
-    bar = look.rng.uniform(0.02, 0.04)
-    frame = wood(look.rgb, look.rng) if look.colour == "brown" else paint(look.rgb, 0.25)
+def picture(build: Assembly) -> None:
+    width, height = build.size(0.42, 0.7), build.size(0.38, 0.56)
+    bar = build.rng.uniform(0.02, 0.04)
+    frame = wood(build.rgb, build.rng) if build.colour == "brown" else paint(build.rgb, 0.25)
     build.add(frame, *[block(bar, 0.026, height, sx * (width - bar) / 2) for sx in (-1, 1)])
     build.add(frame, *[block(width - 2 * bar, 0.026, bar, 0, 0, z) for z in (0.0, height - bar)])
-    margin = bar + (0.045 if look.chance(0.5) else 0.0)
+    margin = bar + (0.045 if build.chance(0.5) else 0.0)
     build.add(paper(tone("white")), block(width - 2 * bar, 0.01, height - 2 * bar, 0, 0.004, bar))
     extent = (-width / 2 + margin, width / 2 - margin, margin, height - margin)
     colours = [
-        look.other(str(name))
-        for name in look.rng.choice(["red", "blue", "green", "yellow", "orange", "purple", "pink"], 2, replace=False)
+        build.other(str(name))
+        for name in build.rng.choice(["red", "blue", "green", "yellow", "orange", "purple", "pink"], 2, replace=False)
     ]
-    art = Material(Texture.PICTURE, colours[0], colours[1], 1.0, 0.1, 0.0, 0, extent, int(look.rng.integers(1, 4000)))
+    art = Material(Texture.PICTURE, colours[0], colours[1], 1.0, 0.1, 0.0, 0, extent, int(build.rng.integers(1, 4000)))
     build.add(art, block(width - 2 * margin, 0.004, height - 2 * margin, 0, -0.0035, margin))
-    return build
 
 
-def clock(look: Look) -> Assembly:
-    build = Assembly(look)
-    r = look.size(0.14, 0.19)
+def clock(build: Assembly) -> None:
+    r = build.size(0.14, 0.19)
     rim = lathe([(0, 0), (r, 0), (r, 0.03), (r * 0.9, 0.036), (r * 0.88, 0.024), (0, 0.024)], 30)
     build.add(
-        metal(look.rgb, look.rng) if look.material == "metal" else plastic(look.rgb), rim.turned("x", 90).moved(z=r)
+        metal(build.rgb, build.rng) if build.material == "metal" else plastic(build.rgb), rim.turned("x", 90).moved(z=r)
     )
     face = Material(
         Texture.CLOCK_FACE, tone("white"), tone("black"), 1.0, 0.2, 0.0, 0, (-r * 0.88, r * 0.88, r * 0.12, r * 1.88)
@@ -264,35 +244,31 @@ def clock(look: Look) -> Assembly:
     build.add(face, cylinder(r * 0.87, 0.003).turned("x", 90).moved(0, -0.0245, r))
     hands = paint(tone("black"))
     for length, thick, turn in (
-        (r * 0.5, 0.016, look.rng.uniform(0, 360)),
-        (r * 0.72, 0.011, look.rng.uniform(0, 360)),
+        (r * 0.5, 0.016, build.rng.uniform(0, 360)),
+        (r * 0.72, 0.011, build.rng.uniform(0, 360)),
     ):
         build.add(hands, block(thick, 0.003, length, 0, 0, -0.02).turned("y", turn).moved(0, -0.031, r))
-    return build
 
 
-def candle(look: Look) -> Assembly:
-    build = Assembly(look)
-    r, h = look.size(0.038, 0.05), look.size(0.12, 0.2)
+def candle(build: Assembly) -> None:
+    r, h = build.size(0.038, 0.05), build.size(0.12, 0.2)
     build.add(
-        metal(linear((176, 140, 70)), look.rng),
+        metal(linear((176, 140, 70)), build.rng),
         lathe([(0, 0), (r * 1.6, 0), (r * 1.75, 0.018), (r * 1.6, 0.018), (r * 1.4, 0.008), (0, 0.008)], 20),
     )
     build.add(
-        paint(look.rgb, 0.2), lathe([(0, 0), (r, 0), (r, h), (r * 0.8, h - 0.008), (0, h - 0.012)], 18).moved(z=0.009)
+        paint(build.rgb, 0.2), lathe([(0, 0), (r, 0), (r, h), (r * 0.8, h - 0.008), (0, h - 0.012)], 18).moved(z=0.009)
     )
     build.add(paint(tone("black")), cylinder(0.003, 0.02, z=h - 0.004))
     flame = Material(Texture.PLAIN, linear((255, 190, 70)), linear((255, 170, 50)), glow=1.0)
     build.add(flame, ellipsoid(0.009, 0.009, 0.02).moved(z=h + 0.03))
-    return build
 
 
-def sculpture(look: Look) -> Assembly:
-    build = Assembly(look)
-    h = look.size(0.26, 0.4)
-    body = stone(look.rgb, look.rng) if look.material == "stone" else metal(look.rgb, look.rng)
+def sculpture(build: Assembly) -> None:
+    h = build.size(0.26, 0.4)
+    body = stone(build.rgb, build.rng) if build.material == "stone" else metal(build.rgb, build.rng)
     build.add(paint(tone("black"), 0.3), block(0.13, 0.13, 0.04))
-    kind = int(look.rng.integers(0, 3))
+    kind = int(build.rng.integers(0, 3))
     if kind == 0:  # a bust
         build.add(
             body,
@@ -329,19 +305,7 @@ def sculpture(look: Look) -> Assembly:
             build.add(
                 body,
                 ellipsoid(share, share * 0.9, share * 0.6).moved(
-                    float(look.rng.uniform(-0.012, 0.012)), 0, z + share * 0.6
+                    float(build.rng.uniform(-0.012, 0.012)), 0, z + share * 0.6
                 ),
             )
             z += share * 1.17
-    return build
-
-
-DECOR: Mapping[str, tuple[Builder, ...]] = {
-    "lamp": (table_lamp, floor_lamp, desk_lamp, ceiling_lamp),
-    "indoor-plant": (indoor_plant,),
-    "vase": (vase,),
-    "picture": (picture,),
-    "clock": (clock,),
-    "candle": (candle,),
-    "sculpture": (sculpture,),
-}

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
-from su3d_bench.datasets.rooms.objects.items import Assembly, Builder, Look
+from su3d_bench.datasets.rooms.objects.items import Assembly
 from su3d_bench.datasets.rooms.objects.materials import (
     Material,
     Texture,
@@ -20,17 +18,16 @@ from su3d_bench.datasets.rooms.objects.materials import (
 from su3d_bench.datasets.rooms.objects.shapes import block, cylinder, lathe, soft_block, tube
 
 
-def refrigerator(look: Look) -> Assembly:
-    build = Assembly(look)
-    width, depth, height = look.size(0.6, 0.7), look.rng.uniform(0.6, 0.66), look.rng.uniform(1.65, 1.85)
-    body = metal(look.rgb, look.rng) if look.colour == "grey" else plastic(look.rgb)
+def refrigerator(build: Assembly) -> None:
+    width, depth, height = build.size(0.6, 0.7), build.rng.uniform(0.6, 0.66), build.rng.uniform(1.65, 1.85)
+    body = metal(build.rgb, build.rng) if build.colour == "grey" else plastic(build.rgb)
     build.add(body, soft_block(width, depth - 0.06, height - 0.04, 0, 0.03, 0.04, 0.02))
     build.add(paint(tone("black")), block(width - 0.06, depth - 0.1, 0.04, 0, 0.02))
-    split = height * look.rng.uniform(0.6, 0.7)
+    split = height * build.rng.uniform(0.6, 0.7)
     y = -depth / 2 + 0.028
     build.add(body, soft_block(width, 0.055, split - 0.055, 0, y, 0.05, 0.018))
     build.add(body, soft_block(width, 0.055, height - split - 0.005, 0, y, split + 0.005, 0.018))
-    steel = chrome(look.rng)
+    steel = chrome(build.rng)
     x = width / 2 - 0.06
     for z0, z1 in ((split - 0.5, split - 0.06), (split + 0.06, min(split + 0.38, height - 0.08))):
         build.add(
@@ -38,31 +35,27 @@ def refrigerator(look: Look) -> Assembly:
             tube([(x, y - 0.02, z0), (x, y - 0.065, z0 + 0.02), (x, y - 0.065, z1 - 0.02), (x, y - 0.02, z1)], 0.012),
         )
     build.spot((-width / 2 + 0.02, width / 2 - 0.02), (-depth / 2 + 0.08, depth / 2 - 0.02), height, 0.45)
-    return build
 
 
-def cooktop(look: Look) -> Assembly:
-    build = Assembly(look)
+def cooktop(build: Assembly) -> None:
     width, depth = 0.58, 0.5
     build.add(glass(linear((22, 22, 25))), soft_block(width, depth, 0.014, 0, 0, 0, 0.005))
-    iron = metal(linear((60, 60, 64)), look.rng)
+    iron = metal(linear((60, 60, 64)), build.rng)
     for sx in (-1, 1):
         for sy in (-1, 1):
             r = 0.085 if sx * sy > 0 else 0.065
             at = (sx * 0.15, sy * 0.12, 0.0142)
             ring = lathe([(r * 0.82, 0), (r, 0), (r, 0.006), (r * 0.82, 0.006), (r * 0.82, 0)], 22)
-            build.add(metal(linear((150, 60, 40)), look.rng), ring.moved(*at))
+            build.add(metal(linear((150, 60, 40)), build.rng), ring.moved(*at))
             build.add(iron, lathe([(0, 0), (r * 0.6, 0), (r * 0.6, 0.005), (0, 0.005)], 20).moved(*at))
             build.spot((at[0] - 0.16, at[0] + 0.16), (at[1] - 0.16, at[1] + 0.16), 0.0225, role="burner")
     for i in range(4):
-        build.add(chrome(look.rng), cylinder(0.016, 0.016, (i - 1.5) * 0.06, -depth / 2 + 0.03, 0.0142))
-    return build
+        build.add(chrome(build.rng), cylinder(0.016, 0.016, (i - 1.5) * 0.06, -depth / 2 + 0.03, 0.0142))
 
 
-def microwave(look: Look) -> Assembly:
-    build = Assembly(look)
-    width, depth, height = look.size(0.45, 0.52), look.rng.uniform(0.32, 0.37), look.size(0.26, 0.3)
-    build.add(plastic(look.rgb), soft_block(width, depth, height, 0, 0, 0.012, 0.012))
+def microwave(build: Assembly) -> None:
+    width, depth, height = build.size(0.45, 0.52), build.rng.uniform(0.32, 0.37), build.size(0.26, 0.3)
+    build.add(plastic(build.rgb), soft_block(width, depth, height, 0, 0, 0.012, 0.012))
     y = -depth / 2
     dark = glass(linear((18, 19, 22)))
     build.add(dark, block(width * 0.6, 0.012, height * 0.68, -width * 0.15, y - 0.006, 0.012 + height * 0.16))
@@ -81,7 +74,7 @@ def microwave(look: Look) -> Assembly:
                 grey, block(0.02, 0.006, 0.016, width * 0.36 + (i - 1) * 0.028, y - 0.0115, height * 0.3 + j * 0.04)
             )
     build.add(
-        chrome(look.rng),
+        chrome(build.rng),
         tube(
             [
                 (width * 0.18, y - 0.012, height * 0.25),
@@ -97,11 +90,10 @@ def microwave(look: Look) -> Assembly:
         *[block(0.04, 0.04, 0.014, sx * width * 0.4, sy * depth * 0.38) for sx in (-1, 1) for sy in (-1, 1)],
     )
     build.spot((-width / 2 + 0.03, width / 2 - 0.03), (-depth / 2 + 0.03, depth / 2 - 0.03), height + 0.012, 0.4)
-    return build
 
 
-def _screen(look: Look, width: float, z0: float, z1: float, lively: float, glow: float) -> Material:
-    base = linear((52, 108, 172)) if look.chance(0.5) else linear((38, 132, 120))
+def _screen(build: Assembly, width: float, z0: float, z1: float, lively: float, glow: float) -> Material:
+    base = linear((52, 108, 172)) if build.chance(0.5) else linear((38, 132, 120))
     return Material(
         Texture.SCREEN,
         base,
@@ -111,14 +103,13 @@ def _screen(look: Look, width: float, z0: float, z1: float, lively: float, glow:
         glow,
         0,
         (-width / 2, width / 2, z0, z1),
-        int(look.rng.integers(1, 999)),
+        int(build.rng.integers(1, 999)),
     )
 
 
-def tv_screen(look: Look) -> Assembly:
+def tv_screen(build: Assembly) -> None:
     """A flat black television on a wide foot."""
-    build = Assembly(look)
-    width = look.size(0.95, 1.2)
+    width = build.size(0.95, 1.2)
     height = width * 0.57
     black = plastic(linear((20, 20, 22)))
     build.add(black, soft_block(width, 0.04, height, 0, 0, 0.07, 0.012))
@@ -127,7 +118,6 @@ def tv_screen(look: Look) -> Assembly:
     build.add(plastic(tone("grey")), block(0.05, 0.004, 0.008, 0, -0.022, 0.0755))
     build.add(black, block(0.1, 0.04, 0.075, 0, 0.005, 0.012))
     build.add(black, soft_block(width * 0.42, 0.2, 0.014, 0, 0, 0, 0.006))
-    return build
 
 
 def _dark_screen(width: float, bottom: float, height: float) -> Material:
@@ -136,25 +126,22 @@ def _dark_screen(width: float, bottom: float, height: float) -> Material:
     return Material(Texture.SCREEN, linear((14, 16, 22)), linear((44, 50, 64)), 0.0, 0.9, 0.0, 0, window, 1)
 
 
-def wall_tv(look: Look) -> Assembly:
-    build = Assembly(look)
-    width = look.size(1.0, 1.25)
+def wall_tv(build: Assembly) -> None:
+    width = build.size(1.0, 1.25)
     height = width * 0.57
     build.add(plastic(linear((20, 20, 22))), soft_block(width, 0.05, height, 0, 0, 0, 0.012))
     dark = _dark_screen(width, 0.0, height)
     build.add(dark, block(width - 0.03, 0.006, height - 0.035, 0, -0.0275, 0.02))
     build.add(plastic(tone("grey")), block(0.05, 0.004, 0.008, 0, -0.027, 0.006))
-    return build
 
 
-def monitor(look: Look) -> Assembly:
-    build = Assembly(look)
-    width = look.size(0.5, 0.6)
+def monitor(build: Assembly) -> None:
+    width = build.size(0.5, 0.6)
     height, lift = width * 0.6, 0.13
-    case = plastic(look.rgb)
+    case = plastic(build.rgb)
     build.add(case, soft_block(width, 0.035, height, 0, 0, lift, 0.012))
     build.add(
-        _screen(look, width - 0.03, lift + 0.02, lift + height, 1.0, 0.55),
+        _screen(build, width - 0.03, lift + 0.02, lift + height, 1.0, 0.55),
         block(width - 0.03, 0.006, height - 0.045, 0, -0.02, lift + 0.03),
     )
     build.add(case, soft_block(0.06, 0.03, lift + height * 0.4, 0, 0.034, 0.012, 0.01))
@@ -164,13 +151,11 @@ def monitor(look: Look) -> Assembly:
         .stretched(1.1, 0.8, 1.0)
         .moved(0, 0.02, 0),
     )
-    return build
 
 
-def laptop(look: Look) -> Assembly:
-    build = Assembly(look)
-    width, depth = look.size(0.33, 0.37), look.size(0.23, 0.25)
-    case = metal(look.rgb, look.rng) if look.material == "metal" else plastic(look.rgb)
+def laptop(build: Assembly) -> None:
+    width, depth = build.size(0.33, 0.37), build.size(0.23, 0.25)
+    case = metal(build.rgb, build.rng) if build.material == "metal" else plastic(build.rgb)
     build.add(case, soft_block(width, depth, 0.02, 0, 0, 0, 0.007))
     keys = Material(
         Texture.KEYS,
@@ -182,30 +167,26 @@ def laptop(look: Look) -> Assembly:
         extent=(-width / 2, width / 2, -depth / 2, depth / 2),
     )
     build.add(keys, block(width * 0.86, depth * 0.5, 0.003, 0, depth * 0.14, 0.0202))
-    build.add(plastic(shade(look.rgb, 0.7)), block(width * 0.3, depth * 0.26, 0.002, 0, -depth * 0.3, 0.0202))
+    build.add(plastic(shade(build.rgb, 0.7)), block(width * 0.3, depth * 0.26, 0.002, 0, -depth * 0.3, 0.0202))
     lid = block(width, 0.009, depth * 0.98)
     top = depth * 0.95
     view = block(width * 0.93, 0.004, depth * 0.86, 0, -0.007, depth * 0.06)
-    for shape, material in ((lid, case), (view, _screen(look, width * 0.93, 0.02, top, 1.0, 0.55))):
+    for shape, material in ((lid, case), (view, _screen(build, width * 0.93, 0.02, top, 1.0, 0.55))):
         build.add(material, shape.turned("x", -16).moved(0, depth / 2 + 0.004, 0.012))
-    return build
 
 
-def keyboard(look: Look) -> Assembly:
-    build = Assembly(look)
-    width, depth = look.size(0.4, 0.47), look.size(0.13, 0.155)
-    build.add(plastic(look.rgb), soft_block(width, depth, 0.022, 0, 0, 0, 0.008))
-    light = look.colour == "black"
+def keyboard(build: Assembly) -> None:
+    width, depth = build.size(0.4, 0.47), build.size(0.13, 0.155)
+    build.add(plastic(build.rgb), soft_block(width, depth, 0.022, 0, 0, 0, 0.008))
+    light = build.colour == "black"
     a, b = (linear((58, 58, 62)), linear((150, 150, 155))) if light else (linear((250, 250, 250)), linear((80, 80, 84)))
     keys = Material(Texture.KEYS, a, b, 0.021, 0.1, axis=2, extent=(-width / 2, width / 2, -depth / 2, depth / 2))
     build.add(keys, block(width - 0.025, depth - 0.025, 0.009, 0, 0, 0.0222))
-    return build
 
 
-def mouse(look: Look) -> Assembly:
-    build = Assembly(look)
-    s = max(1.0, look.scale) * 1.12
-    body = plastic(look.rgb)
+def mouse(build: Assembly) -> None:
+    s = max(1.0, build.scale) * 1.12
+    body = plastic(build.rgb)
     build.add(
         body,
         lathe([(0, 0), (0.95, 0), (1, 0.18), (0.86, 0.6), (0.5, 0.92), (0, 1.0)], 22).stretched(
@@ -213,20 +194,18 @@ def mouse(look: Look) -> Assembly:
         ),
     )
     build.add(plastic(tone("grey")), soft_block(0.012, 0.03, 0.014, 0, -0.032 * s, 0.031 * s, 0.005))
-    build.add(plastic(shade(look.rgb, 0.5)), block(0.003, 0.05 * s, 0.006, 0, -0.006 * s, 0.0375 * s))
-    return build
+    build.add(plastic(shade(build.rgb, 0.5)), block(0.003, 0.05 * s, 0.006, 0, -0.006 * s, 0.0375 * s))
 
 
-def desktop_computer(look: Look) -> Assembly:
-    build = Assembly(look)
-    width, depth, height = look.size(0.18, 0.22), look.size(0.4, 0.46), look.size(0.4, 0.46)
-    build.add(plastic(look.rgb), soft_block(width, depth, height, 0, 0, 0.015, 0.012))
+def desktop_computer(build: Assembly) -> None:
+    width, depth, height = build.size(0.18, 0.22), build.size(0.4, 0.46), build.size(0.4, 0.46)
+    build.add(plastic(build.rgb), soft_block(width, depth, height, 0, 0, 0.015, 0.012))
     build.add(
         paint(tone("black")),
         *[block(0.03, 0.06, 0.015, sx * width * 0.35, sy * depth * 0.35) for sx in (-1, 1) for sy in (-1, 1)],
     )
     y = -depth / 2
-    contrast = plastic(tone("grey") if look.colour == "black" else shade(tone("black"), 1.2))
+    contrast = plastic(tone("grey") if build.colour == "black" else shade(tone("black"), 1.2))
     for z in (0.85, 0.74):
         build.add(contrast, block(width * 0.82, 0.008, height * 0.075, 0, y - 0.004, 0.015 + height * z))
     for i in range(5):
@@ -234,17 +213,3 @@ def desktop_computer(look: Look) -> Assembly:
     glow = Material(Texture.PLAIN, linear((60, 150, 250)), linear((60, 150, 250)), glow=0.8)
     build.add(glow, cylinder(0.014, 0.006).turned("x", 90).moved(0, y, height * 0.6))
     build.spot((-width / 2 + 0.01, width / 2 - 0.01), (-depth / 2 + 0.02, depth / 2 - 0.02), height + 0.015, 0.2)
-    return build
-
-
-DEVICES: Mapping[str, tuple[Builder, ...]] = {
-    "refrigerator": (refrigerator,),
-    "cooktop": (cooktop,),
-    "microwave": (microwave,),
-    "tv-screen": (tv_screen, wall_tv),
-    "monitor": (monitor,),
-    "laptop": (laptop,),
-    "computer-keyboard": (keyboard,),
-    "mouse": (mouse,),
-    "desktop-computer": (desktop_computer,),
-}

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
 
-from su3d_bench.datasets.rooms.objects.items import Assembly, Builder, Look
+from su3d_bench.datasets.rooms.objects.items import Assembly
 from su3d_bench.datasets.rooms.objects.materials import (
     Material,
     Texture,
@@ -34,32 +33,29 @@ from su3d_bench.datasets.rooms.objects.shapes import (
 )
 
 
-def door(look: Look) -> Assembly:
-    build = Assembly(look)
-    width, height = look.rng.uniform(0.84, 0.95), look.rng.uniform(2.02, 2.1)
-    frame = paint(shade(look.rgb, 0.82)) if look.colour == "white" else look.main(axis=2)
+def door(build: Assembly) -> None:
+    width, height = build.rng.uniform(0.84, 0.95), build.rng.uniform(2.02, 2.1)
+    frame = paint(shade(build.rgb, 0.82)) if build.colour == "white" else build.main(axis=2)
     build.add(frame, *[block(0.07, 0.06, height + 0.07, sx * (width / 2 + 0.035)) for sx in (-1, 1)])
     build.add(frame, block(width, 0.06, 0.07, 0, 0, height))
-    leaf = paint(look.rgb) if look.colour == "white" else look.main(axis=2)
+    leaf = paint(build.rgb) if build.colour == "white" else build.main(axis=2)
     build.add(leaf, block(width - 0.006, 0.03, height - 0.01, 0, 0.015, 0.005))
     panel = replace(leaf, a=shade(leaf.a, 0.84), b=shade(leaf.b, 0.84))
-    rows = [(0.14, 0.5), (0.56, 0.95)] if look.chance(0.7) else [(0.1, 0.32), (0.37, 0.62), (0.67, 0.94)]
+    rows = [(0.14, 0.5), (0.56, 0.95)] if build.chance(0.7) else [(0.1, 0.32), (0.37, 0.62), (0.67, 0.94)]
     for low, high in rows:
         for sx in (-1, 1):
             tall, wide = (high - low) * height, width * 0.33
             x = sx * width * 0.21
             build.add(panel, soft_block(wide, 0.016, tall, x, -0.004, low * height, 0.007))
-    steel = chrome(look.rng)
+    steel = chrome(build.rng)
     x = width / 2 - 0.07
     build.add(steel, soft_block(0.045, 0.012, 0.2, x, -0.005, 0.95, 0.005))
     build.add(steel, tube([(x, -0.01, 1.05), (x, -0.06, 1.051), (x - 0.12, -0.061, 1.05)], 0.011))
-    return build
 
 
-def window(look: Look) -> Assembly:
-    build = Assembly(look)
-    width, height = look.size(1.15, 1.5), look.rng.uniform(1.05, 1.25)
-    frame = paint(look.rgb)
+def window(build: Assembly) -> None:
+    width, height = build.size(1.15, 1.5), build.rng.uniform(1.05, 1.25)
+    frame = paint(build.rgb)
     extent = (-width / 2, width / 2, 0.0, height)
     sky = Material(
         Texture.SKY,
@@ -70,7 +66,7 @@ def window(look: Look) -> Assembly:
         0.75,
         0,
         extent,
-        int(look.rng.integers(1, 999)),
+        int(build.rng.integers(1, 999)),
     )
     build.add(sky, block(width - 0.06, 0.012, height - 0.06, 0, 0.014, 0.03))
     bar = 0.055
@@ -80,75 +76,65 @@ def window(look: Look) -> Assembly:
         build.add(
             frame, *[block(width / 2 - 1.5 * bar, 0.046, bar, sx * (width / 4 - bar / 4), 0, z) for sx in (-1, 1)]
         )
-    if look.chance(0.5):
+    if build.chance(0.5):
         build.add(
             frame,
             *[block(width / 2 - 1.5 * bar, 0.03, 0.03, sx * (width / 4 - bar / 4), 0, height * 0.62) for sx in (-1, 1)],
         )
     build.add(frame, soft_block(width + 0.12, 0.17, 0.03, 0, -0.06, -0.032, 0.01))
-    build.add(chrome(look.rng), soft_block(0.02, 0.03, 0.12, 0.0, -0.035, height * 0.4, 0.008))
-    return build
+    build.add(chrome(build.rng), soft_block(0.02, 0.03, 0.12, 0.0, -0.035, height * 0.4, 0.008))
 
 
-def curtain(look: Look) -> Assembly:
+def curtain(build: Assembly) -> None:
     """One hanging, pleated panel with its rod."""
-    build = Assembly(look)
-    width, height = look.rng.uniform(0.34, 0.48), look.rng.uniform(2.05, 2.25)
-    folds = int(look.rng.integers(4, 7))
+    width, height = build.rng.uniform(0.34, 0.48), build.rng.uniform(2.05, 2.25)
+    folds = int(build.rng.integers(4, 7))
     u, v = np.linspace(0, 1, folds * 8 + 1), np.linspace(0, 1, 7)
     x = np.repeat(((u - 0.5) * width)[:, None], len(v), axis=1) * (0.86 + 0.14 * np.abs(v - 0.35))
     y = 0.032 * np.sin(2 * np.pi * folds * u)[:, None] * (0.6 + 0.4 * (1 - v))
     grid = np.stack([x, y, np.repeat((v * height)[None], len(u), axis=0)], axis=-1)
-    build.add(look.main(), sheet(grid, 0.008))
-    rod = metal(tone("black"), look.rng)
+    build.add(build.main(), sheet(grid, 0.008))
+    rod = metal(tone("black"), build.rng)
     build.add(rod, tube([(-width / 2 - 0.03, 0, height + 0.02), (width / 2 + 0.03, 0, height + 0.02)], 0.014))
     build.add(rod, *[ellipsoid(0.025, 0.025, 0.025).moved(sx * (width / 2 + 0.04), 0, height + 0.02) for sx in (-1, 1)])
-    return build
 
 
-def blinds(look: Look) -> Assembly:
-    build = Assembly(look)
-    width, height = look.rng.uniform(1.15, 1.4), look.rng.uniform(0.55, 0.95)
-    slat = paint(look.rgb) if look.material == "plastic" else look.main(axis=0)
+def blinds(build: Assembly) -> None:
+    width, height = build.rng.uniform(1.15, 1.4), build.rng.uniform(0.55, 0.95)
+    slat = paint(build.rgb) if build.material == "plastic" else build.main(axis=0)
     build.add(slat, soft_block(width, 0.055, 0.05, 0, 0, height - 0.05, 0.01))
     n = int(height / 0.042)
     for i in range(1, n):
         tilted = block(width, 0.045, 0.005, 0, 0, -0.0025).turned("x", 32)
         build.add(slat, tilted.moved(0, 0, height - 0.05 - i * 0.042))
     build.add(slat, block(width, 0.03, 0.022))
-    cord = paint(shade(look.rgb, 0.55))
+    cord = paint(shade(build.rgb, 0.55))
     build.add(cord, *[block(0.006, 0.006, height - 0.06, sx * width * 0.32, -0.03, 0.01) for sx in (-1, 1)])
-    return build
 
 
-def switch(look: Look) -> Assembly:
-    build = Assembly(look)
+def switch(build: Assembly) -> None:
     n = 2
-    build.add(plastic(look.rgb), soft_block(0.1 * n, 0.014, 0.13, 0, 0, 0, 0.006))
+    build.add(plastic(build.rgb), soft_block(0.1 * n, 0.014, 0.13, 0, 0, 0, 0.006))
     for i in range(n):
         x = (i - (n - 1) / 2) * 0.088
-        build.add(plastic(shade(look.rgb, 0.82)), block(0.062, 0.012, 0.088, x, -0.009, 0.021).turned("x", 2))
-    return build
+        build.add(plastic(shade(build.rgb, 0.82)), block(0.062, 0.012, 0.088, x, -0.009, 0.021).turned("x", 2))
 
 
-def wall_plug(look: Look) -> Assembly:
-    build = Assembly(look)
-    build.add(plastic(look.rgb), soft_block(0.21, 0.014, 0.11, 0, 0, 0, 0.006))
+def wall_plug(build: Assembly) -> None:
+    build.add(plastic(build.rgb), soft_block(0.21, 0.014, 0.11, 0, 0, 0, 0.006))
     dark = paint(tone("black"))
     for x in (-0.05, 0.05):
         ring = lathe([(0, 0), (0.038, 0), (0.038, 0.008), (0.031, 0.008), (0.031, 0.002), (0, 0.002)], 18).turned(
             "x", 90
         )
-        build.add(plastic(shade(look.rgb, 0.75)), ring.moved(x, -0.0075, 0.055))
+        build.add(plastic(shade(build.rgb, 0.75)), ring.moved(x, -0.0075, 0.055))
         for dx in (-0.012, 0.012):
             build.add(dark, cylinder(0.006, 0.004).turned("x", 90).moved(x + dx, -0.0095, 0.055))
-    return build
 
 
-def vent(look: Look) -> Assembly:
-    build = Assembly(look)
-    width, height = look.size(0.32, 0.45), look.size(0.2, 0.28)
-    frame = paint(look.rgb)
+def vent(build: Assembly) -> None:
+    width, height = build.size(0.32, 0.45), build.size(0.2, 0.28)
+    frame = paint(build.rgb)
     build.add(frame, block(width, 0.016, 0.025), block(width, 0.016, 0.025, z=height - 0.025))
     build.add(frame, *[block(0.025, 0.016, height - 0.05, sx * (width / 2 - 0.0125), 0, 0.025) for sx in (-1, 1)])
     build.add(paint(shade(tone("grey"), 0.25)), block(width - 0.05, 0.006, height - 0.05, 0, 0.005, 0.025))
@@ -156,11 +142,10 @@ def vent(look: Look) -> Assembly:
     for i in range(n):
         slat = block(width - 0.052, 0.016, 0.004, 0, 0, 0).turned("x", 35)
         build.add(frame, slat.moved(0, -0.003, 0.035 + (i + 0.3) * (height - 0.06) / n))
-    return build
 
 
 def _faucet(build: Assembly, x: float, y: float, z: float, reach: float = 0.16, tall: float = 0.2) -> None:
-    steel = chrome(build.look.rng)
+    steel = chrome(build.rng)
     angle = np.linspace(0, np.pi * 0.9, 7)
     radius = reach / 2
     arc = [(x, y - radius + radius * float(np.cos(a)), z + tall + radius * float(np.sin(a))) for a in angle]
@@ -181,35 +166,30 @@ def _basin(material: Material, width: float, depth: float, tall: float, wall: fl
     ]
 
 
-def pedestal_sink(look: Look) -> Assembly:
-    build = Assembly(look)
-    r = look.size(0.25, 0.29)
-    white = ceramic(look.rgb)
+def pedestal_sink(build: Assembly) -> None:
+    r = build.size(0.25, 0.29)
+    white = ceramic(build.rgb)
     bowl = lathe([(0, 0.66), (r * 0.45, 0.66), (r * 0.85, 0.74), (r, 0.83), (r, 0.85), (r * 0.88, 0.85),
                   (r * 0.8, 0.81), (r * 0.5, 0.735), (0, 0.72)], 28)  # fmt: skip
     build.add(white, bowl.stretched(1.15, 0.85, 1.0))
     build.add(white, lathe([(0, 0), (0.12, 0), (0.1, 0.06), (0.075, 0.3), (0.085, 0.67), (0, 0.67)]))
     build.add(white, soft_block(r * 1.7, 0.09, 0.09, 0, r * 0.85, 0.765, 0.02))
-    build.add(chrome(look.rng), cylinder(0.022, 0.006, 0, 0, 0.722))
+    build.add(chrome(build.rng), cylinder(0.022, 0.006, 0, 0, 0.722))
     _faucet(build, 0.0, r * 0.85, 0.855, 0.17, 0.1)
-    return build
 
 
-def kitchen_sink(look: Look) -> Assembly:
+def kitchen_sink(build: Assembly) -> None:
     """A steel or ceramic basin that stands on a countertop, with a faucet."""
-    build = Assembly(look)
     width, depth, tall = 0.52, 0.42, 0.13
-    body = metal(linear((186, 188, 192)), look.rng) if look.material == "metal" else ceramic(look.rgb)
+    body = metal(linear((186, 188, 192)), build.rng) if build.material == "metal" else ceramic(build.rgb)
     build.add(body, *_basin(body, width, depth, tall))
     build.add(paint(tone("black")), cylinder(0.03, 0.004, 0, 0, 0.031))
     build.add(body, soft_block(0.34, 0.06, tall, 0, depth / 2 + 0.031, 0, 0.012))
     _faucet(build, 0.0, depth / 2 + 0.03, tall, 0.22, 0.16)
-    return build
 
 
-def toilet(look: Look) -> Assembly:
-    build = Assembly(look)
-    white = ceramic(look.rgb)
+def toilet(build: Assembly) -> None:
+    white = ceramic(build.rgb)
     seat = 0.4
     bowl = lathe(
         [
@@ -227,24 +207,22 @@ def toilet(look: Look) -> Assembly:
     )
     build.add(white, bowl.stretched(0.95, 1.3, 1.0).moved(0, -0.12, 0))
     ring = lathe([(0.13, 0.0), (0.205, 0.0), (0.207, 0.022), (0.13, 0.022), (0.13, 0.0)], 24).stretched(0.97, 1.3, 1.0)
-    build.add(plastic(look.rgb), ring.moved(0, -0.12, seat - 0.012))
+    build.add(plastic(build.rgb), ring.moved(0, -0.12, seat - 0.012))
     build.add(white, soft_block(0.22, 0.26, 0.38, 0, 0.18, 0, 0.04))
     build.add(white, soft_block(0.42, 0.19, 0.37, 0, 0.24, seat - 0.005, 0.035))
     build.add(white, soft_block(0.44, 0.21, 0.04, 0, 0.24, seat + 0.366, 0.015))
-    build.add(chrome(look.rng), cylinder(0.025, 0.012, 0, 0.24, seat + 0.406))
-    if look.chance(0.6):  # lid up
+    build.add(chrome(build.rng), cylinder(0.025, 0.012, 0, 0.24, seat + 0.406))
+    if build.chance(0.6):  # lid up
         lid = lathe([(0, 0), (0.2, 0), (0.2, 0.02), (0, 0.022)], 24).stretched(0.97, 1.2, 1.0).moved(0, -0.24, 0)
-        build.add(plastic(look.rgb), lid.turned("x", -82).moved(0, 0.115, seat + 0.02))
+        build.add(plastic(build.rgb), lid.turned("x", -82).moved(0, 0.115, seat + 0.02))
     else:
         lid = lathe([(0, 0), (0.205, 0), (0.2, 0.02), (0, 0.026)], 24).stretched(0.97, 1.3, 1.0)
-        build.add(plastic(look.rgb), lid.moved(0, -0.12, seat + 0.012))
-    return build
+        build.add(plastic(build.rgb), lid.moved(0, -0.12, seat + 0.012))
 
 
-def bathtub(look: Look) -> Assembly:
-    build = Assembly(look)
-    length, depth, tall = look.rng.uniform(1.5, 1.7), look.rng.uniform(0.7, 0.76), 0.54
-    white = ceramic(look.rgb)
+def bathtub(build: Assembly) -> None:
+    length, depth, tall = build.rng.uniform(1.5, 1.7), build.rng.uniform(0.7, 0.76), 0.54
+    white = ceramic(build.rgb)
     w, d, rim = length / 2, depth / 2, 0.075
     build.add(white, box(-w + 0.01, w - 0.01, -d + 0.01, d - 0.01, 0, 0.14))
     build.add(white, *[soft_block(rim, depth, tall - 0.141, sx * (w - rim / 2), 0, 0.141, 0.03) for sx in (-1, 1)])
@@ -252,29 +230,25 @@ def bathtub(look: Look) -> Assembly:
         white,
         *[soft_block(length - 2 * rim + 0.04, rim, tall - 0.141, 0, sy * (d - rim / 2), 0.141, 0.03) for sy in (-1, 1)],
     )
-    build.add(chrome(look.rng), cylinder(0.03, 0.005, -w * 0.6, 0, 0.141))
-    steel = chrome(look.rng)
+    build.add(chrome(build.rng), cylinder(0.03, 0.005, -w * 0.6, 0, 0.141))
+    steel = chrome(build.rng)
     build.add(steel, soft_block(0.05, 0.22, 0.05, -w + 0.04, 0, tall + 0.04, 0.02))
     build.add(steel, tube([(-w + 0.04, 0, tall), (-w + 0.04, 0, tall + 0.05)], 0.015))
     build.add(
         steel, tube([(-w + 0.05, 0, tall + 0.065), (-w + 0.16, 0, tall + 0.06), (-w + 0.18, 0, tall + 0.02)], 0.014)
     )
     build.spot((-w + 0.6, w - 0.1), (-d + 0.005, -d + rim - 0.005), tall, role="rim")
-    return build
 
 
-def countertop(look: Look) -> Assembly:
+def countertop(build: Assembly) -> None:
     """A stone slab of one metre; the layout stretches it over its base cabinets."""
-    build = Assembly(look)
-    build.add(look.main(), block(1.0, 0.62, 0.04))
+    build.add(build.main(), block(1.0, 0.62, 0.04))
     build.spot((-0.5, 0.5), (-0.31, 0.3), 0.04)
-    return build
 
 
-def towel_rail(look: Look) -> Assembly:
+def towel_rail(build: Assembly) -> None:
     """A towel over a rail, for a wall."""
-    build = Assembly(look)
-    width, front, back = look.size(0.34, 0.46), look.size(0.45, 0.6), 0.3
+    width, front, back = build.size(0.34, 0.46), build.size(0.45, 0.6), 0.3
     angle = np.linspace(0, np.pi, 7)
     path = [
         (-0.06, -front),
@@ -288,26 +262,9 @@ def towel_rail(look: Look) -> Assembly:
     grid = np.empty((len(u), len(profile), 3))
     wave = 0.006 * np.sin(u * 18.0)[:, None] * np.clip(-profile[:, 1] * 3, 0, 1)[None, :]
     grid[..., 0], grid[..., 1], grid[..., 2] = u[:, None], profile[:, 0] + wave, profile[:, 1] + front
-    build.add(look.main(), sheet(grid, 0.012))
-    band = plain_cloth(shade(look.rgb, 0.55), look.rng)
+    build.add(build.main(), sheet(grid, 0.012))
+    band = plain_cloth(shade(build.rgb, 0.55), build.rng)
     build.add(band, block(width - 0.01, 0.003, 0.05, 0, -0.0735, 0.06))
-    build.add(chrome(look.rng), tube([(-width / 2 - 0.05, -0.035, front), (width / 2 + 0.05, -0.035, front)], 0.011))
+    build.add(chrome(build.rng), tube([(-width / 2 - 0.05, -0.035, front), (width / 2 + 0.05, -0.035, front)], 0.011))
     for sx in (-1, 1):
-        build.add(chrome(look.rng), block(0.02, 0.045, 0.02, sx * (width / 2 + 0.045), -0.0125, front - 0.01))
-    return build
-
-
-FIXTURES: Mapping[str, tuple[Builder, ...]] = {
-    "door": (door,),
-    "window": (window,),
-    "curtain": (curtain,),
-    "blinds": (blinds,),
-    "switch": (switch,),
-    "wall-plug": (wall_plug,),
-    "vent": (vent,),
-    "sink": (pedestal_sink, kitchen_sink),
-    "toilet": (toilet,),
-    "bathtub": (bathtub,),
-    "countertop": (countertop,),
-    "towel": (towel_rail,),
-}
+        build.add(chrome(build.rng), block(0.02, 0.045, 0.02, sx * (width / 2 + 0.045), -0.0125, front - 0.01))

@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 
-from su3d_bench.datasets.rooms.objects.items import Assembly, Builder, Look
+from su3d_bench.datasets.rooms.objects.items import Assembly
 from su3d_bench.datasets.rooms.objects.materials import (
     Material,
     Rgb,
@@ -23,25 +21,19 @@ from su3d_bench.datasets.rooms.objects.materials import (
 from su3d_bench.datasets.rooms.objects.shapes import block, cylinder, ellipsoid, lathe, soft_block, tube
 
 
-def books(look: Look) -> Assembly:
+def books(build: Assembly) -> None:
     """A row of standing books, backs to the front."""
-    build = Assembly(look)
     x = 0.0
-    for i in range(int(look.rng.integers(3, 7))):
-        thick, tall, depth = look.rng.uniform(0.025, 0.048), look.size(0.2, 0.25), look.rng.uniform(0.15, 0.18)
-        rgb = (
-            look.rgb
-            if i % 2 == 0
-            else look.other(str(look.rng.choice(["red", "blue", "green", "brown", "black", "orange", "purple"])))
-        )
+    for i in range(int(build.rng.integers(3, 7))):
+        thick, tall, depth = build.rng.uniform(0.025, 0.048), build.size(0.2, 0.25), build.rng.uniform(0.15, 0.18)
+        rgb = build.rgb if i % 2 == 0 else build.other("red", "blue", "green", "brown", "black", "orange", "purple")
         _volume(build, rgb, thick, depth, tall, x + thick / 2)
         x += thick + 0.0015
-    return build
 
 
 def _volume(build: Assembly, rgb: Rgb, thick: float, depth: float, tall: float, x: float) -> None:
     label = Material(
-        Texture.LABEL, rgb, mix(rgb, (0.9, 0.85, 0.6), 0.75), tall, 0.1, seed=int(build.look.rng.integers(1, 999))
+        Texture.LABEL, rgb, mix(rgb, (0.9, 0.85, 0.6), 0.75), tall, 0.1, seed=int(build.rng.integers(1, 999))
     )
     build.add(
         label, block(0.003, depth, tall, x - thick / 2 + 0.0015), block(0.003, depth, tall, x + thick / 2 - 0.0015)
@@ -50,18 +42,13 @@ def _volume(build: Assembly, rgb: Rgb, thick: float, depth: float, tall: float, 
     build.add(paper(linear((232, 224, 204))), block(thick - 0.0064, depth - 0.01, tall - 0.008, x, 0.002, 0.004))
 
 
-def book_stack(look: Look) -> Assembly:
+def book_stack(build: Assembly) -> None:
     """Books that lie on one another."""
-    build = Assembly(look)
     z = 0.0
-    for i in range(int(look.rng.integers(2, 5))):
-        width, depth, thick = look.size(0.2, 0.26), look.size(0.15, 0.19), look.rng.uniform(0.022, 0.042)
-        rgb = (
-            look.rgb
-            if i % 2 == 0
-            else look.other(str(look.rng.choice(["red", "blue", "green", "brown", "black", "white"])))
-        )
-        turn = float(look.rng.uniform(-14, 14))
+    for i in range(int(build.rng.integers(2, 5))):
+        width, depth, thick = build.size(0.2, 0.26), build.size(0.15, 0.19), build.rng.uniform(0.022, 0.042)
+        rgb = build.rgb if i % 2 == 0 else build.other("red", "blue", "green", "brown", "black", "white")
+        turn = float(build.rng.uniform(-14, 14))
         cover = Material(
             Texture.LABEL,
             rgb,
@@ -80,22 +67,20 @@ def book_stack(look: Look) -> Assembly:
             block(width - 0.01, depth - 0.008, thick - 0.0066, 0, 0.001, z + 0.0033).turned("z", turn),
         )
         z += thick + 0.001
-    return build
 
 
-def cardboard_box(look: Look) -> Assembly:
+def cardboard_box(build: Assembly) -> None:
     """A closed carton with tape, or an open one with its flaps out."""
-    build = Assembly(look)
-    width, depth, height = look.size(0.32, 0.44), look.size(0.25, 0.34), look.size(0.2, 0.3)
-    side = Material(Texture.CARDBOARD, look.rgb, shade(look.rgb, 0.8), 0.012, 0.02, seed=3)
-    if look.chance(0.55):
+    width, depth, height = build.size(0.32, 0.44), build.size(0.25, 0.34), build.size(0.2, 0.3)
+    side = Material(Texture.CARDBOARD, build.rgb, shade(build.rgb, 0.8), 0.012, 0.02, seed=3)
+    if build.chance(0.55):
         build.add(side, block(width, depth, height))
-        tape = plastic(mix(look.rgb, linear((226, 206, 150)), 0.75))
+        tape = plastic(mix(build.rgb, linear((226, 206, 150)), 0.75))
         build.add(tape, block(width * 1.002, 0.055, 0.002, 0, 0, height + 0.001))
         build.add(tape, *[block(0.002, 0.055, 0.07, sx * (width / 2 + 0.0015), 0, height - 0.07) for sx in (-1, 1)])
         build.add(paper(tone("white")), block(0.11, 0.002, 0.075, width * 0.2, -depth / 2 - 0.0015, height * 0.4))
         build.spot((-width / 2 + 0.02, width / 2 - 0.02), (-depth / 2 + 0.02, depth / 2 - 0.02), height + 0.002, 0.4)
-        return build
+        return
     build.add(side, block(width, depth, 0.006))
     build.add(side, *[block(0.006, depth, height - 0.007, sx * (width / 2 - 0.003), 0, 0.007) for sx in (-1, 1)])
     build.add(
@@ -105,15 +90,13 @@ def cardboard_box(look: Look) -> Assembly:
         flap = block(0.13, depth * 0.96, 0.004, sx * 0.065, 0, 0).turned("y", sx * 28)
         build.add(side, flap.moved(sx * (width / 2 + 0.002), 0, height + 0.002))
     build.spot((-width / 2 + 0.02, width / 2 - 0.02), (-depth / 2 + 0.02, depth / 2 - 0.02), 0.007, role="inside")
-    return build
 
 
-def basket(look: Look) -> Assembly:
-    build = Assembly(look)
-    r, h = look.size(0.21, 0.25), look.size(0.24, 0.32)
-    weave = wicker(look.rgb, look.rng)
+def basket(build: Assembly) -> None:
+    r, h = build.size(0.21, 0.25), build.size(0.24, 0.32)
+    weave = wicker(build.rgb, build.rng)
     build.add(weave, lathe([(0, 0), (r * 0.8, 0), (r, h), (r - 0.018, h), (r * 0.8 - 0.018, 0.016), (0, 0.016)], 28))
-    rim = wicker(shade(look.rgb, 0.75), look.rng)
+    rim = wicker(shade(build.rgb, 0.75), build.rng)
     build.add(
         rim,
         lathe(
@@ -133,14 +116,12 @@ def basket(look: Look) -> Assembly:
         build.add(rim, tube(arc, 0.011, 7))
     side = (r * 0.8 - 0.03) * 0.7071
     build.spot((-side, side), (-side, side), 0.017, role="inside")
-    return build
 
 
-def bin_(look: Look) -> Assembly:
-    build = Assembly(look)
-    r, h = look.size(0.13, 0.165), look.size(0.3, 0.4)
-    body = metal(look.rgb, look.rng) if look.material == "metal" else plastic(look.rgb)
-    if look.chance(0.4):  # pedal bin with a domed lid
+def bin_(build: Assembly) -> None:
+    r, h = build.size(0.13, 0.165), build.size(0.3, 0.4)
+    body = metal(build.rgb, build.rng) if build.material == "metal" else plastic(build.rgb)
+    if build.chance(0.4):  # pedal bin with a domed lid
         build.add(body, lathe([(0, 0), (r, 0), (r, h), (0, h)], 24))
         build.add(
             plastic(tone("black")),
@@ -151,7 +132,7 @@ def bin_(look: Look) -> Assembly:
             soft_block(0.09, 0.06, 0.018, 0, -r - 0.02, 0.008, 0.007),
             lathe([(r, 0), (r + 0.006, 0), (r + 0.006, 0.03), (r, 0.03)], 24),
         )
-        return build
+        return
     build.add(
         body,
         lathe(
@@ -168,31 +149,19 @@ def bin_(look: Look) -> Assembly:
             24,
         ),
     )
-    liner = plastic(mix(look.rgb, tone("black"), 0.6))
+    liner = plastic(mix(build.rgb, tone("black"), 0.6))
     build.add(liner, lathe([(0, 0), (r * 0.8, 0), (r * 0.8, 0.004), (0, 0.004)], 20).moved(z=h * 0.35))
     scrap = paper(tone("white"))
     for i in range(3):
         build.add(
             scrap, ellipsoid(r * 0.33, r * 0.3, r * 0.3).moved(r * 0.38, 0, h * 0.35 + r * 0.3).turned("z", 120 * i)
         )
-    return build
 
 
-def exercise_ball(look: Look) -> Assembly:
-    build = Assembly(look)
-    r = look.size(0.26, 0.33)
-    skin = Material(Texture.GORES, look.rgb, shade(look.rgb, 0.7), 0.05, 0.45)
+def exercise_ball(build: Assembly) -> None:
+    r = build.size(0.26, 0.33)
+    skin = Material(Texture.GORES, build.rgb, shade(build.rgb, 0.7), 0.05, 0.45)
     build.add(skin, ellipsoid(r, r, r))
     build.add(
         plastic(tone("white")), cylinder(0.02, 0.012).turned("x", 60).moved(0, -r * 0.866 + 0.004, r * 0.5 - 0.002)
     )
-    return build
-
-
-HOUSEHOLD: Mapping[str, tuple[Builder, ...]] = {
-    "book": (books, book_stack),
-    "box": (cardboard_box,),
-    "basket": (basket,),
-    "bin": (bin_,),
-    "exercise-ball": (exercise_ball,),
-}
