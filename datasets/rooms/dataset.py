@@ -7,7 +7,7 @@ import re
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -26,7 +26,6 @@ from su3d_bench.core.types import (
     SceneInfo,
     Surface,
 )
-from su3d_bench.datasets.rooms.classes import CLASSES
 from su3d_bench.datasets.rooms.rendering.render import LEVELS, add_noise
 
 if TYPE_CHECKING:  # what makes a room is imported where one is made: a list of scenes needs none of it
@@ -39,12 +38,11 @@ if TYPE_CHECKING:  # what makes a room is imported where one is made: a list of 
 SOURCES = ("datasets/rooms", "numerics")  # what moves a room: what is kept of one is keyed by it
 GENERATOR_VERSION = 3  # raise it whenever a scene of the same name comes out different
 DEFAULT_SCENES = ("living0", "bedroom0", "kitchen0", "office0", "bathroom0", "studio0", "living1", "office1")
-KIND_NAMES = ("living", "bedroom", "kitchen", "office", "bathroom", "studio")  # the keys of rooms_kinds.KINDS
+KIND_NAMES = ("living", "bedroom", "kitchen", "office", "bathroom", "studio")  # the keys of recipes.KINDS
 TRAINING_FROM = 10_000  # numbers from here on are kept for training the embedded encoder; no benchmark uses them
 FRAMES_PER_SECOND = 30.0
 N_STRUCTURE = 6  # floor, ceiling and four walls have the ids 1..6
 ROOMS_IN_MEMORY = 2
-LABELS = LabelSet("replica", tuple(c.id for c in CLASSES), tuple(c.name for c in CLASSES))
 
 
 class RoomOptions(BaseModel):
@@ -58,6 +56,14 @@ class RoomOptions(BaseModel):
     noise: int = Field(default=0, ge=0, lt=len(LEVELS))
     mesh_spacing_m: float = Field(default=0.015, ge=0.004, le=0.2)
     seed_offset: int = Field(default=0, ge=0)
+
+
+@cache
+def label_set() -> LabelSet:
+    """The classes of the rooms, which are Replica's."""
+    from su3d_bench.datasets.rooms.classes import CLASS_ID
+
+    return LabelSet("replica", tuple(CLASS_ID.values()), tuple(CLASS_ID))
 
 
 def scene_name_parts(scene: str) -> tuple[str, int]:
@@ -259,7 +265,7 @@ class Rooms:
         else:
             points, owner = scan.vertices[scan.faces.reshape(-1)], np.repeat(scan.object_id, 4)
         source = f"rooms generator {GENERATOR_VERSION}: surface seen on the walk, {variant}"
-        return GroundTruth(points, self._class_of_object(scene)[owner], owner, LABELS, variant, source)
+        return GroundTruth(points, self._class_of_object(scene)[owner], owner, label_set(), variant, source)
 
     def _class_of_object(self, scene: str) -> Int32Array:
         return np.array([0, *[one.class_id for one in self.objects(scene)]], np.int32)
@@ -268,7 +274,7 @@ class Rooms:
         """The rendered mesh itself, whole: hidden sides included."""
         mesh = self._room(scene).mesh
         classes = {one.id: one.class_id for one in self.objects(scene)}
-        return InstanceMesh(mesh.vertices, mesh.triangles, mesh.instance_of_triangle, classes, LABELS)
+        return InstanceMesh(mesh.vertices, mesh.triangles, mesh.instance_of_triangle, classes, label_set())
 
     def surface(self, scene: str) -> Surface:
         """The scan without labels, each quad (0, 1, 2, 3) as the triangles (0, 1, 2) and (0, 2, 3).

@@ -7,40 +7,63 @@ from collections.abc import Sequence
 import numpy as np
 
 from su3d_bench.datasets.rooms.objects.items import Item, Part
-from su3d_bench.datasets.rooms.plan import GAP_M, WALL_YAW, Plan
+from su3d_bench.datasets.rooms.plan import GAP_M, Plan
 from su3d_bench.datasets.rooms.rendering.mesh import Placed
 
-SHELF_THINGS: tuple[str | tuple[str, str], ...] = (
+Wanted = str | tuple[str, str]  # a class, or a class and which of its models
+SHELF_THINGS: tuple[Wanted, ...] = (
     ("book", "books"), ("book", "books"), ("book", "book_stack"), "vase", "indoor-plant", "box", "sculpture", "candle",
     ("book", "books"), "bowl",
 )  # fmt: skip
-SMALL_DECOR: tuple[str | tuple[str, str], ...] = (
+SMALL_DECOR: tuple[Wanted, ...] = (
     "vase", "candle", "sculpture", "indoor-plant", ("book", "book_stack"), "bowl", "tissue-paper",
     ("lamp", "table_lamp"),
 )  # fmt: skip
 
 
-def stock(plan: Plan, anchor: Placed | None, wanted: Sequence[str | tuple[str, str]], role: str = "top") -> None:
+def stock(plan: Plan, anchor: Placed | None, wanted: Sequence[Wanted], role: str = "top", turn: float = 8.0) -> None:
     """Puts things on an anchor, as many as fit."""
     for want in wanted:
-        name, model = want if isinstance(want, tuple) else (want, None)
         if anchor is not None:
-            plan.on(plan.new(name, model), anchor, role)
+            plan.on(new(plan, want), anchor, role, turn=turn)
 
 
-def choose(plan: Plan, pool: Sequence[str | tuple[str, str]], n: int) -> list[str | tuple[str, str]]:
-    return [pool[int(k)] for k in plan.rng.permutation(len(pool))[:n]]
+def some(plan: Plan, n: int, *wanted: Wanted) -> list[Wanted]:
+    return plan.shuffled(wanted)[:n]
 
 
-def stocked_shelf(plan: Plan, extra: Sequence[str | tuple[str, str]] = (), n: int = 7) -> Placed | None:
+def new(plan: Plan, want: Wanted) -> Item:
+    return plan.new(want) if isinstance(want, str) else plan.new(*want)
+
+
+def stocked_shelf(plan: Plan, extra: Sequence[Wanted] = (), n: int = 7) -> None:
     shelf = plan.against_wall(plan.new("shelf", "shelf"))
     if shelf:
-        for want in [*extra, *choose(plan, SHELF_THINGS, n)]:
-            name, model = want if isinstance(want, tuple) else (want, None)
-            item = plan.new(name, model)
+        for want in [*extra, *some(plan, n, *SHELF_THINGS)]:
+            item = new(plan, want)
             if plan.on(item, shelf, "board", turn=3.0) is None:
                 plan.on(item, shelf, "top", turn=3.0)
-    return shelf
+
+
+def stocked_cabinet(plan: Plan, pool: Sequence[Wanted], n: int, extra: Sequence[Wanted] = ()) -> None:
+    """A cabinet with the ``extra`` things and ``n`` of the ``pool`` on it."""
+    cabinet = plan.against_wall(plan.new("cabinet"))
+    stock(plan, cabinet, [*extra, *some(plan, n, *pool)])
+
+
+def stocked_wall_shelf(plan: Plan, wanted: Sequence[Wanted], z: float = 1.45, turn: float = 8.0) -> None:
+    stock(plan, plan.hang_somewhere(plan.new("shelf", "wall_shelf"), z), wanted, turn=turn)
+
+
+def bedding(plan: Plan, bed: Placed) -> None:
+    for side in ("left", "right"):
+        plan.on(plan.new("pillow"), bed, "head", side, turn=3.0, gap=0.0)
+    plan.on(plan.new("blanket", "blanket"), bed, "seat", turn=6.0)
+
+
+def cushions(plan: Plan, sofa: Placed, n: int) -> None:
+    for _ in range(n):
+        plan.on(plan.new("cushion", "cushion"), sofa, "seat", "back", turn=6.0)
 
 
 def wall_things(plan: Plan, n_pictures: int, clock: bool = True, n_plugs: int = 2) -> None:
@@ -58,9 +81,9 @@ def hang_ceiling_lamp(plan: Plan, x: float, y: float) -> Placed | None:
     return plan.try_at(lamp, x, y, 0.0, plan.height - lamp.size[2] - 2 * GAP_M, 0.0, "ceiling")
 
 
-def floor_things(plan: Plan, names: Sequence[str]) -> None:
-    for name in names:
-        plan.somewhere(plan.new(name))
+def floor_things(plan: Plan, wanted: Sequence[Wanted]) -> None:
+    for want in wanted:
+        plan.somewhere(new(plan, want))
 
 
 def filled_basket(plan: Plan, content: str) -> None:
@@ -99,18 +122,14 @@ def seating(plan: Plan) -> Placed | None:
     if plan.facing(rug, sofa, 0.08, turn=0.0) is None:
         plan.facing(plan.new("rug"), sofa, 0.03, turn=0.0)
     low_table = plan.facing(plan.new("table", "coffee_table"), sofa, float(plan.rng.uniform(0.42, 0.52)), turn=0.0)
-    for _ in range(int(plan.rng.integers(2, 4))):
-        plan.on(plan.new("cushion", "cushion"), sofa, "seat", "back", turn=6.0)
+    cushions(plan, sofa, int(plan.rng.integers(2, 4)))
     plan.on(plan.new("blanket", "blanket"), sofa, "seat", turn=6.0)
     side = plan.beside(plan.new("table", "side_table"), sofa)
     stock(plan, side, [("lamp", "table_lamp")])
-    stock(
-        plan,
-        low_table,
-        choose(
-            plan, ["cup", "bowl", ("book", "book_stack"), "candle", "plate", "tissue-paper", "laptop", "cup", "vase"], 5
-        ),
+    more = some(
+        plan, 5, "cup", "bowl", ("book", "book_stack"), "candle", "plate", "tissue-paper", "laptop", "cup", "vase"
     )
+    stock(plan, low_table, more)
     plan.hang_above(plan.new("picture"), sofa, 1.3, float(plan.rng.uniform(-0.2, 0.2)))
     return sofa
 
@@ -122,10 +141,8 @@ def long_walls(plan: Plan) -> list[int]:
 def opposite(plan: Plan, item: Item, other: Placed) -> Placed | None:
     wall, along = plan.wall_of(other)
     facing = (wall + 2) % 4
-    x, y = plan.wall_point(facing, along, item.size[1] / 2 + 0.006)
-    return plan.try_at(item, x, y, WALL_YAW[facing], None, 0.04) or plan.against_wall(
-        item, [facing, (wall + 1) % 4, (wall + 3) % 4]
-    )
+    found = plan.try_at_wall(item, facing, along, item.size[1] / 2 + 0.006, None, 0.04)
+    return found or plan.against_wall(item, [facing, (wall + 1) % 4, (wall + 3) % 4])
 
 
 def television(plan: Plan, sofa: Placed | None) -> None:
@@ -137,7 +154,7 @@ def television(plan: Plan, sofa: Placed | None) -> None:
         plan.on(plan.new("tv-screen", "tv_screen"), stand, where="centre", turn=0.0)
     else:
         plan.hang_above(plan.new("tv-screen", "wall_tv"), stand, 0.95)
-    stock(plan, stand, choose(plan, ["indoor-plant", "vase", "sculpture", "candle"], 2))
+    stock(plan, stand, some(plan, 2, "indoor-plant", "vase", "sculpture", "candle"))
     stock(plan, stand, [("book", "book_stack")], "board")
 
 
@@ -154,20 +171,19 @@ def dining_table(plan: Plan, n_chairs: int) -> Placed | None:
     if table is None:
         return None
     chairs_around(plan, table, n_chairs)
-    stock(plan, table, ["plate", "plate", "cup", "cup", *choose(plan, ["bowl", "bottle", "vase", "candle"], 2)])
+    more = some(plan, 2, "bowl", "bottle", "vase", "candle")
+    stock(plan, table, ["plate", "plate", "cup", "cup", *more])
     return table
 
 
 def chairs_around(plan: Plan, table: Placed, n: int) -> None:
     width, depth = table.item.size[0], table.item.size[1]
-    for side in [int(k) for k in plan.rng.permutation(4)][:n]:
+    for side in plan.shuffled(range(4))[:n]:
         chair = plan.new("chair")
         reach = (depth if side % 2 == 0 else width) / 2 + chair.size[1] / 2 + 0.04
         angle = np.deg2rad(90.0 * side)
-        local = np.array([np.sin(angle) * reach, -np.cos(angle) * reach, 0.0])
-        x, y, _ = table.to_world(local)
         yaw = table.yaw + 180.0 + 90.0 * side + float(plan.rng.uniform(-5, 5))
-        plan.try_at(chair, float(x), float(y), yaw, None, 0.0)
+        plan.try_by(chair, table, np.sin(angle) * reach, -np.cos(angle) * reach, yaw, 0.0)
 
 
 def desk_place(plan: Plan, laptop: bool = False) -> Placed | None:
@@ -187,16 +203,15 @@ def desk_place(plan: Plan, laptop: bool = False) -> Placed | None:
             )
             before_screen(plan, desk, plan.new("computer-keyboard"), local_x, 0.17)
             before_screen(plan, desk, plan.new("mouse"), local_x + 0.34, 0.17)
-    stock(
-        plan,
-        desk,
-        [
-            ("lamp", "desk_lamp"),
-            *choose(
-                plan, ["cup", ("book", "books"), ("book", "book_stack"), "tissue-paper", "indoor-plant", "bottle"], 3
-            ),
-        ],
+    pool: tuple[Wanted, ...] = (
+        "cup",
+        ("book", "books"),
+        ("book", "book_stack"),
+        "tissue-paper",
+        "indoor-plant",
+        "bottle",
     )
+    stock(plan, desk, [("lamp", "desk_lamp"), *plan.shuffled(pool)[:3]])
     plan.facing(
         plan.new("chair"), desk, float(plan.rng.uniform(0.04, 0.15)), float(plan.rng.uniform(-0.15, 0.15)), jitter=8.0
     )
@@ -213,10 +228,8 @@ def before_screen(plan: Plan, desk: Placed, item: Item, local_x: float, from_fro
     found = None
     if spot.x0 + half < local_x < spot.x1 - half:
         x, y, z = desk.to_world(np.array([local_x, spot.y0 + from_front, spot.z]))
-        found = plan.try_at(item, float(x), float(y), desk.yaw, float(z) + GAP_M, 0.005, "object", ignore=[desk.id])
-    if found:
-        plan.parent[found.id] = (desk.id, "on")
-    else:
+        found = plan.try_on(item, desk, (x, y, z + GAP_M), desk.yaw, 0.005)
+    if found is None:
         plan.on(item, desk, turn=3.0)
 
 
@@ -227,18 +240,7 @@ def cushioned_bench(plan: Plan) -> None:
         plan.on(plan.new("cushion", "flat_cushion"), bench, "seat", turn=5.0)
 
 
-def bath_shelf(plan: Plan) -> Placed | None:
+def bath_shelf(plan: Plan) -> None:
+    towels = [("towel", "folded_towel"), ("towel", "folded_towel"), ("towel", "rolled_towel")]
     shelf = plan.against_wall(plan.new("shelf", "shelf"))
-    if shelf:
-        for want in (
-            ("towel", "folded_towel"),
-            ("towel", "folded_towel"),
-            ("towel", "rolled_towel"),
-            "bottle",
-            "indoor-plant",
-            "candle",
-            "tissue-paper",
-        ):
-            name, model = want if isinstance(want, tuple) else (want, None)
-            plan.on(plan.new(name, model), shelf, "board", turn=3.0)
-    return shelf
+    stock(plan, shelf, [*towels, "bottle", "indoor-plant", "candle", "tissue-paper"], "board", turn=3.0)

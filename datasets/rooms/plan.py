@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 
@@ -17,6 +18,7 @@ from su3d_bench.datasets.rooms.rendering.mesh import Light, Placed
 GAP_M = 0.002  # between touching faces, so that neither flickers through the other
 WALL_YAW = (0.0, -90.0, 180.0, 90.0)  # of an item with its back to the wall at y = depth, x = width, y = 0, x = 0
 FLAT = frozenset(("rug", "mat"))
+Value = TypeVar("Value")
 
 
 @dataclass(frozen=True)
@@ -63,6 +65,9 @@ class Plan:
         used.add(item.colour)
         return item
 
+    def shuffled(self, values: Sequence[Value]) -> list[Value]:
+        return [values[int(k)] for k in self.rng.permutation(len(values))]
+
     def wall_length(self, wall: int) -> float:
         return self.width if wall % 2 == 0 else self.depth
 
@@ -104,6 +109,30 @@ class Plan:
                 return None
         return self.add(item, x, y, z, yaw, mount)
 
+    def try_at_wall(
+        self, item: Item, wall: int, along: float, off: float, z: float | None = None, gap: float = 0.0,
+        mount: str = "floor", ignore: Sequence[int] = (),
+    ) -> Placed | None:  # fmt: skip
+        """Back to a wall: its middle ``along`` it and ``off`` it."""
+        x, y = self.wall_point(wall, along, off)
+        return self.try_at(item, x, y, WALL_YAW[wall], z, gap, mount, ignore)
+
+    def try_by(self, item: Item, anchor: Placed, x: float, y: float, yaw: float, gap: float = 0.01) -> Placed | None:
+        """On the floor, at a place (x, y) as the anchor sees it."""
+        world_x, world_y, _ = anchor.to_world(np.array([x, y, 0.0]))
+        return self.try_at(item, float(world_x), float(world_y), yaw, None, gap)
+
+    def try_on(
+        self, item: Item, holder: Placed, place: Sequence[float] | Float64Array, yaw: float, gap: float,
+        relation: str = "on",
+    ) -> Placed | None:  # fmt: skip
+        """At a place (x, y, z) of the world on ``holder``, and held by it."""
+        x, y, z = (float(value) for value in place)
+        found = self.try_at(item, x, y, yaw, z, gap, "object", ignore=self._chain(holder.id))
+        if found:
+            self.parent[found.id] = (holder.id, relation)
+        return found
+
     def _flat(self, placed_id: int) -> bool:
         return self.placed[placed_id - 1].item.class_name in FLAT
 
@@ -111,17 +140,15 @@ class Plan:
         self, item: Item, walls: Sequence[int] = (0, 1, 2, 3), gap: float = 0.05, corner: bool = False
     ) -> Placed | None:
         """Back to a wall, at a random place along it (or in a corner)."""
-        order = [int(w) for w in self.rng.permutation(list(walls))]
         half = item.size[0] / 2
-        for wall in order * 14:
+        for wall in self.shuffled(walls) * 14:
             length = self.wall_length(wall)
             if length < 2 * half + 0.02:
                 continue
             along = float(self.rng.uniform(half + 0.01, length - half - 0.01))
             if corner:
                 along = half + 0.02 if self.rng.random() < 0.5 else length - half - 0.02
-            x, y = self.wall_point(wall, along, item.size[1] / 2 + 0.006)
-            found = self.try_at(item, x, y, WALL_YAW[wall], None, gap)
+            found = self.try_at_wall(item, wall, along, item.size[1] / 2 + 0.006, None, gap)
             if found:
                 return found
         return None
@@ -131,11 +158,10 @@ class Plan:
         half = item.size[0] / 2
         if not half < along < self.wall_length(wall) - half:
             return None
-        x, y = self.wall_point(wall, along, item.size[1] / 2 + GAP_M)
-        return self.try_at(item, x, y, WALL_YAW[wall], z, gap, mount="wall")
+        return self.try_at_wall(item, wall, along, item.size[1] / 2 + GAP_M, z, gap, mount="wall")
 
     def hang_somewhere(self, item: Item, z: float, walls: Sequence[int] = (0, 1, 2, 3)) -> Placed | None:
-        for wall in [int(w) for w in self.rng.permutation(list(walls))] * 10:
+        for wall in self.shuffled(walls) * 10:
             half = item.size[0] / 2 + 0.05
             along = float(self.rng.uniform(half, self.wall_length(wall) - half))
             found = self.hang(item, wall, along, z)
@@ -154,16 +180,10 @@ class Plan:
 
     def beside(self, item: Item, anchor: Placed, gap: float = 0.06, back: bool = True) -> Placed | None:
         """To the left or right of an item, backs aligned."""
-        for side in self.rng.permutation([-1, 1]):
-            local = np.array(
-                [
-                    side * (anchor.item.size[0] / 2 + gap + item.size[0] / 2),
-                    (anchor.item.size[1] - item.size[1]) / 2 if back else 0.0,
-                    0.0,
-                ]
-            )
-            x, y, _ = anchor.to_world(local)
-            found = self.try_at(item, float(x), float(y), anchor.yaw, None, 0.01)
+        y = (anchor.item.size[1] - item.size[1]) / 2 if back else 0.0
+        for side in self.shuffled((-1, 1)):
+            x = side * (anchor.item.size[0] / 2 + gap + item.size[0] / 2)
+            found = self.try_by(item, anchor, x, y, anchor.yaw)
             if found:
                 return found
         return None
@@ -172,10 +192,9 @@ class Plan:
                jitter: float = 0.0) -> Placed | None:  # fmt: skip
         """In front of an item; ``turn`` 180 looks at it."""
         depth = item.size[1] if turn % 180 == 0 else item.size[0]
-        local = np.array([shift, -(anchor.item.size[1] / 2 + distance + depth / 2), 0.0])
-        x, y, _ = anchor.to_world(local)
+        y = -(anchor.item.size[1] / 2 + distance + depth / 2)
         yaw = anchor.yaw + turn + float(self.rng.uniform(-jitter, jitter))
-        return self.try_at(item, float(x), float(y), yaw, None, 0.01)
+        return self.try_by(item, anchor, shift, y, yaw)
 
     def somewhere(self, item: Item, gap: float = 0.1, margin: float = 0.1) -> Placed | None:
         """Anywhere on the floor, rather near a wall."""
@@ -195,17 +214,16 @@ class Plan:
     ) -> Placed | None:
         """On (or in) one of the anchor's spots; ``where``: any, centre, back, front, left, right."""
         spots = [spot for spot in anchor.item.spots if spot.role == role and spot.clearance >= item.size[2]]
-        for spot in [spots[int(k)] for k in self.rng.permutation(len(spots))] if spots else []:
+        for spot in self.shuffled(spots) if spots else []:
             for _ in range(24):
                 yaw = float(self.rng.uniform(-turn, turn))
                 local = self._within(item, spot, where, yaw)
                 if local is None:
                     break
                 x, y, z = anchor.to_world(np.array([*local, spot.z]))
-                found = self.try_at(item, float(x), float(y), anchor.yaw + yaw, float(z) + GAP_M, gap, "object",
-                                    ignore=self._chain(anchor.id))  # fmt: skip
+                relation = "in" if role == "inside" else "on"
+                found = self.try_on(item, anchor, (x, y, z + GAP_M), anchor.yaw + yaw, gap, relation)
                 if found:
-                    self.parent[found.id] = (anchor.id, "in" if role == "inside" else "on")
                     return found
         return None
 
@@ -300,14 +318,12 @@ def add_openings(plan: Plan, n_windows: int, cover: str) -> None:
     wall = int(rng.integers(0, 4))
     length = plan.wall_length(wall)
     along = 0.16 + door.size[0] / 2 if rng.random() < 0.5 else length - 0.16 - door.size[0] / 2
-    x, y = plan.wall_point(wall, along, door.size[1] / 2 + GAP_M)
-    placed = plan.try_at(door, x, y, WALL_YAW[wall], GAP_M, mount="wall")
+    placed = plan.try_at_wall(door, wall, along, door.size[1] / 2 + GAP_M, GAP_M, mount="wall")
     assert placed is not None
     plan.keep_free.append(_in_front(plan, wall, along, door.size[0] / 2 + 0.05, 0.85, 0.0, 2.0))
     side = 1.0 if along < length / 2 else -1.0
     plan.hang(plan.new("switch"), wall, along + side * (door.size[0] / 2 + 0.22), 1.05)
-    free = [w for w in range(4) if w != wall]
-    for chosen in [int(w) for w in rng.permutation(free)][:n_windows]:
+    for chosen in plan.shuffled([other for other in range(4) if other != wall])[:n_windows]:
         _add_window(plan, chosen, cover)
 
 
@@ -337,8 +353,6 @@ def _add_window(plan: Plan, wall: int, cover: str) -> None:
             plan.hang(panel, wall, along + side * (window.size[0] / 2 + panel.size[0] / 2 + 0.06), 0.04, 0.0)
     elif cover == "blinds":
         blind = plan.new("blinds")
-        off = window.size[1] + 0.012 + blind.size[1] / 2
-        bx, by = plan.wall_point(wall, along, off)
-        plan.try_at(blind, bx, by, WALL_YAW[wall], sill + window.size[2] - blind.size[2] * 0.9, mount="wall",
-                    ignore=[placed.id])  # fmt: skip
+        off, z = window.size[1] + 0.012 + blind.size[1] / 2, sill + window.size[2] - blind.size[2] * 0.9
+        plan.try_at_wall(blind, wall, along, off, z, mount="wall", ignore=[placed.id])
     plan.keep_free.append(_in_front(plan, wall, along, window.size[0] / 2, 0.5, sill + 0.05, 2.3))

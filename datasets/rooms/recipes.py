@@ -10,8 +10,9 @@ import numpy as np
 from su3d_bench.datasets.rooms.groups import (
     SMALL_DECOR,
     bath_shelf,
-    choose,
+    bedding,
     cushioned_bench,
+    cushions,
     desk_place,
     dining_table,
     filled_basket,
@@ -20,8 +21,11 @@ from su3d_bench.datasets.rooms.groups import (
     long_walls,
     plant_on_stand,
     seating,
+    some,
     stock,
+    stocked_cabinet,
     stocked_shelf,
+    stocked_wall_shelf,
     television,
     wall_things,
 )
@@ -33,17 +37,13 @@ def living(plan: Plan) -> None:
     sofa = seating(plan)
     television(plan, sofa)
     stocked_shelf(plan, n=7)
-    cabinet = plan.against_wall(plan.new("cabinet"))
-    stock(plan, cabinet, [*choose(plan, SMALL_DECOR, 3)])
+    stocked_cabinet(plan, SMALL_DECOR, 3)
     plan.against_wall(plan.new("lamp", "floor_lamp"), corner=True)
     plant_on_stand(plan)
     filled_basket(plan, "blanket")
     plan.somewhere(plan.new(str(plan.rng.choice(["beanbag", "stool"]))))
     cushioned_bench(plan)
-    floor_things(
-        plan,
-        [str(n) for n in plan.rng.permutation(["backpack", "exercise-ball", "box", "indoor-plant", "umbrella"])[:3]],
-    )
+    floor_things(plan, some(plan, 3, "backpack", "exercise-ball", "box", "indoor-plant", "umbrella"))
     wall_things(plan, 2)
 
 
@@ -56,19 +56,13 @@ def bedroom(plan: Plan) -> None:
             plan.facing(plan.new("rug"), bed, -0.9, turn=0.0)
         for _ in range(2):
             stand = plan.beside(plan.new("nightstand"), bed, 0.07)
-            stock(
-                plan,
-                stand,
-                [("lamp", "table_lamp"), *choose(plan, [("book", "book_stack"), "cup", "tissue-paper", "candle"], 1)],
-            )
-        for side in ("left", "right"):
-            plan.on(plan.new("pillow"), bed, "head", side, turn=3.0, gap=0.0)
-        plan.on(plan.new("blanket", "blanket"), bed, "seat", turn=6.0)
+            more = some(plan, 1, ("book", "book_stack"), "cup", "tissue-paper", "candle")
+            stock(plan, stand, [("lamp", "table_lamp"), *more])
+        bedding(plan, bed)
         plan.on(plan.new("cushion", "flat_cushion"), bed, "seat", turn=20.0)
         plan.hang_above(plan.new("picture"), bed, 1.35)
     wardrobe = plan.against_wall(plan.new("wardrobe"))
-    cabinet = plan.against_wall(plan.new("cabinet"))
-    stock(plan, cabinet, choose(plan, SMALL_DECOR, 4))
+    stocked_cabinet(plan, SMALL_DECOR, 4)
     if wardrobe is None or plan.rng.random() < 0.5:
         stocked_shelf(plan, n=6)
     else:
@@ -78,7 +72,7 @@ def bedroom(plan: Plan) -> None:
     plan.somewhere(plan.new(str(plan.rng.choice(["stool", "beanbag", "beanbag"]))))
     if plan.rng.random() < 0.5:
         cushioned_bench(plan)
-    floor_things(plan, [str(n) for n in plan.rng.permutation(["backpack", "box", "exercise-ball", "umbrella"])[:3]])
+    floor_things(plan, some(plan, 3, "backpack", "box", "exercise-ball", "umbrella"))
     wall_things(plan, 2)
 
 
@@ -88,20 +82,10 @@ def kitchen(plan: Plan) -> None:
     if fridge:
         plan.on(plan.new("box"), fridge, turn=6.0)
     dining_table(plan, 3)
-    cabinet = plan.against_wall(plan.new("cabinet"))
-    stock(
-        plan,
-        cabinet,
-        choose(
-            plan, ["bowl", "vase", "chopping-board", "bottle", "pot", "indoor-plant", "knife-block", "paper-towel"], 5
-        ),
-    )
+    pool = "bowl", "vase", "chopping-board", "bottle", "pot", "indoor-plant", "knife-block", "paper-towel"
+    stocked_cabinet(plan, pool, 5)
     plan.against_wall(plan.new("bin"), gap=0.04)
-    rack = plan.new("shelf", "wall_shelf")
-    hung = plan.hang_somewhere(rack, 1.45)
-    if hung:
-        for name in ("cup", "bottle", "bowl", "indoor-plant"):
-            plan.on(plan.new(name), hung, turn=3.0)
+    stocked_wall_shelf(plan, ["cup", "bottle", "bowl", "indoor-plant"], turn=3.0)
     floor_things(plan, ["stool", "mat", "box", "umbrella"])
     wall_things(plan, 1)
 
@@ -110,22 +94,17 @@ def office(plan: Plan) -> None:
     for laptop in (False, bool(plan.rng.random() < 0.4)):
         desk_place(plan, laptop)
     stocked_shelf(plan, [("book", "books"), "box"], 7)
-    cabinet = plan.against_wall(plan.new("cabinet"))
-    stock(plan, cabinet, choose(plan, [*SMALL_DECOR, "box", "paper-towel"], 3))
+    stocked_cabinet(plan, [*SMALL_DECOR, "box", "paper-towel"], 3)
     if plan.rng.random() < 0.6:
         sofa = plan.against_wall(plan.new("sofa"))
         if sofa:
-            plan.on(plan.new("cushion", "cushion"), sofa, "seat", "back", turn=6.0)
-            plan.on(plan.new("cushion", "cushion"), sofa, "seat", "back", turn=6.0)
+            cushions(plan, sofa, 2)
     else:
         cushioned_bench(plan)
     plan.against_wall(plan.new("lamp", "floor_lamp"), corner=True)
-    hung = plan.hang_somewhere(plan.new("shelf", "wall_shelf"), 1.45)
-    stock(plan, hung, [("book", "books"), "sculpture", "indoor-plant"])
+    stocked_wall_shelf(plan, [("book", "books"), "sculpture", "indoor-plant"])
     plant_on_stand(plan)
-    floor_things(
-        plan, [str(n) for n in plan.rng.permutation(["backpack", "umbrella", "box", "exercise-ball", "basket"])[:3]]
-    )
+    floor_things(plan, some(plan, 3, "backpack", "umbrella", "box", "exercise-ball", "basket"))
     wall_things(plan, 2, n_plugs=3)
 
 
@@ -144,14 +123,9 @@ def bathroom(plan: Plan) -> None:
     if tub:
         plan.facing(plan.new("mat"), tub, 0.05, turn=0.0)
     bath_shelf(plan)
-    cabinet = plan.against_wall(plan.new("cabinet"))
-    stock(
-        plan,
-        cabinet,
-        [("towel", "folded_towel"), *choose(plan, ["candle", "bottle", "tissue-paper", "indoor-plant", "cup"], 3)],
-    )
-    hung = plan.hang_somewhere(plan.new("shelf", "wall_shelf"), 1.4)
-    stock(plan, hung, ["bottle", "cup", "candle", ("towel", "folded_towel")])
+    folded = "towel", "folded_towel"
+    stocked_cabinet(plan, ["candle", "bottle", "tissue-paper", "indoor-plant", "cup"], 3, [folded])
+    stocked_wall_shelf(plan, ["bottle", "cup", "candle", folded], 1.4)
     filled_basket(plan, "towel")
     floor_things(plan, ["stool"])
     plan.hang_somewhere(plan.new("towel", "towel_rail"), 0.95)
@@ -162,9 +136,7 @@ def studio(plan: Plan) -> None:
     """One room to live, sleep and work in."""
     bed = plan.against_wall(plan.new("bed"), gap=0.2, corner=True)
     if bed:
-        for side in ("left", "right"):
-            plan.on(plan.new("pillow"), bed, "head", side, turn=3.0, gap=0.0)
-        plan.on(plan.new("blanket", "blanket"), bed, "seat", turn=6.0)
+        bedding(plan, bed)
         stand = plan.beside(plan.new("nightstand"), bed, 0.07)
         stock(plan, stand, [("lamp", "table_lamp"), "cup"])
     sofa = seating(plan)
@@ -173,12 +145,8 @@ def studio(plan: Plan) -> None:
     plan.against_wall(plan.new("wardrobe"))
     stocked_shelf(plan, n=6)
     plan.against_wall(plan.new("refrigerator"))
-    cabinet = plan.against_wall(plan.new("cabinet"))
-    stock(plan, cabinet, ["microwave", "pot", "paper-towel", "bottle"])
-    floor_things(
-        plan,
-        [str(n) for n in plan.rng.permutation(["backpack", "umbrella", "box", "exercise-ball", "basket", "stool"])[:3]],
-    )
+    stocked_cabinet(plan, (), 0, ["microwave", "pot", "paper-towel", "bottle"])
+    floor_things(plan, some(plan, 3, "backpack", "umbrella", "box", "exercise-ball", "basket", "stool"))
     wall_things(plan, 2)
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from su3d_bench.datasets.rooms.objects.items import Item, Part, Spot
-from su3d_bench.datasets.rooms.plan import GAP_M, WALL_YAW, Plan
+from su3d_bench.datasets.rooms.plan import GAP_M, Plan
 from su3d_bench.datasets.rooms.rendering.mesh import Placed
 
 
@@ -15,7 +15,7 @@ def counter_run(plan: Plan) -> None:
     """Base cabinets side by side under one stone slab with sink and cooktop; wall cabinets above."""
     rng = plan.rng
     colour = str(rng.choice(["white", "beige", "grey", "green", "blue", "brown"]))
-    for wall in [int(w) for w in rng.permutation(4)]:
+    for wall in plan.shuffled(range(4)):
         for start in (float(rng.uniform(0.03, 0.1)), 0.6, 1.2, 1.8):
             run, end = cabinet_row(plan, wall, start, colour)
             if len(run) >= 2:
@@ -32,9 +32,8 @@ def cabinet_row(plan: Plan, wall: int, start: float, colour: str) -> tuple[list[
     for _ in range(4):
         item = plan.new("base-cabinet", colour=colour)
         centre, half = along + item.size[0] / 2, item.size[0] / 2
-        x, y = plan.wall_point(wall, centre, item.size[1] / 2 + 0.006)
         fits = centre + half < plan.wall_length(wall)
-        found = plan.try_at(item, x, y, WALL_YAW[wall]) if fits else None
+        found = plan.try_at_wall(item, wall, centre, item.size[1] / 2 + 0.006) if fits else None
         if found is None:
             break
         run.append(found)
@@ -54,41 +53,25 @@ def counter_top(plan: Plan, wall: int, start: float, end: float, run: Sequence[P
     shape = slab.parts[0].shape.stretched(length, 1.06)
     spot = slab.spots[0]
     stretched = Spot(spot.x0 * length, spot.x1 * length, spot.y0 * 1.04, spot.y1 * 1.04, spot.z)
-    item = Item(
-        "countertop",
-        slab.colour,
-        slab.material,
-        "medium",
-        (Part(shape, slab.parts[0].material),),
-        (stretched,),
-        np.array([length, slab.size[1] * 1.06, slab.size[2]]),
-    )
-    x, y = plan.wall_point(wall, start + length / 2, item.size[1] / 2 + 0.004)
+    part = Part(shape, slab.parts[0].material)
+    size = np.array([length, slab.size[1] * 1.06, slab.size[2]])
+    item = Item("countertop", slab.colour, slab.material, "medium", (part,), (stretched,), size)
     z = float(plan.boxes[run[0].id].high[2]) + GAP_M
-    top = plan.try_at(item, x, y, WALL_YAW[wall], z, 0.0, "object", ignore=[])
+    top = plan.try_at_wall(item, wall, start + length / 2, item.size[1] / 2 + 0.004, z, mount="object")
     if top is None:
         return
     plan.parent[top.id] = (run[0].id, "on")
     plan.rests_also_on.extend((top.id, cabinet.id) for cabinet in run[1:])
-    order = [int(k) for k in plan.rng.permutation(len(run))]
-    sink = at_cabinet(plan, top, run[order[0]], plan.new("sink", "kitchen_sink"))
-    stove = at_cabinet(plan, top, run[order[1]], plan.new("cooktop"))
+    below_sink, below_stove = plan.shuffled(run)[:2]
+    sink = at_cabinet(plan, top, below_sink, plan.new("sink", "kitchen_sink"))
+    stove = at_cabinet(plan, top, below_stove, plan.new("cooktop"))
     if stove:
         for name in ("pan", "pot"):
             plan.on(plan.new(name), stove, "burner", "centre", turn=12.0, gap=0.0)
     if sink:
         beside_on(plan, top, sink, plan.new("towel", "folded_towel"))
     plan.on(plan.new("microwave"), top, where="back", turn=3.0)
-    for name in (
-        "chopping-board",
-        "knife-block",
-        "paper-towel",
-        "bottle",
-        "bowl",
-        "cup",
-        "plate",
-        "indoor-plant",
-    ):
+    for name in ("chopping-board", "knife-block", "paper-towel", "bottle", "bowl", "cup", "plate", "indoor-plant"):
         plan.on(plan.new(name), top, turn=6.0)
     for cabinet in run:
         if plan.rng.random() < 0.8:
@@ -98,23 +81,16 @@ def counter_top(plan: Plan, wall: int, start: float, end: float, run: Sequence[P
 def at_cabinet(plan: Plan, top: Placed, cabinet: Placed, item: Item) -> Placed | None:
     """On the slab, over the middle of one cabinet."""
     wall, along = plan.wall_of(cabinet)
-    x, y = plan.wall_point(wall, along, 0.33)
     z = float(plan.boxes[top.id].high[2]) + GAP_M
-    found = plan.try_at(item, x, y, top.yaw, z, 0.0, "object", ignore=[top.id])
-    if found:
-        plan.parent[found.id] = (top.id, "on")
-    return found
+    return plan.try_on(item, top, (*plan.wall_point(wall, along, 0.33), z), top.yaw, 0.0)
 
 
 def beside_on(plan: Plan, top: Placed, anchor: Placed, item: Item) -> None:
     for side in (-1, 1):
         offset = np.array([side * (anchor.item.size[0] / 2 + 0.04 + item.size[0] / 2), -0.05, 0.0])
-        x, y, z = anchor.to_world(offset)
-        inside = plan.boxes[top.id]
-        if not (inside.low[:2] + 0.1 < (x, y)).all() or not ((x, y) < inside.high[:2] - 0.1).all():
+        place, inside = anchor.to_world(offset), plan.boxes[top.id]
+        if not (inside.low[:2] + 0.1 < place[:2]).all() or not (place[:2] < inside.high[:2] - 0.1).all():
             continue
-        found = plan.try_at(item, float(x), float(y), anchor.yaw, float(z), 0.0, "object", ignore=[top.id])
-        if found:
-            plan.parent[found.id] = (top.id, "on")
+        if plan.try_on(item, top, place, anchor.yaw, 0.0):
             return
     plan.on(item, top)

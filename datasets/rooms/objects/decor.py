@@ -13,7 +13,7 @@ from su3d_bench.datasets.rooms.objects.materials import (
     Texture,
     ceramic,
     chrome,
-    glass,
+    light,
     linear,
     metal,
     mix,
@@ -21,7 +21,6 @@ from su3d_bench.datasets.rooms.objects.materials import (
     paper,
     plastic,
     shade,
-    stone,
     tone,
     wood,
 )
@@ -44,8 +43,7 @@ def _shade(build: Assembly, radius: float, height: float, z: float) -> None:
     top = radius * build.rng.uniform(0.55, 0.85)
     wall = [(radius, 0), (top, height), (top - 0.008, height), (radius - 0.008, 0), (radius, 0)]
     build.add(glowing, lathe(wall, 26).moved(z=z))
-    bulb = Material(Texture.PLAIN, linear((255, 244, 214)), linear((255, 244, 214)), glow=1.0)
-    build.add(bulb, ellipsoid(0.03, 0.03, 0.04).moved(z=z + height * 0.4))
+    build.add(light((255, 244, 214)), ellipsoid(0.03, 0.03, 0.04).moved(z=z + height * 0.4))
 
 
 def table_lamp(build: Assembly) -> None:
@@ -91,8 +89,7 @@ def desk_lamp(build: Assembly) -> None:
     build.add(body, ellipsoid(0.02, 0.02, 0.02).moved(0, 0.1, 0.22))
     hood = lathe([(0.02, 0.09), (0.03, 0.065), (0.08, 0.0), (0.085, 0.0), (0.035, 0.07), (0.03, 0.1), (0.0, 0.1)], 18)
     build.add(body, hood.turned("x", -28).moved(0, -0.09, 0.33))
-    bulb = Material(Texture.PLAIN, linear((255, 244, 214)), linear((255, 244, 214)), glow=1.0)
-    build.add(bulb, ellipsoid(0.028, 0.028, 0.028).moved(0, -0.085, 0.36))
+    build.add(light((255, 244, 214)), ellipsoid(0.028, 0.028, 0.028).moved(0, -0.085, 0.36))
 
 
 def ceiling_lamp(build: Assembly) -> None:
@@ -195,7 +192,7 @@ def vase(build: Assembly) -> None:
     ]
     outer = shapes[int(build.rng.integers(0, 3))]
     inner = [(radius * 0.86, z) for radius, z in reversed(outer[1:])]
-    wall = ceramic(build.rgb) if build.material == "ceramic" else glass(build.rgb)
+    wall = build.main()
     if build.chance(0.4):
         wall = replace(
             wall,
@@ -235,9 +232,7 @@ def picture(build: Assembly) -> None:
 def clock(build: Assembly) -> None:
     r = build.size(0.14, 0.19)
     rim = lathe([(0, 0), (r, 0), (r, 0.03), (r * 0.9, 0.036), (r * 0.88, 0.024), (0, 0.024)], 30)
-    build.add(
-        metal(build.rgb, build.rng) if build.material == "metal" else plastic(build.rgb), rim.turned("x", 90).moved(z=r)
-    )
+    build.add(build.main(), rim.turned("x", 90).moved(z=r))
     face = Material(
         Texture.CLOCK_FACE, tone("white"), tone("black"), 1.0, 0.2, 0.0, 0, (-r * 0.88, r * 0.88, r * 0.12, r * 1.88)
     )
@@ -266,7 +261,7 @@ def candle(build: Assembly) -> None:
 
 def sculpture(build: Assembly) -> None:
     h = build.size(0.26, 0.4)
-    body = stone(build.rgb, build.rng) if build.material == "stone" else metal(build.rgb, build.rng)
+    body = build.main()
     build.add(paint(tone("black"), 0.3), block(0.13, 0.13, 0.04))
     kind = int(build.rng.integers(0, 3))
     if kind == 0:  # a bust

@@ -8,6 +8,7 @@ from su3d_bench.datasets.rooms.objects.materials import (
     Texture,
     chrome,
     glass,
+    light,
     linear,
     metal,
     paint,
@@ -155,7 +156,7 @@ def monitor(build: Assembly) -> None:
 
 def laptop(build: Assembly) -> None:
     width, depth = build.size(0.33, 0.37), build.size(0.23, 0.25)
-    case = metal(build.rgb, build.rng) if build.material == "metal" else plastic(build.rgb)
+    case = build.main()
     build.add(case, soft_block(width, depth, 0.02, 0, 0, 0, 0.007))
     keys = Material(
         Texture.KEYS,
@@ -210,6 +211,5 @@ def desktop_computer(build: Assembly) -> None:
         build.add(contrast, block(width * 0.82, 0.008, height * 0.075, 0, y - 0.004, 0.015 + height * z))
     for i in range(5):
         build.add(contrast, block(width * 0.7, 0.006, 0.01, 0, y - 0.003, 0.05 + i * 0.026))
-    glow = Material(Texture.PLAIN, linear((60, 150, 250)), linear((60, 150, 250)), glow=0.8)
-    build.add(glow, cylinder(0.014, 0.006).turned("x", 90).moved(0, y, height * 0.6))
+    build.add(light((60, 150, 250), 0.8), cylinder(0.014, 0.006).turned("x", 90).moved(0, y, height * 0.6))
     build.spot((-width / 2 + 0.01, width / 2 - 0.01), (-depth / 2 + 0.02, depth / 2 - 0.02), height + 0.015, 0.2)

@@ -12,7 +12,6 @@ from su3d_bench.datasets.rooms.objects.materials import (
     Texture,
     ceramic,
     chrome,
-    glass,
     linear,
     metal,
     mix,
@@ -110,7 +109,7 @@ def bottle(build: Assembly) -> None:
         (r * 0.36, h * 0.95),
         (0, h * 0.95),
     ]
-    build.add(glass(build.rgb) if build.material == "glass" else plastic(build.rgb), lathe(outline, 20))
+    build.add(build.main(), lathe(outline, 20))
     label = Material(
         Texture.LABEL,
         tone("white"),

@@ -72,15 +72,12 @@ def window(build: Assembly) -> None:
     bar = 0.055
     for x in (-width / 2 + bar / 2, 0.0, width / 2 - bar / 2):
         build.add(frame, block(bar, 0.05, height, x))
-    for z in (0.0, height - bar):
-        build.add(
-            frame, *[block(width / 2 - 1.5 * bar, 0.046, bar, sx * (width / 4 - bar / 4), 0, z) for sx in (-1, 1)]
-        )
+    rails = [(0.046, bar, 0.0), (0.046, bar, height - bar)]
     if build.chance(0.5):
-        build.add(
-            frame,
-            *[block(width / 2 - 1.5 * bar, 0.03, 0.03, sx * (width / 4 - bar / 4), 0, height * 0.62) for sx in (-1, 1)],
-        )
+        rails.append((0.03, 0.03, height * 0.62))
+    for depth, thick, z in rails:
+        for sx in (-1, 1):
+            build.add(frame, block(width / 2 - 1.5 * bar, depth, thick, sx * (width / 4 - bar / 4), 0, z))
     build.add(frame, soft_block(width + 0.12, 0.17, 0.03, 0, -0.06, -0.032, 0.01))
     build.add(chrome(build.rng), soft_block(0.02, 0.03, 0.12, 0.0, -0.035, height * 0.4, 0.008))
 

@@ -10,7 +10,6 @@ from su3d_bench.datasets.rooms.objects.materials import (
     Rgb,
     Texture,
     linear,
-    metal,
     mix,
     paper,
     plastic,
@@ -120,7 +119,7 @@ def basket(build: Assembly) -> None:
 
 def bin_(build: Assembly) -> None:
     r, h = build.size(0.13, 0.165), build.size(0.3, 0.4)
-    body = metal(build.rgb, build.rng) if build.material == "metal" else plastic(build.rgb)
+    body = build.main()
     if build.chance(0.4):  # pedal bin with a domed lid
         build.add(body, lathe([(0, 0), (r, 0), (r, h), (0, h)], 24))
         build.add(

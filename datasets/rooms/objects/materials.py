@@ -14,7 +14,7 @@ Rgb = tuple[float, float, float]  # linear light, 0..1
 
 
 class Texture(IntEnum):
-    """What ``rooms_pattern_kernels`` knows how to paint."""
+    """What ``pattern_kernels`` knows how to paint."""
 
     PLAIN = 0
     WOOD = 1
@@ -160,6 +160,11 @@ def cloth(rgb: Rgb, rng: np.random.Generator, patterned: bool = True, large: boo
 
 def plain_cloth(rgb: Rgb, rng: np.random.Generator) -> Material:
     return cloth(rgb, rng, patterned=False)
+
+
+def light(rgb: tuple[float, float, float], glow: float = 1.0) -> Material:
+    """What sends out light of a colour (sRGB 0..255) itself."""
+    return Material(Texture.PLAIN, linear(rgb), linear(rgb), glow=glow)
 
 
 def of_kind(material: str, rgb: Rgb, rng: np.random.Generator, axis: int = 0) -> Material:

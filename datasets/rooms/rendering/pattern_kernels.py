@@ -1,6 +1,6 @@
 """Compiled procedural textures: the colour of a surface before any light falls on it, one pixel at a time.
 
-The numbers of the textures are those of ``rooms_materials.Texture``, the columns of a material row those of
+The numbers of the textures are those of ``materials.Texture``, the columns of a material row those of
 ``Material.row``.
 """
 
