@@ -23,10 +23,9 @@ from su3d_bench.metrics.attribution import masks as instances
 from su3d_bench.metrics.attribution import points as semantic
 from su3d_bench.metrics.attribution.arrays import scored_masks, scored_points
 from su3d_bench.metrics.attribution.overlaps import measure_overlaps
+from su3d_bench.metrics.metric import Counts
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.metrics.results.results import Counts, metric_values
-from su3d_bench.metrics.scoring import SceneScore
-from su3d_bench.metrics.semantic.confusion import nan_mean
+from su3d_bench.metrics.scoring import SceneScore, metric_of
 from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.runs.job import Part, build_dataset
 from su3d_bench.runs.plan import data_root, dataset_targets
@@ -284,11 +283,8 @@ class _Gathered:
 
 def _values(rules: ProtocolRules, counts: Sequence[Counts]) -> dict[str, float]:
     """The headline metrics of the scenes, as the protocol reports them."""
-    if rules.aggregate == "pooled":
-        found = metric_values(rules, counts, pooled=True)
-        return {name: found[name] for name in rules.headline}
-    rows = [metric_values(rules, [one], pooled=False) for one in counts]
-    return {name: nan_mean(np.array([row[name] for row in rows])) for name in rules.headline}
+    reported = metric_of(rules).reported(counts)
+    return {name: reported[name] for name in rules.headline}
 
 
 def _refuse_other_counts(scene: str, rules: ProtocolRules, stored: Counts, formed: Counts) -> None:

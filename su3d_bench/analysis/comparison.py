@@ -25,10 +25,10 @@ from su3d_bench.analysis.sides import (
 from su3d_bench.core.config import MOVES_NO_NUMBER
 from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.types import Float64Array
+from su3d_bench.metrics.metric import Counts, SceneScore
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.metrics.results.resampled_values import resampled_classes
-from su3d_bench.metrics.results.results import Counts, ProtocolResult, resampled_metrics
-from su3d_bench.metrics.scoring import SceneScore, combine
+from su3d_bench.metrics.results import ProtocolResult
+from su3d_bench.metrics.scoring import combine, metric_of
 from su3d_bench.numerics.statistics import SignFlipTest, percentile_interval, resample_weights, sign_flip_test
 from su3d_bench.runs.finished import FinishedRun
 
@@ -111,7 +111,7 @@ class SideNumbers:
             result = combine(rules, scores, with_intervals=False)
             counts = [scores[scene].counts for scene in result.scenes]
             rows = [result.per_scene[scene] for scene in result.scenes]
-            drawn = resampled_metrics(rules, counts, rows, resample_weights(len(rows)))
+            drawn = metric_of(rules).resampled_headline(counts, rows, resample_weights(len(rows)))
             self._resampled[key] = _Resampled(result, counts, drawn)
         return self._resampled[key]
 
@@ -212,8 +212,9 @@ def _compare_classes(
     scenes = results[0].scenes
     alone = np.eye(len(scenes), dtype=np.int64)
     weights = resample_weights(len(scenes))
-    drawn = [resampled_classes(rules, own, weights) for own in counts]
-    single = [resampled_classes(rules, own, alone) for own in counts]
+    metric = metric_of(rules)
+    drawn = [metric.resampled_classes(own, weights) for own in counts]
+    single = [metric.resampled_classes(own, alone) for own in counts]
     return {
         name: {
             column: form_difference(

@@ -24,8 +24,8 @@ from su3d_bench.metrics.matching.labelling import (
     cosines,
     scored_classes,
 )
+from su3d_bench.metrics.metric import present
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.metrics.scene_score import present
 from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.reports.page.maps import (
     Cloud,

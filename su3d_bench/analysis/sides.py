@@ -8,7 +8,7 @@ from pathlib import Path
 
 from su3d_bench.core.errors import ConfigError, printable, suggest
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.metrics.scoring import SceneScore, check_against
+from su3d_bench.metrics.scoring import SceneScore, metric_of
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 
@@ -133,4 +133,4 @@ def rules_of(side: Side, protocol: str) -> ProtocolRules:
 def check_shapes(rules: ProtocolRules, side: Side, scores: Mapping[str, SceneScore]) -> None:
     """A ``DataError`` where counts are of other classes than the rules here have."""
     for scene, score in scores.items():
-        check_against(rules, f"{side.name}: {printable(scene, 100)}", score.counts)
+        metric_of(rules).check(f"{side.name}: {printable(scene, 100)}", score.counts)

@@ -13,7 +13,7 @@ from pydantic import BaseModel, Field, ValidationError
 
 from su3d_bench.analysis.sides import Side, refuse_unlike, rules_of
 from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, printable, suggest
-from su3d_bench.metrics.results.results import ProtocolResult
+from su3d_bench.metrics.results import ProtocolResult
 from su3d_bench.metrics.scoring import combine
 from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.model import BY_PEOPLE, Measured, Origin, is_count

@@ -13,10 +13,10 @@ from su3d_bench.core.errors import PredictionError
 from su3d_bench.evaluation.checks import MaskFacts
 from su3d_bench.evaluation.scoring import SceneOutcome
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
+from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules
-from su3d_bench.metrics.results.results import ProtocolResult, metric_values
-from su3d_bench.metrics.scene_score import SceneScore
-from su3d_bench.metrics.scoring import combine
+from su3d_bench.metrics.results import ProtocolResult
+from su3d_bench.metrics.scoring import combine, combined_metrics, metric_of
 
 SCHEMA = 1
 EVERY_CONFIDENCE = "every confidence is"
@@ -178,8 +178,8 @@ def _form(rules: ProtocolRules, kept: SceneOutcomes, file_confidences: bool) -> 
     evaluation = ProtocolEvaluation(
         kind=rules.kind,
         result=result,
-        ceiling=_metrics_of(rules, ceilings) if is_whole else None,
-        every_class=metric_values(rules, kept.bounds, pooled=True) if len(kept.bounds) == len(kept.scores) else None,
+        ceiling=combined_metrics(rules, ceilings) if is_whole else None,
+        every_class=metric_of(rules).combine(kept.bounds) if len(kept.bounds) == len(kept.scores) else None,
         with_ones=_with_ones(rules, kept) if file_confidences else None,
         coverage=covered if kept.has_coverage else None,
         facts=kept.facts,
@@ -190,13 +190,6 @@ def _form(rules: ProtocolRules, kept: SceneOutcomes, file_confidences: bool) -> 
     lines = [*_scene_warnings(kept), *_confidence_warnings(rules, evaluation, file_confidences), *kept.warnings]
     lines += [line for line in result.warnings if EVERY_CONFIDENCE not in line]  # said above, for all scenes at once
     return replace(evaluation, warnings=tuple(_once(lines)))
-
-
-def _metrics_of(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> Mapping[str, float]:
-    """What the protocol reports of these scenes, without the interval, which takes longest."""
-    if rules.aggregate == "pooled":
-        return metric_values(rules, [scores[scene].counts for scene in sorted(scores)], pooled=True)
-    return combine(rules, scores).metrics
 
 
 def _with_ones(rules: ProtocolRules, kept: SceneOutcomes) -> dict[str, float] | None:
@@ -211,7 +204,7 @@ def _with_ones(rules: ProtocolRules, kept: SceneOutcomes) -> dict[str, float] | 
     if all((one.score == 1).all() for one in counts):
         return None
     ones = [replace(one, score=np.ones(len(one.score))) for one in counts]
-    return metric_values(rules, ones, pooled=rules.aggregate == "pooled")
+    return metric_of(rules).combine(ones)
 
 
 def _scene_warnings(kept: SceneOutcomes) -> list[str]:

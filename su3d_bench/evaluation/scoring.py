@@ -31,7 +31,7 @@ from su3d_bench.evaluation.checks import (
 from su3d_bench.evaluation.truth import MAX_NYU40_ID, TextTruth
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance.score import OBJECT, encode_without_classes, every_class_counts, masks_and_scores
+from su3d_bench.metrics.instance.score import OBJECT, encode_without_classes, masks_and_scores
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import (
     candidate_classes,
@@ -41,8 +41,8 @@ from su3d_bench.metrics.matching.labelling import (
     has_every_label,
     scored_classes,
 )
+from su3d_bench.metrics.metric import SceneScore, present
 from su3d_bench.metrics.protocols import ProtocolRules
-from su3d_bench.metrics.scene_score import SceneScore, present
 from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
@@ -266,7 +266,16 @@ def _bound(
         return None
     assert rules.min_region_size is not None
     used = np.ones(len(masks)) if rules.confidence == "ones" else scores
-    return every_class_counts(values, masks, used, _class_ids(rules), rules.min_region_size, rules.thresholds)
+    return instance_ap.per_scene(
+        values,
+        masks.indptr,
+        masks.indices,
+        None,
+        used,
+        _class_ids(rules),
+        rules.min_region_size,
+        rules.thresholds,
+    )
 
 
 def _instances(rules: ProtocolRules, masks: VertexMasks, points: Float32Array) -> Instances:

@@ -9,7 +9,6 @@ from __future__ import annotations
 import io
 import json
 from collections.abc import Mapping
-from dataclasses import fields
 from typing import Any
 
 import numpy as np
@@ -20,101 +19,38 @@ from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
 from su3d_bench.metrics.fitness import why_not_scorable
-from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance.average_precision import InstanceCounts
-from su3d_bench.metrics.instance.score import score_instances
+from su3d_bench.metrics.instance.score import InstanceMetric
 from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.open_vocabulary import object_means
-from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts
+from su3d_bench.metrics.metric import Counts, Metric, SceneScore
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
-from su3d_bench.metrics.open_vocabulary.score import score_categories, score_queries
-from su3d_bench.metrics.protocols import VALUES_OF_METRIC, ProtocolRules
-from su3d_bench.metrics.questions import shares
-from su3d_bench.metrics.questions.score import score_annotation, score_reasoning, score_retrieval
-from su3d_bench.metrics.questions.shares import ShareCounts
+from su3d_bench.metrics.open_vocabulary.score import CategoriesMetric, QueryMetric
+from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.questions.score import AnnotationMetric, ReasoningMetric, RetrievalMetric
 from su3d_bench.metrics.questions.truths import AnnotationTruth, ReasoningTruth, RetrievalTruth
-from su3d_bench.metrics.results.results import Counts, ProtocolResult, form_result, reported_values
-from su3d_bench.metrics.scene_score import SceneScore
-from su3d_bench.metrics.semantic import confusion as semantic
-from su3d_bench.metrics.semantic.confusion import SemanticCounts
-from su3d_bench.metrics.semantic.score import score_semantic
+from su3d_bench.metrics.results import ProtocolResult, form_result
+from su3d_bench.metrics.semantic.score import SemanticMetric
 from su3d_bench.store.atomic import read_arrays
 
-# Of each array: the kind of its numbers and its axes; axes of one name are equally long.
-ARRAYS: dict[type[Counts], dict[str, tuple[str, tuple[str, ...]]]] = {
-    SemanticCounts: {"confusion": ("i", ("classes", "columns")), "is_present": ("b", ("classes",))},
-    InstanceCounts: {
-        "class_index": ("i", ("rows",)),
-        "threshold_index": ("i", ("rows",)),
-        "score": ("f", ("rows",)),
-        "is_true": ("b", ("rows",)),
-        "n_missed": ("i", ("classes", "thresholds")),
-        "n_truth": ("i", ("classes",)),
-        "n_small_truth": ("i", ("classes",)),
-        "n_predictions": ("i", ("classes",)),
-    },
-    ObjectCounts: {"n_points": ("i", ("objects",)), "totals": ("f", ("objects", "values"))},
-    ShareCounts: {"n_judged": ("i", ("values",)), "n_right": ("i", ("values",))},
-}
-
-
-def checked_counts(kind: type[Counts], arrays: Mapping[str, NDArray[Any]]) -> Counts:
-    """The counts of that kind; a ``DataError`` names the array that is of another kind or shape than it must be."""
-    sizes: dict[str, int] = {}
-    for name, (number_kind, axes) in ARRAYS[kind].items():
-        array = arrays[name]
-        fits = array.dtype.kind == number_kind and array.ndim == len(axes)
-        if not fits or any(sizes.setdefault(axis, n) != n for axis, n in zip(axes, array.shape, strict=True)):
-            raise DataError(f"counts: '{name}' is {array.dtype.name} {array.shape}; score the scene again")
-    for name, axis in (("class_index", "classes"), ("threshold_index", "thresholds")):
-        index = arrays.get(name, np.zeros(0, np.int32)) if axis in sizes else np.zeros(0, np.int32)
-        if len(index) and not 0 <= index.min() <= index.max() < sizes[axis]:
-            raise DataError(f"counts: '{name}' counts beyond the {sizes[axis]} {axis}; score the scene again")
-    if not np.isfinite(arrays.get("score", 0.0)).all():
-        raise DataError("counts: 'score' has values that are NaN or infinite; score the scene again")
-    return kind(**{name: arrays[name] for name in ARRAYS[kind]})
-
-
-def check_against(rules: ProtocolRules, scene: str, counts: Counts) -> None:
-    """A ``DataError`` where counts have other classes, thresholds or values than the rules."""
-    has, expected = _sizes(rules, counts)
-    for what, n in expected.items():
-        if has[what] != n:
-            raise DataError(f"{scene}: was scored with {has[what]} {what}, {rules.name} has {n} here; score it again")
-
-
-def _sizes(rules: ProtocolRules, counts: Counts) -> tuple[dict[str, int], dict[str, int]]:
-    """What the counts have of each, and what the rules have."""
-    if isinstance(counts, InstanceCounts):
-        n_classes, n_thresholds = counts.n_missed.shape
-        has = {"classes": n_classes, "thresholds": n_thresholds}
-        return has, {"classes": len(rules.curve_names), "thresholds": len(rules.thresholds)}
-    if isinstance(counts, SemanticCounts):
-        n_classes, n_columns = counts.confusion.shape
-        has = {"classes": n_classes, "columns": n_columns}
-        return has, {"classes": len(rules.classes), "columns": len(rules.classes) + 1}
-    n_values = len(counts.n_judged) if isinstance(counts, ShareCounts) else counts.totals.shape[1]
-    return {"values": n_values}, {"values": len(VALUES_OF_METRIC[rules.metric])}
-
-
-__all__ = ["SceneScore", "Truth", "combine", "pack_scores", "score_scene", "unpack_scores"]
+__all__ = ["SceneScore", "Truth", "combine", "metric_of", "pack_scores", "score_scene", "unpack_scores"]
 
 QuestionTruth = RetrievalTruth | AnnotationTruth | ReasoningTruth
 Truth = GroundTruth | OpenLexTruth | QueryTruth | QuestionTruth
-_TRUTH_OF_KIND: dict[str, type] = {
-    "queries": QueryTruth,
-    "categories": OpenLexTruth,
-    "retrieval": RetrievalTruth,
-    "annotation": AnnotationTruth,
-    "reasoning": ReasoningTruth,
+METRICS: dict[str, type[Metric[Any]]] = {
+    "semantic": SemanticMetric,
+    "instance": InstanceMetric,
+    "queries": QueryMetric,
+    "categories": CategoriesMetric,
+    "retrieval": RetrievalMetric,
+    "annotation": AnnotationMetric,
+    "reasoning": ReasoningMetric,
 }
-_COUNTS: dict[str, type[Counts]] = {
-    "semantic": semantic.SemanticCounts,
-    "instance": instance_ap.InstanceCounts,
-    "objects": object_means.ObjectCounts,
-    "shares": shares.ShareCounts,
-}
+_COUNTS: dict[str, type[Counts]] = {metric.counts.stored_as: metric.counts for metric in METRICS.values()}
+
+
+def metric_of(rules: ProtocolRules) -> Metric[Any]:
+    """The metric of a protocol's kind under its rules."""
+    return METRICS[rules.kind](rules)
 
 
 def score_scene(rules: ProtocolRules, truth: Truth, prediction: Prediction, encoder: Encoder | None) -> SceneScore:
@@ -123,37 +59,18 @@ def score_scene(rules: ProtocolRules, truth: Truth, prediction: Prediction, enco
     ``encoder`` names the features of predictions that bring no labels. Raises ``PredictionError`` for a prediction that
     cannot be scored and ``DataError`` for a truth that does not fit the protocol.
     """
+    metric = metric_of(rules)
     base = truth.scene if isinstance(truth, QuestionTruth) else truth
     space = base.labels.space if isinstance(base, GroundTruth) else base.space
     if space != rules.label_space:
         raise DataError(f"{rules.name}: scores the label space '{rules.label_space}', the truth has '{space}'")
-    if base.variant != rules.ground_truth or not isinstance(truth, _TRUTH_OF_KIND.get(rules.kind, GroundTruth)):
+    if base.variant != rules.ground_truth or not isinstance(truth, metric.truth):
         raise DataError(f"{rules.name}: scores the truth '{rules.ground_truth}', this one is '{base.variant}'")
     reason = why_not_scorable(rules, prediction)
     if reason:
         raise PredictionError(reason)
     _check_points(rules, prediction)
-    if isinstance(truth, OpenLexTruth):
-        return score_categories(rules, truth, prediction, encoder)
-    if rules.kind == "semantic" and isinstance(truth, GroundTruth):
-        return score_semantic(rules, truth, prediction, encoder)
-    assert not isinstance(prediction, DenseFeatures)  # why_not_scorable says so of the kinds that are left
-    if isinstance(truth, QueryTruth):
-        return score_queries(rules, truth, prediction, encoder)
-    if isinstance(truth, QuestionTruth):
-        return _score_questions(rules, truth, prediction, encoder)
-    return score_instances(rules, truth, prediction, encoder)
-
-
-def _score_questions(
-    rules: ProtocolRules, truth: QuestionTruth, prediction: Instances | Partition, encoder: Encoder | None
-) -> SceneScore:
-    if isinstance(truth, RetrievalTruth):
-        return score_retrieval(rules, truth, prediction, encoder)
-    assert isinstance(prediction, Instances)  # why_not_scorable says so
-    if isinstance(truth, AnnotationTruth):
-        return score_annotation(rules, truth, prediction)
-    return score_reasoning(rules, truth, prediction, encoder)
+    return metric.per_scene(truth, prediction, encoder)
 
 
 def _check_points(rules: ProtocolRules, prediction: Prediction) -> None:
@@ -180,7 +97,7 @@ def combine(rules: ProtocolRules, scores: Mapping[str, SceneScore], *, with_inte
     n_scored = sum(score.n_scored for _, score in ordered)
     n_beyond = np.sum([score.n_farther for _, score in ordered], axis=0)
     return form_result(
-        rules,
+        metric_of(rules),
         [scene for scene, _ in ordered],
         [score.counts for _, score in ordered],
         coverage={
@@ -195,20 +112,21 @@ def combine(rules: ProtocolRules, scores: Mapping[str, SceneScore], *, with_inte
 
 def combined_metrics(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> Mapping[str, float]:
     """The ``metrics`` of ``combine`` alone, without intervals, classes and scenes."""
-    return reported_values(rules, [score.counts for _, score in _ordered(rules, scores)])
+    return metric_of(rules).reported([score.counts for _, score in _ordered(rules, scores)])
 
 
 def _ordered(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> list[tuple[str, SceneScore]]:
     """The scenes by name; a ``DataError`` where there is none, or one that was scored by other rules."""
     if not scores:
         raise DataError(f"{rules.name}: no scene was scored; nothing to combine")
+    metric = metric_of(rules)
     for scene, score in scores.items():
         if (score.protocol, score.version) != (rules.name, rules.version):
             raise DataError(
                 f"{scene}: was scored under {score.protocol} version {score.version}, not {rules.name} version "
                 f"{rules.version}; score it again"
             )
-        check_against(rules, scene, score.counts)
+        metric.check(scene, score.counts)
     return [(scene, scores[scene]) for scene in sorted(scores)]
 
 
@@ -227,7 +145,8 @@ def _gathered(warnings: Mapping[str, tuple[str, ...]]) -> list[str]:
 def pack_scores(scores: Mapping[str, SceneScore]) -> bytes:
     """The npz file of a scene's scores under several protocols; equal scores give equal bytes.
 
-    >>> counts = semantic.SemanticCounts(np.zeros((1, 2), np.int64), np.ones(1, bool))
+    >>> from su3d_bench.metrics.semantic.confusion import SemanticCounts
+    >>> counts = SemanticCounts(np.zeros((1, 2), np.int64), np.ones(1, bool))
     >>> score = SceneScore("p", 1, counts, 3, 0, np.zeros(3, np.int64), ())
     >>> unpack_scores(pack_scores({"p": score}))["p"].n_predictions
     3
@@ -238,15 +157,14 @@ def pack_scores(scores: Mapping[str, SceneScore]) -> bytes:
         about = {
             "protocol": score.protocol,
             "version": score.version,
-            "kind": next(kind for kind, known in _COUNTS.items() if isinstance(score.counts, known)),
+            "kind": score.counts.stored_as,
             "n_predictions": score.n_predictions,
             "n_scored": score.n_scored,
             "n_farther": score.n_farther.tolist(),
             "warnings": score.warnings,
         }
         arrays[f"{name}/about"] = np.frombuffer(json.dumps(about, sort_keys=True).encode(), np.uint8)
-        for field in fields(score.counts):
-            arrays[f"{name}/{field.name}"] = getattr(score.counts, field.name)
+        arrays |= {f"{name}/{array}": getattr(score.counts, array) for array in score.counts.arrays}
     # numpy dates every member 1980-01-01, so the bytes say nothing of when they were written
     buffer = io.BytesIO()
     np.savez_compressed(buffer, allow_pickle=False, **arrays)
@@ -272,7 +190,7 @@ def _unpack_one(name: str, arrays: Mapping[str, NDArray[Any]]) -> SceneScore:
     return SceneScore(
         protocol=about["protocol"],
         version=about["version"],
-        counts=checked_counts(kind, {field.name: arrays[f"{name}/{field.name}"] for field in fields(kind)}),
+        counts=kind.checked({array: arrays[f"{name}/{array}"] for array in kind.arrays}),
         n_predictions=about["n_predictions"],
         n_scored=about["n_scored"],
         n_farther=n_farther,

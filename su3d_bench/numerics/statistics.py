@@ -69,6 +69,28 @@ def percentile_interval(values: Float64Array, level: float = LEVEL) -> tuple[flo
     return float(low), float(high)
 
 
+def nan_mean(values: Float64Array) -> float:
+    """Mean of the values that are not NaN; NaN where there is none.
+
+    >>> nan_mean(np.array([1.0, np.nan, 0.0]))
+    0.5
+    """
+    is_nan = np.isnan(values)
+    n = len(values) - np.count_nonzero(is_nan)
+    return float(np.where(is_nan, 0.0, values).sum() / n) if n else float("nan")  # np.nanmean, which takes its time
+
+
+def row_means(values: Float64Array) -> Float64Array:
+    """Mean of each row without its NaN; NaN for a row without any number.
+
+    >>> row_means(np.array([[1.0, np.nan, 0.0], [np.nan] * 3])).tolist()
+    [0.5, nan]
+    """
+    is_number = ~np.isnan(values)
+    n = is_number.sum(axis=1)
+    return np.where(n > 0, np.where(is_number, values, 0.0).sum(axis=1) / np.maximum(n, 1), np.nan)
+
+
 @dataclass(frozen=True)
 class SignFlipTest:
     """What the sign-flip test of ``n_pairs`` paired differences says.

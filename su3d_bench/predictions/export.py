@@ -36,8 +36,8 @@ from su3d_bench.metrics.matching.labelling import (
     encoder_warning,
     scored_classes,
 )
+from su3d_bench.metrics.metric import present
 from su3d_bench.metrics.protocols import ProtocolRules
-from su3d_bench.metrics.scene_score import present
 from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
 from su3d_bench.predictions.openlex3d import CLOUD, EMBEDDINGS, INDEX
 from su3d_bench.store.atomic import make_folder, write_text

@@ -23,8 +23,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, StoreError
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.protocols import load_protocol
-from su3d_bench.metrics.results.resampled_values import resampled_classes
-from su3d_bench.metrics.results.results import metric_values, resampled_metrics
+from su3d_bench.metrics.scoring import metric_of
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.numerics.statistics import MAX_EXACT_PAIRS, SignFlipTest, resample_weights, sign_flip_test
 from su3d_bench.reports.tables.comparison import comparison_tables
@@ -103,11 +102,12 @@ def test_values_over_drawn_scenes_are_those_of_the_scenes_together() -> None:
         scored = [entry.id for entry in rules.scored]
         counts.append(instance_ap.per_scene(truth, indptr, np.concatenate(masks), labels, scores, scored))
     weights = np.concatenate([np.ones((1, 4), np.int64), np.eye(4, dtype=np.int64), resample_weights(4, 6)])
-    drawn = resampled_metrics(rules, counts, [], weights)
-    classes = resampled_classes(rules, counts, weights)
+    metric = metric_of(rules)
+    drawn = metric.resampled_headline(counts, [], weights)
+    classes = metric.resampled_classes(counts, weights)
     for row, weight in enumerate(weights):
         chosen = [counts[s] for s in range(4) for _ in range(weight[s])]
-        whole = metric_values(rules, chosen, pooled=True)
+        whole = metric.combine(chosen)
         ap = instance_ap.combine(chosen, rules.thresholds)
         for name in rules.headline:
             assert drawn[name][row] == pytest.approx(whole[name], abs=1e-12)
@@ -123,7 +123,7 @@ def test_recall_and_iou_of_a_class_over_drawn_scenes() -> None:
     n = len(rules.classes)
     first = semantic.per_scene(np.array([0, 0, 1]), np.array([0, 1, 1]), np.ones(n, bool))
     second = semantic.per_scene(np.array([0, 0]), np.array([0, 0]), np.ones(n, bool))
-    values = resampled_classes(rules, [first, second], np.array([[1, 0], [0, 1], [1, 1]]))
+    values = metric_of(rules).resampled_classes([first, second], np.array([[1, 0], [0, 1], [1, 1]]))
     zero, one = rules.classes[0].name, rules.classes[1].name
     assert set(values) == {zero, one}
     assert values[zero]["recall"].tolist() == [0.5, 1.0, 0.75]

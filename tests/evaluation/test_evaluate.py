@@ -27,11 +27,9 @@ from prediction_files import (
 )
 
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError
-from su3d_bench.core.types import Masks
 from su3d_bench.evaluation.evaluate import Request, evaluate
 from su3d_bench.evaluation.scenes import Source, match_scenes
 from su3d_bench.metrics.instance.average_precision import THRESHOLDS, combine, per_scene
-from su3d_bench.metrics.instance.score import every_class_counts
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.predictions.formats import READERS
 
@@ -68,9 +66,8 @@ def test_the_bound_equals_every_mask_listed_under_every_class() -> None:
     scores = rng.random(len(masks))
     class_ids = [5, 7, 12, 14]
     indptr = np.concatenate([[0], np.cumsum([len(one) for one in masks])])
-    bound = every_class_counts(
-        truth, Masks(indptr, np.concatenate(masks).astype(np.int32)), scores, class_ids, 100, THRESHOLDS
-    )
+    indices = np.concatenate(masks).astype(np.int32)
+    bound = per_scene(truth, indptr, indices, None, scores, class_ids, 100, THRESHOLDS)
     listed = [one for _ in class_ids for one in masks]
     listed_ptr = np.concatenate([[0], np.cumsum([len(one) for one in listed])])
     labels = np.repeat(class_ids, len(masks))

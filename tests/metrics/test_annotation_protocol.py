@@ -16,8 +16,7 @@ from su3d_bench.metrics.instance.score import Covered
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.questions.score import judge_merging, labels_n
 from su3d_bench.metrics.questions.truths import AnnotationTruth, RefinedNames
-from su3d_bench.metrics.results.results import metric_values
-from su3d_bench.metrics.scoring import score_scene
+from su3d_bench.metrics.scoring import metric_of, score_scene
 from su3d_bench.questions.refined_names import FILE_NAME, records_of, refined_digest, refined_names, write_records
 from su3d_bench.questions.refinement import RefinedName, TopNames
 from su3d_bench.questions.truths import Refine, question_truth, voted_names
@@ -36,7 +35,7 @@ def truth(refine: Refine | None = None) -> AnnotationTruth:
 
 def values(prediction: Instances, refine: Refine | None = None) -> dict[str, float]:
     score = score_scene(RULES, truth(refine), prediction, None)
-    return metric_values(RULES, [score.counts], pooled=True)
+    return metric_of(RULES).combine([score.counts])
 
 
 def named(names: tuple[str, ...]) -> Instances:

@@ -43,7 +43,7 @@ def ap_of(name: str, truth: GroundTruth, prediction: Instances | Partition) -> f
 def test_each_rule_has_its_own_instances(name: str, n_instances: int) -> None:
     rules = load_protocol(name)
     counts = score_scene(rules, scan(), masks(scan(), 1), None).counts
-    assert counts.n_truth.tolist() == [n_instances]  # type: ignore[union-attr]
+    assert counts.n_truth.tolist() == [n_instances]  # type: ignore[attr-defined]
 
 
 def test_no_two_rules_give_the_same_number() -> None:
@@ -108,9 +108,9 @@ def test_both_forms_of_ground_truth_give_maskclustering_the_same_counts(is_own_w
     prediction = masks(truth, 1, 3, 0)
     theirs = per_scene(values, prediction.indptr, prediction.indices, np.full(3, 2), np.ones(3), [2, 3])
     ours = score_scene(load_protocol(NAMES[0]), truth, prediction, None).counts
-    assert theirs.n_truth.tolist()[0] == ours.n_truth.tolist()[0]  # type: ignore[union-attr]
-    assert theirs.n_missed.tolist()[0] == ours.n_missed.tolist()[0]  # type: ignore[union-attr]
-    assert theirs.is_true.tolist() == ours.is_true.tolist()  # type: ignore[union-attr]
+    assert theirs.n_truth.tolist()[0] == ours.n_truth.tolist()[0]  # type: ignore[attr-defined]
+    assert theirs.n_missed.tolist()[0] == ours.n_missed.tolist()[0]  # type: ignore[attr-defined]
+    assert theirs.is_true.tolist() == ours.is_true.tolist()  # type: ignore[attr-defined]
 
 
 def test_results_name_the_one_class_object_and_no_group() -> None:

@@ -225,4 +225,4 @@ def test_a_background_object_with_a_label_counts_only_where_its_class_is_scored(
     assert "wall" not in {name for name, row in without.per_class.items() if row["recall"] > 0}
     only_chair = instances(truth.points, masks[:1], None, features[:1])
     alone = score_scene(load_protocol("replica-conceptgraphs-ex6"), truth, only_chair, encoder)
-    np.testing.assert_array_equal(scored[6].counts.confusion, alone.counts.confusion)  # type: ignore[union-attr]
+    np.testing.assert_array_equal(scored[6].counts.confusion, alone.counts.confusion)  # type: ignore[attr-defined]

@@ -10,15 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from su3d_bench.core.types import Masks
-from su3d_bench.metrics import scoring
+from su3d_bench.metrics import results, scoring
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance import precision_recall
+from su3d_bench.metrics.instance import precision_recall, resampling
 from su3d_bench.metrics.instance import precision_recall as dot_product
 from su3d_bench.metrics.matching import labelling
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import most_similar
 from su3d_bench.metrics.matching.nearest import duplicate_pairs, nearest, reduce_to_voxels, transfer_masks
-from su3d_bench.metrics.results import resampling, results
 from su3d_bench.metrics.semantic import confusion as semantic
 
 

@@ -21,8 +21,7 @@ from su3d_bench.metrics.protocols import load_protocol, protocols_for, read_prot
 from su3d_bench.metrics.questions.score import are_objects_right, is_answer_right
 from su3d_bench.metrics.questions.shares import ShareCounts
 from su3d_bench.metrics.questions.truths import AskedText, GivenAnswer, ReasoningTruth, RetrievalTruth, TrueAnswer
-from su3d_bench.metrics.results.results import metric_values
-from su3d_bench.metrics.scoring import combine, pack_scores, score_scene, unpack_scores
+from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.predictions.mask_arrays import vertex_masks
 from su3d_bench.questions.truths import question_truth
@@ -46,7 +45,7 @@ PERFECT = truth_as_prediction(TRUTH, with_labels=False)
 
 def values(prediction: object, truth: RetrievalTruth = QUESTIONS) -> dict[str, float]:
     score = score_scene(RULES, truth, prediction, ENCODER)  # type: ignore[arg-type]
-    return metric_values(RULES, [score.counts], pooled=True)
+    return metric_of(RULES).combine([score.counts])
 
 
 def test_the_instance_ranked_first_is_right_where_it_stands_for_an_answer() -> None:
@@ -113,7 +112,7 @@ def test_hostile_texts_are_asked_as_they_are(text: str) -> None:
     features = embedded.encode_texts(list(NAMES))
     prediction = replace(PERFECT, features=features)
     score = score_scene(RULES, asked, prediction, embedded)
-    assert metric_values(RULES, [score.counts], pooled=True)["n_instance"] == 1
+    assert metric_of(RULES).combine([score.counts])["n_instance"] == 1
 
 
 def test_a_map_without_features_is_told_why() -> None:
@@ -180,10 +179,10 @@ def test_the_truth_answers_its_own_questions() -> None:
     boxes = np.array([[np.percentile(c, 1, axis=0), np.percentile(c, 99, axis=0)] for c in parts], np.float32)
     oracle = replace(whole, boxes=boxes, centroids=np.array([c.mean(axis=0) for c in parts], np.float32))
     score = score_scene(REASONING, truth, oracle, None)
-    found = metric_values(REASONING, [score.counts], pooled=True)
+    found = metric_of(REASONING).combine([score.counts])
     assert (found["answer"], found["objects"]) == (1.0, 1.0)
     wrong = replace(oracle, labels=tuple(reversed(oracle.labels or ())))
-    assert metric_values(REASONING, [score_scene(REASONING, truth, wrong, None).counts], pooled=True)["answer"] < 1
+    assert metric_of(REASONING).combine([score_scene(REASONING, truth, wrong, None).counts])["answer"] < 1
 
 
 def test_generated_questions_find_their_objects_by_name() -> None:
@@ -195,7 +194,7 @@ def test_generated_questions_find_their_objects_by_name() -> None:
     assert set(NAMES) - {"wall"} <= set(answers)
     encoder = OneHotEncoder()
     score = score_scene(rules, truth, PERFECT, encoder)
-    assert metric_values(rules, [score.counts], pooled=True)["reachable"] == 1.0
+    assert metric_of(rules).combine([score.counts])["reachable"] == 1.0
 
 
 def test_a_run_scores_variants_under_the_protocols_of_questions(

@@ -10,7 +10,7 @@ import pytest
 import su3d_bench.numerics.statistics
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.results import resampling
+from su3d_bench.metrics.instance import resampling
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.numerics.statistics import bootstrap_interval, percentile_interval, resample_weights
 
@@ -76,7 +76,7 @@ def test_resampled_semantic_metrics_equal_those_of_the_scenes_drawn(metric: str)
         truth[: 50 * (scene == 1)] = 4
         counts.append(semantic.per_scene(truth, rng.integers(-1, 6, 200), np.ones(6, bool)))
     weights = resample_weights(4, 30, seed=1)
-    resampled = resampling.resampled_semantic(counts, weights, "scannet" if metric == "scannet" else "conceptgraphs")
+    resampled = semantic.resampled_semantic(counts, weights, "scannet" if metric == "scannet" else "conceptgraphs")
     for row, weight in enumerate(weights):
         whole = semantic.concatenate([counts[s] for s in range(4) for _ in range(weight[s])]).confusion
         if metric == "scannet":

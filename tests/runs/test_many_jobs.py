@@ -15,8 +15,7 @@ from su3d_bench.analysis import page_numbers as page_sources
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance import precision_recall
-from su3d_bench.metrics.results import resampling
+from su3d_bench.metrics.instance import precision_recall, resampling
 from su3d_bench.metrics.scoring import pack_scores, unpack_scores
 from su3d_bench.numerics.statistics import growth_exponent, resample_weights
 from su3d_bench.runs import resume as finished_scenes
@@ -177,7 +176,7 @@ def test_counts_with_a_changed_byte_are_damaged_or_the_same() -> None:
 
 
 def _packed(rng: np.random.Generator) -> bytes:
-    from su3d_bench.metrics.scene_score import SceneScore
+    from su3d_bench.metrics.metric import SceneScore
 
     return pack_scores({"p": SceneScore("p", 1, made_scene(rng, 30, False), 3, 9, np.zeros(3, np.int64), ())})
 

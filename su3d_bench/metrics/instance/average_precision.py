@@ -7,9 +7,9 @@ A scene gives a table of counted predictions, tables of scenes are concatenated,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array
 from su3d_bench.metrics.instance.precision_recall import average_precisions
+from su3d_bench.metrics.metric import Arrays, Counts
 
 # arange(0.5, 0.95, 0.05) excludes its end: nine thresholds up to 0.90, as these doubles; then 0.25
 THRESHOLDS: tuple[float, ...] = (*(float(t) for t in np.arange(0.5, 0.95, 0.05)), 0.25)
@@ -28,7 +29,7 @@ IntArray = NDArray[np.integer[Any]]
 
 
 @dataclass(frozen=True)
-class InstanceCounts:
+class InstanceCounts(Counts):
     """What one scene, or several, adds to AP: one row for each counted prediction, class and threshold.
 
     ``class_index`` (E,) int32 and ``threshold_index`` (E,) int32 say where row e counts, ``score`` (E,) float64 its
@@ -36,6 +37,18 @@ class InstanceCounts:
     instances that nothing matched, ``n_truth`` (C,) those that take part, ``n_small_truth`` (C,) those below the
     minimum size, ``n_predictions`` (C,) the predictions of at least that size, ignored ones included.
     """
+
+    stored_as = "instance"
+    arrays: ClassVar[Arrays] = {
+        "class_index": ("i", ("rows",)),
+        "threshold_index": ("i", ("rows",)),
+        "score": ("f", ("rows",)),
+        "is_true": ("b", ("rows",)),
+        "n_missed": ("i", ("classes", "thresholds")),
+        "n_truth": ("i", ("classes",)),
+        "n_small_truth": ("i", ("classes",)),
+        "n_predictions": ("i", ("classes",)),
+    }
 
     class_index: Int32Array
     threshold_index: Int32Array
@@ -45,6 +58,21 @@ class InstanceCounts:
     n_truth: Int64Array
     n_small_truth: Int64Array
     n_predictions: Int64Array
+
+    @classmethod
+    def checked(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
+        """Those in ``arrays``; rows beyond the classes or thresholds, or without a finite score, are errors too."""
+        counts = super().checked(arrays)
+        for name, axis in (("class_index", "classes"), ("threshold_index", "thresholds")):
+            index, n = arrays[name], counts.sizes[axis]
+            if len(index) and not 0 <= index.min() <= index.max() < n:
+                raise DataError(f"counts: '{name}' counts beyond the {n} {axis}; score the scene again")
+        if not np.isfinite(counts.score).all():
+            raise DataError("counts: 'score' has values that are NaN or infinite; score the scene again")
+        return counts
+
+
+_ROWS = [name for name, (_, axes) in InstanceCounts.arrays.items() if axes == ("rows",)]
 
 
 @dataclass(frozen=True)
@@ -121,7 +149,7 @@ def per_scene(
     ground_truth: IntArray,
     indptr: IntArray,
     indices: IntArray,
-    labels: IntArray,
+    labels: IntArray | None,
     scores: Float64Array,
     class_ids: Sequence[int],
     min_region_size: int = MIN_REGION_SIZE,
@@ -132,6 +160,7 @@ def per_scene(
     ``ground_truth`` (N,) holds label * 1000 + instance a point, 0 where unannotated; prediction k covers the points
     ``indices[indptr[k]:indptr[k + 1]]``, strictly ascending, and has ``labels[k]`` and ``scores[k]``. Their
     order counts for AP25 alone, as in the original under Python 3. Points whose label is not in ``class_ids`` are void.
+    Without ``labels`` every mask is listed once under each class.
 
     >>> truth = np.array([3001] * 200 + [0] * 50)
     >>> counts = per_scene(truth, np.array([0, 150]), np.arange(150), np.array([3]), np.array([0.9]), [3, 4])
@@ -139,23 +168,30 @@ def per_scene(
     [1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0]
     >>> combine([counts]).ap50, counts.n_truth.tolist()
     (1.0, [1, 0])
+    >>> truth = np.repeat([3001, 4001], 200)
+    >>> counts = per_scene(truth, np.array([0, 200, 400]), np.arange(400), None, np.ones(2), [3, 4], 100, (0.5, 0.25))
+    >>> counts.n_predictions.tolist(), counts.is_true.tolist()
+    ([2, 2], [True, False, True, False, True, False, True, False])
     """
-    _check_predictions(ground_truth, indptr, indices, labels, scores)
+    _check_predictions(ground_truth, indptr, indices, len(scores) if labels is None else len(labels), scores)
     class_of = {class_id: index for index, class_id in enumerate(class_ids)}
     if any(class_id < 1 for class_id in class_of):
         raise DataError(f"class ids: {min(class_of)} cannot be scored; class ids start at 1")
     segment_of_point, segment_value, segment_size = _segments(ground_truth)
     segment_class = np.array([class_of.get(int(v) // INSTANCES_PER_CLASS, -1) for v in segment_value], np.int64)
     size = np.diff(indptr)
-    prediction_class = np.array([class_of.get(int(label), -1) for label in labels], np.int64)
-    kept = np.flatnonzero((prediction_class >= 0) & (size >= min_region_size))
+    is_listed = np.ones((len(class_of), len(size)), bool)
+    if labels is not None:
+        prediction_class = np.array([class_of.get(int(label), -1) for label in labels], np.int64)
+        is_listed = prediction_class == np.arange(len(class_of))[:, None]
+    kept = np.flatnonzero(is_listed.any(axis=0) & (size >= min_region_size))
     intersection = intersections(segment_of_point, len(segment_value), indptr, indices, kept)
     n_void = intersection[:, segment_class < 0].sum(axis=1)
 
     parts = []
     for c in range(len(class_of)):
         columns = np.flatnonzero(segment_class == c)  # ascending value, as the original walks them
-        rows = np.flatnonzero(prediction_class[kept] == c)
+        rows = np.flatnonzero(is_listed[c, kept])
         n_points = size[kept[rows]]
         shared = intersection[np.ix_(rows, columns)]
         is_small = segment_size[columns] < min_region_size
@@ -174,16 +210,8 @@ def per_scene(
 
 def stacked(parts: Sequence[InstanceCounts]) -> InstanceCounts:
     """The counts of classes one after another."""
-    return InstanceCounts(
-        class_index=np.concatenate([part.class_index for part in parts]),
-        threshold_index=np.concatenate([part.threshold_index for part in parts]),
-        score=np.concatenate([part.score for part in parts]),
-        is_true=np.concatenate([part.is_true for part in parts]),
-        n_missed=np.concatenate([part.n_missed for part in parts]),
-        n_truth=np.concatenate([part.n_truth for part in parts]),
-        n_small_truth=np.concatenate([part.n_small_truth for part in parts]),
-        n_predictions=np.concatenate([part.n_predictions for part in parts]),
-    )
+    names = InstanceCounts.arrays
+    return InstanceCounts(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
 
 def count_class(
@@ -240,16 +268,17 @@ def _match(over: BoolArray, takes_part: BoolArray, scores: Float64Array) -> tupl
 
 def concatenate(counts: Sequence[InstanceCounts]) -> InstanceCounts:
     """The counts of several scenes as one: rows one after another, numbers summed."""
+    columns = {name: [getattr(of_scene, name) for of_scene in counts] for name in InstanceCounts.arrays}
     return InstanceCounts(
-        class_index=np.concatenate([c.class_index for c in counts]),
-        threshold_index=np.concatenate([c.threshold_index for c in counts]),
-        score=np.concatenate([c.score for c in counts]),
-        is_true=np.concatenate([c.is_true for c in counts]),
-        n_missed=np.sum([c.n_missed for c in counts], axis=0),
-        n_truth=np.sum([c.n_truth for c in counts], axis=0),
-        n_small_truth=np.sum([c.n_small_truth for c in counts], axis=0),
-        n_predictions=np.sum([c.n_predictions for c in counts], axis=0),
+        **{name: np.concatenate(each) if name in _ROWS else np.sum(each, axis=0) for name, each in columns.items()}
     )
+
+
+def only(counts: InstanceCounts, index: int) -> InstanceCounts:
+    """The counts of one class alone."""
+    rows = np.flatnonzero(counts.class_index == index)
+    own = {name: getattr(counts, name)[rows if name in _ROWS else [index]] for name in InstanceCounts.arrays}
+    return InstanceCounts(**own | {"class_index": np.zeros(len(rows), np.int32)})
 
 
 def combine(counts: Sequence[InstanceCounts], thresholds: Sequence[float] = THRESHOLDS) -> InstanceAP:
@@ -297,9 +326,9 @@ def combine_each(counts: Sequence[InstanceCounts], thresholds: Sequence[float] =
 
 
 def _check_predictions(
-    ground_truth: IntArray, indptr: IntArray, indices: IntArray, labels: IntArray, scores: Float64Array
+    ground_truth: IntArray, indptr: IntArray, indices: IntArray, n_predictions: int, scores: Float64Array
 ) -> None:
-    n_predictions, n_points = len(labels), len(ground_truth)
+    n_points = len(ground_truth)
     if len(indptr) != n_predictions + 1 or len(scores) != n_predictions:
         raise PredictionError(
             f"{n_predictions} labels, {len(indptr) - 1} masks, {len(scores)} scores; they must pair up"

@@ -1,8 +1,8 @@
-"""One scene under a protocol of kind ``instance``: masks on the truth's points, and their counts."""
+"""Protocols whose numbers are average precision; those of kind ``instance``, from masks on the truth's points."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -13,13 +13,8 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Instances, Int64Array, Masks, Partition
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance.average_precision import (
-    INSTANCES_PER_CLASS,
-    InstanceCounts,
-    count_class,
-    intersections,
-    stacked,
-)
+from su3d_bench.metrics.instance.average_precision import InstanceAP, InstanceCounts
+from su3d_bench.metrics.instance.resampling import resampled_ap
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import (
     candidate_classes,
@@ -28,45 +23,135 @@ from su3d_bench.metrics.matching.labelling import (
     encoder_warning,
     scored_classes,
 )
-from su3d_bench.metrics.protocols import ProtocolRules, TransferRules
-from su3d_bench.metrics.results.results import Counts
-from su3d_bench.metrics.scene_score import SceneScore, n_predictions, present
+from su3d_bench.metrics.metric import Counts, Metric, Pooled, SceneScore, Values, n_predictions, present
+from su3d_bench.metrics.protocols import AP_NAMES, ProtocolRules, TransferRules
 
 IntArray = NDArray[np.integer[Any]]
 
 DUPLICATE_IOU = 0.9  # pairs above it are the same object twice; duplicates can raise AP under constant confidences
 OBJECT = 1  # the one label that all have where the protocol has no classes
+NO_OBJECT = 0
 
 
-def score_instances(
+class CurveMetric(Metric[InstanceCounts]):
+    """What the kinds share whose counts are rows of precision-recall curves."""
+
+    counts = InstanceCounts
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        return {"classes": len(self.rules.curve_names), "thresholds": len(self.rules.thresholds)}
+
+    def pooled(self, counts: Sequence[InstanceCounts]) -> Pooled:
+        curve = instance_ap.combine(counts, self.rules.thresholds)
+        of_class = {name: _named(curve.of_class(index)) for index, name in enumerate(self.rules.curve_names)}
+        return Pooled(_ap_values(curve), of_class, self._groups(curve), self._warnings(counts))
+
+    def _groups(self, curve: InstanceAP) -> dict[str, Values]:
+        """The mean of each group over those of its classes that have a value."""
+        members: dict[str, list[int]] = {}
+        for index, entry in enumerate(() if self.rules.class_agnostic is not None else self.rules.scored):
+            if entry.group:
+                members.setdefault(entry.group, []).append(index)
+        return {name: _named(curve.of_group(indices)) for name, indices in members.items()}
+
+    def _warnings(self, counts: Sequence[InstanceCounts]) -> tuple[str, ...]:
+        whole = instance_ap.concatenate(counts)
+        small = np.flatnonzero((whole.n_truth == 0) & (whole.n_small_truth > 0))
+        names = ", ".join(f"'{self.rules.curve_names[index]}'" for index in small)
+        size = self.rules.min_region_size
+        return (f"not scored, because no scene has an instance of {size} points: {names}",) if names else ()
+
+    def combine(self, counts: Sequence[InstanceCounts]) -> Values:
+        return _ap_values(instance_ap.combine(counts, self.rules.thresholds))
+
+    def combine_each(self, counts: Sequence[InstanceCounts]) -> list[Values]:
+        return [_ap_values(curve) for curve in instance_ap.combine_each(counts, self.rules.thresholds)]
+
+    def resampled(self, counts: Sequence[InstanceCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
+        return resampled_ap(counts, weights, self.rules.thresholds)
+
+    def resampled_classes(
+        self, counts: Sequence[InstanceCounts], weights: Int64Array
+    ) -> dict[str, dict[str, Float64Array]]:
+        columns = [name for name in AP_NAMES if name in self.rules.headline]
+        answer = {}
+        for index, name in enumerate(self.rules.curve_names):
+            if any(of_scene.n_truth[index] for of_scene in counts):
+                values = self.resampled([instance_ap.only(of_scene, index) for of_scene in counts], weights)
+                answer[name] = {column: values[column] for column in columns}
+        return answer
+
+
+def _named(values: tuple[float, float, float]) -> Values:
+    return dict(zip(AP_NAMES, values, strict=True))
+
+
+def _ap_values(curve: InstanceAP) -> Values:
+    return _named((curve.ap, curve.ap50, curve.ap25))
+
+
+class InstanceMetric(CurveMetric):
+    """Masks on the truth's points, each with a label unless class-agnostic."""
+
+    truth = GroundTruth
+
+    def per_scene(self, truth: GroundTruth, prediction: Instances | Partition, encoder: Encoder | None) -> SceneScore:
+        rules = self.rules
+        assert rules.min_region_size is not None
+        if truth.evaluation_points is not None:
+            raise DataError(f"{rules.name}: the truth '{truth.variant}' has no instances on its evaluation points")
+        scored = masks_on_truth(rules, truth, prediction, encoder)
+        counts = instance_ap.per_scene(
+            scored.values,
+            scored.masks.indptr,
+            scored.masks.indices,
+            scored.labels,
+            scored.scores,
+            scored.class_ids,
+            rules.min_region_size,
+            rules.thresholds,
+        )
+        wanted = np.isin(scored.values // instance_ap.INSTANCES_PER_CLASS, scored.class_ids)
+        of_encoder = None if rules.class_agnostic else encoder_warning(rules, prediction, encoder)
+        warnings = _instance_warnings(rules, truth, scored, of_encoder)
+        return score_of_masks(rules, counts, prediction, truth.points, wanted, warnings)
+
+
+@dataclass(frozen=True)
+class ScoredMasks:
+    """What the evaluator sees: the truth ``values`` (N,) as label * 1000 + instance and the labels that are scored.
+
+    ``masks`` are K masks on the truth's points with ``labels`` (K,) and ``scores`` (K,), the confidences that count.
+    """
+
+    values: Int64Array
+    class_ids: list[int]
+    masks: Masks
+    labels: Int64Array
+    scores: Float64Array
+
+
+def masks_on_truth(
     rules: ProtocolRules, truth: GroundTruth, prediction: Instances | Partition, encoder: Encoder | None
-) -> SceneScore:
-    """The additive counts of one scene: masks on the truth's points, each with a label unless class-agnostic."""
-    assert rules.min_region_size is not None
-    if truth.evaluation_points is not None:
-        raise DataError(f"{rules.name}: the truth '{truth.variant}' has no instances on its evaluation points")
-    values, scored_ids, labels = truth_and_labels(rules, truth, prediction, encoder)
+) -> ScoredMasks:
+    """The masks of a prediction as a protocol of kind ``instance`` scores them."""
+    values, class_ids, labels = _truth_and_labels(rules, truth, prediction, encoder)
     masks, scores = masks_and_scores(prediction)
-    moved = transfer.transfer_masks(
-        prediction.points, masks, truth.points, rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
-    )
-    counts = instance_ap.per_scene(
-        values,
-        moved.indptr,
-        moved.indices,
-        labels,
-        np.ones(len(scores)) if rules.confidence == "ones" else scores,
-        scored_ids,
-        rules.min_region_size,
-        rules.thresholds,
-    )
-    wanted = np.isin(values // instance_ap.INSTANCES_PER_CLASS, scored_ids)
-    told = None if rules.class_agnostic else encoder_warning(rules, prediction, encoder)
-    warnings = _instance_warnings(rules, truth, moved, scores, told)
-    return score_of_masks(rules, counts, prediction, masks, truth.points, wanted, warnings)
+    cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
+    moved = transfer.transfer_masks(prediction.points, masks, truth.points, cap_m, voxel_m)
+    return ScoredMasks(values, class_ids, moved, labels, np.ones(len(masks)) if rules.confidence == "ones" else scores)
 
 
-def truth_and_labels(
+def masks_and_scores(prediction: Instances | Partition) -> tuple[Masks, Float64Array]:
+    """The masks on the prediction's own points and their confidences, 1 for those of a partition."""
+    masks = transfer.masks_of(prediction)
+    if isinstance(prediction, Instances):
+        return masks, np.asarray(prediction.scores, np.float64)
+    return masks, np.ones(len(masks))
+
+
+def _truth_and_labels(
     rules: ProtocolRules, truth: GroundTruth, prediction: Instances | Partition, encoder: Encoder | None
 ) -> tuple[Int64Array, list[int], Int64Array]:
     """The truth as label * 1000 + instance, the labels that are scored, and the label of each prediction."""
@@ -80,14 +165,6 @@ def truth_and_labels(
     ids = np.array([entry.id for entry in rules.classes])
     values = instance_ap.encode_ground_truth(truth.semantic, truth.instance)
     return values, scored_ids, np.where(classes >= 0, ids[classes], 0)
-
-
-def masks_and_scores(prediction: Instances | Partition) -> tuple[Masks, Float64Array]:
-    """The masks on the prediction's own points and their confidences, 1 for those of a partition."""
-    masks = transfer.masks_of(prediction)
-    if isinstance(prediction, Instances):
-        return masks, np.asarray(prediction.scores, np.float64)
-    return masks, np.ones(len(masks))
 
 
 def encode_without_classes(
@@ -118,14 +195,13 @@ def score_of_masks(
     rules: ProtocolRules,
     counts: Counts,
     prediction: Instances | Partition,
-    masks: Masks,
     targets: transfer.Points,
     wanted: BoolArray,
     warnings: Sequence[str],
 ) -> SceneScore:
     """The score, with how far the ``wanted`` (P,) of ``targets`` (P, 3) are from the nearest point of any mask."""
     covered = np.full(len(prediction.points), -1, np.int64)
-    covered[masks.indices] = 0
+    covered[transfer.masks_of(prediction).indices] = 0
     reach = max(transfer.COVERAGE_RADII_M)
     _, distance = transfer.transfer_values(prediction.points, covered, covered, targets, wanted, reach)
     return SceneScore(
@@ -140,14 +216,14 @@ def score_of_masks(
 
 
 def _instance_warnings(
-    rules: ProtocolRules, truth: GroundTruth, moved: Masks, scores: Float64Array, encoder: str | None
+    rules: ProtocolRules, truth: GroundTruth, scored: ScoredMasks, encoder: str | None
 ) -> tuple[str, ...]:
     assert rules.min_region_size is not None
-    warnings = [encoder] if encoder else []
+    warnings, scores = [encoder] if encoder else [], scored.scores
     if rules.confidence == "prediction" and len(scores) > 1 and (scores == scores[0]).all():
         warnings.append(f"every confidence is {scores[0]:g}: AP of a class is then recall (1 + precision) / 2")
-    large = np.flatnonzero(moved.sizes >= rules.min_region_size)
-    pairs = transfer.duplicate_pairs(transfer.select(moved, large), len(truth.points), DUPLICATE_IOU)
+    large = np.flatnonzero(scored.masks.sizes >= rules.min_region_size)
+    pairs = transfer.duplicate_pairs(transfer.select(scored.masks, large), len(truth.points), DUPLICATE_IOU)
     if pairs:
         first, second = large[list(pairs[0])]
         what = "1 pair of predictions overlaps" if len(pairs) == 1 else f"{len(pairs)} pairs of predictions overlap"
@@ -155,9 +231,6 @@ def _instance_warnings(
             f"{what} with IoU above {DUPLICATE_IOU} (first {first} and {second}); duplicates can raise or lower AP"
         )
     return tuple(warnings)
-
-
-NO_OBJECT = 0
 
 
 @dataclass(frozen=True)
@@ -191,50 +264,3 @@ def covered_objects(rules: TransferRules, truth: GroundTruth, prediction: Instan
     shared = instance_ap.intersections(column, len(ids), moved.indptr, moved.indices, np.arange(len(masks)))
     is_object = ids > 0
     return Covered(ids[is_object].astype(np.int64), shared[:, is_object])
-
-
-def every_class_counts(
-    values: Int64Array,
-    masks: Masks,
-    scores: Float64Array,
-    class_ids: Sequence[int],
-    min_region_size: int,
-    thresholds: Sequence[float],
-) -> InstanceCounts:
-    """The counts of one scene when every mask is listed once under each class; each mask is intersected once only.
-
-    ``values`` (N,) are class id * 1000 + instance of each point, as the metric takes them.
-
-    >>> truth = np.repeat([3001, 4001], 200)
-    >>> masks = Masks(np.array([0, 200, 400]), np.arange(400, dtype=np.int32))
-    >>> counts = every_class_counts(truth, masks, np.ones(2), [3, 4], 100, (0.5, 0.25))
-    >>> counts.n_predictions.tolist(), counts.is_true.tolist()
-    ([2, 2], [True, False, True, False, True, False, True, False])
-    """
-    n_of_value = np.bincount(values) if len(values) else np.zeros(0, np.int64)
-    distinct = np.flatnonzero(n_of_value)
-    size_of_segment = n_of_value[distinct]
-    row_of_value = np.zeros(len(n_of_value), np.int64)
-    row_of_value[distinct] = np.arange(len(distinct))
-    size = masks.sizes
-    kept = np.flatnonzero(size >= min_region_size)
-    shared = intersections(row_of_value[values], len(distinct), masks.indptr, masks.indices, kept)
-    label_of_segment = distinct // INSTANCES_PER_CLASS
-    n_void = shared[:, ~np.isin(label_of_segment, class_ids)].sum(axis=1)
-    n_points = size[kept]
-    parts = []
-    for index, class_id in enumerate(class_ids):
-        columns = np.flatnonzero(label_of_segment == class_id)
-        of_class, sizes = shared[:, columns], size_of_segment[columns]
-        is_small = sizes < min_region_size
-        parts.append(
-            count_class(
-                index,
-                iou=of_class / (sizes[None, :] + n_points[:, None] - of_class),
-                takes_part=~is_small,
-                scores=scores[kept],
-                ignored_share=(n_void + of_class[:, is_small].sum(axis=1)) / n_points,
-                thresholds=thresholds,
-            )
-        )
-    return stacked(parts)

@@ -4,18 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from su3d_bench.core.types import Float64Array, Int64Array
+from su3d_bench.metrics.metric import Arrays, Counts
 
 
 @dataclass(frozen=True)
-class ObjectCounts:
+class ObjectCounts(Counts):
     """What one scene, or several, adds: a row for each object that has scored points.
 
     ``n_points`` (O,) int64; ``totals`` (O, V) float64, V values summed over the points, NaN where the object has none.
     """
+
+    stored_as = "objects"
+    arrays: ClassVar[Arrays] = {"n_points": ("i", ("objects",)), "totals": ("f", ("objects", "values"))}
 
     n_points: Int64Array
     totals: Float64Array

@@ -1,8 +1,8 @@
-"""One scene under a protocol of kind ``categories`` or ``queries``: features against texts, without a label set."""
+"""Protocols of kind ``categories`` and ``queries``: features against texts, without a label set."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,15 +20,16 @@ from su3d_bench.core.types import (
     Partition,
     Prediction,
 )
-from su3d_bench.metrics.instance.score import score_of_masks
+from su3d_bench.metrics.instance.score import CurveMetric, score_of_masks
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, has_every_label, text_features
 from su3d_bench.metrics.matching.votes import transfer_each_mask
+from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, n_predictions
 from su3d_bench.metrics.open_vocabulary import object_means, openlex3d, query_ap
+from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
-from su3d_bench.metrics.protocols import ProtocolRules
-from su3d_bench.metrics.scene_score import SceneScore, n_predictions
+from su3d_bench.metrics.protocols import VALUES_OF_METRIC, ProtocolRules
 from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.store.scratch import release_pages
@@ -37,32 +38,49 @@ NEEDS_FEATURES = "needs features to compare with texts, and the prediction has n
 _BLOCK_UNITS = 2048  # 2048 units x 3407 prompts of float64 are 56 MB
 
 
-def score_categories(
-    rules: ProtocolRules, truth: OpenLexTruth, prediction: Prediction, encoder: Encoder | None
-) -> SceneScore:
-    """The additive counts of one scene for OpenLex3D's category frequencies or its ranking of labels."""
-    cloud = _units(prediction, rules.transfer.evaluation_voxel_m)
-    is_ranking = rules.metric == "openlex3d-ranking"
-    ids = sorted(truth.objects) if is_ranking else openlex3d.scored_objects(truth.objects, rules.ignore)
-    object_row = _rows_of(truth.object_of_point, ids)
-    scored = object_row >= 0
-    reach = None if rules.transfer.cap_m is None else max(rules.transfer.cap_m, *transfer.COVERAGE_RADII_M)
-    unit, distance = np.full(len(scored), -1, np.int64), np.full(len(scored), np.inf)
-    distance[scored], found = transfer.nearest(cloud.points, truth.points[scored], np.inf if reach is None else reach)
-    unit[scored] = np.where(found >= 0, cloud.unit[found], -1) if len(cloud.unit) else -1
-    if rules.transfer.cap_m is not None:
-        unit[distance > rules.transfer.cap_m] = -1
-    count = _count_ranks if is_ranking else _count_categories
-    warnings = (encoder_warning(rules, prediction, encoder), _shared_points_warning(prediction))
-    return SceneScore(
-        protocol=rules.name,
-        version=rules.version,
-        counts=count(rules, truth, prediction, encoder, ids, object_row, unit),
-        n_predictions=n_predictions(prediction),
-        n_scored=int(scored.sum()),
-        n_farther=transfer.n_farther(distance[scored]),
-        warnings=tuple(warning for warning in warnings if warning),
-    )
+class CategoriesMetric(Metric[ObjectCounts]):
+    """OpenLex3D's category frequencies or its ranking of labels."""
+
+    truth = OpenLexTruth
+    counts = ObjectCounts
+
+    def per_scene(self, truth: OpenLexTruth, prediction: Prediction, encoder: Encoder | None) -> SceneScore:
+        rules = self.rules
+        cloud = _units(prediction, rules.transfer.evaluation_voxel_m)
+        is_ranking = rules.metric == "openlex3d-ranking"
+        ids = sorted(truth.objects) if is_ranking else openlex3d.scored_objects(truth.objects, rules.ignore)
+        object_row = _rows_of(truth.object_of_point, ids)
+        scored = object_row >= 0
+        cap_m = rules.transfer.cap_m
+        reach_m = np.inf if cap_m is None else max(cap_m, *transfer.COVERAGE_RADII_M)
+        unit, distance = np.full(len(scored), -1, np.int64), np.full(len(scored), np.inf)
+        distance[scored], nearest = transfer.nearest(cloud.points, truth.points[scored], reach_m)
+        unit[scored] = np.where(nearest >= 0, cloud.unit[nearest], -1) if len(cloud.unit) else -1
+        if cap_m is not None:
+            unit[distance > cap_m] = -1
+        count = _count_ranks if is_ranking else _count_categories
+        warnings = (encoder_warning(rules, prediction, encoder), _shared_points_warning(prediction))
+        return SceneScore(
+            protocol=rules.name,
+            version=rules.version,
+            counts=count(rules, truth, prediction, encoder, ids, object_row, unit),
+            n_predictions=n_predictions(prediction),
+            n_scored=int(scored.sum()),
+            n_farther=transfer.n_farther(distance[scored]),
+            warnings=tuple(warning for warning in warnings if warning),
+        )
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        return {"values": len(VALUES_OF_METRIC[self.rules.metric])}
+
+    def pooled(self, counts: Sequence[ObjectCounts]) -> Pooled:
+        means = object_means.combine(counts)
+        return Pooled(dict(zip(VALUES_OF_METRIC[self.rules.metric], means.tolist(), strict=True)))
+
+    def resampled(self, counts: Sequence[ObjectCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
+        values = object_means.resampled(counts, weights)
+        return dict(zip(VALUES_OF_METRIC[self.rules.metric], values.T, strict=True))
 
 
 @dataclass(frozen=True)
@@ -115,7 +133,7 @@ def _count_categories(
     ids: list[int],
     object_row: Int64Array,
     unit: Int64Array,
-) -> object_means.ObjectCounts:
+) -> ObjectCounts:
     assert rules.top_k is not None
     labels = getattr(prediction, "labels", None)
     used, of_point = _used_units(unit)
@@ -144,7 +162,7 @@ def _count_ranks(
     ids: list[int],
     object_row: Int64Array,
     unit: Int64Array,
-) -> object_means.ObjectCounts:
+) -> ObjectCounts:
     used, of_point = _used_units(unit)
     labels = [openlex3d.ranked_labels(truth.objects[one], truth.prompts) for one in ids]
     rows, units, _ = openlex3d.distinct_pairs(object_row, of_point)
@@ -162,11 +180,11 @@ def _count_ranks(
     return openlex3d.count_ranks(object_row, of_point, scores, len(ids))
 
 
-def _nothing_ranked(labels: list[openlex3d.RankedLabels], object_row: Int64Array) -> object_means.ObjectCounts:
+def _nothing_ranked(labels: list[openlex3d.RankedLabels], object_row: Int64Array) -> ObjectCounts:
     n_points = np.bincount(object_row[object_row >= 0], minlength=len(labels))
     has = np.array([(len(one.synonyms) > 0, len(one.secondary) > 0) for one in labels])
     totals = np.where(np.stack([has.any(axis=1), has[:, 0], has[:, 1]], axis=1), 0.0, np.nan)
-    return object_means.ObjectCounts(n_points[n_points > 0].astype(np.int64), totals[n_points > 0])
+    return ObjectCounts(n_points[n_points > 0].astype(np.int64), totals[n_points > 0])
 
 
 def _used_units(unit: Int64Array) -> tuple[Int64Array, Int64Array]:
@@ -204,32 +222,34 @@ def _shared_points_warning(prediction: Prediction) -> str | None:
     return f"points in several instances, counted for the first of them: {n_shared}" if n_shared else None
 
 
-def score_queries(
-    rules: ProtocolRules, truth: QueryTruth, prediction: Instances | Partition, encoder: Encoder | None
-) -> SceneScore:
-    """The additive counts of one scene: its masks ranked by their similarity to each text."""
-    assert rules.min_region_size is not None
-    assert rules.confidence in ("similarity", "similarity-min-max")
-    masks = transfer.masks_of(prediction)
-    similarity = np.zeros((len(masks), len(truth.queries)))
-    if len(masks) and truth.queries:
-        features, known = _features(rules, prediction, encoder)
-        text = text_features(rules, [query.text for query in truth.queries], features, known)
-        similarity = cosines(features, text, device_of(known))
-    moved = _moved(rules, prediction.points, masks, truth.points)
-    counts = query_ap.per_scene(
-        truth.object_of_point,
-        truth.queries,
-        moved,
-        query_ap.confidences(similarity, rules.confidence),
-        top_k=rules.top_k,
-        min_region_size=rules.min_region_size,
-        thresholds=rules.thresholds,
-    )
-    asked_for = np.unique(np.array([one for query in truth.queries for one in query.object_ids], np.int64))
-    wanted = np.isin(truth.object_of_point, asked_for[asked_for >= 0])
-    told = encoder_warning(rules, prediction, encoder)
-    return score_of_masks(rules, counts, prediction, masks, truth.points, wanted, (told,) if told else ())
+class QueryMetric(CurveMetric):
+    """Masks ranked by their similarity to each text."""
+
+    truth = QueryTruth
+
+    def per_scene(self, truth: QueryTruth, prediction: Instances | Partition, encoder: Encoder | None) -> SceneScore:
+        rules = self.rules
+        assert rules.min_region_size is not None
+        assert rules.confidence in ("similarity", "similarity-min-max")
+        masks = transfer.masks_of(prediction)
+        similarity = np.zeros((len(masks), len(truth.queries)))
+        if len(masks) and truth.queries:
+            features, known = _features(rules, prediction, encoder)
+            text = text_features(rules, [query.text for query in truth.queries], features, known)
+            similarity = cosines(features, text, device_of(known))
+        counts = query_ap.per_scene(
+            truth.object_of_point,
+            truth.queries,
+            _moved(rules, prediction.points, masks, truth.points),
+            query_ap.confidences(similarity, rules.confidence),
+            top_k=rules.top_k,
+            min_region_size=rules.min_region_size,
+            thresholds=rules.thresholds,
+        )
+        asked_for = np.unique(np.array([each for query in truth.queries for each in query.object_ids], np.int64))
+        wanted = np.isin(truth.object_of_point, asked_for[asked_for >= 0])
+        warning = encoder_warning(rules, prediction, encoder)
+        return score_of_masks(rules, counts, prediction, truth.points, wanted, (warning,) if warning else ())
 
 
 def _moved(rules: ProtocolRules, points: Float32Array, masks: Masks, targets: Float32Array) -> Masks:

@@ -1,18 +1,19 @@
-"""One scene under a protocol of kind ``retrieval``, ``annotation`` or ``reasoning``: the map, judged by the truth."""
+"""Protocols of kind ``retrieval``, ``annotation`` and ``reasoning``: the map, judged by the truth."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import BoolArray, GroundTruth, Instances, Int64Array, Partition
+from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Instances, Int64Array, Partition
 from su3d_bench.metrics.instance.score import NO_OBJECT, Covered, covered_objects, score_of_masks
-from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, text_features
+from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, n_predictions
 from su3d_bench.metrics.protocols import VALUES_OF_METRIC, AnswerRules, MergeRules, ProtocolRules
+from su3d_bench.metrics.questions import shares
 from su3d_bench.metrics.questions.shares import ShareCounts
 from su3d_bench.metrics.questions.truths import (
     AnnotationTruth,
@@ -22,26 +23,69 @@ from su3d_bench.metrics.questions.truths import (
     RetrievalTruth,
     TrueAnswer,
 )
-from su3d_bench.metrics.scene_score import SceneScore, n_predictions
 
 WELL_MERGED, UNDER_MERGED, OVER_MERGED = "well-merged", "under-merged", "over-merged"
 
 
-def score_retrieval(
-    rules: ProtocolRules, truth: RetrievalTruth, prediction: Instances | Partition, encoder: Encoder | None
-) -> SceneScore:
-    """The additive counts of one scene: is the instance ranked first one that answers?"""
-    covered = covered_objects(rules.transfer, truth.scene, prediction)
-    first = first_instances(rules, [one.text for one in truth.asked], prediction, encoder)
-    is_right = judge_retrieval(covered.main_object, first, truth.asked)
-    found = set(covered.main_object.tolist()) - {NO_OBJECT}
-    kinds = np.array([one.kind for one in truth.asked])
-    rows = {kind: is_right[kinds == kind] for kind in VALUES_OF_METRIC[rules.metric][:4]}
-    rows["all"] = is_right
-    rows["reachable"] = np.array([not found.isdisjoint(one.answers) for one in truth.asked], bool)
-    told = encoder_warning(rules, prediction, encoder)
-    asked_for = [one for asked in truth.asked for one in asked.answers]
-    return _scored(rules, truth.scene, asked_for, prediction, _counts(rules, rows), [told] if told else [])
+class ShareMetric(Metric[ShareCounts]):
+    """What the kinds share whose numbers are shares of what was judged."""
+
+    counts = ShareCounts
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """What the values are called."""
+        return VALUES_OF_METRIC[self.rules.metric]
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        return {"values": len(self.names)}
+
+    def pooled(self, counts: Sequence[ShareCounts]) -> Pooled:
+        """The share of right judgements under each value's name, and how many there were under ``n_<name>``."""
+        whole = shares.combine(counts)
+        n_judged = {f"n_{name}": n for name, n in zip(self.names, whole.n_judged.tolist(), strict=True)}
+        return Pooled(dict(zip(self.names, shares.shares(whole).tolist(), strict=True)) | n_judged)
+
+    def resampled(self, counts: Sequence[ShareCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
+        return dict(zip(self.names, shares.resampled(counts, weights).T, strict=True))
+
+    def _score(
+        self,
+        truth: GroundTruth,
+        object_ids: Sequence[int],
+        prediction: Instances | Partition,
+        rows: Mapping[str, BoolArray],
+        warnings: Sequence[str],
+    ) -> SceneScore:
+        """The score, ``rows`` telling what is right, with the coverage of the objects on which that rests."""
+        judged = [rows[name] for name in self.names]
+        counts = ShareCounts(
+            np.array([len(row) for row in judged], np.int64), np.array([int(row.sum()) for row in judged], np.int64)
+        )
+        wanted = np.isin(truth.instance, np.array([*object_ids], np.int64))
+        return score_of_masks(self.rules, counts, prediction, truth.points, wanted, warnings)
+
+
+class RetrievalMetric(ShareMetric):
+    """Is the instance ranked first one that answers?"""
+
+    truth = RetrievalTruth
+
+    def per_scene(
+        self, truth: RetrievalTruth, prediction: Instances | Partition, encoder: Encoder | None
+    ) -> SceneScore:
+        covered = covered_objects(self.rules.transfer, truth.scene, prediction)
+        first = first_instances(self.rules, [asked.text for asked in truth.asked], prediction, encoder)
+        is_right = judge_retrieval(covered.main_object, first, truth.asked)
+        in_map = set(covered.main_object.tolist()) - {NO_OBJECT}
+        kinds = np.array([asked.kind for asked in truth.asked])
+        rows = {kind: is_right[kinds == kind] for kind in self.names[:4]}
+        rows["all"] = is_right
+        rows["reachable"] = np.array([not in_map.isdisjoint(asked.answers) for asked in truth.asked], bool)
+        warning = encoder_warning(self.rules, prediction, encoder)
+        asked_for = [answer for asked in truth.asked for answer in asked.answers]
+        return self._score(truth.scene, asked_for, prediction, rows, [warning] if warning else [])
 
 
 def first_instances(
@@ -68,26 +112,30 @@ def judge_retrieval(main_object: Int64Array, first: Int64Array, asked: Sequence[
     return np.array([bool(k >= 0 and int(main_object[k]) in one.answers) for k, one in rows], bool)
 
 
-def score_annotation(rules: ProtocolRules, truth: AnnotationTruth, prediction: Instances) -> SceneScore:
-    """The additive counts of one scene: names n and n' of its instances, and how their masks were merged.
+class AnnotationMetric(ShareMetric):
+    """Are the names n and n' of instances right, and how were their masks merged?
 
     Judged are instances whose main object is among ``truth.object_ids``; an empty name is a wrong one.
     """
-    assert rules.merging is not None
-    covered = covered_objects(rules.transfer, truth.scene, prediction)
-    objects = covered.main_object
-    judged = np.flatnonzero(np.isin(objects, truth.object_ids))
-    refined = truth.refined(prediction)
-    merges = np.array(judge_merging(rules.merging, covered))[judged]
-    rows = {
-        "label n": _are_called(truth, labels_n(prediction), objects, judged),
-        "label n'": np.zeros(0, bool) if refined is None else _are_called(truth, refined.names, objects, judged),
-        **{name: merges == name for name in (WELL_MERGED, UNDER_MERGED, OVER_MERGED)},
-    }
-    warnings = ["no label n': the map keeps no names of views" if refined is None else f"n': {refined.source}"]
-    if len(judged) < len(objects):
-        warnings.append("not judged: instances that stand for no object, a small one, or a wall, floor or ceiling")
-    return _scored(rules, truth.scene, truth.object_ids, prediction, _counts(rules, rows), warnings)
+
+    truth = AnnotationTruth
+
+    def per_scene(self, truth: AnnotationTruth, prediction: Instances, encoder: Encoder | None) -> SceneScore:
+        assert self.rules.merging is not None
+        covered = covered_objects(self.rules.transfer, truth.scene, prediction)
+        objects = covered.main_object
+        judged = np.flatnonzero(np.isin(objects, truth.object_ids))
+        refined = truth.refined(prediction)
+        merges = np.array(judge_merging(self.rules.merging, covered))[judged]
+        rows = {
+            "label n": _are_called(truth, labels_n(prediction), objects, judged),
+            "label n'": np.zeros(0, bool) if refined is None else _are_called(truth, refined.names, objects, judged),
+            **{name: merges == name for name in (WELL_MERGED, UNDER_MERGED, OVER_MERGED)},
+        }
+        warnings = ["no label n': the map keeps no names of views" if refined is None else f"n': {refined.source}"]
+        if len(judged) < len(objects):
+            warnings.append("not judged: instances that stand for no object, a small one, or a wall, floor or ceiling")
+        return self._score(truth.scene, truth.object_ids, prediction, rows, warnings)
 
 
 def labels_n(instances: Instances) -> tuple[str, ...]:
@@ -125,22 +173,25 @@ def judge_merging(rules: MergeRules, covered: Covered) -> tuple[str, ...]:
     return tuple(answers)
 
 
-def score_reasoning(
-    rules: ProtocolRules, truth: ReasoningTruth, prediction: Instances, encoder: Encoder | None
-) -> SceneScore:
-    """The additive counts of one scene: is the answer right, and are the objects that it names right?"""
-    assert rules.answers is not None
-    main = covered_objects(rules.transfer, truth.scene, prediction).main_object
-    given = truth.solve(prediction, encoder)
-    pairs = list(zip(truth.asked, given, strict=True))
-    rows = {
-        "answer": np.array([is_answer_right(rules.answers, one, told, main) for one, told in pairs], bool),
-        "objects": np.array([are_objects_right(one, told, main) for one, told in pairs if one.object_ids], bool),
-    }
-    n_open = sum(not told.is_settled for told in given)
-    warnings = ["questions that the solver could not settle count as wrong"] if n_open else []
-    named = [one for asked in truth.asked for one in asked.object_ids]
-    return _scored(rules, truth.scene, named, prediction, _counts(rules, rows), warnings)
+class ReasoningMetric(ShareMetric):
+    """Is the answer right, and are the objects that it names right?"""
+
+    truth = ReasoningTruth
+
+    def per_scene(self, truth: ReasoningTruth, prediction: Instances, encoder: Encoder | None) -> SceneScore:
+        rules = self.rules.answers
+        assert rules is not None
+        main = covered_objects(self.rules.transfer, truth.scene, prediction).main_object
+        answers = truth.solve(prediction, encoder)
+        pairs = list(zip(truth.asked, answers, strict=True))
+        rows = {
+            "answer": np.array([is_answer_right(rules, asked, given, main) for asked, given in pairs], bool),
+            "objects": np.array([are_objects_right(*pair, main) for pair in pairs if pair[0].object_ids], bool),
+        }
+        is_open = any(not given.is_settled for given in answers)
+        warnings = ["questions that the solver could not settle count as wrong"] if is_open else []
+        named = [object_id for asked in truth.asked for object_id in asked.object_ids]
+        return self._score(truth.scene, named, prediction, rows, warnings)
 
 
 def is_answer_right(rules: AnswerRules, true: TrueAnswer, given: GivenAnswer, main_object: Int64Array) -> bool:
@@ -163,24 +214,3 @@ def is_answer_right(rules: AnswerRules, true: TrueAnswer, given: GivenAnswer, ma
 def are_objects_right(true: TrueAnswer, given: GivenAnswer, main_object: Int64Array) -> bool:
     """Whether the instances named stand for exactly the objects that the true answer names."""
     return given.is_settled and {int(main_object[row]) for row in given.rows} == set(true.object_ids)
-
-
-def _counts(rules: ProtocolRules, rows: dict[str, BoolArray]) -> ShareCounts:
-    judged = [rows[name] for name in VALUES_OF_METRIC[rules.metric]]
-    return ShareCounts(
-        np.array([len(one) for one in judged], np.int64), np.array([int(one.sum()) for one in judged], np.int64)
-    )
-
-
-def _scored(
-    rules: ProtocolRules,
-    truth: GroundTruth,
-    object_ids: Sequence[int],
-    prediction: Instances | Partition,
-    counts: ShareCounts,
-    warnings: Sequence[str],
-) -> SceneScore:
-    """The score, with the coverage of the objects ``object_ids``, on which the counts rest."""
-    masks = transfer.masks_of(prediction)
-    wanted = np.isin(truth.instance, np.array([*object_ids], np.int64))
-    return score_of_masks(rules, counts, prediction, masks, truth.points, wanted, warnings)

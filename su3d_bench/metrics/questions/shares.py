@@ -4,15 +4,20 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
 from su3d_bench.core.types import Float64Array, Int64Array
+from su3d_bench.metrics.metric import Arrays, Counts
 
 
 @dataclass(frozen=True)
-class ShareCounts:
+class ShareCounts(Counts):
     """What one scene adds: ``n_judged`` and ``n_right`` (V,) int64 for each of the protocol's V values."""
+
+    stored_as = "shares"
+    arrays: ClassVar[Arrays] = {"n_judged": ("i", ("values",)), "n_right": ("i", ("values",))}
 
     n_judged: Int64Array
     n_right: Int64Array

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
+from su3d_bench.metrics.metric import Arrays, Counts
+from su3d_bench.numerics.statistics import nan_mean, row_means
 
 IntArray = NDArray[np.integer[Any]]
 
@@ -21,8 +23,11 @@ IOU_LEVELS = (0.15, 0.25, 0.50, 0.75)  # conceptgraph/utils/eval.py counts the c
 
 
 @dataclass(frozen=True)
-class SemanticCounts:
+class SemanticCounts(Counts):
     """What one scene, or several, adds: ``confusion`` (C, C + 1) int64 and the classes that the scenes contain (C,)."""
+
+    stored_as = "semantic"
+    arrays: ClassVar[Arrays] = {"confusion": ("i", ("classes", "columns")), "is_present": ("b", ("classes",))}
 
     confusion: Int64Array
     is_present: BoolArray
@@ -205,12 +210,43 @@ def _ratio(numerator: Float64Array, denominator: Float64Array) -> Float64Array:
     return quotient
 
 
-def nan_mean(values: Float64Array) -> float:
-    """Mean of the values that are not NaN; NaN where there is none.
+def resampled_semantic(
+    counts: Sequence[SemanticCounts], weights: Int64Array, metric: str, is_scored: BoolArray | None = None
+) -> dict[str, Float64Array]:
+    """mAcc, mIoU and F-mIoU (R,) of the pooled confusion of the scenes drawn ``weights`` (R, S) times.
 
-    >>> nan_mean(np.array([1.0, np.nan, 0.0]))
-    0.5
+    Classes that are true somewhere in the drawn scenes count; under ``scannet`` those that are only predicted join the
+    mean IoU with 0. Where the confusion matrices hold ignored classes too, ``is_scored`` (C,) marks the others.
+
+    >>> a = SemanticCounts(np.array([[4, 0, 0], [0, 0, 0]]), np.array([True, True]))
+    >>> b = SemanticCounts(np.array([[0, 0, 0], [1, 1, 0]]), np.array([True, True]))
+    >>> resampled_semantic([a, b], np.array([[2, 0], [1, 1], [0, 2]]), "conceptgraphs")["mAcc"].tolist()
+    [1.0, 0.75, 0.5]
     """
-    is_nan = np.isnan(values)
-    n = len(values) - np.count_nonzero(is_nan)
-    return float(np.where(is_nan, 0.0, values).sum() / n) if n else float("nan")  # np.nanmean, which takes its time
+    hit, n_true, n_predicted = resampled_points(counts, weights)
+    if is_scored is not None:
+        hit, n_true, n_predicted = hit[:, is_scored], n_true[:, is_scored], n_predicted[:, is_scored]
+    counted = n_true > 0
+    recall = np.where(counted, hit / np.maximum(n_true, 1), np.nan)
+    union = n_true + n_predicted - hit
+    has_iou = union > 0 if metric == "scannet" else counted
+    iou = np.where(has_iou, hit / np.maximum(union, 1), np.nan)
+    n_points = n_true.sum(axis=1)
+    weighted = (n_true * np.nan_to_num(iou)).sum(axis=1) / np.maximum(n_points, 1)
+    return {
+        "mAcc": row_means(recall),
+        "mIoU": row_means(iou),
+        "F-mIoU": np.where(n_points > 0, weighted, np.nan),
+    }
+
+
+def resampled_points(
+    counts: Sequence[SemanticCounts], weights: Int64Array
+) -> tuple[Float64Array, Float64Array, Float64Array]:
+    """Points (R, C) of each class that are called rightly, are true, are predicted, in the scenes that were drawn."""
+    n_classes = len(counts[0].is_present)
+    drawn = weights.astype(np.float64)
+    hit = drawn @ np.stack([np.diag(c.confusion[:, :n_classes]) for c in counts]).astype(np.float64)
+    n_true = drawn @ np.stack([c.confusion.sum(axis=1) for c in counts]).astype(np.float64)
+    n_predicted = drawn @ np.stack([c.confusion[:, :n_classes].sum(axis=0) for c in counts]).astype(np.float64)
+    return hit, n_true, n_predicted

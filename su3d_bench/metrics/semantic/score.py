@@ -1,6 +1,9 @@
-"""One scene under a protocol of kind ``semantic``: which points count, and what the prediction is called there."""
+"""Protocols of kind ``semantic``: which points count, what the prediction is called there, what that comes to."""
 
 from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,47 +18,226 @@ from su3d_bench.metrics.matching.labelling import (
     encoder_warning,
     scored_classes,
 )
-from su3d_bench.metrics.protocols import ProtocolRules
-from su3d_bench.metrics.scene_score import SceneScore, n_predictions, present
+from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, Values, n_predictions, present
+from su3d_bench.metrics.protocols import ClassEntry, ProtocolRules
 from su3d_bench.metrics.semantic import confusion as semantic
+from su3d_bench.metrics.semantic.confusion import SemanticCounts, SemanticMetrics
+from su3d_bench.numerics.statistics import nan_mean
 from su3d_bench.store.scratch import row_blocks
 
+GROUP_COLUMNS = {"mAcc": "recall", "mIoU": "IoU"}  # what a group of classes is called by, and what it averages
 
-def score_semantic(
+
+class SemanticMetric(Metric[SemanticCounts]):
+    """A class a point, counted in a confusion matrix of the scored points.
+
+    ConceptGraphs' rows differ: the pooled one averages over the classes that have scored points, that of a scene over
+    the classes that its ground truth contains.
+    """
+
+    truth = GroundTruth
+    counts = SemanticCounts
+
+    def per_scene(self, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None) -> SceneScore:
+        rules = self.rules
+        called = call_points(rules, truth, prediction, encoder)
+        warnings = [encoder_warning(rules, prediction, encoder)]
+        has_points = present(called.true_class[called.is_wanted], len(rules.classes))
+        without_points = np.flatnonzero(called.is_present & ~has_points)
+        if len(without_points):
+            names = ", ".join(f"'{rules.classes[index].name}'" for index in without_points)
+            warnings.append(
+                f"the ground truth has {names}, but no scored point does; such a class counts 0 in this scene"
+            )
+        return SceneScore(
+            protocol=rules.name,
+            version=rules.version,
+            counts=semantic.per_scene(called.true_class, called.predicted, called.is_counted),
+            n_predictions=n_predictions(prediction),
+            n_scored=int(called.is_scored.sum()),
+            n_farther=transfer.n_farther(called.distance_m[called.is_scored]),
+            warnings=tuple(warning for warning in warnings if warning),
+        )
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        return {"classes": len(self.rules.classes), "columns": len(self.rules.classes) + 1}
+
+    def pooled(self, counts: Sequence[SemanticCounts]) -> Pooled:
+        metrics = self._metrics(semantic.concatenate(counts), pooled=True)
+        classes = {
+            self._entries[index].name: {
+                "recall": float(metrics.recall[row]),
+                "precision": float(metrics.precision[row]),
+                "IoU": float(metrics.iou[row]),
+                "F1": float(metrics.f1[row]),
+                "F1-conceptgraphs": float(metrics.f1_conceptgraphs[row]),
+            }
+            for row, index in enumerate(metrics.class_index)
+        }
+        return Pooled(self._values(metrics), classes, self._groups(classes))
+
+    def combine_each(self, counts: Sequence[SemanticCounts]) -> list[Values]:
+        return [self._values(self._metrics(semantic.concatenate([of_scene]), pooled=False)) for of_scene in counts]
+
+    def resampled(self, counts: Sequence[SemanticCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
+        is_scored = scored_classes(self.rules) if self.rules.metric == "hovsg" else None
+        return semantic.resampled_semantic(counts, weights, self.rules.metric, is_scored)
+
+    def resampled_classes(
+        self, counts: Sequence[SemanticCounts], weights: Int64Array
+    ) -> dict[str, dict[str, Float64Array]]:
+        hit, n_true, n_predicted = semantic.resampled_points(counts, weights)
+        recall = np.where(n_true > 0, hit / np.maximum(n_true, 1), np.nan)
+        iou = np.where(n_true > 0, hit / np.maximum(n_true + n_predicted - hit, 1), np.nan)
+        return {
+            self.rules.classes[index].name: {"recall": recall[:, index], "IoU": iou[:, index]}
+            for index in np.flatnonzero(scored_classes(self.rules))
+            if any(of_scene.confusion[index].any() for of_scene in counts)
+        }
+
+    @property
+    def _entries(self) -> tuple[ClassEntry, ...]:
+        """The classes that the metrics number."""
+        return self.rules.scored if self.rules.metric == "scannet" else self.rules.classes
+
+    def _values(self, metrics: SemanticMetrics) -> Values:
+        return {
+            "mAcc": metrics.mean_accuracy,
+            "mIoU": metrics.mean_iou,
+            "F-mIoU": metrics.frequency_weighted_iou,
+            **({"pAcc": metrics.point_accuracy} if self.rules.metric == "hovsg" else {}),
+            "mPrecision": metrics.mean_precision,
+            "mF1": metrics.mean_f1,
+            "mF1-conceptgraphs": metrics.mean_f1_conceptgraphs,
+            "n_classes": len(metrics.class_index),
+            **{f"n_IoU>{level:.2f}": n for level, n in zip(semantic.IOU_LEVELS, metrics.n_classes_above, strict=True)},
+        }
+
+    def _groups(self, classes: Mapping[str, Values]) -> dict[str, Values]:
+        """The mean of each group over those of its classes that have a value."""
+        rows: dict[str, list[Values]] = {}
+        for entry in self.rules.scored:
+            if entry.group:
+                rows.setdefault(entry.group, []).append(classes.get(entry.name, {}))
+        return {
+            name: {
+                shown: nan_mean(np.array([row.get(column, np.nan) for row in of_group]))
+                for shown, column in GROUP_COLUMNS.items()
+            }
+            for name, of_group in rows.items()
+        }
+
+    def _metrics(self, whole: SemanticCounts, *, pooled: bool) -> SemanticMetrics:
+        is_scored = scored_classes(self.rules)
+        if self.rules.metric == "hovsg":
+            return semantic.hovsg_metrics(whole.confusion, is_scored)
+        if self.rules.metric == "scannet":
+            scored = np.flatnonzero(is_scored)
+            return semantic.scannet_metrics(_keep_columns(whole.confusion, scored)[scored])
+        has_points = whole.confusion.sum(axis=1) > 0
+        keep = np.flatnonzero(has_points if pooled else whole.is_present)
+        confusion = whole.confusion.copy()
+        if pooled:
+            # Of a class that a ground-truth cloud has and no scored point, the original slices away what was called so
+            confusion[:, np.flatnonzero(whole.is_present & ~has_points)] = 0
+        folded = np.zeros_like(confusion)
+        folded[:, [*keep, -1]] = _keep_columns(confusion, keep)
+        return semantic.conceptgraphs_metrics(folded, keep)
+
+
+def _keep_columns(confusion: Int64Array, keep: Int64Array) -> Int64Array:
+    """The columns ``keep`` and a last one with all others: a point called anything else is called wrongly."""
+    n_elsewhere = confusion.sum(axis=1) - confusion[:, keep].sum(axis=1)
+    return np.concatenate([confusion[:, keep], n_elsewhere[:, None]], axis=1)
+
+
+@dataclass(frozen=True)
+class CalledPoints:
+    """The P points that a protocol of kind ``semantic`` looks at, and what a prediction calls them.
+
+    ``source`` (P,): the truth's point that each one takes its class from. ``true_class`` and ``predicted`` (P,) are -1
+    for none; ``mask`` (P,) is the object, or row of features, that gives the predicted class, None where several
+    neighbours vote; ``distance_m`` (P,) of its point. ``is_wanted`` (P,) points are in the matrix, ``is_scored`` (P,)
+    ones of a scored class. ``is_present`` (C,) scored classes are in the scene, ``is_counted`` (C,) ones in the matrix;
+    ``classes`` are those of the prediction's objects.
+    """
+
+    targets: transfer.Points
+    source: Int64Array
+    true_class: Int64Array
+    is_wanted: BoolArray
+    is_scored: BoolArray
+    is_present: BoolArray
+    is_counted: BoolArray
+    classes: Int64Array
+    predicted: Int64Array
+    mask: Int64Array | None
+    distance_m: Float64Array
+
+
+def call_points(
     rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
-) -> SceneScore:
-    """The additive counts of one scene: a confusion matrix of the scored points."""
+) -> CalledPoints:
+    """What each evaluation point is and is called."""
     class_of_label = class_index_of_ids(rules, truth.semantic)
     is_scored = scored_classes(rules)
     is_present = present(class_of_label, len(rules.classes)) & is_scored
-    targets, true_class = truth.points, class_of_label
+    targets, source = truth.points, np.arange(len(truth.points))
+    true_class = class_of_label
     if truth.evaluation_points is not None:
         targets = truth.evaluation_points
-        _, found = transfer.nearest(truth.points, targets)
-        true_class = np.where(found >= 0, class_of_label[found], -1)
-    counted = counted_classes(rules, is_scored, is_present)
-    wanted = (true_class >= 0) & counted[true_class]
-
+        _, source = transfer.nearest(truth.points, targets)
+        true_class = np.where(source >= 0, class_of_label[source], -1)
+    is_counted = _counted_classes(rules, is_scored, is_present)
+    is_wanted = (true_class >= 0) & is_counted[true_class]
     classes = classes_of_prediction(rules, prediction, encoder, candidate_classes(rules, is_present))
-    predicted, distance = _predicted_classes(rules, prediction, classes, is_scored, targets, wanted)
-    scored = wanted & is_scored[true_class]
-    warnings = [encoder_warning(rules, prediction, encoder)]
-    without_points = np.flatnonzero(is_present & ~present(true_class[wanted], len(rules.classes)))
-    if len(without_points):
-        names = ", ".join(f"'{rules.classes[index].name}'" for index in without_points)
-        warnings.append(f"the ground truth has {names}, but no scored point does; such a class counts 0 in this scene")
-    return SceneScore(
-        protocol=rules.name,
-        version=rules.version,
-        counts=semantic.per_scene(true_class, predicted, counted),
-        n_predictions=n_predictions(prediction),
-        n_scored=int(scored.sum()),
-        n_farther=transfer.n_farther(distance[scored]),
-        warnings=tuple(warning for warning in warnings if warning),
+    if rules.transfer.neighbours > 1:
+        mask = None
+        predicted, distance_m = transfer_votes(rules, prediction, classes, targets, is_wanted)
+    else:
+        owner, rank = _point_owners(prediction, _taking_part(rules, classes, is_scored))
+        mask, distance_m = transfer.transfer_values(prediction.points, owner, rank, targets, is_wanted)
+        if rules.transfer.cap_m is not None:
+            mask = np.where(distance_m <= rules.transfer.cap_m, mask, -1)
+        predicted = np.where(mask >= 0, classes[mask], -1) if len(classes) else mask
+    return CalledPoints(
+        targets=targets,
+        source=source,
+        true_class=true_class,
+        is_wanted=is_wanted,
+        is_scored=is_wanted & is_scored[true_class],
+        is_present=is_present,
+        is_counted=is_counted,
+        classes=classes,
+        predicted=predicted,
+        mask=mask,
+        distance_m=distance_m,
     )
 
 
-def counted_classes(rules: ProtocolRules, is_scored: BoolArray, is_present: BoolArray) -> BoolArray:
+def transfer_votes(
+    rules: ProtocolRules,
+    prediction: Prediction,
+    classes: Int64Array,
+    targets: transfer.Points,
+    wanted: BoolArray,
+    *,
+    of_masks: bool = False,
+) -> tuple[Int64Array, Float64Array]:
+    """The class, or ``of_masks`` the mask, that most neighbours of each wanted target have, and how far the nearest is.
+
+    Objects without a class do not vote.
+    """
+    point, owner = _points_and_owners(prediction)
+    votes = classes[owner] >= 0
+    points, owner = prediction.points[point[votes]], owner[votes]
+    cap_m = np.inf if rules.transfer.cap_m is None else rules.transfer.cap_m
+    values = owner if of_masks else classes[owner]
+    return neighbours.transfer_votes(points, values, targets, wanted, rules.transfer.neighbours, cap_m)
+
+
+def _counted_classes(rules: ProtocolRules, is_scored: BoolArray, is_present: BoolArray) -> BoolArray:
     """The classes whose points enter the confusion matrix.
 
     Those that the scene contains for ConceptGraphs, all scored ones for ScanNet, and for HOV-SG the ignored ones too,
@@ -66,30 +248,7 @@ def counted_classes(rules: ProtocolRules, is_scored: BoolArray, is_present: Bool
     return is_present if rules.metric == "conceptgraphs" else is_scored
 
 
-def _predicted_classes(
-    rules: ProtocolRules,
-    prediction: Prediction,
-    classes: Int64Array,
-    is_scored: BoolArray,
-    targets: transfer.Points,
-    wanted: BoolArray,
-) -> tuple[Int64Array, Float64Array]:
-    """The class of each wanted target, -1 for none, and how far the nearest point that takes part is from it."""
-    if rules.transfer.neighbours > 1:
-        point, owner = points_and_owners(prediction)
-        votes = classes[owner]  # objects without a class do not vote
-        points, votes = prediction.points[point[votes >= 0]], votes[votes >= 0]
-        cap_m = np.inf if rules.transfer.cap_m is None else rules.transfer.cap_m
-        return neighbours.transfer_votes(points, votes, targets, wanted, rules.transfer.neighbours, cap_m)
-    owner, rank = point_owners(prediction, taking_part(rules, classes, is_scored))
-    values = np.where(owner >= 0, classes[owner], -1) if len(classes) else owner
-    predicted, distance = transfer.transfer_values(prediction.points, values, rank, targets, wanted)
-    if rules.transfer.cap_m is not None:
-        predicted = np.where(distance <= rules.transfer.cap_m, predicted, -1)
-    return predicted, distance
-
-
-def points_and_owners(prediction: Prediction) -> tuple[Int64Array, Int64Array]:
+def _points_and_owners(prediction: Prediction) -> tuple[Int64Array, Int64Array]:
     """The points of all objects, one object after another, and the object (or row of features) of each."""
     if isinstance(prediction, DenseFeatures):
         point = np.flatnonzero(has_feature(prediction))
@@ -100,7 +259,7 @@ def points_and_owners(prediction: Prediction) -> tuple[Int64Array, Int64Array]:
     return prediction.indices.astype(np.int64), prediction.owners
 
 
-def taking_part(rules: ProtocolRules, classes: Int64Array, is_scored: BoolArray) -> BoolArray:
+def _taking_part(rules: ProtocolRules, classes: Int64Array, is_scored: BoolArray) -> BoolArray:
     """Which objects take part: what was named as an ignored class is left out, as ConceptGraphs does not load its
     background objects; HOV-SG has all."""
     if rules.metric == "hovsg":
@@ -108,7 +267,7 @@ def taking_part(rules: ProtocolRules, classes: Int64Array, is_scored: BoolArray)
     return (classes < 0) | is_scored[classes]
 
 
-def point_owners(prediction: Prediction, takes_part: BoolArray) -> tuple[Int64Array, Int64Array]:
+def _point_owners(prediction: Prediction, takes_part: BoolArray) -> tuple[Int64Array, Int64Array]:
     """The object (or row of features) of each point of the prediction, and its rank among points at one distance.
 
     Both are -1 where a point takes no part. A point that several instances share belongs to the first.

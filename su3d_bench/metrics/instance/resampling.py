@@ -1,4 +1,4 @@
-"""The metrics of many resamples of the scenes at once, straight from the additive counts of each scene."""
+"""Average precision of many resamples of the scenes at once, straight from the additive counts of each scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 from su3d_bench.metrics.instance.average_precision import THRESHOLDS, InstanceCounts, ap_columns
 from su3d_bench.metrics.instance.precision_recall import MANY_ROWS
-from su3d_bench.metrics.semantic.confusion import SemanticCounts
+from su3d_bench.numerics.statistics import row_means
 
 AT_ONCE = 64  # resamples that go through the rows side by side: their counts stay in the nearest cache
 _MAX_CELLS = 4_000_000  # of a (resamples, rows) block: 32 MB of float64
@@ -42,9 +42,9 @@ def resampled_ap(
     table = resampled_areas(rows, bounds, n_truth, weights).reshape(len(weights), n_classes, n_thresholds)
     table[n_truth == 0] = np.nan
     return {
-        "AP": _row_means(table[:, :, ap_columns(thresholds)].reshape(len(weights), -1)),
-        "AP50": _row_means(table[:, :, tuple(thresholds).index(0.5)]),
-        "AP25": _row_means(table[:, :, tuple(thresholds).index(0.25)]),
+        "AP": row_means(table[:, :, ap_columns(thresholds)].reshape(len(weights), -1)),
+        "AP50": row_means(table[:, :, tuple(thresholds).index(0.5)]),
+        "AP25": row_means(table[:, :, tuple(thresholds).index(0.25)]),
     }
 
 
@@ -115,44 +115,3 @@ def _weighted_areas(
         recall = np.concatenate([np.zeros((len(drawn), 1)), recall], axis=1)
         areas[start : start + step] = (np.diff(recall, axis=1) * (precision[:, 1:] + precision[:, :-1]) / 2).sum(axis=1)
     return areas
-
-
-def resampled_semantic(
-    counts: Sequence[SemanticCounts], weights: Int64Array, metric: str, is_scored: BoolArray | None = None
-) -> dict[str, Float64Array]:
-    """mAcc, mIoU and F-mIoU (R,) of the pooled confusion of the scenes drawn ``weights`` (R, S) times.
-
-    Classes that are true somewhere in the drawn scenes count; under ``scannet`` those that are only predicted join the
-    mean IoU with 0. Where the confusion matrices hold ignored classes too, ``is_scored`` (C,) marks the others.
-
-    >>> a = SemanticCounts(np.array([[4, 0, 0], [0, 0, 0]]), np.array([True, True]))
-    >>> b = SemanticCounts(np.array([[0, 0, 0], [1, 1, 0]]), np.array([True, True]))
-    >>> resampled_semantic([a, b], np.array([[2, 0], [1, 1], [0, 2]]), "conceptgraphs")["mAcc"].tolist()
-    [1.0, 0.75, 0.5]
-    """
-    n_classes = len(counts[0].is_present)
-    drawn = weights.astype(np.float64)
-    hit = drawn @ np.stack([np.diag(c.confusion[:, :n_classes]) for c in counts]).astype(np.float64)
-    n_true = drawn @ np.stack([c.confusion.sum(axis=1) for c in counts]).astype(np.float64)
-    n_predicted = drawn @ np.stack([c.confusion[:, :n_classes].sum(axis=0) for c in counts]).astype(np.float64)
-    if is_scored is not None:
-        hit, n_true, n_predicted = hit[:, is_scored], n_true[:, is_scored], n_predicted[:, is_scored]
-    counted = n_true > 0
-    recall = np.where(counted, hit / np.maximum(n_true, 1), np.nan)
-    union = n_true + n_predicted - hit
-    has_iou = union > 0 if metric == "scannet" else counted
-    iou = np.where(has_iou, hit / np.maximum(union, 1), np.nan)
-    n_points = n_true.sum(axis=1)
-    weighted = (n_true * np.nan_to_num(iou)).sum(axis=1) / np.maximum(n_points, 1)
-    return {
-        "mAcc": _row_means(recall),
-        "mIoU": _row_means(iou),
-        "F-mIoU": np.where(n_points > 0, weighted, np.nan),
-    }
-
-
-def _row_means(values: Float64Array) -> Float64Array:
-    """Mean of each row without its NaN; NaN for a row without any number."""
-    is_number = ~np.isnan(values)
-    n = is_number.sum(axis=1)
-    return np.where(n > 0, np.where(is_number, values, 0.0).sum(axis=1) / np.maximum(n, 1), np.nan)

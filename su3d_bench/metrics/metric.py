@@ -1,0 +1,175 @@
+"""What every kind of metric is: the additive counts of a scene, and the numbers that counts of scenes come to."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, ClassVar, Generic, Self, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.types import BoolArray, Float64Array, Instances, Int64Array, Prediction
+from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.numerics.statistics import nan_mean
+
+Values = dict[str, float]
+Arrays = Mapping[str, tuple[str, tuple[str, ...]]]
+C = TypeVar("C", bound="Counts")
+
+
+@dataclass(frozen=True)
+class Counts:
+    """What scenes add to a protocol's numbers, as arrays.
+
+    ``stored_as`` names the kind in files; ``arrays``: of each array the kind of its numbers and its axes, of which
+    those of one name are equally long.
+    """
+
+    stored_as: ClassVar[str]
+    arrays: ClassVar[Arrays]
+
+    @classmethod
+    def checked(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
+        """The counts in ``arrays``; a ``DataError`` names one that is of another kind or shape than it must be."""
+        sizes: dict[str, int] = {}
+        for name, (number_kind, axes) in cls.arrays.items():
+            array = arrays[name]
+            fits = array.dtype.kind == number_kind and array.ndim == len(axes)
+            if not fits or any(sizes.setdefault(axis, n) != n for axis, n in zip(axes, array.shape, strict=True)):
+                raise DataError(f"counts: '{name}' is {array.dtype.name} {array.shape}; score the scene again")
+        return cls(**{name: arrays[name] for name in cls.arrays})
+
+    @property
+    def sizes(self) -> dict[str, int]:
+        """How long each axis is."""
+        return {
+            axis: n
+            for name, (_, axes) in self.arrays.items()
+            for axis, n in zip(axes, getattr(self, name).shape, strict=True)
+        }
+
+
+@dataclass(frozen=True)
+class SceneScore:
+    """What one scene adds to a protocol's numbers, with what a reader must know about it.
+
+    ``n_scored`` points of the truth count; ``n_farther`` (3,) of them have no predicted point within 2.5, 5 and 10 cm.
+    """
+
+    protocol: str
+    version: int
+    counts: Counts
+    n_predictions: int
+    n_scored: int
+    n_farther: Int64Array
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class Pooled:
+    """The metrics of all scenes together, of each class and of each group of classes, and what a reader must know."""
+
+    values: Values
+    classes: dict[str, Values] = field(default_factory=dict)
+    groups: dict[str, Values] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+
+class Metric(ABC, Generic[C]):
+    """One kind of protocol under its rules: what a scene counts, and the ratios that counts of scenes come to.
+
+    ``truth``: what ``per_scene`` takes; ``counts``: what it gives. Ratios are formed in ``pooled``, ``combine_each``
+    and ``resampled`` alone.
+    """
+
+    truth: ClassVar[type]
+    counts: ClassVar[type[Counts]]
+
+    def __init__(self, rules: ProtocolRules) -> None:
+        self.rules = rules
+
+    @abstractmethod
+    def per_scene(self, truth: Any, prediction: Any, encoder: Encoder | None) -> SceneScore:
+        """The additive counts of one scene; ``encoder`` names features of predictions that bring no labels."""
+
+    @property
+    @abstractmethod
+    def sizes(self) -> dict[str, int]:
+        """How long the axes of the counts are that the rules fix."""
+
+    @abstractmethod
+    def pooled(self, counts: Sequence[C]) -> Pooled:
+        """The numbers of the scenes together."""
+
+    @abstractmethod
+    def resampled(self, counts: Sequence[C], weights: Int64Array) -> Mapping[str, Float64Array]:
+        """The metrics (R,) of the scenes drawn ``weights`` (R, S) times, pooled."""
+
+    def resampled_classes(self, counts: Sequence[C], weights: Int64Array) -> dict[str, dict[str, Float64Array]]:
+        """Class -> column -> value (R,) of the scenes drawn ``weights`` (R, S) times; NaN where it has no truth there.
+
+        With weights of ones this is the value over all scenes, with a single one that of a scene alone.
+        """
+        return {}
+
+    def combine(self, counts: Sequence[C]) -> Values:
+        """The metrics of the scenes together."""
+        return self.pooled(counts).values
+
+    def combine_each(self, counts: Sequence[C]) -> list[Values]:
+        """The metrics of each scene alone."""
+        return [self.combine([of_scene]) for of_scene in counts]
+
+    def reported(self, counts: Sequence[C]) -> Values:
+        """The metrics that the protocol reports: pooled, or the mean over scenes."""
+        return self.combine(counts) if self.rules.aggregate == "pooled" else scene_mean(self.combine_each(counts))
+
+    def resampled_headline(
+        self, counts: Sequence[C], rows: Sequence[Mapping[str, float]], weights: Int64Array
+    ) -> dict[str, Float64Array]:
+        """Each headline metric (R,) of the scenes drawn ``weights`` (R, S) times, pooled or as the mean over scenes.
+
+        ``rows`` hold the metrics of each scene alone, from which the mean over scenes is formed. With weights of ones
+        this is the value over all scenes, with a single one that of a scene alone.
+        """
+        names = self.rules.headline
+        if self.rules.aggregate == "scene-mean":
+            return {name: _weighted_mean(np.array([row[name] for row in rows]), weights) for name in names}
+        values = self.resampled(counts, weights)
+        return {name: values[name] for name in names}
+
+    def check(self, scene: str, counts: Counts) -> None:
+        """A ``DataError`` where counts have other classes, thresholds or values than the rules."""
+        has = counts.sizes
+        for axis, n in self.sizes.items():
+            if has.get(axis, 0) != n:
+                raise DataError(
+                    f"{scene}: was scored with {has.get(axis, 0)} {axis}, {self.rules.name} has {n} here; "
+                    "score it again"
+                )
+
+
+def scene_mean(rows: Collection[Mapping[str, float]]) -> Values:
+    """The mean of each metric over scenes, without those where it is NaN."""
+    return {name: nan_mean(np.array([row[name] for row in rows])) for name in next(iter(rows))}
+
+
+def _weighted_mean(values: Float64Array, weights: Int64Array) -> Float64Array:
+    is_number = ~np.isnan(values)
+    drawn = weights[:, is_number].astype(np.float64)
+    n = drawn.sum(axis=1)
+    return np.where(n > 0, (drawn * values[is_number]).sum(axis=1) / np.maximum(n, 1), np.nan)
+
+
+def present(class_index: Int64Array, n_classes: int) -> BoolArray:
+    """Which classes have points (C,); negative indices are none."""
+    return np.bincount(class_index[class_index >= 0], minlength=n_classes) > 0
+
+
+def n_predictions(prediction: Prediction) -> int:
+    """How many instances, or rows of features, a prediction has."""
+    return len(prediction) if isinstance(prediction, Instances) else len(prediction.features)
