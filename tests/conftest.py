@@ -1,4 +1,4 @@
-"""Where the tests keep their files, what they share within a session, and what belongs to which round."""
+"""Where the tests keep their files, and what they share."""
 
 from __future__ import annotations
 
@@ -7,14 +7,26 @@ import shutil
 import sys
 from pathlib import Path
 
-TESTS = Path(__file__).resolve().parent
-sys.path += sorted(
-    {str(file.parent) for file in TESTS.rglob("*.py")} - {*sys.path}
-)  # readers' samples are their tests'
+import pytest
 
+TESTS = Path(__file__).resolve().parent
 MEMORY = Path("/dev/shm")
 MOST_KEPT_BYTES = 4 << 30
+
+# The table of readers to damage takes its samples from the tests of those readers.
+sys.path += sorted({str(file.parent) for file in TESTS.rglob("*.py")} - {*sys.path})
 
 # Every file of a run is brought to the disk before it counts; thousands of small runs would wait for nothing else.
 if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > MOST_KEPT_BYTES:
     os.environ.setdefault("PYTEST_DEBUG_TEMPROOT", str(MEMORY))
+
+# Hundreds of processes start, each of which would compile the package again.
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+sys.dont_write_bytecode = False
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_cmdline_main(config: pytest.Config) -> None:
+    """Where several processes share the work, each takes whole files: what the tests of a file share is made once."""
+    if getattr(config.option, "numprocesses", None) and config.option.dist == "no":
+        config.option.dist = "loadfile"

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import os
 import sys
-import time
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import psutil
 import pytest
 from made_programs import MASKS, fed, refused
 from pydantic import ValidationError
+from waiting import wait_until
 
 from su3d_bench.baselines.command.method import Command, CommandConfig
 from su3d_bench.baselines.command.process import ContainerWatch, run_program
@@ -23,10 +23,7 @@ def test_a_timeout_ends_children_too_even_those_that_left_the_group(tmp_path: Pa
     refused(fed(Command(CommandConfig(command=line, shell=True, timeout_s=2.0))))
     pids = [int(line) for line in (tmp_path / "pids").read_text().split()]
     assert len(pids) == 2
-    deadline = time.monotonic() + 10
-    while any(_runs(pid) for pid in pids) and time.monotonic() < deadline:
-        time.sleep(0.05)
-    assert not any(_runs(pid) for pid in pids)
+    wait_until(lambda: not any(_runs(pid) for pid in pids), "a child runs on")
 
 
 def _runs(pid: int) -> bool:

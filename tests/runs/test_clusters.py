@@ -6,7 +6,6 @@ import signal
 import socket
 import subprocess
 import sys
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -15,6 +14,7 @@ import psutil
 import pytest
 from painted import colour_perception
 from places import SCENES
+from waiting import wait_until
 
 from su3d_bench.cli.main import main
 from su3d_bench.runs import scene as scene_run
@@ -79,13 +79,11 @@ def assert_equal_runs(one: Path | str, other: Path | str) -> None:
 def workers_of(node: Any) -> list[psutil.Process]:
     """Processes of ``node`` that carry out a job, as soon as there are some."""
     raylet = psutil.Process(node.all_processes["raylet"][0].process.pid)
-    end = time.monotonic() + WHILE_LOADED_S
-    while time.monotonic() < end:
-        found = [child for child in raylet.children(recursive=True) if "ray::_on_node" in " ".join(child.cmdline())]
-        if found:
-            return found
-        time.sleep(0.02)
-    raise AssertionError("no job came to the machine")
+    return wait_until(
+        lambda: [child for child in raylet.children(recursive=True) if "ray::_on_node" in " ".join(child.cmdline())],
+        "no job came to the machine",
+        WHILE_LOADED_S,
+    )
 
 
 def test_a_machine_that_dies_in_mid_run_costs_no_scene_and_no_byte(cluster: Any) -> None:

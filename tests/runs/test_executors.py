@@ -3,6 +3,7 @@ from __future__ import annotations
 import os
 import signal
 import sys
+import threading
 import time
 
 import pytest
@@ -22,8 +23,8 @@ def work(unit: str, report: Report) -> str:
         raise StoreError("cannot write x: the disk is full")
     if unit == "bug":
         raise KeyError("a mistake")
-    if unit == "sleep":
-        time.sleep(60)
+    if unit == "wait":
+        threading.Event().wait(60)
     if unit == "threads":
         return " ".join(os.environ[name] for name in sorted(ONE_THREAD))
     if unit == "pid":
@@ -64,7 +65,7 @@ def test_a_unit_that_takes_its_process_down_fails_alone(unit: str, reason: str) 
 def test_an_error_of_the_user_stops_all_at_once() -> None:
     start = time.monotonic()
     with pytest.raises(StoreError, match="the disk is full"):
-        in_processes(["disk", "sleep"])
+        in_processes(["disk", "wait"])
     assert time.monotonic() - start < 30
 
 

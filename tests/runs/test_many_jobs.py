@@ -30,12 +30,17 @@ PROTOCOLS = ["--protocols", "rooms-semantic", "rooms-instance", "--no-pictures",
 
 
 @pytest.fixture
-def finished(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """A run that is done, in the folder ``out`` below the current one."""
+def scenes() -> str:
+    return "*"
+
+
+@pytest.fixture
+def finished(monkeypatch: pytest.MonkeyPatch, tmp_path: Path, scenes: str) -> Path:
+    """A run of ``scenes`` that is done, in the folder ``out`` below the current one."""
     monkeypatch.setattr(scene_run, "build_perception", colour_perception)
     monkeypatch.setattr(finished_scenes, "build_perception", colour_perception)
     monkeypatch.chdir(tmp_path)
-    assert main([*WORDS, *PROTOCOLS, "--jobs", "1"]) == 0
+    assert main([*WORDS, *PROTOCOLS, "--scenes", f"{SCENES}/painted.py:Painted/{scenes}", "--jobs", "1"]) == 0
     return tmp_path / "out"
 
 
@@ -74,10 +79,13 @@ def test_a_scene_with_a_damaged_file_is_no_finished_one(
     assert asked == ["painted/a"]
 
 
+@pytest.mark.parametrize("scenes", ["a"])
 def test_pictures_that_were_not_asked_for_before_are_drawn(finished: Path) -> None:
     assert not list(finished.glob("scenes/*/*/pictures/*"))
-    assert main([*WORDS, *(word for word in PROTOCOLS if word != "--no-pictures"), "--jobs", "1"]) == 0
+    words = [word for word in PROTOCOLS if word != "--no-pictures"]
+    assert main([*WORDS, *words, "--scenes", f"{SCENES}/painted.py:Painted/a", "--jobs", "1"]) == 0
     n_jobs = len(list(finished.glob("scenes/*/*/done.json")))
+    assert n_jobs == 2
     assert len({path.parent for path in finished.glob("scenes/*/*/pictures/*.png")}) == n_jobs
 
 

@@ -1,11 +1,11 @@
 from __future__ import annotations
 
 import threading
-import time
 from collections.abc import Callable, Sequence
 
 import numpy as np
 import pytest
+from waiting import wait_until
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Frame
@@ -35,16 +35,20 @@ def threads() -> int:
     return sum(one.name.startswith("read-ahead") for one in threading.enumerate())
 
 
-def wait_until(is_so: Callable[[], bool]) -> None:
-    until = time.monotonic() + 10
-    while not is_so():
-        assert time.monotonic() < until, "it never became so"
-        time.sleep(0.002)
+def settle(ahead: ReadAhead[Frame]) -> None:
+    """Wait until all reads that were ordered, and would be done by a free thread, have begun."""
+    ahead._threads.submit(int).result(10)
 
 
 def test_frames_come_in_their_order_however_long_each_takes() -> None:
-    delays = np.random.default_rng(0).uniform(0, 0.004, N_FRAMES)
-    with ReadAhead(Watched(lambda i: time.sleep(delays[i])), N_FRAMES, n_threads=4, n_ahead=8) as ahead:
+    is_read = [threading.Event() for _ in range(N_FRAMES)]
+
+    def read(position: int) -> None:
+        if position % 2 and position + 1 < N_FRAMES:
+            assert is_read[position + 1].wait(10)
+        is_read[position].set()
+
+    with ReadAhead(Watched(read), N_FRAMES, n_threads=4, n_ahead=8) as ahead:
         assert [ahead.next_frame().index for _ in range(N_FRAMES)] == list(range(N_FRAMES))
 
 
@@ -54,7 +58,7 @@ def test_no_more_frames_are_read_than_may_wait() -> None:
         for n_taken in range(1, 10):
             ahead.next_frame()
             wait_until(lambda n=n_taken: len(frames.begun) == n + 3)  # type: ignore[misc]
-            time.sleep(0.002)
+            settle(ahead)
             assert len(frames.begun) == n_taken + 3
 
 
@@ -62,7 +66,7 @@ def test_without_any_ahead_each_frame_is_read_when_it_is_asked_for() -> None:
     frames = Watched()
     with ReadAhead(frames, N_FRAMES, n_ahead=0) as ahead:
         for n_taken in range(3):
-            time.sleep(0.002)
+            settle(ahead)
             assert len(frames.begun) == n_taken
             assert ahead.next_frame().index == n_taken
 
@@ -71,7 +75,7 @@ def test_the_first_frame_is_read_before_any_other_begins() -> None:
     frames, is_over = Watched(lambda _: is_over.wait(10) and None), threading.Event()
     with ReadAhead(frames, N_FRAMES) as ahead:
         wait_until(lambda: frames.begun == [0])
-        time.sleep(0.02)
+        settle(ahead)
         assert frames.begun == [0]
         is_over.set()
         ahead.next_frame()
@@ -105,7 +109,6 @@ def test_leaving_early_ends_the_threads_and_reads_nothing_more(n_taken: int) -> 
     assert threads() == 0
     n_begun = len(frames.begun)
     assert n_begun <= min(n_taken + 2, N_FRAMES)
-    time.sleep(0.01)
     assert len(frames.begun) == n_begun
 
 

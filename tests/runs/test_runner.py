@@ -10,7 +10,7 @@ import subprocess
 import sys
 import time
 import tomllib
-from collections.abc import Iterator
+from contextlib import suppress
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 from painted import ColourPerception, colour_perception
 from places import SCENES
+from waiting import wait_until
 
 from su3d_bench.cli.main import main
 from su3d_bench.runs import feeding as scene_feeding
@@ -326,8 +327,7 @@ def test_an_interrupt_ends_cleanly_and_the_run_resumes() -> None:
     # a shell ignores interrupts for what it runs in the background, and children inherit that
     heard = partial(signal.signal, signal.SIGINT, signal.SIG_DFL)
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, start_new_session=True, preexec_fn=heard)
-    for _ in wait_for(job("a")):
-        pass
+    wait_until(job("a").exists)
     os.killpg(process.pid, signal.SIGINT)
     _, error = process.communicate(timeout=20)
     assert process.returncode == 130
@@ -345,7 +345,8 @@ def test_killed_at_any_moment_and_taken_up_again_it_gives_the_same_bytes() -> No
     for k in range(10):
         command = in_process(*slow, "--jobs", "2" if k % 3 == 0 else "1")
         process = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        time.sleep(moments.uniform(0.1, 0.9) * whole_s)
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(moments.uniform(0.1, 0.9) * whole_s)
         process.kill()
         process.wait()
         if moments.random() < 0.5:
@@ -359,15 +360,6 @@ def finish(command: list[str]) -> None:
     """Run ``command`` to its end, which must be a good one."""
     done = subprocess.run(command, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-
-
-def wait_for(path: Path, timeout_s: float = 20.0) -> Iterator[None]:
-    """Yields until ``path`` exists."""
-    end = time.monotonic() + timeout_s
-    while not path.exists():
-        assert time.monotonic() < end, f"{path} did not come in {timeout_s} s"
-        time.sleep(0.02)
-        yield
 
 
 def test_progress_shows_scenes_and_frames_on_a_terminal_only() -> None:
@@ -396,8 +388,7 @@ def read_some(descriptor: int) -> bytes:
 
 def test_the_second_of_two_runs_on_one_folder_is_refused() -> None:
     process = subprocess.Popen(in_process("--set", "painted.frame_ms=200"), stdout=subprocess.DEVNULL)
-    for _ in wait_for(Path("out/run.json")):
-        pass
+    wait_until(Path("out/run.json").exists)
     assert run("--set", "painted.frame_ms=200") == 2
     process.kill()
     process.wait()

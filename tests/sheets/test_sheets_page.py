@@ -3,13 +3,13 @@ from __future__ import annotations
 import csv
 import json
 import re
-import time
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from chromium import Chromium, find_chromium
 from made_sheets import HOSTILE, made
+from waiting import wait_until
 
 from su3d_bench.reports.sheet.page import json_in_html
 from su3d_bench.sheets.items import ANSWER_COLUMNS, SheetKind
@@ -41,10 +41,7 @@ def answers(browser: Chromium, folder: Path) -> list[dict[str, str]]:
     folder.mkdir(exist_ok=True)
     browser.downloads_to(folder)
     browser.run("document.getElementById('export').click()")
-    end = time.monotonic() + 60
-    while not (found := list(folder.glob("*.csv"))):
-        assert time.monotonic() < end, "nothing was exported"
-        time.sleep(0.05)
+    found = wait_until(lambda: list(folder.glob("*.csv")), "nothing was exported")
     return list(csv.DictReader(found[0].open(newline="")))
 
 

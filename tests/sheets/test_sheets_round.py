@@ -6,7 +6,6 @@ import csv
 import io
 import json
 import random
-import time
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +14,7 @@ import numpy as np
 import openpyxl
 import pytest
 from chromium import Chromium, find_chromium
+from waiting import wait_until
 
 from su3d_bench.cli.main import main
 from su3d_bench.sheets.drafts import Draft
@@ -136,10 +136,7 @@ def test_a_page_answered_by_keyboard_over_a_reload_is_scored(
         browser.press(*keys[7:])
         browser.downloads_to(down)
         browser.run("document.getElementById('export').click()")
-        end = time.monotonic() + 60
-        while not (files := list(down.glob("*.csv"))) and time.monotonic() < end:
-            time.sleep(0.05)
-        assert files, "nothing was exported"
+        files = wait_until(lambda: list(down.glob("*.csv")), "nothing was exported")
         assert browser.faults() == []
     assert main(["sheets", "score", str(files[0]), "--key", str(tmp_path / "sheets-key"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)

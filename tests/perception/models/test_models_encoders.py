@@ -18,9 +18,10 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.models.config import ModelsConfig
+from su3d_bench.perception.models.encoders import towers_transformers
 from su3d_bench.perception.models.encoders.encoder import EncoderSpec, FoundationEncoder, unit_rows
 from su3d_bench.perception.models.encoders.image_transform import ImageTransform
-from su3d_bench.perception.models.files import read_weights
+from su3d_bench.perception.models.files import ModelFiles, read_weights
 from su3d_bench.perception.models.loading import load_encoder
 
 TEXTS = ("chair", "a red cup on the table", "chair", "zebra")
@@ -92,7 +93,19 @@ def test_half_precision_on_the_cpu_only_where_it_is_asked_for(folder: Path) -> N
 
 
 @needs_models
-def test_the_older_form_of_weights_gives_the_same_features(folder: Path, tmp_path: Path) -> None:
+def test_the_older_form_of_weights_gives_the_same_features(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A product of matrices rounds by where its factors lie in memory, and one of the two forms is mapped from its file.
+    load_model = towers_transformers.load_model
+
+    def aligned(files: ModelFiles) -> Any:
+        model = load_model(files)
+        for weights in model.parameters():
+            weights.data = weights.data.clone()
+        return model
+
+    monkeypatch.setattr(towers_transformers, "load_model", aligned)
     write_tiny_clip(tmp_path / "clip-vit-h-14", weights="pytorch_model.bin")
     older, newer = load_encoder(config(tmp_path)), load_encoder(config(folder))
     assert np.array_equal(older.encode_images(noise_images(2)), newer.encode_images(noise_images(2)))

@@ -13,6 +13,8 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any
 
+from waiting import wait_until
+
 NAMES = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome")
 FLAGS: tuple[str, ...] = (
     "--headless", "--no-sandbox", "--disable-gpu", "--no-first-run", "--disable-background-networking",
@@ -113,10 +115,7 @@ class Chromium:
 
     def until(self, script: str) -> None:
         """Wait until an expression is true."""
-        end = time.monotonic() + WAIT_S
-        while not self.run(script):
-            assert time.monotonic() < end, f"it never came true: {script}"
-            time.sleep(0.02)
+        wait_until(lambda: self.run(script), f"it never came true: {script}", WAIT_S)
 
     def press(self, *keys: str) -> None:
         """Press keys one after another: ``1``, ``u``, ``ArrowLeft``."""
