@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing, Su3dError, printable
-from su3d_bench.core.interfaces import Dataset
+from su3d_bench.core.interfaces import Dataset, HasProblems
 from su3d_bench.core.types import Float32Array, Frame, InstanceMesh
 from su3d_bench.datasets.checks_of_frames import (
     Finding,
@@ -254,7 +254,7 @@ def _read_frames(
 
 def _ask_for_problems(dataset: Dataset, scene: str, found: _Findings) -> int:
     """Take over what the dataset itself names, and count it."""
-    if not hasattr(dataset, "problems"):
+    if not isinstance(dataset, HasProblems):
         return 0
     try:
         for line in dataset.problems(scene):

@@ -1,8 +1,12 @@
-"""What a dataset, a method and perception offer to the runner, and what it hands a method besides frames."""
+"""What a dataset, a method and perception offer to the runner, and what it hands a method besides frames.
+
+``Dataset`` and ``Method`` are what each must have. An ability that it may have is a protocol of its own, listed in
+``ABILITIES``; ``registry.load`` refuses a class with a misspelt one.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -59,12 +63,6 @@ class Dataset(Protocol):
     The class also has ``Options``, a strict model of its settings, ``label_space``, whose class ids its truth uses, and
     ``variants``, the forms of ground truth it can give, the fullest first; it is made as ``Cls(data_root, options)``.
     Frames are read from several threads at once.
-
-    It may have: ``places()``, the folders that it searches; ``status(scene)``, a word on a scene from a quick look;
-    ``groups()``, names for sets of scenes such as ``val``; ``problems(scene)``, every fault of its files, a line each;
-    ``surface(scene)``, the scan's mesh without labels; ``queries(scene)``, texts with ``kind`` and ``answers``, the
-    ids of all objects that answer them; ``renders_frames = True``, where frames are computed and not read: they are
-    not made ahead then, since the pipeline's timed stages would wait for the interpreter.
     """
 
     name: str
@@ -96,6 +94,58 @@ class Dataset(Protocol):
         ...
 
 
+@runtime_checkable
+class HasPlaces(Protocol):
+    """The folders that a dataset searches."""
+
+    def places(self) -> Sequence[Path]: ...
+
+
+@runtime_checkable
+class HasStatus(Protocol):
+    """A word on a scene, from a quick look."""
+
+    def status(self, scene: str) -> str: ...
+
+
+@runtime_checkable
+class HasGroups(Protocol):
+    """Names for sets of scenes, such as official splits."""
+
+    def groups(self) -> Mapping[str, Sequence[str]]: ...
+
+
+@runtime_checkable
+class HasProblems(Protocol):
+    """Every fault of a scene's files, a line each."""
+
+    def problems(self, scene: str) -> Sequence[str]: ...
+
+
+@runtime_checkable
+class HasSurface(Protocol):
+    """The scan's mesh without labels."""
+
+    def surface(self, scene: str) -> Surface: ...
+
+
+@runtime_checkable
+class HasQueries(Protocol):
+    """Texts with ``kind`` and ``answers``, the ids of all objects that answer them."""
+
+    def queries(self, scene: str) -> Sequence[Any]: ...
+
+
+@runtime_checkable
+class RendersFrames(Protocol):
+    """True where frames are computed and not read.
+
+    They are not made ahead then, since the pipeline's timed stages would wait for the interpreter.
+    """
+
+    renders_frames: bool
+
+
 class StageTimer(Protocol):
     def stage(self, name: str) -> Any:
         """A context manager that adds the time inside it to stage ``name`` of the current update."""
@@ -105,12 +155,7 @@ class StageTimer(Protocol):
 class Method(Protocol):
     """A system under test: fed frame by frame, asked for a map at the end or midway.
 
-    It may have ``receive_tools(tools: SceneTools)``, called before ``start``; ``receive_device(device: str)``, called
-    before that with ``cpu`` or ``cuda:0``, where it may compute with torch; ``n_points`` and ``n_instances``, the size
-    of its map after an update; ``close()``, called when the prediction is written; ``caveat``, what must be said
-    beside its numbers; ``about``, a ``MethodAbout``; ``inputs``, digests of files outside the configuration that move
-    its numbers, by name; ``finish_costs``, numbers on the last ``finish`` that stand beside its time;
-    ``has_own_perception``, so that the caveat of the run's perception is not its.
+    The class also has ``Config``, a strict model of its settings; it is made as ``Cls(config)``.
     """
 
     name: str
@@ -140,6 +185,130 @@ class MethodAbout:
     licence: str
     needs: tuple[str, ...]
     status: str
+
+
+@runtime_checkable
+class HasAbout(Protocol):
+    about: MethodAbout
+
+
+@runtime_checkable
+class HasPresets(Protocol):
+    """Settings under a name: ``METHOD@PRESET`` is a method of its own."""
+
+    presets: Mapping[str, Mapping[str, Any]]
+
+
+@runtime_checkable
+class HasShortNames(Protocol):
+    """Other names of settings for sweeps: the setting, and what a value written there comes to."""
+
+    short_names: Mapping[str, tuple[str, Callable[[Any], Any]]]
+
+
+@runtime_checkable
+class TakesDevice(Protocol):
+    """May compute with torch; called before all else with ``cpu`` or a device of torch such as ``cuda:0``."""
+
+    def receive_device(self, device: str) -> None: ...
+
+
+@runtime_checkable
+class TakesTools(Protocol):
+    """Works on the whole scene; called before ``start``."""
+
+    def receive_tools(self, tools: SceneTools) -> None: ...
+
+
+@runtime_checkable
+class TakesTruth(Method, Protocol):
+    """Is told the ground truth, and is a ceiling."""
+
+    def receive_truth(self, truth: GroundTruth) -> None: ...
+
+
+@runtime_checkable
+class CountsPoints(Protocol):
+    """The points of its map after an update."""
+
+    @property
+    def n_points(self) -> int: ...
+
+
+@runtime_checkable
+class CountsInstances(Protocol):
+    """The instances of its map after an update."""
+
+    @property
+    def n_instances(self) -> int: ...
+
+
+@runtime_checkable
+class CountsBytes(Protocol):
+    """The memory of its map after an update."""
+
+    @property
+    def map_bytes(self) -> int: ...
+
+
+@runtime_checkable
+class HasFinishCosts(Protocol):
+    """Numbers on the last ``finish`` that stand beside its time."""
+
+    @property
+    def finish_costs(self) -> Mapping[str, float | int]: ...
+
+
+@runtime_checkable
+class HasInputs(Protocol):
+    """Digests, by name, of files outside the configuration that move its numbers."""
+
+    @property
+    def inputs(self) -> Mapping[str, str]: ...
+
+
+@runtime_checkable
+class HasCaveat(Protocol):
+    """What must be said beside its numbers."""
+
+    @property
+    def caveat(self) -> str | None: ...
+
+
+@runtime_checkable
+class HasOwnPerception(Protocol):
+    """True where it finds masks itself, so that the caveat of the run's perception is not its."""
+
+    has_own_perception: bool
+
+
+@runtime_checkable
+class Closes(Protocol):
+    """Gives back what it holds, called when the prediction is written."""
+
+    def close(self) -> None: ...
+
+
+INTERFACES = {"dataset": Dataset, "method": Method}
+ABILITIES = {
+    "dataset": (HasPlaces, HasStatus, HasGroups, HasProblems, HasSurface, HasQueries, RendersFrames),
+    "method": (
+        HasAbout,
+        HasPresets,
+        HasShortNames,
+        TakesDevice,
+        TakesTools,
+        TakesTruth,
+        CountsPoints,
+        CountsInstances,
+        CountsBytes,
+        HasFinishCosts,
+        HasInputs,
+        HasCaveat,
+        HasOwnPerception,
+        Closes,
+    ),
+}
 
 
 @runtime_checkable

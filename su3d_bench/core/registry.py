@@ -1,12 +1,15 @@
 """Names to classes: the built-in table first, then entry points, then ``file.py:Class``.
 
-A plug-in may not take a built-in's name.
+A plug-in may not take a built-in's name. A class is checked when it is loaded: it has what it must have, and no name
+that is almost one of what it may have.
 """
 
 from __future__ import annotations
 
+import difflib
 import importlib
 import importlib.util
+from functools import cache
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any
@@ -34,6 +37,8 @@ METHODS = {
 }
 GROUPS = {"dataset": "su3d_bench.datasets", "method": "su3d_bench.methods"}
 BUILT_IN = {"dataset": DATASETS, "method": METHODS}
+OF_THE_CLASS = {"dataset": ("name", "Options", "label_space", "variants"), "method": ("name", "Config")}
+LEAST_LIKENESS = 0.84  # of a name to the one that was meant: a letter missing, added, changed or in the wrong place
 
 
 def names(kind: str) -> list[str]:
@@ -48,6 +53,10 @@ def names(kind: str) -> list[str]:
 
 def load(kind: str, name: str) -> Any:
     """The class behind ``name``; ``name`` may be a built-in, an entry point or ``path/to/file.py:Class``."""
+    return checked(kind, name, _found(kind, name))
+
+
+def _found(kind: str, name: str) -> Any:
     if name in BUILT_IN[kind]:
         return _from_module(BUILT_IN[kind][name])
     for entry in entry_points(group=GROUPS[kind]):
@@ -75,3 +84,28 @@ def _from_file(kind: str, target: str) -> Any:
     if not hasattr(module, attribute):
         raise ConfigError(f"{kind} '{target}': {path} defines no '{attribute}'")
     return getattr(module, attribute)
+
+
+@cache
+def checked(kind: str, target: str, plug_in: Any) -> Any:
+    """``plug_in``; ``ConfigError`` where it is a class that lacks what ``kind`` must have or misspells an ability."""
+    from su3d_bench.core.interfaces import ABILITIES, INTERFACES  # with numpy: not for a line of help
+
+    if not isinstance(plug_in, type):
+        return plug_in
+    interface = INTERFACES[kind]
+    own = {name for base in plug_in.__mro__[:-1] for name in (*vars(base), *vars(base).get("__annotations__", ()))}
+    required = {*OF_THE_CLASS[kind], *(name for name in _members(interface) if callable(vars(interface).get(name)))}
+    absent = required.union(*map(_members, (interface, *ABILITIES[kind]))) - own
+    for name in sorted(name for name in own if not name.startswith("_")):
+        meant = difflib.get_close_matches(name, absent, 1, LEAST_LIKENESS)
+        # ``points`` is a name of its own beside ``n_points``
+        if meant and meant[0].count("_") == name.count("_"):
+            raise ConfigError(f"{kind} '{target}': a {kind} has no '{name}'; did you mean '{meant[0]}'?")
+    if missing := sorted(required - own):
+        raise ConfigError(f"{kind} '{target}': lacks '{missing[0]}'; a {kind} has {', '.join(sorted(required))}")
+    return plug_in
+
+
+def _members(protocol: type) -> list[str]:
+    return [name for name in (*vars(protocol), *protocol.__annotations__) if not name.startswith("_")]

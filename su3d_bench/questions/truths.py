@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder, HasQueries
 from su3d_bench.core.types import GroundTruth, Instances
 from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.metrics.questions.truths import (
@@ -34,7 +34,7 @@ MOST_NAMES = 5  # the paper's m: n' comes from the names of so many best views
 
 def has_own_queries(dataset: Any) -> bool:
     """Whether a dataset (class or object) knows questions and answers itself."""
-    return hasattr(dataset, "queries")
+    return isinstance(dataset, HasQueries)
 
 
 def own_questions(dataset: Any, scene: str) -> tuple[Question, ...]:

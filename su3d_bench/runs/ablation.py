@@ -15,6 +15,7 @@ from pydantic import BaseModel, ValidationError
 from su3d_bench.core import registry
 from su3d_bench.core.config import parse_value, toml_value
 from su3d_bench.core.errors import ConfigError, StoreError, suggest
+from su3d_bench.core.interfaces import HasShortNames
 from su3d_bench.store.atomic import read_json, write_json
 
 FILE = "ablation.json"
@@ -69,7 +70,7 @@ def _choices(method: str, method_class: Any, text: str) -> list[_Choice]:
     parameter = parameter.strip()
     if not equals or not values.strip():
         raise ConfigError(f"--vary {text}: expected KEY=VALUE,VALUE such as top_m=1,5,10")
-    shorts: Mapping[str, Short] = getattr(method_class, "short_names", {})
+    shorts: Mapping[str, Short] = method_class.short_names if isinstance(method_class, HasShortNames) else {}
     known = [*shorts, *method_class.Config.model_fields]
     if parameter not in known:
         raise ConfigError(f"--vary {text}: {method} has no setting '{parameter}'{suggest(parameter, known)}")

@@ -17,7 +17,7 @@ from typing import Any, Generic, Self, TypeVar, overload
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.interfaces import Method
+from su3d_bench.core.interfaces import Dataset, HasFinishCosts, HasSurface, Method
 from su3d_bench.core.timing import Timer, calibration_ms, memory_bytes
 from su3d_bench.core.types import Detections, Frame, GroundTruth, PerceptionNeeds, Proposals, Surface, starts_of
 from su3d_bench.perception.profiles import Perception
@@ -62,12 +62,11 @@ def no_detections(frame: Frame, needs: PerceptionNeeds) -> Detections:
     )
 
 
-def surface_of(dataset: Any, scene: str) -> Surface:
+def surface_of(dataset: Dataset, scene: str) -> Surface:
     """The mesh of a scene without labels; ``DataError`` where its dataset has none."""
-    if not hasattr(dataset, "surface"):
+    if not isinstance(dataset, HasSurface):
         raise DataError(f"{dataset.name}/{scene}: the dataset has no mesh; this method works on one")
-    surface: Surface = dataset.surface(scene)
-    return surface
+    return dataset.surface(scene)
 
 
 def true_proposals(truth: GroundTruth) -> Proposals:
@@ -191,7 +190,7 @@ class Feeding:
         prediction = self._method.finish()
         elapsed_ms = (time.perf_counter() - start) * 1e3
         write_prediction(path, prediction)
-        costs: dict[str, float | int] = dict(getattr(self._method, "finish_costs", {}))
+        costs = dict(self._method.finish_costs) if isinstance(self._method, HasFinishCosts) else {}
         self.maps.append({"n_updates": len(self._rows), "finish_ms": round(elapsed_ms, 3)} | costs)
 
     def csv_text(self) -> str:

@@ -12,7 +12,7 @@ from su3d_bench.core import registry
 from su3d_bench.core.config import flatten
 from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_json, package_versions
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.interfaces import Method
+from su3d_bench.core.interfaces import HasCaveat, HasInputs, HasOwnPerception, Method
 from su3d_bench.core.types import SceneInfo
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.perception.profiles import Perception
@@ -100,7 +100,7 @@ def config_key(job: SceneJob, part: Part, method: Method) -> dict[str, str]:
         for path, value in flatten(json.loads(options)):
             key[".".join((prefix, *path))] = json.dumps(value, ensure_ascii=False)
     key = {name: text for name, text in key.items() if not name.startswith(NOT_IN_KEY)}
-    if hasattr(method, "inputs"):
+    if isinstance(method, HasInputs):
         key |= {f"input.{name}": digest for name, digest in method.inputs.items()}
     return (
         key
@@ -183,8 +183,11 @@ class JobInputs:
 
 def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str | None:
     """What must be said beside every number: where the scenes, the masks, or the method's own proposals come from."""
-    own = TRUE_PROPOSALS_CAVEAT if method.needs.true_proposals else getattr(method, "caveat", None)
-    is_seen_by_profile = method.needs.frames and not getattr(method, "has_own_perception", False)
+    own = method.caveat if isinstance(method, HasCaveat) else None
+    if method.needs.true_proposals:
+        own = TRUE_PROPOSALS_CAVEAT
+    has_own_perception = isinstance(method, HasOwnPerception) and method.has_own_perception
+    is_seen_by_profile = method.needs.frames and not has_own_perception
     is_made = scene.image_domain == "rendered-rooms" and scene.dataset in LAYOUTS_OF_ROOMS
     made = f"made rooms in the layout of {scene.dataset}, not its scenes" if is_made else None
     parts = [made, perception.caveat if is_seen_by_profile else None, own]

@@ -28,7 +28,7 @@ from su3d_bench.core.config import (
 from su3d_bench.core.devices import device_for
 from su3d_bench.core.digests import code_digest, digest_json
 from su3d_bench.core.errors import ConfigError, DataError, StoreError, suggest
-from su3d_bench.core.interfaces import Dataset
+from su3d_bench.core.interfaces import Dataset, HasGroups, HasPresets
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.protocols import load_protocol, protocols_for
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
@@ -84,7 +84,7 @@ def named_method(text: str) -> NamedMethod:
 
 
 def _preset(text: str, base: str, method: Any, variant: str) -> Mapping[str, Any]:
-    presets: Mapping[str, Mapping[str, Any]] = getattr(method, "presets", {})
+    presets = method.presets if isinstance(method, HasPresets) else {}
     if variant not in presets:
         hint = suggest(variant, presets) or (f"; it has {', '.join(presets)}" if presets else "; it has none")
         raise ConfigError(f"--methods {text}: {base} has no preset '{variant}'{hint}; or write {base}@KEY=VALUE")
@@ -321,7 +321,7 @@ def _matching_scenes(dataset: Dataset, pattern: str) -> list[str]:
 
 def _groups(dataset: Any) -> Mapping[str, Sequence[str]]:
     """Names that stand for several scenes, such as official splits; a dataset that has some has ``groups``."""
-    return dataset.groups() if hasattr(dataset, "groups") else {}
+    return dataset.groups() if isinstance(dataset, HasGroups) else {}
 
 
 def _whole_group(dataset: Dataset, name: str, here: set[str]) -> list[str]:

@@ -16,7 +16,7 @@ from typing import Any
 
 from su3d_bench.core.devices import device_for
 from su3d_bench.core.errors import GroundTruthMissing, StoreError, Su3dError
-from su3d_bench.core.interfaces import Method, SceneTools
+from su3d_bench.core.interfaces import Closes, Method, RendersFrames, SceneTools, TakesDevice, TakesTools, TakesTruth
 from su3d_bench.core.timing import device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Prediction, Proposals, SceneInfo
 from su3d_bench.metrics.fitness import why_not_scorable
@@ -176,25 +176,25 @@ class _Scene:
         if method.needs.frames:
             frames = self.dataset.frames(self.job.scene_name, info.stride)
             n = min(len(frames), self.job.limit or len(frames))
-        if hasattr(method, "receive_device"):
+        if isinstance(method, TakesDevice):
             method.receive_device(device_for(self.perception_config.models.device, self.job.index))
-        if hasattr(method, "receive_tools"):
+        if isinstance(method, TakesTools):
             method.receive_tools(self._tools(method, perception, frames, n))
-        if hasattr(method, "receive_truth"):
+        if isinstance(method, TakesTruth):
             if not self.dataset.variants:
                 raise GroundTruthMissing(f"{self.job.scene}: {method.name} needs ground truth, the dataset has none")
             method.receive_truth(self.truth(self.dataset.variants[0]))
         start_memory_watch()
         feeding = Feeding(self.job.scene, method, perception, self.report)
         shares = self.job.anytime if method.needs.frames else ()
-        with ReadAhead(frames, n, n_ahead=0 if getattr(self.dataset, "renders_frames", False) else N_AHEAD) as ahead:
+        with ReadAhead(frames, n, n_ahead=0 if self._renders_frames else N_AHEAD) as ahead:
             method.start(info)
             for share in shares:
                 feeding.up_to(math.ceil(share * n), ahead, n)
                 feeding.write_map(folder.anytime(share))
             feeding.up_to(n, ahead, n)
         feeding.write_map(folder.prediction)
-        if hasattr(method, "close"):
+        if isinstance(method, Closes):
             method.close()
         write_text(folder.updates, feeding.csv_text())
         files = [folder.prediction, folder.updates, *map(folder.anytime, shares)]
@@ -205,6 +205,10 @@ class _Scene:
             "device_bytes": device_memory_bytes(),
         }
         folder.seal("predict", key, files, {"costs": costs} | log.remarks())
+
+    @property
+    def _renders_frames(self) -> bool:
+        return isinstance(self.dataset, RendersFrames) and self.dataset.renders_frames
 
     def _tools(self, method: Method, perception: Perception, frames: Sequence[Frame], n: int) -> SceneTools:
         return SceneTools(
@@ -268,7 +272,7 @@ class _Scene:
         """``prediction``; that of a method that was told the truth is told anew where ``truth`` names its classes
         otherwise than the truth that it was told: ScanNet has two sets of labels."""
         method = build_method(part)
-        if not hasattr(method, "receive_truth") or truth.labels == self.truth(self.dataset.variants[0]).labels:
+        if not isinstance(method, TakesTruth) or truth.labels == self.truth(self.dataset.variants[0]).labels:
             return prediction
         method.receive_truth(truth)
         told: Prediction = method.finish()

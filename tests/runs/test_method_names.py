@@ -37,7 +37,9 @@ def test_values_are_toml_and_lists_may_hold_commas() -> None:
 def test_a_file_may_have_an_at_sign_before_its_class(tmp_path: Path) -> None:
     folder = tmp_path / "me@home"
     folder.mkdir()
-    (folder / "mine.py").write_text("class Mine:\n    name = 'mine'\n")
+    (folder / "mine.py").write_text(
+        "from su3d_bench.baselines.oracle import Oracle\nclass Mine(Oracle):\n    name = 'mine'\n"
+    )
     assert named_method(f"{folder}/mine.py:Mine").name == "mine"
     assert named_method(f"{folder}/mine.py:Mine@x=1").name == "mine@x=1"
 

@@ -9,6 +9,7 @@ from typing import Any
 
 from su3d_bench.cli.common import add_group, add_settings, add_verb, answer, answer_json
 from su3d_bench.core.errors import EXIT_DONE, DataError, Su3dError
+from su3d_bench.core.interfaces import HasPlaces, HasStatus
 
 LAYOUTS = ("native", "replica", "scannet", "scannet-python", "scannet-cpp", "tum")
 MAX_LISTED = 40
@@ -130,7 +131,7 @@ def _row(name: str, dataset_class: Any, root: Path) -> dict[str, Any]:
     row: dict[str, Any] = {
         "name": name,
         "summary": (dataset_class.__doc__ or "").strip().partition("\n")[0].replace("`", ""),
-        "places": [str(place) for place in (dataset.places() if hasattr(dataset, "places") else ())],
+        "places": [str(place) for place in (dataset.places() if isinstance(dataset, HasPlaces) else ())],
         "ground_truth": list(dataset_class.variants),
         "scenes": [],
         "error": None,
@@ -144,7 +145,7 @@ def _row(name: str, dataset_class: Any, root: Path) -> dict[str, Any]:
 
 def _status(dataset: Any, scene: str) -> str:
     try:
-        if hasattr(dataset, "status"):
+        if isinstance(dataset, HasStatus):
             return str(dataset.status(scene))
         return f"{dataset.info(scene, 1).n_frames} frames"
     except Su3dError as error:

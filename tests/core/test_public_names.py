@@ -1,0 +1,60 @@
+"""What the package itself offers, and the Python examples of the documentation, which use nothing else."""
+
+from __future__ import annotations
+
+import ast
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from places import ROOT
+
+import su3d_bench
+
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+EXAMPLES = [
+    pytest.param(block, id=f"{page.name}-{number}")
+    for page in PAGES
+    for number, block in enumerate(re.findall(r"^```python\n(.*?)^```$", page.read_text(), re.DOTALL | re.MULTILINE))
+]
+
+
+def test_importing_the_package_imports_nothing_heavy() -> None:
+    code = "import sys, su3d_bench; print(*sorted(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = done.stdout.split()
+    assert "numpy" not in loaded
+    assert [name for name in loaded if name.startswith("su3d_bench.")] == []
+
+
+@pytest.mark.parametrize("name", su3d_bench.__all__)
+def test_each_name_is_found_and_listed(name: str) -> None:
+    assert getattr(su3d_bench, name).__name__ == name
+    assert name in dir(su3d_bench)
+
+
+def test_type_checkers_see_the_same_names() -> None:
+    tree = ast.parse(Path(su3d_bench.__file__).read_text())
+    checked = next(node for node in tree.body if isinstance(node, ast.If))
+    named = [each.name for line in checked.body if isinstance(line, ast.ImportFrom) for each in line.names]
+    assert sorted(named) == sorted(su3d_bench.__all__)
+
+
+def test_another_name_is_an_attribute_error() -> None:
+    with pytest.raises(AttributeError, match="module 'su3d_bench' has no attribute 'Instance'"):
+        _ = su3d_bench.Instance
+
+
+def test_there_are_examples() -> None:
+    assert len(EXAMPLES) >= 2
+
+
+@pytest.mark.parametrize("block", EXAMPLES)
+def test_an_example_runs_and_uses_names_of_the_package_alone(block: str) -> None:
+    for node in ast.walk(ast.parse(block)):
+        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("su3d_bench"):
+            assert node.module == "su3d_bench"
+            assert {each.name for each in node.names} <= set(su3d_bench.__all__)
+    subprocess.run([sys.executable, "-c", block], check=True)
