@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cache
 from typing import Annotated, Literal
 
 import numpy as np
@@ -65,6 +64,7 @@ class ConceptFusion:
     """Pixel features from masks of named objects, fused into one feature a point; it has no instances."""
 
     name = "conceptfusion"
+    warms_up = True
     Config: type[ConceptFusionConfig] = ConceptFusionConfig
     about = MethodAbout(
         paper=PAPER,
@@ -106,7 +106,6 @@ class ConceptFusion:
     def start(self, scene: SceneInfo) -> None:
         """Forgets the scene before; of the new one nothing needs to be known."""
         self._clear()
-        _warm_up()
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
         """Fuses one image into the map; the association goes over the whole map, the rest over the image."""
@@ -169,17 +168,6 @@ class ConceptFusion:
         """Give the features' disk space back; the map cannot be updated after that."""
         if self._features is not None:
             self._features.close()
-
-
-@cache
-def _warm_up() -> None:
-    """Fuses a made-up image twice, so that no timed step waits for a compiler."""
-    intrinsics = np.array([[2.0, 0, 0.5], [0, 2.0, 0.5], [0, 0, 1]])
-    frame = Frame(0, 0.0, np.zeros((2, 2, 3), np.uint8), np.ones((2, 2), np.float32), np.eye(4), intrinsics)
-    scratch = PointFusion(0.05, 20.0)
-    for _ in range(2):
-        view = view_of(frame, picked(2, 2), picked(2, 2), 0.6)
-        scratch.insert(view, scratch.associate(view))
 
 
 class ConceptFusionSamConfig(ConceptFusionConfig):

@@ -8,7 +8,6 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 
 import numpy as np
 
@@ -26,7 +25,6 @@ from su3d_bench.baselines.conceptgraphs.objects import (
 from su3d_bench.baselines.conceptgraphs.regions import LiftedRegion, kept_regions, lift, subtract_contained
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import StageTimer
-from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Detections, Float32Array, Frame, Instances
 from su3d_bench.predictions.clouds import instances_of
 
@@ -175,27 +173,3 @@ def _score(one: MapObject, rule: InstanceScore) -> float:
     if rule == "ones":
         return 1.0
     return float(one.n_detections if rule == "num-detections" else max(seen.score for seen in one.sightings))
-
-
-@cache
-def warm_up(config: MappingConfig) -> None:
-    """Maps a made-up image twice, so that no timed step waits for a compiler or an import."""
-    size = 32
-    depth_m = 1 + np.linspace(0, 0.5, size * size, dtype=np.float32).reshape(size, size) ** 2
-    intrinsics = np.array([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1]])
-    frame = Frame(0, 0.0, np.zeros((size, size, 3), np.uint8), depth_m, np.eye(4), intrinsics)
-    detections = Detections(
-        frame_index=0,
-        masks=np.ones((1, size, size), np.bool_),
-        boxes=np.zeros((1, 4), np.float32),
-        scores=np.ones(1, np.float32),
-        names=("",),
-        captions=("",),
-        crop_ratios=(1.0,),
-        crop_features=np.ones((1, 1, 1), np.float32),
-        global_feature=np.ones(1, np.float32),
-    )
-    scratch = ObjectMap(config.model_copy(update={"obj_min_detections": 0}), seed=0)
-    for _ in range(2):
-        scratch.update(frame, detections, np.ones((1, 1), np.float32), Timer())
-    scratch.finish()

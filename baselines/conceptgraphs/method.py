@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated
 
 import numpy as np
 from pydantic import Field
 
 from su3d_bench.baselines.conceptgraphs.config import Cosine, Fraction, Interval, MappingConfig
-from su3d_bench.baselines.conceptgraphs.map import ObjectMap, warm_up
+from su3d_bench.baselines.conceptgraphs.map import ObjectMap
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.types import Detections, Frame, Instances, PerceptionNeeds, SceneInfo
 
@@ -23,7 +24,8 @@ class ConceptGraphs:
     """
 
     name = "conceptgraphs"
-    Config = MappingConfig
+    warms_up = True
+    Config: type[MappingConfig] = MappingConfig
     about = MethodAbout(
         paper="Gu, Kuwajerwala, Morin et al.: ConceptGraphs: Open-Vocabulary 3D Scene Graphs for Perception and "
         "Planning, ICRA 2024",
@@ -35,8 +37,11 @@ class ConceptGraphs:
     )
 
     def __init__(self, config: MappingConfig | None = None) -> None:
-        self.config = config or MappingConfig()
-        self._map = ObjectMap(self.config, seed=0)
+        self.config = config or self.Config()
+        self._map = self._empty_map(seed=0)
+
+    def _empty_map(self, seed: int) -> ObjectMap:
+        return ObjectMap(self.config, seed)
 
     @property
     def needs(self) -> PerceptionNeeds:
@@ -63,12 +68,11 @@ class ConceptGraphs:
 
     @property
     def n_instances(self) -> int:
-        """Objects now, those seen too rarely included."""
+        """Objects now, background and those seen too rarely included."""
         return len(self._map)
 
     def start(self, scene: SceneInfo) -> None:
-        warm_up(self.config)
-        self._map = ObjectMap(self.config, scene.seed)
+        self._map = self._empty_map(scene.seed)
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
         # The original encodes the word "item" for every region; whatever its feature, all are equal and the cosine of
@@ -91,7 +95,7 @@ class DetectorConfig(MappingConfig):
     background_names: Annotated[tuple[str, ...], Field(strict=False)] = ("wall", "floor", "ceiling")
 
 
-class ConceptGraphsDetector:
+class ConceptGraphsDetector(ConceptGraphs):
     """ConceptGraphs with named masks of a tagger and a detector; walls, floor and ceiling are one object a class.
 
     Background regions are merged whatever they look like. As in the original's evaluation the feature of an object
@@ -100,20 +104,14 @@ class ConceptGraphsDetector:
 
     name = "conceptgraphs-detector"
     Config = DetectorConfig
-    about = MethodAbout(
-        paper=ConceptGraphs.about.paper,
-        source=ConceptGraphs.about.source,
-        licence=ConceptGraphs.about.licence,
+    config: DetectorConfig
+    about = replace(
+        ConceptGraphs.about,
         needs=("named masks of a tagger and a detector", "an encoder of images and texts"),
-        status=ConceptGraphs.about.status,
     )
 
-    def __init__(self, config: DetectorConfig | None = None) -> None:
-        self.config = config or DetectorConfig()
-        self._clear(seed=0)
-
-    def _clear(self, seed: int) -> None:
-        self._map = ObjectMap(self.config, seed, () if self.config.skip_bg else self.config.background_names)
+    def _empty_map(self, seed: int) -> ObjectMap:
+        return ObjectMap(self.config, seed, () if self.config.skip_bg else self.config.background_names)
 
     @property
     def needs(self) -> PerceptionNeeds:
@@ -127,30 +125,6 @@ class ConceptGraphsDetector:
             grounding="conceptgraphs",
         )
 
-    @property
-    def caveat(self) -> str:
-        return self.config.score_caveat
-
-    @property
-    def n_points(self) -> int:
-        return self._map.n_points
-
-    @property
-    def map_bytes(self) -> int:
-        return self._map.n_bytes
-
-    @property
-    def n_instances(self) -> int:
-        """Objects now, background and those seen too rarely included."""
-        return len(self._map)
-
-    def start(self, scene: SceneInfo) -> None:
-        warm_up(self.config)
-        self._clear(scene.seed)
-
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
         assert detections.name_features is not None, "needs.name_features asks for them"
         self._map.update(frame, detections, detections.name_features, timer)
-
-    def finish(self) -> Instances:
-        return self._map.finish()

@@ -63,87 +63,6 @@ class MaskPipelineConfig(ProposalConfig):
         )
 
 
-class MaskPipeline:
-    """Counts in each update what each mask shows; ``finish`` reads the chosen frames again, once each and in order."""
-
-    def __init__(self, config: MaskPipelineConfig, tools: SceneTools, scene: SceneInfo) -> None:
-        self.proposals = make_proposals(config, tools, scene.dataset, scene.scene)
-        self.finish_costs: dict[str, float | int] = {}
-        self._config, self._tools, self._scene = config, tools, scene
-        self._views = MaskViews(len(self.proposals), config.top_k)
-        self._frame_indices: list[int] = []
-
-    def update(self, frame: Frame, timer: StageTimer) -> None:
-        """Projects all vertices into the frame and enters it among each mask's views."""
-        with timer.stage("project"):
-            pixels = self._visible(frame)
-        with timer.stage("select"):
-            counts = count_pixels(pixels, self.proposals, frame.depth_m.size)
-            self._views.add(len(self._frame_indices), counts)
-        self._frame_indices.append(frame.index)
-
-    def _visible(self, frame: Frame) -> np.ndarray:
-        config = self._config
-        exact = config.intrinsics == "as-is"
-        intrinsics = frame.intrinsics if exact else as_openmask3d(frame, config.intrinsic_resolution)
-        return visible_pixels(self.proposals.points, frame, intrinsics, config.vis_threshold)
-
-    def finish(self) -> Instances:
-        """The proposals with the mean feature of their views so far; changes nothing."""
-        start = time.perf_counter()
-        means = FeatureMeans(len(self.proposals), self._tools.regions.dim)
-        chosen = np.unique(self._views.positions[self._views.positions != NO_VIEW])
-        n_views = 0
-        for position in chosen.tolist():
-            frame = self._frame_again(position)
-            pixels = self._visible(frame)
-            for mask in np.flatnonzero((self._views.positions == position).any(axis=1)).tolist():
-                n_views += self._look(mask, frame, pixels, means)
-        self.finish_costs = {
-            "n_frames_again": len(chosen),
-            "n_views": n_views,
-            "look_ms": round((time.perf_counter() - start) * 1e3, 3),
-        }
-        return self._instances(means.means)
-
-    def _frame_again(self, position: int) -> Frame:
-        frame = self._tools.frames[position]
-        if frame.index != self._frame_indices[position]:
-            raise DataError(
-                f"{self._scene.dataset}/{self._scene.scene}: update {position} was frame "
-                f"{self._frame_indices[position]}, read again it is frame {frame.index}; the scene has changed"
-            )
-        return frame
-
-    def _look(self, mask: int, frame: Frame, visible: np.ndarray, means: FeatureMeans) -> int:
-        """Adds the features of the crops of one view of ``mask``; 0 where its prompts find nothing."""
-        config, regions = self._config, self._tools.regions
-        pixels = pixels_of_mask(visible, self.proposals.mask(mask), frame.depth_m.shape[1])
-        # Each view has a generator of its own, so that neither other masks nor an earlier finish move its prompts.
-        rng = np.random.default_rng([self._scene.seed, mask, frame.index])
-        seen = prompted_mask(regions, frame, pixels, config.looking, rng)
-        if seen is None:
-            return 0
-        means.add(mask, regions.encode_regions(frame, seen, crop_boxes(seen, config.looking)))
-        return 1
-
-    def _instances(self, features: Float64Array) -> Instances:
-        proposals, views = self.proposals, self._views
-        k = len(proposals)
-        is_view = views.positions != NO_VIEW
-        frame_of = np.append(np.array(self._frame_indices, np.int32), np.int32(-1))
-        # In the order of their number of pixels; of a view no detection is known but the mask itself.
-        rows = np.stack([frame_of[views.positions], np.broadcast_to(np.arange(k)[:, None], is_view.shape)], axis=-1)
-        return Instances.of(
-            proposals.points,
-            proposals,
-            None if self._config.confidence == "ones" else proposals.scores,
-            features.astype(np.float32),
-            views=[rows[mask, is_view[mask]].tolist() for mask in range(k)],
-            ids=range(1, k + 1),
-        )
-
-
 class OpenMask3DConfig(MaskPipelineConfig):
     """The settings of the original's ScanNet200 run; Mask3D's masks where ``proposals_folder`` names them."""
 
@@ -164,9 +83,8 @@ class OpenMask3D:
     )
 
     def __init__(self, config: MaskPipelineConfig | None = None) -> None:
-        self.config = config or OpenMask3DConfig()
-        self._tools: SceneTools | None = None
-        self._pipeline: MaskPipeline | None = None
+        self.config = config or self.Config()
+        self.finish_costs: dict[str, float | int] = {}  # frames read again and views looked at by the last ``finish``
 
     @property
     def needs(self) -> PerceptionNeeds:
@@ -183,29 +101,19 @@ class OpenMask3D:
         return self.config.inputs
 
     @property
-    def finish_costs(self) -> Mapping[str, float | int]:
-        """Frames read again and views looked at by the last ``finish``."""
-        return self._started.finish_costs
-
-    @property
     def n_points(self) -> int:
-        return len(self._started.proposals.points)
+        return len(self.proposals.points)
 
     @property
     def map_bytes(self) -> int:
         """What the proposals take: their points, masks and scores."""
-        proposals = self._started.proposals
+        proposals = self.proposals
         arrays = (proposals.points, proposals.indptr, proposals.indices, proposals.scores)
         return sum(array.nbytes for array in arrays)
 
     @property
     def n_instances(self) -> int:
-        return len(self._started.proposals)
-
-    @property
-    def _started(self) -> MaskPipeline:
-        assert self._pipeline is not None, "start comes first"
-        return self._pipeline
+        return len(self.proposals)
 
     def receive_tools(self, tools: SceneTools) -> None:
         """The frames to look at again, the mesh, and perception on demand."""
@@ -213,16 +121,84 @@ class OpenMask3D:
 
     def start(self, scene: SceneInfo) -> None:
         """Makes or reads the proposals."""
-        assert self._tools is not None, "the runner hands over tools before the start"
-        self._pipeline = MaskPipeline(self.config, self._tools, scene)
+        self.proposals = make_proposals(self.config, self._tools, scene.dataset, scene.scene)
+        self.finish_costs = {}
+        self._scene = scene
+        self._views = MaskViews(len(self.proposals), self.config.top_k)
+        self._frame_indices: list[int] = []
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
         """Enters the frame among the views of the masks it shows; costs what the mesh and the masks are large."""
-        self._started.update(frame, timer)
+        with timer.stage("project"):
+            pixels = self._visible(frame)
+        with timer.stage("select"):
+            counts = count_pixels(pixels, self.proposals, frame.depth_m.size)
+            self._views.add(len(self._frame_indices), counts)
+        self._frame_indices.append(frame.index)
 
     def finish(self) -> Instances:
-        """The proposals with features from their best views so far."""
-        return self._started.finish()
+        """The proposals with the mean feature of their best views so far; changes nothing.
+
+        The chosen frames are read again, once each and in order.
+        """
+        start = time.perf_counter()
+        means = FeatureMeans(len(self.proposals), self._tools.regions.dim)
+        chosen = np.unique(self._views.positions[self._views.positions != NO_VIEW])
+        n_views = 0
+        for position in chosen.tolist():
+            frame = self._frame_again(position)
+            pixels = self._visible(frame)
+            for mask in np.flatnonzero((self._views.positions == position).any(axis=1)).tolist():
+                n_views += self._look(mask, frame, pixels, means)
+        self.finish_costs = {
+            "n_frames_again": len(chosen),
+            "n_views": n_views,
+            "look_ms": round((time.perf_counter() - start) * 1e3, 3),
+        }
+        return self._instances(means.means)
+
+    def _visible(self, frame: Frame) -> np.ndarray:
+        config = self.config
+        exact = config.intrinsics == "as-is"
+        intrinsics = frame.intrinsics if exact else as_openmask3d(frame, config.intrinsic_resolution)
+        return visible_pixels(self.proposals.points, frame, intrinsics, config.vis_threshold)
+
+    def _frame_again(self, position: int) -> Frame:
+        frame = self._tools.frames[position]
+        if frame.index != self._frame_indices[position]:
+            raise DataError(
+                f"{self._scene.dataset}/{self._scene.scene}: update {position} was frame "
+                f"{self._frame_indices[position]}, read again it is frame {frame.index}; the scene has changed"
+            )
+        return frame
+
+    def _look(self, mask: int, frame: Frame, visible: np.ndarray, means: FeatureMeans) -> int:
+        """Adds the features of the crops of one view of ``mask``; 0 where its prompts find nothing."""
+        config, regions = self.config, self._tools.regions
+        pixels = pixels_of_mask(visible, self.proposals.mask(mask), frame.depth_m.shape[1])
+        # Each view has a generator of its own, so that neither other masks nor an earlier finish move its prompts.
+        rng = np.random.default_rng([self._scene.seed, mask, frame.index])
+        seen = prompted_mask(regions, frame, pixels, config.looking, rng)
+        if seen is None:
+            return 0
+        means.add(mask, regions.encode_regions(frame, seen, crop_boxes(seen, config.looking)))
+        return 1
+
+    def _instances(self, features: Float64Array) -> Instances:
+        proposals, views = self.proposals, self._views
+        k = len(proposals)
+        is_view = views.positions != NO_VIEW
+        frame_of = np.append(np.array(self._frame_indices, np.int32), np.int32(-1))
+        # In the order of their number of pixels; of a view no detection is known but the mask itself.
+        rows = np.stack([frame_of[views.positions], np.broadcast_to(np.arange(k)[:, None], is_view.shape)], axis=-1)
+        return Instances.of(
+            proposals.points,
+            proposals,
+            None if self.config.confidence == "ones" else proposals.scores,
+            features.astype(np.float32),
+            views=[rows[mask, is_view[mask]].tolist() for mask in range(k)],
+            ids=range(1, k + 1),
+        )
 
 
 # Views, prompts, crops and features are OpenMask3D's. Source of what differs: Segment3D's evaluation script at commit
@@ -255,6 +231,3 @@ class OpenMask3DSegment3D(OpenMask3D):
         status="as openmask3d; connected parts, dropped ones and the kept share are tested on hand-worked values; no "
         "public file of these proposals was found, and no figure has been reproduced",
     )
-
-    def __init__(self, config: MaskPipelineConfig | None = None) -> None:
-        super().__init__(config or OpenMask3DSegment3DConfig())

@@ -10,7 +10,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import cache
 from typing import Annotated, ClassVar, Literal
 
 import numpy as np
@@ -22,7 +21,6 @@ from su3d_bench.baselines.sam3d.overlap import (
     MergeRules,
     ensemble,
     groups_on_surface,
-    match_pairs,
     merge,
     merge_regions,
     numbered,
@@ -96,6 +94,7 @@ class SAM3D:
     """
 
     name = "sam3d"
+    warms_up = True
     Config = SAM3DConfig
     presets: ClassVar[Mapping[str, Mapping[str, object]]] = {
         "incremental": {"schedule": "incremental"},
@@ -162,7 +161,6 @@ class SAM3D:
         self._clear()
         self._scene = f"{scene.dataset}/{scene.scene}"
         self._surface = self._read_surface()
-        _warm_up()
 
     def _read_surface(self) -> Surface | None:
         if self._tools is None:
@@ -305,9 +303,3 @@ def _members(group: Int64Array, ids: Int64Array) -> list[Int32Array]:
 
 _NO_IDS = np.zeros(0, np.int64)
 _EMPTY = GroupedCloud(np.zeros((0, 3)), _NO_IDS, _NO_IDS, _NO_IDS)
-
-
-@cache
-def _warm_up() -> None:
-    """Matches two points, so that no timed step waits for a compiler."""
-    match_pairs(np.zeros((1, 3)), np.zeros((1, 3)), 1.0)

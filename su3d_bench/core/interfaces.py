@@ -207,6 +207,14 @@ class HasShortNames(Protocol):
 
 
 @runtime_checkable
+class WarmsUp(Protocol):
+    """True where its first frames wait for compilers or imports: before the clock runs, a scratch of its kind is fed a
+    made-up frame; it needs no tools for that."""
+
+    warms_up: bool
+
+
+@runtime_checkable
 class TakesDevice(Protocol):
     """May compute with torch; called before all else with ``cpu`` or a device of torch such as ``cuda:0``."""
 
@@ -296,6 +304,7 @@ ABILITIES = {
         HasAbout,
         HasPresets,
         HasShortNames,
+        WarmsUp,
         TakesDevice,
         TakesTools,
         TakesTruth,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from functools import cache
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -12,7 +11,6 @@ import numpy as np
 from su3d_bench.core.devices import CPU
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
-from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Detections, Frame, Instances, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
 from su3d_bench.opensu3d.association import assign_ids, count_overlaps, overlap_ratios
 from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig, crop_levels
@@ -30,6 +28,7 @@ class OpenSU3D:
     """Masks of single images, fused and tracked into one map of instances, frame by frame: the reference pipeline."""
 
     name = "opensu3d"
+    warms_up = True
     Config = OpenSU3DConfig
     about = MethodAbout(
         paper="Mohiuddin et al.: OpenSU3D: Open World 3D Scene Understanding using Foundation Models",
@@ -89,7 +88,6 @@ class OpenSU3D:
     def start(self, scene: SceneInfo) -> None:
         """Forgets the scene before; of the new one nothing needs to be known."""
         self._clear()
-        _warm_up(self.config, self._device)
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
         """Fuses one image into the map; costs what the view costs, however large the map is."""
@@ -154,31 +152,3 @@ def _empty_map(eps: float, device: str) -> VoxelMap | DeviceVoxelMap:
     from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap
 
     return DeviceVoxelMap(eps, device)
-
-
-@cache
-def _warm_up(config: OpenSU3DConfig, device: str) -> None:
-    """Fuses a made-up image twice, so that no timed step waits for a compiler or an import."""
-    size = 16
-    depth_m = np.linspace(0.6, 1.0, size * size, dtype=np.float32).reshape(size, size)
-    depth_m *= np.float32(config.depth_max) * np.arange(1, size + 1, dtype=np.float32) / size
-    intrinsics = np.array([[size / 2, 0, size / 2], [0, size / 2, size / 2], [0, 0, 1]])
-    frame = Frame(0, 0.0, np.zeros((size, size, 3), np.uint8), depth_m, np.eye(4), intrinsics)
-    ratios = config.fusion.crop_ratios
-    detections = Detections(
-        frame_index=0,
-        masks=np.ones((1, size, size), np.bool_),
-        boxes=np.array([[0, 0, size, size]], np.float32),
-        scores=np.ones(1, np.float32),
-        names=("",),
-        captions=("",),
-        crop_ratios=ratios,
-        crop_features=np.ones((1, len(ratios), 1), np.float32),
-        global_feature=np.ones(1, np.float32),
-    )
-    scratch = OpenSU3D(config)
-    scratch.receive_device(device)
-    for _ in range(2):
-        scratch.update(frame, detections, Timer())
-    scratch.finish()
-    scratch.close()

@@ -17,9 +17,18 @@ from typing import Any, Generic, Self, TypeVar, overload
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.interfaces import Dataset, HasFinishCosts, HasSurface, Method
+from su3d_bench.core.interfaces import Closes, Dataset, HasFinishCosts, HasSurface, Method
 from su3d_bench.core.timing import Timer, calibration_ms, memory_bytes
-from su3d_bench.core.types import Detections, Frame, GroundTruth, PerceptionNeeds, Proposals, Surface, starts_of
+from su3d_bench.core.types import (
+    Detections,
+    Frame,
+    GroundTruth,
+    PerceptionNeeds,
+    Proposals,
+    SceneInfo,
+    Surface,
+    starts_of,
+)
 from su3d_bench.perception.profiles import Perception
 from su3d_bench.runs.executors.local import Event, Report
 from su3d_bench.store.predictions import write_prediction
@@ -60,6 +69,32 @@ def no_detections(frame: Frame, needs: PerceptionNeeds) -> Detections:
         crop_features=np.zeros((0, len(needs.crop_ratios), 0), np.float32),
         global_feature=np.zeros(0, np.float32),
     )
+
+
+def warm_up(method: Method) -> None:
+    """Feeds ``method``, which is thrown away, a made-up frame: no timed step then waits for a compiler or an import."""
+    size, needs = 32, method.needs
+    depth_m = 1 + np.linspace(0, 0.5, size * size, dtype=np.float32).reshape(size, size) ** 2
+    intrinsics = np.array([[size, 0, size / 2], [0, size, size / 2], [0, 0, 1]])
+    frame = Frame(0, 0.0, np.zeros((size, size, 3), np.uint8), depth_m, np.eye(4), intrinsics)
+    detections = Detections(
+        frame_index=0,
+        masks=np.ones((1, size, size), np.bool_),
+        boxes=np.zeros((1, 4), np.float32),
+        scores=np.ones(1, np.float32),
+        names=("",),
+        captions=("",),
+        crop_ratios=needs.crop_ratios,
+        crop_features=np.ones((1, len(needs.crop_ratios), 1), np.float32),
+        global_feature=np.ones(1, np.float32),
+        name_features=np.ones((1, 1), np.float32) if needs.name_features else None,
+    )
+    method.start(SceneInfo("made-up", "made-up", N_WARM_UP, 1, "camera"))
+    for _ in range(N_WARM_UP):
+        method.update(frame, detections, Timer())
+    method.finish()
+    if isinstance(method, Closes):
+        method.close()
 
 
 def surface_of(dataset: Dataset, scene: str) -> Surface:
@@ -122,6 +157,7 @@ class ReadAhead(Generic[Read]):
 
 
 Row = dict[str, float | int]
+N_WARM_UP = 3  # sightings that an object must have by default to be in a map
 CALIBRATE_EVERY = 4  # about 5 ms each: a hundredth of the time of the updates
 # What a method may say of its size after an update.
 SIZES = ("n_points", "n_instances", "map_bytes")

@@ -11,12 +11,21 @@ import math
 import traceback
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property, partial
+from functools import cache, cached_property, partial
 from typing import Any
 
 from su3d_bench.core.devices import device_for
 from su3d_bench.core.errors import GroundTruthMissing, StoreError, Su3dError
-from su3d_bench.core.interfaces import Closes, Method, RendersFrames, SceneTools, TakesDevice, TakesTools, TakesTruth
+from su3d_bench.core.interfaces import (
+    Closes,
+    Method,
+    RendersFrames,
+    SceneTools,
+    TakesDevice,
+    TakesTools,
+    TakesTruth,
+    WarmsUp,
+)
 from su3d_bench.core.timing import device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Prediction, Proposals, SceneInfo
 from su3d_bench.metrics.fitness import why_not_scorable
@@ -27,7 +36,16 @@ from su3d_bench.questions.refined_names import refined_names
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.reports.pictures.maps import draw_scene
 from su3d_bench.runs.executors.local import Report
-from su3d_bench.runs.feeding import N_AHEAD, Feeding, FirstFrames, ReadAhead, SceneLog, surface_of, true_proposals
+from su3d_bench.runs.feeding import (
+    N_AHEAD,
+    Feeding,
+    FirstFrames,
+    ReadAhead,
+    SceneLog,
+    surface_of,
+    true_proposals,
+    warm_up,
+)
 from su3d_bench.runs.job import (
     JobInputs,
     MethodOutcome,
@@ -49,6 +67,16 @@ def run_scene(job: SceneJob, report: Report) -> tuple[MethodOutcome, ...]:
     scene = _Scene(job, report)
     parts = job.methods if job.ceiling is None else (*job.methods, job.ceiling)
     return tuple(_guarded(scene, part) for part in parts)
+
+
+@cache
+def _warm_up(part: Part, device: str) -> None:
+    """Once a process for each method and its settings, where it asks for it."""
+    scratch: Method = build_method(part)
+    if isinstance(scratch, WarmsUp) and scratch.warms_up:
+        if isinstance(scratch, TakesDevice):
+            scratch.receive_device(device)
+        warm_up(scratch)
 
 
 def failed_outcomes(job: SceneJob, reason: str) -> tuple[MethodOutcome, ...]:
@@ -155,7 +183,7 @@ class _Scene:
         if was_resumed:
             log.recall(folder.remarks("predict"))
         else:
-            self._predict(method, info, perception, folder, key, log)
+            self._predict(part, method, info, perception, folder, key, log)
         score_key = inputs.score_key(key, folder)
         if not folder.is_done("score", score_key):
             self._score(part, perception, folder, score_key, log)
@@ -164,6 +192,7 @@ class _Scene:
 
     def _predict(
         self,
+        part: Part,
         method: Method,
         info: SceneInfo,
         perception: Perception,
@@ -176,14 +205,16 @@ class _Scene:
         if method.needs.frames:
             frames = self.dataset.frames(self.job.scene_name, info.stride)
             n = min(len(frames), self.job.limit or len(frames))
+        device = device_for(self.perception_config.models.device, self.job.index)
         if isinstance(method, TakesDevice):
-            method.receive_device(device_for(self.perception_config.models.device, self.job.index))
+            method.receive_device(device)
         if isinstance(method, TakesTools):
             method.receive_tools(self._tools(method, perception, frames, n))
         if isinstance(method, TakesTruth):
             if not self.dataset.variants:
                 raise GroundTruthMissing(f"{self.job.scene}: {method.name} needs ground truth, the dataset has none")
             method.receive_truth(self.truth(self.dataset.variants[0]))
+        _warm_up(part, device)
         start_memory_watch()
         feeding = Feeding(self.job.scene, method, perception, self.report)
         shares = self.job.anytime if method.needs.frames else ()

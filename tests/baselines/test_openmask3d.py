@@ -316,7 +316,7 @@ class TestMethod:
     def test_other_intrinsics_move_the_views(self) -> None:
         config = OpenMask3DConfig(proposals="oracle", intrinsics="openmask3d", intrinsic_resolution=(16, 12))
         as_is, moved = ran(made(WALL, LEFT), [frame()])[0], ran(made(WALL, LEFT), [frame()], config)[0]
-        assert as_is._started._views.n_pixels[0, 0] == 32 != moved._started._views.n_pixels[0, 0]
+        assert as_is._views.n_pixels[0, 0] == 32 != moved._views.n_pixels[0, 0]
 
     def test_a_frame_that_is_another_when_read_again_is_an_error(self) -> None:
         method, _, counted, _ = ran(made(WALL, LEFT), [frame()])

@@ -9,7 +9,6 @@ from typing import Any
 
 from su3d_bench.cli.common import add_group, add_settings, add_verb, answer, answer_json
 from su3d_bench.core.errors import EXIT_DONE, DataError, Su3dError
-from su3d_bench.core.interfaces import HasPlaces, HasStatus
 
 LAYOUTS = ("native", "replica", "scannet", "scannet-python", "scannet-cpp", "tum")
 MAX_LISTED = 40
@@ -127,6 +126,8 @@ def data_root() -> Path:
 
 def _row(name: str, dataset_class: Any, root: Path) -> dict[str, Any]:
     """What is known of a dataset; a dataset may say where it looks (``places``) and how a scene is (``status``)."""
+    from su3d_bench.core.interfaces import HasPlaces
+
     dataset = dataset_class(root, dataset_class.Options())
     row: dict[str, Any] = {
         "name": name,
@@ -144,6 +145,8 @@ def _row(name: str, dataset_class: Any, root: Path) -> dict[str, Any]:
 
 
 def _status(dataset: Any, scene: str) -> str:
+    from su3d_bench.core.interfaces import HasStatus
+
     try:
         if isinstance(dataset, HasStatus):
             return str(dataset.status(scene))

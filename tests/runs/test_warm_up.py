@@ -1,0 +1,31 @@
+"""Before the clock runs, a scratch of a method that asks for it is fed a made-up frame."""
+
+from __future__ import annotations
+
+import pytest
+
+from su3d_bench.core import registry
+from su3d_bench.core.interfaces import TakesTools, WarmsUp
+from su3d_bench.runs.feeding import warm_up
+
+WARMED = [name for name in registry.METHODS if isinstance(registry.load("method", name), WarmsUp)]
+
+
+def test_the_methods_that_fuse_frames_ask_for_it() -> None:
+    assert WARMED == [
+        "opensu3d",
+        "conceptfusion",
+        "conceptfusion-sam",
+        "conceptgraphs",
+        "conceptgraphs-detector",
+        "sam3d",
+    ]
+
+
+@pytest.mark.parametrize("name", WARMED)
+def test_a_made_up_frame_goes_through_every_step(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    method = registry.load("method", name)()
+    monkeypatch.setattr(type(method), "close", lambda self: None, raising=False)  # keeps the map
+    warm_up(method)
+    assert method.n_points > 0
+    assert not isinstance(method, TakesTools) or method._tools is None
