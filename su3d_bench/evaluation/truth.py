@@ -14,11 +14,11 @@ import numpy as np
 from su3d_bench.core import registry
 from su3d_bench.core.errors import DataError, PredictionError, printable, shown, suggest
 from su3d_bench.core.types import Int64Array
+from su3d_bench.formats.reading import reading
 from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
 from su3d_bench.metrics.protocols import ProtocolRules
-from su3d_bench.predictions.base import MOST_POINTS
-from su3d_bench.predictions.mask_arrays import scene_files
+from su3d_bench.predictions.base import MOST_POINTS, scene_files
 from su3d_bench.runs.plan import data_root
 
 LARGEST_LABEL = 1357  # of scannetv2-labels.combined.tsv; values above it are label * 1000 + instance
@@ -78,9 +78,8 @@ def _read_all(files: Mapping[str, Path]) -> dict[str, Int64Array]:
 def _read_values(path: Path) -> Int64Array:
     where = shown(path)
     try:
-        values = integer_lines(path.read_bytes(), where).astype(np.int64)
-    except OSError as error:
-        raise DataError(f"{where}: cannot be read: {error.strerror or error}") from error
+        with reading(where):
+            values = integer_lines(path.read_bytes(), where).astype(np.int64)
     except PredictionError as error:
         raise DataError(str(error)) from error
     if not 0 < len(values) <= MOST_POINTS:

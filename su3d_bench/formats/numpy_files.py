@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.formats.pickles.pickle_constructors import MOST_DIMENSIONS, SIMPLE_TYPE, RefusedError, check_texts
 from su3d_bench.formats.pickles.pickles import read_pickle
+from su3d_bench.formats.reading import reading
 
 MOST_MEMBER = 4 << 30  # bytes; masks of a scene are some hundred MiB
 MOST_RATIO = 1032  # deflate cannot do better
@@ -178,7 +179,5 @@ def _header(content: bytes, where: str) -> NpyHeader:
 
 
 def _content(path: Path) -> bytes:
-    try:
+    with reading(shown(path)):
         return path.read_bytes()
-    except OSError as error:
-        raise PredictionError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
 from su3d_bench.formats.ply_parts import clip
+from su3d_bench.formats.reading import reading
 from su3d_bench.store.atomic import write_bytes
 
 MOST_HEADER_BYTES = 1 << 16  # headers have some hundred
@@ -62,10 +63,8 @@ def read_pcd_points(path: Path, where: str | None = None) -> Float64Array:
     Raises ``DataError`` for a file that is missing, damaged, cut short or longer than its header says.
     """
     where = where or str(path)
-    try:
+    with reading(where, DataError):
         content = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{where}: cannot be read: {error.strerror or error}") from error
     header = read_header(content, where)
     axes = [next((field for field in header.fields if field.name == axis), None) for axis in AXES]
     found = [field for field in axes if field is not None and field.count == 1]

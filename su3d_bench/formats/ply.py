@@ -33,6 +33,7 @@ from su3d_bench.formats.ply_parts import (
     clip,
     read_header,
 )
+from su3d_bench.formats.reading import reading
 from su3d_bench.store.atomic import write_bytes
 
 AnyArray = NDArray[Any]
@@ -85,10 +86,8 @@ def read_ply(path: Path, where: str | None = None) -> PlyFile:
     Raises ``DataError`` for a file that is missing, damaged, cut short or longer than its header says.
     """
     where = where or str(path)
-    try:
+    with reading(where, DataError):
         content = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{where}: cannot be read: {error.strerror or error}") from error
     header = read_header(content, where)
     body = TextBody(content, header, where) if header.format == "ascii" else BinaryBody(content, header)
     at, elements = body.start, []

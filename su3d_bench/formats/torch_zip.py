@@ -29,6 +29,7 @@ from su3d_bench.formats.pickles.pickle_constructors import (
     named,
 )
 from su3d_bench.formats.pickles.pickles import read_pickle
+from su3d_bench.formats.reading import reading
 
 Kind = Literal["tensor", "sparse", "array", "dict", "tuple", "other"]
 ZIP_START = b"PK\x03\x04"
@@ -114,11 +115,8 @@ def read_torch(path: Path) -> object:
 
 
 def _check_start(path: Path) -> None:
-    try:
-        with path.open("rb") as stream:
-            start = stream.read(4)
-    except OSError as error:
-        raise PredictionError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
+    with reading(shown(path)), path.open("rb") as stream:
+        start = stream.read(4)
     if start != ZIP_START:
         raise PredictionError(
             f"{shown(path)}: not a zip archive of torch.save, or of torch before 1.6; copy it again, or write it anew "

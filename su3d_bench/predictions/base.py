@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.types import (
     DenseFeatures,
     Float32Array,
@@ -19,6 +20,7 @@ from su3d_bench.core.types import (
     Masks,
     Partition,
 )
+from su3d_bench.formats.reading import reading
 
 Numbering = Literal["id", "index"]
 MOST_POINTS = 100_000_000  # points of one scene; the largest scans of rooms have some millions
@@ -96,25 +98,95 @@ class ScenePrediction:
     remarks: tuple[str, ...] = ()
 
 
-class Reader(Protocol):
-    """One format of predictions."""
+class Reader(ABC):
+    """One format of predictions; ``summary`` is one line for lists: whose format, which files."""
 
-    @property
-    def name(self) -> str: ...
+    name: str
+    summary: str
+    noun = "prediction"  # what messages call that of a scene
 
-    @property
-    def summary(self) -> str:
-        """One line for lists: whose format, which files."""
-        ...
-
+    @abstractmethod
     def recognise(self, path: Path) -> str | None:
         """Why ``path`` is of this format, from names and first bytes alone; None where it is not."""
-        ...
 
+    @abstractmethod
     def scenes(self, path: Path) -> Mapping[str, Path]:
         """The file or folder of each scene, by the name that the files give it."""
-        ...
 
     def read(self, path: Path, scene: str) -> ScenePrediction:
         """The prediction of one of ``scenes(path)``; ``PredictionError`` where it cannot be used."""
-        ...
+        place = self.scenes(path).get(scene)
+        if place is None:
+            raise PredictionError(f"{shown(path)}: has no {self.noun} of scene '{printable(scene, 80)}'")
+        return self.read_scene(place, scene)
+
+    @abstractmethod
+    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
+        """The prediction in the file or folder of a scene."""
+
+
+class SceneFiles(Reader):
+    """A format of one file a scene, called after it and ending in the first of ``suffixes`` that fits."""
+
+    suffixes: tuple[str, ...]
+
+    def scenes(self, path: Path) -> dict[str, Path]:
+        return scene_files(path, self.suffixes)
+
+    def first(self, path: Path, suffix: str) -> Path | None:
+        """The first of the files with ``suffix`` at ``path``, in alphabetical order."""
+        if not path.is_dir() and path.suffix != suffix:
+            return None
+        return next(iter(scene_files(path, (suffix,)).values()), None)
+
+
+class SceneFolders(Reader):
+    """A format of a folder a scene, at most ``n_above`` folders below the path: ``first`` and ``second`` lie in it."""
+
+    first: str
+    second: str
+    n_above = 2
+
+    def recognise(self, path: Path) -> str | None:
+        return f"it holds {self.first} and {self.second}" if path.is_dir() and self._folders(path) else None
+
+    def scenes(self, path: Path) -> Mapping[str, Path]:
+        return named_once([(self.scene_of(folder, path), folder) for folder in self._folders(path)], path)
+
+    def _folders(self, path: Path) -> list[Path]:
+        found = first_found(path, ["*/" * n + self.first for n in range(self.n_above + 1)])
+        return [file.parent for file in found if (file.parent / self.second).exists()]
+
+    @abstractmethod
+    def scene_of(self, folder: Path, path: Path) -> str:
+        """The name of the scene whose ``folder`` was found at ``path``."""
+
+
+def scene_files(path: Path, suffixes: Sequence[str]) -> dict[str, Path]:
+    """The files with one of ``suffixes`` in a folder by their names without it, in alphabetical order; or one file."""
+    with reading(shown(path)):
+        files = [path] if path.is_file() else sorted(file for file in path.iterdir() if file.is_file())
+    found = {}
+    for file in files:
+        suffix = next((one for one in suffixes if file.name.endswith(one) and file.name != one), None)
+        if suffix is not None and not file.name.startswith("."):
+            found[file.name.removesuffix(suffix)] = file
+    return found
+
+
+def first_found(path: Path, patterns: Sequence[str]) -> list[Path]:
+    """What the first of ``patterns`` that matches anything below ``path`` matches, in alphabetical order."""
+    with reading(shown(path)):
+        return next((found for pattern in patterns if (found := sorted(path.glob(pattern)))), [])
+
+
+def named_once(pairs: Sequence[tuple[str, Path]], path: Path) -> Mapping[str, Path]:
+    """``pairs`` as a table; ``PredictionError`` where two paths claim one scene."""
+    table: dict[str, Path] = {}
+    for name, found in pairs:
+        if table.setdefault(name, found) != found:
+            raise PredictionError(
+                f"{printable(str(path), 120)}: {printable(str(table[name]), 120)} and {printable(str(found), 120)} are "
+                f"both of scene '{printable(name, 80)}'; give one of them"
+            )
+    return table

@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError, PredictionError, printable, shown
+from su3d_bench.core.errors import DataError, PredictionError, shown
 from su3d_bench.core.types import Float32Array, Instances, Masks, starts_of
 from su3d_bench.predictions.base import MOST_MASKS, MOST_POINTS
 from su3d_bench.predictions.mask_arrays import kind_of
@@ -25,26 +25,6 @@ def as_prediction_error() -> Iterator[None]:
         raise PredictionError(str(error)) from error
 
 
-def folders_with(path: Path, patterns: Sequence[str]) -> list[Path]:
-    """What the first of ``patterns`` that matches anything below ``path`` matches, in alphabetical order."""
-    try:
-        return next((found for pattern in patterns if (found := sorted(path.glob(pattern)))), [])
-    except OSError as error:
-        raise PredictionError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
-
-
-def named_once(pairs: Sequence[tuple[str, Path]], path: Path) -> Mapping[str, Path]:
-    """``pairs`` as a table; ``PredictionError`` where two paths claim one scene."""
-    table: dict[str, Path] = {}
-    for name, found in pairs:
-        if table.setdefault(name, found) != found:
-            raise PredictionError(
-                f"{printable(str(path), 120)}: {printable(str(table[name]), 120)} and {printable(str(found), 120)} are "
-                f"both of scene '{printable(name, 80)}'; give one of them"
-            )
-    return table
-
-
 def checked_points(values: object, where: str) -> Float32Array:
     """Points (N, 3) as float32; ``PredictionError`` for another shape, and for what float32 metres cannot hold."""
     is_table = isinstance(values, np.ndarray) and values.ndim == 2 and values.shape[1] == 3
@@ -59,6 +39,14 @@ def checked_points(values: object, where: str) -> Float32Array:
         row = int(np.argmin(is_finite))
         raise PredictionError(f"{where}: point {row} is at {values[row].tolist()}; expected finite metres")
     return points
+
+
+def feature_table(value: object, file: Path) -> Float32Array:
+    """A row of features an object, as float32."""
+    if not isinstance(value, np.ndarray) or value.ndim != 2 or value.dtype.kind != "f" or not value.shape[1]:
+        raise PredictionError(f"{shown(file)}: holds {kind_of(value)}; expected a row of features an object")
+    with np.errstate(over="ignore", invalid="ignore"):
+        return value.astype(np.float32, copy=False)
 
 
 def without_nonfinite(features: Float32Array, what: str) -> tuple[Float32Array, tuple[str, ...]]:

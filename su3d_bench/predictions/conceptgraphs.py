@@ -15,13 +15,11 @@ import numpy as np
 from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.types import Float32Array, Instances
 from su3d_bench.formats.pickles.pickles import read_pickle_file
-from su3d_bench.predictions.base import MOST_MASKS, ScenePrediction
+from su3d_bench.predictions.base import MOST_MASKS, Reader, ScenePrediction, first_found, named_once
 from su3d_bench.predictions.clouds import (
     ONES,
     checked_points,
-    folders_with,
     instances_of,
-    named_once,
     without_nonfinite,
 )
 from su3d_bench.predictions.mask_arrays import kind_of
@@ -34,9 +32,10 @@ NAME_OF_NONE = "item"  # what the class-agnostic variant calls every object
 MOST_TEXT = 1000
 
 
-class ConceptGraphs:
+class ConceptGraphs(Reader):
     name = "conceptgraphs"
     summary = "ConceptGraphs' pcd_saves/full_pcd_*.pkl.gz (_post before the other) or exps/*/pcd_*.pkl.gz of ali-dev"
+    noun = "map"
 
     def recognise(self, path: Path) -> str | None:
         if path.is_file():
@@ -49,11 +48,8 @@ class ConceptGraphs:
             return {_scene_of(path): path}
         return named_once([(_scene_of(one), one.parent) for one in _maps(path)], path)
 
-    def read(self, path: Path, scene: str) -> ScenePrediction:
-        found = self.scenes(path).get(scene)
-        if found is None:
-            raise PredictionError(f"{shown(path)}: has no map of scene '{printable(scene, 80)}'")
-        file, remarks = (found, []) if found.is_file() else _chosen(found)
+    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
+        file, remarks = (place, []) if place.is_file() else _chosen(place)
         where = shown(file)
         value = read_pickle_file(file, forget=FORGOTTEN)
         if not isinstance(value, dict) or not isinstance(value.get("objects"), list):
@@ -67,7 +63,7 @@ def _maps(path: Path) -> list[Path]:
     """The map files of one scene or several, at whatever level of the layout ``path`` is."""
     full = [f"{above}{FULL}" for above in ("", "pcd_saves/", "*/pcd_saves/")]
     streamlined = [f"{above}{STREAMLINED}" for above in ("", "*/", "exps/*/", "*/exps/*/")]
-    return [one for one in folders_with(path, [*full, *streamlined]) if one.is_file()]
+    return [one for one in first_found(path, [*full, *streamlined]) if one.is_file()]
 
 
 def _scene_of(file: Path) -> str:

@@ -7,19 +7,18 @@ the points are in the frame of the first camera; the first pose of the recording
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import PredictionError, StoreError, printable, shown
+from su3d_bench.core.errors import PredictionError, StoreError, shown
 from su3d_bench.core.types import DenseFeatures, Float32Array
 from su3d_bench.datasets.replica.cloud_truth import moved, read_first_pose
 from su3d_bench.formats.hdf5 import n_columns_of, read_rows, row_blocks
-from su3d_bench.predictions.base import ScenePrediction
-from su3d_bench.predictions.clouds import as_prediction_error, checked_points, folders_with, named_once
+from su3d_bench.predictions.base import SceneFolders, ScenePrediction
+from su3d_bench.predictions.clouds import as_prediction_error, checked_points
 
 POINTS, EMBEDDINGS = "pc_points.h5", "pc_embeddings.h5"
 POSE_FILES = ("first_pose.txt", "traj.txt", "traj_w_c.txt")
@@ -27,44 +26,29 @@ FOLDERS_OF_A_MAP = ("pointclouds", "saved-map", "saved-maps", "Sequence_1")
 HELD_IN_MEMORY = 64 << 20  # bytes of features; larger tables are mapped from a temporary file
 
 
-class Gradslam:
+class Gradslam(SceneFolders):
     name = "gradslam"
     summary = "ConceptFusion's saved-map/pointclouds of gradslam: pc_points.h5 with pc_embeddings.h5"
+    noun, first, second, n_above = "map", POINTS, EMBEDDINGS, 3
 
-    def recognise(self, path: Path) -> str | None:
-        return f"it holds {POINTS} and {EMBEDDINGS}" if path.is_dir() and _folders(path) else None
+    def scene_of(self, folder: Path, path: Path) -> str:
+        """The first name upwards that is no folder of the map's own."""
+        absolute = folder.absolute()
+        names = [one.name for one in (absolute, *absolute.parents) if one.name not in FOLDERS_OF_A_MAP]
+        return names[0] or "scene"
 
-    def scenes(self, path: Path) -> Mapping[str, Path]:
-        return named_once([(_scene_of(folder), folder) for folder in _folders(path)], path)
-
-    def read(self, path: Path, scene: str) -> ScenePrediction:
-        folder = self.scenes(path).get(scene)
-        if folder is None:
-            raise PredictionError(f"{shown(path)}: has no map of scene '{printable(scene, 80)}'")
-        where = shown(folder / POINTS)
+    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
+        where = shown(place / POINTS)
         with as_prediction_error():
-            points = checked_points(read_rows(folder / POINTS, 3, where), where)
-            points, pose_remark = _in_world(points, folder)
-            features, n_without = _features(folder / EMBEDDINGS, len(points))
+            points = checked_points(read_rows(place / POINTS, 3, where), where)
+            points, pose_remark = _in_world(points, place)
+            features, n_without = _features(place / EMBEDDINGS, len(points))
         if not np.isfinite(points).all():
             raise PredictionError(f"{where}: the first pose moves points out of what float32 metres can hold")
         remarks = [pose_remark]
         if n_without:
             remarks.append(f"{n_without} of {len(points)} points have no feature (a row of zeros or NaN)")
-        return ScenePrediction(scene, self.name, folder, DenseFeatures(points, features), tuple(remarks))
-
-
-def _folders(path: Path) -> list[Path]:
-    """The folders of point files at ``path``, or in the map folders of one scene or several."""
-    found = folders_with(path, [f"{above}{POINTS}" for above in ("", "*/", "*/*/", "*/*/*/")])
-    return [file.parent for file in found if (file.parent / EMBEDDINGS).is_file()]
-
-
-def _scene_of(folder: Path) -> str:
-    """The first name upwards that is no folder of the map's own."""
-    absolute = folder.absolute()
-    names = [one.name for one in (absolute, *absolute.parents) if one.name not in FOLDERS_OF_A_MAP]
-    return names[0] or "scene"
+        return ScenePrediction(scene, self.name, place, DenseFeatures(points, features), tuple(remarks))
 
 
 def _in_world(points: Float32Array, folder: Path) -> tuple[Float32Array, str]:

@@ -7,50 +7,45 @@ on, which loses the last ones where a number is missing; here the number is read
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError, printable, shown
-from su3d_bench.core.types import Float32Array
+from su3d_bench.core.errors import PredictionError, shown
 from su3d_bench.formats.pcd import read_pcd_points
 from su3d_bench.formats.ply import read_ply
+from su3d_bench.formats.reading import reading
 from su3d_bench.formats.torch_zip import read_torch
-from su3d_bench.predictions.base import MOST_MASKS, ScenePrediction
+from su3d_bench.predictions.base import MOST_MASKS, SceneFolders, ScenePrediction
 from su3d_bench.predictions.clouds import (
     ONES,
     as_prediction_error,
     checked_points,
-    folders_with,
+    feature_table,
     instances_of,
-    named_once,
     some,
     without_nonfinite,
 )
-from su3d_bench.predictions.mask_arrays import kind_of
 
 FEATURES = "mask_feats.pt"
 OBJECTS = "objects"
 OBJECT_FILE = re.compile(r"pcd_(0|[1-9]\d{0,8})\.(ply|pcd)")
 
 
-class HovSg:
+class HovSg(SceneFolders):
     name = "hovsg"
     summary = "HOV-SG's objects/pcd_<i>.ply (or .pcd) with mask_feats.pt, row i of object i"
+    noun, first, second = "map", FEATURES, OBJECTS
 
     def recognise(self, path: Path) -> str | None:
-        return f"it holds {FEATURES} beside {OBJECTS}/" if path.is_dir() and _folders(path) else None
+        return f"it holds {FEATURES} beside {OBJECTS}/" if super().recognise(path) else None
 
-    def scenes(self, path: Path) -> Mapping[str, Path]:
-        return named_once([(folder.absolute().name, folder) for folder in _folders(path)], path)
+    def scene_of(self, folder: Path, path: Path) -> str:
+        return folder.absolute().name
 
-    def read(self, path: Path, scene: str) -> ScenePrediction:
-        folder = self.scenes(path).get(scene)
-        if folder is None:
-            raise PredictionError(f"{shown(path)}: has no map of scene '{printable(scene, 80)}'")
-        table = _features(folder / FEATURES)
-        files = _object_files(folder / OBJECTS)
+    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
+        table = feature_table(read_torch(place / FEATURES), place / FEATURES)
+        files = _object_files(place / OBJECTS)
         numbers = sorted(files)
         if numbers and numbers[-1] >= len(table):
             raise PredictionError(
@@ -60,7 +55,7 @@ class HovSg:
         features, remarks = without_nonfinite(table[numbers], "objects")
         instances = instances_of(
             [checked_points(read_cloud(files[number]), shown(files[number])) for number in numbers],
-            shown(folder),
+            shown(place),
             features=features,
             labels=None,
             names=tuple(f"object {number}" for number in numbers),
@@ -68,7 +63,7 @@ class HovSg:
             ids=numbers,
         )
         remarks += _gap_remarks(numbers, len(table))
-        return ScenePrediction(scene, self.name, folder, instances, (ONES, *remarks))
+        return ScenePrediction(scene, self.name, place, instances, (ONES, *remarks))
 
 
 def read_cloud(file: Path) -> np.ndarray:
@@ -86,26 +81,10 @@ def read_cloud(file: Path) -> np.ndarray:
     return np.stack([axis.astype(np.float64) for axis in found], axis=1)
 
 
-def _folders(path: Path) -> list[Path]:
-    """The folders of scenes at ``path`` or up to two levels below it."""
-    found = folders_with(path, [f"{above}{FEATURES}" for above in ("", "*/", "*/*/")])
-    return [file.parent for file in found if (file.parent / OBJECTS).is_dir()]
-
-
-def _features(file: Path) -> Float32Array:
-    table = read_torch(file)
-    if not isinstance(table, np.ndarray) or table.ndim != 2 or table.dtype.kind != "f" or not table.shape[1]:
-        raise PredictionError(f"{shown(file)}: holds {kind_of(table)}; expected a row of features an object")
-    with np.errstate(over="ignore", invalid="ignore"):
-        return table.astype(np.float32)
-
-
 def _object_files(folder: Path) -> dict[int, Path]:
     """The cloud of each object by its number."""
-    try:
+    with reading(shown(folder)):
         names = [entry.name for entry in folder.iterdir() if entry.is_file()]
-    except OSError as error:
-        raise PredictionError(f"{shown(folder)}: cannot be read: {error.strerror or error}") from error
     files: dict[int, Path] = {}
     for name in sorted(names):
         match = OBJECT_FILE.fullmatch(name)

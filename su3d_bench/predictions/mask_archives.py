@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from su3d_bench.core.errors import PredictionError, shown
 from su3d_bench.core.types import Int32Array
 from su3d_bench.formats.numpy_files import npz_names, read_npz
 from su3d_bench.formats.torch_zip import Kind, SparseTensor, read_torch, torch_kind
-from su3d_bench.predictions.base import ScenePrediction, VertexMasks
+from su3d_bench.predictions.base import SceneFiles, ScenePrediction, VertexMasks
 from su3d_bench.predictions.mask_arrays import (
     NO_SCORES,
     check_sizes,
@@ -23,38 +22,35 @@ from su3d_bench.predictions.mask_arrays import (
     kind_of,
     matrix_of,
     run_members,
-    scene_file,
-    scene_files,
     scores_of,
     vertex_masks,
 )
 
 
-def first_of_kind(path: Path, suffix: str, kinds: tuple[Kind, ...]) -> Path | None:
-    """The first file with ``suffix`` at ``path`` where that holds one of ``kinds``; None where it does not."""
-    if not path.is_dir() and path.suffix != suffix:
-        return None
-    first = next(iter(scene_files(path, (suffix,)).values()), None)
-    return first if first is not None and torch_kind(first) in kinds else None
+class TorchFiles(SceneFiles):
+    """A format of one file of ``torch.save`` a scene, known by what the first of them holds."""
 
-
-class MaskClustering:
-    name = "maskclustering"
-    summary = "MaskClustering's <scene>.npz with pred_masks (points, masks), pred_score and pred_classes (Mask3D's too)"
+    kinds: tuple[Kind, ...]
+    content: str  # what messages call that
 
     def recognise(self, path: Path) -> str | None:
-        if not path.is_dir() and path.suffix != ".npz":
-            return None
-        first = next(iter(scene_files(path, (".npz",)).values()), None)
+        first = self.first(path, suffix := self.suffixes[-1])
+        holds_kind = first is not None and torch_kind(first) in self.kinds
+        return f"its {suffix} files hold {self.content}" if holds_kind else None
+
+
+class MaskClustering(SceneFiles):
+    name = "maskclustering"
+    summary = "MaskClustering's <scene>.npz with pred_masks (points, masks), pred_score and pred_classes (Mask3D's too)"
+    suffixes = (".npz",)
+
+    def recognise(self, path: Path) -> str | None:
+        first = self.first(path, ".npz")
         return "its .npz files hold 'pred_masks'" if first is not None and "pred_masks" in npz_names(first) else None
 
-    def scenes(self, path: Path) -> Mapping[str, Path]:
-        return scene_files(path, (".npz",))
-
-    def read(self, path: Path, scene: str) -> ScenePrediction:
-        file = scene_file(scene_files(path, (".npz",)), path, scene)
-        where = shown(file)
-        arrays = read_npz(file, ("pred_masks", "pred_score", "pred_scores", "pred_classes"))
+    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
+        where = shown(place)
+        arrays = read_npz(place, ("pred_masks", "pred_score", "pred_scores", "pred_classes"))
         if "pred_masks" not in arrays:
             raise PredictionError(f"{where}: has no 'pred_masks'; expected an archive of MaskClustering or Mask3D")
         matrix = matrix_of(arrays["pred_masks"], where)
@@ -73,23 +69,18 @@ class MaskClustering:
             scores=None if scores is None else scores_of(scores, n_masks, where),
             class_numbers=None if classes is None else classes_of(classes, n_masks, where),
         )
-        return ScenePrediction(scene, self.name, file, masks, tuple(remarks))
+        return ScenePrediction(scene, self.name, place, masks, tuple(remarks))
 
 
-class Open3dis:
+class Open3dis(TorchFiles):
     name = "open3dis"
     summary = "Open3DIS's <scene>.pth: a dict of ins (run-length masks or a tensor), conf and final_class"
+    suffixes = (".pth",)
+    kinds = ("dict",)
+    content = "a dict"
 
-    def recognise(self, path: Path) -> str | None:
-        first = first_of_kind(path, ".pth", ("dict",))
-        return None if first is None else "its .pth files hold a dict"
-
-    def scenes(self, path: Path) -> Mapping[str, Path]:
-        return scene_files(path, (".pth",))
-
-    def read(self, path: Path, scene: str) -> ScenePrediction:
-        file = scene_file(scene_files(path, (".pth",)), path, scene)
-        where, value = shown(file), read_torch(file)
+    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
+        where, value = shown(place), read_torch(place)
         if not isinstance(value, dict) or "ins" not in value:
             raise PredictionError(f"{where}: holds {kind_of(value)} without 'ins'; expected a dict of Open3DIS")
         scores, classes = value.get("conf"), value.get("final_class")
@@ -106,7 +97,7 @@ class Open3dis:
             class_numbers=None if classes is None else classes_of(classes, len(members), where),
             numbering="index",
         )
-        return ScenePrediction(scene, self.name, file, masks, tuple(remarks))
+        return ScenePrediction(scene, self.name, place, masks, tuple(remarks))
 
 
 def _instances(value: object, n_known: int | None, where: str) -> tuple[list[Int32Array], int | None]:
@@ -137,43 +128,33 @@ def _masks_in_columns(matrix: NDArray[Any], n_known: int | None, where: str) -> 
     return matrix.T if are_rows else matrix
 
 
-class OpenYolo3d:
+class OpenYolo3d(TorchFiles):
     name = "openyolo3d"
     summary = "Open-YOLO 3D's proposals <scene>.pt: a pair of masks (points, masks) and scores, without classes"
+    suffixes = (".pt",)
+    kinds = ("tuple",)
+    content = "a tuple"
 
-    def recognise(self, path: Path) -> str | None:
-        first = first_of_kind(path, ".pt", ("tuple",))
-        return None if first is None else "its .pt files hold a tuple"
-
-    def scenes(self, path: Path) -> Mapping[str, Path]:
-        return scene_files(path, (".pt",))
-
-    def read(self, path: Path, scene: str) -> ScenePrediction:
-        file = scene_file(scene_files(path, (".pt",)), path, scene)
-        where, value = shown(file), read_torch(file)
+    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
+        where, value = shown(place), read_torch(place)
         if not isinstance(value, tuple | list) or len(value) != 2:
             raise PredictionError(f"{where}: holds {kind_of(value)}; expected a pair of masks and scores")
         matrix = matrix_of(value[0], where)
         scores = scores_of(value[1], matrix.shape[1], where)
         masks = vertex_masks(where, column_members(matrix, where), len(matrix), scores=scores)
         remarks = ("proposals without classes", "Open-YOLO 3D's own evaluator puts 1 for every score")
-        return ScenePrediction(scene, self.name, file, masks, remarks)
+        return ScenePrediction(scene, self.name, place, masks, remarks)
 
 
-class OpenIns3d:
+class OpenIns3d(TorchFiles):
     name = "openins3d"
     summary = "OpenIns3D's masks <scene>.pt: a sparse tensor (points, masks), without scores and classes"
+    suffixes = (".pt",)
+    kinds = ("sparse",)
+    content = "a sparse tensor"
 
-    def recognise(self, path: Path) -> str | None:
-        first = first_of_kind(path, ".pt", ("sparse",))
-        return None if first is None else "its .pt files hold a sparse tensor"
-
-    def scenes(self, path: Path) -> Mapping[str, Path]:
-        return scene_files(path, (".pt",))
-
-    def read(self, path: Path, scene: str) -> ScenePrediction:
-        file = scene_file(scene_files(path, (".pt",)), path, scene)
-        where, value = shown(file), read_torch(file)
+    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
+        where, value = shown(place), read_torch(place)
         if not isinstance(value, SparseTensor) or len(value.shape) != 2:
             raise PredictionError(
                 f"{where}: holds {kind_of(value)}; expected a sparse tensor (points, masks), as OpenIns3D saves it"
@@ -182,7 +163,7 @@ class OpenIns3d:
             NO_SCORES,
             "masks without classes; OpenIns3D evaluates with classes and scores that it does not save",
         )
-        return ScenePrediction(scene, self.name, file, _sparse_masks(value, where), remarks)
+        return ScenePrediction(scene, self.name, place, _sparse_masks(value, where), remarks)
 
 
 def _sparse_masks(sparse: SparseTensor, where: str) -> VertexMasks:

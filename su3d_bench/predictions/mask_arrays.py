@@ -3,39 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import PredictionError, printable, shown
+from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Masks
 from su3d_bench.predictions.base import MOST_MASKS, MOST_MEMBERS, MOST_POINTS, Numbering, VertexMasks
 
 NO_SCORES = "the file has no scores: 1 for every mask"
 ROWS_AT_ONCE = 1 << 16
-
-
-def scene_files(path: Path, suffixes: Sequence[str]) -> dict[str, Path]:
-    """The files with one of ``suffixes`` in a folder by their names without it, in alphabetical order; or one file."""
-    try:
-        files = [path] if path.is_file() else sorted(file for file in path.iterdir() if file.is_file())
-    except OSError as error:
-        raise PredictionError(f"{shown(path)}: cannot be read: {error.strerror or error}") from error
-    found = {}
-    for file in files:
-        suffix = next((one for one in suffixes if file.name.endswith(one) and file.name != one), None)
-        if suffix is not None and not file.name.startswith("."):
-            found[file.name.removesuffix(suffix)] = file
-    return found
-
-
-def scene_file(scenes: dict[str, Path], path: Path, scene: str) -> Path:
-    """The file of ``scene``."""
-    if scene not in scenes:
-        raise PredictionError(f"{shown(path)}: has no prediction of scene '{printable(scene, 80)}'")
-    return scenes[scene]
 
 
 def vertex_masks(

@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.formats.numpy_files import npy_header_of, npz_names, read_npz
-from su3d_bench.predictions.base import ScenePrediction
-from su3d_bench.predictions.mask_arrays import kind_of, scene_file
+from su3d_bench.predictions.base import Reader, ScenePrediction
+from su3d_bench.predictions.mask_arrays import kind_of
 from su3d_bench.store.predictions import features_beside, prediction_from_arrays
 
 FILE = "prediction.npz"
 FLOATS = ("f2", "f4", "f8")
 
 
-class OwnRuns:
+class OwnRuns(Reader):
     name = "su3d-bench"
     summary = "our own prediction.npz, or a run folder with those of one method"
 
@@ -37,17 +37,16 @@ class OwnRuns:
     def scenes(self, path: Path) -> Mapping[str, Path]:
         return _files(path)
 
-    def read(self, path: Path, scene: str) -> ScenePrediction:
-        file = scene_file(_files(path), path, scene)
-        arrays = read_npz(file)
+    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
+        where, arrays = shown(place), read_npz(place)
         if str(arrays.get("kind")) == DenseFeatures.__name__ and "features" not in arrays:
-            arrays["features"] = _mapped_features(features_beside(file))
+            arrays["features"] = _mapped_features(features_beside(place))
         try:
-            content = prediction_from_arrays(arrays, shown(file))
+            content = prediction_from_arrays(arrays, where)
         except PredictionError as error:
-            raise PredictionError(f"{shown(file)}: {str(error).removeprefix(f'{shown(file)}: ')}") from error
-        _check_points(shown(file), content)
-        return ScenePrediction(scene, self.name, file, content)
+            raise PredictionError(f"{where}: {str(error).removeprefix(f'{where}: ')}") from error
+        _check_points(where, content)
+        return ScenePrediction(scene, self.name, place, content)
 
 
 def _mapped_features(file: Path) -> NDArray[Any]:

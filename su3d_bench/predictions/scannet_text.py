@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import math
 import os
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,10 +12,11 @@ import numpy as np
 
 from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.types import Int32Array
+from su3d_bench.formats.reading import reading
 from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file
-from su3d_bench.predictions.base import ScenePrediction, VertexLabels
-from su3d_bench.predictions.mask_arrays import run_members, scene_file, scene_files, vertex_masks
+from su3d_bench.predictions.base import SceneFiles, ScenePrediction, VertexLabels
+from su3d_bench.predictions.mask_arrays import run_members, vertex_masks
 
 OWN_OUTPUT = "semantic_instance_evaluation"  # the original evaluator's own answer, which it leaves out
 MASK3D_FOLDER = "decoder_-1"  # Mask3D and Segment3D write the lists of the last decoder here
@@ -34,14 +34,37 @@ class Line:
     score: float
 
 
-class ScannetText:
+class TextFiles(SceneFiles):
+    """A format of ScanNet's: one text a scene."""
+
+    suffixes = (".txt",)
+
+    def scenes(self, path: Path) -> dict[str, Path]:
+        files = super().scenes(path)
+        files.pop(OWN_OUTPUT, None)
+        return files
+
+    def first_lines(self, path: Path) -> list[str]:
+        """The first line of some files, empty for empty ones."""
+        lines = []
+        files = self.scenes(path).values() if path.is_dir() or path.suffix == ".txt" else ()
+        for file in list(files)[:MOST_LOOKED_AT]:
+            try:
+                with file.open("rb") as stream:
+                    lines.append(stream.readline(MOST_FIRST_LINE).decode("utf-8", "replace").rstrip("\r\n"))
+            except OSError:
+                continue
+        return lines
+
+
+class ScannetText(TextFiles):
     name = "scannet-text"
     summary = (
         "ScanNet's submission: <scene>.txt with lines 'mask file, class id, confidence' (Mask3D, Segment3D, ScanNet++)"
     )
 
     def recognise(self, path: Path) -> str | None:
-        lines = _first_lines(self.scenes(path)) if _has_texts(path) else []
+        lines = self.first_lines(path)
         if not lines:
             return None
         words = next((line.split(" ") for line in lines if line), None)
@@ -50,58 +73,53 @@ class ScannetText:
         is_list = len(words) == 3 and _number(words[1]) is not None and _number(words[2]) is not None
         return "its .txt files list a mask file, a class and a confidence a line" if is_list else None
 
-    def scenes(self, path: Path) -> Mapping[str, Path]:
-        return _text_files(path / MASK3D_FOLDER if (path / MASK3D_FOLDER).is_dir() else path)
+    def scenes(self, path: Path) -> dict[str, Path]:
+        return super().scenes(path / MASK3D_FOLDER if (path / MASK3D_FOLDER).is_dir() else path)
 
-    def read(self, path: Path, scene: str) -> ScenePrediction:
-        file = scene_file(dict(self.scenes(path)), path, scene)
-        lines = read_list(file)
+    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
+        where, lines = shown(place), read_list(place)
         pairs = last_line_of_each_mask_file([line.file for line in lines])
         members, n_points = [], None
         for first, _ in pairs:
-            n, indices = _read_mask(file.parent, lines[first], shown(file))
+            n, indices = _read_mask(place.parent, lines[first], where)
             if n_points not in {None, n}:
                 raise PredictionError(
-                    f"{shown(file)}:{lines[first].number}: mask '{printable(lines[first].file, 120)}' is of {n} points "
+                    f"{where}:{lines[first].number}: mask '{printable(lines[first].file, 120)}' is of {n} points "
                     f"and '{printable(lines[0].file, 120)}' of {n_points}; all must have the points of the scene"
                 )
             n_points = n
             members.append(indices)
         masks = vertex_masks(
-            shown(file),
+            where,
             members,
             n_points,
             scores=np.array([lines[last].score for _, last in pairs], np.float64),
             class_numbers=np.array([lines[last].label for _, last in pairs], np.int32),
             keys=[printable(lines[first].file, 200) for first, _ in pairs],
         )
-        return ScenePrediction(scene, self.name, file, masks, _remarks(lines, len(pairs)))
+        return ScenePrediction(scene, self.name, place, masks, _remarks(lines, len(pairs)))
 
 
-class ScannetSemanticText:
+class ScannetSemanticText(TextFiles):
     name = "scannet-semantic-text"
     summary = "ScanNet's semantic submission: <scene>.txt with one class id a line, one line a point"
 
     def recognise(self, path: Path) -> str | None:
-        lines = _first_lines(_text_files(path)) if _has_texts(path) else []
-        words = next((line.split() for line in lines if line), [])
+        words = next((line.split() for line in self.first_lines(path) if line), [])
         is_label = len(words) == 1 and words[0].removeprefix("-").isdigit()
         return "its .txt files hold one integer a line" if is_label else None
 
-    def scenes(self, path: Path) -> Mapping[str, Path]:
-        return _text_files(path)
-
-    def read(self, path: Path, scene: str) -> ScenePrediction:
-        file = scene_file(_text_files(path), path, scene)
-        values = integer_lines(_content(file, shown(file)), shown(file))
+    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
+        where = shown(place)
+        values = integer_lines(_content(place, where), where)
         if not len(values):
-            raise PredictionError(f"{shown(file)}: is empty; expected one class id a line, one line a point")
+            raise PredictionError(f"{where}: is empty; expected one class id a line, one line a point")
         limits = np.iinfo(np.int32)
         is_wrong = (values < limits.min) | (values > limits.max)
         if is_wrong.any():
             line = int(np.argmax(is_wrong))
-            raise PredictionError(f"{shown(file)}:{line + 1}: {int(values[line])} is no class id")
-        return ScenePrediction(scene, self.name, file, VertexLabels(values.astype(np.int32)))
+            raise PredictionError(f"{where}:{line + 1}: {int(values[line])} is no class id")
+        return ScenePrediction(scene, self.name, place, VertexLabels(values.astype(np.int32)))
 
 
 def read_list(file: Path) -> list[Line]:
@@ -182,30 +200,6 @@ def _number(word: str) -> float | None:
     return value if math.isfinite(value) else None
 
 
-def _has_texts(path: Path) -> bool:
-    return path.is_dir() or path.suffix == ".txt"
-
-
-def _text_files(path: Path) -> dict[str, Path]:
-    files = scene_files(path, (".txt",))
-    files.pop(OWN_OUTPUT, None)
-    return files
-
-
-def _first_lines(files: Mapping[str, Path]) -> list[str]:
-    """The first line of some files, empty for empty ones."""
-    lines = []
-    for file in list(files.values())[:MOST_LOOKED_AT]:
-        try:
-            with file.open("rb") as stream:
-                lines.append(stream.readline(MOST_FIRST_LINE).decode("utf-8", "replace").rstrip("\r\n"))
-        except OSError:
-            continue
-    return lines
-
-
 def _content(file: Path, where: str) -> bytes:
-    try:
+    with reading(where):
         return file.read_bytes()
-    except OSError as error:
-        raise PredictionError(f"{where}: cannot be read: {error.strerror or error}") from error

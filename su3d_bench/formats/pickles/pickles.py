@@ -12,6 +12,7 @@ from typing import BinaryIO, cast
 from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.formats.pickles.pickle_constructors import CONSTRUCTORS, Constructors, Forgotten, Inert, RefusedError
 from su3d_bench.formats.pickles.pickle_machine import PickleMachine
+from su3d_bench.formats.reading import reading
 
 __all__ = ["Forgotten", "Inert", "read_pickle", "read_pickle_file"]
 
@@ -27,18 +28,15 @@ def read_pickle_file(path: Path, *, forget: Iterable[str] = ()) -> object:
     become ``Inert``. Raises ``PredictionError`` for whatever is damaged or not plain data.
     """
     where = printable(str(path), 300)
-    try:
-        with path.open("rb") as stream:
-            is_gzip = stream.read(2) == GZIP_START
-            n_bytes = stream.seek(0, io.SEEK_END)
-            stream.seek(0)
-            if not is_gzip:
-                return read_pickle(stream, n_bytes, where, forget=forget)
-            with gzip.open(stream, "rb") as inflated:
-                buffered = io.BufferedReader(cast(io.RawIOBase, inflated), INFLATED_A_READ)
-                return read_pickle(buffered, MOST_INFLATED, where, forget=forget)
-    except OSError as error:
-        raise PredictionError(f"{where}: cannot be read: {error.strerror or error}") from error
+    with reading(where), path.open("rb") as stream:
+        is_gzip = stream.read(2) == GZIP_START
+        n_bytes = stream.seek(0, io.SEEK_END)
+        stream.seek(0)
+        if not is_gzip:
+            return read_pickle(stream, n_bytes, where, forget=forget)
+        with gzip.open(stream, "rb") as inflated:
+            buffered = io.BufferedReader(cast(io.RawIOBase, inflated), INFLATED_A_READ)
+            return read_pickle(buffered, MOST_INFLATED, where, forget=forget)
 
 
 def read_pickle(
