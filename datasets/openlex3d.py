@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,7 +18,8 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing, printable
 from su3d_bench.core.types import Float32Array, Int64Array
-from su3d_bench.datasets.replica.mesh_truth import MESH_NAME, AnnotatedMesh
+from su3d_bench.datasets.replica.folders import find_original_scene, original_name
+from su3d_bench.datasets.replica.mesh_truth import MESH_NAME, AnnotatedMesh, read_annotated_mesh
 from su3d_bench.formats.pcd import read_pcd_points
 from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels, OpenLexTruth
@@ -32,6 +34,9 @@ MOST_ID = 2**31 - 1
 
 Level = Literal["l0", "l1", "all"]
 LEVELS: tuple[Level, ...] = ("l0", "l1", "all")  # synonyms, what depicts them, both
+DATASET = "replica"  # of those that OpenLex3D labels, the one whose mesh can be read here
+QUERY_LEVEL: Level = "l0"  # the level that the release evaluates unless another is asked for
+VISIBLE, FACE_CORNERS = "openlex3d-visible", "openlex3d-face-corners"
 
 
 def queries_name(level: Level) -> str:
@@ -122,7 +127,7 @@ def categories_truth(files: OpenLexFiles, corners: Corners) -> OpenLexTruth:
         np.append(corners.object_of_point, -1)[found],
         files.objects(),
         files.prompts(),
-        "openlex3d-visible",
+        VISIBLE,
         f"{VISIBLE_NAME}, {CATEGORIES_NAME} and {PROMPTS_NAME} of OpenLex3D, objects from {corners.source}",
     )
 
@@ -133,9 +138,47 @@ def queries_truth(files: OpenLexFiles, corners: Corners, level: Level) -> QueryT
         corners.points,
         corners.object_of_point,
         files.queries(level),
-        "openlex3d-face-corners",
+        FACE_CORNERS,
         f"{queries_name(level)} of OpenLex3D, objects from {corners.source}",
     )
+
+
+@dataclass(frozen=True)
+class OpenLexRelease:
+    """The release below ``folder``, and the original release of Replica below ``data_root``."""
+
+    folder: Path
+    data_root: Path
+
+    @staticmethod
+    def is_at(folder: Path) -> bool:
+        """Whether a folder of ground truth is the release."""
+        return (folder / DATASET / PROMPTS_NAME).is_file()
+
+    def scenes(self) -> tuple[str, ...]:
+        """The scenes with labels, in alphabetical order."""
+        return tuple(sorted(path.parent.name for path in (self.folder / DATASET).glob(f"*/{CATEGORIES_NAME}")))
+
+    def truth(self, scene: str, variant: str) -> OpenLexTruth | QueryTruth:
+        """The truth of a scene; ``GroundTruthMissing`` where one of its files is not there."""
+        files = OpenLexFiles(self.folder, DATASET, scene)
+        corners = _corners(self.data_root, scene)
+        if variant == VISIBLE:
+            return categories_truth(files, corners)
+        return queries_truth(files, corners, QUERY_LEVEL)
+
+
+@lru_cache(maxsize=1)
+def _corners(data_root: Path, scene: str) -> Corners:
+    """The corners of a scene; the last ones are kept, because every protocol asks for them anew."""
+    where = f"{DATASET}/{scene}"
+    original = find_original_scene(data_root, scene)
+    if original is None:
+        raise GroundTruthMissing(
+            f"{where}: no mesh for OpenLex3D's objects; expected {original_name(scene)}/habitat of the original "
+            f"release in {data_root / 'replica_v1'}"
+        )
+    return replica_corners(read_annotated_mesh(original, where))
 
 
 def read_prompts(path: Path, where: str) -> tuple[str, ...]:

@@ -26,7 +26,7 @@ from su3d_bench.baselines.conceptgraphs.regions import LiftedRegion, kept_region
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import StageTimer
 from su3d_bench.core.types import Detections, Float32Array, Frame, Instances
-from su3d_bench.predictions.clouds import instances_of
+from su3d_bench.predictions.base import instances_of
 
 
 class ObjectMap:

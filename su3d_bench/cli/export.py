@@ -271,17 +271,18 @@ def _has_masks(rules: ProtocolRules) -> bool:
 def _encoder(content: Content, source: Source, rules: ProtocolRules, texts: Path | None) -> Encoder | None:
     """What names the features; None where the prediction has classes or no features."""
     from su3d_bench.cli.query import encoder_of
-    from su3d_bench.evaluation.scoring import n_feature_dimensions
+    from su3d_bench.evaluation.scoring import facts_of
     from su3d_bench.evaluation.texts import encoder_for, read_text_features
+    from su3d_bench.metrics.fitness import n_feature_dimensions
     from su3d_bench.store.run_folder import RunFolder
 
-    n_dimensions = n_feature_dimensions(rules, content)
+    n_dimensions = n_feature_dimensions(rules, facts_of(content))
     if n_dimensions is None:
         return None
     if source.run is not None and texts is None:
         return encoder_of(RunFolder(source.run))
-    given = None if texts is None else read_text_features(texts)
-    found = encoder_for(rules, n_dimensions, given, is_own=source.reader.name == "su3d-bench")
+    is_own = source.reader.name == "su3d-bench"
+    found = encoder_for(rules, n_dimensions, read_text_features(texts), is_own=is_own)
     if isinstance(found, str):
         raise PredictionError(f"{rules.name}: {found}")
     return found

@@ -7,7 +7,8 @@ in lower case, without a full stop.
 from __future__ import annotations
 
 import difflib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -108,3 +109,21 @@ def suggest(word: str, known: Iterable[str]) -> str:
     """A clause ``; did you mean 'x'?`` for the known word nearest to ``word``, or nothing when none is near."""
     near = difflib.get_close_matches(word, list(known), n=1, cutoff=0.6)
     return f"; did you mean '{near[0]}'?" if near else ""
+
+
+@contextmanager
+def reading(where: str, error_class: type[Su3dError] = PredictionError) -> Iterator[None]:
+    """Files and folders that are missing or closed to us, in the block, as an ``error_class``."""
+    try:
+        yield
+    except OSError as error:
+        raise error_class(f"{where}: cannot be read: {error.strerror or error}") from error
+
+
+@contextmanager
+def converted(known: type[Su3dError], wanted: type[Su3dError]) -> Iterator[None]:
+    """Errors of one class out of the block as errors of another, with the same text."""
+    try:
+        yield
+    except known as error:
+        raise wanted(str(error)) from error

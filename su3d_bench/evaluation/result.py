@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, cast
@@ -10,12 +9,11 @@ from typing import Any, cast
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.evaluation.checks import MaskFacts
-from su3d_bench.evaluation.scoring import SceneOutcome
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
+from su3d_bench.metrics.matching.checks import MaskFacts
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules
-from su3d_bench.metrics.results import ProtocolResult
+from su3d_bench.metrics.results import ProtocolResult, plain_json
 from su3d_bench.metrics.scoring import combine, combined_metrics, metric_of
 
 SCHEMA = 1
@@ -27,6 +25,17 @@ KEYS = {
 }  # fmt: skip
 OWN_NAMES = ("categories", *SHARE_KINDS)  # kinds all of whose metrics are reported
 MAIN = ("ap", "ap50", "ap25", "macc", "miou", "fmiou")
+
+
+@dataclass(frozen=True)
+class SceneOutcome:
+    """A scene under a protocol: its counts, those of the ceiling, those of every mask under every class, facts."""
+
+    score: SceneScore
+    ceiling: SceneScore | None = None
+    bound: InstanceCounts | None = None
+    facts: MaskFacts | None = None
+    warnings: tuple[str, ...] = ()
 
 
 @dataclass
@@ -114,7 +123,7 @@ class ProtocolEvaluation:
             "groups": {name: _renamed(values) for name, values in result.groups.items()},
             "per_class": {name: _renamed(values) for name, values in result.per_class.items()},
             "per_scene": {name: _renamed(values) for name, values in result.per_scene.items()},
-            "coverage": None if self.coverage is None else _plain(self.coverage),
+            "coverage": None if self.coverage is None else plain_json(self.coverage),
             "n_predictions": dict(result.n_predictions),
             "duplicates": {"near": near, "identical": identical},
             "confidences": None
@@ -149,25 +158,42 @@ class Evaluation:
         }
 
 
-def form_evaluation(
-    rules: Mapping[str, ProtocolRules],
-    outcomes: Mapping[str, SceneOutcomes],
-    unfit: Mapping[str, str],
-    formats: tuple[str, ...],
-    ground_truth: str,
-    remarks: Sequence[str],
-    *,
-    file_confidences: bool,
-) -> Evaluation:
-    """The evaluation of all scenes; a protocol for which no scene has a truth joins those that are not scored."""
-    not_scored = dict(unfit)
-    for name, kept in outcomes.items():
-        if not kept.scores:
-            not_scored[name] = next(iter(kept.unscored.values()), "no scene was scored")
-    formed = [_form(rules[name], kept, file_confidences) for name, kept in outcomes.items() if kept.scores]
-    if not formed:
-        raise PredictionError(f"nothing could be scored: {next(iter(not_scored.values()))}")
-    return Evaluation(tuple(formed), dict(sorted(not_scored.items())), formats, ground_truth, tuple(_once(remarks)))
+@dataclass
+class Tally:
+    """What the scenes gave so far under the protocols that are still in, and why others are out.
+
+    ``counts_file_confidences``: those of the files count where a protocol has 1 for every mask.
+    """
+
+    rules: dict[str, ProtocolRules] = field(default_factory=dict)
+    outcomes: dict[str, SceneOutcomes] = field(default_factory=dict)
+    unfit: dict[str, str] = field(default_factory=dict)
+    counts_file_confidences: bool = False
+
+    def enter(self, rules: ProtocolRules) -> None:
+        """Score under a protocol."""
+        self.rules[rules.name], self.outcomes[rules.name] = rules, SceneOutcomes()
+
+    def leave_out(self, name: str, reason: str) -> None:
+        """Score no longer under a protocol."""
+        self.rules.pop(name, None)
+        self.outcomes.pop(name, None)
+        self.unfit[name] = reason
+
+    def evaluation(self, formats: tuple[str, ...], ground_truth: str, remarks: Sequence[str]) -> Evaluation:
+        """The numbers of all scenes; a protocol for which no scene has a truth joins those that are not scored."""
+        not_scored = dict(self.unfit)
+        for name, kept in self.outcomes.items():
+            if not kept.scores:
+                not_scored[name] = next(iter(kept.unscored.values()), "no scene was scored")
+        formed = [
+            _form(self.rules[name], kept, self.counts_file_confidences)
+            for name, kept in self.outcomes.items()
+            if kept.scores
+        ]
+        if not formed:
+            raise PredictionError(f"nothing could be scored: {next(iter(not_scored.values()))}")
+        return Evaluation(tuple(formed), dict(sorted(not_scored.items())), formats, ground_truth, tuple(_once(remarks)))
 
 
 def _form(rules: ProtocolRules, kept: SceneOutcomes, file_confidences: bool) -> ProtocolEvaluation:
@@ -248,13 +274,5 @@ def _once(lines: Sequence[str]) -> list[str]:
 
 def _renamed(values: Mapping[str, Any]) -> dict[str, Any]:
     """Values under the names that the file has for them, without counts of classes."""
-    plain = {KEYS.get(name, name.lower().replace("-", "_")): _plain(one) for name, one in values.items()}
+    plain = {KEYS.get(name, name.lower().replace("-", "_")): plain_json(one) for name, one in values.items()}
     return {name: one for name, one in plain.items() if not name.startswith("n_") and "conceptgraphs" not in name}
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, Mapping):
-        return {key: _plain(item) for key, item in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value

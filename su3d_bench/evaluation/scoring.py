@@ -1,26 +1,39 @@
-"""One scene's prediction from elsewhere under one protocol: whether it fits, its counts, what stands beside them."""
+"""Scene after scene under the protocols of an evaluation: which may score it, its counts, what stands beside them."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
 
 import numpy as np
 
 from su3d_bench.core import registry
-from su3d_bench.core.errors import PredictionError
+from su3d_bench.core.errors import ConfigError, DataError, GroundTruthMissing, PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import (
     DenseFeatures,
-    Float32Array,
     Float64Array,
     GroundTruth,
     Instances,
     Int64Array,
     Masks,
+    Partition,
     Prediction,
 )
-from su3d_bench.evaluation.checks import (
-    MaskFacts,
+from su3d_bench.datasets.openlex3d import FACE_CORNERS, VISIBLE
+from su3d_bench.evaluation.request import Request
+from su3d_bench.evaluation.result import SceneOutcome, Tally
+from su3d_bench.evaluation.texts import encoder_for, read_text_features
+from su3d_bench.evaluation.truth import SceneTruths, VertexTruth
+from su3d_bench.metrics.fitness import ContentFacts, n_feature_dimensions, why_not_content, why_not_numbers
+from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance.score import (
+    OBJECT,
+    encode_without_classes,
+    masks_and_scores,
+    named_classes,
+)
+from su3d_bench.metrics.matching import nearest as transfer
+from su3d_bench.metrics.matching.checks import (
     check_cloud,
     class_warnings,
     duplicate_warnings,
@@ -28,184 +41,227 @@ from su3d_bench.evaluation.checks import (
     label_warnings,
     mask_facts,
 )
-from su3d_bench.evaluation.truth import MAX_NYU40_ID, TextTruth
-from su3d_bench.metrics.fitness import why_not_scorable
-from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.instance.score import OBJECT, encode_without_classes, masks_and_scores
-from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import (
-    candidate_classes,
     class_index_of_ids,
-    classes_of_prediction,
     encoder_warning,
-    has_every_label,
     scored_classes,
 )
-from su3d_bench.metrics.metric import SceneScore, present
-from su3d_bench.metrics.protocols import ProtocolRules
-from su3d_bench.metrics.scoring import score_scene
+from su3d_bench.metrics.metric import SceneScore
+from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
+from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
+from su3d_bench.metrics.protocols import ProtocolRules, load_protocol, protocol_names
+from su3d_bench.metrics.scoring import QuestionTruth, score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
-from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
+from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
+from su3d_bench.predictions.own_runs import OwnRuns
 
-NAMED_KINDS = ("annotation", "reasoning")  # go by names alone
-# Ground truths of ScanNet and whose class ids they hold.
-ID_LISTS = {"nyu40-vertices": "ids of NYU40 do", "scannet200-vertices": "ids of ScanNet200 do"}
-
-
-@dataclass(frozen=True)
-class SceneOutcome:
-    """A scene under a protocol: its counts, those of the ceiling, those of every mask under every class, facts."""
-
-    score: SceneScore
-    ceiling: SceneScore | None
-    bound: instance_ap.InstanceCounts | None
-    facts: MaskFacts | None
-    warnings: tuple[str, ...]
+NO_CEILING = (
+    "no ceiling is known: masks grow by the threshold, over their neighbours too, and each query's best mask has "
+    "confidence 1, so that perfect masks with perfect features need not reach 1"
+)
+NO_QUERY_CEILING = "no ceiling is known: how well perfect masks are ranked is up to the encoder"
+NOTHING = Instances.of(np.zeros((0, 3), np.float32), [], labels=())
 
 
-def why_not_content(rules: ProtocolRules, content: Content, *, has_points: bool) -> str | None:
-    """Why a prediction of this kind cannot be scored under the protocol; None where it can.
+class Scoring:
+    """Outcomes of scene after scene under the protocols that are named, or else that fit."""
 
-    ``has_points``: the points of the truth have coordinates.
+    def __init__(self, request: Request) -> None:
+        self.tally = Tally()
+        self._named = request.protocols
+        self._texts = read_text_features(request.text_features)
+        self._first: Content | None = None
+
+    def begin(self, truths: SceneTruths, *, counts_file_confidences: bool) -> None:
+        """Choose the protocols that may score these truths; named ones that cannot are an error."""
+        self._truths = truths
+        self.tally.counts_file_confidences = counts_file_confidences
+        for rules in map(load_protocol, dict.fromkeys(self._named or protocol_names())):
+            reason = truths.why_not(rules, is_named=bool(self._named))
+            if reason is None:
+                self.tally.enter(rules)
+            elif self._named:
+                raise ConfigError(f"protocol '{rules.name}' cannot score these predictions: {reason}")
+            else:
+                self.tally.leave_out(rules.name, reason)
+        if not self.tally.rules:
+            raise ConfigError(f"no protocol scores {truths.where}; see su3d-bench protocols")
+
+    def add(self, scene: str, prediction: ScenePrediction, where: str) -> None:
+        """Score one scene; at the first that is not empty, protocols that do not fit go out or, when named, raise."""
+        outcomes = {name: self._score(rules, scene, prediction) for name, rules in self.tally.rules.items()}
+        reasons = {name: reason for name, reason in outcomes.items() if reason is not None}
+        for name, reason in reasons.items():
+            if self._named or self._first is not None:
+                raise PredictionError(f"{where}: {name}: {reason}")
+            self.tally.leave_out(name, reason)
+        if not self.tally.rules:
+            first, *others = dict.fromkeys(reasons.values())
+            more = f" (and {len(others)} more reasons)" if others else ""
+            raise PredictionError(f"{where}: none of {len(reasons)} protocols can score it: {first}{more}")
+        if self._first is None and not _is_empty(prediction.content):
+            self._first = prediction.content
+
+    def add_missed(self, scenes: Sequence[str]) -> None:
+        """Scenes without a prediction: left out where the original leaves them out, otherwise counted as missed."""
+        nothing = nothing_like(self._first)
+        for rules in self.tally.rules.values():
+            kept = self.tally.outcomes[rules.name]
+            if skips_missing_scenes(rules):
+                kept.skipped += scenes
+                continue
+            for scene in scenes:
+                reason = self._score_content(rules, scene, nothing, None)
+                if reason is not None:
+                    raise DataError(f"{rules.name}: {reason}")
+                if scene not in kept.unscored:
+                    kept.missed.append(scene)
+
+    def _score(self, rules: ProtocolRules, scene: str, prediction: ScenePrediction) -> str | None:
+        """The reason why a scene cannot be scored under the protocol; None where it was."""
+        facts, has_points = facts_of(prediction.content), self._truths.has_points
+        reason = why_not_content(rules, facts, has_points=has_points)
+        if reason is None and has_points and not self._named and self._first is None:
+            reason = why_not_numbers(rules, facts)
+        if reason is not None:
+            return reason
+        encoder: Encoder | str | None = None
+        if (n_dimensions := n_feature_dimensions(rules, facts)) is not None:
+            encoder = encoder_for(rules, n_dimensions, self._texts, is_own=prediction.format == OwnRuns.name)
+        if isinstance(encoder, str):
+            return encoder
+        return self._score_content(rules, scene, prediction.content, encoder)
+
+    def _score_content(self, rules: ProtocolRules, scene: str, content: Content, encoder: Encoder | None) -> str | None:
+        kept = self.tally.outcomes[rules.name]
+        try:
+            truth = self._truths.of_scene(rules, scene)
+        except GroundTruthMissing as error:
+            if kept.scores or len(self._truths.scenes) > 1:
+                kept.unscored[scene] = str(error)
+                return None
+            return str(error)
+        changes = self.tally.counts_file_confidences and rules.kind == "instance" and rules.confidence == "ones"
+        used = rules.model_copy(update={"confidence": "prediction"}) if changes else rules
+        if isinstance(truth, VertexTruth):
+            if (reason := why_not_as_long(content, len(truth.values))) is not None:
+                raise PredictionError(f"{scene}: {reason}")
+            outcome = score_on_vertices(used, truth, scene, content, encoder)
+            kept.warnings += [line for line in truth.doubts if line not in kept.warnings]
+        elif isinstance(truth, GroundTruth):
+            if (reason := why_not_as_long(content, len(truth.points))) is not None:
+                return reason
+            outcome = score_on_truth(used, truth, scene, content, encoder)
+        else:
+            outcome = score_on_objects(used, truth, scene, content, encoder)
+        kept.has_coverage = self._truths.has_points
+        kept.add(scene, outcome)
+        return None
+
+
+def _is_empty(content: Content) -> bool:
+    return isinstance(content, VertexMasks | Instances) and not len(content)
+
+
+def skips_missing_scenes(rules: ProtocolRules) -> bool:
+    """Whether the original leaves scenes without a prediction out, so that their objects never count as missed.
+
+    evaluate_semantic_instance.py, evaluate_semantic_label.py and those made after them walk the prediction files.
     """
-    if rules.kind in ("queries", "categories"):
-        return f"needs ground truth of the form '{rules.ground_truth}', which neither a dataset nor such texts give"
-    if not isinstance(content, VertexMasks | VertexLabels):
-        if not has_points:
-            return "the prediction has points of its own, the ground truth has no coordinates; name a --dataset"
-        reason = why_not_scorable(rules, content)
-        return reason.removeprefix(f"{rules.name}: ") if reason else _why_no_labels(rules, content)
-    if isinstance(content, VertexLabels):
-        if rules.kind == "instance":
-            return "needs instances, the prediction has one class a point"
-        return (
-            None if has_points or rules.metric == "scannet" else "needs the coordinates of the points; name a --dataset"
-        )
-    if rules.kind == "semantic" and not has_points:
-        return "needs a class for every point, the prediction has masks; name a --dataset to make them a map"
-    if rules.class_agnostic is None and len(content):
-        if content.class_numbers is None and content.features is None:
-            return "needs classes, the masks have neither classes nor features"
-        if content.class_numbers is not None and content.numbering == "id" and not content.class_numbers.any():
-            return "needs classes, every mask has class 0"
-    return None
+    return rules.metric == "scannet" and rules.name in protocol_names() and "rooms" not in rules.name
 
 
-def why_not_numbers(rules: ProtocolRules, content: Content) -> str | None:
-    """Why the class ids of a prediction cannot be those of the protocol, where its label space has two lists of ids."""
-    if rules.class_agnostic is not None or rules.ground_truth not in ID_LISTS:
-        return None
-    ids: np.ndarray | None = None
+def facts_of(content: Content) -> ContentFacts:
+    """What the question asks whether a protocol may score ``content``."""
     if isinstance(content, VertexLabels):
-        ids = content.class_ids
-    elif isinstance(content, VertexMasks) and content.numbering == "id":
-        ids = content.class_numbers
-    if ids is None or not len(ids):
-        return None
-    found = "nyu40-vertices" if int(ids.max()) <= MAX_NYU40_ID else "scannet200-vertices"
-    return (
-        None
-        if found == rules.ground_truth
-        else f"the predicted classes go up to {int(ids.max())}, as {ID_LISTS[found]}"
+        return ContentFacts("vertex-labels", len(content.class_ids), class_ids=content.class_ids)
+    if not isinstance(content, VertexMasks):
+        return ContentFacts.of(content)
+    return ContentFacts(
+        "vertex-masks",
+        len(content),
+        n_dimensions=None if content.features is None else content.features.shape[1],
+        has_labels=content.class_numbers is not None,
+        class_ids=content.class_numbers if content.numbering == "id" else None,
     )
 
 
-def _why_no_labels(rules: ProtocolRules, content: Prediction) -> str | None:
-    lacks = isinstance(content, Instances) and len(content) and content.labels is None and content.features is None
-    return (
-        "needs classes, the instances have neither labels nor features" if lacks and not rules.class_agnostic else None
-    )
-
-
-def n_feature_dimensions(rules: ProtocolRules, content: Content) -> int | None:
-    """The dimensions of the features that must be named; None where labels are there or the protocol needs none."""
-    if rules.class_agnostic is not None or isinstance(content, VertexLabels) or rules.kind in NAMED_KINDS:
-        return None
-    if isinstance(content, VertexMasks):
-        has_labels = content.class_numbers is not None
-    else:
-        compares = (
-            rules.kind in ("queries", "retrieval") or rules.metric == "openlex3d-ranking"
-        )  # with texts, whatever the labels
-        has_labels = has_every_label(content) and not compares
-    features = content.features
-    return None if has_labels or features is None or not len(features) else int(features.shape[1])
-
-
-def check_length(scene: str, content: Content, n_points: int) -> None:
-    """``PredictionError`` where masks or labels are not over the points of the truth."""
+def why_not_as_long(content: Content, n_points: int) -> str | None:
+    """Why masks or labels are not over the points of the truth; None where they are, or bring their own."""
     n = None
     if isinstance(content, VertexMasks):
         n = content.n_points
     elif isinstance(content, VertexLabels):
         n = len(content.class_ids)
-    if n is not None and n != n_points:
-        what = "masks are" if isinstance(content, VertexMasks) else "labels are"
-        raise PredictionError(
-            f"{scene}: the {what} of {n} points, the ground truth has {n_points}; both must be over the vertices of "
-            "one mesh, in its order"
-        )
+    if n in {None, n_points}:
+        return None
+    what = "masks are" if isinstance(content, VertexMasks) else "labels are"
+    return (
+        f"the {what} of {n} points, the ground truth has {n_points}; both must be over the vertices of one mesh, in "
+        "its order"
+    )
 
 
 def nothing_like(content: Content | None) -> Content:
     """An empty prediction of the same kind, for a scene that was not predicted; masks where no kind is known."""
-    if isinstance(content, VertexLabels):
-        return VertexLabels(np.zeros(0, np.int32))
     none = np.zeros(0, np.int32)
+    if isinstance(content, VertexLabels):
+        return VertexLabels(none)
     return VertexMasks(np.zeros(1, np.int64), none, n_points=None, scores=np.zeros(0), class_numbers=none, keys=())
 
 
 def score_on_vertices(
-    rules: ProtocolRules, truth: TextTruth, scene: str, content: Content, encoder: Encoder | None
+    rules: ProtocolRules, truth: VertexTruth, scene: str, content: Content, encoder: Encoder | None
 ) -> SceneOutcome:
     """The outcome of masks or labels over points without coordinates: no neighbours, no coverage."""
-    labels = truth.labels(scene)
+    labels, values = truth.labels, truth.values
     if isinstance(content, VertexLabels):
         class_ids = content.class_ids if len(content.class_ids) else np.zeros(len(labels), np.int32)
-        ceiling = _semantic_score(rules, labels, labels)
-        told = label_warnings(scene, rules, content.class_ids.astype(np.int64))
-        return SceneOutcome(_semantic_score(rules, labels, class_ids), ceiling, None, None, tuple(told))
+        warnings = label_warnings(scene, rules, content.class_ids.astype(np.int64))
+        score, ceiling = (_semantic_score(rules, labels, called) for called in (class_ids, labels))
+        return SceneOutcome(score, ceiling, warnings=tuple(warnings))
     assert isinstance(content, VertexMasks)
-    values = truth.values[scene]
     if rules.class_agnostic is not None:
         is_scored = np.isin(labels, [entry.id for entry in rules.scored])
         values = encode_without_classes(rules.class_agnostic, values % instance_ap.INSTANCES_PER_CLASS, is_scored)
-    ids = _ids_of_masks(rules, content, labels, encoder)
+    ids, named = _ids_of_masks(rules, content, labels, encoder)
     facts = mask_facts(content, content.scores, len(values))
-    told = [
+    warnings = [
         *empty_warnings(scene, facts, content, content.keys),
         *duplicate_warnings(scene, facts, content.keys),
         *class_warnings(scene, rules, content.class_numbers, ids),
+        *named,
     ]
-    if (named := encoder_warning(rules, _instances(rules, content, np.zeros((0, 3), np.float32)), encoder)) is not None:
-        told.append(named)
     return SceneOutcome(
         _instance_score(rules, values, content, content.scores, ids),
-        _instance_ceiling(rules, truth, scene, values),
-        _bound(rules, values, content, content.scores),
+        _instance_ceiling(rules, truth, values),
+        None if rules.class_agnostic else _instance_counts(rules, values, content, content.scores, None),
         facts,
-        tuple(told),
+        tuple(warnings),
     )
 
 
 def _semantic_score(rules: ProtocolRules, labels: Int64Array, class_ids: np.ndarray) -> SceneScore:
-    is_scored = scored_classes(rules)
     true_class = class_index_of_ids(rules, labels)
-    counts = semantic.per_scene(true_class, class_index_of_ids(rules, class_ids), is_scored)
+    counts = semantic.per_scene(true_class, class_index_of_ids(rules, class_ids), scored_classes(rules))
     return _score(rules, counts, len(np.unique(class_ids)), int((true_class >= 0).sum()))
 
 
 def _instance_score(
     rules: ProtocolRules, values: Int64Array, masks: Masks, scores: Float64Array, ids: Int64Array
 ) -> SceneScore:
+    n_scored = int(np.isin(values // instance_ap.INSTANCES_PER_CLASS, _class_ids(rules)).sum())
+    return _score(rules, _instance_counts(rules, values, masks, scores, ids), len(masks), n_scored)
+
+
+def _instance_counts(
+    rules: ProtocolRules, values: Int64Array, masks: Masks, scores: Float64Array, ids: Int64Array | None
+) -> instance_ap.InstanceCounts:
+    """The counts of masks with class ids (K,), or without any of each mask under every class."""
     assert rules.min_region_size is not None
-    scores = np.ones(len(masks)) if rules.confidence == "ones" else scores
-    class_ids = _class_ids(rules)
-    counts = instance_ap.per_scene(
-        values, masks.indptr, masks.indices, ids, scores, class_ids, rules.min_region_size, rules.thresholds
-    )
-    n_scored = int(np.isin(values // instance_ap.INSTANCES_PER_CLASS, class_ids).sum())
-    return _score(rules, counts, len(masks), n_scored)
+    used = np.ones(len(masks)) if rules.confidence == "ones" else scores
+    size, thresholds = rules.min_region_size, rules.thresholds
+    return instance_ap.per_scene(values, masks.indptr, masks.indices, ids, used, _class_ids(rules), size, thresholds)
 
 
 def _score(
@@ -222,133 +278,57 @@ def _class_ids(rules: ProtocolRules) -> list[int]:
     return [OBJECT] if rules.class_agnostic is not None else [entry.id for entry in rules.scored]
 
 
-def _ids_of_masks(rules: ProtocolRules, masks: VertexMasks, labels: Int64Array, encoder: Encoder | None) -> Int64Array:
-    """The class id of each mask, 0 where it has none of the protocol's."""
-    if rules.class_agnostic is not None:
-        return np.full(len(masks), OBJECT, np.int64)
+def _ids_of_masks(
+    rules: ProtocolRules, masks: VertexMasks, labels: Int64Array, encoder: Encoder | None
+) -> tuple[Int64Array, list[str]]:
+    """The class id of each mask, 0 where it has none of the protocol's; and what a reader must know of the names."""
+    if rules.class_agnostic is not None or not len(masks):
+        return np.full(len(masks), OBJECT, np.int64), []
     if masks.class_numbers is not None:
-        return _ids_of_numbers(rules, masks)
-    is_present = present(class_index_of_ids(rules, labels), len(rules.classes)) & scored_classes(rules)
-    instances = _instances(rules, masks, np.zeros((0, 3), np.float32))
-    classes = classes_of_prediction(rules, instances, encoder, candidate_classes(rules, is_present))
-    ids = np.array([entry.id for entry in rules.classes], np.int64)
-    return np.where(classes >= 0, ids[classes], 0) if len(classes) else np.zeros(0, np.int64)
+        return masks.class_ids(rules), []
+    assert masks.features is not None  # the protocol would not score masks without classes and features
+    rows = Partition(NOTHING.points, np.zeros(0, np.int32), masks.features)
+    warning = encoder_warning(rules, rows, encoder)
+    return named_classes(rules, labels, rows, encoder), [] if warning is None else [warning]
 
 
-def _ids_of_numbers(rules: ProtocolRules, masks: VertexMasks) -> Int64Array:
-    """Class ids from what the file has: ids already, or places in the list of the classes that are scored."""
-    assert masks.class_numbers is not None
-    numbers = masks.class_numbers.astype(np.int64)
-    if masks.numbering == "id":
-        return numbers
-    ids = np.array([entry.id for entry in rules.scored], np.int64)
-    is_known = (numbers >= 0) & (numbers < len(ids))
-    return np.where(is_known, ids[np.where(is_known, numbers, 0)], 0)
-
-
-def _instance_ceiling(rules: ProtocolRules, truth: TextTruth, scene: str, values: Int64Array) -> SceneScore:
+def _instance_ceiling(rules: ProtocolRules, truth: VertexTruth, values: Int64Array) -> SceneScore:
     """What the annotated objects themselves score."""
-    own = truth.values[scene]
-    n_of_value = np.bincount(own, minlength=1)
-    distinct = np.flatnonzero(n_of_value[instance_ap.INSTANCES_PER_CLASS :]) + instance_ap.INSTANCES_PER_CLASS
-    row_of_value = np.full(len(n_of_value), -1, np.int64)
-    row_of_value[distinct] = np.arange(len(distinct))
-    masks = transfer.masks_of_partition(row_of_value[own], len(distinct))
-    labels = distinct // instance_ap.INSTANCES_PER_CLASS
-    ids = np.full(len(distinct), OBJECT) if rules.class_agnostic is not None else labels
-    return _instance_score(rules, values, masks, np.ones(len(distinct)), ids.astype(np.int64))
-
-
-def _bound(
-    rules: ProtocolRules, values: Int64Array, masks: Masks, scores: np.ndarray
-) -> instance_ap.InstanceCounts | None:
-    if rules.class_agnostic is not None:
-        return None
-    assert rules.min_region_size is not None
-    used = np.ones(len(masks)) if rules.confidence == "ones" else scores
-    return instance_ap.per_scene(
-        values,
-        masks.indptr,
-        masks.indices,
-        None,
-        used,
-        _class_ids(rules),
-        rules.min_region_size,
-        rules.thresholds,
-    )
-
-
-def _instances(rules: ProtocolRules, masks: VertexMasks, points: Float32Array) -> Instances:
-    """Masks over the truth's points as a map on these points."""
-    k = len(masks)
-    labels = None
-    if masks.class_numbers is not None:
-        name_of = {entry.id: entry.name for entry in rules.classes}
-        ids = _ids_of_numbers(rules, masks)
-        labels = tuple(name_of.get(int(one), f"class {one}") for one in ids)
-    elif not k:
-        labels = ()
-    shown = masks if len(points) else Masks.of_sets([masks.indices[:0]] * k)
-    return Instances.of(points, shown, masks.scores, masks.features, labels=labels, names=masks.keys)
-
-
-def _map_of_labels(rules: ProtocolRules, content: VertexLabels, points: Float32Array) -> Instances:
-    """One mask a predicted class over the truth's points."""
-    distinct, row = np.unique(content.class_ids, return_inverse=True)
-    masks = transfer.masks_of_partition(row, len(distinct))
-    keys = tuple(f"class {one}" for one in distinct)
-    of_classes = VertexMasks(
-        masks.indptr,
-        masks.indices,
-        n_points=len(content.class_ids),
-        scores=np.ones(len(distinct)),
-        class_numbers=distinct.astype(np.int32),
-        keys=keys,
-    )
-    return _instances(rules, of_classes, points)
+    distinct, row = np.unique(truth.values, return_inverse=True)
+    is_object = distinct >= instance_ap.INSTANCES_PER_CLASS
+    n_void = int((~is_object).sum())
+    masks = transfer.masks_of_partition(row - n_void, len(distinct) - n_void)
+    labels = distinct[is_object] // instance_ap.INSTANCES_PER_CLASS
+    ids = np.full(len(labels), OBJECT, np.int64) if rules.class_agnostic is not None else labels
+    return _instance_score(rules, values, masks, np.ones(len(masks)), ids)
 
 
 def score_on_truth(
     rules: ProtocolRules, truth: GroundTruth, scene: str, content: Content, encoder: Encoder | None
 ) -> SceneOutcome:
     """The outcome against the truth of a dataset; what has no points of its own stands on those of the truth."""
-    told: list[str] = []
+    prediction: Prediction
     if isinstance(content, VertexMasks):
-        prediction: Prediction = _instances(rules, content, truth.points)
-        if content.class_numbers is not None:
-            told += class_warnings(scene, rules, content.class_numbers, _ids_of_numbers(rules, content))
+        prediction = content.on(truth.points, rules)
+        warnings = class_warnings(scene, rules, content.class_numbers, content.class_ids(rules))
     elif isinstance(content, VertexLabels):
-        prediction = _map_of_labels(rules, content, truth.points)
-        told += label_warnings(scene, rules, content.class_ids.astype(np.int64))
+        prediction = content.masks().on(truth.points, rules)
+        warnings = label_warnings(scene, rules, content.class_ids.astype(np.int64))
     else:
-        prediction = content
-        told += check_cloud(scene, prediction.points, truth.points)
-    facts = None
-    masks, scores = _masks_and_scores(prediction)
-    if masks is not None and not isinstance(content, VertexLabels):
-        facts = mask_facts(masks, scores, len(prediction.points))
-        told += empty_warnings(scene, facts, masks, getattr(prediction, "names", ()))
-    return SceneOutcome(
-        score_scene(rules, truth, prediction, encoder),
-        _oracle_score(rules, truth),
-        None if masks is None else _bound_on_truth(rules, truth, prediction, masks, scores),
-        facts,
-        tuple(told),
-    )
-
-
-def _masks_and_scores(prediction: Prediction) -> tuple[Masks | None, np.ndarray]:
-    return (None, np.zeros(0)) if isinstance(prediction, DenseFeatures) else masks_and_scores(prediction)
-
-
-def _bound_on_truth(
-    rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, masks: Masks, scores: np.ndarray
-) -> instance_ap.InstanceCounts | None:
-    if rules.kind != "instance" or rules.class_agnostic is not None:
-        return None
-    cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
-    moved = transfer.transfer_masks(prediction.points, masks, truth.points, cap_m, voxel_m)
-    return _bound(rules, instance_ap.encode_ground_truth(truth.semantic, truth.instance), moved, scores)
+        prediction, warnings = content, check_cloud(scene, content.points, truth.points)
+    facts = bound = None
+    if not isinstance(prediction, DenseFeatures):
+        masks, scores = masks_and_scores(prediction)
+        if not isinstance(content, VertexLabels):
+            facts = mask_facts(masks, scores, len(prediction.points))
+            warnings += empty_warnings(scene, facts, masks, getattr(prediction, "names", ()))
+        if rules.kind == "instance" and rules.class_agnostic is None:
+            cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
+            moved = transfer.transfer_masks(prediction.points, masks, truth.points, cap_m, voxel_m)
+            values = instance_ap.encode_ground_truth(truth.semantic, truth.instance)
+            bound = _instance_counts(rules, values, moved, scores, None)
+    score = score_scene(rules, truth, prediction, encoder)
+    return SceneOutcome(score, _oracle_score(rules, truth), bound, facts, tuple(warnings))
 
 
 def _oracle_score(rules: ProtocolRules, truth: GroundTruth) -> SceneScore | None:
@@ -359,3 +339,26 @@ def _oracle_score(rules: ProtocolRules, truth: GroundTruth) -> SceneScore | None
     oracle = method_class(method_class.Config())
     oracle.receive_truth(truth)
     return score_scene(rules, truth, oracle.finish(), None)
+
+
+def score_on_objects(
+    rules: ProtocolRules,
+    truth: OpenLexTruth | QueryTruth | QuestionTruth,
+    scene: str,
+    content: Content,
+    encoder: Encoder | None,
+) -> SceneOutcome:
+    """The outcome against objects with labels, queries or questions; an empty map where ``content`` has no points.
+
+    Labels n' are those of the vote, for a file beside a run's map is not part of a prediction.
+    """
+    prediction: Prediction = NOTHING if isinstance(content, VertexMasks | VertexLabels) else content
+    base = truth.scene if isinstance(truth, QuestionTruth) else truth
+    warnings = check_cloud(scene, prediction.points, base.points)
+    facts = None
+    if isinstance(prediction, Instances):
+        facts = mask_facts(prediction, np.asarray(prediction.scores, np.float64), len(prediction.points))
+        warnings += empty_warnings(scene, facts, prediction, prediction.names)
+    if rules.kind == "queries":
+        warnings.append(NO_CEILING if base.variant in (VISIBLE, FACE_CORNERS) else NO_QUERY_CEILING)
+    return SceneOutcome(score_scene(rules, truth, prediction, encoder), facts=facts, warnings=tuple(warnings))

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.digests import digest_file
-from su3d_bench.core.errors import DataError, PredictionError, printable, shown
+from su3d_bench.core.errors import DataError, PredictionError, converted, printable, shown
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.formats.numpy_files import read_npz
@@ -37,11 +37,8 @@ class TextFeatures:
         """The classes of the protocol among which a classifier may choose and that have no feature here."""
         known = set(self.names)
         candidates = rules.classes if rules.vocabulary == "all" else rules.scored
-        return [one.name for one in candidates if one.name not in known and not known.issuperset(_prompts(rules, one))]
-
-
-def _prompts(rules: ProtocolRules, entry: object) -> tuple[str, ...]:
-    return rules.texts_of(str(getattr(entry, "name", entry)))
+        names = [entry.name for entry in candidates]
+        return [name for name in names if name not in known and not known.issuperset(rules.texts_of(name))]
 
 
 class GivenTexts:
@@ -69,13 +66,13 @@ class GivenTexts:
         return features
 
 
-def read_text_features(path: Path) -> TextFeatures:
+def read_text_features(path: Path | None) -> TextFeatures | None:
     """The arrays ``names`` (C,) and ``features`` (C, D) of a .npz file, and ``encoder``, a text, where it is there."""
+    if path is None:
+        return None
     where = shown(path)
-    try:
+    with converted(PredictionError, DataError):
         arrays = read_npz(path, ("names", "features", "encoder"))
-    except PredictionError as error:
-        raise DataError(str(error)) from error
     names, features = arrays.get("names"), arrays.get("features")
     if names is None or features is None:
         raise DataError(f"{where}: has no 'names' and 'features'; expected both, one row of features a name")

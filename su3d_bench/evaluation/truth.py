@@ -1,62 +1,301 @@
-"""Ground truth for predictions made elsewhere: a dataset's, or text files in the layout of ScanNet's benchmark."""
+"""The ground truth of an evaluation: a dataset's, text files in the layout of ScanNet's benchmark, or OpenLex3D's.
+
+Each kind opens its scenes, finds the prediction of each, and says which protocols are meant for it.
+"""
 
 from __future__ import annotations
 
+import fnmatch
 import re
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from functools import cached_property
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from su3d_bench.core import registry
-from su3d_bench.core.errors import DataError, PredictionError, printable, shown, suggest
-from su3d_bench.core.types import Int64Array
-from su3d_bench.formats.reading import reading
+from su3d_bench.core.errors import (
+    ConfigError,
+    DataError,
+    GroundTruthMissing,
+    PredictionError,
+    converted,
+    printable,
+    reading,
+    shown,
+    suggest,
+)
+from su3d_bench.core.types import GroundTruth, Int64Array
+from su3d_bench.datasets.openlex3d import FACE_CORNERS, VISIBLE, OpenLexRelease
+from su3d_bench.evaluation.request import Request
+from su3d_bench.formats.arrays import MOST_POINTS
 from su3d_bench.formats.text_integers import integer_lines
+from su3d_bench.metrics.fitness import LARGEST_NYU40_ID, TruthFacts, why_not_truth
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
-from su3d_bench.metrics.protocols import ProtocolRules
-from su3d_bench.predictions.base import MOST_POINTS, scene_files
+from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
+from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules
+from su3d_bench.metrics.scoring import Truth
+from su3d_bench.predictions.base import scene_files
+from su3d_bench.predictions.scenes import Match, Source, match_scenes, planned_scenes
+from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
+from su3d_bench.questions.files.queries import query_truth, read_query_file
+from su3d_bench.questions.truths import question_truth
 from su3d_bench.runs.plan import data_root
 
+NOT_MEANT = "is not meant for"
 LARGEST_LABEL = 1357  # of scannetv2-labels.combined.tsv; values above it are label * 1000 + instance
-MAX_NYU40_ID = 40
 LARGEST_VALUE = 10_000 * INSTANCES_PER_CLASS  # as the instance metric has it
 # Scenes by whose names alone text files are known; the built-in rooms share names with Replica.
 SCENE_NAMES = {"scannet": re.compile(r"scene\d{4}_\d\d"), "replica": re.compile(r"(room_?[0-2]|office_?[0-4])")}
 
 
 @dataclass(frozen=True)
-class TextTruth:
-    """One value a point of each scene: a class id, or with ``has_instances`` class id * 1000 + instance."""
+class VertexTruth:
+    """The truth of a scene whose points have no coordinates: ``values`` (N,) class id * 1000 + instance, or class ids.
 
-    values: Mapping[str, Int64Array]
-    has_instances: bool
+    ``doubts``: what makes it doubtful that the labels are those of the protocol.
+    """
 
-    def labels(self, scene: str) -> Int64Array:
-        """Class id of each point, 0 for none."""
-        values = self.values[scene]
-        return values // INSTANCES_PER_CLASS if self.has_instances else values
+    values: Int64Array
+    labels: Int64Array
+    doubts: tuple[str, ...]
 
-    def with_scenes(self, files: Mapping[str, Path]) -> TextTruth:
-        """The truth with further scenes."""
-        return TextTruth({**self.values, **_read_all(files)}, self.has_instances)
 
-    @cached_property
-    def largest_label(self) -> int:
-        return max((int(self.labels(scene).max(initial=0)) for scene in self.values), default=0)
+class SceneTruths(ABC):
+    """The truth of every scene of an evaluation, and the prediction of each that has one.
+
+    ``where`` is what messages call it; ``has_points``: its points have coordinates.
+    """
+
+    has_points = True
+    where: str
+    dataset_name: str | None
+    scenes: tuple[str, ...]
+    matches: list[Match]
+    remarks: list[str]
+
+    def take_queries(self, path: Path) -> None:
+        """Score the texts in a file too, over the objects that they speak of."""
+        raise ConfigError("evaluate: --queries needs the objects of a dataset; name one with --dataset")
+
+    @abstractmethod
+    def why_not(self, rules: ProtocolRules, *, is_named: bool) -> str | None:
+        """Why no prediction can be scored under a protocol; None where one can."""
+
+    @abstractmethod
+    def of_scene(self, rules: ProtocolRules, scene: str) -> Truth | VertexTruth:
+        """What a protocol scores a scene against; ``GroundTruthMissing`` where there is none in its form."""
+
+
+def kind_of_truth(request: Request) -> Callable[[Request, Sequence[Source]], SceneTruths]:
+    """The kind of truth that is asked for, to be opened with the request and the predictions."""
+    return DatasetTruths if request.ground_truth is None else _folder_truths
+
+
+def _folder_truths(request: Request, sources: Sequence[Source]) -> SceneTruths:
+    assert request.ground_truth is not None
+    kind = OpenLexTruths if OpenLexRelease.is_at(request.ground_truth) else TextTruths
+    return kind(request, sources)
+
+
+# ---- datasets
+
+
+class DatasetTruths(SceneTruths):
+    """Truth with coordinates, read when it is asked for; that of one scene is kept."""
+
+    def __init__(self, request: Request, sources: Sequence[Source]) -> None:
+        self._dataset = open_dataset(request.dataset or _dataset_of(sources))
+        self.where = self.dataset_name = name = str(self._dataset.name)
+        known = list(self._dataset.scenes())
+        asked = choose_scenes(request.scenes, known, name) if _are_all(request.scenes, known) else []
+        matches, self.remarks = match_scenes(sources, known, name, name, asked)
+        matched = [match.scene for match in matches]
+        if request.scenes:
+            scenes = choose_scenes(request.scenes, list(dict.fromkeys([*known, *matched])), name)
+        elif all(_is_of_one_scene(source.path) for source in sources):
+            scenes = matched
+        else:
+            planned = planned_scenes(sources, name)
+            scenes = [*dict.fromkeys([*matched, *(known if planned is None else planned)])]
+        self.scenes = tuple(scenes)
+        self.matches = [match for match in matches if match.scene in scenes]
+        self._queries: Mapping[str, tuple[TextQuery, ...]] | None = None
+        self._kept: dict[tuple[str, str], GroundTruth] = {}
+
+    def take_queries(self, path: Path) -> None:
+        if not self._dataset.variants:
+            super().take_queries(path)
+        self._queries = read_query_file(path)
+
+    def why_not(self, rules: ProtocolRules, *, is_named: bool) -> str | None:
+        if rules.ground_truth == QUERY_OBJECTS:
+            return _why_no_queries(is_named=is_named) if self._queries is None else None
+        if not is_named and (self.dataset_name not in rules.datasets or not rules.by_default):
+            return f"{NOT_MEANT} {self.dataset_name} unless it is named"
+        return why_not_truth(rules, TruthFacts.of_dataset(self._dataset))
+
+    def of_scene(self, rules: ProtocolRules, scene: str) -> Truth:
+        if rules.ground_truth != QUERY_OBJECTS:
+            truth = self._truth(scene, rules.ground_truth)
+            return question_truth(rules, self._dataset, scene, truth) if rules.kind in SHARE_KINDS else truth
+        assert self._queries is not None
+        if scene not in self._queries:
+            raise GroundTruthMissing(f"{self.where}/{scene}: the file of queries has none of this scene")
+        truth = self._truth(scene, self._dataset.variants[0])
+        return query_truth(truth, self._queries[scene], f"{self.where}/{scene}")
+
+    def _truth(self, scene: str, variant: str) -> GroundTruth:
+        if (scene, variant) not in self._kept:
+            self._kept = {key: truth for key, truth in self._kept.items() if key[0] == scene}
+            self._kept[scene, variant] = self._dataset.ground_truth(scene, variant)
+        return self._kept[scene, variant]
+
+
+def _why_no_queries(*, is_named: bool) -> str:
+    return "needs --queries FILE" if is_named else f"{NOT_MEANT} scenes without queries"
+
+
+def _dataset_of(sources: Sequence[Source]) -> str:
+    """The dataset that the names of the predictions begin with."""
+    names = [name for source in sources for name in source.scenes]
+    of_names = {name.partition("/")[0] for name in names if "/" in name}
+    if len(of_names) == 1:
+        return of_names.pop()
+    hint = dataset_of_names(names)
+    what = f"--dataset {hint}" if hint else "--dataset NAME"
+    raise ConfigError(f"evaluate: against which ground truth? name one with {what} or --ground-truth DIR")
+
+
+def open_dataset(name: str) -> Any:
+    """The dataset called ``name`` with its default settings, below the data root."""
+    dataset_class = registry.load("dataset", name)
+    return dataset_class(data_root(), dataset_class.Options())
+
+
+def _is_of_one_scene(path: Path) -> bool:
+    """Whether a path stands for its scene alone: a file, or the folder of one method and scene in a run."""
+    return path.is_file() or (path / "prediction.npz").is_file()
+
+
+def _are_all(asked: Sequence[str], known: Sequence[str]) -> bool:
+    """Whether every one of ``asked`` names a scene of the list, and not one that is made on demand."""
+    return bool(asked) and all(word.rpartition("/")[2] in known for word in asked)
+
+
+def choose_scenes(asked: Sequence[str], known: Sequence[str], where: str) -> list[str]:
+    """The scenes of ``known`` that names or patterns in ``asked`` mean; a dataset before a slash is passed over."""
+    chosen: dict[str, None] = {}
+    for word in asked:
+        pattern = word.rpartition("/")[2]
+        matching = [scene for scene in known if fnmatch.fnmatchcase(scene, pattern)]
+        if not matching:
+            hint = suggest(pattern, known) or "; known: " + ", ".join(known[:8])
+            raise DataError(f"no scene of {where} matches '{word}'{hint}")
+        chosen.update(dict.fromkeys(matching))
+    return list(chosen)
+
+
+# ---- OpenLex3D
+
+
+class OpenLexTruths(SceneTruths):
+    """OpenLex3D's labels and queries, which lie beside the mesh of the dataset."""
+
+    def __init__(self, request: Request, sources: Sequence[Source]) -> None:
+        assert request.ground_truth is not None
+        self._release = OpenLexRelease(request.ground_truth, data_root())
+        self.where, self.dataset_name, known = shown(request.ground_truth), None, self._release.scenes()
+        self.scenes = tuple(choose_scenes(request.scenes, known, self.where)) if request.scenes else known
+        asked = self.scenes if request.scenes else ()
+        matches, self.remarks = match_scenes(sources, known, None, self.where, asked)
+        self.matches = [match for match in matches if match.scene in self.scenes]
+
+    def why_not(self, rules: ProtocolRules, *, is_named: bool) -> str | None:
+        return None if rules.ground_truth in (VISIBLE, FACE_CORNERS) else f"{NOT_MEANT} the labels of OpenLex3D"
+
+    def of_scene(self, rules: ProtocolRules, scene: str) -> Truth:
+        return self._release.truth(scene, rules.ground_truth)
+
+
+# ---- texts
+
+
+class TextTruths(SceneTruths):
+    """Labels of points without coordinates; whether values hold instances is told from all scenes together."""
+
+    has_points = False
+
+    def __init__(self, request: Request, sources: Sequence[Source]) -> None:
+        assert request.ground_truth is not None
+        every_file = text_scenes(request.ground_truth)
+        self.where = shown(request.ground_truth)
+        chosen = choose_scenes(request.scenes, list(every_file), self.where) if request.scenes else list(every_file)
+        self._files = {scene: every_file[scene] for scene in chosen}
+        self.scenes = tuple(chosen)
+        self.dataset_name = dataset_of_names(chosen)
+        if request.dataset is not None:
+            self.dataset_name = str(registry.load("dataset", request.dataset).name)
+        left_out = set(every_file) - set(chosen)
+        sources = [replace(one, scenes=tuple(name for name in one.scenes if name not in left_out)) for one in sources]
+        asked = chosen if request.scenes else ()
+        self.matches, self.remarks = match_scenes(sources, chosen, self.dataset_name, self.where, asked)
+        self._values = {match.scene: read_values(self._files[match.scene]) for match in self.matches}
+        largest = max((int(values.max(initial=0)) for values in self._values.values()), default=0)
+        self._has_instances = largest > LARGEST_LABEL
+        self._largest_label = self._label(largest)
+        if self.matches and self.dataset_name is None and not request.protocols:
+            raise ConfigError(
+                f"{self.where}: whose labels are these? name the protocol with --protocol or the dataset with --dataset"
+            )
+
+    def why_not(self, rules: ProtocolRules, *, is_named: bool) -> str | None:
+        if rules.ground_truth == QUERY_OBJECTS:
+            return _why_no_queries(is_named=is_named)
+        if rules.kind in SHARE_KINDS and not is_named:
+            return f"{NOT_MEANT} texts"
+        facts = TruthFacts(self.where, None, (), has_points=False, has_instances=self._has_instances)
+        reason = why_not_truth(rules, facts)
+        if reason is not None or is_named:
+            return reason
+        if self.dataset_name not in rules.datasets:
+            return f"{NOT_MEANT} {self.dataset_name}"
+        # The label space of ScanNet alone has several forms of ground truth.
+        variant = "nyu40-vertices" if self._largest_label <= LARGEST_NYU40_ID else "scannet200-vertices"
+        fits = rules.label_space != "scannet" or variant == rules.ground_truth
+        return None if fits else f"the labels of the ground truth are '{variant}'"
+
+    def of_scene(self, rules: ProtocolRules, scene: str) -> VertexTruth:
+        if scene not in self._values:  # missed: the doubts speak of all that are scored
+            self._values |= {name: read_values(file) for name, file in self._files.items() if name not in self._values}
+            self._largest_label = self._label(max(int(values.max(initial=0)) for values in self._values.values()))
+        values = self._values[scene]
+        labels = values // INSTANCES_PER_CLASS if self._has_instances else values
+        return VertexTruth(values, labels, self._doubts(rules))
+
+    def _label(self, value: int) -> int:
+        return value // INSTANCES_PER_CLASS if self._has_instances else value
+
+    def _doubts(self, rules: ProtocolRules) -> tuple[str, ...]:
+        largest = self._largest_label
+        if rules.ground_truth == "nyu40-vertices" and largest > LARGEST_NYU40_ID:
+            return (
+                f"the ground truth holds the label {largest}, NYU40 ends at {LARGEST_NYU40_ID}: are these raw ids "
+                "of ScanNet200? points of other classes are void",
+            )
+        if rules.ground_truth == "scannet200-vertices" and largest <= LARGEST_NYU40_ID:
+            return (f"the largest label of the ground truth is {largest}: are these NYU40 ids?",)
+        return ()
 
 
 def text_scenes(folder: Path) -> dict[str, Path]:
     """Scene -> its file in a folder of ground truth."""
     if not folder.is_dir():
         raise DataError(f"{shown(folder)}: no such folder; give the one with <scene>.txt, one value a point")
-    try:
+    with converted(PredictionError, DataError):
         files = scene_files(folder, (".txt",))
-    except PredictionError as error:
-        raise DataError(str(error)) from error
     if odd := next((name for name in files if not name.isprintable()), None):
         raise DataError(f"{shown(folder)}: holds a file '{printable(odd, 80)}'; name files after scenes")
     if not files:
@@ -64,24 +303,11 @@ def text_scenes(folder: Path) -> dict[str, Path]:
     return files
 
 
-def read_text_truth(files: Mapping[str, Path]) -> TextTruth:
-    """The truth of the scenes in ``files``; whether values hold instances is told from all of them together."""
-    values = _read_all(files)
-    largest = max((int(one.max(initial=0)) for one in values.values()), default=0)
-    return TextTruth(values, largest > LARGEST_LABEL)
-
-
-def _read_all(files: Mapping[str, Path]) -> dict[str, Int64Array]:
-    return {scene: _read_values(path) for scene, path in files.items()}
-
-
-def _read_values(path: Path) -> Int64Array:
+def read_values(path: Path) -> Int64Array:
+    """One value a point of a scene: a class id, or class id * 1000 + instance."""
     where = shown(path)
-    try:
-        with reading(where):
-            values = integer_lines(path.read_bytes(), where).astype(np.int64)
-    except PredictionError as error:
-        raise DataError(str(error)) from error
+    with converted(PredictionError, DataError), reading(where, DataError):
+        values = integer_lines(path.read_bytes(), where).astype(np.int64)
     if not 0 < len(values) <= MOST_POINTS:
         raise DataError(f"{where}: has {len(values)} values; expected one a point of the scene")
     is_wrong = (values < 0) | (values > LARGEST_VALUE)
@@ -100,43 +326,3 @@ def dataset_of_names(scenes: Iterable[str]) -> str | None:
     names = list(scenes)
     fitting = [one for one, form in SCENE_NAMES.items() if names and all(form.fullmatch(name) for name in names)]
     return fitting[0] if fitting else None
-
-
-def text_variant(truth: TextTruth, space: str) -> str | None:
-    """The form of ground truth that the labels speak of, where the label space has several; None otherwise."""
-    if space != "scannet":
-        return None
-    return "nyu40-vertices" if truth.largest_label <= MAX_NYU40_ID else "scannet200-vertices"
-
-
-def doubts(rules: ProtocolRules, truth: TextTruth) -> tuple[str, ...]:
-    """What makes it doubtful that the labels are those of the protocol."""
-    if rules.ground_truth == "nyu40-vertices" and truth.largest_label > MAX_NYU40_ID:
-        return (
-            f"the ground truth holds the label {truth.largest_label}, NYU40 ends at {MAX_NYU40_ID}: are these raw ids "
-            "of ScanNet200? points of other classes are void",
-        )
-    if rules.ground_truth == "scannet200-vertices" and truth.largest_label <= MAX_NYU40_ID:
-        return (f"the largest label of the ground truth is {truth.largest_label}: are these NYU40 ids?",)
-    return ()
-
-
-def open_dataset(name: str) -> Any:
-    """The dataset called ``name`` with its default settings, below the data root."""
-    dataset_class = registry.load("dataset", name)
-    return dataset_class(data_root(), dataset_class.Options())
-
-
-def choose_scenes(asked: Sequence[str], known: Sequence[str], where: str) -> list[str]:
-    """The scenes of ``known`` that names or patterns in ``asked`` mean; a dataset before a slash is passed over."""
-    import fnmatch
-
-    chosen: dict[str, None] = {}
-    for word in asked:
-        pattern = word.rpartition("/")[2]
-        found = [scene for scene in known if fnmatch.fnmatchcase(scene, pattern)]
-        if not found:
-            hint = suggest(pattern, known) or "; known: " + ", ".join(known[:8])
-            raise DataError(f"no scene of {where} matches '{word}'{hint}")
-        chosen.update(dict.fromkeys(found))
-    return list(chosen)

@@ -17,10 +17,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import PredictionError, printable, shown
+from su3d_bench.core.errors import PredictionError, printable, reading, shown
 from su3d_bench.formats.pickles.pickle_constructors import MOST_DIMENSIONS, SIMPLE_TYPE, RefusedError, check_texts
 from su3d_bench.formats.pickles.pickles import read_pickle
-from su3d_bench.formats.reading import reading
 
 MOST_MEMBER = 4 << 30  # bytes; masks of a scene are some hundred MiB
 MOST_RATIO = 1032  # deflate cannot do better

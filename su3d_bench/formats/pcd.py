@@ -14,10 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import DataError, printable
+from su3d_bench.core.errors import DataError, printable, reading
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
-from su3d_bench.formats.ply_parts import clip
-from su3d_bench.formats.reading import reading
 from su3d_bench.store.atomic import write_bytes
 
 MOST_HEADER_BYTES = 1 << 16  # headers have some hundred
@@ -92,12 +90,12 @@ def read_header(content: bytes, where: str) -> Header:
             continue
         key = "FIELDS" if words[0] == "COLUMNS" else words[0]  # the name before version 0.7
         if key not in {"VERSION", "FIELDS", "SIZE", "TYPE", "COUNT", "WIDTH", "HEIGHT", "VIEWPOINT", "POINTS", "DATA"}:
-            raise DataError(f"{where}:{number}: '{clip(printable(' '.join(words)))}' belongs in no PCD header")
+            raise DataError(f"{where}:{number}: '{printable(' '.join(words), 60)}' belongs in no PCD header")
         if lines.setdefault(key, words[1:]) is not words[1:] and lines[key] != words[1:]:
             raise DataError(f"{where}:{number}: '{key}' stands there twice; the file is damaged")
     form = " ".join(lines["DATA"])
     if form not in FORMS:
-        raise DataError(f"{where}:{number}: DATA is '{clip(printable(form))}'; expected {', '.join(FORMS)}")
+        raise DataError(f"{where}:{number}: DATA is '{printable(form, 60)}'; expected {', '.join(FORMS)}")
     return Header(_fields(lines, where), _n_points(lines, where), form, at)
 
 
@@ -116,8 +114,8 @@ def _fields(lines: dict[str, list[str]], where: str) -> tuple[Field, ...]:
         n = int(count) if _NUMBER.fullmatch(count) else 0
         if f"{kind} {size}" not in TYPES or not 0 < n <= MOST_VALUES:
             raise DataError(
-                f"{where}: field '{clip(printable(name))}' has TYPE {clip(printable(kind))}, SIZE "
-                f"{clip(printable(size))}, COUNT {clip(printable(count))}; the file is damaged"
+                f"{where}: field '{printable(name, 60)}' has TYPE {printable(kind, 60)}, SIZE "
+                f"{printable(size, 60)}, COUNT {printable(count, 60)}; the file is damaged"
             )
         if name in AXES and any(name == field.name for field in fields):
             raise DataError(f"{where}: field '{name}' stands there twice; the file is damaged")
@@ -134,7 +132,7 @@ def _n_points(lines: dict[str, list[str]], where: str) -> int:
         if len(words) == 1 and _NUMBER.fullmatch(words[0]):
             numbers[key] = int(words[0])
         elif words or key != "POINTS":
-            raise DataError(f"{where}: {key} is '{clip(printable(' '.join(words)))}'; expected a number")
+            raise DataError(f"{where}: {key} is '{printable(' '.join(words), 60)}'; expected a number")
     n = numbers["WIDTH"] * numbers["HEIGHT"]
     if numbers.get("POINTS", n) != n:
         raise DataError(f"{where}: POINTS is {numbers['POINTS']}, WIDTH times HEIGHT is {n}; the file is damaged")

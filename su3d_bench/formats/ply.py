@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import DataError
+from su3d_bench.core.errors import DataError, reading
 from su3d_bench.core.types import Int64Array
 from su3d_bench.formats.ply_parts import (
     BYTE_ORDERS,
@@ -33,7 +33,6 @@ from su3d_bench.formats.ply_parts import (
     clip,
     read_header,
 )
-from su3d_bench.formats.reading import reading
 from su3d_bench.store.atomic import write_bytes
 
 AnyArray = NDArray[Any]

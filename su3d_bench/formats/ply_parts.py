@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -123,35 +123,9 @@ class UnfitValueError(ValueError):
         self.index = index
 
 
-class Body(Protocol):
-    """The rows behind the header, addressed in units: bytes of a binary file, values of a text file."""
-
-    unit: str
-    start: int
-    n_units: int
-
-    def size(self, kind: np.dtype[Any]) -> int:
-        """Units of one value."""
-        ...
-
-    def count(self, at: int, kind: np.dtype[Any]) -> int:
-        """The list length at ``at``; -1 where there is none."""
-        ...
-
-    def strided(self, at: int, stride: int, n_rows: int, n_values: int, kind: np.dtype[Any]) -> AnyArray:
-        """Values (n_rows, n_values) that begin at ``at`` and again every ``stride`` units."""
-        ...
-
-    def gathered(self, starts: Int64Array, kind: np.dtype[Any]) -> AnyArray:
-        """One value at each of ``starts``."""
-        ...
-
-    def n_left_over(self, at: int) -> int:
-        """Units from ``at`` on that are not mere white space."""
-        ...
-
-
 class BinaryBody:
+    """The rows of a binary file, addressed in bytes."""
+
     unit = "bytes"
 
     def __init__(self, content: bytes, header: Header) -> None:
@@ -161,13 +135,16 @@ class BinaryBody:
         self.start, self.n_units = header.n_bytes, len(content)
 
     def size(self, kind: np.dtype[Any]) -> int:
+        """Units of one value."""
         return kind.itemsize
 
     def count(self, at: int, kind: np.dtype[Any]) -> int:
+        """The list length at ``at``; -1 where there is none."""
         order: Literal["little", "big"] = "little" if self._order == "<" else "big"
         return int.from_bytes(self._content[at : at + kind.itemsize], order, signed=kind.kind == "i")
 
     def strided(self, at: int, stride: int, n_rows: int, n_values: int, kind: np.dtype[Any]) -> AnyArray:
+        """Values (n_rows, n_values) that begin at ``at`` and again every ``stride`` units."""
         stored = kind.newbyteorder(self._order)
         shape, strides = (n_rows, n_values), (stride, kind.itemsize)
         if n_rows * n_values == 0:
@@ -175,12 +152,14 @@ class BinaryBody:
         return np.ndarray(shape, stored, self._content, at, strides).astype(kind)
 
     def gathered(self, starts: Int64Array, kind: np.dtype[Any]) -> AnyArray:
+        """One value at each of ``starts``."""
         raw = np.empty((len(starts), kind.itemsize), np.uint8)
         for byte in range(kind.itemsize):
             raw[:, byte] = self._bytes[starts + byte]
         return raw.view(kind.newbyteorder(self._order)).reshape(-1).astype(kind)
 
     def n_left_over(self, at: int) -> int:
+        """Units from ``at`` on that are not mere white space."""
         return len(self._content[at:].strip())
 
 
@@ -237,3 +216,6 @@ def _place_of_stranger(content: bytes, header: Header) -> str:
             except ValueError:
                 return f":{number}: '{clip(word.decode('utf-8', 'replace'))}' is not a number"
     return ": it holds something that is not a number"
+
+
+Body = BinaryBody | TextBody

@@ -13,7 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import PredictionError, shown
+from su3d_bench.core.errors import PredictionError, reading, shown
 from su3d_bench.formats.numpy_files import opened_zip, read_member
 from su3d_bench.formats.pickles.pickle_constructors import (
     CONSTRUCTORS,
@@ -29,7 +29,6 @@ from su3d_bench.formats.pickles.pickle_constructors import (
     named,
 )
 from su3d_bench.formats.pickles.pickles import read_pickle
-from su3d_bench.formats.reading import reading
 
 Kind = Literal["tensor", "sparse", "array", "dict", "tuple", "other"]
 ZIP_START = b"PK\x03\x04"

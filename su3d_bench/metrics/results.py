@@ -49,12 +49,12 @@ class ProtocolResult:
 
 
 def plain_json(value: Any) -> Any:
-    """``value`` with NaN as None and tuples as lists."""
+    """``value`` with None for what is no finite number, and tuples as lists."""
     if isinstance(value, Mapping):
         return {key: plain_json(item) for key, item in value.items()}
     if isinstance(value, tuple | list):
         return [plain_json(item) for item in value]
-    return None if isinstance(value, float) and math.isnan(value) else value
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def form_result(

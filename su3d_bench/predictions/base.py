@@ -3,28 +3,32 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError, printable, shown
+from su3d_bench.core.errors import PredictionError, printable, reading, shown
 from su3d_bench.core.types import (
     DenseFeatures,
     Float32Array,
     Float64Array,
     Instances,
     Int32Array,
+    Int64Array,
     Masks,
     Partition,
+    starts_of,
 )
-from su3d_bench.formats.reading import reading
+from su3d_bench.formats.arrays import MOST_MASKS, MOST_POINTS
+from su3d_bench.metrics.matching.nearest import masks_of_partition
+from su3d_bench.metrics.protocols import ProtocolRules
 
+NO_SCORES = "the file has no scores: 1 for every mask"
+ONES = "the format has no scores: 1 for every object"
 Numbering = Literal["id", "index"]
-MOST_POINTS = 100_000_000  # points of one scene; the largest scans of rooms have some millions
-MOST_MASKS = 100_000  # of one scene; methods give some hundred
 MOST_MEMBERS = (
     200_000_000  # points of all masks of a scene together; 600 masks of a large ScanNet scene have 10 million
 )
@@ -76,6 +80,25 @@ class VertexMasks(Masks):
                 f"order, the scene has {self.n_points} points"
             )
 
+    def class_ids(self, rules: ProtocolRules) -> Int64Array:
+        """The class id (K,) of each mask, 0 where it has none; positions count the classes that a protocol scores."""
+        if self.class_numbers is None:
+            return np.zeros(len(self), np.int64)
+        numbers = self.class_numbers.astype(np.int64)
+        if self.numbering == "id":
+            return numbers
+        ids = np.array([entry.id for entry in rules.scored], np.int64)
+        is_known = (numbers >= 0) & (numbers < len(ids))
+        return np.where(is_known, ids[np.where(is_known, numbers, 0)], 0)
+
+    def on(self, points: Float32Array, rules: ProtocolRules) -> Instances:
+        """The map of the masks on the ``points`` of the truth, with the names of the protocol's classes as labels."""
+        labels: tuple[str, ...] | None = None if len(self) else ()
+        if self.class_numbers is not None:
+            name_of = {entry.id: entry.name for entry in rules.classes}
+            labels = tuple(name_of.get(class_id, f"class {class_id}") for class_id in self.class_ids(rules).tolist())
+        return Instances.of(points, self, self.scores, self.features, labels=labels, names=self.keys)
+
 
 @dataclass(frozen=True)
 class VertexLabels:
@@ -83,8 +106,76 @@ class VertexLabels:
 
     class_ids: Int32Array
 
+    def masks(self) -> VertexMasks:
+        """One mask a class."""
+        distinct, row = np.unique(self.class_ids, return_inverse=True)
+        masks = masks_of_partition(row, len(distinct))
+        return VertexMasks(
+            masks.indptr,
+            masks.indices,
+            n_points=len(self.class_ids),
+            scores=np.ones(len(distinct)),
+            class_numbers=distinct.astype(np.int32),
+            keys=tuple(f"class {class_id}" for class_id in distinct),
+        )
+
 
 Content = VertexMasks | VertexLabels | Instances | Partition | DenseFeatures  # the last three have their own points
+
+
+def vertex_masks(
+    where: str,
+    members: Iterable[Int32Array],
+    n_points: int | None,
+    *,
+    scores: Float64Array | None = None,
+    class_numbers: Int32Array | None = None,
+    numbering: Numbering = "id",
+    features: Float32Array | None = None,
+    keys: Sequence[str] | None = None,
+) -> VertexMasks:
+    """The masks whose point indices are ``members``; score 1 and keys ``mask 0``, ... where none are given."""
+    parts: list[Int32Array] = []
+    n = 0
+    for part in members:
+        n += len(part)
+        if n > MOST_MEMBERS:
+            raise PredictionError(f"{where}: the masks hold more than {MOST_MEMBERS} points together; is it damaged?")
+        parts.append(part)
+    masks = Masks.of_sets(parts)
+    try:
+        return VertexMasks(
+            masks.indptr,
+            masks.indices,
+            n_points=n_points,
+            scores=np.ones(len(parts)) if scores is None else scores,
+            class_numbers=class_numbers,
+            numbering=numbering,
+            features=features,
+            keys=tuple(keys) if keys is not None else tuple(f"mask {k}" for k in range(len(parts))),
+        )
+    except PredictionError as error:
+        raise PredictionError(f"{where}: {error}") from error
+
+
+def instances_of(
+    clouds: Sequence[Float32Array],
+    where: str,
+    *,
+    features: Float32Array | None,
+    labels: tuple[str, ...] | None,
+    names: tuple[str, ...],
+    captions: tuple[str, ...],
+    ids: Sequence[int],
+) -> Instances:
+    """One instance a cloud, each with points of its own, score 1 and no views; boxes of empty clouds are zeros."""
+    sizes = np.array([len(cloud) for cloud in clouds], np.int64)
+    n = int(sizes.sum())
+    if n > MOST_POINTS or len(clouds) > MOST_MASKS:
+        raise PredictionError(f"{where}: {len(clouds)} objects of {n} points; is it damaged?")
+    points = np.concatenate([np.zeros((0, 3), np.float32), *clouds])
+    masks = Masks(starts_of(sizes), np.arange(n, dtype=np.int32))
+    return Instances.of(points, masks, None, features, labels=labels, names=names, captions=captions, ids=ids)
 
 
 @dataclass(frozen=True)

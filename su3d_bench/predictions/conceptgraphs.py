@@ -14,15 +14,9 @@ import numpy as np
 
 from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.types import Float32Array, Instances
+from su3d_bench.formats.arrays import MOST_MASKS, checked_points, kind_of, without_nonfinite
 from su3d_bench.formats.pickles.pickles import read_pickle_file
-from su3d_bench.predictions.base import MOST_MASKS, Reader, ScenePrediction, first_found, named_once
-from su3d_bench.predictions.clouds import (
-    ONES,
-    checked_points,
-    instances_of,
-    without_nonfinite,
-)
-from su3d_bench.predictions.mask_arrays import kind_of
+from su3d_bench.predictions.base import ONES, Reader, ScenePrediction, first_found, instances_of, named_once
 
 SUFFIX = ".pkl.gz"
 POST = f"_post{SUFFIX}"

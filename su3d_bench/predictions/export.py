@@ -27,16 +27,11 @@ from su3d_bench.core.types import (
     Partition,
 )
 from su3d_bench.formats.pcd import write_pcd_points
-from su3d_bench.metrics.instance.score import masks_and_scores
+from su3d_bench.metrics.instance.score import masks_and_scores, named_classes
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import (
-    candidate_classes,
-    class_index_of_ids,
-    classes_of_prediction,
     encoder_warning,
-    scored_classes,
 )
-from su3d_bench.metrics.metric import present
 from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
 from su3d_bench.predictions.openlex3d import CLOUD, EMBEDDINGS, INDEX
@@ -191,17 +186,18 @@ def masks_on_truth(
     """
     if isinstance(content, VertexLabels | DenseFeatures):
         raise PredictionError("has no masks, and ScanNet's list needs them")
-    named = _instances(content, truth) if isinstance(content, VertexMasks) else content
+    if isinstance(content, VertexMasks) and content.n_points not in {None, len(truth.points)}:
+        raise PredictionError(
+            f"is of {content.n_points} points, the ground truth of {len(truth.points)}; both must be of one mesh"
+        )
+    named = content.on(truth.points, rules) if isinstance(content, VertexMasks) else content
     masks, scores, remarks = _masks_and_scores(named)
     moved = transfer.transfer_masks(
         named.points, masks, truth.points, rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
     )
     if isinstance(content, VertexMasks) and content.class_numbers is not None:
-        return LabelledMasks(moved, len(truth.points), _own_ids(content, rules), scores, remarks)
-    ids = np.array([entry.id for entry in rules.classes], np.int64)
-    is_present = present(class_index_of_ids(rules, truth.semantic), len(ids)) & scored_classes(rules)
-    classes = classes_of_prediction(rules, named, encoder, candidate_classes(rules, is_present))
-    class_ids = np.where(classes >= 0, ids[classes], 0)
+        return LabelledMasks(moved, len(truth.points), content.class_ids(rules), scores, remarks)
+    class_ids = named_classes(rules, truth.semantic, named, encoder)
     if (told := encoder_warning(rules, named, encoder)) is not None:
         remarks = (*remarks, told)
     return LabelledMasks(moved, len(truth.points), class_ids, scores, remarks)
@@ -217,26 +213,6 @@ def _masks_and_scores(named: Instances | Partition) -> tuple[Masks, Float64Array
     if not np.isfinite(named.points).all() or not np.isfinite(scores).all():
         raise PredictionError("has points or scores that are NaN or infinite; make it again")
     return masks, scores, remarks
-
-
-def _own_ids(content: VertexMasks, rules: ProtocolRules) -> Int64Array:
-    """The class ids that the file itself gives; positions count the scored classes, beyond them there is none: 0."""
-    assert content.class_numbers is not None
-    numbers = content.class_numbers.astype(np.int64)
-    if content.numbering == "id":
-        return numbers
-    ids = np.array([entry.id for entry in rules.scored], np.int64)
-    is_known = (numbers >= 0) & (numbers < len(ids))
-    return np.where(is_known, ids[np.where(is_known, numbers, 0)], 0)
-
-
-def _instances(content: VertexMasks, truth: GroundTruth) -> Instances:
-    """The masks as instances over the points of the truth."""
-    if content.n_points not in {None, len(truth.points)}:
-        raise PredictionError(
-            f"is of {content.n_points} points, the ground truth of {len(truth.points)}; both must be of one mesh"
-        )
-    return Instances.of(truth.points, content, content.scores, content.features, names=content.keys)
 
 
 def write_scannet(labelled: LabelledMasks, scene: str, folder: Path) -> tuple[str, ...]:

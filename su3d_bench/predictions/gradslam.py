@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import PredictionError, StoreError, shown
+from su3d_bench.core.errors import DataError, PredictionError, StoreError, converted, shown
 from su3d_bench.core.types import DenseFeatures, Float32Array
 from su3d_bench.datasets.replica.cloud_truth import moved, read_first_pose
+from su3d_bench.formats.arrays import checked_points
 from su3d_bench.formats.hdf5 import n_columns_of, read_rows, row_blocks
 from su3d_bench.predictions.base import SceneFolders, ScenePrediction
-from su3d_bench.predictions.clouds import as_prediction_error, checked_points
 
 POINTS, EMBEDDINGS = "pc_points.h5", "pc_embeddings.h5"
 POSE_FILES = ("first_pose.txt", "traj.txt", "traj_w_c.txt")
@@ -39,7 +39,7 @@ class Gradslam(SceneFolders):
 
     def read_scene(self, place: Path, scene: str) -> ScenePrediction:
         where = shown(place / POINTS)
-        with as_prediction_error():
+        with converted(DataError, PredictionError):
             points = checked_points(read_rows(place / POINTS, 3, where), where)
             points, pose_remark = _in_world(points, place)
             features, n_without = _features(place / EMBEDDINGS, len(points))

@@ -7,25 +7,17 @@ on, which loses the last ones where a number is missing; here the number is read
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError, shown
+from su3d_bench.core.errors import DataError, PredictionError, converted, reading, shown
+from su3d_bench.formats.arrays import MOST_MASKS, checked_points, feature_table, without_nonfinite
 from su3d_bench.formats.pcd import read_pcd_points
 from su3d_bench.formats.ply import read_ply
-from su3d_bench.formats.reading import reading
 from su3d_bench.formats.torch_zip import read_torch
-from su3d_bench.predictions.base import MOST_MASKS, SceneFolders, ScenePrediction
-from su3d_bench.predictions.clouds import (
-    ONES,
-    as_prediction_error,
-    checked_points,
-    feature_table,
-    instances_of,
-    some,
-    without_nonfinite,
-)
+from su3d_bench.predictions.base import ONES, SceneFolders, ScenePrediction, instances_of
 
 FEATURES = "mask_feats.pt"
 OBJECTS = "objects"
@@ -69,7 +61,7 @@ class HovSg(SceneFolders):
 def read_cloud(file: Path) -> np.ndarray:
     """The points (N, 3) of a .ply or .pcd file, as they are; ``PredictionError`` where it is damaged."""
     where = shown(file)
-    with as_prediction_error():
+    with converted(DataError, PredictionError):
         if file.suffix == ".pcd":
             return read_pcd_points(file, where)
         vertices = read_ply(file, where).element("vertex")
@@ -108,3 +100,12 @@ def _gap_remarks(numbers: list[int], n_rows: int) -> tuple[str, ...]:
     if lost:
         remarks.append(f"the original's loader would not read the last {len(lost)} objects ({some(lost)})")
     return tuple(remarks)
+
+
+def some(numbers: Sequence[int]) -> str:
+    """The first of ``numbers`` for a message.
+
+    >>> some([1, 2, 3, 4, 5, 6])
+    '1, 2, 3, 4, 5, ...'
+    """
+    return ", ".join(str(number) for number in numbers[:5]) + (", ..." if len(numbers) > 5 else "")

@@ -11,11 +11,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, shown
 from su3d_bench.core.types import Int32Array
-from su3d_bench.formats.numpy_files import npz_names, read_npz
-from su3d_bench.formats.torch_zip import Kind, SparseTensor, read_torch, torch_kind
-from su3d_bench.predictions.base import SceneFiles, ScenePrediction, VertexMasks
-from su3d_bench.predictions.mask_arrays import (
-    NO_SCORES,
+from su3d_bench.formats.arrays import (
     check_sizes,
     classes_of,
     column_members,
@@ -23,8 +19,10 @@ from su3d_bench.predictions.mask_arrays import (
     matrix_of,
     run_members,
     scores_of,
-    vertex_masks,
 )
+from su3d_bench.formats.numpy_files import npz_names, read_npz
+from su3d_bench.formats.torch_zip import Kind, SparseTensor, read_torch, torch_kind
+from su3d_bench.predictions.base import NO_SCORES, SceneFiles, ScenePrediction, VertexMasks, vertex_masks
 
 
 class TorchFiles(SceneFiles):

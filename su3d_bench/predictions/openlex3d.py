@@ -11,11 +11,10 @@ import numpy as np
 
 from su3d_bench.core.errors import PredictionError, shown
 from su3d_bench.core.types import Int32Array, Partition
+from su3d_bench.formats.arrays import checked_points, feature_table, kind_of, without_nonfinite
 from su3d_bench.formats.numpy_files import read_npy
 from su3d_bench.predictions.base import SceneFolders, ScenePrediction
-from su3d_bench.predictions.clouds import checked_points, feature_table, without_nonfinite
 from su3d_bench.predictions.hovsg import read_cloud
-from su3d_bench.predictions.mask_arrays import kind_of
 
 CLOUD = "point_cloud.pcd"
 CLOUDS = (CLOUD, "point_cloud.ply", "input.ply")  # the order in which the original looks for them

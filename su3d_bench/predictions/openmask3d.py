@@ -8,18 +8,11 @@ import numpy as np
 
 from su3d_bench.core.errors import PredictionError, shown
 from su3d_bench.core.types import Float32Array
+from su3d_bench.formats.arrays import column_members, kind_of, matrix_of, without_nonfinite
 from su3d_bench.formats.numpy_files import read_npy
 from su3d_bench.formats.torch_zip import read_torch
-from su3d_bench.predictions.base import ScenePrediction
-from su3d_bench.predictions.clouds import without_nonfinite
+from su3d_bench.predictions.base import NO_SCORES, ScenePrediction, vertex_masks
 from su3d_bench.predictions.mask_archives import TorchFiles
-from su3d_bench.predictions.mask_arrays import (
-    NO_SCORES,
-    column_members,
-    kind_of,
-    matrix_of,
-    vertex_masks,
-)
 
 FEATURES_SUFFIXES = ("_openmask3d_features.npy", "_features.npy", ".npy")
 

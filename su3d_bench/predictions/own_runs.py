@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, printable, shown
 from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
+from su3d_bench.formats.arrays import kind_of
 from su3d_bench.formats.numpy_files import npy_header_of, npz_names, read_npz
 from su3d_bench.predictions.base import Reader, ScenePrediction
-from su3d_bench.predictions.mask_arrays import kind_of
 from su3d_bench.store.predictions import features_beside, prediction_from_arrays
 
 FILE = "prediction.npz"

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError, shown
+from su3d_bench.formats.arrays import MOST_POINTS, kind_of
 from su3d_bench.formats.numpy_files import npy_header_of, read_npy
 from su3d_bench.formats.torch_zip import read_torch
-from su3d_bench.predictions.base import MOST_POINTS, ScenePrediction
+from su3d_bench.predictions.base import NO_SCORES, ScenePrediction, vertex_masks
 from su3d_bench.predictions.mask_archives import TorchFiles
-from su3d_bench.predictions.mask_arrays import NO_SCORES, kind_of, vertex_masks
 
 
 class Sam3d(TorchFiles):

@@ -10,13 +10,12 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError, printable, shown
+from su3d_bench.core.errors import PredictionError, printable, reading, shown
 from su3d_bench.core.types import Int32Array
-from su3d_bench.formats.reading import reading
+from su3d_bench.formats.arrays import run_members
 from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file
-from su3d_bench.predictions.base import SceneFiles, ScenePrediction, VertexLabels
-from su3d_bench.predictions.mask_arrays import run_members, vertex_masks
+from su3d_bench.predictions.base import SceneFiles, ScenePrediction, VertexLabels, vertex_masks
 
 OWN_OUTPUT = "semantic_instance_evaluation"  # the original evaluator's own answer, which it leaves out
 MASK3D_FOLDER = "decoder_-1"  # Mask3D and Segment3D write the lists of the last decoder here

@@ -26,8 +26,7 @@ from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Instances, Surface
 from su3d_bench.datasets.replica.mesh_truth import read_surface
 from su3d_bench.datasets.rgbd.dataset import Rgbd
-from su3d_bench.predictions.base import VertexLabels
-from su3d_bench.predictions.mask_arrays import vertex_masks
+from su3d_bench.predictions.base import VertexLabels, vertex_masks
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.feeding import no_detections
 

@@ -28,10 +28,10 @@ from prediction_files import (
 
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError
 from su3d_bench.evaluation.evaluate import Request, evaluate
-from su3d_bench.evaluation.scenes import Source, match_scenes
 from su3d_bench.metrics.instance.average_precision import THRESHOLDS, combine, per_scene
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.predictions.formats import READERS
+from su3d_bench.predictions.scenes import Source, match_scenes
 
 # ---- numbers and what stands beside them
 

@@ -15,9 +15,9 @@ from prediction_files import (
 
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.types import Masks
-from su3d_bench.evaluation.checks import check_cloud, mask_facts
 from su3d_bench.evaluation.texts import read_text_features
-from su3d_bench.evaluation.truth import read_text_truth
+from su3d_bench.evaluation.truth import read_values
+from su3d_bench.metrics.matching.checks import check_cloud, mask_facts
 
 # ---- checks
 
@@ -96,7 +96,7 @@ def test_every_damage_to_a_truth_file_is_one_error_with_its_name(tmp_path: Path)
 
     def read(damaged: bytes) -> object:
         file.write_bytes(damaged)
-        return read_text_truth({"scene0001_00": file})
+        return read_values(file)
 
     for copies in (truncations(content), damages(content)):
         n_read, n_refused = outcomes(read, copies, must_name=file.name)

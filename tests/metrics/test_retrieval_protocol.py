@@ -14,8 +14,8 @@ from scored_room import ENCODER, NAMES, OneHotEncoder, instances, nothing, room,
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.core.types import Partition
-from su3d_bench.evaluation.openlex import score_on_questions, why_not_lex_content
-from su3d_bench.metrics.fitness import why_not_scorable
+from su3d_bench.evaluation.scoring import facts_of, score_on_objects
+from su3d_bench.metrics.fitness import why_not_content, why_not_scorable
 from su3d_bench.metrics.instance.score import covered_objects
 from su3d_bench.metrics.protocols import load_protocol, protocols_for, read_protocol, rules_file
 from su3d_bench.metrics.questions.score import are_objects_right, is_answer_right
@@ -23,7 +23,7 @@ from su3d_bench.metrics.questions.shares import ShareCounts
 from su3d_bench.metrics.questions.truths import AskedText, GivenAnswer, ReasoningTruth, RetrievalTruth, TrueAnswer
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
-from su3d_bench.predictions.mask_arrays import vertex_masks
+from su3d_bench.predictions.base import vertex_masks
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.runs.plan import protocols_of_run
 
@@ -225,10 +225,11 @@ def test_a_run_scores_variants_under_the_protocols_of_questions(
 def test_predictions_from_elsewhere_are_scored_as_a_run_is() -> None:
     rules = load_protocol("replica-retrieval")
     dataset = SimpleNamespace(name="replica")
-    outcome = score_on_questions(rules, dataset, "made", TRUTH, PERFECT, ENCODER)
-    score = score_scene(rules, question_truth(rules, dataset, "made", TRUTH), PERFECT, ENCODER)
+    truth = question_truth(rules, dataset, "made", TRUTH)
+    outcome = score_on_objects(rules, truth, "made", PERFECT, ENCODER)
+    score = score_scene(rules, truth, PERFECT, ENCODER)
     assert isinstance(outcome.score.counts, ShareCounts)
     assert isinstance(score.counts, ShareCounts)
     assert outcome.score.counts.n_right.tolist() == score.counts.n_right.tolist()
     masks = vertex_masks("none", [], None)
-    assert "needs a map with points of its own" in str(why_not_lex_content(rules, masks))
+    assert "needs a map with points of its own" in str(why_not_content(rules, facts_of(masks)))

@@ -17,7 +17,7 @@ from su3d_bench.core.types import DenseFeatures, Instances, Partition
 from su3d_bench.metrics.matching.nearest import masks_of, transfer_masks
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
-from su3d_bench.predictions.base import VertexLabels, VertexMasks
+from su3d_bench.predictions.base import VertexLabels, VertexMasks, vertex_masks
 from su3d_bench.predictions.export import (
     file_name,
     masks_as_they_are,
@@ -28,7 +28,6 @@ from su3d_bench.predictions.export import (
     write_scannet,
 )
 from su3d_bench.predictions.formats import READERS
-from su3d_bench.predictions.mask_arrays import vertex_masks
 
 RULES = load_protocol("rooms-instance")
 RNG = np.random.default_rng(0)

@@ -35,7 +35,7 @@ from su3d_bench.evaluation.evaluate import Request, evaluate
 from su3d_bench.formats.pcd import write_pcd_points
 from su3d_bench.formats.ply import PlyElement, write_ply
 from su3d_bench.metrics.protocols import load_protocol
-from su3d_bench.predictions import clouds, gradslam
+from su3d_bench.predictions import gradslam, hovsg
 from su3d_bench.predictions.base import ScenePrediction
 from su3d_bench.predictions.formats import READERS, recognise
 
@@ -104,7 +104,7 @@ def test_the_truth_in_each_format_is_scored_as_perfect(
 
 
 def test_the_examples_of_the_shared_parts_are_right() -> None:
-    assert doctest.testmod(clouds).attempted > 0 and doctest.testmod(clouds).failed == 0
+    assert doctest.testmod(hovsg).attempted > 0 and doctest.testmod(hovsg).failed == 0
 
 
 # ---- ConceptGraphs

@@ -35,11 +35,11 @@ from prediction_files import (
 from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.formats import text_integers
+from su3d_bench.formats.arrays import run_members
 from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file
 from su3d_bench.predictions.base import ScenePrediction, VertexLabels, VertexMasks
 from su3d_bench.predictions.formats import READERS, format_names, recognise
-from su3d_bench.predictions.mask_arrays import run_members
 from su3d_bench.store.predictions import write_prediction
 
 MASK_CASES = sorted(p.stem for kind in ("inst", "replica", "scannet200") for p in CASES.glob(f"{kind}*.npz"))

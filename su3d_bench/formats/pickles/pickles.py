@@ -9,10 +9,9 @@ from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import BinaryIO, cast
 
-from su3d_bench.core.errors import PredictionError, printable
+from su3d_bench.core.errors import PredictionError, printable, reading
 from su3d_bench.formats.pickles.pickle_constructors import CONSTRUCTORS, Constructors, Forgotten, Inert, RefusedError
 from su3d_bench.formats.pickles.pickle_machine import PickleMachine
-from su3d_bench.formats.reading import reading
 
 __all__ = ["Forgotten", "Inert", "read_pickle", "read_pickle_file"]
 

@@ -160,11 +160,18 @@ def _truth_and_labels(
         has_scored_class = np.isin(truth.semantic, scored_ids)
         values = encode_without_classes(rules.class_agnostic, truth.instance, has_scored_class)
         return values, [OBJECT], np.full(n_predictions(prediction), OBJECT)
-    is_present = present(class_index_of_ids(rules, truth.semantic), len(rules.classes)) & scored_classes(rules)
-    classes = classes_of_prediction(rules, prediction, encoder, candidate_classes(rules, is_present))
-    ids = np.array([entry.id for entry in rules.classes])
     values = instance_ap.encode_ground_truth(truth.semantic, truth.instance)
-    return values, scored_ids, np.where(classes >= 0, ids[classes], 0)
+    return values, scored_ids, named_classes(rules, truth.semantic, prediction, encoder)
+
+
+def named_classes(
+    rules: ProtocolRules, semantic: IntArray, prediction: Instances | Partition, encoder: Encoder | None
+) -> Int64Array:
+    """The class id (K,) that each mask is called in a scene with the class ids ``semantic`` (N,), 0 for none."""
+    is_present = present(class_index_of_ids(rules, semantic), len(rules.classes)) & scored_classes(rules)
+    classes = classes_of_prediction(rules, prediction, encoder, candidate_classes(rules, is_present))
+    ids = np.array([entry.id for entry in rules.classes], np.int64)
+    return np.where(classes >= 0, ids[classes], 0)
 
 
 def encode_without_classes(

@@ -123,10 +123,10 @@ def _own_prediction(kind: str) -> Make:
 def _truth(folder: Path) -> Read:
     from evaluated_text import write_truth
 
-    from su3d_bench.evaluation.truth import read_text_truth
+    from su3d_bench.evaluation.truth import read_values
 
     write_truth(folder, values=[0, 5001, 1163002, 39001, 7])
-    return lambda: read_text_truth({"scene0001_00": folder / "scene0001_00.txt"})
+    return lambda: read_values(folder / "scene0001_00.txt")
 
 
 def _texts(folder: Path) -> Read:

@@ -9,9 +9,8 @@ from pathlib import Path
 from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, printable, shown, suggest
 from su3d_bench.predictions.base import Reader
 from su3d_bench.predictions.formats import recognise
+from su3d_bench.predictions.own_runs import OwnRuns
 from su3d_bench.store.atomic import read_json
-
-OWN_FORMAT = "su3d-bench"
 
 
 @dataclass(frozen=True)
@@ -133,7 +132,7 @@ def planned_scenes(sources: Sequence[Source], dataset: str) -> list[str] | None:
     planned: list[str] = []
     for source in sources:
         record_file = source.path / "run.json"
-        if source.reader.name != OWN_FORMAT or not record_file.is_file():
+        if source.reader.name != OwnRuns.name or not record_file.is_file():
             return None
         try:
             record = read_json(record_file)

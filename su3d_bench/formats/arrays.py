@@ -1,54 +1,19 @@
-"""Parts that readers of masks share: from matrices, run lengths and number lists to ``VertexMasks``."""
+"""Arrays out of files, checked before they are used: masks as matrices and run lengths, points, features, scores."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import PredictionError, printable
-from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Masks
-from su3d_bench.predictions.base import MOST_MASKS, MOST_MEMBERS, MOST_POINTS, Numbering, VertexMasks
+from su3d_bench.core.errors import PredictionError, printable, shown
+from su3d_bench.core.types import Float32Array, Float64Array, Int32Array
 
-NO_SCORES = "the file has no scores: 1 for every mask"
+MOST_POINTS = 100_000_000  # points of one scene; the largest scans of rooms have some millions
+MOST_MASKS = 100_000  # of one scene; methods give some hundred
 ROWS_AT_ONCE = 1 << 16
-
-
-def vertex_masks(
-    where: str,
-    members: Iterable[Int32Array],
-    n_points: int | None,
-    *,
-    scores: Float64Array | None = None,
-    class_numbers: Int32Array | None = None,
-    numbering: Numbering = "id",
-    features: Float32Array | None = None,
-    keys: Sequence[str] | None = None,
-) -> VertexMasks:
-    """The masks whose point indices are ``members``; score 1 and keys ``mask 0``, ... where none are given."""
-    parts: list[Int32Array] = []
-    n = 0
-    for part in members:
-        n += len(part)
-        if n > MOST_MEMBERS:
-            raise PredictionError(f"{where}: the masks hold more than {MOST_MEMBERS} points together; is it damaged?")
-        parts.append(part)
-    masks = Masks.of_sets(parts)
-    try:
-        return VertexMasks(
-            masks.indptr,
-            masks.indices,
-            n_points=n_points,
-            scores=np.ones(len(parts)) if scores is None else scores,
-            class_numbers=class_numbers,
-            numbering=numbering,
-            features=features,
-            keys=tuple(keys) if keys is not None else tuple(f"mask {k}" for k in range(len(parts))),
-        )
-    except PredictionError as error:
-        raise PredictionError(f"{where}: {error}") from error
 
 
 def matrix_of(value: object, where: str, what: str = "the masks") -> NDArray[Any]:
@@ -141,3 +106,37 @@ def kind_of(value: object) -> str:
     if isinstance(value, np.ndarray):
         return f"an array of shape {value.shape} {value.dtype.name}"
     return printable(str(value), 40) if isinstance(value, int | float) else f"a {type(value).__name__}"
+
+
+def checked_points(values: object, where: str) -> Float32Array:
+    """Points (N, 3) as float32; ``PredictionError`` for another shape, and for what float32 metres cannot hold."""
+    is_table = isinstance(values, np.ndarray) and values.ndim == 2 and values.shape[1] == 3
+    if not isinstance(values, np.ndarray) or not is_table or values.dtype.kind not in "fiu":
+        raise PredictionError(f"{where}: the points are {kind_of(values)}; expected three coordinates a point")
+    if len(values) > MOST_POINTS:
+        raise PredictionError(f"{where}: has {len(values)} points; is it damaged?")
+    with np.errstate(over="ignore", invalid="ignore"):
+        points = values.astype(np.float32)
+    is_finite = np.isfinite(points).all(axis=1)
+    if not is_finite.all():
+        row = int(np.argmin(is_finite))
+        raise PredictionError(f"{where}: point {row} is at {values[row].tolist()}; expected finite metres")
+    return points
+
+
+def feature_table(value: object, file: Path) -> Float32Array:
+    """A row of features an object, as float32."""
+    if not isinstance(value, np.ndarray) or value.ndim != 2 or value.dtype.kind != "f" or not value.shape[1]:
+        raise PredictionError(f"{shown(file)}: holds {kind_of(value)}; expected a row of features an object")
+    with np.errstate(over="ignore", invalid="ignore"):
+        return value.astype(np.float32, copy=False)
+
+
+def without_nonfinite(features: Float32Array, what: str) -> tuple[Float32Array, tuple[str, ...]]:
+    """``features`` with rows of zeros in place of rows that hold NaN or infinity, and how many rows have no feature."""
+    is_bad = ~np.isfinite(features).all(axis=1)
+    if is_bad.any():
+        features = features.copy()
+        features[is_bad] = 0
+    n = int((~features.any(axis=1)).sum())
+    return features, (f"{n} {what} have no feature (a row of zeros or NaN)",) if n else ()

@@ -9,6 +9,7 @@ import numpy as np
 
 from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array, Masks
+from su3d_bench.metrics.matching.nearest import duplicate_pairs
 from su3d_bench.metrics.protocols import ProtocolRules
 
 NEAR_IOU = 0.9  # pairs above it are the same object twice
@@ -40,40 +41,19 @@ class MaskFacts:
 def mask_facts(masks: Masks, scores: Float64Array, n_points: int) -> MaskFacts:
     """Facts of K masks over ``n_points`` points."""
     n_owners = np.bincount(masks.indices, minlength=n_points) if n_points else np.zeros(0, np.int64)
-    near, identical = _pairs(masks, n_owners)
+    near = None
+    if float((n_owners.astype(np.float64) ** 2).sum()) <= MOST_SHARED:
+        near = tuple(duplicate_pairs(masks, n_points, NEAR_IOU))
     return MaskFacts(
         n_masks=len(masks),
         n_empty=int((masks.sizes == 0).sum()),
         near=near,
-        identical=identical,
+        identical=tuple((k, m) for k, m in near or () if np.array_equal(masks.mask(k), masks.mask(m))),
         lowest_score=float(scores.min()) if len(scores) else None,
         highest_score=float(scores.max()) if len(scores) else None,
         n_covered=int((n_owners > 0).sum()),
         n_contested=int((n_owners > 1).sum()),
     )
-
-
-def _pairs(
-    masks: Masks, n_owners: Int64Array
-) -> tuple[tuple[tuple[int, int], ...] | None, tuple[tuple[int, int], ...]]:
-    """Pairs of masks, the lower first, with IoU above ``NEAR_IOU``, and the equal ones among them."""
-    if float((n_owners.astype(np.float64) ** 2).sum()) > MOST_SHARED:
-        return None, ()
-    from scipy.sparse import csr_array
-
-    # points in one mask alone tell nothing of pairs
-    is_shared = n_owners[masks.indices] > 1
-    starts = np.concatenate([[0], np.cumsum(is_shared)])[masks.indptr]
-    chosen = masks.indices[is_shared]
-    member = csr_array((np.ones(len(chosen), np.int32), chosen, starts), shape=(len(masks), len(n_owners)))
-    shared = (member @ member.T).tocoo()
-    size = masks.sizes
-    union = size[shared.row] + size[shared.col] - shared.data
-    is_near = (shared.row < shared.col) & (shared.data > NEAR_IOU * union)
-    near = sorted(zip(shared.row[is_near].tolist(), shared.col[is_near].tolist(), strict=True))
-    is_equal = (shared.row < shared.col) & (shared.data == union)
-    identical = sorted(zip(shared.row[is_equal].tolist(), shared.col[is_equal].tolist(), strict=True))
-    return tuple(near), tuple(identical)
 
 
 def empty_warnings(scene: str, facts: MaskFacts, masks: Masks, keys: Sequence[str]) -> list[str]:
