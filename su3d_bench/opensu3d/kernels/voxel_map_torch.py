@@ -1,8 +1,8 @@
 """The scene cloud on a torch device: the answers of ``VoxelMap``, to the last bit; imported only when one is asked for.
 
-Voxels, blocks and the lists of points are those of ``_kernels.py``, but blocks are found by a search in their sorted
+Voxels, blocks and the lists of points are those of ``voxel_map.py``, but blocks are found by a search in their sorted
 keys and a view is worked on as a whole. Every number is made by single float64 operations in the order of
-``_kernels.py``, each rounded as IEEE 754 says, so that a GPU gives the bits that the CPU gives.
+``voxel_map.py``, each rounded as IEEE 754 says, so that a GPU gives the bits that the CPU gives.
 """
 
 from __future__ import annotations
@@ -284,14 +284,11 @@ class DeviceVoxelMap:
             setattr(self, name, larger)
 
     def _reserve_blocks(self, n: int) -> None:
-        capacity = len(self._heads) // VOXELS
-        if n <= capacity:
-            return
-        while capacity < n:
-            capacity *= 2
-        larger = self._full(capacity * VOXELS, ABSENT, torch.int32)
-        larger[: len(self._heads)] = self._heads
-        self._heads = larger
+        capacity = doubled(len(self._heads), n * VOXELS)
+        if capacity > len(self._heads):
+            larger = self._full(capacity, ABSENT, torch.int32)
+            larger[: len(self._heads)] = self._heads
+            self._heads = larger
 
     def _up(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(np.require(array, requirements=["C", "W"])).to(self._device)
@@ -336,7 +333,7 @@ def _number(digits: Tensor, base: int) -> Tensor:
 def _squared_gaps(points: Tensor, voxels: Tensor, side: Tensor) -> Tensor:
     """Of each axis, squared distances (N, 3, 5) from a point to the voxels 2 below to 2 above its own, rounded down.
 
-    The margins are those of ``_kernels.py``, so that no voxel is passed over for rounding.
+    The margins are those of ``voxel_map.py``, so that no voxel is passed over for rounding.
     """
     below, above = points - voxels * side, (voxels + 1) * side - points
     gaps = torch.stack([below + side, below, torch.zeros_like(below), above, above + side], dim=-1)

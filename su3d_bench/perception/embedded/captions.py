@@ -127,7 +127,7 @@ def _attribute_caption(crop: CropTruth, random: Generator) -> Caption:
     has_colour = random.random() < 0.7
     has_size = bool(SIZE_WORDS.get(crop.size_word)) and random.random() < (0.3 if has_colour else 0.5)
     has_material = bool(crop.material) and random.random() < 0.25
-    colour = draw(COLOUR_WORDS.get(crop.colour, (crop.colour,)), random) if has_colour else ""
+    colour = _colour(crop.colour, random) if has_colour else ""
     size = draw(SIZE_WORDS[crop.size_word], random) if has_size else ""
     is_anything = (has_colour or has_material) and random.random() < 0.15
     noun = draw(ANYTHING if is_anything else class_words(crop.class_name), random)
@@ -146,8 +146,8 @@ def _relation_caption(crop: CropTruth, neighbour: Neighbour, random: Generator) 
     has_colour, has_other_colour = random.random() < 0.35, random.random() < 0.15
     noun = draw(class_words(crop.class_name), random)
     other = draw(class_words(neighbour.class_name), random)
-    colour = draw(COLOUR_WORDS.get(crop.colour, (crop.colour,)), random) if has_colour else ""
-    other_colour = draw(COLOUR_WORDS.get(neighbour.colour, (neighbour.colour,)), random) if has_other_colour else ""
+    colour = _colour(crop.colour, random) if has_colour else ""
+    other_colour = _colour(neighbour.colour, random) if has_other_colour else ""
     subject = " ".join(word for word in (colour, noun) if word)
     target = " ".join(word for word in (other_colour, other) if word)
     relation = draw(RELATION_WORDS.get(neighbour.relation, (neighbour.relation,)), random)
@@ -190,6 +190,10 @@ def wrong_relation(caption: Caption, class_names: Sequence[str], random: Generat
 def fill(template: str, name: str) -> str:
     """``name`` in a template, where ``{a}`` stands for the name after its article."""
     return template.replace("{a}", with_article(name)).replace("{}", name)
+
+
+def _colour(name: str, random: Generator) -> str:
+    return draw(COLOUR_WORDS.get(name, (name,)), random)
 
 
 def draw(choices: Sequence[Word], random: Generator) -> Word:

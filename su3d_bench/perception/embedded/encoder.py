@@ -123,19 +123,20 @@ class EmbeddedEncoder:
 
     @cached_property
     def _image_tower(self) -> Any:
-        return self._tower(self._path(IMAGE_FILE), is_image=True)
+        return self._tower(IMAGE_FILE)
 
     @cached_property
     def _text_tower(self) -> Any:
-        return self._tower(self._path(TEXT_FILE), is_image=False)
+        return self._tower(TEXT_FILE)
 
-    def _tower(self, path: Path, *, is_image: bool) -> Any:
+    def _tower(self, name: str) -> Any:
+        path = self._path(name)
         if self.device == "cpu":
             return open_session(path)
         require("torch", f"device '{self.device}'")
         from su3d_bench.perception.embedded.torch_towers import TorchTower
 
-        return TorchTower(path, is_image=is_image, device=self.device)
+        return TorchTower(path, is_image=name == IMAGE_FILE, device=self.device)
 
     def _path(self, name: str) -> Path:
         path = self._folder / name

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from importlib.resources import files
 
 import numpy as np
@@ -46,6 +48,11 @@ class NamingConfig(BaseModel):
 def vocabulary() -> tuple[str, ...]:
     """The class names that regions may be called, in the order of the list file."""
     text = files("su3d_bench.perception.embedded.weights").joinpath("vocabulary.txt").read_text(encoding="utf-8")
+    return listed_words(text)
+
+
+def listed_words(text: str) -> tuple[str, ...]:
+    """The words of a list, one a line, empty lines and those that begin with # aside."""
     lines = (line.strip() for line in text.splitlines())
     return tuple(line for line in lines if line and not line.startswith("#"))
 
@@ -99,25 +106,38 @@ class Names:
     confidences: Float64Array
 
 
+class PromptedWords:
+    """A list of ``words`` in a prompt, with "{}" where the word stands; encoded at the first use."""
+
+    def __init__(self, encoder: Encoder, words: Sequence[str], prompt: str) -> None:
+        self.words = tuple(words)
+        self._encoder = encoder
+        self._prompt = prompt
+
+    def similarity(self, features: Float32Array) -> Float64Array:
+        """The cosines (K, W) of ``features`` (K, D) of images with the words."""
+        # einsum sums in one order whatever the number of threads; a matrix product may not.
+        similarity: Float64Array = np.einsum("kd,wd->kw", features.astype(np.float64), self._features)
+        return similarity
+
+    @cached_property
+    def _features(self) -> Float64Array:
+        prompts = [self._prompt.replace("{}", with_article(word)) for word in self.words]
+        return self._encoder.encode_texts(prompts).astype(np.float64)
+
+
 class Namer:
     """Zero-shot classifier over the embedded vocabulary."""
 
     def __init__(self, config: NamingConfig, encoder: Encoder, words: tuple[str, ...] | None = None) -> None:
-        self._config = config
-        self._encoder = encoder
-        self._words = vocabulary() if words is None else words
-        self._text_features: Float32Array | None = None
-        self.digest = content_key("namer", config.model_dump_json(), encoder.digest, *self._words)
+        self._temperature = config.temperature
+        self._words = PromptedWords(encoder, vocabulary() if words is None else words, config.prompt)
+        self.digest = content_key("namer", config.model_dump_json(), encoder.digest, *self._words.words)
 
     def name(self, features: Float32Array) -> Names:
         """The likeliest word for each of the ``features`` (K, D) of crops at ratio 1.0."""
-        if self._text_features is None:
-            prompts = [self._config.prompt.replace("{}", with_article(word)) for word in self._words]
-            self._text_features = self._encoder.encode_texts(prompts)
-        # einsum sums in one order whatever the number of threads; a matrix product may not.
-        similarity = np.einsum("kd,wd->kw", features.astype(np.float64), self._text_features.astype(np.float64))
-        logits = similarity / self._config.temperature
+        logits = self._words.similarity(features) / self._temperature
         weights = np.exp(logits - logits.max(axis=1, keepdims=True)) if len(logits) else logits
         best = weights.argmax(axis=1) if len(logits) else np.zeros(0, np.intp)
         confidences = 1.0 / weights.sum(axis=1)
-        return Names(tuple(self._words[index] for index in best), confidences)
+        return Names(tuple(self._words.words[index] for index in best), confidences)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import AbstractContextManager, nullcontext, suppress
 from functools import partial
 from importlib.util import find_spec
 
@@ -106,24 +107,21 @@ def _locate_sam(config: PaperConfig, models: ModelsConfig) -> ModelFiles:
 def _tagger(config: PaperConfig, models: ModelsConfig, encoder: Encoder, device: str) -> Tagger:
     """The tagger that is asked for, or with ``auto`` the first that is here."""
     if config.tagger == "ram" or (config.tagger == "auto" and find_spec("ram") is not None):
-        try:
+        with _passed_over(config.tagger):
             require("ram", "tagger 'ram'")
             files = _locate(models, TAGGER, ("original",))
-        except ModelMissing:
-            if config.tagger == "ram":
-                raise
-        else:
             digests = [text for pair in sorted(files.digests().items()) for text in pair]
             # RAM++'s own code mixes float32 in, so it runs in float32 wherever it runs.
             load = partial(kept, files, (device,), partial(load_ram, files, device))
             return RamTagger(load, device, content_key(*digests))
     if config.tagger in ("ram-onnx", "auto"):
-        try:
+        with _passed_over(config.tagger):
             files = _locate(models, TAGGER, ("onnx",))
-        except ModelMissing:
-            if config.tagger == "ram-onnx":
-                raise
-        else:
             tags = read_word_list(files.folder / RAM_TAG_LIST)
             return OnnxRamTagger(partial(open_session, files.weights), tags, content_key(*files.digests().values()))
     return WordTagger(encoder, read_word_list(config.words), config.n_tags)
+
+
+def _passed_over(tagger: str) -> AbstractContextManager[None]:
+    """A model that is not here is an error where it was asked for by its name."""
+    return suppress(ModelMissing) if tagger == "auto" else nullcontext()

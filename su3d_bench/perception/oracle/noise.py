@@ -29,71 +29,54 @@ class OracleNoise(BaseModel):
     flip_probability: float = Field(default=0.0, ge=0, le=1)
 
 
+Region = tuple[BoolArray, str]
+
+
 def disturb(
     masks: list[BoolArray], names: list[str], known: list[str], noise: OracleNoise, frame_index: int
 ) -> tuple[list[BoolArray], list[str]]:
     """``masks`` and ``names`` with the faults of ``noise``; ``known`` are the names that a flip may give."""
     generator = np.random.default_rng([noise.seed, frame_index])
-    masks, names = _drop(masks, names, noise.drop_probability, generator)
-    masks, names = _merge(masks, names, noise.merge_probability, generator)
-    masks, names = _split(masks, names, noise.split_probability, generator)
+    regions = list(zip(masks, names, strict=True))
+    is_kept = generator.random(len(regions)) >= noise.drop_probability
+    regions = _merge([regions[k] for k in np.flatnonzero(is_kept)], noise.merge_probability, generator)
+    regions = _split(regions, noise.split_probability, generator)
+    masks = [mask for mask, _ in regions]
     if noise.erode_px or noise.dilate_px:
         masks = [_resize(mask, noise.erode_px, noise.dilate_px) for mask in masks]
-    return masks, _flip(names, known, noise.flip_probability, generator)
+    return masks, _flip([name for _, name in regions], known, noise.flip_probability, generator)
 
 
-def _drop(
-    masks: list[BoolArray], names: list[str], probability: float, generator: np.random.Generator
-) -> tuple[list[BoolArray], list[str]]:
-    is_kept = generator.random(len(masks)) >= probability
-    kept = np.flatnonzero(is_kept)
-    return [masks[k] for k in kept], [names[k] for k in kept]
-
-
-def _merge(
-    masks: list[BoolArray], names: list[str], probability: float, generator: np.random.Generator
-) -> tuple[list[BoolArray], list[str]]:
+def _merge(regions: list[Region], probability: float, generator: np.random.Generator) -> list[Region]:
     """Each drawn mask joins the touching mask of the most pixels, under the name of the larger of the two."""
-    is_drawn = generator.random(len(masks)) < probability
-    masks, alive = list(masks), np.ones(len(masks), bool)
-    names = list(names)
-    for k in np.flatnonzero(is_drawn):
-        if not alive[k]:
-            continue
-        grown = _resize(masks[k], 0, 2)
-        touching = [j for j in np.flatnonzero(alive) if j != k and np.any(grown & masks[j])]
-        if not touching:
-            continue
-        sizes = [int(np.count_nonzero(masks[j])) for j in touching]
-        other = touching[int(np.argmax(sizes))]
-        if np.count_nonzero(masks[k]) > max(sizes):
-            names[other] = names[k]
-        masks[other] = masks[other] | masks[k]
-        alive[k] = False
-    kept = np.flatnonzero(alive)
-    return [masks[k] for k in kept], [names[k] for k in kept]
+    is_drawn = generator.random(len(regions)) < probability
+    merged = dict(enumerate(regions))
+    for k in np.flatnonzero(is_drawn).tolist():
+        mask, name = merged[k]
+        grown = _resize(mask, 0, 2)
+        sizes = {j: np.count_nonzero(near) for j, (near, _) in merged.items() if j != k and np.any(grown & near)}
+        if sizes:
+            other = max(sizes, key=lambda j: sizes[j])
+            near, near_name = merged[other]
+            merged[other] = near | mask, name if np.count_nonzero(mask) > sizes[other] else near_name
+            del merged[k]
+    return list(merged.values())
 
 
-def _split(
-    masks: list[BoolArray], names: list[str], probability: float, generator: np.random.Generator
-) -> tuple[list[BoolArray], list[str]]:
-    is_drawn = generator.random(len(masks)) < probability
-    angles = generator.random(len(masks)) * math.pi
-    pieces: list[BoolArray] = []
-    piece_names: list[str] = []
-    for mask, name, drawn, angle in zip(masks, names, is_drawn, angles, strict=True):
+def _split(regions: list[Region], probability: float, generator: np.random.Generator) -> list[Region]:
+    is_drawn = generator.random(len(regions)) < probability
+    angles = generator.random(len(regions)) * math.pi
+    pieces: list[Region] = []
+    for (mask, name), drawn, angle in zip(regions, is_drawn, angles, strict=True):
         if not drawn or not mask.any():
-            pieces.append(mask)
-            piece_names.append(name)
+            pieces.append((mask, name))
             continue
         v, u = np.nonzero(mask)
         side = (u - u.mean()) * math.cos(angle) + (v - v.mean()) * math.sin(angle) > 0
-        first, second = np.zeros_like(mask), np.zeros_like(mask)
+        first = np.zeros_like(mask)
         first[v[side], u[side]] = True
-        second[v[~side], u[~side]] = True
-        pieces += [first, second]
-        piece_names += [name, name]
-    return pieces, piece_names
+        pieces += [(first, name), (mask & ~first, name)]
+    return pieces
 
 
 def _resize(mask: BoolArray, erode_px: int, dilate_px: int) -> BoolArray:

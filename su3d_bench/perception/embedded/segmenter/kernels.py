@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -232,7 +234,7 @@ def _chord(planes: Float32Array, v: int, u: int, v1: int, u1: int) -> float:
 
 
 @njit(cache=True)
-def _find(parent: Int32Array, node: int) -> int:
+def _find(parent: NDArray[Any], node: int) -> int:
     while parent[node] != node:
         parent[node] = parent[parent[node]]
         node = parent[node]
@@ -401,17 +403,8 @@ def connected(a: NDArray[np.intp], b: NDArray[np.intp], n: int) -> tuple[NDArray
     """
     parent = np.arange(n)
     for k in range(len(a)):
-        i, j = a[k], b[k]
-        while parent[i] != i:
-            parent[i] = parent[parent[i]]
-            i = parent[i]
-        while parent[j] != j:
-            parent[j] = parent[parent[j]]
-            j = parent[j]
-        if i < j:
-            parent[j] = i
-        else:
-            parent[i] = j
+        i, j = _find(parent, a[k]), _find(parent, b[k])
+        parent[max(i, j)] = min(i, j)
     component = np.empty(n, np.intp)
     n_components = 0
     for i in range(n):

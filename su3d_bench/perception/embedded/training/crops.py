@@ -14,7 +14,7 @@ import numpy as np
 
 from su3d_bench.core import registry
 from su3d_bench.core.types import Float32Array, Frame, Int32Array, Int64Array, Regions, UInt8Array
-from su3d_bench.perception.crops import crop_window
+from su3d_bench.perception.crops import crop_window, mask_boxes
 from su3d_bench.perception.embedded.captions import CropTruth, Neighbour
 from su3d_bench.perception.embedded.encoder import IMAGE_SIZE, log_size, shrink
 from su3d_bench.perception.embedded.segmenter.segmenter import RgbdSegmenter, SegmenterConfig
@@ -164,8 +164,7 @@ def _row(crop: CropTruth, window: Int64Array, ratio: float, is_exact: bool) -> l
 
 def _boxes(mask: np.ndarray[Any, Any], rng: np.random.Generator) -> Iterator[tuple[Float32Array, float, bool]]:
     """Boxes, ratios, and whether the box is exact: the object's box, a careless one, a part of it, a wide one."""
-    columns, rows = np.flatnonzero(mask.any(axis=0)), np.flatnonzero(mask.any(axis=1))
-    box = np.array([columns[0], rows[0], columns[-1] + 1, rows[-1] + 1], np.float32)
+    box = mask_boxes(mask[None])[0]
     yield box, float(rng.choice(TIGHT_RATIOS)), True
     size = np.array([box[2] - box[0], box[3] - box[1]] * 2, np.float32)
     careless = (box + rng.uniform(-0.18, 0.18, 4) * size).astype(np.float32)
@@ -186,9 +185,8 @@ def _part_box(mask: np.ndarray[Any, Any], box: Float32Array, rng: np.random.Gene
         top = int(rng.integers(y0, max(y0, y1 - height) + 1))
         inside = mask[top : top + height, left : left + width]
         if inside.mean() > 0.55:
-            columns, rows = np.flatnonzero(inside.any(axis=0)), np.flatnonzero(inside.any(axis=1))
-            part = [left + columns[0], top + rows[0], left + columns[-1] + 1, top + rows[-1] + 1]
-            return np.array(part, np.float32)
+            part: Float32Array = mask_boxes(inside[None])[0] + np.array([left, top, left, top], np.float32)
+            return part
     return None
 
 

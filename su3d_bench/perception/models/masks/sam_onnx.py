@@ -15,7 +15,7 @@ from su3d_bench.core.errors import CheckFailed, DataError
 from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.masks.sam import Prompts
-from su3d_bench.perception.models.onnx.export import Parity, compare_outputs, export_onnx
+from su3d_bench.perception.models.onnx.export import Parity, export_onnx, measure_parity
 from su3d_bench.perception.models.onnx.manifest import OnnxManifest, wrong_files
 from su3d_bench.perception.models.onnx.session import Provider, open_session
 from su3d_bench.perception.models.pretrained import load_sam
@@ -85,23 +85,21 @@ def export_sam(files: ModelFiles, folder: Path) -> SamManifest:
     written = export_onnx(encoder, {"pixels": pixels}, folder / ENCODER_FILE, ["embedding"])
     with torch.inference_mode():
         embedding = encoder(pixels).clone()
-    seen = open_session(folder / ENCODER_FILE).run(["embedding"], {"pixels": pixels.numpy()})[0]
-    parity = [compare_outputs("embedding", embedding.numpy(), seen)]
     # Two prompts of three points are traced, five of two compared: neither number must be part of the file.
-    traced = _probes(random, side, 2, 3)
+    traced = {"embedding": embedding, **_probes(random, side, 2, 3)}
     axes = {name: {0: "n_prompts", 1: "n_points"} for name in ("points", "labels")}
     outputs = {name: {0: "n_prompts"} for name in ("logits", "iou")}
-    inputs = {"embedding": embedding, **traced}
-    written += export_onnx(decoder, inputs, folder / DECODER_FILE, ["logits", "iou"], {**axes, **outputs})
-    session = open_session(folder / DECODER_FILE)
+    written += export_onnx(decoder, traced, folder / DECODER_FILE, ["logits", "iou"], {**axes, **outputs})
     compared = {"embedding": embedding, **_probes(random, side, 5, 2)}
+    parity = (
+        *measure_parity(encoder, open_session(folder / ENCODER_FILE), {"pixels": pixels}, ["embedding"]),
+        *measure_parity(decoder, open_session(folder / DECODER_FILE), compared, ["logits", "iou"]),
+    )
     with torch.inference_mode():
-        mine = decoder(*compared.values())
-    other = session.run(["logits", "iou"], {name: value.numpy() for name, value in compared.items()})
-    parity += [compare_outputs(name, a.numpy(), b) for name, a, b in zip(("logits", "iou"), mine, other, strict=True)]
+        largest = [float(values.abs().max()) for values in (embedding, *decoder(*compared.values()))]
     manifest = SamManifest.of_export(files, written, parity, str(torch.__version__), image_px=side)
-    for one, values in zip(parity, (embedding, *mine), strict=True):
-        _check(manifest.name, one, float(values.abs().max()))
+    for part, value in zip(parity, largest, strict=True):
+        _check(manifest.name, part, value)
     return manifest
 
 
@@ -114,11 +112,11 @@ def _probes(random: np.random.Generator, side: int, n_prompts: int, n_points: in
     return {"points": torch.from_numpy(points), "labels": torch.from_numpy(labels)}
 
 
-def _check(name: str, one: Parity, largest: float) -> None:
-    if one.max_abs_difference > LARGEST_DIFFERENCE * max(largest, 1e-6):
+def _check(name: str, parity: Parity, largest: float) -> None:
+    if parity.max_abs_difference > LARGEST_DIFFERENCE * max(largest, 1e-6):
         raise CheckFailed(
-            f"{name}: {one.output} differs between torch and ONNX Runtime by {one.max_abs_difference:.2e} of at most "
-            f"{largest:.2e}; tolerance {LARGEST_DIFFERENCE:.0e} of the largest value"
+            f"{name}: {parity.output} differs between torch and ONNX Runtime by {parity.max_abs_difference:.2e} of "
+            f"at most {largest:.2e}; tolerance {LARGEST_DIFFERENCE:.0e} of the largest value"
         )
 
 

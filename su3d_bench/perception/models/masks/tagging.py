@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from functools import cached_property
+from functools import cache
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -14,7 +14,7 @@ from su3d_bench.core.errors import DataError, ModelMissing
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.perception.cache import content_key
-from su3d_bench.perception.embedded.naming import vocabulary, with_article
+from su3d_bench.perception.embedded.naming import PromptedWords, listed_words, vocabulary
 from su3d_bench.perception.models.encoders.model_images import normalised, resized
 from su3d_bench.perception.models.files import ModelFiles, bounded, read_weights
 
@@ -42,13 +42,9 @@ class RamTagger:
     caveat: str | None = None
 
     def __init__(self, load: Callable[[], Any], device: str, digest: str) -> None:
-        self._load = load
+        self._model = cache(load)
         self._device = device
         self.digest = content_key("ram", digest)
-
-    @cached_property
-    def _model(self) -> Any:
-        return self._load()
 
     def tags(self, rgb: UInt8Array) -> tuple[str, ...]:
         """The tags of ``rgb`` (H, W, 3) in the order of RAM++'s list."""
@@ -56,7 +52,7 @@ class RamTagger:
 
         pixels = torch.from_numpy(ram_pixels(rgb)[None]).to(self._device)
         with torch.inference_mode():
-            english, _ = self._model.generate_tag(pixels)
+            english, _ = self._model().generate_tag(pixels)
         return tuple(tag for tag in str(english[0]).split(" | ") if tag)
 
 
@@ -67,17 +63,14 @@ class OnnxRamTagger:
     caveat: str | None = None
 
     def __init__(self, load: Callable[[], Any], tag_list: Sequence[str], digest: str) -> None:
-        self._load = load
+        self._session = cache(load)
         self._tag_list = tuple(tag_list)
         self.digest = content_key("ram-onnx", digest, *self._tag_list)
 
-    @cached_property
-    def _session(self) -> Any:
-        return self._load()
-
     def tags(self, rgb: UInt8Array) -> tuple[str, ...]:
         """The tags of ``rgb`` (H, W, 3) in the order of the list."""
-        is_there = self._session.run(None, {self._session.get_inputs()[0].name: ram_pixels(rgb)[None]})[0]
+        session = self._session()
+        is_there = session.run(None, {session.get_inputs()[0].name: ram_pixels(rgb)[None]})[0]
         if is_there.shape != (1, len(self._tag_list)):
             raise DataError(
                 f"tagger 'ram-onnx': the model answers {is_there.shape}, {RAM_TAG_LIST} has {len(self._tag_list)} "
@@ -97,37 +90,22 @@ class WordTagger:
 
     def __init__(self, encoder: Encoder, words: Sequence[str], n_tags: int, prompt: str = "{} in a scene") -> None:
         self._encoder = encoder
-        self._words = tuple(words)
+        self._words = PromptedWords(encoder, words, prompt)
         self._n_tags = n_tags
-        self._prompt = prompt
-        self._text_features: Float32Array | None = None
-        self.digest = content_key("words", encoder.digest, str(n_tags), prompt, *self._words)
+        self.digest = content_key("words", encoder.digest, str(n_tags), prompt, *self._words.words)
 
     def tags(self, rgb: UInt8Array) -> tuple[str, ...]:
         """At most ``n_tags`` words for ``rgb`` (H, W, 3)."""
-        if self._text_features is None:
-            prompts = [self._prompt.replace("{}", with_article(word)) for word in self._words]
-            self._text_features = self._encoder.encode_texts(prompts)
-        views = self._encoder.encode_images(_views(rgb))
-        # einsum sums in one order whatever the number of threads; a matrix product may not.
-        similarity = np.einsum("vd,wd->vw", views.astype(np.float64), self._text_features.astype(np.float64))
+        similarity = self._words.similarity(self._encoder.encode_images(_views(rgb)))
         order = np.argsort(-similarity.max(axis=0), kind="stable")
-        return tuple(self._words[index] for index in order[: self._n_tags])
+        return tuple(self._words.words[index] for index in order[: self._n_tags])
 
 
 def _views(rgb: UInt8Array) -> list[UInt8Array]:
     height, width = rgb.shape[:2]
     half_height, half_width = max(height // 2, 1), max(width // 2, 1)
-    corners = [
-        (top, left)
-        for top, left in (
-            (0, 0),
-            (0, width - half_width),
-            (height - half_height, 0),
-            (height - half_height, width - half_width),
-            ((height - half_height) // 2, (width - half_width) // 2),
-        )
-    ]
+    below, beside = height - half_height, width - half_width
+    corners = ((0, 0), (0, beside), (below, 0), (below, beside), (below // 2, beside // 2))
     parts = [np.ascontiguousarray(rgb[top : top + half_height, left : left + half_width]) for top, left in corners]
     return [rgb, *parts]
 
@@ -154,12 +132,11 @@ def read_word_list(path: Path | None) -> tuple[str, ...]:
     try:
         if path.stat().st_size > MAX_LIST_BYTES:
             raise DataError(f"{path}: has {path.stat().st_size} bytes; expected a list of words, one a line")
-        lines = [line.strip() for line in path.read_text(encoding="utf-8").splitlines()]
+        words = listed_words(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise DataError(f"{path}: the list of words cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
         raise DataError(f"{path}: is no UTF-8 text; expected a list of words, one a line") from error
-    words = tuple(line for line in lines if line and not line.startswith("#"))
     if not 1 <= len(words) <= MAX_WORDS:
         raise DataError(f"{path}: has {len(words)} words; expected 1 to {MAX_WORDS}")
     for word in words:

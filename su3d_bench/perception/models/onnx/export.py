@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import ModelMissing, StoreError
+from su3d_bench.core.errors import StoreError
 from su3d_bench.store.atomic import make_folder
 
 # 17 has LayerNormalization as one operator; newer ones bring nothing that our towers use.
@@ -43,7 +43,6 @@ def export_onnx(
     path: Path,
     output_names: Sequence[str],
     dynamic_axes: Mapping[str, Mapping[int, str]] | None = None,
-    opset: int = OPSET,
 ) -> list[Path]:
     """Write ``module`` as ``path`` and return the files made: the weights of a large one lie in ``<path>.data``.
 
@@ -51,7 +50,8 @@ def export_onnx(
     inputs and outputs, the axes whose size may differ from that of ``inputs``. The module's own mode is kept; give it
     in evaluation mode.
     """
-    torch = _torch()
+    import torch
+
     make_folder(path.parent)
     with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
         draft = Path(folder) / path.name
@@ -66,7 +66,7 @@ def export_onnx(
                 input_names=list(inputs),
                 output_names=list(output_names),
                 dynamic_axes={name: dict(axes) for name, axes in (dynamic_axes or {}).items()},
-                opset_version=opset,
+                opset_version=OPSET,
                 do_constant_folding=True,
                 dynamo=False,
             )
@@ -107,17 +107,6 @@ def _slow_attention(torch: Any) -> Iterator[None]:
         yield
     finally:
         torch.backends.mha.set_fastpath_enabled(before)
-
-
-def _torch() -> Any:
-    try:
-        import onnx  # noqa: F401 - the exporter itself imports it, with a message of its own
-        import torch
-    except ImportError as error:
-        raise ModelMissing(
-            f"models export: the package '{error.name}' is not installed; pip install 'su3d-bench[models]'"
-        ) from error
-    return torch
 
 
 def measure_parity(
