@@ -17,12 +17,12 @@ from su3d_bench.datasets.replica.frames import (
     check_frames_complete,
     colour_name,
     depth_name,
-    poses_of_lines,
     read_camera,
     trajectory_lines,
 )
 from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, MESH_NAME, read_annotated_mesh
 from su3d_bench.formats.images import JPEG_END, JPEG_END_WITHIN, PNG_SIGNATURE, image_size
+from su3d_bench.formats.poses import poses_of_lines
 
 MOST_LINES = 20  # of one kind of fault; the rest is counted
 HEAD_BYTES = (4096, 1 << 18)  # a JPEG may carry its size behind the blocks of its camera, each below 64 KB

@@ -17,12 +17,11 @@ import numpy as np
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, GroundTruth
 from su3d_bench.datasets.replica.folders import FUSED_CLOUD, replica_label_set
-from su3d_bench.datasets.replica.frames import poses_of_lines
 from su3d_bench.formats.hdf5 import largest_column, read_rows
+from su3d_bench.formats.poses import moved, read_first_pose
 
 N_EMBEDDING = 102  # channel i is Replica's class i, 0 is 'other'
 TRAJECTORY_NAME = "traj_w_c.txt"
-MAX_LINE = 4096  # characters of a pose; 16 numbers have about 400
 
 
 def cloud_files(sequence: Path) -> tuple[Path, ...]:
@@ -67,29 +66,3 @@ def read_points(path: Path, where: str) -> Float32Array:
     if not len(points):
         raise DataError(f"{where}: holds no point; make or copy it again")
     return points
-
-
-def read_first_pose(path: Path, where: str) -> Float32Array:
-    """The camera-to-world matrix (4, 4) in the first line, in single precision as the original reads it."""
-    try:
-        with path.open(encoding="utf-8") as file:
-            line = file.readline(MAX_LINE)
-    except OSError as error:
-        raise DataError(f"{where} cannot be read: {error.strerror}; it belongs to the ground-truth cloud") from error
-    except UnicodeDecodeError as error:
-        raise DataError(f"{where}: is not a text file; copy it again") from error
-    pose: Float32Array = poses_of_lines([line], where)[0].astype(np.float32)
-    return pose
-
-
-def moved(points: Float32Array, camera_to_world: Float32Array) -> Float32Array:
-    """``points`` (N, 3) in the world, in single precision, the same bits on every machine."""
-    rotation, translation = camera_to_world[:3, :3], camera_to_world[:3, 3]
-    world = [
-        points[:, 0] * rotation[row, 0]
-        + points[:, 1] * rotation[row, 1]
-        + points[:, 2] * rotation[row, 2]
-        + translation[row]
-        for row in range(3)
-    ]
-    return np.stack(world, axis=1).astype(np.float32)

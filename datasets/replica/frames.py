@@ -8,7 +8,6 @@ complete, so a gap or a NaN means a damaged copy, and a number computed around i
 from __future__ import annotations
 
 import json
-import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -21,7 +20,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
 from su3d_bench.datasets.replica.mesh_truth import shown
 from su3d_bench.formats.images import decode_colour, decode_depth, read_bytes
-from su3d_bench.numerics.geometry import are_rigid
+from su3d_bench.formats.poses import poses_of_lines
 
 CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
 FRAMES_PER_SECOND = 30.0  # the release has no timestamps
@@ -88,33 +87,6 @@ def trajectory_lines(path: Path, where: str) -> list[str]:
     if not lines:
         raise DataError(f"{where}: traj.txt is empty; expected one pose a line")
     return lines
-
-
-def poses_of_lines(lines: Sequence[str], where: str, first_line: int = 1) -> Float64Array:
-    """Rigid camera-to-world poses (n, 4, 4), one a line; ``where`` names the file, ``first_line`` counts from 1."""
-    poses = np.array([_values(line, f"{where} line {n}") for n, line in enumerate(lines, first_line)])
-    poses = poses.reshape(-1, 4, 4)
-    is_rigid = are_rigid(poses)
-    if not is_rigid.all():
-        raise DataError(
-            f"{where} line {first_line + int(np.argmin(is_rigid))}: not a rigid motion; expected a row-major "
-            "camera-to-world matrix with last row 0 0 0 1"
-        )
-    return poses
-
-
-def _values(line: str, where: str) -> list[float]:
-    words = line.split()
-    if len(words) != 16:
-        raise DataError(f"{where} has {len(words)} values; expected 16, a row-major 4x4 camera-to-world matrix")
-    try:
-        values = [float(word) for word in words]
-    except ValueError as error:
-        raise DataError(f"{where}: {str(error)[:80]}; expected 16 numbers") from error
-    for value, word in zip(values, words, strict=True):
-        if not math.isfinite(value):
-            raise DataError(f"{where}: the pose holds '{word[:20]}'; mend the trajectory or leave the scene out")
-    return values
 
 
 def check_frames_complete(scene_folder: Path, n_poses: int, where: str) -> None:

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, PredictionError, StoreError, converted, shown
 from su3d_bench.core.types import DenseFeatures, Float32Array
-from su3d_bench.datasets.replica.cloud_truth import moved, read_first_pose
 from su3d_bench.formats.arrays import checked_points
 from su3d_bench.formats.hdf5 import n_columns_of, read_rows, row_blocks
+from su3d_bench.formats.poses import moved, read_first_pose
 from su3d_bench.predictions.base import SceneFolders, ScenePrediction
 
 POINTS, EMBEDDINGS = "pc_points.h5", "pc_embeddings.h5"
