@@ -28,4 +28,4 @@ def test_a_made_up_frame_goes_through_every_step(name: str, monkeypatch: pytest.
     monkeypatch.setattr(type(method), "close", lambda self: None, raising=False)  # keeps the map
     warm_up(method)
     assert method.n_points > 0
-    assert not isinstance(method, TakesTools) or method._tools is None
+    assert not isinstance(method, TakesTools) or vars(method)["_tools"] is None
