@@ -13,7 +13,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable
-from su3d_bench.metrics.protocols import load_protocol, protocol_names
+from su3d_bench.metrics.protocol_files import protocol_names
+from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import combine
 from su3d_bench.reports.tables.model import NOT_MEASURED, Cell, Origin, Table, TableRow, bracketed, percent
 from su3d_bench.runs.finished import FinishedRun, read_run

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -34,7 +35,8 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.metrics.protocols import load_protocol, protocol_names, rules_file
+    from su3d_bench.metrics.protocol_files import protocol_names, rules_files
+    from su3d_bench.metrics.protocols import load_protocol
 
     if arguments.action not in ACTIONS:
         hint = suggest(arguments.action, ACTIONS) or "; known: list, show NAME"
@@ -46,7 +48,7 @@ def call(arguments: argparse.Namespace) -> int:
         if arguments.json:
             answer_json(rules.model_dump(mode="json") | {"digest": rules.digest})
         else:
-            answer(_rules_text(rules, rules_file(arguments.name)))
+            answer(_rules_text(rules, rules_files(arguments.name)))
         return 0
     rows = [load_protocol(name) for name in protocol_names()]
     if arguments.json:
@@ -58,12 +60,12 @@ def call(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _rules_text(rules: ProtocolRules, file: Path) -> str:
-    """Every rule as a line, beneath it what the protocol's file says of it: its source, or that it is ours."""
+def _rules_text(rules: ProtocolRules, files: Sequence[Path]) -> str:
+    """Every rule as a line, beneath it what the file that sets it says of it: its source, or that it is ours."""
     from su3d_bench.core.config import flatten, toml_value
     from su3d_bench.metrics.protocols import not_comparable_with
 
-    remarks = read_remarks(file)
+    remarks = _remarks_of(files)
     shown = rules.model_dump(mode="json", exclude={"classes"}) | {"not_comparable_with": not_comparable_with(rules)}
     lines = [*remarks.pop(HEADING, []), ""]
     for path, value in flatten(shown):
@@ -79,6 +81,16 @@ def _rules_text(rules: ProtocolRules, file: Path) -> str:
         remark = "" if entry in rules.scored else "  (ignored)"
         lines.append(f"{entry.id:>6}  {entry.name}{f'  {entry.group}' if entry.group else ''}{remark}")
     return "\n".join(lines)
+
+
+def _remarks_of(files: Sequence[Path]) -> dict[str, list[str]]:
+    """The comments of a protocol's file and of those that it extends; one that sets a rule alone speaks of it."""
+    each = [read_remarks(file) for file in files]
+    remarks = {key: lines for own in reversed(each) for key, lines in own.items()}
+    remarks[HEADING] = list(each[0].get(HEADING, []))
+    for file, own in zip(files[1:], each[1:], strict=True):
+        remarks[HEADING] += [f"extends {file.stem}:", *own.get(HEADING, [])]
+    return remarks
 
 
 def read_remarks(file: Path) -> dict[str, list[str]]:

@@ -12,7 +12,7 @@ from su3d_bench.core.errors import PredictionError
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.matching.checks import MaskFacts
 from su3d_bench.metrics.metric import SceneScore
-from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules
+from su3d_bench.metrics.protocols import RULES_OF_KIND, ProtocolRules
 from su3d_bench.metrics.results import ProtocolResult, plain_json
 from su3d_bench.metrics.scoring import combine, combined_metrics, metric_of
 
@@ -23,7 +23,8 @@ KEYS = {
     "AP": "ap", "AP50": "ap50", "AP25": "ap25", "mAcc": "macc", "mIoU": "miou", "F-mIoU": "fmiou", "pAcc": "pacc",
     "recall": "acc", "precision": "precision", "IoU": "iou", "F1": "f1", "mPrecision": "mprecision", "mF1": "mf1",
 }  # fmt: skip
-OWN_NAMES = ("categories", *SHARE_KINDS)  # kinds all of whose metrics are reported
+# Kinds all of whose metrics are reported.
+OWN_NAMES = ("categories", *(kind for kind, rules in RULES_OF_KIND.items() if rules.is_judged))
 MAIN = ("ap", "ap50", "ap25", "macc", "miou", "fmiou")
 
 

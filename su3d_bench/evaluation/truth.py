@@ -35,7 +35,7 @@ from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.metrics.fitness import LARGEST_NYU40_ID, TruthFacts, why_not_truth
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
-from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules
+from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
 from su3d_bench.predictions.base import scene_files
 from su3d_bench.predictions.scenes import Match, Source, match_scenes, planned_scenes
@@ -140,7 +140,7 @@ class DatasetTruths(SceneTruths):
     def of_scene(self, rules: ProtocolRules, scene: str) -> Truth:
         if rules.ground_truth != QUERY_OBJECTS:
             truth = self._truth(scene, rules.ground_truth)
-            return question_truth(rules, self._dataset, scene, truth) if rules.kind in SHARE_KINDS else truth
+            return question_truth(rules, self._dataset, scene, truth) if rules.is_judged else truth
         assert self._queries is not None
         if scene not in self._queries:
             raise GroundTruthMissing(f"{self.where}/{scene}: the file of queries has none of this scene")
@@ -254,7 +254,7 @@ class TextTruths(SceneTruths):
     def why_not(self, rules: ProtocolRules, *, is_named: bool) -> str | None:
         if rules.ground_truth == QUERY_OBJECTS:
             return _why_no_queries(is_named=is_named)
-        if rules.kind in SHARE_KINDS and not is_named:
+        if rules.is_judged and not is_named:
             return f"{NOT_MEANT} texts"
         facts = TruthFacts(self.where, None, (), has_points=False, has_instances=self._has_instances)
         reason = why_not_truth(rules, facts)

@@ -14,14 +14,12 @@ from numpy.typing import NDArray
 from su3d_bench.core.types import Instances, Partition, Prediction
 from su3d_bench.metrics.matching.labelling import has_every_label
 from su3d_bench.metrics.open_vocabulary.score import NEEDS_FEATURES
-from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules
+from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.metrics.questions.score import labels_n
 
 LARGEST_NYU40_ID = 40
 # Ground truths of ScanNet and whose class ids they hold.
 ID_LISTS = {"nyu40-vertices": "ids of NYU40 do", "scannet200-vertices": "ids of ScanNet200 do"}
-OBJECT_KINDS = ("queries", "categories", *SHARE_KINDS)  # they go by objects, found by the points of the map itself
-NAMED_KINDS = ("annotation", "reasoning")  # they go by names alone
 
 Form = Literal["instances", "partition", "dense", "vertex-masks", "vertex-labels"]
 
@@ -90,7 +88,7 @@ class ContentFacts:
 
 def why_not_truth(rules: ProtocolRules, truth: TruthFacts) -> str | None:
     """Why no prediction at all can be scored under a protocol against a truth."""
-    if rules.kind in SHARE_KINDS and not truth.has_points:
+    if rules.is_judged and not truth.has_points:
         return "needs the objects of a dataset; name one with --dataset"
     if rules.kind == "instance" and not truth.has_instances:
         return "needs instances, the ground truth holds class ids alone (expected class id * 1000 + instance)"
@@ -107,9 +105,9 @@ def why_not_truth(rules: ProtocolRules, truth: TruthFacts) -> str | None:
 
 def why_not_content(rules: ProtocolRules, content: ContentFacts, *, has_points: bool = True) -> str | None:
     """Why such a prediction cannot be scored under a protocol; ``has_points``: those of the truth have coordinates."""
-    if rules.kind in OBJECT_KINDS and not has_points:
+    if rules.needs_own_points and not has_points:
         return f"needs ground truth of the form '{rules.ground_truth}', which neither a dataset nor such texts give"
-    if rules.kind in OBJECT_KINDS and not content.has_own_points:
+    if rules.needs_own_points and not content.has_own_points:
         return "needs a map with points of its own, the prediction is over the points of another truth"
     if content.has_own_points:
         if not has_points:
@@ -133,9 +131,9 @@ def why_not_scorable(rules: ProtocolRules, prediction: Prediction) -> str | None
 
 def why_not_map(rules: ProtocolRules, content: ContentFacts) -> str | None:
     """Why a map with points of its own cannot be scored under a protocol at all."""
-    if rules.kind not in ("semantic", "categories") and content.form == "dense":
+    if not rules.takes_dense and content.form == "dense":
         return "needs instances, and the method gives one feature a point"
-    if rules.kind in NAMED_KINDS:
+    if rules.goes_by_names:
         if content.form != "instances":
             return "needs instances with names, and the method gives a partition"
         return "needs names, and the method gives its instances none" if content.n and not content.has_names else None
@@ -144,7 +142,7 @@ def why_not_map(rules: ProtocolRules, content: ContentFacts) -> str | None:
 
 def _why_not_named(rules: ProtocolRules, content: ContentFacts) -> str | None:
     """Why masks cannot get the classes that a protocol of classes asks for."""
-    if rules.class_agnostic is not None or rules.kind in OBJECT_KINDS or not content.n:
+    if rules.class_agnostic is not None or rules.needs_own_points or not content.n:
         return None
     if not content.has_labels and content.n_dimensions is None:
         is_map = content.has_own_points
@@ -169,7 +167,7 @@ def why_not_numbers(rules: ProtocolRules, content: ContentFacts) -> str | None:
 
 def n_feature_dimensions(rules: ProtocolRules, content: ContentFacts) -> int | None:
     """The dimensions of the features that must be named; None where labels are there or the protocol needs none."""
-    if rules.class_agnostic is not None or rules.kind in NAMED_KINDS or not content.n:
+    if rules.class_agnostic is not None or rules.goes_by_names or not content.n:
         return None
     has_names = content.has_labels if content.form == "vertex-masks" else content.has_every_label
     return None if has_names and not (content.has_own_points and _compares_texts(rules)) else content.n_dimensions

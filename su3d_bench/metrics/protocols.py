@@ -1,4 +1,4 @@
-"""Named, versioned evaluations: everything that moves a number, read from ``rules/*.toml``.
+"""Named, versioned evaluations: everything that moves a number, as a file of ``rules/`` says it.
 
 A protocol is chosen by name, or by the path of a TOML file of the same form. Unknown keys and wrong values are errors
 of one line that name the file and the key.
@@ -7,31 +7,52 @@ of one line that name the file and the key.
 from __future__ import annotations
 
 import hashlib
-import re
-import tomllib
+from collections.abc import Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, ClassVar, Literal, Self
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
 
 from su3d_bench.core.errors import ConfigError, suggest
+from su3d_bench.metrics.protocol_files import line_of, protocol_names, read_content, rules_file
 
-RULES = Path(__file__).parent / "rules"
-_TABLE_PREFIX = "classes."  # rules/classes.<name>.toml holds a class table, not a protocol
+ValuesOfMetric = Mapping[str, tuple[str, ...]]
+CATEGORIES = ("synonyms", "depictions", "vis_sim", "clutter", "missing", "incorrect")
+AP_NAMES = ("AP", "AP50", "AP25")
+_CURVE_FIELDS = ("min_region_size", "thresholds", "confidence")
+_NEEDS_QUESTIONS = "questions: kinds 'retrieval' and 'reasoning' need them, and min_region_size"
+_ONLY_CURVES = "min_region_size, thresholds and confidence belong to kind 'instance' or 'queries'"
+# The fields that not every kind has, and what is said where one is missing or out of place.
+_OWN_FIELDS = {
+    "classes": "classes: needed where labels count, that is under kinds 'semantic' and 'instance'",
+    "class_agnostic": "class_agnostic: belongs to kind 'instance'",
+    "vocabulary": "vocabulary: belongs to protocols that choose among classes, and these need it",
+    "min_region_size": _ONLY_CURVES,
+    "thresholds": _ONLY_CURVES,
+    "confidence": _ONLY_CURVES,
+    "top_k": "top_k: belongs to kind 'queries' and to metric 'openlex3d-topn', which needs it",
+    "questions": _NEEDS_QUESTIONS,
+    "per_kind": "per_kind: belongs to generated questions",
+    "synonyms": "synonyms: kind 'annotation' and generated questions need a table, others take none",
+    "merging": "merging: kind 'annotation' needs it, others take none",
+    "answers": "answers: kind 'reasoning' needs it, others take none",
+}
 
 
-class ClassEntry(BaseModel):
-    """A class of the label set: its id in the label space, its name, the group it is averaged in."""
-
+class _Strict(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+
+class ClassEntry(_Strict):
+    """A class of the label set: its id in the label space, its name, the group it is averaged in."""
 
     id: Annotated[int, Field(ge=0)]
     name: str
     group: str | None = None
 
 
-class TransferRules(BaseModel):
+class TransferRules(_Strict):
     """How a prediction on other points than the truth's reaches the scored points.
 
     ``candidates``: ``object-points`` (only points that belong to an instance, as ConceptGraphs concatenates its object
@@ -44,15 +65,13 @@ class TransferRules(BaseModel):
     are taken as they are.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-
     candidates: Literal["object-points", "map-points", "each-mask"]
     neighbours: Annotated[int, Field(ge=1, le=100)] = 1
     cap_m: Annotated[float, Field(gt=0)] | None = None
     evaluation_voxel_m: Annotated[float, Field(ge=0)] = 0.0
 
 
-class MergeRules(BaseModel):
+class MergeRules(_Strict):
     """When a mask is faulty: over-merged or under-merged.
 
     ``over_merged_share``: of the object vertices that it covers, at least this share belongs to other objects than the
@@ -60,16 +79,12 @@ class MergeRules(BaseModel):
     it cover, one after another, it covers less than this share; so one thing twice is under-merged too.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
-
     over_merged_share: Annotated[float, Field(gt=0, le=1)]
     under_merged_share: Annotated[float, Field(ge=0, le=1)]
 
 
-class AnswerRules(BaseModel):
+class AnswerRules(_Strict):
     """How far a distance may be off: ``distance_m`` or ``distance_share`` of the true one, whichever is more."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     distance_m: Annotated[float, Field(ge=0)]
     distance_share: Annotated[float, Field(ge=0)]
@@ -77,35 +92,8 @@ class AnswerRules(BaseModel):
 
 _SECTIONS: dict[str, type[BaseModel]] = {"transfer": TransferRules, "merging": MergeRules, "answers": AnswerRules}
 
-CATEGORIES = ("synonyms", "depictions", "vis_sim", "clutter", "missing", "incorrect")
-AP_NAMES = ("AP", "AP50", "AP25")
-VALUES_OF_METRIC: dict[str, tuple[str, ...]] = {
-    "openlex3d-topn": CATEGORIES,
-    "openlex3d-ranking": ("overall", "synonyms", "secondary"),
-    "query-ap": AP_NAMES,
-    "retrieval": ("instance", "affordance", "property", "relative", "all", "reachable"),
-    "annotation": ("label n", "label n'", "well-merged", "under-merged", "over-merged"),
-    "reasoning": ("answer", "objects"),
-}
-SHARE_KINDS = ("retrieval", "annotation", "reasoning")  # their counts are how many were judged and how many are right
-_METRICS = {
-    "semantic": ("conceptgraphs", "scannet", "hovsg"),
-    "instance": ("scannet",),
-    "queries": ("query-ap",),
-    "categories": ("openlex3d-topn", "openlex3d-ranking"),
-    **{kind: (kind,) for kind in SHARE_KINDS},
-}
-_CONFIDENCES = {"instance": ("ones", "prediction"), "queries": ("similarity", "similarity-min-max")}
-_CANDIDATES = {
-    "semantic": ("object-points", "map-points"),
-    "instance": ("map-points",),
-    "queries": ("each-mask", "map-points"),
-    "categories": ("object-points",),
-    **dict.fromkeys(SHARE_KINDS, ("map-points",)),
-}
 
-
-class ProtocolRules(BaseModel):
+class ProtocolRules(_Strict):
     """One evaluation, complete: the same rules and the same prediction give the same number.
 
     ``kind``: ``semantic`` (a class a point), ``instance`` (masks with a class), ``queries`` (masks ranked for each
@@ -123,8 +111,6 @@ class ProtocolRules(BaseModel):
     where absent. ``class_agnostic`` drops the labels: the truth's instances are those of the ``scored`` classes (the
     rest is void), all ``annotated`` ones, or ``everything``, with the points that nobody annotated as one more.
     """
-
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     name: str
     version: Annotated[int, Field(ge=1)]
@@ -168,89 +154,88 @@ class ProtocolRules(BaseModel):
     headline: Annotated[tuple[str, ...], Field(min_length=1)]
     not_comparable_with: tuple[str, ...] = ()
 
+    # What the kinds differ in
+    values_of_metric: ClassVar[ValuesOfMetric] = {}  # of each metric, what its values are called
+    candidates: ClassVar[tuple[str, ...]] = ("map-points",)
+    confidences: ClassVar[tuple[str, ...]] = ()
+    takes_dense: ClassVar[bool] = False  # a map with one feature a point
+    goes_by_names: ClassVar[bool] = False  # of instances, without features
+    needs_own_points: ClassVar[bool] = False  # objects are found by the points of the map itself
+    is_judged: ClassVar[bool] = False  # its counts are how many were judged and how many are right
+    needs: ClassVar[tuple[str, ...]] = ()  # those of _OWN_FIELDS that must be there
+    takes: ClassVar[tuple[str, ...]] = ()  # those that may be there
+
+    def _needed(self) -> tuple[str, ...]:
+        """Those of ``_OWN_FIELDS`` that must be there beside what these rules say already."""
+        return self.needs
+
     @model_validator(mode="after")
     def _is_consistent(self) -> Self:
-        self._check_classes()
-        self._check_texts()
-        self._check_metric()
-        return self
-
-    def _check_classes(self) -> None:
         names = [entry.name for entry in self.classes]
         if len(set(names)) != len(names) or len({entry.id for entry in self.classes}) != len(names):
             raise ValueError("classes: each id and each name may stand there once")
-        has_labels = self.kind in ("semantic", "instance") and self.class_agnostic in (None, "scored")
-        if bool(names) != has_labels:
-            raise ValueError("classes: needed where labels count, that is under kinds 'semantic' and 'instance'")
+        self._check_texts()
+        needed = self._needed()
+        for field, message in _OWN_FIELDS.items():
+            is_there = getattr(self, field) not in (None, ())
+            if is_there != (field in needed) and not (is_there and field in self.takes):
+                is_size = field == "min_region_size" and self.is_judged
+                raise ValueError(_NEEDS_QUESTIONS if is_size else message)
         unknown = [name for name in (*self.ignore, *self.prompt_names) if not any(name in known for known in names)]
         if unknown and self.kind != "categories":
             raise ValueError(f"ignore or prompt_names: '{unknown[0]}' is no class{suggest(unknown[0], names)}")
-        if self.class_agnostic is not None and self.kind != "instance":
-            raise ValueError("class_agnostic: belongs to kind 'instance'")
+        self._check_metric()
+        self._check_transfer()
+        if self.kind == "reasoning" and self.questions != "generated":
+            raise ValueError("questions: kind 'reasoning' takes 'generated'")
+        if self.per_kind is not None and self.questions != "generated":
+            raise ValueError("per_kind: belongs to generated questions")
+        return self
 
     def _check_texts(self) -> None:
         texts = self.prompts if self.prompt is None else (self.prompt, *self.prompts)
-        if self.class_agnostic is not None and (texts or self.vocabulary or self.encoder):
-            raise ValueError("class_agnostic: takes no prompt, vocabulary or encoder")
-        if (self.vocabulary is None) == (self.kind in ("semantic", "instance") and self.class_agnostic is None):
-            raise ValueError("vocabulary: belongs to protocols that choose among classes, and these need it")
-        if self.kind in ("annotation", "reasoning"):
+        if self.class_agnostic is not None and self.kind == "instance":
+            if texts or self.vocabulary or self.encoder:
+                raise ValueError("class_agnostic: takes no prompt, vocabulary or encoder")
+        elif self.goes_by_names:
             if texts or self.encoder:
                 raise ValueError(f"prompt: kind '{self.kind}' compares no features; it takes no prompt and no encoder")
-        elif self.class_agnostic is None and (self.prompt is None) == (not self.prompts):
+        elif (self.prompt is None) == (not self.prompts):
             raise ValueError("prompt: give either prompt or prompts")
         without = [text for text in texts if "{}" not in text]
         if without:
             raise ValueError(f"prompt: '{without[0]}' has no {{}} for the class name")
 
     def _check_metric(self) -> None:
-        has_curve = self.kind in ("instance", "queries")
-        if self.metric not in _METRICS[self.kind] or (has_curve and None in (self.min_region_size, self.confidence)):
-            names = " or ".join(f"'{name}'" for name in _METRICS[self.kind])
+        has_curve = bool(self.confidences)
+        lacks_curve = has_curve and None in (self.min_region_size, self.confidence)
+        if self.metric not in self.values_of_metric or lacks_curve:
+            names = " or ".join(f"'{name}'" for name in self.values_of_metric)
             rest = ", min_region_size, thresholds and confidence" if has_curve else ""
             raise ValueError(f"kind '{self.kind}' needs metric {names}{rest}")
-        known = VALUES_OF_METRIC.get(self.metric, AP_NAMES if has_curve else ("mAcc", "mIoU", "F-mIoU"))
-        if not set(self.headline) <= set(known):
-            raise ValueError(f"headline: a protocol of kind '{self.kind}' has {', '.join(known)}")
-        has_size = self.min_region_size is not None and self.kind not in SHARE_KINDS
-        if not has_curve and (has_size or self.thresholds or self.confidence):
-            raise ValueError("min_region_size, thresholds and confidence belong to kind 'instance' or 'queries'")
+        if not set(self.headline) <= set(self.value_names):
+            raise ValueError(f"headline: a protocol of kind '{self.kind}' has {', '.join(self.value_names)}")
         if has_curve and not {0.25, 0.5} <= set(self.thresholds):
             raise ValueError("thresholds: 0.25 and 0.5 must be among them")
-        if has_curve and self.confidence not in _CONFIDENCES[self.kind]:
-            raise ValueError(f"confidence: kind '{self.kind}' takes {' or '.join(_CONFIDENCES[self.kind])}")
-        if (self.metric == "openlex3d-topn") != (self.top_k is not None) and self.kind != "queries":
-            raise ValueError("top_k: belongs to kind 'queries' and to metric 'openlex3d-topn', which needs it")
-        self._check_transfer()
-        self._check_questions()
-
-    def _check_questions(self) -> None:
-        asks = self.kind in ("retrieval", "reasoning")
-        if (self.questions is not None) != asks or (self.kind in SHARE_KINDS and self.min_region_size is None):
-            raise ValueError("questions: kinds 'retrieval' and 'reasoning' need them, and min_region_size")
-        if self.kind == "reasoning" and self.questions != "generated":
-            raise ValueError("questions: kind 'reasoning' takes 'generated'")
-        if self.per_kind is not None and self.questions != "generated":
-            raise ValueError("per_kind: belongs to generated questions")
-        needs_names = self.kind == "annotation" or self.questions == "generated"
-        if (self.synonyms is not None) != needs_names:
-            raise ValueError("synonyms: kind 'annotation' and generated questions need a table, others take none")
-        if (self.merging is not None) != (self.kind == "annotation"):
-            raise ValueError("merging: kind 'annotation' needs it, others take none")
-        if (self.answers is not None) != (self.kind == "reasoning"):
-            raise ValueError("answers: kind 'reasoning' needs it, others take none")
+        if has_curve and self.confidence not in self.confidences:
+            raise ValueError(f"confidence: kind '{self.kind}' takes {' or '.join(self.confidences)}")
 
     def _check_transfer(self) -> None:
         transfer = self.transfer
-        if transfer.candidates not in _CANDIDATES[self.kind]:
-            names = " or ".join(f"'{name}'" for name in _CANDIDATES[self.kind])
+        if transfer.candidates not in self.candidates:
+            names = " or ".join(f"'{name}'" for name in self.candidates)
             raise ValueError(f"transfer.candidates: kind '{self.kind}' takes {names}")
         if transfer.candidates == "each-mask" and (transfer.cap_m is None or transfer.evaluation_voxel_m > 0):
             raise ValueError("transfer.cap_m: 'each-mask' needs one, and no evaluation_voxel_m")
         if transfer.neighbours > 1 and self.kind != "semantic":
             raise ValueError("transfer.neighbours: belongs to kind 'semantic'")
-        if self.kind in SHARE_KINDS and transfer.cap_m is None:
+        if self.is_judged and transfer.cap_m is None:
             raise ValueError(f"transfer.cap_m: kind '{self.kind}' needs one")
+
+    @property
+    def value_names(self) -> tuple[str, ...]:
+        """What the values of the metric are called that may stand in the headline."""
+        return self.values_of_metric[self.metric]
 
     def is_ignored(self, name: str) -> bool:
         """Whether the class ``name`` is left out, by exact name or, under the substring rule, by a part of it."""
@@ -264,9 +249,8 @@ class ProtocolRules(BaseModel):
     @property
     def curve_names(self) -> tuple[str, ...]:
         """What the precision-recall curves are named after: the scored classes, or ``object`` where labels are none."""
-        if self.class_agnostic is not None or self.kind == "queries":
-            return ("object",)
-        return tuple(entry.name for entry in self.scored)
+        has_labels = self.class_agnostic is None and self.kind != "queries"
+        return tuple(entry.name for entry in self.scored) if has_labels else ("object",)
 
     def texts_of(self, name: str) -> tuple[str, ...]:
         """The texts that stand for the class, label or query ``name``; their mean feature counts."""
@@ -279,9 +263,103 @@ class ProtocolRules(BaseModel):
         return hashlib.sha256(self.model_dump_json(exclude_defaults=True).encode()).hexdigest()
 
 
-def protocol_names() -> list[str]:
-    """The names of the built-in protocols."""
-    return sorted(path.stem for path in RULES.glob("*.toml") if not path.name.startswith(_TABLE_PREFIX))
+class SemanticRules(ProtocolRules):
+    """A class a point."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = dict.fromkeys(
+        ("conceptgraphs", "scannet", "hovsg"), ("mAcc", "mIoU", "F-mIoU")
+    )
+    candidates = ("object-points", "map-points")
+    takes_dense = True
+    needs = ("classes", "vocabulary")
+
+
+class InstanceRules(ProtocolRules):
+    """Masks with a class."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {"scannet": AP_NAMES}
+    confidences = ("ones", "prediction")
+    takes = ("class_agnostic", *_CURVE_FIELDS)
+
+    def _needed(self) -> tuple[str, ...]:
+        if self.class_agnostic is None:
+            return ("classes", "vocabulary")
+        return ("classes",) if self.class_agnostic == "scored" else ()
+
+
+class QueryRules(ProtocolRules):
+    """Masks ranked for each text."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {"query-ap": AP_NAMES}
+    candidates = ("each-mask", "map-points")
+    needs_own_points = True
+    confidences = ("similarity", "similarity-min-max")
+    takes = ("top_k", *_CURVE_FIELDS)
+
+
+class CategoryRules(ProtocolRules):
+    """How near a point's label comes to those of its object."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {
+        "openlex3d-topn": CATEGORIES,
+        "openlex3d-ranking": ("overall", "synonyms", "secondary"),
+    }
+    candidates = ("object-points",)
+    takes_dense = True
+    needs_own_points = True
+
+    def _needed(self) -> tuple[str, ...]:
+        return ("top_k",) if self.metric == "openlex3d-topn" else ()
+
+
+class _JudgedRules(ProtocolRules):
+    """What people are asked otherwise."""
+
+    is_judged = True
+    needs_own_points = True
+
+
+class RetrievalRules(_JudgedRules):
+    """The first mask of each text."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {
+        "retrieval": ("instance", "affordance", "property", "relative", "all", "reachable")
+    }
+    needs = ("questions", "min_region_size")
+    takes = ("per_kind",)
+
+    def _needed(self) -> tuple[str, ...]:
+        return (*self.needs, "synonyms") if self.questions == "generated" else self.needs
+
+
+class AnnotationRules(_JudgedRules):
+    """Names and shapes of masks."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {
+        "annotation": ("label n", "label n'", "well-merged", "under-merged", "over-merged")
+    }
+    goes_by_names = True
+    needs = ("min_region_size", "synonyms", "merging")
+
+
+class ReasoningRules(_JudgedRules):
+    """Questions that boxes settle."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {"reasoning": ("answer", "objects")}
+    goes_by_names = True
+    needs = ("questions", "min_region_size", "synonyms", "answers")
+    takes = ("per_kind",)
+
+
+RULES_OF_KIND: dict[str, type[ProtocolRules]] = {
+    "semantic": SemanticRules,
+    "instance": InstanceRules,
+    "queries": QueryRules,
+    "categories": CategoryRules,
+    "retrieval": RetrievalRules,
+    "annotation": AnnotationRules,
+    "reasoning": ReasoningRules,
+}
 
 
 def protocols_for(dataset: str) -> list[str]:
@@ -294,11 +372,6 @@ def not_comparable_with(rules: ProtocolRules) -> list[str]:
     """Protocols whose numbers must not stand beside those of ``rules``: it names them, or they name it."""
     naming = [name for name in protocol_names() if rules.name in load_protocol(name).not_comparable_with]
     return sorted({*rules.not_comparable_with, *naming})
-
-
-def rules_file(name: str) -> Path:
-    """Where the rules called ``name`` are read from."""
-    return RULES / f"{name}.toml" if name in protocol_names() else Path(name)
 
 
 @lru_cache(maxsize=64)
@@ -316,37 +389,13 @@ def load_protocol(name: str) -> ProtocolRules:
 
 
 def read_protocol(path: Path) -> ProtocolRules:
-    """The rules in a TOML file, where ``classes`` names a class table or lists rows [id, name] or [id, name, group]."""
-    content = _read_toml(path)
-    table = content.get("classes")
-    if isinstance(table, str):
-        tables = {p.stem.removeprefix(_TABLE_PREFIX): p for p in RULES.glob(f"{_TABLE_PREFIX}*.toml")}
-        if table not in tables:
-            known = suggest(table, tables) or "; known: " + ", ".join(sorted(tables))
-            raise ConfigError(f"{_line_of(path, 'classes')}: unknown class table '{table}'{known}")
-        content["classes"] = _read_toml(tables[table])["classes"]
-    if "classes" in content:
-        content["classes"] = _entries(path, content.get("classes"))
+    """The rules in a TOML file and in those that it extends."""
+    content = read_content(path)
     try:
-        return ProtocolRules.model_validate(_with_tuples(content))
+        rules = RULES_OF_KIND.get(str(content.values.get("kind")), ProtocolRules)
+        return rules.model_validate(_with_tuples(content.values))
     except ValidationError as error:
-        raise ConfigError(_first_line(path, error)) from error
-
-
-def _entries(path: Path, table: Any) -> list[dict[str, Any]]:
-    keys = ("id", "name", "group")
-    if not isinstance(table, list) or not all(isinstance(row, list) and 2 <= len(row) <= 3 for row in table):
-        raise ConfigError(f"{_line_of(path, 'classes')}: classes must be a table's name or rows of [id, name]")
-    return [dict(zip(keys, row, strict=False)) for row in table]
-
-
-def _read_toml(path: Path) -> dict[str, Any]:
-    try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, thousands of digits, nested thousands deep
-        raise ConfigError(f"{path}: is no valid TOML: {error}") from error
+        raise ConfigError(_first_line(content.files, error)) from error
 
 
 def _with_tuples(value: Any) -> Any:
@@ -358,31 +407,18 @@ def _with_tuples(value: Any) -> Any:
     return value
 
 
-def _first_line(path: Path, error: ValidationError) -> str:
+def _first_line(files: Sequence[Path], error: ValidationError) -> str:
     """The first complaint as one line with the file, the line and, for an unknown key, the likely one."""
     # a misspelt key is both unknown and, under its right name, missing: the first says more
     first = min(error.errors(), key=lambda complaint: complaint["type"] != "extra_forbidden")
     key = ".".join(str(part) for part in first["loc"])
     if first["type"] == "extra_forbidden":
         last = str(first["loc"][-1])
-        sections: dict[str, type[BaseModel]] = {
-            "transfer": TransferRules,
-            "merging": MergeRules,
-            "answers": AnswerRules,
-        }
-        fields = sections.get(key.partition(".")[0], ProtocolRules).model_fields
-        return f"{_line_of(path, last)}: unknown key '{key}'{suggest(last, fields)}"
+        fields = _SECTIONS.get(key.partition(".")[0], ProtocolRules).model_fields
+        return f"{line_of(files, last)}: unknown key '{key}'{suggest(last, fields)}"
     if first["type"] == "missing":
-        return f"{path}: the key '{key}' is missing"
+        return f"{files[0]}: the key '{key}' is missing"
     message = first["msg"].removeprefix("Value error, ")
-    where = _line_of(path, str(first["loc"][-1]) if first["loc"] else message.split(":")[0])
+    where = line_of(files, str(first["loc"][-1]) if first["loc"] else message.split(":")[0])
     message = message[0].lower() + message[1:]
     return f"{where}: {key}: {message}, not {first['input']!r}" if key else f"{where}: {message}"
-
-
-def _line_of(path: Path, key: str) -> str:
-    """``path:line`` of the first line that sets ``key``, or ``path`` alone."""
-    for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
-        if re.match(rf"\s*{re.escape(key)}\s*=", line):
-            return f"{path}:{number}"
-    return str(path)

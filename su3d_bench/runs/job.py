@@ -133,7 +133,6 @@ LAYOUTS_OF_ROOMS = ("replica", "scannet", "tum")  # in which `datasets make room
 TRUE_PROPOSALS_CAVEAT = "proposals from the ground truth; a ceiling, not a result"
 DEVICE, CPU = "perception.models.device", '"cpu"'
 TORCH_PACKAGES = ("torch", "transformers")  # what computes where not all is done by the packages of every key
-NAMED_KINDS = ("annotation", "reasoning")  # labels n' of a file beside the map move their numbers
 
 
 @dataclass(frozen=True)
@@ -163,7 +162,7 @@ class JobInputs:
         key = {"predict": digest_json(predict_key), "encoder": self.perception.encoder.digest}
         key |= {"pictures": str(self.job.pictures)}
         key |= {f"protocol.{name}": one.digest for name, one in rules.items()}
-        return key | refined_digest(folder) if any(one.kind in NAMED_KINDS for one in rules.values()) else key
+        return key | refined_digest(folder) if any(one.goes_by_names for one in rules.values()) else key
 
     def outcome(self, remarks: Mapping[str, Any], *, was_resumed: bool) -> MethodOutcome:
         """The outcome once both steps are sealed; ``remarks`` stand beside the seal of the scores."""

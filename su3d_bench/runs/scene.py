@@ -29,7 +29,7 @@ from su3d_bench.core.interfaces import (
 from su3d_bench.core.timing import device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Prediction, Proposals, SceneInfo
 from su3d_bench.metrics.fitness import why_not_scorable
-from su3d_bench.metrics.protocols import SHARE_KINDS, ProtocolRules, load_protocol
+from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import SceneScore, Truth, pack_scores, score_scene
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
 from su3d_bench.questions.refined_names import refined_names
@@ -294,7 +294,7 @@ class _Scene:
         return scores, unscored
 
     def _truth_of(self, rules: ProtocolRules, truth: GroundTruth, refined_in: JobFolder | None) -> Truth:
-        if rules.kind not in SHARE_KINDS:
+        if not rules.is_judged:
             return truth
         refine = None if refined_in is None else partial(refined_names, refined_in)
         return question_truth(rules, self.dataset, self.job.scene_name, truth, refine)

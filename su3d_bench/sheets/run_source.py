@@ -24,7 +24,8 @@ from su3d_bench.core.errors import (
 from su3d_bench.core.types import Frame, GroundTruth, Instances
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.instance.score import Covered, covered_objects
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol, protocol_names
+from su3d_bench.metrics.protocol_files import protocol_names
+from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.runs.job import Part, build_dataset
 from su3d_bench.runs.plan import data_root, dataset_targets

@@ -25,7 +25,8 @@ from su3d_bench.metrics.attribution import points as attribution_semantic
 from su3d_bench.metrics.attribution.arrays import scored_masks, scored_points
 from su3d_bench.metrics.attribution.masks import count_masks
 from su3d_bench.metrics.attribution.points import CAUSES, causes_of, mend_points
-from su3d_bench.metrics.protocols import load_protocol, protocol_names
+from su3d_bench.metrics.protocol_files import protocol_names
+from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.reports.tables.attribution import MEANINGS

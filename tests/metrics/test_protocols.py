@@ -13,14 +13,8 @@ from su3d_bench.cli.protocols import read_remarks
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.datasets.rooms.classes import CLASSES
 from su3d_bench.metrics.instance.average_precision import MIN_REGION_SIZE, THRESHOLDS
-from su3d_bench.metrics.protocols import (
-    RULES,
-    SHARE_KINDS,
-    load_protocol,
-    not_comparable_with,
-    protocol_names,
-    protocols_for,
-)
+from su3d_bench.metrics.protocol_files import RULES, protocol_names
+from su3d_bench.metrics.protocols import load_protocol, not_comparable_with, protocols_for
 
 NAMES = {
     "class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d", "openlex3d-queries",
@@ -87,7 +81,7 @@ def test_instance_protocols_use_the_original_thresholds_and_size(name: str) -> N
         n_points = MIN_REGION_SIZE if rules.kind == "instance" else 1
         assert (rules.thresholds, rules.min_region_size) == (THRESHOLDS, n_points)
     else:
-        n_vertices = MIN_REGION_SIZE if rules.kind in SHARE_KINDS else None
+        n_vertices = MIN_REGION_SIZE if rules.is_judged else None
         assert (rules.thresholds, rules.min_region_size, rules.confidence) == ((), n_vertices, None)
 
 
@@ -264,3 +258,66 @@ def test_show_prints_every_rule_with_what_its_file_says_of_it(name: str, capsys:
 def test_a_missing_file_is_told(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="cannot be read"):
         load_protocol(str(tmp_path / "none.toml"))
+
+
+# what a file extends
+
+
+def extending(folder: Path, name: str, parent: str, rest: str = "") -> str:
+    path = folder / f"{name}.toml"
+    path.write_text(f'extends = "{parent}"\nname = "{name}"\n{rest}')
+    return str(path)
+
+
+def test_a_file_that_extends_another_sets_only_what_differs(tmp_path: Path) -> None:
+    rest = 'ignore = ["other"]\n[transfer]\ncap_m = 0.5\n'
+    mine = load_protocol(extending(tmp_path, "mine", "replica-conceptgraphs-ex6", rest))
+    base = load_protocol("replica-conceptgraphs-ex6")
+    assert (mine.ignore, mine.transfer.cap_m, mine.transfer.candidates) == (("other",), 0.5, "object-points")
+    assert mine.model_copy(update={"name": base.name, "ignore": base.ignore, "transfer": base.transfer}) == base
+
+
+def test_files_extend_one_another_by_path_and_the_nearest_decides(tmp_path: Path) -> None:
+    (tmp_path / "below").mkdir()
+    extending(tmp_path, "first", "rooms-semantic", 'version = 3\nprompt = "{}"\n')
+    extending(tmp_path / "below", "second", "../first.toml", "version = 4\n")
+    third = load_protocol(extending(tmp_path, "third", "below/second.toml"))
+    assert (third.name, third.version, third.prompt, third.kind) == ("third", 4, "{}", "semantic")
+
+
+EXTENSION_FAULTS = (
+    ("mine.toml", "", "extends itself: mine.toml -> mine.toml"),
+    ("other.toml", "", "extends itself: mine.toml -> other.toml -> mine.toml"),
+    ("rooms-semantics", "", "mine.toml:1: extends the unknown protocol 'rooms-semantics'; did you mean"),
+    ("none.toml", "", "none.toml: cannot be read"),
+    ("rooms-semantic", "version = 0", "mine.toml:3: version: input should be greater than or equal to 1, not 0"),
+    ("rooms-semantic", 'colour = "red"', "mine.toml:3: unknown key 'colour'"),
+    ("rooms-semantic", 'metric = "query-ap"', "kind 'semantic' needs metric 'conceptgraphs' or"),
+)
+
+
+@pytest.mark.parametrize(("parent", "rest", "message"), EXTENSION_FAULTS, ids=[one[2] for one in EXTENSION_FAULTS])
+def test_an_extension_that_cannot_be_used_is_told_in_one_line(
+    tmp_path: Path, parent: str, rest: str, message: str
+) -> None:
+    extending(tmp_path, "other", "mine.toml")
+    with pytest.raises(ConfigError) as caught:
+        load_protocol(extending(tmp_path, "mine", parent, rest))
+    assert message in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_a_file_extends_is_a_name_or_a_path(tmp_path: Path) -> None:
+    (tmp_path / "mine.toml").write_text('extends = 3\nname = "mine"\n')
+    with pytest.raises(ConfigError, match=r"extends must be a protocol's name or the path of a \.toml file, not 3"):
+        load_protocol(str(tmp_path / "mine.toml"))
+
+
+def test_show_prints_the_rules_that_a_file_extends_with_their_sources(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["protocols", "show", "replica-conceptgraphs-ex4"]) == 0
+    text = capsys.readouterr().out
+    assert "extends replica-conceptgraphs-ex6:" in text
+    assert "[U] conceptgraph/utils/eval.py" in text
+    assert "    [C], n_exclude = 4" in text
+    assert "[C], n_exclude = 6" not in text
+    assert "    [E], raw hyphenated names" in text

@@ -17,7 +17,8 @@ from su3d_bench.core.types import Partition
 from su3d_bench.evaluation.scoring import facts_of, score_on_objects
 from su3d_bench.metrics.fitness import why_not_content, why_not_scorable
 from su3d_bench.metrics.instance.score import covered_objects
-from su3d_bench.metrics.protocols import load_protocol, protocols_for, read_protocol, rules_file
+from su3d_bench.metrics.protocol_files import rules_file
+from su3d_bench.metrics.protocols import load_protocol, protocols_for, read_protocol
 from su3d_bench.metrics.questions.score import are_objects_right, is_answer_right
 from su3d_bench.metrics.questions.shares import ShareCounts
 from su3d_bench.metrics.questions.truths import AskedText, GivenAnswer, ReasoningTruth, RetrievalTruth, TrueAnswer

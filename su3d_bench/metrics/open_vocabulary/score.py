@@ -29,7 +29,7 @@ from su3d_bench.metrics.open_vocabulary import object_means, openlex3d, query_ap
 from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
-from su3d_bench.metrics.protocols import VALUES_OF_METRIC, ProtocolRules
+from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.store.scratch import release_pages
@@ -72,15 +72,15 @@ class CategoriesMetric(Metric[ObjectCounts]):
 
     @property
     def sizes(self) -> dict[str, int]:
-        return {"values": len(VALUES_OF_METRIC[self.rules.metric])}
+        return {"values": len(self.rules.value_names)}
 
     def pooled(self, counts: Sequence[ObjectCounts]) -> Pooled:
         means = object_means.combine(counts)
-        return Pooled(dict(zip(VALUES_OF_METRIC[self.rules.metric], means.tolist(), strict=True)))
+        return Pooled(dict(zip(self.rules.value_names, means.tolist(), strict=True)))
 
     def resampled(self, counts: Sequence[ObjectCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
         values = object_means.resampled(counts, weights)
-        return dict(zip(VALUES_OF_METRIC[self.rules.metric], values.T, strict=True))
+        return dict(zip(self.rules.value_names, values.T, strict=True))
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Instance
 from su3d_bench.metrics.instance.score import NO_OBJECT, Covered, covered_objects, score_of_masks
 from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, text_features
 from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, n_predictions
-from su3d_bench.metrics.protocols import VALUES_OF_METRIC, AnswerRules, MergeRules, ProtocolRules
+from su3d_bench.metrics.protocols import AnswerRules, MergeRules, ProtocolRules
 from su3d_bench.metrics.questions import shares
 from su3d_bench.metrics.questions.shares import ShareCounts
 from su3d_bench.metrics.questions.truths import (
@@ -33,22 +33,17 @@ class ShareMetric(Metric[ShareCounts]):
     counts = ShareCounts
 
     @property
-    def names(self) -> tuple[str, ...]:
-        """What the values are called."""
-        return VALUES_OF_METRIC[self.rules.metric]
-
-    @property
     def sizes(self) -> dict[str, int]:
-        return {"values": len(self.names)}
+        return {"values": len(self.rules.value_names)}
 
     def pooled(self, counts: Sequence[ShareCounts]) -> Pooled:
         """The share of right judgements under each value's name, and how many there were under ``n_<name>``."""
         whole = shares.combine(counts)
-        n_judged = {f"n_{name}": n for name, n in zip(self.names, whole.n_judged.tolist(), strict=True)}
-        return Pooled(dict(zip(self.names, shares.shares(whole).tolist(), strict=True)) | n_judged)
+        n_judged = {f"n_{name}": n for name, n in zip(self.rules.value_names, whole.n_judged.tolist(), strict=True)}
+        return Pooled(dict(zip(self.rules.value_names, shares.shares(whole).tolist(), strict=True)) | n_judged)
 
     def resampled(self, counts: Sequence[ShareCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
-        return dict(zip(self.names, shares.resampled(counts, weights).T, strict=True))
+        return dict(zip(self.rules.value_names, shares.resampled(counts, weights).T, strict=True))
 
     def _score(
         self,
@@ -59,7 +54,7 @@ class ShareMetric(Metric[ShareCounts]):
         warnings: Sequence[str],
     ) -> SceneScore:
         """The score, ``rows`` telling what is right, with the coverage of the objects on which that rests."""
-        judged = [rows[name] for name in self.names]
+        judged = [rows[name] for name in self.rules.value_names]
         counts = ShareCounts(
             np.array([len(row) for row in judged], np.int64), np.array([int(row.sum()) for row in judged], np.int64)
         )
@@ -80,7 +75,7 @@ class RetrievalMetric(ShareMetric):
         is_right = judge_retrieval(covered.main_object, first, truth.asked)
         in_map = set(covered.main_object.tolist()) - {NO_OBJECT}
         kinds = np.array([asked.kind for asked in truth.asked])
-        rows = {kind: is_right[kinds == kind] for kind in self.names[:4]}
+        rows = {kind: is_right[kinds == kind] for kind in self.rules.value_names[:4]}
         rows["all"] = is_right
         rows["reachable"] = np.array([not in_map.isdisjoint(asked.answers) for asked in truth.asked], bool)
         warning = encoder_warning(self.rules, prediction, encoder)

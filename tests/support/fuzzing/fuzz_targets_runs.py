@@ -232,7 +232,8 @@ def _method_config(folder: Path) -> Read:
 
 
 def _protocol(folder: Path) -> Read:
-    from su3d_bench.metrics.protocols import read_protocol, rules_file
+    from su3d_bench.metrics.protocol_files import rules_file
+    from su3d_bench.metrics.protocols import read_protocol
 
     for name in ("rooms-semantic", "openlex3d-topn", "rooms-instance"):
         (folder / f"{name}.toml").write_bytes(rules_file(name).read_bytes())

@@ -1,0 +1,108 @@
+"""The TOML files of protocols: which there are, what one holds with what it extends, and where a key stands."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.core.errors import ConfigError, suggest
+
+RULES = Path(__file__).parent / "rules"
+_TABLE_PREFIX = "classes."  # rules/classes.<name>.toml holds a class table, not a protocol
+
+
+def protocol_names() -> list[str]:
+    """The names of the built-in protocols."""
+    return sorted(path.stem for path in RULES.glob("*.toml") if not path.name.startswith(_TABLE_PREFIX))
+
+
+def rules_files(name: str) -> tuple[Path, ...]:
+    """Where the rules called ``name`` are read from: their own file, then the one that it extends, and so on."""
+    return read_content(rules_file(name)).files
+
+
+def rules_file(name: str) -> Path:
+    """The file of the rules called ``name``, or the path ``name`` itself."""
+    return RULES / f"{name}.toml" if name in protocol_names() else Path(name)
+
+
+@dataclass(frozen=True)
+class Content:
+    """All rules that a file sets or extends, as ``values``; ``files``: the file itself, the one that it extends, ..."""
+
+    values: dict[str, Any]
+    files: tuple[Path, ...]
+
+
+def read_content(path: Path) -> Content:
+    """What a TOML file holds, where ``classes`` names a class table or lists rows [id, name] or [id, name, group].
+
+    A file that ``extends`` another, by a protocol's name or by a path from its own folder, has all its rules but those
+    that it sets itself; sections are joined key by key.
+    """
+    chain = _chain(path)
+    files = tuple(file for file, _ in chain)
+    values: dict[str, Any] = {}
+    for _, own in reversed(chain):
+        for key, value in own.items():
+            is_section = isinstance(value, dict) and isinstance(values.get(key), dict)
+            values[key] = values[key] | value if is_section else value
+    table = values.get("classes")
+    if isinstance(table, str):
+        tables = {p.stem.removeprefix(_TABLE_PREFIX): p for p in RULES.glob(f"{_TABLE_PREFIX}*.toml")}
+        if table not in tables:
+            known = suggest(table, tables) or "; known: " + ", ".join(sorted(tables))
+            raise ConfigError(f"{line_of(files, 'classes')}: unknown class table '{table}'{known}")
+        values["classes"] = _read_toml(tables[table])["classes"]
+    if "classes" in values:
+        values["classes"] = _entries(files, values.get("classes"))
+    return Content(values, files)
+
+
+def _chain(path: Path) -> list[tuple[Path, dict[str, Any]]]:
+    """A protocol's file and what it holds, the file that it extends, and so on."""
+    chain: list[tuple[Path, dict[str, Any]]] = []
+    while True:
+        content = _read_toml(path)
+        chain.append((path, content))
+        if "extends" not in content:
+            return chain
+        name, where = content.pop("extends"), line_of([path], "extends")
+        if not isinstance(name, str):
+            raise ConfigError(f"{where}: extends must be a protocol's name or the path of a .toml file, not {name!r}")
+        known = protocol_names()
+        if name not in known and not name.endswith(".toml"):
+            hint = suggest(name, known) or "; known: " + ", ".join(known)
+            raise ConfigError(f"{where}: extends the unknown protocol '{name}'{hint}")
+        path = rules_file(name) if name in known else path.parent / name
+        if path.resolve() in [file.resolve() for file, _ in chain]:
+            raise ConfigError(f"{where}: extends itself: {' -> '.join(file.name for file, _ in chain)} -> {path.name}")
+
+
+def _entries(files: Sequence[Path], table: Any) -> list[dict[str, Any]]:
+    keys = ("id", "name", "group")
+    if not isinstance(table, list) or not all(isinstance(row, list) and 2 <= len(row) <= 3 for row in table):
+        raise ConfigError(f"{line_of(files, 'classes')}: classes must be a table's name or rows of [id, name]")
+    return [dict(zip(keys, row, strict=False)) for row in table]
+
+
+def _read_toml(path: Path) -> dict[str, Any]:
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
+    except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, thousands of digits, nested thousands deep
+        raise ConfigError(f"{path}: is no valid TOML: {error}") from error
+
+
+def line_of(files: Sequence[Path], key: str) -> str:
+    """``path:line`` of the first line that sets ``key``, or the first file alone."""
+    for path in files:
+        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+            if re.match(rf"\s*{re.escape(key)}\s*=", line):
+                return f"{path}:{number}"
+    return str(files[0])
