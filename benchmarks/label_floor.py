@@ -19,7 +19,7 @@ from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
-from su3d_bench.runs.plan import data_root
+from su3d_bench.runs.scenes import data_root
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.run_folder import RunFolder
 

@@ -24,7 +24,6 @@ from measured import write_measured
 
 from su3d_bench.analysis.page_maps import QUERIES, page_scenes, points_of_each
 from su3d_bench.analysis.page_numbers import page_numbers, scored_maps
-from su3d_bench.cli.query import encoder_of
 from su3d_bench.reports.page.page import page_html
 from su3d_bench.runs.executors.local import limit_threads
 
@@ -50,8 +49,8 @@ FIRST_MAP = "document.querySelector('#maps .say').hidden && document.querySelect
 def simulated_page(run: Path) -> str:
     """The page of a run as if it had ``N_SCENES`` scenes and ``N_METHODS`` methods."""
     most_points = points_of_each(N_SCENES * N_METHODS, MOST_BYTES)
-    made = [one for one in page_scenes(scored_maps([run]), encoder_of, QUERIES, most_points) if one.maps]
-    numbers = page_numbers([run], encoder_of)
+    made = [one for one in page_scenes(scored_maps([run]), QUERIES, most_points) if one.maps]
+    numbers = page_numbers([run])
     numbers["runs"][0] |= {"scenes": SCENES, "methods": METHODS}
     for key in ("results", "confusions", "errors", "timing"):
         numbers[key] = list(_of_all_methods(numbers[key]))

@@ -6,17 +6,16 @@ the kinds of errors are is said in ``metrics.attribution`` and ``metrics.attribu
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from su3d_bench.analysis.sides import Side, refuse_unlike
-from su3d_bench.core import registry
-from su3d_bench.core.config import Setting, Settings, resolve
-from su3d_bench.core.errors import ConfigError, DataError, PredictionError, printable, suggest
+from su3d_bench.core.errors import ConfigError, PredictionError, printable, suggest
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import DenseFeatures, GroundTruth, Prediction
 from su3d_bench.metrics.attribution import masks as instances
@@ -27,15 +26,11 @@ from su3d_bench.metrics.metric import Counts
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import SceneScore, metric_of
 from su3d_bench.runs.finished import FinishedRun, read_run
-from su3d_bench.runs.job import Part, build_dataset
-from su3d_bench.runs.plan import data_root, dataset_targets
 from su3d_bench.store.predictions import read_prediction
-from su3d_bench.store.run_folder import RunFolder
 
 SCHEMA = 1
 KINDS = {"instance": instances.KINDS, "semantic": semantic.CAUSES}
 Values = Mapping[str, float]
-EncoderOf = Callable[[RunFolder], Encoder]
 
 
 @dataclass(frozen=True)
@@ -87,7 +82,6 @@ class RunAttribution:
 
 def attribute(
     path: Path,
-    encoder_of: EncoderOf,
     *,
     method: str | None = None,
     protocols: Sequence[str] = (),
@@ -95,8 +89,7 @@ def attribute(
 ) -> RunAttribution:
     """Where the run at ``path`` loses its points, under each protocol of kind ``instance`` or ``semantic``.
 
-    ``encoder_of`` gives the encoder that named the run's instances. ``oracle``: a run of the same method on the same
-    scenes with the profile ``oracle``, for the stage of the 2D masks.
+    ``oracle``: a run of the same method on the same scenes with the profile ``oracle``, for the stage of the 2D masks.
     """
     run = read_run(path)
     side = Side(run, _method_of(run, method))
@@ -106,7 +99,7 @@ def attribute(
         other.run.check_method(other.method)
     scores = run.scores(side.method)
     gathered = {name: _Gathered(load_protocol(name)) for name in names}
-    read = _Reader(run, encoder_of)
+    read = _Reader(run)
     for scene in run.scenes:
         mine = [name for name in names if scene in scores[name]]
         if mine:
@@ -139,9 +132,9 @@ def _protocols_of(run: FinishedRun, wanted: Sequence[str]) -> tuple[list[str], l
     chosen, remarks = [], []
     for name in wanted or run.protocols:
         rules = load_protocol(name)
-        if rules.version != run.protocols[name][0]:
+        if rules.version != run.protocols[name].version:
             raise ConfigError(
-                f"{run.name}: was scored under {name} version {run.protocols[name][0]}, here is version "
+                f"{run.name}: was scored under {name} version {run.protocols[name].version}, here is version "
                 f"{rules.version}; score it again"
             )
         if rules.kind in KINDS:
@@ -157,9 +150,9 @@ def _protocols_of(run: FinishedRun, wanted: Sequence[str]) -> tuple[list[str], l
 
 def _oracle_run(path: Path) -> FinishedRun:
     run = read_run(path)
-    if run.profile != "oracle":
+    if run.record.profile != "oracle":
         raise ConfigError(
-            f"{run.name}: has the profile '{printable(str(run.profile), 60)}'; --oracle takes a run made with "
+            f"{run.name}: has the profile '{printable(str(run.record.profile), 60)}'; --oracle takes a run made with "
             "--profile oracle"
         )
     return run
@@ -182,27 +175,17 @@ def _oracle_values(rules: ProtocolRules, side: Side, other: Side | None, scenes:
 class _Reader:
     """Truths and the encoder of a run, read when they are asked for."""
 
-    def __init__(self, run: FinishedRun, encoder_of: EncoderOf) -> None:
+    def __init__(self, run: FinishedRun) -> None:
         self._run = run
-        self._encoder_of = encoder_of
-        self._encoder: Encoder | None = None
         self._truths: dict[tuple[str, str], GroundTruth] = {}
-        settings = Settings(tuple(Setting(path, value, "run.toml") for path, value in run.settings.items()))
-        self._datasets: dict[str, Any] = {}
-        for target in dataset_targets([str(each) for each in run.settings.get(("scenes",), ())]):
-            cls = registry.load("dataset", target)
-            options = resolve(settings, ("dataset", cls.name), cls.Options)
-            self._datasets[cls.name] = build_dataset(Part(target, cls.name, options.model_dump_json()), data_root())
+
+    @cached_property
+    def _encoder(self) -> Encoder:
+        return self._run.encoder()
 
     def truth(self, scene: str, variant: str) -> GroundTruth:
         if (scene, variant) not in self._truths:
-            dataset_name, _, name = scene.partition("/")
-            if dataset_name not in self._datasets:
-                raise DataError(f"{printable(scene, 100)}: run.toml names no dataset '{printable(dataset_name, 60)}'")
-            dataset = self._datasets[dataset_name]
-            if dataset.digest(name) != self._run.data_digests.get(scene):
-                raise DataError(f"{printable(scene, 100)}: its data are not those of the run; run it again")
-            self._truths[scene, variant] = dataset.ground_truth(name, variant)
+            self._truths[scene, variant] = self._run.dataset(scene).ground_truth(scene.partition("/")[2], variant)
         return self._truths[scene, variant]
 
     def forget(self, scene: str) -> None:
@@ -210,11 +193,7 @@ class _Reader:
 
     def encoder(self, prediction: Prediction) -> Encoder | None:
         """None for a prediction that has labels of its own."""
-        if getattr(prediction, "labels", None) is not None:
-            return None
-        if self._encoder is None:
-            self._encoder = self._encoder_of(self._run.folder)
-        return self._encoder
+        return self._encoder if getattr(prediction, "labels", None) is None else None
 
 
 @dataclass
@@ -301,7 +280,7 @@ def _refuse_other_counts(scene: str, rules: ProtocolRules, stored: Counts, forme
 
 def _remarks(run: FinishedRun) -> list[str]:
     lines = []
-    if run.is_partial:
+    if run.record.is_partial:
         lines.append(f"PARTIAL: only the first {run.limit} frames of each scene")
     if run.is_incomplete:
         lines.append("INCOMPLETE: scenes that failed are not in these numbers")

@@ -270,7 +270,7 @@ def _own_remarks(left: Side, right: Side, protocol: str) -> list[str]:
         record = side.run.results.get((side.method, protocol))
         if record is not None and record.failed:
             lines.append(f"INCOMPLETE: {side.name} failed on {_some(record.failed)}")
-    if load_protocol(protocol).digest != left.run.protocols[protocol][1]:
+    if load_protocol(protocol).digest != left.run.protocols[protocol].digest:
         lines.append(f"the rules of {protocol} here are not to the letter those that scored both runs (same version)")
     return lines
 
@@ -288,7 +288,7 @@ def _remarks(left: FinishedRun, right: FinishedRun, methods: Set[str]) -> list[s
     lines = []
     for run in dict.fromkeys((left.name, right.name)):
         one = left if run == left.name else right
-        if one.is_partial:
+        if one.record.is_partial:
             lines.append(f"PARTIAL: {run} has only the first {one.limit} frames of each scene")
         if one.is_incomplete:
             lines.append(f"INCOMPLETE: {run} lacks scenes that failed")
@@ -300,7 +300,7 @@ def _remarks(left: FinishedRun, right: FinishedRun, methods: Set[str]) -> list[s
             changed.append(printable(f"{'.'.join(path)} {pair[0]} and {pair[1]}", 120))
     if changed:
         lines.append("settings that differ: " + "; ".join(changed[:6]) + _more(len(changed) - 6))
-    if left.code != right.code:
+    if left.record.code != right.record.code:
         lines.append("the runs were made by different versions of the code")
     return lines
 

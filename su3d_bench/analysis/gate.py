@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
@@ -20,6 +20,7 @@ from su3d_bench.metrics.costs import MAP, WARM_UP, pooled
 from su3d_bench.reports.gate import Finding, Verdict
 from su3d_bench.runs.finished import FinishedRun, read_update_times
 from su3d_bench.store.atomic import read_json
+from su3d_bench.store.records import NumbersRecord, ResultRecord
 
 SPREADS = 2.0  # a value may leave the taught ones by this many times their range: 2 of 50 unchanged repeats would at 1
 ACROSS_MACHINES = 0.02  # 2 points: what ONNX Runtime's and BLAS's kernels of other processors may move a headline value
@@ -85,30 +86,6 @@ class Reference(_Model):
     calibration_ms: float | None = Field(default=None, gt=0, allow_inf_nan=False)
 
 
-Number = Annotated[float, Field(allow_inf_nan=False)]  # NaN would differ from nothing, and so pass
-
-
-class _Numbers(BaseModel):
-    """What is read of a result's ``result`` in ``metrics.json``."""
-
-    metrics: dict[str, Number | None]
-    per_scene: dict[str, dict[str, Number | None]]
-    per_class: dict[str, dict[str, Number | None]]
-
-
-class _Result(BaseModel):
-    method: str
-    protocol: str
-    profile: str | None
-    encoder_digest: str | None
-    headline: tuple[str, ...]
-    result: _Numbers | None
-
-
-class _Metrics(BaseModel):
-    results: tuple[_Result, ...]
-
-
 def read_reference(path: Path) -> Reference:
     """The reference in ``path``; ``ConfigError`` where it is none."""
     try:
@@ -134,22 +111,22 @@ def learn(
             raise ConfigError(f"{run.name}: is incomplete; a reference is learnt from complete runs")
         if differing := next(_differing_keys(_settings(first), _settings(run)), None):
             raise ConfigError(f"{run.name}: differs from {first.name} in {differing[0]}; learn from repeats of one run")
-        if (run.data_digests, run.protocols) != (first.data_digests, first.protocols):
+        if (run.record.data_digests, run.protocols) != (first.record.data_digests, first.protocols):
             raise ConfigError(f"{run.name}: has other data or protocols than {first.name}; learn from repeats")
-    tables = [_results(run) for run in runs]
+    tables = [run.results for run in runs]
     if any(set(table) != set(tables[0]) for table in tables):
         raise ConfigError(f"{first.name}: the runs hold different methods or protocols; learn from repeats of one run")
     costs = [update_costs(run) for run in runs]
     return Reference(
-        hardware=first.hardware,
-        processor=first.processor,
+        hardware=first.record.hardware,
+        processor=first.record.processor,
         n_runs=len(runs),
         across_machines=across_machines,
         cost_limit=cost_limit,
         limit=first.limit,
         settings=_settings(first),
-        data_digests=dict(first.data_digests),
-        protocols={name: ProtocolKey(version=one[0], digest=one[1]) for name, one in first.protocols.items()},
+        data_digests=dict(first.record.data_digests),
+        protocols={name: ProtocolKey(version=one.version, digest=one.digest) for name, one in first.protocols.items()},
         results=tuple(_learn_result([table[key] for table in tables]) for key in tables[0]),
         costs={name: float(np.median([cost[name] for cost in costs if name in cost])) for name in costs[0]},
         calibration_ms=_median([one for run in runs if (one := calibration_of(run)) is not None]),
@@ -160,7 +137,7 @@ def _median(values: Sequence[float]) -> float | None:
     return float(np.median(values)) if values else None
 
 
-def _learn_result(repeats: Sequence[_Result]) -> MethodResult:
+def _learn_result(repeats: Sequence[ResultRecord]) -> MethodResult:
     first = repeats[0]
     numbers = [one.result for one in repeats if one.result is not None]
     if len(numbers) < len(repeats):
@@ -197,9 +174,9 @@ def _learn_value(repeats: Sequence[float | None]) -> Value:
 
 def check(run: FinishedRun, reference: Reference) -> Verdict:
     """Everything in which ``run`` differs from ``reference``, failures and improvements."""
-    is_same_machine = run.processor == reference.processor
+    is_same_machine = run.record.processor == reference.processor
     findings = [*_identity(run, reference)]
-    table = _results(run)
+    table = run.results
     n_compared = 0
     for expected in reference.results:
         where = f"{expected.method} / {expected.protocol}"
@@ -221,8 +198,9 @@ def check(run: FinishedRun, reference: Reference) -> Verdict:
 
 def _other_machine(run: FinishedRun, reference: Reference) -> str:
     return (
-        f"another processor ({run.hardware}) than the reference's ({reference.hardware}): headline values are compared "
-        f"within {100 * reference.across_machines:g} points, scenes and classes by presence, costs are not judged"
+        f"another processor ({run.record.hardware}) than the reference's ({reference.hardware}): headline values are "
+        f"compared within {100 * reference.across_machines:g} points, scenes and classes by presence, costs are not "
+        "judged"
     )
 
 
@@ -247,17 +225,17 @@ def _identity(run: FinishedRun, reference: Reference) -> Iterator[Finding]:
     for scene, digest in reference.data_digests.items():
         if scene not in run.scenes:
             yield Finding("missing", scene, "the run does not have this scene")
-        elif run.data_digests.get(scene) != digest:
-            yield _changed(scene, "data digest", digest, run.data_digests.get(scene))
+        elif run.record.data_digests.get(scene) != digest:
+            yield _changed(scene, "data digest", digest, run.record.data_digests.get(scene))
     for name, expected in reference.protocols.items():
         if name not in run.protocols:
             yield Finding("missing", name, "the run does not have this protocol")
             continue
-        version, digest = run.protocols[name]
-        if version != expected.version:
-            yield _changed(name, "protocol version", expected.version, version)
-        elif digest != expected.digest:
-            yield _changed(name, "protocol digest", expected.digest, digest)
+        rules = run.protocols[name]
+        if rules.version != expected.version:
+            yield _changed(name, "protocol version", expected.version, rules.version)
+        elif rules.digest != expected.digest:
+            yield _changed(name, "protocol digest", expected.digest, rules.digest)
 
 
 def _changed(where: str, what: str, before: object, now: object) -> Finding:
@@ -269,7 +247,7 @@ def _short(value: object) -> str:
     return f"{text[:12]}..." if len(text) > 40 and " " not in text else text
 
 
-def _numbers(where: str, expected: MethodResult, found: _Numbers, across: float | None) -> Iterator[Finding]:
+def _numbers(where: str, expected: MethodResult, found: NumbersRecord, across: float | None) -> Iterator[Finding]:
     """``across``: the tolerance of headline values of another machine; None on the same one."""
     yield from _compare(where, expected.metrics, found.metrics, across)
     for kind, tables, rows in (
@@ -346,12 +324,3 @@ def _differing_keys(before: Mapping[str, str], now: Mapping[str, str]) -> Iterat
     for key in [*before, *(key for key in now if key not in before)]:
         if before.get(key) != now.get(key):
             yield key, before.get(key, "not set"), now.get(key, "not set")
-
-
-def _results(run: FinishedRun) -> dict[tuple[str, str], _Result]:
-    path = run.folder.path / "metrics.json"
-    try:
-        metrics = _Metrics.model_validate(read_json(path))
-    except (ValidationError, RecursionError) as error:
-        raise StoreError(f"{run.name}: metrics.json is not as a run writes it; run it again") from error
-    return {(one.method, one.protocol): one for one in metrics.results}

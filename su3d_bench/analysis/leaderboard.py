@@ -112,14 +112,14 @@ def _entries(name: str, run: FinishedRun, protocols: Sequence[str]) -> Iterator[
         except Su3dError as error:
             yield Refused(name, what, printable(str(error), 300))
             continue
-        if result is None or record.metrics is None:
+        if result is None or record.result is None:
             yield Refused(name, what, "was not scored")
             continue
         recomputed = result.to_json()
-        if any(recomputed["metrics"].get(key) != record.metrics.get(key) for key in record.headline):
+        if any(recomputed["metrics"].get(key) != record.result.metrics.get(key) for key in record.headline):
             yield Refused(name, what, "metrics.json does not follow from the counts; run its command again")
             continue
-        unknown = [scene for scene in result.scenes if scene not in run.data_digests]
+        unknown = [scene for scene in result.scenes if scene not in run.record.data_digests]
         if unknown:
             yield Refused(name, what, f"the data of {printable(unknown[0], 80)} have no digest")
             continue
@@ -131,14 +131,14 @@ def _entries(name: str, run: FinishedRun, protocols: Sequence[str]) -> Iterator[
             headline=result.headline,
             values=tuple(recomputed["metrics"].get(key) for key in result.headline),
             intervals=tuple(result.intervals.get(key) for key in result.headline),
-            data=tuple((scene, run.data_digests[scene]) for scene in sorted(result.scenes)),
-            profile=printable(run.profile or "", 40),
+            data=tuple((scene, run.record.data_digests[scene]) for scene in sorted(result.scenes)),
+            profile=printable(run.record.profile or "", 40),
             is_ceiling="a ceiling, not a result" in (record.caveat or "") or method == "oracle",
         )
 
 
 def _why_not(run: FinishedRun, protocol: str, failed: Sequence[str]) -> str | None:
-    if run.is_partial:
+    if run.record.is_partial:
         return f"is partial: the first {run.limit} frames of each scene"
     if failed:
         return f"is incomplete: {len(failed)} scenes failed"
@@ -146,10 +146,10 @@ def _why_not(run: FinishedRun, protocol: str, failed: Sequence[str]) -> str | No
         return "its protocol is none of those installed here"
     if protocol not in run.protocols:
         return "its protocol is none of those that run.json names"
-    here, (version, digest) = load_protocol(protocol), run.protocols[protocol]
-    if version != here.version:
-        return f"was scored under version {version} of the protocol, here it is {here.version}"
-    return None if digest == here.digest else "its protocol has the version of the one here and other rules"
+    here, rules = load_protocol(protocol), run.protocols[protocol]
+    if rules.version != here.version:
+        return f"was scored under version {rules.version} of the protocol, here it is {here.version}"
+    return None if rules.digest == here.digest else "its protocol has the version of the one here and other rules"
 
 
 def _of_same_data(entries: Sequence[Entry]) -> tuple[list[Entry], list[Refused]]:

@@ -11,9 +11,6 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.analysis.attribution import EncoderOf
-from su3d_bench.core import registry
-from su3d_bench.core.config import Setting, Settings, resolve
 from su3d_bench.core.errors import Su3dError, printable, printable_json
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import DenseFeatures, Frame, GroundTruth, Instances, Int64Array, Prediction
@@ -40,9 +37,7 @@ from su3d_bench.reports.page.maps import (
     thinned,
 )
 from su3d_bench.reports.pictures.scene_look import SceneLook, look_at
-from su3d_bench.runs.finished import FinishedRun
-from su3d_bench.runs.job import Part, build_dataset
-from su3d_bench.runs.plan import data_root, dataset_targets
+from su3d_bench.runs.finished import FinishedRun, OtherDataError
 from su3d_bench.store.predictions import read_prediction
 
 QUERIES = (
@@ -106,13 +101,12 @@ def points_of_each(n_maps: int, most_bytes: int) -> int:
 
 def page_scenes(
     maps: Sequence[MapOfRun],
-    encoder_of: EncoderOf,
     queries: Sequence[str],
     most_points: int,
     progress: Callable[[str], None] = lambda line: None,
 ) -> Iterator[PageScene]:
     """The scenes of ``maps`` in their order. What fails of a map is a reason on the page, never a page without it."""
-    known = _Known(encoder_of, tuple(queries))
+    known = _Known(tuple(queries))
     for scene in dict.fromkeys(one[2] for one in maps):
         progress(f"{printable(scene, 120)}: maps")
         yield _Scene(scene, [one for one in maps if one[2] == scene], known).page(most_points)
@@ -121,15 +115,14 @@ def page_scenes(
 class _Known:
     """Encoders of the runs and the features of the queries under each, made once."""
 
-    def __init__(self, encoder_of: EncoderOf, queries: tuple[str, ...]) -> None:
+    def __init__(self, queries: tuple[str, ...]) -> None:
         self.queries = queries
-        self._encoder_of = encoder_of
         self._encoders: dict[Path, tuple[Encoder, Any]] = {}
 
     def encoder(self, run: FinishedRun) -> tuple[Encoder, Any]:
         path = run.folder.path
         if path not in self._encoders:
-            encoder = self._encoder_of(run.folder)
+            encoder = run.encoder()
             self._encoders[path] = encoder, encoder.encode_texts(list(self.queries))
         return self._encoders[path]
 
@@ -167,18 +160,9 @@ class _Scene:
     @cached_property
     def _dataset(self) -> Any:
         """The dataset where its data are those of the runs, else None."""
-        run = self._maps[0][1]
-        settings = Settings(tuple(Setting(path, value, "run.toml") for path, value in run.settings.items()))
-        name, _, scene = self._scene.partition("/")
         try:
-            for target in dataset_targets([str(each) for each in run.settings.get(("scenes",), ())]):
-                cls = registry.load("dataset", target)
-                if cls.name != name:
-                    continue
-                options = resolve(settings, ("dataset", name), cls.Options)
-                dataset = build_dataset(Part(target, name, options.model_dump_json()), data_root())
-                if dataset.digest(scene) == run.data_digests.get(self._scene):
-                    return dataset
+            return self._maps[0][1].dataset(self._scene)
+        except OtherDataError:
             self._remarks.append("its data here are not those of the run: no colours, views and truth")
         except Su3dError as error:
             self._remarks.append(f"no colours, views and truth: {error}")
@@ -213,7 +197,7 @@ class _Scene:
         rules = [load_protocol(name) for name in run.protocols]
         fitting = [one for one in rules if one.kind in ("semantic", "instance") and one.classes]
         fitting = [one for one in fitting if one.class_agnostic is None]
-        fitting = [one for one in fitting if one.version == run.protocols[one.name][0]]
+        fitting = [one for one in fitting if one.version == run.protocols[one.name].version]
         return min(fitting, key=lambda one: one.kind != "semantic", default=None)
 
     def _truth(self, rules: ProtocolRules) -> GroundTruth | None:

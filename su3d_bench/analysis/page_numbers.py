@@ -5,20 +5,18 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, TypeVar
+from typing import Any
 
-from pydantic import BaseModel, Field, ValidationError
-
-from su3d_bench.analysis.attribution import EncoderOf, attribute
+from su3d_bench.analysis.attribution import attribute
 from su3d_bench.analysis.comparison import SideNumbers, compare
 from su3d_bench.core.config import KeyPath
-from su3d_bench.core.errors import StoreError, Su3dError, printable, printable_json
+from su3d_bench.core.errors import Su3dError, printable, printable_json
 from su3d_bench.metrics.costs import summarise
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
 from su3d_bench.reports.page.numbers import confusion_cells, series_of, summary_data
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
-from su3d_bench.store.atomic import read_json
+from su3d_bench.store.records import ResultRecord, plain
 
 MOST_PAIRS = 40  # pairs of methods that are compared: all of nine methods, and a few seconds
 # Jobs (a scene under a method) up to which each is read. The courses and comparisons of more take minutes to make and
@@ -29,69 +27,14 @@ LEFT_OUT = (
     "what each job's own files say is left out: errors (su3d-bench attribute), confusions, times (report timing), "
     f"comparisons (compare) and all maps but those of the first scenes, at most {MOST_MAPS}"
 )
-Number = Annotated[float, Field(allow_inf_nan=False)]
-Values = dict[str, Number | None]
-Model = TypeVar("Model", bound=BaseModel)
+# Of a record of results: what the page says elsewhere, or not at all.
+NOT_SHOWN = ("encoder_digest", "anytime")
+NUMBERS_NOT_SHOWN = ("protocol", "version", "headline", "n_scenes", "scene_mean")
 Progress = Callable[[str], None]
 
 
-class _Values(BaseModel):
-    metrics: Values
-    pooled: Values = {}
-    intervals: dict[str, tuple[Number, Number] | None]
-    scenes: tuple[str, ...]
-    per_scene: dict[str, Values]
-    per_class: dict[str, Values] = {}
-    groups: dict[str, Values] = {}
-    coverage: Values = {}
-    n_predictions: dict[str, int] = {}
-    warnings: tuple[str, ...] = ()
-
-
-class _Midway(BaseModel):
-    share: Number
-    metrics: Values
-
-
-class _Result(BaseModel):
-    method: str
-    protocol: str
-    version: int
-    kind: str
-    headline: tuple[str, ...]
-    profile: str | None
-    caveat: str | None
-    encoder: str | None
-    n_planned: int
-    failed: tuple[str, ...]
-    unscored: tuple[str, ...]
-    ceiling: Values | None
-    result: _Values | None
-    anytime: tuple[_Midway, ...] = ()
-
-
-class _Metrics(BaseModel):
-    results: tuple[_Result, ...]
-
-
-class _Git(BaseModel):
-    commit: str
-    is_dirty: bool
-
-
-class _Record(BaseModel):
-    """What is read of ``run.json`` for the provenance alone."""
-
-    git: _Git | None = None
-    packages: dict[str, str] = {}
-    seed: int | None = None
-    encoder: str | None = None
-    failed: tuple[dict[str, Any], ...] = ()
-    warnings: tuple[Any, ...] = ()
-
-
 def page_numbers(
-    folders: Sequence[Path], encoder_of: EncoderOf, *, with_errors: bool = True, progress: Progress = lambda line: None
+    folders: Sequence[Path], *, with_errors: bool = True, progress: Progress = lambda line: None
 ) -> dict[str, Any]:
     """Plain values for the page of the runs in ``folders``, every text in them on one line and printable.
 
@@ -107,7 +50,7 @@ def page_numbers(
     errors: list[dict[str, Any]] = []
     for index, run in enumerate(runs):
         progress(f"{run.name}: numbers")
-        results += [{"run": index, **one.model_dump()} for one in _results(run)]
+        results += [{"run": index, **_shown(result)} for result in run.results.values()]
         if n_jobs > MOST_JOBS:
             continue
         timing += [{"run": index, **one} for method in run.methods if (one := _times(run, method)) is not None]
@@ -115,7 +58,7 @@ def page_numbers(
             confusions += [{"run": index, **one} for one in _confusions(run, method)]
             if with_errors:
                 progress(f"{run.name}: errors of {printable(method, 80)}")
-                errors.append({"run": index, **_errors(run, method, encoder_of)})
+                errors.append({"run": index, **_errors(run, method)})
     progress("comparisons")
     found = {
         "left_out": f"{n_jobs} jobs, more than {MOST_JOBS}: {LEFT_OUT}" if n_jobs > MOST_JOBS else None,
@@ -130,42 +73,29 @@ def page_numbers(
     return plain
 
 
-def _results(run: FinishedRun) -> tuple[_Result, ...]:
-    return _read(_Metrics, run, "metrics.json").results
-
-
-def _read(model: type[Model], run: FinishedRun, name: str) -> Model:
-    try:
-        return model.model_validate(read_json(run.folder.path / name))
-    except (ValidationError, RecursionError) as error:
-        key = ".".join(map(str, error.errors()[0]["loc"])) if isinstance(error, ValidationError) else "it"
-        raise StoreError(
-            f"{run.name}: {name}: {printable(key, 120)} is not as a run writes it; run it again"
-        ) from error
+def _shown(result: ResultRecord) -> dict[str, Any]:
+    shown: dict[str, Any] = {key: value for key, value in plain(result).items() if key not in NOT_SHOWN}
+    if result.result is not None:
+        shown["result"] = {key: value for key, value in shown["result"].items() if key not in NUMBERS_NOT_SHOWN}
+    return shown | {"anytime": [plain(midway) for midway in result.anytime or ()]}
 
 
 def _about(run: FinishedRun) -> dict[str, Any]:
-    record = _read(_Record, run, "run.json")
+    record = run.record
+    of_record = plain(record)
+    shared = ("profile", "encoder", "encoder_digest", "code", "git", "seed", "hardware", "packages", "data_digests")
     return {
         "name": run.name,
-        "is_partial": run.is_partial,
+        "is_partial": record.is_partial,
         "is_incomplete": run.is_incomplete,
         "limit": run.limit,
         "scenes": run.scenes,
         "methods": run.methods,
-        "profile": run.profile,
-        "encoder": record.encoder,
-        "encoder_digest": run.encoder_digest,
-        "code": run.code,
-        "git": None if record.git is None else record.git.model_dump(),
-        "seed": record.seed,
-        "hardware": run.hardware,
-        "packages": record.packages,
-        "data_digests": dict(run.data_digests),
-        "protocols": [{"name": name, "version": v, "digest": d} for name, (v, d) in run.protocols.items()],
+        **{key: of_record[key] for key in shared},
+        "protocols": of_record["protocols"],
         "settings": [{"key": _dotted(path), "value": value} for path, value in run.settings.items()],
-        "failed": [" ".join(f"{value}" for value in one.values()) for one in record.failed],
-        "warnings": [one if isinstance(one, str) else str(one) for one in record.warnings],
+        "failed": [f"{failure.scene} {failure.method} {failure.error}" for failure in record.failed],
+        "warnings": list(record.warnings),
     }
 
 
@@ -182,7 +112,7 @@ def _confusions(run: FinishedRun, method: str) -> list[dict[str, Any]]:
             continue
         rules = load_protocol(name)
         one: dict[str, Any] = {"method": method, "protocol": name}
-        if rules.digest != run.protocols[name][1] or any(len(c.is_present) != len(rules.classes) for c in counts):
+        if rules.digest != run.protocols[name].digest or any(len(c.is_present) != len(rules.classes) for c in counts):
             found.append(one | {"reason": f"the rules of {name} here are not those that scored the run"})
             continue
         names = [entry.name for entry in rules.classes]
@@ -190,9 +120,9 @@ def _confusions(run: FinishedRun, method: str) -> list[dict[str, Any]]:
     return found
 
 
-def _errors(run: FinishedRun, method: str, encoder_of: EncoderOf) -> dict[str, Any]:
+def _errors(run: FinishedRun, method: str) -> dict[str, Any]:
     try:
-        return {**attribute(run.folder.path, encoder_of, method=method).to_json(), "reason": None}
+        return {**attribute(run.folder.path, method=method).to_json(), "reason": None}
     except Su3dError as error:
         return {"method": method, "protocols": [], "remarks": [], "reason": str(error)}
 

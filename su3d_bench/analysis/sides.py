@@ -93,15 +93,16 @@ def refuse_unlike(left: Side, right: Side, protocol: str, scenes: Sequence[str])
     The encoder counts where it named the instances of both.
     """
     where = f"{left.name} and {right.name} cannot be compared"
-    for place, what in enumerate(("version", "digest")):
-        one, other = left.run.protocols[protocol][place], right.run.protocols[protocol][place]
+    rules, others = left.run.protocols[protocol], right.run.protocols[protocol]
+    for what in ("version", "digest"):
+        one, other = getattr(rules, what), getattr(others, what)
         if one != other:
             raise ConfigError(
                 f"{where}: {what} of protocol {protocol} is {_short(one)} and {_short(other)}; score both again with "
                 "the same rules"
             )
     for scene in scenes:
-        pair = (left.run.data_digests.get(scene), right.run.data_digests.get(scene))
+        pair = (left.run.record.data_digests.get(scene), right.run.record.data_digests.get(scene))
         if pair[0] != pair[1] or None in pair:
             raise ConfigError(
                 f"{where}: data digest of {printable(scene, 100)} is {_short(pair[0])} and {_short(pair[1])}; run both "
@@ -121,7 +122,7 @@ def _short(value: int | str | None) -> str:
 def rules_of(side: Side, protocol: str) -> ProtocolRules:
     """The rules here, which must be those of the run as far as a version says so."""
     rules = load_protocol(protocol)
-    version = side.run.protocols[protocol][0]
+    version = side.run.protocols[protocol].version
     if rules.version != version:
         raise ConfigError(
             f"{side.run.name}: was scored under {protocol} version {version}, here is version {rules.version}; score "

@@ -7,12 +7,9 @@ import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
-
-from pydantic import BaseModel, Field, ValidationError
 
 from su3d_bench.analysis.sides import Side, refuse_unlike, rules_of
-from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, printable, suggest
+from su3d_bench.core.errors import ConfigError, Su3dError, printable, suggest
 from su3d_bench.metrics.results import ProtocolResult
 from su3d_bench.metrics.scoring import combine
 from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
@@ -22,39 +19,12 @@ from su3d_bench.runs.job import CEILING_METHOD
 from su3d_bench.sheets.score_file import FILE as SCORES_FILE
 from su3d_bench.sheets.score_file import read_scores
 from su3d_bench.sheets.scores import ScoreCell, Scores
-from su3d_bench.store.atomic import is_file, read_json
+from su3d_bench.store.atomic import is_file
+from su3d_bench.store.records import ResultRecord
 
-Number = Annotated[float, Field(allow_inf_nan=False)]
 MOST_SOURCE_BYTES, MOST_SOURCES = 1 << 24, 500  # of a paper's LaTeX
 _READ_SOURCE = re.compile(r"\\(?:input|include)\s*\{([^{}\0]{1,200})\}")
 _COMMENT = re.compile(r"(?<!\\)%.*")
-
-
-class _Values(BaseModel):
-    metrics: dict[str, Number | None]
-    intervals: dict[str, tuple[Number, Number] | None]
-    per_scene: dict[str, dict[str, Number | None]]
-
-
-class _Result(BaseModel):
-    method: str
-    protocol: str
-    version: int
-    kind: str
-    headline: tuple[str, ...]
-    n_planned: int
-    failed: tuple[str, ...]
-    unscored: tuple[str, ...]
-    profile: str | None
-    encoder: str | None
-    caveat: str | None
-    ceiling: dict[str, Number | None] | None
-    result: _Values | None
-
-
-class _Metrics(BaseModel):
-    limit: int
-    results: tuple[_Result, ...]
 
 
 def measured_results(folders: Sequence[Path]) -> list[Measured]:
@@ -128,40 +98,37 @@ def _who_judged(scores: Scores, cells: Sequence[ScoreCell]) -> str:
 
 
 def _results_of(name: str, run: FinishedRun) -> list[Measured]:
-    try:
-        metrics = _Metrics.model_validate(read_json(run.folder.path / "metrics.json"))
-    except (ValidationError, RecursionError) as error:
-        key = ".".join(map(str, error.errors()[0]["loc"])) if isinstance(error, ValidationError) else "it"
-        raise StoreError(f"{run.name}: metrics.json: {printable(key, 120)} is not as a run writes it") from error
     names: dict[str, list[str]] = {}
-    for one in metrics.results:
-        if one.result is not None:
-            names.setdefault(one.protocol, list(one.result.metrics))
-    return [_measured(name, metrics.limit, one, names.get(one.protocol, one.headline)) for one in metrics.results]
+    for result in run.results.values():
+        if result.result is not None:
+            names.setdefault(result.protocol, list(result.result.metrics))
+    return [
+        _measured(name, run.limit, result, names.get(result.protocol, result.headline))
+        for result in run.results.values()
+    ]
 
 
-def _measured(run: str, limit: int, one: _Result, names: Sequence[str]) -> Measured:
+def _measured(run: str, limit: int, record: ResultRecord, names: Sequence[str]) -> Measured:
     """``names`` of the protocol's metrics, for a method without any value."""
-    nothing = _Values(metrics=dict.fromkeys(names), intervals={}, per_scene={})
-    values = one.result or nothing
+    numbers = record.result
     return Measured(
         run=run,
-        method=one.method,
-        protocol=one.protocol,
-        version=one.version,
-        kind=one.kind,
-        headline=one.headline,
-        metrics=values.metrics,
-        intervals=values.intervals,
-        per_scene=values.per_scene,
-        ceilings=one.ceiling or {},
-        n_planned=one.n_planned,
-        failed=one.failed,
-        unscored=one.unscored,
+        method=record.method,
+        protocol=record.protocol,
+        version=record.version,
+        kind=record.kind,
+        headline=record.headline,
+        metrics=dict.fromkeys(names) if numbers is None else numbers.metrics,
+        intervals={} if numbers is None else numbers.intervals,
+        per_scene={} if numbers is None else numbers.per_scene,
+        ceilings=record.ceiling or {},
+        n_planned=record.n_planned,
+        failed=record.failed,
+        unscored=record.unscored,
         limit=limit,
-        profile=one.profile,
-        encoder=one.encoder,
-        caveat=one.caveat,
+        profile=record.profile,
+        encoder=record.encoder,
+        caveat=record.caveat,
     )
 
 

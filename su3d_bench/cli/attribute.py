@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.cli.common import add_table_format, add_verb, answer, answer_json, formatted, remark
-from su3d_bench.cli.query import encoder_of
 from su3d_bench.core.errors import EXIT_DONE
 
 
@@ -49,7 +48,6 @@ def call(arguments: argparse.Namespace) -> int:
 
     found = attribute(
         arguments.run,
-        encoder_of,
         method=arguments.method,
         protocols=arguments.protocol,
         oracle=arguments.oracle,

@@ -174,7 +174,7 @@ def _maps_of_run(path: Path) -> dict[str, list[Path]]:
 
 def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> list[Source]:
     """The sources that a pattern matches, all without patterns; a scene without a dataset takes that of its pattern."""
-    from su3d_bench.runs.plan import split_address
+    from su3d_bench.runs.scenes import split_address
 
     if not patterns:
         return list(sources)
@@ -197,7 +197,7 @@ def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> li
 def _names(addresses: Sequence[str], *, is_flat: bool) -> list[str]:
     """The name of each scene's files: its address, or in a flat folder its last part, which must tell scenes apart."""
     from su3d_bench.predictions.export import file_name
-    from su3d_bench.runs.plan import split_address
+    from su3d_bench.runs.scenes import split_address
 
     names = []
     for address in addresses:
@@ -227,23 +227,13 @@ def _labelled(content: Content, source: Source, arguments: argparse.Namespace) -
 
 
 def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
-    """The dataset and the scene of a prediction, with the options of the run that it lies in."""
+    """The dataset and the scene of a prediction, with the options and the data of the run that it lies in."""
     from su3d_bench.cli.datasets.check import chosen_scenes
-    from su3d_bench.core import registry
-    from su3d_bench.core.config import RunConfig, read_file, resolve
-    from su3d_bench.runs.job import Part, build_dataset
-    from su3d_bench.runs.plan import data_root, dataset_targets
+    from su3d_bench.runs.finished import read_data
 
     if source.run is None:
         return chosen_scenes([source.address], [], is_quiet=is_quiet)[0]
-    name, _, scene = source.address.partition("/")
-    settings = read_file(source.run / "run.toml")
-    for target in dataset_targets(resolve(settings, (), RunConfig).scenes):
-        dataset = registry.load("dataset", target)
-        if dataset.name == name:
-            options = resolve(settings, ("dataset", name), dataset.Options)
-            return build_dataset(Part(target, name, options.model_dump_json()), data_root()), scene
-    raise ConfigError(f"{source.run / 'run.toml'}: names no dataset '{name}'; run it again")
+    return read_data(source.run).dataset(source.address), source.address.partition("/")[2]
 
 
 def _rules(name: str | None, dataset: Any) -> ProtocolRules:
@@ -270,10 +260,10 @@ def _has_masks(rules: ProtocolRules) -> bool:
 
 def _encoder(content: Content, source: Source, rules: ProtocolRules, texts: Path | None) -> Encoder | None:
     """What names the features; None where the prediction has classes or no features."""
-    from su3d_bench.cli.query import encoder_of
     from su3d_bench.evaluation.scoring import facts_of
     from su3d_bench.evaluation.texts import encoder_for, read_text_features
     from su3d_bench.metrics.fitness import n_feature_dimensions
+    from su3d_bench.runs.finished import encoder_of
     from su3d_bench.store.run_folder import RunFolder
 
     n_dimensions = n_feature_dimensions(rules, facts_of(content))

@@ -12,7 +12,6 @@ from su3d_bench.cli.common import add_verb, add_whose_map, answer, answer_json, 
 from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, suggest
 
 if TYPE_CHECKING:
-    from su3d_bench.core.interfaces import Encoder
     from su3d_bench.core.types import Instances
     from su3d_bench.questions.retrieval import Ranking
     from su3d_bench.store.run_folder import RunFolder
@@ -44,6 +43,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.core.types import DenseFeatures, Instances
     from su3d_bench.questions.retrieval import rank
     from su3d_bench.reports.pictures.maps import draw_heat_map
+    from su3d_bench.runs.finished import encoder_of
     from su3d_bench.store.predictions import read_prediction
     from su3d_bench.store.run_folder import RunFolder
 
@@ -104,51 +104,17 @@ def latest_run(scene: str, method: str) -> RunFolder:
 
 def no_map(run: RunFolder, scene: str, method: str) -> StoreError:
     """The error of a run without such a map: the names that it has instead, else the command that would make it."""
-    from su3d_bench.store.atomic import read_json
+    from su3d_bench.store.records import RequestRecord, read_record
 
-    record: Any = None
+    record = RequestRecord()
     with suppress(StoreError):
-        record = read_json(run.path / "run.json")
-    told = record if isinstance(record, dict) else {}
-    lists = (told.get(key) for key in ("scenes", "methods"))
-    scenes, methods = ([str(name) for name in names] if isinstance(names, list) else [] for names in lists)
+        record = read_record(RequestRecord, run.path / "run.json", str(run.path))
+    scenes, methods = record.scenes, record.methods
     hint = suggest(scene, scenes) if scene not in scenes else ""
     if scene in scenes and method not in methods:
         hint = suggest(method, methods) or f"; it has {', '.join(methods)}"
     hint = hint or f"; run: su3d-bench run --scenes {scene} --methods {method} --out {run.path}"
     return StoreError(f"{run.path}: holds no map of {scene} by {method}{hint}")
-
-
-def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
-    """The text tower that the run's features go with, on ``device``; another one is an error, never a wrong ranking."""
-    from su3d_bench.core.config import read_file, resolve
-    from su3d_bench.perception.cache import FrameCache
-    from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
-    from su3d_bench.perception.models.catalogue import encoder_known_as
-    from su3d_bench.perception.models.encoders.encoder import FoundationEncoder
-    from su3d_bench.perception.models.loading import load_encoder
-    from su3d_bench.perception.profiles import PerceptionConfig
-    from su3d_bench.runs.plan import cache_root
-    from su3d_bench.store.atomic import read_json
-
-    record = read_json(run.path / "run.json")
-    record = record if isinstance(record, dict) else {}
-    made_by, made_with = record.get("encoder"), record.get("encoder_digest")
-    entry = encoder_known_as(made_by)
-    config = PerceptionConfig()
-    if entry is not None:
-        config = resolve(read_file(run.path / "run.toml"), ("perception",), PerceptionConfig)
-    here = {"device": device, "precision": "auto", "provider": None, "batch": 0}
-    models = config.models.model_copy(update={**here, "encoder": entry.name if entry else None})
-    encoder = load_encoder(models, cache=FrameCache(cache_root() if config.cache else None))
-    if made_with in (None, encoder.digest):
-        return encoder
-    if isinstance(encoder, FoundationEncoder | EmbeddedEncoder) and encoder.is_same_space(made_with):
-        return encoder
-    raise PredictionError(
-        f"{run.path}: its features were made by encoder {made_by} ({made_with[:12]}), here is "
-        f"{encoder.name} ({encoder.digest[:12]}); run it again"
-    )
 
 
 def _file_name(text: str) -> str:

@@ -76,7 +76,7 @@ def _make(arguments: argparse.Namespace) -> int:
 def _made(arguments: argparse.Namespace) -> list[Question]:
     from su3d_bench.questions.making import questions_of
     from su3d_bench.runs.job import Part, build_dataset
-    from su3d_bench.runs.plan import data_root, dataset_targets, expand_scenes
+    from su3d_bench.runs.scenes import data_root, dataset_targets, expand_scenes
 
     parts = {target: _part(target, Part) for target in dataset_targets(arguments.scenes)}
     scenes, notes = expand_scenes(arguments.scenes, parts)

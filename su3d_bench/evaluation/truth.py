@@ -42,7 +42,7 @@ from su3d_bench.predictions.scenes import Match, Source, match_scenes, planned_s
 from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
 from su3d_bench.questions.files.queries import query_truth, read_query_file
 from su3d_bench.questions.truths import question_truth
-from su3d_bench.runs.plan import data_root
+from su3d_bench.runs.scenes import data_root
 
 NOT_MEANT = "is not meant for"
 LARGEST_LABEL = 1357  # of scannetv2-labels.combined.tsv; values above it are label * 1000 + instance

@@ -9,20 +9,13 @@ import numpy as np
 
 from su3d_bench.core.types import Float64Array
 from su3d_bench.numerics.statistics import Growth, growth_exponent
+from su3d_bench.store.records import MapCost
 
 # Stages that are no part of keeping the map: reading the frame, and perception.
 NOT_MAP = ("decode", "cache", "segment", "encode", "caption")
 MAP = "map"
 TOTAL = "total"
 WARM_UP = 3  # first updates: caches and memory are cold, and the map is small
-
-
-@dataclass(frozen=True)
-class MapCost:
-    """What one map took: the updates before it and the milliseconds of ``finish``."""
-
-    n_updates: int
-    finish_ms: float
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, pri
 from su3d_bench.predictions.base import Reader
 from su3d_bench.predictions.formats import recognise
 from su3d_bench.predictions.own_runs import OwnRuns
-from su3d_bench.store.atomic import read_json
+from su3d_bench.store.records import RequestRecord, read_record
 
 
 @dataclass(frozen=True)
@@ -135,10 +135,8 @@ def planned_scenes(sources: Sequence[Source], dataset: str) -> list[str] | None:
         if source.reader.name != OwnRuns.name or not record_file.is_file():
             return None
         try:
-            record = read_json(record_file)
+            record = read_record(RequestRecord, record_file, str(source.path))
         except StoreError:
             return None
-        addresses = record.get("scenes") if isinstance(record, dict) else None
-        texts = [one for one in addresses if isinstance(one, str)] if isinstance(addresses, list) else []
-        planned += [one.removeprefix(f"{dataset}/") for one in texts if one.startswith(f"{dataset}/")]
+        planned += [scene.removeprefix(f"{dataset}/") for scene in record.scenes if scene.startswith(f"{dataset}/")]
     return planned

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import glob
-import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,6 +10,7 @@ from typing import Any
 from su3d_bench.core.errors import DataError
 from su3d_bench.runs.job import Part, SceneJob, build_dataset, build_method, stride_of
 from su3d_bench.runs.plan import Plan
+from su3d_bench.store.records import read_updates
 
 # Where no earlier run says better: an update of opensu3d under the embedded profile at 640x480, and reading, scoring
 # and drawing one room under two protocols, both on two cores of a 2020s server.
@@ -72,8 +71,7 @@ def recent_update_s(runs: Path, method: str) -> float | None:
 
 def _totals(path: Path) -> list[float]:
     try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            totals = [float(row["total_ms"]) for row in csv.DictReader(stream)]
-    except (OSError, ValueError, KeyError, TypeError, csv.Error):
+        totals: list[float] = read_updates(path, path.name)["total_ms"].tolist()
+    except (OSError, DataError, KeyError):
         return []
-    return totals if all(0 <= ms < math.inf for ms in totals) else []
+    return totals if all(ms >= 0 for ms in totals) else []

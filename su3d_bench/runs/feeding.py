@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 import logging
 import time
 from collections import deque
@@ -32,6 +30,7 @@ from su3d_bench.core.types import (
 from su3d_bench.perception.profiles import Perception
 from su3d_bench.runs.executors.local import Event, Report
 from su3d_bench.store.predictions import write_prediction
+from su3d_bench.store.records import updates_text
 
 
 @dataclass(frozen=True)
@@ -229,15 +228,9 @@ class Feeding:
         costs = dict(self._method.finish_costs) if isinstance(self._method, HasFinishCosts) else {}
         self.maps.append({"n_updates": len(self._rows), "finish_ms": round(elapsed_ms, 3)} | costs)
 
-    def csv_text(self) -> str:
-        """The table of the updates, one row each; a stage that an update lacks is 0."""
-        columns = list(dict.fromkeys(name for row in self._rows for name in row if name != "total_ms"))
-        text = io.StringIO()
-        fields = [*columns, "total_ms"] if self._rows else ["update"]
-        writer = csv.DictWriter(text, fields, restval=0, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(self._rows)
-        return text.getvalue()
+    def updates_text(self) -> str:
+        """The table of the updates."""
+        return updates_text(self._rows)
 
 
 class SceneLog(logging.Handler):

@@ -2,112 +2,105 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import ValidationError
 
-from su3d_bench.core.config import KeyPath, read_file
-from su3d_bench.core.errors import ConfigError, DataError, StoreError, printable, suggest
-from su3d_bench.core.types import Float64Array
-from su3d_bench.metrics.costs import MapCost, UpdateTimes
+from su3d_bench.core import registry
+from su3d_bench.core.config import KeyPath, Settings, read_file, resolve
+from su3d_bench.core.errors import ConfigError, DataError, PredictionError, StoreError, printable, suggest
+from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.scoring import SceneScore, unpack_scores
-from su3d_bench.runs.job import CEILING_METHOD
-from su3d_bench.store.atomic import is_file, read_json
+from su3d_bench.runs.job import CEILING_METHOD, Part, build_dataset
+from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets
+from su3d_bench.store.atomic import is_file
+from su3d_bench.store.records import (
+    CostsRecord,
+    MetricsRecord,
+    ProtocolRecord,
+    RequestRecord,
+    ResultRecord,
+    RunRecord,
+    checked,
+    read_record,
+    read_updates,
+)
 from su3d_bench.store.run_folder import RunFolder
 
-Model = TypeVar("Model", bound=BaseModel)
+if TYPE_CHECKING:
+    from su3d_bench.core.interfaces import Encoder
 
 
-class _Protocol(BaseModel):
-    name: str
-    version: int
-    digest: str
-
-
-class _Record(BaseModel):
-    """What is read of ``run.json``."""
-
-    status: str
-    is_partial: bool
-    code: str
-    hardware: str
-    processor: str = ""  # runs of the first version do not say
-    profile: str | None
-    encoder_digest: str | None
-    data_digests: dict[str, str]
-    protocols: tuple[_Protocol, ...]
-    methods: tuple[str, ...] = Field(min_length=1)
-    scenes: tuple[str, ...]
-
-
-class _Values(BaseModel):
-    metrics: dict[str, float | None]
-
-
-class _Midway(_Values):
-    share: float
-
-
-class _Result(BaseModel):
-    """What is read of a result in ``metrics.json``."""
-
-    method: str
-    protocol: str
-    encoder: str | None
-    encoder_digest: str | None
-    failed: tuple[str, ...]
-    caveat: str | None
-    headline: tuple[str, ...]
-    result: _Values | None
-    anytime: tuple[_Midway, ...] = ()
-
-
-class _Metrics(BaseModel):
-    limit: int
-    results: tuple[_Result, ...]
+class OtherDataError(DataError):
+    """The data here are not those that a run was made from."""
 
 
 @dataclass(frozen=True)
-class ResultRecord:
-    """How a method fared under a protocol; ``encoder`` is None where it named its instances itself.
+class RunData:
+    """The data of a run, opened with the options that it had; ``digests`` are those of its scenes."""
 
-    ``metrics`` are those of the final maps, None where none was scored; ``anytime`` those of maps midway, by the share
-    of the updates.
-    """
+    settings: Settings
+    digests: Mapping[str, str]
 
-    encoder: str | None
-    encoder_digest: str | None
-    failed: tuple[str, ...]
-    caveat: str | None
-    headline: tuple[str, ...]
-    metrics: Mapping[str, float | None] | None
-    anytime: Mapping[float, Mapping[str, float | None]]
+    @cached_property
+    def _datasets(self) -> dict[str, Any]:
+        addresses = {entry.path: entry.value for entry in self.settings.entries}.get(("scenes",), ())
+        found = {}
+        for target in dataset_targets([str(address) for address in addresses]):
+            name = str(registry.load("dataset", target).name)
+            options = resolve(self.settings, ("dataset", name), registry.load("dataset", target).Options)
+            found[name] = build_dataset(Part(target, name, options.model_dump_json()), data_root())
+        return found
+
+    def dataset(self, scene: str) -> Any:
+        """The dataset of ``scene``; a ``DataError`` where it is not known, or its data are not those of the run."""
+        name, _, of_dataset = scene.partition("/")
+        if name not in self._datasets:
+            raise DataError(f"{printable(scene, 100)}: run.toml names no dataset '{printable(name, 60)}'")
+        dataset = self._datasets[name]
+        if dataset.digest(of_dataset) != self.digests.get(scene):
+            raise OtherDataError(f"{printable(scene, 100)}: its data are not those of the run; run it again")
+        return dataset
 
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """The records of a run; ``protocols`` holds version and digest of the rules that scored it."""
+    """The records of a run; ``protocols`` holds the rules that scored it, ``results`` are by method and protocol."""
 
     folder: RunFolder
-    scenes: tuple[str, ...]
-    methods: tuple[str, ...]
-    protocols: Mapping[str, tuple[int, str]]
-    data_digests: Mapping[str, str]
+    record: RunRecord
+    protocols: Mapping[str, ProtocolRecord]
     results: Mapping[tuple[str, str], ResultRecord]
-    is_partial: bool
-    is_incomplete: bool
     limit: int
-    code: str
-    hardware: str
-    processor: str
-    profile: str | None
-    encoder_digest: str | None
-    settings: Mapping[KeyPath, Any]
+    data: RunData
+
+    @property
+    def scenes(self) -> tuple[str, ...]:
+        return self.record.scenes
+
+    @property
+    def methods(self) -> tuple[str, ...]:
+        return self.record.methods
+
+    @property
+    def is_incomplete(self) -> bool:
+        return self.record.status != "complete"
+
+    @cached_property
+    def settings(self) -> Mapping[KeyPath, Any]:
+        return {entry.path: entry.value for entry in self.data.settings.entries}
+
+    def dataset(self, scene: str) -> Any:
+        """The dataset of ``scene``, whose data are those of the run; a ``DataError`` where they are others."""
+        return self.data.dataset(scene)
+
+    def encoder(self, device: str = "cpu") -> Encoder:
+        """The text tower that the run's features go with; a ``PredictionError`` where it is another here."""
+        return encoder_of(self.folder, device)
 
     @property
     def name(self) -> str:
@@ -141,14 +134,14 @@ class FinishedRun:
         return found
 
 
-class _Rules(dict[str, tuple[int, str]]):
-    """Version and digest of protocols; one that the run's record does not name is a ``StoreError``."""
+class _Rules(dict[str, ProtocolRecord]):
+    """Protocols by name; one that the run's record does not name is a ``StoreError``."""
 
-    def __init__(self, rules: Mapping[str, tuple[int, str]], shown: str) -> None:
+    def __init__(self, rules: Mapping[str, ProtocolRecord], shown: str) -> None:
         super().__init__(rules)
         self._shown = shown
 
-    def __missing__(self, protocol: str) -> tuple[int, str]:
+    def __missing__(self, protocol: str) -> ProtocolRecord:
         raise StoreError(f"{self._shown}: run.json does not name the protocol '{protocol}'; run its command again")
 
 
@@ -159,93 +152,83 @@ def read_run(path: Path) -> FinishedRun:
         raise StoreError(f"{shown}: holds no run.json; name the folder of a run, such as runs/my-run")
     if not is_file(path / "metrics.json"):
         raise StoreError(f"{shown}: holds no metrics.json, so the run is not finished; run its command again")
-    record = _checked(_Record, path / "run.json", shown)
-    metrics = _checked(_Metrics, path / "metrics.json", shown)
+    record = read_record(RunRecord, path / "run.json", shown)
+    metrics = read_record(MetricsRecord, path / "metrics.json", shown)
     return FinishedRun(
         folder=RunFolder(path),
-        scenes=record.scenes,
-        methods=record.methods,
-        protocols=_Rules({one.name: (one.version, one.digest) for one in record.protocols}, shown),
-        data_digests=record.data_digests,
-        results={(one.method, one.protocol): _result_record(one) for one in metrics.results},
-        is_partial=record.is_partial,
-        is_incomplete=record.status != "complete",
+        record=record,
+        protocols=_Rules({rules.name: rules for rules in record.protocols}, shown),
+        results={(result.method, result.protocol): result for result in metrics.results},
         limit=metrics.limit,
-        code=record.code,
-        hardware=record.hardware,
-        processor=record.processor,
-        profile=record.profile,
-        encoder_digest=record.encoder_digest,
-        settings={entry.path: entry.value for entry in read_file(path / "run.toml").entries},
+        data=RunData(read_file(path / "run.toml"), record.data_digests),
     )
 
 
-def _result_record(one: _Result) -> ResultRecord:
-    return ResultRecord(
-        encoder=one.encoder,
-        encoder_digest=one.encoder_digest,
-        failed=one.failed,
-        caveat=one.caveat,
-        headline=one.headline,
-        metrics=None if one.result is None else one.result.metrics,
-        anytime={midway.share: midway.metrics for midway in one.anytime},
+def read_data(path: Path) -> RunData:
+    """The data of the run in the folder ``path``, which need not be finished."""
+    record = read_record(RequestRecord, path / "run.json", printable(str(path), 200))
+    return RunData(read_file(path / "run.toml"), record.data_digests)
+
+
+def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:
+    """The text tower that the run's features go with, on ``device``; another one is an error, never a wrong ranking."""
+    from su3d_bench.perception.cache import FrameCache
+    from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
+    from su3d_bench.perception.models.catalogue import encoder_known_as
+    from su3d_bench.perception.models.encoders.encoder import FoundationEncoder
+    from su3d_bench.perception.models.loading import load_encoder
+    from su3d_bench.perception.profiles import PerceptionConfig
+
+    record = read_record(RequestRecord, run.path / "run.json", printable(str(run.path), 200))
+    entry = encoder_known_as(record.encoder)
+    config = PerceptionConfig()
+    if entry is not None:
+        config = resolve(read_file(run.path / "run.toml"), ("perception",), PerceptionConfig)
+    here = {"device": device, "precision": "auto", "provider": None, "batch": 0}
+    models = config.models.model_copy(update={**here, "encoder": entry.name if entry else None})
+    encoder = load_encoder(models, cache=FrameCache(cache_root() if config.cache else None))
+    made_with = record.encoder_digest
+    if made_with is None or made_with == encoder.digest:
+        return encoder
+    if isinstance(encoder, FoundationEncoder | EmbeddedEncoder) and encoder.is_same_space(made_with):
+        return encoder
+    raise PredictionError(
+        f"{run.path}: its features were made by encoder {record.encoder} ({made_with[:12]}), here is "
+        f"{encoder.name} ({encoder.digest[:12]}); run it again"
     )
-
-
-def _checked(model: type[Model], file: Path, shown: str) -> Model:
-    try:
-        return model.model_validate(read_json(file))
-    except RecursionError as error:
-        raise StoreError(f"{shown}: {file.name}: is nested too deep for a record of a run; run it again") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        key = printable(".".join(map(str, first["loc"])), 120)
-        raise StoreError(f"{shown}: {file.name}: {key or 'it'} is not as a run writes it; run it again") from error
-
-
-MAX_UPDATES = 10_000_000
 
 
 def read_update_times(run: FinishedRun, method: str) -> list[UpdateTimes]:
     """The updates of every scene that ``method`` finished; scenes where it looks at no frame are left out."""
     run.check_method(method)
-    found = []
+    times = []
     for scene in run.scenes:
         job = run.folder.job(scene, method)
         if not is_file(job.updates):
             continue
         where = f"{printable(scene, 120)}: {job.updates.name}"
-        columns = _columns(job.updates, where)
-        if not columns or not len(columns["total_ms"]):
-            continue
-        costs = _costs(job.remarks("predict").get("costs"), where)
-        found.append(UpdateTimes(run.name, scene, method, columns, *costs))
-    return found
+        columns = read_updates(job.updates, where)
+        if columns and len(columns["total_ms"]):
+            costs = _costs(job.remarks("predict").get("costs"), where)
+            times.append(
+                UpdateTimes(
+                    run.name,
+                    scene,
+                    method,
+                    columns,
+                    costs.maps,
+                    costs.peak_rss_bytes,
+                    costs.device_bytes,
+                    costs.calibration_ms,
+                )
+            )
+    return times
 
 
-def _columns(path: Path, where: str) -> dict[str, Float64Array]:
-    try:
-        with path.open(newline="", encoding="utf-8") as stream:
-            reader = csv.reader(stream)
-            header = next(reader, [])
-            rows = [row for row, _ in zip(reader, range(MAX_UPDATES), strict=False)]
-            if "total_ms" not in header:
-                return {}
-            table = np.array(rows, np.float64).reshape(len(rows), len(header))
-    except (ValueError, csv.Error, UnicodeDecodeError) as error:
-        raise DataError(f"{where}: is not a table of numbers; run the same command again to mend it") from error
-    if not np.isfinite(table).all():
-        raise DataError(f"{where}: holds a number that is not finite; run the same command again to mend it")
-    return {name: table[:, column] for column, name in enumerate(header)}
-
-
-def _costs(costs: Any, where: str) -> tuple[tuple[MapCost, ...], int | None, int | None, float | None]:
+def _costs(costs: Any, where: str) -> CostsRecord:
     if costs is None:
-        return (), None, None, None
+        return CostsRecord((), None, None, None)
     try:
-        maps = tuple(MapCost(int(one["n_updates"]), float(one["finish_ms"])) for one in costs["maps"])
-        peak, device = (None if costs[key] is None else int(costs[key]) for key in ("peak_rss_bytes", "device_bytes"))
-        calibration = None if costs["calibration_ms"] is None else float(costs["calibration_ms"])
-    except (KeyError, TypeError, ValueError, OverflowError) as error:
+        return checked(CostsRecord, costs)
+    except (ValidationError, RecursionError) as error:
         raise DataError(f"{where}: the costs in done.json are not as a run writes them; run it again") from error
-    return maps, peak, device, calibration

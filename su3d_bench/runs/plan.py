@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
-import fnmatch
 import os
 import re
 from collections.abc import Mapping, Sequence
@@ -27,8 +25,8 @@ from su3d_bench.core.config import (
 )
 from su3d_bench.core.devices import device_for
 from su3d_bench.core.digests import code_digest, digest_json
-from su3d_bench.core.errors import ConfigError, DataError, StoreError, suggest
-from su3d_bench.core.interfaces import Dataset, HasGroups, HasPresets
+from su3d_bench.core.errors import ConfigError, StoreError, suggest
+from su3d_bench.core.interfaces import HasPresets
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.protocols import load_protocol, protocols_for
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
@@ -38,14 +36,14 @@ from su3d_bench.runs.job import (
     FIELDS_KNOWN_LATER,
     Part,
     SceneJob,
-    build_dataset,
     build_method,
     config_key,
     refuse_other_run,
 )
 from su3d_bench.runs.remote.data import DataPlace, RemoteData, data_place
 from su3d_bench.runs.remote.folder import is_url
-from su3d_bench.runs.remote.scene import CACHE_ROOT, fetch_seals, mirror_of
+from su3d_bench.runs.remote.scene import fetch_seals, mirror_of
+from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets, expand_scenes
 from su3d_bench.store.run_folder import RunFolder
 
 MOST_CHARACTERS = 120  # the name is a folder's name too
@@ -101,7 +99,6 @@ def _assigned(text: str, variant: str) -> Mapping[str, Any]:
     return values
 
 
-DATA_ROOT = "~/.cache/su3d-bench/data"
 NO_SYSTEMS = (CEILING_METHOD, "command")  # what `--methods all` leaves out: the truth itself, and programs of others
 
 
@@ -129,19 +126,6 @@ class Plan:
     @property
     def is_partial(self) -> bool:
         return self.config.limit > 0
-
-
-def data_root() -> Path:
-    """Where datasets are: ``$SU3D_DATA``, else the user's cache."""
-    named = os.environ.get("SU3D_DATA") or DATA_ROOT
-    if is_url(named):
-        raise ConfigError(f"SU3D_DATA={named}: only su3d-bench run and ablate read a store; name a folder")
-    return Path(named).expanduser()
-
-
-def cache_root() -> Path:
-    """Where per-frame perception is kept: ``$SU3D_CACHE``, else the user's cache."""
-    return Path(os.environ.get("SU3D_CACHE") or CACHE_ROOT).expanduser()
 
 
 def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | str | None = None) -> Plan:
@@ -248,104 +232,6 @@ def _method_targets(methods: Sequence[str]) -> list[str]:
     if not targets:
         raise ConfigError("no method was named; known: " + ", ".join(registry.names("method")))
     return targets
-
-
-def split_address(address: str) -> tuple[str, str]:
-    """Dataset target and scene (or pattern) of ``rooms/living0`` or ``path/to/file.py:Class/scene``."""
-    head, colon, tail = address.partition(".py:")
-    if colon:
-        name, _, scene = tail.partition("/")
-        return f"{head}.py:{name}", scene
-    target, _, scene = address.partition("/")
-    return target, scene
-
-
-def dataset_targets(addresses: Sequence[str]) -> list[str]:
-    """The datasets that ``addresses`` speak of, in order; addresses that are mere files are passed over."""
-    targets: dict[str, None] = {}
-    for address in addresses:
-        target, _ = split_address(address)
-        if target in registry.names("dataset") or ".py:" in target:
-            targets[target] = None
-        elif not os.path.exists(address):
-            raise ConfigError(f"no scene matches '{address}'{_nearest_address(address)}")
-    if not targets:
-        raise ConfigError(
-            f"no scene among {', '.join(addresses) or 'no --scenes'}; such as: rooms/living0 or 'rooms/*'"
-        )
-    return list(targets)
-
-
-def expand_scenes(
-    addresses: Sequence[str], datasets: Mapping[str, Part], root: Path | None = None
-) -> tuple[list[tuple[str, str]], tuple[str, ...]]:
-    """(dataset target, scene) of every address or pattern, each once, in the order asked; and notes.
-
-    Files among the addresses, which a shell put there by expanding ``replica/*``, are left out with a note when
-    other addresses match. ``root`` None: ``data_root()``.
-    """
-    root = data_root() if root is None else root
-    chosen: dict[tuple[str, str], None] = {}
-    strangers = []
-    for address in addresses:
-        target, pattern = split_address(address)
-        dataset = build_dataset(datasets[target], root) if target in datasets else None
-        scenes = [] if dataset is None else _matching_scenes(dataset, pattern)
-        if not scenes and os.path.exists(address):
-            strangers.append(address)
-        elif not scenes:
-            assert dataset is not None
-            known = [f"{target}/{scene}" for scene in (*dataset.scenes(), *_groups(dataset))]
-            raise ConfigError(f"no scene matches '{address}'{suggest(address, known) or _some(known)}")
-        chosen.update(dict.fromkeys((target, scene) for scene in scenes))
-    if not chosen:
-        raise ConfigError(f"no scene matches {', '.join(addresses)}; such as: rooms/living0 or 'rooms/*'")
-    notes = (f"not scenes, left out: {' '.join(strangers)}",) if strangers else ()
-    return list(chosen), notes
-
-
-def _matching_scenes(dataset: Dataset, pattern: str) -> list[str]:
-    scenes = list(dataset.scenes())
-    if any(character in pattern for character in "*?["):
-        return [scene for scene in scenes if fnmatch.fnmatchcase(scene, pattern)]
-    if pattern in scenes:
-        return [pattern]
-    if pattern in _groups(dataset):
-        return _whole_group(dataset, pattern, set(scenes))
-    try:  # a scene that is made on demand stands in no list
-        dataset.info(pattern, 1)
-    except DataError:
-        return []
-    return [pattern]
-
-
-def _groups(dataset: Any) -> Mapping[str, Sequence[str]]:
-    """Names that stand for several scenes, such as official splits; a dataset that has some has ``groups``."""
-    return dataset.groups() if isinstance(dataset, HasGroups) else {}
-
-
-def _whole_group(dataset: Dataset, name: str, here: set[str]) -> list[str]:
-    """The scenes of a group, in its order, all of which must be here: a number over fewer is not the group's."""
-    group = _groups(dataset)[name]
-    missing = [scene for scene in group if scene not in here]
-    if missing:
-        raise ConfigError(
-            f"{dataset.name}/{name}: {len(missing)} of its {len(group)} scenes are not here (the first: {missing[0]}); "
-            "get them or name the scenes that are"
-        )
-    return list(group)
-
-
-def _some(known: Sequence[str]) -> str:
-    return "; known: " + ", ".join(known[:8]) + (", ..." if len(known) > 8 else "") if known else ""
-
-
-def _nearest_address(address: str) -> str:
-    target, slash, pattern = address.partition("/")
-    near = difflib.get_close_matches(target, registry.names("dataset"), n=1, cutoff=0.6)
-    if not near:
-        return "; known datasets: " + ", ".join(registry.names("dataset"))
-    return f"; did you mean '{near[0]}{slash or '/'}{pattern or '*'}'?"
 
 
 def protocols_of_run(asked: Sequence[str], targets: Sequence[str]) -> dict[str, tuple[str, ...]]:

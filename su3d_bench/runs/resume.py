@@ -18,6 +18,7 @@ from su3d_bench.runs.job import (
     config_key,
     stride_of,
 )
+from su3d_bench.store.records import SealRecord
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 SAME_EVERYWHERE = ("embedded", "paper")  # profiles whose digest does not depend on the scene
@@ -54,7 +55,9 @@ class FinishedScenes:
             package.removeHandler(unheard)
         return None if None in found else tuple(one for one in found if one is not None)
 
-    def _outcome(self, job: SceneJob, part: Part, folder: JobFolder, seals: Mapping[str, Any]) -> MethodOutcome | None:
+    def _outcome(
+        self, job: SceneJob, part: Part, folder: JobFolder, seals: Mapping[str, SealRecord]
+    ) -> MethodOutcome | None:
         inputs = self.inputs(job, part)
         if inputs is None:
             return None
@@ -62,7 +65,7 @@ class FinishedScenes:
         is_done = folder.is_whole(seals["predict"], key)
         if not is_done or not folder.is_whole(seals["score"], inputs.score_key(key, folder)):
             return None
-        return inputs.outcome(seals["score"]["remarks"], was_resumed=True)
+        return inputs.outcome(seals["score"].remarks, was_resumed=True)
 
     def inputs(self, job: SceneJob, part: Part) -> JobInputs | None:
         """What decides the numbers of a job; None where only a worker can tell."""

@@ -26,12 +26,25 @@ from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.runs.executors.choose import ELSEWHERE, run_units
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
 from su3d_bench.runs.job import CEILING_METHOD, MethodOutcome, SceneJob
-from su3d_bench.runs.plan import Plan, cache_root
+from su3d_bench.runs.plan import Plan
 from su3d_bench.runs.remote.scene import DistantJob, failed_distant, fetch_results, run_distant_scene, send_records
 from su3d_bench.runs.resume import FinishedScenes
 from su3d_bench.runs.scene import failed_outcomes, run_scene
+from su3d_bench.runs.scenes import cache_root
 from su3d_bench.store.atomic import remove_file, write_json, write_text
-from su3d_bench.store.run_folder import SCHEMA, JobFolder
+from su3d_bench.store.records import (
+    FailureRecord,
+    GitRecord,
+    MetricsRecord,
+    MidwayRecord,
+    NumbersRecord,
+    ProtocolRecord,
+    ResultRecord,
+    RunRecord,
+    UnscoredRecord,
+    plain,
+)
+from su3d_bench.store.run_folder import JobFolder
 
 Scores = Mapping[tuple[str, str], SceneScore]
 
@@ -57,12 +70,12 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
         metrics_file = plan.folder.path / "metrics.json"
         remove_file(metrics_file)  # what stands there may be of another plan
         write_text(plan.folder.path / "run.toml", write_toml(resolved_values(plan)))
-        write_json(plan.folder.path / "run.json", record(plan, (), "running"))
+        write_json(plan.folder.path / "run.json", plain(record(plan, (), "running")))
         publish(plan)
         try:
             outcomes = _execute(plan, report)
         except BaseException:
-            write_json(plan.folder.path / "run.json", record(plan, (), "interrupted"))
+            write_json(plan.folder.path / "run.json", plain(record(plan, (), "interrupted")))
             with suppress(StoreError):  # what ended the run says more
                 publish(plan)
             raise
@@ -70,9 +83,10 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
             fetch_results(plan.store, plan.folder.path)
         failed = [(one.scene, one.method, one.error) for one in outcomes if one.error is not None]
         failures = tuple(each for each in failed if each[1] in plan.methods)
-        metrics = summarise(plan, outcomes)
+        metrics = plain(summarise(plan, outcomes))
         write_json(metrics_file, metrics)
-        write_json(plan.folder.path / "run.json", record(plan, outcomes, "incomplete" if failures else "complete"))
+        status = "incomplete" if failures else "complete"
+        write_json(plan.folder.path / "run.json", plain(record(plan, outcomes, status)))
         publish(plan)
     return RunResult(plan, metrics, outcomes, failures, _remarks(plan, outcomes))
 
@@ -147,8 +161,8 @@ def resolved_values(plan: Plan) -> list[tuple[KeyPath, Any, str]]:
     return [(path, value, plan.settings.source(path)) for path, value in leaves]
 
 
-def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> dict[str, Any]:
-    """What ``metrics.json`` holds: one result a method and protocol, with ceiling and the scenes that are missing.
+def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> MetricsRecord:
+    """One result a method and protocol, with ceiling and the scenes that are missing.
 
     The counts of one method and of the ceiling are in memory at a time.
     """
@@ -156,13 +170,11 @@ def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> dict[str, Any]:
     for one in outcomes:
         by_method.setdefault(one.method, []).append(one)
     perfect = _read_scores(plan, by_method.get(CEILING_METHOD, ()), _final_counts)
-    rules = [load_protocol(name) for name in dict.fromkeys(name for job in plan.jobs for name in job.protocols)]
+    rules = _rules(plan)
 
     @cache
     def ceiling(protocol: str, scenes: tuple[str, ...]) -> Any:
-        found = {scene: perfect[protocol, scene] for scene in scenes if (protocol, scene) in perfect}
-        is_whole = scenes and len(found) == len(scenes)
-        return plain_json(combined_metrics(load_protocol(protocol), found)) if is_whole else None
+        return _metrics_over(scenes, load_protocol(protocol), perfect)
 
     results = {}
     for method in plan.methods:
@@ -173,17 +185,20 @@ def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> dict[str, Any]:
             for share in sorted(set(plan.config.anytime))
         }
         for rule in rules:
-            found = _result(plan, method, rule, mine, scores)
-            scored = tuple(found["result"]["scenes"]) if found["result"] else ()
-            results[rule.name, method] = found | {"ceiling": ceiling(rule.name, scored)} | _anytime(rule, scores, early)
-    return {
-        "schema": SCHEMA,
-        "is_partial": plan.is_partial,
-        "limit": plan.config.limit,
-        "seed": plan.config.seed,
-        "scenes": [job.scene for job in plan.jobs],
-        "results": [results[rule.name, method] for rule in rules for method in plan.methods],
-    }
+            result = _result(plan, method, rule, mine, scores, early)
+            scored = tuple(result.result.scenes) if result.result else ()
+            results[rule.name, method] = replace(result, ceiling=ceiling(rule.name, scored))
+    return MetricsRecord(
+        is_partial=plan.is_partial,
+        limit=plan.config.limit,
+        seed=plan.config.seed,
+        scenes=tuple(job.scene for job in plan.jobs),
+        results=tuple(results[rule.name, method] for rule in rules for method in plan.methods),
+    )
+
+
+def _rules(plan: Plan) -> list[ProtocolRules]:
+    return [load_protocol(name) for name in dict.fromkeys(name for job in plan.jobs for name in job.protocols)]
 
 
 def _final_counts(job: JobFolder) -> Path:
@@ -200,42 +215,44 @@ def _read_scores(plan: Plan, outcomes: Sequence[MethodOutcome], file_of: Callabl
     return scores
 
 
-def _anytime(rules: ProtocolRules, scores: Scores, early: Mapping[float, Scores]) -> dict[str, Any]:
-    """The metrics of the maps midway, over the scenes that the final one is scored on."""
-    if not early:
-        return {}
-    scenes = [scene for protocol, scene in scores if protocol == rules.name]
-    midway = []
-    for share, counts in early.items():
-        found = {scene: counts[key] for scene in scenes if (key := (rules.name, scene)) in counts}
-        if found and len(found) == len(scenes):
-            midway.append({"share": share, "metrics": plain_json(combined_metrics(rules, found))})
-    return {"anytime": midway}
+def _metrics_over(scenes: Sequence[str], rules: ProtocolRules, scores: Scores) -> Any:
+    """The metrics over ``scenes``; None where there is none, or one has no score."""
+    found = {scene: scores[rules.name, scene] for scene in scenes if (rules.name, scene) in scores}
+    return plain_json(combined_metrics(rules, found)) if found and len(found) == len(scenes) else None
 
 
 def _result(
-    plan: Plan, method: str, rules: ProtocolRules, outcomes: Sequence[MethodOutcome], scores: Scores
-) -> dict[str, Any]:
-    planned = {job.scene: None for job in plan.jobs if rules.name in _protocol_names(job)}
-    mine = {one.scene: one for one in outcomes if one.scene in planned}
+    plan: Plan,
+    method: str,
+    rules: ProtocolRules,
+    outcomes: Sequence[MethodOutcome],
+    scores: Scores,
+    early: Mapping[float, Scores],
+) -> ResultRecord:
+    """The result without its ceiling; the maps midway count where all scenes of the final one are scored."""
+    planned = {job.scene: job for job in plan.jobs if rules.name in _protocol_names(job)}
+    mine = {outcome.scene: outcome for outcome in outcomes if outcome.scene in planned}
     scored = {scene: scores[rules.name, scene] for scene in planned if (rules.name, scene) in scores}
-    failed = {scene: None for scene in planned if mine[scene].error is not None}
-    return {
-        "method": method,
-        "protocol": rules.name,
-        "version": rules.version,
-        "kind": rules.kind,
-        "headline": list(rules.headline),
-        "profile": _join(one.profile for one in mine.values()),
-        "caveat": _join((one.caveat for one in mine.values()), "; "),
-        "encoder": _join(one.encoder for one in mine.values() if one.profile is not None),
-        "encoder_digest": _join(one.encoder_digest for one in mine.values()),
-        "n_planned": len(planned),
-        "failed": list(failed),
-        "unscored": [scene for scene in planned if scene not in scored and scene not in failed],
-        "ceiling": None,
-        "result": combine(rules, scored).to_json() if scored else None,
-    }
+    failed = {scene: mine[scene].error for scene in planned if mine[scene].error is not None}
+    scenes = [scene for protocol, scene in scores if protocol == rules.name]
+    midway = [(share, _metrics_over(scenes, rules, counts)) for share, counts in early.items()]
+    return ResultRecord(
+        method=method,
+        protocol=rules.name,
+        version=rules.version,
+        kind=rules.kind,
+        headline=rules.headline,
+        profile=_join(outcome.profile for outcome in mine.values()),
+        caveat=_join((outcome.caveat for outcome in mine.values()), "; "),
+        encoder=_join(outcome.encoder for outcome in mine.values() if outcome.profile is not None),
+        encoder_digest=_join(outcome.encoder_digest for outcome in mine.values()),
+        n_planned=len(planned),
+        failed=tuple(failed),
+        unscored=tuple(scene for scene in planned if scene not in scored and scene not in failed),
+        ceiling=None,
+        result=NumbersRecord(**combine(rules, scored).to_json()) if scored else None,
+        anytime=tuple(MidwayRecord(share, metrics) for share, metrics in midway if metrics) if early else None,
+    )
 
 
 def _protocol_names(job: SceneJob) -> list[str]:
@@ -257,33 +274,28 @@ def _model_files(plan: Plan, outcomes: Sequence[MethodOutcome]) -> dict[str, dic
     return models_record(names, PerceptionConfig.model_validate_json(plan.jobs[0].perception).models) if names else {}
 
 
-def record(plan: Plan, outcomes: Sequence[MethodOutcome], status: str) -> dict[str, Any]:
-    """What ``run.json`` holds: where the numbers come from."""
-    rules = [load_protocol(name) for name in dict.fromkeys(name for job in plan.jobs for name in job.protocols)]
-    return {
-        "schema": SCHEMA,
-        "status": status,
-        "is_partial": plan.is_partial,
-        "code": code_digest(),
-        "git": git_state(),
-        "packages": package_versions(),
-        "hardware": hardware_line(),
-        "processor": processor_digest(),
-        "n_workers": plan.n_workers,
-        "seed": plan.config.seed,
-        "profile": _join(one.profile for one in outcomes) or plan.config.profile,
-        "models": _model_files(plan, outcomes),
-        "encoder": _join(one.encoder for one in outcomes),
-        "encoder_digest": _join(one.encoder_digest for one in outcomes),
-        "data_digests": {one.scene: one.data_digest for one in outcomes if one.data_digest is not None},
-        "protocols": [{"name": one.name, "version": one.version, "digest": one.digest} for one in rules],
-        "methods": [part.name for part in plan.jobs[0].methods],
-        "scenes": [job.scene for job in plan.jobs],
-        "failed": [{"scene": o.scene, "method": o.method, "error": o.error} for o in outcomes if o.error is not None],
-        "unscored": [
-            {"scene": one.scene, "method": one.method, "protocol": protocol, "reason": reason}
-            for one in outcomes
-            for protocol, reason in one.unscored
-        ],
-        "warnings": list(dict.fromkeys(line for one in outcomes for line in one.warnings)),
-    }
+def record(plan: Plan, outcomes: Sequence[MethodOutcome], status: str) -> RunRecord:
+    """Where the numbers come from."""
+    git = git_state()
+    return RunRecord(
+        status=status,
+        is_partial=plan.is_partial,
+        code=code_digest(),
+        git=None if git is None else GitRecord(**git),
+        packages=package_versions(),
+        hardware=hardware_line(),
+        processor=processor_digest(),
+        n_workers=plan.n_workers,
+        seed=plan.config.seed,
+        profile=_join(outcome.profile for outcome in outcomes) or plan.config.profile,
+        models=_model_files(plan, outcomes),
+        encoder=_join(outcome.encoder for outcome in outcomes),
+        encoder_digest=_join(outcome.encoder_digest for outcome in outcomes),
+        data_digests={one.scene: one.data_digest for one in outcomes if one.data_digest is not None},
+        protocols=tuple(ProtocolRecord(rules.name, rules.version, rules.digest) for rules in _rules(plan)),
+        methods=plan.methods,
+        scenes=tuple(job.scene for job in plan.jobs),
+        failed=tuple(FailureRecord(one.scene, one.method, one.error) for one in outcomes if one.error is not None),
+        unscored=tuple(UnscoredRecord(one.scene, one.method, *pair) for one in outcomes for pair in one.unscored),
+        warnings=tuple(dict.fromkeys(line for outcome in outcomes for line in outcome.warnings)),
+    )

@@ -227,7 +227,7 @@ class _Scene:
         feeding.write_map(folder.prediction)
         if isinstance(method, Closes):
             method.close()
-        write_text(folder.updates, feeding.csv_text())
+        write_text(folder.updates, feeding.updates_text())
         files = [folder.prediction, folder.updates, *map(folder.anytime, shares)]
         costs = {
             "maps": feeding.maps,

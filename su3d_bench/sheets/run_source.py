@@ -5,16 +5,13 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Sequence
 from copy import copy
-from functools import cached_property, lru_cache
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
 
-from su3d_bench.core import registry
-from su3d_bench.core.config import Setting, Settings, resolve
 from su3d_bench.core.errors import (
     ConfigError,
-    DataError,
     GroundTruthMissing,
     PredictionError,
     StoreError,
@@ -27,8 +24,6 @@ from su3d_bench.metrics.instance.score import Covered, covered_objects
 from su3d_bench.metrics.protocol_files import protocol_names
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.runs.finished import FinishedRun
-from su3d_bench.runs.job import Part, build_dataset
-from su3d_bench.runs.plan import data_root, dataset_targets
 from su3d_bench.store.predictions import read_prediction
 
 MOST_FRAMES = 32  # of a scene, among which the best view of an object is looked for
@@ -56,7 +51,6 @@ class RunSource:
 
     def of_methods(self, methods: Sequence[str]) -> RunSource:
         """The same run with these of its methods alone; what was read is shared."""
-        _ = self._datasets
         other = copy(self)
         other.methods = tuple(methods)
         return other
@@ -77,25 +71,9 @@ class RunSource:
             )
         return found
 
-    @cached_property
-    def _datasets(self) -> dict[str, Any]:
-        settings = Settings(tuple(Setting(path, value, "run.toml") for path, value in self.run.settings.items()))
-        found = {}
-        for target in dataset_targets([str(each) for each in self.run.settings.get(("scenes",), ())]):
-            cls = registry.load("dataset", target)
-            options = resolve(settings, ("dataset", cls.name), cls.Options)
-            found[cls.name] = build_dataset(Part(target, cls.name, options.model_dump_json()), data_root())
-        return found
-
     def dataset(self, scene: str) -> Any:
         """The dataset of a scene, whose data are those of the run."""
-        name, _, of_dataset = scene.partition("/")
-        if name not in self._datasets:
-            raise DataError(f"{printable(scene, 100)}: run.toml names no dataset '{printable(name, 60)}'")
-        dataset = self._datasets[name]
-        if dataset.digest(of_dataset) != self.run.data_digests.get(scene):
-            raise DataError(f"{printable(scene, 100)}: its data are not those of the run; run it again")
-        return dataset
+        return self.run.dataset(scene)
 
     def frames(self, scene: str, method: str) -> tuple[Frame, ...]:
         """Some of the frames that the map was made from, spread over the scene."""

@@ -11,17 +11,19 @@ import errno
 import fcntl
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from pydantic import ValidationError
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import StoreError
 from su3d_bench.store.atomic import make_folder, read_json, remove_file, write_error, write_json
 from su3d_bench.store.predictions import features_beside
+from su3d_bench.store.records import SCHEMA, SealRecord, checked, plain
 
-SCHEMA = 1
 # What a lock on a folder itself gets from network disks, which lock files that are open for writing only: flock(2).
 NO_FOLDER_LOCKS = (errno.EBADF, errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)
 LOCK_FILE = ".lock"
@@ -123,14 +125,18 @@ class JobFolder:
         for folder in (self.path, self.pictures):
             _clear_half_written(folder)
 
-    def seals(self) -> dict[str, Any]:
+    def seals(self) -> dict[str, SealRecord]:
         """The sealed steps; nothing where ``done.json`` is missing or damaged."""
         try:
             record = read_json(self.done)
         except StoreError:
             return {}
         steps = record.get("steps") if isinstance(record, dict) and record.get("schema") == SCHEMA else None
-        return steps if isinstance(steps, dict) else {}
+        seals = {}
+        for step, seal in steps.items() if isinstance(steps, dict) else ():
+            with suppress(ValidationError, RecursionError):
+                seals[step] = checked(SealRecord, seal)
+        return seals
 
     def seal(
         self, step: str, key: Mapping[str, str], files: Sequence[Path], remarks: Mapping[str, Any] | None = None
@@ -142,19 +148,21 @@ class JobFolder:
         steps = {} if step == "predict" else self.seals()
         beside = [table for file in files if (table := features_beside(file)) != file and table.is_file()]
         digests = {file.relative_to(self.path).as_posix(): digest_file(file) for file in [*files, *beside]}
-        steps[step] = {"key": dict(key), "files": digests, "remarks": dict(remarks or {})}
-        write_json(self.done, {"schema": SCHEMA, "steps": steps})
+        steps[step] = SealRecord(key, digests, remarks or {})
+        write_json(self.done, {"schema": SCHEMA, "steps": {name: plain(seal) for name, seal in steps.items()}})
 
-    def remarks(self, step: str) -> dict[str, Any]:
+    def remarks(self, step: str) -> Mapping[str, Any]:
         """What was kept beside the seal of ``step``."""
-        return self._part(step, "remarks")
+        seal = self.seals().get(step)
+        return {} if seal is None else seal.remarks
 
     def changed_field(self, step: str, key: Mapping[str, str], *, known_later: Sequence[str] = ()) -> str | None:
         """A clause that names the first field in which the sealed key differs from ``key``; None where none does.
 
         Fields in ``known_later`` are not compared.
         """
-        sealed = self._part(step, "key")
+        seal = self.seals().get(step)
+        sealed = {} if seal is None else seal.key
         if not sealed or (key.items() <= sealed.items() and sealed.keys() - key.keys() <= set(known_later)):
             return None
         for name in [*key, *(name for name in sealed if name not in key)]:
@@ -162,18 +170,13 @@ class JobFolder:
                 return f"{name} was {sealed.get(name, 'not set')}, now {key.get(name, 'not set')}"
         return None
 
-    def _part(self, step: str, part: str) -> dict[str, Any]:
-        seal = self.seals().get(step)
-        found = seal.get(part) if isinstance(seal, dict) else None
-        return found if isinstance(found, dict) else {}
-
     def is_done(self, step: str, key: Mapping[str, str]) -> bool:
         """Whether ``step`` is sealed under exactly ``key`` and every file that it vouches for is whole."""
         return self.is_whole(self.seals().get(step), key)
 
-    def is_whole(self, seal: Any, key: Mapping[str, str]) -> bool:
+    def is_whole(self, seal: SealRecord | None, key: Mapping[str, str]) -> bool:
         """Whether ``seal``, one of ``seals``, is of exactly ``key`` and every file that it vouches for is whole."""
-        files = seal.get("files") if isinstance(seal, dict) else None
-        if not isinstance(files, dict) or not files or seal.get("key") != dict(key):
+        if seal is None or seal.key != dict(key):
             return False
-        return all((self.path / name).is_file() and digest_file(self.path / name) == sha for name, sha in files.items())
+        files = {self.path / name: digest for name, digest in seal.files.items()}
+        return all(file.is_file() and digest_file(file) == digest for file, digest in files.items())

@@ -17,7 +17,6 @@ from scored_room import ENCODER, NAMES, instances, noisy, room, truth_as_predict
 
 import su3d_bench.reports.tables.attribution
 from su3d_bench.analysis.attribution import KINDS, attribute
-from su3d_bench.cli import attribute as verb
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError
 from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
@@ -30,6 +29,7 @@ from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.reports.tables.attribution import MEANINGS
+from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 
 PAINTED = f"{SCENES}/painted.py:Painted"
@@ -191,11 +191,11 @@ def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(autouse=True)
 def _in_folder(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(runs)
-    monkeypatch.setattr(verb, "encoder_of", lambda _: WordEncoder())
+    monkeypatch.setattr(finished_run, "encoder_of", lambda run, device: WordEncoder())
 
 
 def attributed(run: str, **more: Any) -> dict[str, Any]:
-    found = attribute(Path(run), lambda _: WordEncoder(), **more)
+    found = attribute(Path(run), **more)
     return {one["protocol"]: one for one in found.to_json()["protocols"]}
 
 
@@ -238,7 +238,7 @@ def test_perfect_2d_masks_come_from_the_oracle_s_run() -> None:
 
 
 def test_a_partial_run_is_marked() -> None:
-    found = attribute(Path("part"), lambda _: WordEncoder())
+    found = attribute(Path("part"))
     assert found.remarks == ("PARTIAL: only the first 3 frames of each scene",)
 
 

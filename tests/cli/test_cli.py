@@ -12,10 +12,10 @@ import pytest
 from painted import colour_perception
 from places import SCENES
 
-from su3d_bench.cli import query
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.core.errors import EXIT_INTERNAL
 from su3d_bench.reports.tables.formats import FORMATS
+from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 
 PAINTED = f"{SCENES}/painted.py:Painted"
@@ -275,7 +275,7 @@ def test_json_answers_are_the_metrics_file(capsys: pytest.CaptureFixture[str]) -
 def test_a_query_ranks_the_map_and_draws_it(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(query, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
+    monkeypatch.setattr(finished_run, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a"]) == 0
     capsys.readouterr()
     words = ["query", "painted/a", "a red sofa", "--method", "collector"]
@@ -297,7 +297,7 @@ def test_a_query_ranks_the_map_and_draws_it(
 def test_a_map_without_features_cannot_be_queried(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(query, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
+    monkeypatch.setattr(finished_run, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
     assert main([*RUN, "--jobs", "1", "--scenes", f"{PAINTED}/a", "--quiet"]) == 0
     capsys.readouterr()
     assert main(["query", "painted/a", "sofa", "--method", "oracle"]) == 2

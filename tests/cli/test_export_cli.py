@@ -11,12 +11,12 @@ from painted import colour_perception
 from places import SCENES
 from prediction_files import TOY, write_open3dis, write_scannet_text
 
-from su3d_bench.cli import query
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import Instances, Partition
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.predictions.base import VertexMasks
 from su3d_bench.predictions.formats import READERS, recognise
+from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 
 PAINTED, COLLECTOR = f"{SCENES}/painted.py:Painted", f"{SCENES}/painted.py:Collector"
@@ -33,7 +33,7 @@ def read_text(folder: Path, scene: str) -> VertexMasks:
 def run_folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> str:
     """A finished run of two scenes by two methods."""
     monkeypatch.setattr(scene_run, "build_perception", colour_perception)
-    monkeypatch.setattr(query, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
+    monkeypatch.setattr(finished_run, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
     words = ["run", "--scenes", f"{PAINTED}/a", f"{PAINTED}/b", "--methods", COLLECTOR, "oracle", "--jobs", "1"]

@@ -14,7 +14,6 @@ import pytest
 from tiny_encoders import DIM, write_tiny_clip
 
 from su3d_bench.cli.main import build_parser, main
-from su3d_bench.cli.query import encoder_of
 from su3d_bench.core.errors import ModelMissing, PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.evaluation.texts import encoder_for
@@ -22,6 +21,7 @@ from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.loading import load_encoder
+from su3d_bench.runs.finished import encoder_of
 from su3d_bench.store.run_folder import RunFolder
 
 needs_models = pytest.mark.skipif(

@@ -21,7 +21,6 @@ from places import SCENES
 
 from su3d_bench.analysis import page_maps
 from su3d_bench.analysis.page_maps import points_of_each
-from su3d_bench.cli import query
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import DenseFeatures, Instances
 from su3d_bench.reports.page import maps as html_map
@@ -39,6 +38,7 @@ from su3d_bench.reports.page.maps import (
     thinned,
 )
 from su3d_bench.reports.page.page import page_html
+from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.predictions import read_prediction, write_prediction
 
@@ -61,7 +61,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def made(run: Path, page: Path, *words: str) -> str:
     """The page of a run, made with the encoder of painted scenes."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(query, "encoder_of", lambda folder, device="cpu": WordEncoder())
+        patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
         assert main(["report", "html", str(run), "--out", str(page), "--quiet", *words]) == 0
     return page.read_text(encoding="utf-8")
 

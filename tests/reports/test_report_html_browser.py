@@ -15,8 +15,8 @@ from chromium import Chromium, find_chromium
 from painted import WordEncoder, colour_perception
 from places import SCENES
 
-from su3d_bench.cli import query
 from su3d_bench.cli.main import main
+from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 
 pytestmark = pytest.mark.skipif(find_chromium() is None, reason="needs Chromium")
@@ -37,7 +37,7 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
     methods = [f"{PAINTED}:Collector", f"{PAINTED}:Collector@noise_m=0.3"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene_run, "build_perception", colour_perception)
-        patch.setattr(query, "encoder_of", lambda folder, device="cpu": WordEncoder())
+        patch.setattr(finished_run, "encoder_of", lambda folder, device="cpu": WordEncoder())
         first = ["--scenes", *scenes, "--methods", *methods, "--anytime", "0.5", "--out", str(folder / "one")]
         assert main(["run", *first, *words]) == 0
         assert main(["run", "--scenes", scenes[0], "--methods", methods[0], "--out", str(folder / "two"), *words]) == 0

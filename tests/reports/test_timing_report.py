@@ -16,10 +16,11 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.timing import peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Float64Array
-from su3d_bench.metrics.costs import MapCost, UpdateTimes, summarise
+from su3d_bench.metrics.costs import UpdateTimes, summarise
 from su3d_bench.numerics.statistics import growth_exponent
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run, read_update_times
+from su3d_bench.store.records import MapCost
 
 PAINTED = f"{SCENES}/painted.py"
 WORDS = ["run", "--scenes", f"{PAINTED}:Painted/a", f"{PAINTED}:Painted/b", "--methods", f"{PAINTED}:Collector"]

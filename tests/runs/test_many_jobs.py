@@ -18,6 +18,7 @@ from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import precision_recall, resampling
 from su3d_bench.metrics.scoring import pack_scores, unpack_scores
 from su3d_bench.numerics.statistics import growth_exponent, resample_weights
+from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import resume as finished_scenes
 from su3d_bench.runs import runner
 from su3d_bench.runs import scene as scene_run
@@ -192,15 +193,16 @@ def _packed(rng: np.random.Generator) -> bytes:
 def test_the_page_of_many_jobs_holds_the_records_and_says_what_it_lacks(
     finished: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def no_encoder(_: Any) -> Any:
+    def no_encoder(run: Any, device: str) -> Any:
         raise AssertionError("nothing is scored again")
 
-    whole = page_sources.page_numbers([finished], no_encoder, with_errors=False)
+    monkeypatch.setattr(finished_run, "encoder_of", no_encoder)
+    whole = page_sources.page_numbers([finished], with_errors=False)
     assert whole["left_out"] is None
     assert whole["timing"]
     monkeypatch.setattr(page_sources, "MOST_JOBS", 1)
     monkeypatch.setattr(page_sources, "MOST_MAPS", 1)
-    page = page_sources.page_numbers([finished], no_encoder)
+    page = page_sources.page_numbers([finished])
     assert page["results"] == whole["results"]
     assert page["runs"] == whole["runs"]
     assert [page[part] for part in ("confusions", "errors", "timing", "comparisons")] == [[], [], [], []]

@@ -14,10 +14,10 @@ from chat_server import KEY, Answered, ChatServer, chat_server, error
 from made_sheets import METHODS, RUN
 from painted import colour_perception
 
-from su3d_bench.cli import query
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import Instances
 from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.sheets.items import read_key, read_sheet
 from su3d_bench.sheets.run_source import RunSource
@@ -48,7 +48,7 @@ def folder(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     monkeypatch.setenv("SU3D_DATA", str(made / "data"))
     monkeypatch.setenv("OPENAI_API_KEY", KEY)
     monkeypatch.setattr(RunSource, "rules", lambda self, scene, kind: load_protocol(f"rooms-{kind}"))
-    monkeypatch.setattr(query, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
+    monkeypatch.setattr(finished_run, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
     return tmp_path
 
 

@@ -15,7 +15,6 @@ from made_sheets import HOSTILE, METHODS, RUN, drafts_of, made
 from painted import WordEncoder, colour_perception
 from PIL import Image
 
-from su3d_bench.cli import query
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.core.types import Frame
@@ -32,6 +31,7 @@ from su3d_bench.reports.pictures.items import (
     seen_in,
     zoomed,
 )
+from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.executors.local import run_processes
 from su3d_bench.runs.finished import read_run
@@ -312,7 +312,7 @@ def test_sheets_are_made_from_the_command_line(
 ) -> None:
     monkeypatch.chdir(folder)
     monkeypatch.setenv("SU3D_DATA", str(folder / "data"))
-    monkeypatch.setattr(query, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
+    monkeypatch.setattr(finished_run, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
     words = ["sheets", "make", "run", "--kind", "retrieval", "--out", "out"]
     assert main([*words, "--questions", "queries.csv", "--annotators", "2", "--json"]) == 0
     (told,) = json.loads(capsys.readouterr().out)["sets"]
@@ -343,7 +343,7 @@ def test_a_figure_has_its_words_as_text(
 ) -> None:
     monkeypatch.chdir(folder)
     monkeypatch.setenv("SU3D_DATA", str(folder / "data"))
-    monkeypatch.setattr(query, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
+    monkeypatch.setattr(finished_run, "encoder_of", lambda run, device="cpu": colour_perception().encoder)
     words = ["sheets", "pictures", "run", "--methods", "collector", "--photo", "--colours", "cividis"]
     wanted = [*words, "--queries", "<b>sofa</b> $x_1$", "--out", f"heat.{suffix}"]
     assert main(wanted) == 0

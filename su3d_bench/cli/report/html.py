@@ -45,7 +45,6 @@ def call(arguments: argparse.Namespace) -> int:
     limit_threads()
     from su3d_bench.analysis.page_maps import MOST_POINTS, QUERIES, page_scenes, points_of_each
     from su3d_bench.analysis.page_numbers import page_numbers, scored_maps
-    from su3d_bench.cli.query import encoder_of
     from su3d_bench.core.errors import printable
     from su3d_bench.reports.page.page import page_html
     from su3d_bench.store.atomic import make_folder, write_text
@@ -57,10 +56,10 @@ def call(arguments: argparse.Namespace) -> int:
     def progress(line: str) -> None:
         remark(line, quiet=arguments.quiet)
 
-    numbers = page_numbers(arguments.runs, encoder_of, with_errors=not arguments.no_errors, progress=progress)
+    numbers = page_numbers(arguments.runs, with_errors=not arguments.no_errors, progress=progress)
     maps = [] if arguments.no_maps else scored_maps(arguments.runs)
     most_points = points_of_each(len(maps), round(arguments.most_megabytes * MEGABYTE)) if maps else MOST_POINTS
-    scenes = list(page_scenes(maps, encoder_of, queries, most_points, progress))
+    scenes = list(page_scenes(maps, queries, most_points, progress))
     title = arguments.title or ", ".join(dict.fromkeys(run.resolve().name for run in arguments.runs))
     shown = [one for scene in scenes for one in scene.maps]
     page = page_html(

@@ -54,7 +54,7 @@ def call(arguments: argparse.Namespace) -> int:
         raise ConfigError("no update was timed in these runs: their methods look at no frame")
     summaries = [summarise(each, arguments.warm_up) for each in times]
     anytime = [point for each in times for point in _anytime(next(r for r in runs if r.name == each[0].run), each)]
-    hardware = {run.name: run.hardware for run in runs}
+    hardware = {run.name: run.record.hardware for run in runs}
     tables = timing_tables(summaries, anytime, hardware, arguments.camera_rate)
     if arguments.json:
         answer_json({"hardware": hardware, "methods": [asdict(one) for one in summaries]})
@@ -86,15 +86,16 @@ def _anytime(run: FinishedRun, times: list[UpdateTimes]) -> list[Any]:
 
     method = times[0].method
     points = []
-    for (name, protocol), result in run.results.items():
-        if name != method or not result.anytime or result.metrics is None:
+    for (name, protocol), record in run.results.items():
+        if name != method or not record.anytime or record.result is None:
             continue
-        shares = [*sorted(result.anytime.items()), (1.0, result.metrics)]
-        if any(len(one.maps) != len(shares) for one in times):
+        midway = sorted(record.anytime, key=lambda one: one.share)
+        maps = [*((one.share, one.metrics) for one in midway), (1.0, record.result.metrics)]
+        if any(len(one.maps) != len(maps) for one in times):
             continue  # the record of a scene's maps is damaged
-        for index, (share, metrics) in enumerate(shares):
+        for index, (share, metrics) in enumerate(maps):
             seconds = sum(_seconds_until(one, index) for one in times)
-            headline = {metric: metrics.get(metric) for metric in result.headline}
+            headline = {metric: metrics.get(metric) for metric in record.headline}
             points.append(AnytimePoint(run.name, method, protocol, share, seconds, headline))
     return points
 

@@ -155,7 +155,6 @@ def _drafts(
     """What is judged, and who answered the questions of reasoning sheets."""
     import numpy as np
 
-    from su3d_bench.cli.query import encoder_of
     from su3d_bench.sheets.drafts import annotation_drafts, questions_of, reasoning_drafts, retrieval_drafts
     from su3d_bench.sheets.making import check_split
 
@@ -164,7 +163,7 @@ def _drafts(
     given = _given(source, arguments)
     found: dict[SheetKind, list[Draft]] = {kind: [] for kind in sources}
     needs_encoder = "retrieval" in sources or ("reasoning" in sources and arguments.solver != "llm")
-    encoder = encoder_of(source.run.folder, arguments.device) if needs_encoder else None
+    encoder = source.run.encoder(arguments.device) if needs_encoder else None
     ask, answered_by = _ask_map(source, encoder, arguments) if "reasoning" in sources else (None, "")
     for scene in source.scenes:  # all kinds of one scene together, for they share its truth
         for kind, mine in sources.items():
@@ -266,7 +265,7 @@ def _write(
     for kind, source in sources.items():
         rules = {rules.name for scene in source.scenes if (rules := source.rules(scene, kind)) is not None}
         by = answered_by if kind == "reasoning" else ""
-        origin = Origin(source.run.name, source.run.code, source.methods, ", ".join(sorted(rules)), by)
+        origin = Origin(source.run.name, source.run.record.code, source.methods, ", ".join(sorted(rules)), by)
         made = make_sheets(
             kind,
             drafts[kind],

@@ -41,7 +41,6 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.runs.executors.local import limit_threads
 
     limit_threads()
-    from su3d_bench.cli.query import encoder_of
     from su3d_bench.reports.pictures.figures import draw_grid
     from su3d_bench.reports.pictures.heat_scales import scale_stops
     from su3d_bench.runs.finished import read_run
@@ -64,9 +63,9 @@ def call(arguments: argparse.Namespace) -> int:
     if arguments.what == "labels":
         columns, rows = figures.labels()
     elif arguments.what == "reasoning":
-        rows = figures.reasoning(texts, encoder_of(run.folder, arguments.device))
+        rows = figures.reasoning(texts, run.encoder(arguments.device))
     else:
-        rows = figures.similarity(texts, encoder_of(run.folder, arguments.device), arguments.colours)
+        rows = figures.similarity(texts, run.encoder(arguments.device), arguments.colours)
         scale = scale_stops(arguments.colours)
     draw_grid(arguments.out, columns, rows, scale)
     if arguments.json:

@@ -1,0 +1,263 @@
+"""What the small files of a run hold: ``run.json``, ``metrics.json``, the seals of ``done.json``, ``updates.csv``.
+
+Whoever writes one of them writes these records, and whoever reads one gets them. Their fields stand in the order in
+which a file has them; one with a default may be missing, for earlier versions did not write it.
+"""
+
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+
+import numpy as np
+from pydantic import Field, TypeAdapter, ValidationError
+
+from su3d_bench.core.errors import DataError, StoreError, printable
+from su3d_bench.core.types import Float64Array
+from su3d_bench.store.atomic import read_json
+
+SCHEMA = 1
+MOST_UPDATES = 10_000_000
+Kind = TypeVar("Kind")
+Number = Annotated[float, Field(allow_inf_nan=False)]  # NaN would differ from nothing, and so pass every comparison
+Values = Mapping[str, Number | None]
+
+
+@dataclass(frozen=True)
+class ProtocolRecord:
+    """The rules that scored a run."""
+
+    name: str
+    version: int
+    digest: str
+
+
+@dataclass(frozen=True)
+class FailureRecord:
+    """A scene under a method that failed, with its line."""
+
+    scene: str
+    method: str
+    error: str
+
+
+@dataclass(frozen=True)
+class UnscoredRecord:
+    """Why a scene under a method has no score of a protocol."""
+
+    scene: str
+    method: str
+    protocol: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class GitRecord:
+    """The checkout that the code ran from."""
+
+    commit: str
+    is_dirty: bool
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunRecord:
+    """``run.json``: where the numbers come from. ``models`` holds the SHA-256 of weight files by model and file name.
+
+    ``status`` is ``running``, ``interrupted``, ``incomplete`` or ``complete``.
+    """
+
+    schema: int = SCHEMA
+    status: str
+    is_partial: bool
+    code: str
+    git: GitRecord | None = None
+    packages: Mapping[str, str] = field(default_factory=dict)
+    hardware: str
+    processor: str = ""
+    n_workers: int = 1
+    seed: int | None = None
+    profile: str | None
+    models: Mapping[str, Mapping[str, str]] = field(default_factory=dict)
+    encoder: str | None = None
+    encoder_digest: str | None
+    data_digests: Mapping[str, str]
+    protocols: tuple[ProtocolRecord, ...]
+    methods: Annotated[tuple[str, ...], Field(min_length=1)]
+    scenes: tuple[str, ...]
+    failed: tuple[FailureRecord, ...] = ()
+    unscored: tuple[UnscoredRecord, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class RequestRecord:
+    """What ``run.json`` says of a run that may not be finished."""
+
+    encoder: str | None = None
+    encoder_digest: str | None = None
+    data_digests: Mapping[str, str] = field(default_factory=dict)
+    methods: tuple[str, ...] = ()
+    scenes: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True, kw_only=True)
+class NumbersRecord:
+    """``result`` of a result: the numbers over the scored scenes as fractions, null where undefined."""
+
+    protocol: str = ""
+    version: int = 0
+    headline: tuple[str, ...] = ()
+    n_scenes: int = 0
+    scenes: tuple[str, ...]
+    metrics: Values
+    intervals: Mapping[str, tuple[Number, Number] | None]
+    pooled: Values = field(default_factory=dict)
+    scene_mean: Values = field(default_factory=dict)
+    per_scene: Mapping[str, Values]
+    per_class: Mapping[str, Values]
+    groups: Mapping[str, Values] = field(default_factory=dict)
+    coverage: Values = field(default_factory=dict)
+    n_predictions: Mapping[str, int] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+
+
+@dataclass(frozen=True)
+class MidwayRecord:
+    """The metrics of the maps after ``share`` of the updates."""
+
+    share: Number
+    metrics: Values
+
+
+@dataclass(frozen=True, kw_only=True)
+class ResultRecord:
+    """One method under one protocol; ``encoder`` is null where the method named its instances itself.
+
+    ``result`` is null where no scene was scored; ``anytime`` is missing where no map midway was asked for.
+    """
+
+    method: str
+    protocol: str
+    version: int
+    kind: str
+    headline: tuple[str, ...]
+    profile: str | None
+    caveat: str | None
+    encoder: str | None
+    encoder_digest: str | None
+    n_planned: int
+    failed: tuple[str, ...]
+    unscored: tuple[str, ...]
+    ceiling: Values | None
+    result: NumbersRecord | None
+    anytime: tuple[MidwayRecord, ...] | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class MetricsRecord:
+    """``metrics.json``: what the run measured; ``limit`` is 0 where all frames were used."""
+
+    schema: int = SCHEMA
+    is_partial: bool = False
+    limit: int
+    seed: int = 0
+    scenes: tuple[str, ...] = ()
+    results: tuple[ResultRecord, ...]
+
+
+@dataclass(frozen=True)
+class MapCost:
+    """What one map took: the updates before it and the milliseconds of ``finish``."""
+
+    n_updates: int
+    finish_ms: Number
+
+
+@dataclass(frozen=True)
+class CostsRecord:
+    """``costs`` beside the seal of ``predict``: maps midway and the last one, null for what was not measured.
+
+    ``calibration_ms``: the time of a fixed piece of work, measured between the updates. What a method measures itself
+    stands beside the two numbers of a map.
+    """
+
+    maps: tuple[MapCost, ...]
+    calibration_ms: Number | None
+    peak_rss_bytes: int | None
+    device_bytes: int | None
+
+
+@dataclass(frozen=True)
+class SealRecord:
+    """A step of ``done.json``: the key of its inputs, the SHA-256 of the files that it vouches for, and remarks."""
+
+    key: Mapping[str, str]
+    files: Annotated[Mapping[str, str], Field(min_length=1)]
+    remarks: Mapping[str, Any]
+
+
+_ADAPTERS: dict[Any, TypeAdapter[Any]] = {
+    kind: TypeAdapter(kind) for kind in (RunRecord, RequestRecord, MetricsRecord, CostsRecord, SealRecord)
+}
+
+
+def plain(record: Any) -> dict[str, Any]:
+    """``record`` as it is written."""
+    written = asdict(record)
+    for result in written["results"] if isinstance(record, MetricsRecord) else ():
+        if result["anytime"] is None:
+            del result["anytime"]
+    return written
+
+
+def checked(kind: type[Kind], value: Any) -> Kind:
+    """The record that ``value`` is; a ``ValidationError`` or ``RecursionError`` where it is none."""
+    record: Kind = _ADAPTERS[kind].validate_python(value)
+    return record
+
+
+def read_record(kind: type[Kind], file: Path, shown: str) -> Kind:
+    """The record in ``file``; ``shown`` begins the ``StoreError`` where it holds none."""
+    try:
+        return checked(kind, read_json(file))
+    except RecursionError as error:
+        raise StoreError(f"{shown}: {file.name}: is nested too deep for a record of a run; run it again") from error
+    except ValidationError as error:
+        first = error.errors()[0]
+        key = printable(".".join(map(str, first["loc"])), 120)
+        if first["type"] == "finite_number":
+            what = f"{file.name} is not as a run writes it: {key} is no finite number"
+        else:
+            what = f"{file.name}: {key or 'it'} is not as a run writes it"
+        raise StoreError(f"{shown}: {what}; run it again") from error
+
+
+def updates_text(rows: Sequence[Mapping[str, float | int]]) -> str:
+    """``updates.csv``: the updates of a scene, one row each; a stage that an update lacks is 0."""
+    columns = list(dict.fromkeys(name for row in rows for name in row if name != "total_ms"))
+    text = io.StringIO()
+    writer = csv.DictWriter(text, [*columns, "total_ms"] if rows else ["update"], restval=0, lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(rows)
+    return text.getvalue()
+
+
+def read_updates(file: Path, where: str) -> dict[str, Float64Array]:
+    """The columns (N,) of an ``updates.csv``, none where no update was timed; ``where`` begins a ``DataError``."""
+    try:
+        with file.open(newline="", encoding="utf-8") as stream:
+            reader = csv.reader(stream)
+            header = next(reader, [])
+            rows = [row for row, _ in zip(reader, range(MOST_UPDATES), strict=False)]
+            if "total_ms" not in header:
+                return {}
+            table = np.array(rows, np.float64).reshape(len(rows), len(header))
+    except (ValueError, csv.Error, UnicodeDecodeError) as error:
+        raise DataError(f"{where}: is not a table of numbers; run the same command again to mend it") from error
+    if not np.isfinite(table).all():
+        raise DataError(f"{where}: holds a number that is not finite; run the same command again to mend it")
+    return {name: table[:, column] for column, name in enumerate(header)}

@@ -1,0 +1,110 @@
+"""The records of a run: what is written is read again, and the page that describes them follows the code."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import MISSING, fields, replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+from places import ROOT
+
+from su3d_bench.core.errors import StoreError
+from su3d_bench.store import records
+from su3d_bench.store.atomic import write_json
+from su3d_bench.store.records import (
+    CostsRecord,
+    MetricsRecord,
+    MidwayRecord,
+    NumbersRecord,
+    ResultRecord,
+    plain,
+    read_record,
+)
+
+PAGE = ROOT / "docs/run-folder.md"
+DESCRIBED = (
+    records.RunRecord,
+    records.ProtocolRecord,
+    records.FailureRecord,
+    records.UnscoredRecord,
+    MetricsRecord,
+    ResultRecord,
+    NumbersRecord,
+    MidwayRecord,
+    records.SealRecord,
+    CostsRecord,
+    records.MapCost,
+)
+VALUES = NumbersRecord(
+    scenes=("d/a",),
+    metrics={"mAcc": 0.5, "n_classes": 3},
+    intervals={},
+    per_scene={"d/a": {"mAcc": None}},
+    per_class={},
+)
+RESULT = ResultRecord(
+    method="m",
+    protocol="p",
+    version=1,
+    kind="semantic",
+    headline=("mAcc",),
+    profile=None,
+    caveat=None,
+    encoder=None,
+    encoder_digest=None,
+    n_planned=1,
+    failed=(),
+    unscored=(),
+    ceiling=None,
+    result=VALUES,
+)
+
+
+def described(kind: Any) -> str:
+    """A record as the page shows it: what it is, then a line a field."""
+    text = " ".join(kind.__doc__.split()).replace("``", "`")
+    lines = [f"### {kind.__name__}", "", text, "", "| field | type |", "|---|---|"]
+    for each in fields(kind):
+        is_optional = each.default is not MISSING or each.default_factory is not MISSING
+        shown = str(each.type).removeprefix("Annotated[").replace(", Field(min_length=1)]", "").replace("|", "\\|")
+        lines.append(f"| `{each.name}` | {shown}{', may be missing' if is_optional else ''} |")
+    return "\n".join(lines)
+
+
+@pytest.mark.parametrize("kind", DESCRIBED, ids=lambda kind: str(kind.__name__))
+def test_the_page_describes_the_records_as_they_are(kind: Any) -> None:
+    assert described(kind) in PAGE.read_text()
+
+
+@pytest.mark.parametrize("anytime", [None, (), (MidwayRecord(0.5, {"mAcc": 0.25}),)])
+def test_what_is_written_is_read_again(tmp_path: Path, anytime: tuple[MidwayRecord, ...] | None) -> None:
+    metrics = MetricsRecord(limit=0, results=(replace(RESULT, anytime=anytime),))
+    write_json(tmp_path / "metrics.json", plain(metrics))
+    assert read_record(MetricsRecord, tmp_path / "metrics.json", "run") == metrics
+    (written,) = json.loads((tmp_path / "metrics.json").read_text())["results"]
+    assert ("anytime" in written) == (anytime is not None)
+    assert '"n_classes": 3\n' in (tmp_path / "metrics.json").read_text()
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ({"results": []}, r"^run: metrics\.json: limit is not as a run writes it; run it again$"),
+        ({"limit": 0, "results": 5}, r"^run: metrics\.json: results is not as a run writes it; run it again$"),
+        ([], r"^run: metrics\.json: it is not as a run writes it; run it again$"),
+    ],
+)
+def test_a_damaged_record_is_one_line_that_names_the_field(tmp_path: Path, value: object, message: str) -> None:
+    write_json(tmp_path / "metrics.json", value)
+    with pytest.raises(StoreError, match=message):
+        read_record(MetricsRecord, tmp_path / "metrics.json", "run")
+
+
+def test_a_number_that_is_none_is_named(tmp_path: Path) -> None:
+    written = plain(MetricsRecord(limit=0, results=(RESULT,)))
+    written["results"][0]["result"]["metrics"]["mAcc"] = float("nan")
+    (tmp_path / "metrics.json").write_text(json.dumps(written))
+    with pytest.raises(StoreError, match=r"^run: metrics\.json is not as a run writes it: results\.0\.result\.metrics"):
+        read_record(MetricsRecord, tmp_path / "metrics.json", "run")
