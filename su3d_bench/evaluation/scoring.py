@@ -24,7 +24,13 @@ from su3d_bench.evaluation.request import Request
 from su3d_bench.evaluation.result import SceneOutcome, Tally
 from su3d_bench.evaluation.texts import encoder_for, read_text_features
 from su3d_bench.evaluation.truth import SceneTruths, VertexTruth
-from su3d_bench.metrics.fitness import ContentFacts, n_feature_dimensions, why_not_content, why_not_numbers
+from su3d_bench.metrics.fitness import (
+    ContentFacts,
+    n_feature_dimensions,
+    why_not_content,
+    why_not_length,
+    why_not_numbers,
+)
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.score import (
     OBJECT,
@@ -134,7 +140,7 @@ class Scoring:
         return self._score_content(rules, scene, prediction.content, encoder)
 
     def _score_content(self, rules: ProtocolRules, scene: str, content: Content, encoder: Encoder | None) -> str | None:
-        kept = self.tally.outcomes[rules.name]
+        kept, facts = self.tally.outcomes[rules.name], facts_of(content)
         try:
             truth = self._truths.of_scene(rules, scene)
         except GroundTruthMissing as error:
@@ -145,12 +151,12 @@ class Scoring:
         changes = self.tally.counts_file_confidences and rules.kind == "instance" and rules.confidence == "ones"
         used = rules.model_copy(update={"confidence": "prediction"}) if changes else rules
         if isinstance(truth, VertexTruth):
-            if (reason := why_not_as_long(content, len(truth.values))) is not None:
+            if (reason := why_not_length(facts, len(truth.values))) is not None:
                 raise PredictionError(f"{scene}: {reason}")
             outcome = score_on_vertices(used, truth, scene, content, encoder)
             kept.warnings += [line for line in truth.doubts if line not in kept.warnings]
         elif isinstance(truth, GroundTruth):
-            if (reason := why_not_as_long(content, len(truth.points))) is not None:
+            if (reason := why_not_length(facts, len(truth.points))) is not None:
                 return reason
             outcome = score_on_truth(used, truth, scene, content, encoder)
         else:
@@ -175,7 +181,8 @@ def skips_missing_scenes(rules: ProtocolRules) -> bool:
 def facts_of(content: Content) -> ContentFacts:
     """What the question asks whether a protocol may score ``content``."""
     if isinstance(content, VertexLabels):
-        return ContentFacts("vertex-labels", len(content.class_ids), class_ids=content.class_ids)
+        n = len(content.class_ids)
+        return ContentFacts("vertex-labels", n, class_ids=content.class_ids, n_points=n)
     if not isinstance(content, VertexMasks):
         return ContentFacts.of(content)
     return ContentFacts(
@@ -184,22 +191,7 @@ def facts_of(content: Content) -> ContentFacts:
         n_dimensions=None if content.features is None else content.features.shape[1],
         has_labels=content.class_numbers is not None,
         class_ids=content.class_numbers if content.numbering == "id" else None,
-    )
-
-
-def why_not_as_long(content: Content, n_points: int) -> str | None:
-    """Why masks or labels are not over the points of the truth; None where they are, or bring their own."""
-    n = None
-    if isinstance(content, VertexMasks):
-        n = content.n_points
-    elif isinstance(content, VertexLabels):
-        n = len(content.class_ids)
-    if n in {None, n_points}:
-        return None
-    what = "masks are" if isinstance(content, VertexMasks) else "labels are"
-    return (
-        f"the {what} of {n} points, the ground truth has {n_points}; both must be over the vertices of one mesh, in "
-        "its order"
+        n_points=content.n_points,
     )
 
 

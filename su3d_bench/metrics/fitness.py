@@ -53,6 +53,7 @@ class ContentFacts:
     ``form``: ``vertex-masks`` and ``vertex-labels`` (one class a point) lie over the points of the truth, the others
     bring their own. ``n``: how many masks or rows of features. ``n_dimensions`` of the features, None without any.
     ``has_names``: some instance has a name or label. ``class_ids``: classes given as ids of the label space.
+    ``n_points``: over how many points of the truth it lies, None where it has its own or says no number.
     """
 
     form: Form
@@ -62,6 +63,7 @@ class ContentFacts:
     has_every_label: bool = False
     has_names: bool = False
     class_ids: NDArray[np.integer[Any]] | None = None
+    n_points: int | None = None
 
     @classmethod
     def of(cls, prediction: Prediction) -> ContentFacts:
@@ -163,6 +165,17 @@ def why_not_numbers(rules: ProtocolRules, content: ContentFacts) -> str | None:
     if list_of_ids == rules.ground_truth:
         return None
     return f"the predicted classes go up to {largest}, as {ID_LISTS[list_of_ids]}"
+
+
+def why_not_length(content: ContentFacts, n_points: int) -> str | None:
+    """Why a prediction cannot be one over the ``n_points`` points of a truth."""
+    if content.n_points in {None, n_points}:
+        return None
+    what = "labels" if content.form == "vertex-labels" else "masks"
+    return (
+        f"the {what} are of {content.n_points} points, the ground truth has {n_points}; both must be over the vertices "
+        "of one mesh, in its order"
+    )
 
 
 def n_feature_dimensions(rules: ProtocolRules, content: ContentFacts) -> int | None:
