@@ -5,13 +5,27 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check install -c constraints.txt
 DEMO_SCENES := rooms/living0 rooms/bedroom0 rooms/kitchen0 rooms/office0
 
-.PHONY: demo test bench bench-methods reference architecture lint clean
+.PHONY: demo test test-quick proofs bench bench-methods reference architecture lint clean
 
 demo: $(VENV)/core
 	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods opensu3d oracle --protocols rooms-semantic rooms-instance --out runs/demo
 
 test: $(VENV)/test
 	$(BIN)/python -m pytest -q -n auto
+
+# What guards the numbers (what the original evaluators answer, to the last bit), and each verb once.
+QUICK := tests/metrics tests/evaluation/test_evaluate_cases.py tests/cli/test_each_verb.py tests/test_of_tests.py
+test-quick: $(VENV)/test
+	$(BIN)/python -m pytest -q -n auto $(QUICK)
+
+# What docs/reliability.md claims, at length: half an hour on two cores, the disks as root alone.
+proofs: $(VENV)/test
+	@mkdir -p build/measured
+	$(BIN)/python -m pytest -q -n auto -m proof
+	SU3D_FUZZ_EXAMPLES=60 $(BIN)/python -m pytest -q -n auto tests/fuzz
+	$(BIN)/python benchmarks/fuzz.py --inputs 100000 --seed 1 --json build/measured/fuzz.json
+	$(BIN)/python benchmarks/kill_at_random.py --kills 200 --json build/measured/kills.json
+	if [ "$$(id -u)" = 0 ]; then $(BIN)/python benchmarks/full_disk.py --disks 20; fi
 
 bench: $(VENV)/test
 	@mkdir -p build

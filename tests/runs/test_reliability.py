@@ -60,6 +60,7 @@ def results(out: str = "out") -> dict[str, bytes]:
     return {path.relative_to(out).as_posix(): path.read_bytes() for path in paths}
 
 
+@pytest.mark.proof
 def test_runs_killed_at_random_and_after_power_cuts_end_in_the_bytes_of_an_undisturbed_one() -> None:
     words = [sys.executable, str(KILLS), "--kills", "5", "--seed", "3", "--executors", "inline", "--json", "found.json"]
     done = subprocess.run(words, capture_output=True, text=True, timeout=300)

@@ -1,0 +1,27 @@
+#!/usr/bin/env bash
+# A browser and an office for the tests that drive them, where this machine lets us; those tests skip where it does not.
+set -u
+
+has() { for name in "$@"; do command -v "$name" >/dev/null && return 0; done; return 1; }
+as_root() { if [ "$(id -u)" = 0 ]; then "$@"; else sudo -n "$@"; fi; }
+install() {
+    local log
+    log=$(mktemp)
+    if as_root env DEBIAN_FRONTEND=noninteractive apt-get install -qq -y --no-install-recommends "$@" >"$log" 2>&1 </dev/null; then
+        echo "installed $*"
+    else
+        echo "$* cannot be installed here ($(tail -n 1 "$log")); the tests that need it skip"
+    fi
+}
+
+browsers=(chromium chromium-browser google-chrome google-chrome-stable chrome)  # as tests/support/programs/chromium.py
+offices=(soffice libreoffice)
+missing=()
+has "${browsers[@]}" || missing+=("chromium")
+has "${offices[@]}" || missing+=("libreoffice-calc python3-uno")
+[ ${#missing[@]} = 0 ] || as_root apt-get update -qq >/dev/null 2>&1 </dev/null
+for packages in "${missing[@]}"; do
+    # shellcheck disable=SC2086 - one word a package
+    install $packages
+done
+exit 0

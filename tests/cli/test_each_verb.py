@@ -1,0 +1,84 @@
+"""Every verb of the command line, carried out once on one small real run: the quick answer to "does it still work?"."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from fuzz_words import verbs
+
+from su3d_bench.cli.main import main
+
+SCENE = "rooms/living0"
+FEW = ["--set", "rooms.n_frames=8"]
+PROTOCOLS = ["--protocols", "rooms-semantic", "rooms-instance"]
+RUN = ["--scenes", SCENE, "--methods", "opensu3d", "oracle", *PROTOCOLS, *FEW, "--no-pictures", "--jobs", "1"]
+
+# What follows each verb, the exit code, and a file that it leaves or words that it says.
+CASES: dict[str, tuple[list[str], int, str]] = {
+    "run": ([*RUN, "--out", "out"], 0, "| opensu3d"),
+    "ablate": (
+        ["--vary", "m=1,2", "--scenes", SCENE, *FEW, "--limit", "2", "--no-pictures", "--jobs", "1", "--out", "sweep"],
+        0,
+        "sweep/metrics.json",
+    ),
+    "evaluate": (
+        ["out/scenes/rooms.living0/opensu3d", "--dataset", "rooms", "--protocol", "rooms-instance"],
+        0,
+        "rooms-instance",
+    ),
+    "check": (["--learn", "out", "--out", "reference.json"], 0, "reference.json"),
+    "compare": (["out:opensu3d", "out:oracle"], 0, "rooms-instance"),
+    "attribute": (["out", "--method", "opensu3d"], 0, "rooms-instance"),
+    "report tables": (["out", "--format", "latex", "--out", "tables.tex"], 0, "tables.tex"),
+    "report timing": (["out"], 0, "opensu3d"),
+    "report html": (["out", "--no-maps", "--out", "page.html"], 0, "page.html"),
+    "report leaderboard": (["."], 0, "opensu3d"),
+    "report verify": (["tables.tex"], 0, ""),
+    "sheets make": (["out", "--kind", "retrieval", "--per-kind", "1", "--jobs", "1", "--out", "sheets"], 0, "sheets"),
+    "sheets score": (["--key", "sheets-key"], 0, ""),
+    "sheets pictures": (["out", "--what", "labels", "--out", "labels.png"], 0, "labels.png"),
+    "query": ([SCENE, "plant on shelf", "--run", "out"], 0, "opensu3d"),
+    "questions": (["show", "paper"], 0, "663 questions on 13 scenes"),
+    "ask": ([SCENE, "Which lamp is closer to the sofa?", "--run", "out"], 0, "lamp"),
+    "refine": (["out"], 0, "opensu3d"),
+    "datasets list": ([], 0, "replica"),
+    "datasets check": ([SCENE, *FEW, "--quick"], 0, "living0"),
+    "datasets show": ([SCENE, *FEW, "--out", "room.png"], 0, "room.png"),
+    "datasets make": (
+        ["rooms", "--layout", "tum", "--scenes", "living0", "--set", "n_frames=2", "--out", "made"],
+        0,
+        "",
+    ),
+    "methods": (["opensu3d"], 0, "opensu3d"),
+    "models list": ([], 0, "clip-vit-h-14"),
+    "models check": (["clip-vit-h-14"], 1, "clip-vit-h-14"),
+    "models export": (["clip-vit-h-14", "--out", "exported"], 2, "clip-vit-h-14"),
+    "models warm": (["--profile", "embedded"], 0, ""),
+    "protocols": (["show", "rooms-semantic"], 0, "rooms-semantic"),
+    "export": (["out", "--to", "openlex3d", "--method", "opensu3d", "--out", "exported"], 0, "exported"),
+}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A folder where each verb works on what those before it left."""
+    folder = tmp_path_factory.mktemp("verbs")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        for name in ("SU3D_DATA", "SU3D_CACHE", "SU3D_MODELS"):
+            patch.setenv(name, str(folder / name.lower()))
+        yield
+
+
+def test_every_verb_of_the_parser_has_its_case() -> None:
+    assert sorted(CASES) == sorted(" ".join(words) for words, _ in verbs())
+
+
+@pytest.mark.parametrize("verb", CASES)
+def test_the_verb_does_its_work(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
+    words, code, left = CASES[verb]
+    assert main([*verb.split(), *words]) == code, capsys.readouterr().err
+    answer = capsys.readouterr()
+    assert left in answer.out + answer.err or Path(left).exists(), answer.out + answer.err

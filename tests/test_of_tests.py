@@ -1,0 +1,47 @@
+"""What holds for the tests themselves: names that stay unique, modules that exist, and nobody who sleeps."""
+
+from __future__ import annotations
+
+import re
+from collections import Counter
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+from places import ROOT, TESTS
+
+FILES = sorted(TESTS.rglob("*.py"))
+# Where time itself is the point: the one loop that waits, a data set that takes its time, a program of LibreOffice's
+# own Python, and a program whose duration is measured.
+MAY_SLEEP = {"waiting.py", "painted.py", "office_fill.py", "test_command_runners.py"}
+
+
+def test_no_two_files_have_one_name() -> None:
+    # Folders of tests are no packages: each file is a module by its name alone.
+    twice = [name for name, n in Counter(file.name for file in FILES).items() if n > 1]
+    assert twice == []
+
+
+def test_nobody_waits_by_sleeping() -> None:
+    assert {file.name for file in FILES if re.search(r"\bsleep\(", file.read_text())} - {
+        Path(__file__).name
+    } == MAY_SLEEP
+
+
+@pytest.mark.parametrize("folder", ["tests", "benchmarks"])
+def test_programs_in_texts_import_what_there_is(folder: str) -> None:
+    """Imports in the text of a program that a test starts, which no other tool looks at."""
+    names = {
+        name
+        for file in (ROOT / folder).rglob("*.py")
+        for name in re.findall(r"\b(?:from|import) (su3d_bench(?:\.\w+)+)", file.read_text())
+    }
+    assert names or folder == "benchmarks"
+    assert sorted(name for name in names if not _exists(name)) == []
+
+
+def _exists(name: str) -> bool:
+    try:
+        return find_spec(name) is not None
+    except ModuleNotFoundError:
+        return False
