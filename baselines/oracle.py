@@ -14,6 +14,7 @@ class Oracle:
     """Hands back the ground truth as a map: one mask an instance, labelled with its class, scored 1."""
 
     name = "oracle"
+    is_system = False
     about = MethodAbout(
         paper="",
         source="",

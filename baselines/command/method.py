@@ -103,6 +103,7 @@ class Command:
     """Runs a program of yours once a scene: frames in a folder, a prediction in any format that evaluate reads."""
 
     name = "command"
+    is_system = False
     Config = CommandConfig
     has_own_perception = True
     about = MethodAbout(

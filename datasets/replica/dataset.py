@@ -65,6 +65,7 @@ class Replica:
     """NICE-SLAM's render of Replica, with ground truth from the original release; read below the data root."""
 
     name = "replica"
+    reads_made_rooms = True
     label_space = "replica"
     variants: tuple[str, ...] = ("mesh-vertices", "face-corners", "conceptgraphs", "openmask3d", "ovo-51")
     Options = ReplicaOptions

@@ -62,6 +62,7 @@ class ScanNet:
     """ScanNet, recordings and annotated meshes as released or exported; read below the data root."""
 
     name = "scannet"
+    reads_made_rooms = True
     label_space = "scannet"
     variants: tuple[str, ...] = ("nyu40-vertices", "scannet200-vertices")
     Options = ScannetOptions

@@ -74,6 +74,7 @@ class Tum:
     """Sequences in the layout of the TUM RGB-D benchmark; unscored, because they have no ground truth of objects."""
 
     name = "tum"
+    reads_made_rooms = True
     label_space = "none"
     variants: tuple[str, ...] = ()
     Options = TumOptions

@@ -13,6 +13,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable
+from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.protocol_files import protocol_names
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import combine
@@ -133,7 +134,7 @@ def _entries(name: str, run: FinishedRun, protocols: Sequence[str]) -> Iterator[
             intervals=tuple(result.intervals.get(key) for key in result.headline),
             data=tuple((scene, run.record.data_digests[scene]) for scene in sorted(result.scenes)),
             profile=printable(run.record.profile or "", 40),
-            is_ceiling="a ceiling, not a result" in (record.caveat or "") or method == "oracle",
+            is_ceiling="a ceiling, not a result" in (record.caveat or "") or method == CEILING_METHOD,
         )
 
 

@@ -149,7 +149,7 @@ def sources_of(path: Path, format: str | None, method: str | None) -> list[Sourc
 def _only_method(found: Mapping[str, Sequence[Path]]) -> str | None:
     """The one method that a run was asked for; the ceiling that comes with it is not meant."""
     from su3d_bench.core.config import RunConfig, read_file, resolve
-    from su3d_bench.runs.job import CEILING_METHOD
+    from su3d_bench.core.registry import CEILING_METHOD
 
     run = _run_of(next(iter(found.values()))[0])
     is_single = run is not None and len(resolve(read_file(run / "run.toml"), (), RunConfig).methods) == 1

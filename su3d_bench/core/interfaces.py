@@ -146,6 +146,13 @@ class RendersFrames(Protocol):
     renders_frames: bool
 
 
+@runtime_checkable
+class ReadsMadeRooms(Protocol):
+    """True where rooms that the program makes are written in its layout, which are not its scenes."""
+
+    reads_made_rooms: bool
+
+
 class StageTimer(Protocol):
     def stage(self, name: str) -> Any:
         """A context manager that adds the time inside it to stage ``name`` of the current update."""
@@ -204,6 +211,13 @@ class HasShortNames(Protocol):
     """Other names of settings for sweeps: the setting, and what a value written there comes to."""
 
     short_names: Mapping[str, tuple[str, Callable[[Any], Any]]]
+
+
+@runtime_checkable
+class IsSystem(Protocol):
+    """False where ``all`` methods are not meant to hold it: the truth itself, a program that must be named."""
+
+    is_system: bool
 
 
 @runtime_checkable
@@ -299,11 +313,12 @@ class Closes(Protocol):
 
 INTERFACES = {"dataset": Dataset, "method": Method}
 ABILITIES = {
-    "dataset": (HasPlaces, HasStatus, HasGroups, HasProblems, HasSurface, HasQueries, RendersFrames),
+    "dataset": (HasPlaces, HasStatus, HasGroups, HasProblems, HasSurface, HasQueries, RendersFrames, ReadsMadeRooms),
     "method": (
         HasAbout,
         HasPresets,
         HasShortNames,
+        IsSystem,
         WarmsUp,
         TakesDevice,
         TakesTools,

@@ -74,7 +74,7 @@ class SceneInfo:
 
 @dataclass(frozen=True)
 class LabelSet:
-    """Class ids and their names in a label space such as ``replica``; id 0 is never a class."""
+    """Class ids and their names in a label space, most often named as its dataset; id 0 is never a class."""
 
     space: str
     ids: tuple[int, ...]
@@ -90,7 +90,7 @@ class LabelSet:
 
 @dataclass(frozen=True)
 class GroundTruth:
-    """Labelled points of a scene in one ``variant`` (mesh-vertices, face-corners, conceptgraphs, ...).
+    """Labelled points of a scene in one ``variant`` (mesh-vertices, face-corners, ...).
 
     ``points`` (N, 3) float32 m; ``semantic`` (N,) int32 class ids of ``labels``, 0 where unannotated;
     ``instance`` (N,) int32 ids unique in the scene, 0 where there is none; ``source`` says how it was made.

@@ -21,7 +21,7 @@ def back_project(
 ) -> Float64Array:
     """World points (N, 3) m of the chosen ``pixels`` (H, W) in row-major order: T (D(u,v) K^-1 (u,v,1)).
 
-    Integer pixel indices, no half-pixel shift (as every Replica loader has it).
+    Integer pixel indices, no half-pixel shift.
     """
     of_row, of_column = ray_parts(intrinsics, camera_to_world, *depth_m.shape)
     z = depth_m[pixels].astype(np.float64)

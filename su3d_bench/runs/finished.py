@@ -13,9 +13,10 @@ from pydantic import ValidationError
 from su3d_bench.core import registry
 from su3d_bench.core.config import KeyPath, Settings, read_file, resolve
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, StoreError, printable, suggest
+from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.scoring import SceneScore, unpack_scores
-from su3d_bench.runs.job import CEILING_METHOD, Part, build_dataset
+from su3d_bench.runs.job import Part, build_dataset
 from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets
 from su3d_bench.store.atomic import is_file
 from su3d_bench.store.records import (

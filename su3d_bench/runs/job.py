@@ -12,14 +12,13 @@ from su3d_bench.core import registry
 from su3d_bench.core.config import flatten
 from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_json, package_versions
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.interfaces import HasCaveat, HasInputs, HasOwnPerception, Method
+from su3d_bench.core.interfaces import HasCaveat, HasInputs, HasOwnPerception, Method, ReadsMadeRooms
 from su3d_bench.core.types import SceneInfo
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.perception.profiles import Perception
 from su3d_bench.questions.refined_names import refined_digest
 from su3d_bench.store.run_folder import JobFolder
 
-CEILING_METHOD = "oracle"
 # Settings of perception that move no number, or whose part that does is in perception's digest.
 NOT_IN_KEY = ("perception.cache", "perception.models.folder", "perception.models.paths", "perception.language.")
 FIELDS_KNOWN_LATER = ("data", "profile", "perception", "packages.torch", "packages.transformers")
@@ -129,7 +128,6 @@ def build_method(part: Part) -> Any:
     return method_class(method_class.Config.model_validate_json(part.options))
 
 
-LAYOUTS_OF_ROOMS = ("replica", "scannet", "tum")  # in which `datasets make rooms` writes files
 TRUE_PROPOSALS_CAVEAT = "proposals from the ground truth; a ceiling, not a result"
 DEVICE, CPU = "perception.models.device", '"cpu"'
 TORCH_PACKAGES = ("torch", "transformers")  # what computes where not all is done by the packages of every key
@@ -187,7 +185,8 @@ def caveat_of(method: Method, perception: Perception, scene: SceneInfo) -> str |
         own = TRUE_PROPOSALS_CAVEAT
     has_own_perception = isinstance(method, HasOwnPerception) and method.has_own_perception
     is_seen_by_profile = method.needs.frames and not has_own_perception
-    is_made = scene.image_domain == "rendered-rooms" and scene.dataset in LAYOUTS_OF_ROOMS
+    dataset = registry.load("dataset", scene.dataset) if scene.dataset in registry.DATASETS else None
+    is_made = scene.image_domain == "rendered-rooms" and isinstance(dataset, ReadsMadeRooms)
     made = f"made rooms in the layout of {scene.dataset}, not its scenes" if is_made else None
     parts = [made, perception.caveat if is_seen_by_profile else None, own]
     return "; ".join(part for part in parts if part) or None

@@ -26,13 +26,13 @@ from su3d_bench.core.config import (
 from su3d_bench.core.devices import device_for
 from su3d_bench.core.digests import code_digest, digest_json
 from su3d_bench.core.errors import ConfigError, StoreError, suggest
-from su3d_bench.core.interfaces import HasPresets
+from su3d_bench.core.interfaces import HasPresets, IsSystem
+from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.protocols import load_protocol, protocols_for
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
 from su3d_bench.runs.executors.choose import ELSEWHERE, check_execution
 from su3d_bench.runs.job import (
-    CEILING_METHOD,
     FIELDS_KNOWN_LATER,
     Part,
     SceneJob,
@@ -97,9 +97,6 @@ def _assigned(text: str, variant: str) -> Mapping[str, Any]:
             raise ConfigError(f"--methods {text}: '{part}' is no KEY=VALUE")
         values[key.strip()] = parse_value(value)
     return values
-
-
-NO_SYSTEMS = (CEILING_METHOD, "command")  # what `--methods all` leaves out: the truth itself, and programs of others
 
 
 @dataclass(frozen=True)
@@ -225,9 +222,13 @@ def _check_sections(kind: str, settings: Settings, used: Mapping[str, str], vari
             resolve(settings, (kind, name), _options_model(kind, used.get(name, name)))
 
 
+def _all_systems() -> list[str]:
+    loaded = {name: registry.load("method", name) for name in registry.METHODS}
+    return [name for name, method in loaded.items() if not isinstance(method, IsSystem) or method.is_system]
+
+
 def _method_targets(methods: Sequence[str]) -> list[str]:
-    all_systems = [name for name in registry.METHODS if name not in NO_SYSTEMS]
-    named = [name for one in methods for name in (all_systems if one == "all" else [one])]
+    named = [name for one in methods for name in (_all_systems() if one == "all" else [one])]
     targets = list(dict.fromkeys(named))
     if not targets:
         raise ConfigError("no method was named; known: " + ", ".join(registry.names("method")))

@@ -18,6 +18,7 @@ from typing import Any
 from su3d_bench.core.config import KeyPath, flatten, write_toml
 from su3d_bench.core.digests import code_digest, git_state, package_versions
 from su3d_bench.core.errors import StoreError
+from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.timing import hardware_line, processor_digest
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.results import plain_json
@@ -25,7 +26,7 @@ from su3d_bench.metrics.scoring import SceneScore, combine, combined_metrics, un
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.runs.executors.choose import ELSEWHERE, run_units
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
-from su3d_bench.runs.job import CEILING_METHOD, MethodOutcome, SceneJob
+from su3d_bench.runs.job import MethodOutcome, SceneJob
 from su3d_bench.runs.plan import Plan
 from su3d_bench.runs.remote.scene import DistantJob, failed_distant, fetch_results, run_distant_scene, send_records
 from su3d_bench.runs.resume import FinishedScenes

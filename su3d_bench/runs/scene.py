@@ -301,7 +301,7 @@ class _Scene:
 
     def _prediction_in_words_of(self, truth: GroundTruth, part: Part, prediction: Prediction) -> Prediction:
         """``prediction``; that of a method that was told the truth is told anew where ``truth`` names its classes
-        otherwise than the truth that it was told: ScanNet has two sets of labels."""
+        otherwise than the truth that it was told: a dataset may have two sets of labels."""
         method = build_method(part)
         if not isinstance(method, TakesTruth) or truth.labels == self.truth(self.dataset.variants[0]).labels:
             return prediction

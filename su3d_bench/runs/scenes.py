@@ -63,7 +63,7 @@ def expand_scenes(
 ) -> tuple[list[tuple[str, str]], tuple[str, ...]]:
     """(dataset target, scene) of every address or pattern, each once, in the order asked; and notes.
 
-    Files among the addresses, which a shell put there by expanding ``replica/*``, are left out with a note when
+    Files among the addresses, which a shell put there by expanding ``dataset/*``, are left out with a note when
     other addresses match. ``root`` None: ``data_root()``.
     """
     root = data_root() if root is None else root

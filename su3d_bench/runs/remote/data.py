@@ -18,7 +18,7 @@ from su3d_bench.runs.job import Part, build_dataset
 from su3d_bench.runs.remote.folder import RemoteFolder
 from su3d_bench.store.atomic import make_folder
 
-MOST_SHARED_BYTES = 1 << 26  # label tables and camera files; ScanNet's largest has 1 MB
+MOST_SHARED_BYTES = 1 << 26  # label tables and camera files; the largest has 1 MB
 
 
 @dataclass(frozen=True)
