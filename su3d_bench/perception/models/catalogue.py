@@ -180,12 +180,7 @@ _ENTRIES = (
         "vit_base_patch32_clip_224",
     ),
     _siglip(
-        "siglip-base-224",
-        "SigLIP ViT-B/16, 768-d, 224 px",
-        203,
-        813,
-        "siglip-base-patch16-224",
-        "ViT-B-16-SigLIP",
+        "siglip-base-224", "SigLIP ViT-B/16, 768-d, 224 px", 203, 813, "siglip-base-patch16-224", "ViT-B-16-SigLIP"
     ),
     _siglip(
         "siglip-so400m-384",

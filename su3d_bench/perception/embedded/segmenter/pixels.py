@@ -11,7 +11,7 @@ from su3d_bench.perception.embedded.segmenter.graph import Graph, Pieces, measur
 
 def superpixels(frame: Frame, config: SegmenterConfig) -> tuple[Int32Array, Graph]:
     """The superpixels (H, W) of ``frame`` and the graph of their borders, at working resolution."""
-    from su3d_bench.perception.embedded.segmenter import kernels as kernels
+    from su3d_bench.perception.embedded.segmenter import kernels
 
     rgb, depth_m, intrinsics = _at_working_size(frame, config.max_width)
     height, width = depth_m.shape
@@ -92,7 +92,7 @@ def _planes(
     """Local planes of every pixel (H, W, 3), fitted at half resolution."""
     import cv2
 
-    from su3d_bench.perception.embedded.segmenter import kernels as kernels
+    from su3d_bench.perception.embedded.segmenter import kernels
 
     half = np.ascontiguousarray(disparity[::2, ::2])
     broken = kernels.discontinuities(half, 2 * config.depth_jump, config.noise_margin * noise, 2.0)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -45,23 +44,17 @@ def read_spec(files: ModelFiles, convention: Convention) -> EncoderSpec:
 def load_model(files: ModelFiles) -> Any:
     """The model in evaluation mode and float32 on the CPU, with every weight out of the file."""
     open_clip = require_open_clip(files.entry.name)
-    with _without_warnings():  # of random weights, which are replaced below
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)  # of random weights, which are replaced below
+    try:
         model = open_clip.create_model(files.form.architecture, pretrained=None, precision="fp32", device="cpu")
+    finally:
+        logging.disable(before)
     try:
         model.load_state_dict(read_weights(files.weights), strict=True)
     except RuntimeError as error:
         raise DataError(f"{files.weights}: is no {files.form.architecture}: {bounded(error)}") from error
     return model.eval()
-
-
-@contextmanager
-def _without_warnings() -> Iterator[None]:
-    before = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        yield
-    finally:
-        logging.disable(before)
 
 
 def read_tokeniser(files: ModelFiles) -> Callable[[Sequence[str]], Int64Array]:
