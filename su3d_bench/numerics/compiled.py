@@ -49,13 +49,13 @@ class MendingCache(FunctionCache):
 def imported_sources(function: Callable[..., Any]) -> list[Path]:
     """The files of the compiled functions that the file of ``function`` has imported, and of those that these have."""
     own = function.__code__.co_filename
-    found, waiting = {own}, [function]
+    sources, waiting = {own}, [function]
     while waiting:
         for value in list(waiting.pop().__globals__.values()):
-            if isinstance(value, Dispatcher) and value.py_func.__code__.co_filename not in found:
-                found.add(value.py_func.__code__.co_filename)
+            if isinstance(value, Dispatcher) and value.py_func.__code__.co_filename not in sources:
+                sources.add(value.py_func.__code__.co_filename)
                 waiting.append(value.py_func)
-    return sorted(Path(name) for name in found - {own})
+    return sorted(Path(name) for name in sources - {own})
 
 
 @remembered

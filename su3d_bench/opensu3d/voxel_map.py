@@ -46,7 +46,7 @@ class VoxelMap:
     @property
     def n_bytes(self) -> int:
         """What the arrays take, their spare room included."""
-        return sum(one.nbytes for one in vars(self).values() if isinstance(one, np.ndarray))
+        return sum(array.nbytes for array in vars(self).values() if isinstance(array, np.ndarray))
 
     @property
     def points(self) -> Float64Array:
@@ -60,10 +60,10 @@ class VoxelMap:
 
     def ids_of(self, indices: Int64Array) -> Int32Array:
         """Instance id of each point (N,) of the map, NO_INSTANCE for index -1."""
-        found = np.full(len(indices), NO_INSTANCE, np.int32)
+        ids = np.full(len(indices), NO_INSTANCE, np.int32)
         is_there = indices >= 0
-        found[is_there] = self._ids[indices[is_there]]
-        return found
+        ids[is_there] = self._ids[indices[is_there]]
+        return ids
 
     def nearest(self, queries: Float64Array) -> Int64Array:
         """Index of the nearest point strictly within eps of each query, -1 where there is none; ties: the lowest."""
@@ -74,14 +74,14 @@ class VoxelMap:
         from su3d_bench.opensu3d.kernels import voxel_map as _kernels
 
         queries = checked_points(queries)
-        found = np.empty(len(queries), np.int64)
+        answer = np.empty(len(queries), np.int64)
 
         def look_up(part: slice) -> int:
-            answer = found[part]
+            part_answer = answer[part]
             of_map = (self._points, self._following, self._keys, self._heads, self._table)
-            return int(_kernels.nearest(queries[part], self.eps, *of_map, answer))
+            return int(_kernels.nearest(queries[part], self.eps, *of_map, part_answer))
 
-        return found, sum(in_threads(look_up, len(queries)))
+        return answer, sum(in_threads(look_up, len(queries)))
 
     def count_inside(self, lower: Float64Array, upper: Float64Array, wanted: Int32Array) -> Int64Array:
         """Number of points of each wanted id inside the closed box from ``lower`` to ``upper``."""
@@ -93,9 +93,9 @@ class VoxelMap:
         """As ``count_inside``, with the number of blocks that were looked for."""
         from su3d_bench.opensu3d.kernels import voxel_map as _kernels
 
-        found = np.zeros(len(wanted), np.int64)
+        counts = np.zeros(len(wanted), np.int64)
         if len(wanted) == 0:
-            return found, 0
+            return counts, 0
         row_of_id = np.full(int(wanted.max()) + 1, -1, np.int64)
         row_of_id[wanted] = np.arange(len(wanted))
         visited = _kernels.count_inside(
@@ -110,9 +110,9 @@ class VoxelMap:
             self._heads,
             self._table,
             self.n_blocks,
-            found,
+            counts,
         )
-        return found, int(visited)
+        return counts, int(visited)
 
     def insert(self, points: Float64Array, ids: Int32Array, *, keep_density: bool, refill: bool) -> Int64Array:
         """Adds points in order; gives the map index that each took, -1 where it was not added.

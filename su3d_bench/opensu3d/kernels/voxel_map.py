@@ -95,7 +95,7 @@ def _write_gaps(x, voxel, eps, gaps):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def nearest(queries, eps, points, following, keys, heads, table, found):  # type: ignore[no-untyped-def]
+def nearest(queries, eps, points, following, keys, heads, table, answer):  # type: ignore[no-untyped-def]
     """Writes the nearest map point strictly within ``eps`` of each query into ``found``, ABSENT where there is none.
 
     Of equally near points the lowest index wins. Gives the number of voxels that were looked into.
@@ -141,12 +141,12 @@ def nearest(queries, eps, points, following, keys, heads, table, found):  # type
                         if squared < best_squared or (squared == best_squared and best != ABSENT and j < best):
                             best, best_squared = j, squared
                         j = following[j]
-        found[i] = best
+        answer[i] = best
     return visited
 
 
 @njit(cache=True)
-def _count_block(block, lower, upper, points, ids, following, heads, row_of_id, found):  # type: ignore[no-untyped-def]
+def _count_block(block, lower, upper, points, ids, following, heads, row_of_id, counts):  # type: ignore[no-untyped-def]
     for local in range(VOXELS):
         j = heads[block, local]
         while j != ABSENT:
@@ -154,13 +154,13 @@ def _count_block(block, lower, upper, points, ids, following, heads, row_of_id, 
             if row != ABSENT:
                 x, y, z = points[j, 0], points[j, 1], points[j, 2]
                 if lower[0] <= x <= upper[0] and lower[1] <= y <= upper[1] and lower[2] <= z <= upper[2]:
-                    found[row] += 1
+                    counts[row] += 1
             j = following[j]
 
 
 @njit(cache=True)
 def count_inside(  # type: ignore[no-untyped-def]
-    lower, upper, row_of_id, eps, points, ids, following, keys, heads, table, n_blocks, found
+    lower, upper, row_of_id, eps, points, ids, following, keys, heads, table, n_blocks, counts
 ):
     """Adds to ``found[row_of_id[id]]`` the points of each id in the closed box; gives the number of blocks visited.
 
@@ -177,12 +177,12 @@ def count_inside(  # type: ignore[no-untyped-def]
                 and first[1] <= keys[block, 1] <= last[1]
                 and first[2] <= keys[block, 2] <= last[2]
             ):
-                _count_block(block, lower, upper, points, ids, following, heads, row_of_id, found)
+                _count_block(block, lower, upper, points, ids, following, heads, row_of_id, counts)
         return n_blocks
     for bx in range(first[0], last[0] + 1):
         for by in range(first[1], last[1] + 1):
             for bz in range(first[2], last[2] + 1):
                 block = table[slot_of(table, keys, bx, by, bz)]
                 if block != ABSENT:
-                    _count_block(block, lower, upper, points, ids, following, heads, row_of_id, found)
+                    _count_block(block, lower, upper, points, ids, following, heads, row_of_id, counts)
     return span[0] * span[1] * span[2]

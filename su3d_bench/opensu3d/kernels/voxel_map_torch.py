@@ -64,7 +64,7 @@ class DeviceVoxelMap:
     @property
     def n_bytes(self) -> int:
         """What the tensors take, their spare room included."""
-        return sum(one.nbytes for one in vars(self).values() if isinstance(one, Tensor))
+        return sum(tensor.nbytes for tensor in vars(self).values() if isinstance(tensor, Tensor))
 
     @property
     def points(self) -> Float64Array:
@@ -79,19 +79,19 @@ class DeviceVoxelMap:
     def ids_of(self, indices: Int64Array) -> Int32Array:
         """Instance id of each point (N,) of the map, NO_INSTANCE for index -1."""
         at = self._up(indices)
-        found = torch.where(at >= 0, self._ids[at.clamp(min=0)], 0)
-        return np.asarray(found.cpu().numpy(), np.int32)
+        ids = torch.where(at >= 0, self._ids[at.clamp(min=0)], 0)
+        return np.asarray(ids.cpu().numpy(), np.int32)
 
     def nearest(self, queries: Float64Array) -> Int64Array:
         """Index of the nearest point strictly within eps of each query, -1 where there is none; ties: the lowest."""
         queries = checked_points(queries)
-        found = np.full(len(queries), ABSENT, np.int64)
+        absent = np.full(len(queries), ABSENT, np.int64)
         if len(self) == 0:
-            return found
-        asked = self._up(queries)
+            return absent
+        points = self._up(queries)
         at_once = AT_ONCE[self._device.type]
-        parts = [self._nearest(asked[first : first + at_once]) for first in range(0, len(asked), at_once)]
-        return np.asarray(torch.cat(parts).cpu().numpy(), np.int64) if parts else found
+        parts = [self._nearest(points[first : first + at_once]) for first in range(0, len(points), at_once)]
+        return np.asarray(torch.cat(parts).cpu().numpy(), np.int64) if parts else absent
 
     def count_inside(self, lower: Float64Array, upper: Float64Array, wanted: Int32Array) -> Int64Array:
         """Number of points of each wanted id inside the closed box from ``lower`` to ``upper``."""
@@ -132,39 +132,39 @@ class DeviceVoxelMap:
             self._refill(new_points, new_ids, slots, placed)
         return np.asarray(placed.cpu().numpy(), np.int64)
 
-    def _nearest(self, asked: Tensor) -> Tensor:
-        best = torch.full((len(asked),), self.eps * self.eps, dtype=torch.float64, device=self._device)
-        found = self._full(len(asked), LARGEST_ROW, torch.int64)
-        view = self._view(asked)
-        every = torch.arange(len(asked), device=self._device)
-        self._lower(view, every, torch.zeros_like(view.voxels), best, found)
-        gaps = _squared_gaps(asked, view.voxels, self._side)
-        self._look_around(view, every, gaps[:, :, 1:4], best, found)
+    def _nearest(self, points: Tensor) -> Tensor:
+        best = torch.full((len(points),), self.eps * self.eps, dtype=torch.float64, device=self._device)
+        answer = self._full(len(points), LARGEST_ROW, torch.int64)
+        view = self._view(points)
+        every = torch.arange(len(points), device=self._device)
+        self._lower(view, every, torch.zeros_like(view.voxels), best, answer)
+        gaps = _squared_gaps(points, view.voxels, self._side)
+        self._look_around(view, every, gaps[:, :, 1:4], best, answer)
         # Where a query lies on the border of its voxel, up to rounding, the second voxel can hold a point within eps.
         on_border = (gaps[:, :, [0, 4]].amin(dim=(1, 2)) <= best).nonzero()[:, 0]
         if len(on_border):
-            self._look_around(view, on_border, gaps[on_border], best, found)
-        return torch.where(found == LARGEST_ROW, ABSENT, found)
+            self._look_around(view, on_border, gaps[on_border], best, answer)
+        return torch.where(answer == LARGEST_ROW, ABSENT, answer)
 
-    def _view(self, asked: Tensor) -> _View:
-        voxels = self._voxels(asked)
+    def _view(self, points: Tensor) -> _View:
+        voxels = self._voxels(points)
         distinct, place = _distinct(self._packed(voxels >> 3))
         near = torch.arange(-1, 2, device=self._device)
         around = torch.stack(torch.meshgrid(near, near, near, indexing="ij"), dim=-1).view(1, 27, 3)
         rows = self._found_rows(_packed_relative(_unpacked(distinct)[:, None] + around))
         rows[distinct < 0] = NO_BLOCK
-        return _View(asked, voxels, rows.view(-1), place * 27)
+        return _View(points, voxels, rows.view(-1), place * 27)
 
-    def _look_around(self, view: _View, queries: Tensor, gaps: Tensor, best: Tensor, found: Tensor) -> None:
+    def _look_around(self, view: _View, queries: Tensor, gaps: Tensor, best: Tensor, answer: Tensor) -> None:
         """Looks where ``gaps`` (Q, 3, S) to the voxels about ``queries`` (Q,) leave room for a nearer point."""
         x, y, z = gaps.unbind(1)
         bounds = (x[:, :, None, None] + y[:, None, :, None]) + z[:, None, None, :]
         row, *steps = (bounds <= best[queries][:, None, None, None]).nonzero(as_tuple=True)
         step = torch.stack(steps, dim=1) - gaps.shape[2] // 2
         is_other = (step != 0).any(dim=1)
-        self._lower(view, queries[row[is_other]], step[is_other], best, found)
+        self._lower(view, queries[row[is_other]], step[is_other], best, answer)
 
-    def _lower(self, view: _View, query: Tensor, step: Tensor, best: Tensor, found: Tensor) -> None:
+    def _lower(self, view: _View, query: Tensor, step: Tensor, best: Tensor, answer: Tensor) -> None:
         """Lowers ``best`` (squared) and ``found`` to the nearest points in voxels ``step`` (P, 3) from a query's."""
         own = view.voxels[query]
         voxel = own + step
@@ -176,10 +176,10 @@ class DeviceVoxelMap:
             offset *= offset
             squared = (offset[:, 0] + offset[:, 1]) + offset[:, 2]
             nearest = best.scatter_reduce(0, query, squared, "amin")
-            found[nearest < best] = LARGEST_ROW
+            answer[nearest < best] = LARGEST_ROW
             # At eps itself nothing matches: best starts there, and stays unless a point lies nearer.
             wins = (squared == nearest[query]) & (squared < self.eps * self.eps)
-            found.scatter_reduce_(0, query[wins], at[wins], "amin")
+            answer.scatter_reduce_(0, query[wins], at[wins], "amin")
             best.copy_(nearest)
             at = self._following[at]
 

@@ -71,8 +71,8 @@ class Caption:
         """Whether every part of the statement holds for ``crop``."""
         if self.is_whole_image != (not crop.class_name):
             return False
-        asked = ((self.colour, crop.colour), (self.material, crop.material), (self.size_word, crop.size_word))
-        if any(want and want != have for want, have in (*asked, (self.room, crop.room))):
+        pairs = ((self.colour, crop.colour), (self.material, crop.material), (self.size_word, crop.size_word))
+        if any(want and want != have for want, have in (*pairs, (self.room, crop.room))):
             return False
         if self.classes and crop.class_name not in self.classes:
             return False

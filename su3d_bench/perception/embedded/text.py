@@ -36,8 +36,8 @@ def words(text: str) -> tuple[str, ...]:
     >>> words("An indoor-plant next to the shelves")
     ('indoor', 'plant', 'next', 'to', 'shelf')
     """
-    found = _WORD.findall(text.lower().replace("'", "").replace("’", ""))
-    return tuple(singular(word) for word in found if word not in _ARTICLES)[:N_WORDS]
+    parts = _WORD.findall(text.lower().replace("'", "").replace("’", ""))
+    return tuple(singular(word) for word in parts if word not in _ARTICLES)[:N_WORDS]
 
 
 def singular(word: str) -> str:

@@ -82,22 +82,22 @@ class Captioner:
         """One caption a crop; ``tagger_names`` are what the fallback calls them. Reasons of fallbacks go to the log."""
         requests = self.requests(crops)
         replies = self._model.ask_all(requests)
-        found = [
+        captions = [
             caption_from(reply, name, request.key)
             for request, reply, name in zip(requests, replies, tagger_names, strict=True)
         ]
-        for reason in dict.fromkeys(one.reason for one in found if one.source == "fallback"):
+        for reason in dict.fromkeys(caption.reason for caption in captions if caption.source == "fallback"):
             logger.warning("captions: the tagger's name and the simple caption stand where the answer was: %s", reason)
-        return found
+        return captions
 
 
 def caption_from(reply: Reply, tagger_name: str, key: str) -> CropCaption:
     """What the model said, or the tagger's name and "an {object} in a scene" (the paper's section IV-B)."""
-    found = None if reply.failure else described(reply.text)
-    if found is None:
+    description = None if reply.failure else described(reply.text)
+    if description is None:
         name = tagger_name.strip() or "object"
         return CropCaption(name, scene_caption(name), "fallback", reason_of(reply), key)
-    return CropCaption(found.name, found.description or scene_caption(found.name), "model", "", key)
+    return CropCaption(description.name, description.description or scene_caption(description.name), "model", "", key)
 
 
 def reason_of(reply: Reply) -> str:

@@ -100,10 +100,10 @@ def described(text: str) -> Described | None:
     True
     """
     plain = _unfenced(text)
-    found = _from_json(plain) or _from_quotes(plain) or _from_labels(plain)
-    if found is None and not is_refusal(plain):
-        found = _from_bare_pair(plain) or _from_prose(plain)
-    return found
+    pair = _from_json(plain) or _from_quotes(plain) or _from_labels(plain)
+    if pair is None and not is_refusal(plain):
+        pair = _from_bare_pair(plain) or _from_prose(plain)
+    return pair
 
 
 def chosen_name(text: str, names: Sequence[str]) -> str | None:
@@ -134,22 +134,22 @@ def answered(text: str, known_ids: Sequence[int]) -> Answered | None:
         return None
     known = set(known_ids)
     for value in _json_objects(plain):
-        said = value.get("answer")
-        if not isinstance(said, str | int | float | bool):
+        answer = value.get("answer")
+        if not isinstance(answer, str | int | float | bool):
             continue
         ids = value.get("object_ids", value.get("ids", ()))
-        found = [one for one in ids if _is_id(one)] if isinstance(ids, list) else []
-        numbers = dict.fromkeys(int(str(one).lstrip("#")) for one in found)
+        given = [value for value in ids if _is_id(value)] if isinstance(ids, list) else []
+        numbers = dict.fromkeys(int(str(value).lstrip("#")) for value in given)
         reasons = value.get("reasoning", "")
-        shown = ("yes" if said else "no") if isinstance(said, bool) else str(said)
+        shown = ("yes" if answer else "no") if isinstance(answer, bool) else str(answer)
         return Answered(
             printable(shown, 1000),
-            tuple(one for one in numbers if one in known),
+            tuple(number for number in numbers if number in known),
             printable(reasons if isinstance(reasons, str) else "", 2000),
         )
     groups = [match[1] for match in _OBJECT_ID.finditer(plain)]
     numbers = dict.fromkeys(int(number) for group in groups for number in re.findall(r"\d+", group))
-    return Answered(printable(plain, 1000), tuple(one for one in numbers if one in known), "")
+    return Answered(printable(plain, 1000), tuple(number for number in numbers if number in known), "")
 
 
 def clean_name(text: str) -> str | None:
@@ -224,15 +224,15 @@ def _pair(name: Any, caption: Any) -> Described | None:
 
 def _from_json(text: str) -> Described | None:
     for value in _json_objects(text):
-        lower = {str(key).lower(): one for key, one in value.items()}
+        lower = {str(key).lower(): text for key, text in value.items()}
         name = next((lower[key] for key in _KEYS_OF_NAME if isinstance(lower.get(key), str)), None)
         if name is not None:
             caption = next((lower[key] for key in _KEYS_OF_CAPTION if isinstance(lower.get(key), str)), "")
             return _pair(name, caption)
         if not _KEYS_OF_ERRORS & set(lower):
-            found = next((pair for one in value.items() if (pair := _pair(*one))), None)
-            if found is not None:
-                return found
+            pairs = (_pair(*item) for item in value.items())
+            if (pair := next((pair for pair in pairs if pair), None)) is not None:
+                return pair
     return None
 
 
@@ -240,8 +240,8 @@ def _from_quotes(text: str) -> Described | None:
     for match in _QUOTED_PAIR.finditer(text):
         if match["name"].strip(_QUOTE + " ").lower() in (*_KEYS_OF_NAME, *_KEYS_OF_CAPTION):
             continue
-        if found := _pair(match["name"], match["caption"]):
-            return found
+        if pair := _pair(match["name"], match["caption"]):
+            return pair
     return None
 
 
@@ -267,11 +267,11 @@ def _from_prose(text: str) -> Described | None:
 
 
 def _json_names(text: str) -> list[str]:
-    found: list[str] = []
+    names: list[str] = []
     for value in _json_objects(text):
-        found += [str(value[key]) for key in _KEYS_OF_NAME if isinstance(value.get(key), str)]
-        found += [one for one in value.values() if isinstance(one, str) and len(value) == 1]
-    return found
+        names += [str(value[key]) for key in _KEYS_OF_NAME if isinstance(value.get(key), str)]
+        names += [name for name in value.values() if isinstance(name, str) and len(value) == 1]
+    return names
 
 
 def _lines_without_lead(text: str) -> list[str]:
@@ -283,21 +283,21 @@ def _quoted(text: str) -> list[str]:
     quoted = re.findall(
         r"[`\"“‘]([^`\"“”‘’\n]{1,60})[`\"”’]|\*\*([^*\n]{1,60})\*\*|(?<!\w)'([^'\n]{1,60})'(?!\w)", text
     )
-    found = list(dict.fromkeys("".join(groups) for groups in quoted))
-    return found if len(found) == 1 else []
+    phrases = list(dict.fromkeys("".join(groups) for groups in quoted))
+    return phrases if len(phrases) == 1 else []
 
 
 def _mentioned(text: str, by_words: Mapping[tuple[str, ...], str]) -> list[str]:
     """Names whose words stand in ``text`` one after the other; of two that overlap the longer one."""
-    said = _all_words(text)
-    hits = [name_words for name_words in by_words if name_words and _holds(said, name_words)]
-    longest = [one for one in hits if not any(other != one and _holds(other, one) for other in hits)]
-    return [by_words[one] for one in longest]
+    all_words = _all_words(text)
+    hits = [name_words for name_words in by_words if name_words and _holds(all_words, name_words)]
+    longest = [hit for hit in hits if not any(other != hit and _holds(other, hit) for other in hits)]
+    return [by_words[hit] for hit in longest]
 
 
 def _all_words(text: str) -> tuple[str, ...]:
     return tuple(word for line in re.findall(r"[A-Za-z0-9'’\-]+", text) for word in words(line))
 
 
-def _holds(said: tuple[str, ...], part: tuple[str, ...]) -> bool:
-    return any(said[k : k + len(part)] == part for k in range(len(said) - len(part) + 1))
+def _holds(whole: tuple[str, ...], part: tuple[str, ...]) -> bool:
+    return any(whole[k : k + len(part)] == part for k in range(len(whole) - len(part) + 1))

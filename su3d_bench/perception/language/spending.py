@@ -48,15 +48,15 @@ def cost_usd(config: LanguageConfig, model: str, input_tokens: int, output_token
 
 def estimate_of(config: LanguageConfig, to_send: Sequence[ChatRequest], n_stored: int) -> Estimate:
     """The most that sending ``to_send`` can cost, beside ``n_stored`` requests that have replies."""
-    costs = [cost_usd(config, one.model, one.n_input_tokens, one.max_answer_tokens) for one in to_send]
+    costs = [cost_usd(config, request.model, request.n_input_tokens, request.max_answer_tokens) for request in to_send]
     known = [cost for cost in costs if cost is not None]
     return Estimate(
         n_requests=len(to_send) + n_stored,
         n_stored=n_stored,
-        input_tokens=sum(one.n_input_tokens for one in to_send),
-        output_tokens=sum(one.max_answer_tokens for one in to_send),
+        input_tokens=sum(request.n_input_tokens for request in to_send),
+        output_tokens=sum(request.max_answer_tokens for request in to_send),
         usd=sum(known) if len(known) == len(costs) else None,
-        models=tuple(dict.fromkeys(one.model for one in to_send)),
+        models=tuple(dict.fromkeys(request.model for request in to_send)),
     )
 
 

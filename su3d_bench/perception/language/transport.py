@@ -183,18 +183,18 @@ class Transport:
         while error is not None and len(chain) < 10:
             chain.append(error)
             error = error.__cause__ or error.__context__  # type: ignore[assignment]
-        if any(isinstance(one, _TooLarge) for one in chain):
+        if any(isinstance(cause, _TooLarge) for cause in chain):
             return GiveUp(f"the answer is larger than {self._config.max_answer_bytes:,} bytes")
-        if any(isinstance(one, _TooLate) for one in chain):
+        if any(isinstance(cause, _TooLate) for cause in chain):
             return TryAgain(f"no whole answer within {self._config.total_timeout_s:g} s")
-        is_refused = any(type(one).__name__ in ("ConnectError", "UnsupportedProtocol") for one in chain)
+        is_refused = any(type(cause).__name__ in ("ConnectError", "UnsupportedProtocol") for cause in chain)
         reason = self._shown(str(chain[1] if len(chain) > 1 else chain[0]), 120) or type(chain[-1]).__name__
         return TryAgain(f"the connection failed: {reason}", is_answered=not is_refused)
 
     def _judged(self, error: Any) -> Exception:
         """What an answer with an error status means."""
         status = int(error.status_code)
-        told = self._shown(_message_of(error), 200)
+        message = self._shown(_message_of(error), 200)
         code = str(getattr(error, "code", "") or "")
         if status in (401, 403):
             return ModelMissing(
@@ -202,18 +202,18 @@ class Transport:
             )
         if status == 404:
             return ModelMissing(
-                f"{self.server}: knows no such model or address (status 404: {told}); name the model with --model and "
-                "the server with --base-url, which usually ends with /v1"
+                f"{self.server}: knows no such model or address (status 404: {message}); name the model with --model "
+                "and the server with --base-url, which usually ends with /v1"
             )
         if status == 429 and code == "insufficient_quota":
-            return ModelMissing(f"{self.server}: the account has no quota left ({told}); top it up, then ask again")
+            return ModelMissing(f"{self.server}: the account has no quota left ({message}); top it up, then ask again")
         if status in (400, 422):
-            named = next((name for name in OPTIONAL_PARAMETERS if re.search(rf"\b{name}\b", told)), None)
+            named = next((name for name in OPTIONAL_PARAMETERS if re.search(rf"\b{name}\b", message)), None)
             if named is not None:
                 return _Unsupported(named)
         if status in STATUS_TO_TRY_AGAIN or status >= 500:
-            return TryAgain(f"status {status}: {told}", _pause_of(error.response.headers))
-        return GiveUp(f"status {status}: {told}")
+            return TryAgain(f"status {status}: {message}", _pause_of(error.response.headers))
+        return GiveUp(f"status {status}: {message}")
 
     def _reply(self, request: ChatRequest, text: str, dropped: tuple[str, ...]) -> Reply:
         try:
@@ -221,11 +221,11 @@ class Transport:
         except (ValueError, RecursionError, ValidationError):
             raise TryAgain(f"the server's answer is no chat completion: '{self._shown(text, 60)}'") from None
         choice = completion.choices[0]
-        said = self._clean(choice.message.content or choice.message.refusal or "")
-        usage = completion.usage or _Usage(prompt_tokens=request.n_input_tokens, completion_tokens=n_tokens(said))
+        answer = self._clean(choice.message.content or choice.message.refusal or "")
+        usage = completion.usage or _Usage(prompt_tokens=request.n_input_tokens, completion_tokens=n_tokens(answer))
         finish = printable(choice.finish_reason or "", 40)
         model = self._shown(completion.model, 200)
-        return Reply(said, finish, model, usage.prompt_tokens, usage.completion_tokens, dropped)
+        return Reply(answer, finish, model, usage.prompt_tokens, usage.completion_tokens, dropped)
 
     def _clean(self, text: str) -> str:
         """``text`` without the key, and writable as UTF-8."""
@@ -273,8 +273,8 @@ def _without(body: dict[str, Any], dropped: tuple[str, ...]) -> dict[str, Any]:
 
 def _message_of(error: Any) -> str:
     body = error.body
-    told = body.get("message") if isinstance(body, dict) else None
-    return told if isinstance(told, str) else str(error)
+    message = body.get("message") if isinstance(body, dict) else None
+    return message if isinstance(message, str) else str(error)
 
 
 def _pause_of(headers: Any) -> float | None:

@@ -57,12 +57,12 @@ class ModelFiles:
 
     def wrong_digests(self) -> list[str]:
         """A line for each file whose digest is not the published one."""
-        found = self.digests()
+        digests = self.digests()
         advice = f"fetch it anew from {self.form.source}"
         return [
-            f"{self.folder / name}: sha256 is {found[name]}, published is {known}; {advice}"
+            f"{self.folder / name}: sha256 is {digests[name]}, published is {known}; {advice}"
             for name, known in self.form.sha256.items()
-            if name in found and found[name] != known
+            if name in digests and digests[name] != known
         ]
 
 
@@ -149,10 +149,10 @@ def _snapshots(folder: Path) -> Iterator[Path]:
     if revision.isalnum() and (snapshots / revision).is_dir():
         yield snapshots / revision
         return
-    found = sorted(path for path in snapshots.glob("*") if path.is_dir())
-    if len(found) > 1:
-        raise ConfigError(f"{snapshots}: holds {len(found)} snapshots and no refs/main; name one with models.paths")
-    yield from found
+    folders = sorted(path for path in snapshots.glob("*") if path.is_dir())
+    if len(folders) > 1:
+        raise ConfigError(f"{snapshots}: holds {len(folders)} snapshots and no refs/main; name one with models.paths")
+    yield from folders
 
 
 def _names(requirement: str) -> list[str]:

@@ -41,16 +41,16 @@ class ModelState:
 
 def model_state(entry: ModelEntry, path: Path | None = None, folder: Path | None = None) -> ModelState:
     """Which forms of ``entry`` are here, at ``path`` or where models are looked for."""
-    found = []
+    forms = []
     for form in entry.forms:
         with suppress(ModelMissing, ConfigError):
             if form.is_read:
-                found.append(locate(entry.name, (form.form,), path=path, folder=folder))
+                forms.append(locate(entry.name, (form.form,), path=path, folder=folder))
     try:
-        missing = None if found else str(locate(entry.name, path=path, folder=folder))
+        missing = None if forms else str(locate(entry.name, path=path, folder=folder))
     except (ModelMissing, ConfigError) as error:
         missing = str(error)
-    return ModelState(entry, tuple(found), missing)
+    return ModelState(entry, tuple(forms), missing)
 
 
 def problems_of(files: ModelFiles) -> list[str]:

@@ -137,10 +137,10 @@ def _pretrained(files: ModelFiles, class_name: str) -> Any:
     """A transformers model in float32 on the CPU; weights that are missing are an error, never random."""
     transformers = require_transformers(f"model '{files.entry.name}'")
     model_class = getattr(transformers, class_name)
-    told = read_settings(files.folder / "config.json").get("model_type")
-    if told != model_class.config_class.model_type:
+    model_type = read_settings(files.folder / "config.json").get("model_type")
+    if model_type != model_class.config_class.model_type:
         wanted = model_class.config_class.model_type
-        raise DataError(f"{files.folder}: model_type is {str(told)[:40]!r}; '{files.entry.name}' is {wanted!r}")
+        raise DataError(f"{files.folder}: model_type is {str(model_type)[:40]!r}; '{files.entry.name}' is {wanted!r}")
     return load_pretrained(files, model_class)
 
 

@@ -99,18 +99,18 @@ def numbered_files(
     parent = _inside(folder, directory or ".", where, key)
     before, _, behind = name_pattern.partition(INDEX)
     form = re.compile(re.escape(before) + r"(\d{1,18})" + re.escape(behind), re.ASCII)
-    found: dict[int, Path] = {}
+    files: dict[int, Path] = {}
     try:
         for path in sorted(parent.iterdir()):
             if match := form.fullmatch(path.name):
                 number = int(match[1])
-                if number in found:
+                if number in files:
                     raise DataError(
-                        f"{where}: {found[number].name} and {path.name} are of one frame; expected one file"
+                        f"{where}: {files[number].name} and {path.name} are of one frame; expected one file"
                     )
-                found[number] = _inside(folder, path.relative_to(folder).as_posix(), where, key)
+                files[number] = _inside(folder, path.relative_to(folder).as_posix(), where, key)
     except OSError as error:
         raise DataError(f"{where}: {parent}: cannot be read: {error.strerror}; it should hold {what}s") from error
-    if not found:
+    if not files:
         raise DataError(f"{where}: no {what} in {parent} matches {pattern!r}")
-    return dict(sorted(found.items()))
+    return dict(sorted(files.items()))

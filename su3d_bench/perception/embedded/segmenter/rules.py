@@ -84,7 +84,7 @@ def structural_planes(surfaces: Graph, config: SegmenterConfig) -> list[Structur
 
 def plane_of_flush(pieces: Pieces, planes: list[StructuralPlane], config: SegmenterConfig) -> IndexArray:
     """The structural plane (N,) that a piece lies flush with, -1 for none."""
-    found = np.full(len(pieces), -1, np.intp)
+    plane_of_piece = np.full(len(pieces), -1, np.intp)
     centroid, normal = pieces.centroid(), pieces.unit_normal()
     tolerance = np.maximum(config.structure_flush_m, config.structure_flush_relative * centroid[:, 2])
     for number, plane in enumerate(planes):
@@ -94,8 +94,8 @@ def plane_of_flush(pieces: Pieces, planes: list[StructuralPlane], config: Segmen
             & (normal @ plane.normal > np.cos(np.deg2rad(12)))
             & (pieces.n_points > 0)
         )
-        found[is_flush & (found < 0)] = number
-    return found
+        plane_of_piece[is_flush & (plane_of_piece < 0)] = number
+    return plane_of_piece
 
 
 def take_out_structure(graph: Graph, config: SegmenterConfig) -> tuple[Graph, BoolArray]:

@@ -54,8 +54,8 @@ class TruthTable:
             else:
                 classes[row] = True
         result &= classes[:, self.class_of[crops]]
-        for numbers, of_crop, asked in zip(self._words, self._word_of, _WORDS, strict=True):
-            wanted = np.array([numbers.get(asked(caption), -2) if asked(caption) else -1 for caption in captions])
+        for numbers, of_crop, word_of in zip(self._words, self._word_of, _WORDS, strict=True):
+            wanted = np.array([numbers.get(word_of(caption), -2) if word_of(caption) else -1 for caption in captions])
             result &= (wanted[:, None] == -1) | (wanted[:, None] == of_crop[crops][None])
         return np.asarray(result & self._relations(captions, crops))
 

@@ -166,16 +166,16 @@ class FoundationEncoder:
     def encode_texts(self, texts: Sequence[str]) -> Float32Array:
         """Features (N, dim) of texts, each computed once."""
         new = [text for text in dict.fromkeys(texts) if text not in self._texts]
-        found = {text: row for text in new if (row := self._stored(text)) is not None}
-        missing = [text for text in new if text not in found]
+        features = {text: row for text in new if (row := self._stored(text)) is not None}
+        missing = [text for text in new if text not in features]
         if missing:
             made = unit_rows(np.concatenate(self._text_batches.run(missing, self._text_work)), self.name)
-            found |= dict(zip(missing, made, strict=True))
+            features |= dict(zip(missing, made, strict=True))
             for text in missing:
-                self._cache.save(self._text_key(text), {"feature": found[text]})
-        if len(self._texts) + len(found) <= LARGEST_MEMORY_OF_TEXTS:
-            self._texts |= found
-        rows = [self._texts[text] if text in self._texts else found[text] for text in texts]
+                self._cache.save(self._text_key(text), {"feature": features[text]})
+        if len(self._texts) + len(features) <= LARGEST_MEMORY_OF_TEXTS:
+            self._texts |= features
+        rows = [self._texts[text] if text in self._texts else features[text] for text in texts]
         return np.array(rows, np.float32).reshape(len(texts), self.dim)
 
     def _text_work(self, batch: Sequence[str]) -> Float32Array:

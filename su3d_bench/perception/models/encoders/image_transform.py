@@ -111,13 +111,13 @@ def read_transform(path: Path, convention: Convention) -> ImageTransform:
 
 def _size(path: Path, content: Mapping[str, Any]) -> tuple[Literal["shortest", "squash"], int]:
     """Kind and size of the resize step; older files write a bare number for the shortest side."""
-    asked = content.get("size")
+    size = content.get("size")
     does_crop = content.get("do_center_crop", content.get("image_processor_type") != "SiglipImageProcessor") is True
-    if isinstance(asked, int):
-        asked = {"shortest_edge": asked}
-    if isinstance(asked, Mapping):
-        shortest = asked.get("shortest_edge")
-        square = asked.get("height"), asked.get("width")
+    if isinstance(size, int):
+        size = {"shortest_edge": size}
+    if isinstance(size, Mapping):
+        shortest = size.get("shortest_edge")
+        square = size.get("height"), size.get("width")
         if does_crop and _is_size(shortest):
             crop = content.get("crop_size", shortest)
             sides = list(crop.values()) if isinstance(crop, Mapping) else [crop]
@@ -126,7 +126,7 @@ def _size(path: Path, content: Mapping[str, Any]) -> tuple[Literal["shortest", "
         elif not does_crop and square[0] == square[1] and _is_size(square[0]):
             return "squash", square[0]
     raise DataError(
-        f"{path}: size {str(asked)[:80]} with crop_size {str(content.get('crop_size'))[:80]}; expected a shortest edge "
+        f"{path}: size {str(size)[:80]} with crop_size {str(content.get('crop_size'))[:80]}; expected a shortest edge "
         "with a crop of the same size, or a square without one"
     )
 

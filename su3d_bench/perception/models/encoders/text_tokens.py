@@ -57,7 +57,7 @@ def _siglip(folder: Path, n_tokens: int, pad_id: int) -> Callable[[list[str]], A
     tokenizer = _load(folder, lambda: tokenizers.Tokenizer.from_file(str(folder / "tokenizer.json")))
     tokenizer.enable_truncation(n_tokens)
     tokenizer.enable_padding(length=n_tokens, pad_id=pad_id)
-    return lambda texts: [one.ids for one in tokenizer.encode_batch([canonical_text(text) for text in texts])]
+    return lambda texts: [encoding.ids for encoding in tokenizer.encode_batch([canonical_text(text) for text in texts])]
 
 
 def canonical_text(text: str) -> str:

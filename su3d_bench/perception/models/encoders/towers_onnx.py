@@ -80,11 +80,11 @@ def export_encoder(files: ModelFiles, folder: Path) -> Manifest:
 
 def check_parity(manifest: Manifest) -> None:
     """Raise ``CheckFailed`` where a tower's features differ by more than the tolerance."""
-    for one in manifest.parity:
-        if one.max_abs_difference > LARGEST_DIFFERENCE or one.min_cosine < SMALLEST_COSINE:
+    for parity in manifest.parity:
+        if parity.max_abs_difference > LARGEST_DIFFERENCE or parity.min_cosine < SMALLEST_COSINE:
             raise CheckFailed(
-                f"{manifest.name}: the {one.output} tower differs between torch and ONNX Runtime by "
-                f"{one.max_abs_difference:.2e} (cosine {one.min_cosine:.6f}); tolerance {LARGEST_DIFFERENCE:.0e}"
+                f"{manifest.name}: the {parity.output} tower differs between torch and ONNX Runtime by "
+                f"{parity.max_abs_difference:.2e} (cosine {parity.min_cosine:.6f}); tolerance {LARGEST_DIFFERENCE:.0e}"
             )
 
 

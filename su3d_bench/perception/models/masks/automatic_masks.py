@@ -176,13 +176,13 @@ class AutomaticMasks:
         config = self._config
         height, width = rgb.shape[:2]
         crops = crops_of(height, width, config.crop_n_layers, config.crop_overlap_ratio)
-        found = _Found.joined([self._in_crop(rgb, crop) for crop in crops])
+        candidates = _Found.joined([self._in_crop(rgb, crop) for crop in crops])
         if len(crops) > 1:
-            found = found.at(suppress(found.boxes, 1 / found.crop_areas, config.crop_nms_thresh))
-        masks = np.zeros((len(found.cuts), height, width), bool)
-        for mask, cut, (x0, y0, x1, y1) in zip(masks, found.cuts, found.windows.tolist(), strict=True):
+            candidates = candidates.at(suppress(candidates.boxes, 1 / candidates.crop_areas, config.crop_nms_thresh))
+        masks = np.zeros((len(candidates.cuts), height, width), bool)
+        for mask, cut, (x0, y0, x1, y1) in zip(masks, candidates.cuts, candidates.windows.tolist(), strict=True):
             mask[y0:y1, x0:x1] = cut
-        scores = found.scores
+        scores = candidates.scores
         if config.min_mask_region_area:
             masks, kept = self._cleaned(masks)
             scores = scores[kept]
@@ -197,8 +197,8 @@ class AutomaticMasks:
         n_side = int(self._config.points_per_side / self._config.crop_n_points_downscale_factor**crop.layer)
         points = (point_grid(max(n_side, 1)) * np.array([x1 - x0, y1 - y0])).astype(np.float32)
         batches = self._batches.run(range(len(points)), lambda part: self._from_points(image, points[part], crop, rgb))
-        found = _Found.joined(batches)
-        return found.at(suppress(found.boxes, found.scores, self._config.box_nms_thresh))
+        candidates = _Found.joined(batches)
+        return candidates.at(suppress(candidates.boxes, candidates.scores, self._config.box_nms_thresh))
 
     def _from_points(self, image: SeenImage, points: Float32Array, crop: Crop, rgb: UInt8Array) -> _Found:
         """The three masks at each point that pass the filters, which look at one mask alone, whatever the batch."""
@@ -229,8 +229,8 @@ class AutomaticMasks:
         cuts = [mask[b:d, a:c].copy() for mask, (a, b, c, d) in zip(masks, inside.tolist(), strict=True)]
         windows = inside + np.array([x0, y0, x0, y0])
         area = np.full(len(masks), float((x1 - x0) * (y1 - y0)))
-        found = _Found(cuts, windows, predicted.cpu().numpy().astype(np.float32), area)
-        return found.at(np.flatnonzero(~is_cut_by_crop(found.boxes, crop, *rgb.shape[:2])))
+        candidates = _Found(cuts, windows, predicted.cpu().numpy().astype(np.float32), area)
+        return candidates.at(np.flatnonzero(~is_cut_by_crop(candidates.boxes, crop, *rgb.shape[:2])))
 
     def _cleaned(self, masks: BoolArray) -> tuple[BoolArray, Int64Array]:
         """``masks`` without small holes and islands, duplicates that this makes taken out; which of them are left.

@@ -83,19 +83,19 @@ class GroundedSam:
         """Named regions, the detector's best first; empty where no tag is found."""
         config = self._config
         tags = chosen_tags(self._networks.tagger.tags(frame.rgb), config.stop_words, config.added_tags)
-        found = self._networks.load_detector().detect(frame.rgb, tags, config.boxes)
+        named = self._networks.load_detector().detect(frame.rgb, tags, config.boxes)
         # A box beyond the image's edge has been cut to a line there.
-        found = found.at(np.flatnonzero((found.boxes[:, 2:] > found.boxes[:, :2]).all(axis=1)))
+        named = named.at(np.flatnonzero((named.boxes[:, 2:] > named.boxes[:, :2]).all(axis=1)))
         height, width = frame.rgb.shape[:2]
-        if not len(found.names):
-            return Regions(np.zeros((0, height, width), bool), found.boxes, found.scores, ())
+        if not len(named.names):
+            return Regions(np.zeros((0, height, width), bool), named.boxes, named.scores, ())
         sam = self._networks.load_sam()
         image = sam.look(frame.rgb)
-        masks, _ = sam.from_boxes(image, found.boxes, is_single=config.masks == "single")
+        masks, _ = sam.from_boxes(image, named.boxes, is_single=config.masks == "single")
         kept = np.flatnonzero(masks.any(axis=(1, 2)))
-        masks, found = masks[kept], found.at(kept)
-        boxes = mask_boxes(masks) if config.region_boxes == "mask" else found.boxes
-        return Regions(masks, boxes, found.scores, found.names)
+        masks, named = masks[kept], named.at(kept)
+        boxes = mask_boxes(masks) if config.region_boxes == "mask" else named.boxes
+        return Regions(masks, boxes, named.scores, named.names)
 
 
 class SamRegions(CropsOnDemand):

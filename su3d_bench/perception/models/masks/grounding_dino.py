@@ -106,16 +106,17 @@ class GroundingDino:
         """
         tags = [tag for tag in dict.fromkeys(clean_tag(tag) for tag in tags) if tag]
         parts = [self._found(rgb, part, config) for part in self._texts(tags)]
-        found = NamedBoxes(
+        candidates = NamedBoxes(
             np.concatenate([part.boxes for part in parts] or [np.zeros((0, 4), np.float32)]),
             np.concatenate([part.scores for part in parts] or [np.zeros(0, np.float32)]),
             tuple(name for part in parts for name in part.names),
         )
-        found = found.at(suppress(found.boxes, found.scores, config.nms_iou))
+        candidates = candidates.at(suppress(candidates.boxes, candidates.scores, config.nms_iou))
         # A box found by marks alone has no name; it goes.
-        named = [tag_of(name, tags) if config.names == "tag" else name or None for name in found.names]
+        named = [tag_of(name, tags) if config.names == "tag" else name or None for name in candidates.names]
         kept = np.flatnonzero([name is not None for name in named])
-        return NamedBoxes(found.boxes[kept], found.scores[kept], tuple(name for name in named if name is not None))
+        names = tuple(name for name in named if name is not None)
+        return NamedBoxes(candidates.boxes[kept], candidates.scores[kept], names)
 
     def answer(self, pixels: Float32Array, text: str) -> tuple[Float32Array, Float32Array, list[int]]:
         """Token probabilities (Q, T) and boxes (Q, 4), centre and size in shares, for pixels (3, H, W), and the text's

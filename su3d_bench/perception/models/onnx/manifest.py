@@ -54,9 +54,9 @@ class OnnxManifest(BaseModel):
     def read(cls, path: Path) -> Self:
         """The manifest at ``path``; raises ``DataError`` for anything else, and where a required file is not named."""
         content = read_settings(path)
-        found = content.get("format")
-        if found != cls.FORMAT:
-            raise DataError(f"{path}: format is {str(found)[:60]!r}; expected {cls.FORMAT!r}; export it anew")
+        layout = content.get("format")
+        if layout != cls.FORMAT:
+            raise DataError(f"{path}: format is {str(layout)[:60]!r}; expected {cls.FORMAT!r}; export it anew")
         try:
             manifest = cls.model_validate_json(json.dumps(content))
         except ValidationError as error:
