@@ -96,7 +96,7 @@ def _write_gaps(x, voxel, eps, gaps):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True)
 def nearest(queries, eps, points, following, keys, heads, table, answer):  # type: ignore[no-untyped-def]
-    """Writes the nearest map point strictly within ``eps`` of each query into ``found``, ABSENT where there is none.
+    """Writes the nearest map point strictly within ``eps`` of each query into ``answer``, ABSENT where there is none.
 
     Of equally near points the lowest index wins. Gives the number of voxels that were looked into.
     """

@@ -165,7 +165,7 @@ class DeviceVoxelMap:
         self._lower(view, queries[row[is_other]], step[is_other], best, answer)
 
     def _lower(self, view: _View, query: Tensor, step: Tensor, best: Tensor, answer: Tensor) -> None:
-        """Lowers ``best`` (squared) and ``found`` to the nearest points in voxels ``step`` (P, 3) from a query's."""
+        """Lowers ``best`` (squared) and ``answer`` to the nearest points in voxels ``step`` (P, 3) from a query's."""
         own = view.voxels[query]
         voxel = own + step
         row = view.rows[view.place[query] + _number((voxel >> 3) - (own >> 3) + 1, 3)]
