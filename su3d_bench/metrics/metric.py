@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Generic, Self, TypeVar
 
@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import BoolArray, Float64Array, Instances, Int64Array, Prediction
+from su3d_bench.metrics.matching.nearest import n_farther
 from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.numerics.statistics import nan_mean
 
@@ -95,6 +96,20 @@ class Metric(ABC, Generic[C]):
     @abstractmethod
     def per_scene(self, truth: Any, prediction: Any, encoder: Encoder | None) -> SceneScore:
         """The additive counts of one scene; ``encoder`` names features of predictions that bring no labels."""
+
+    def score(
+        self, counts: C, prediction: Prediction, distance_m: Float64Array, warnings: Iterable[str | None]
+    ) -> SceneScore:
+        """The score of a scene whose scored points are ``distance_m`` from the nearest point of the prediction."""
+        return SceneScore(
+            protocol=self.rules.name,
+            version=self.rules.version,
+            counts=counts,
+            n_predictions=n_predictions(prediction),
+            n_scored=len(distance_m),
+            n_farther=n_farther(distance_m),
+            warnings=tuple(warning for warning in warnings if warning),
+        )
 
     @property
     @abstractmethod

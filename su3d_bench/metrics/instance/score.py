@@ -23,7 +23,7 @@ from su3d_bench.metrics.matching.labelling import (
     encoder_warning,
     scored_classes,
 )
-from su3d_bench.metrics.metric import Counts, Metric, Pooled, SceneScore, Values, n_predictions, present
+from su3d_bench.metrics.metric import C, Metric, Pooled, SceneScore, Values, n_predictions, present
 from su3d_bench.metrics.protocols import AP_NAMES, ProtocolRules, TransferRules
 
 IntArray = NDArray[np.integer[Any]]
@@ -113,9 +113,9 @@ class InstanceMetric(CurveMetric):
             rules.thresholds,
         )
         wanted = np.isin(scored.values // instance_ap.INSTANCES_PER_CLASS, scored.class_ids)
-        of_encoder = None if rules.class_agnostic else encoder_warning(rules, prediction, encoder)
-        warnings = _instance_warnings(rules, truth, scored, of_encoder)
-        return score_of_masks(rules, counts, prediction, truth.points, wanted, warnings)
+        warnings = [None if rules.class_agnostic else encoder_warning(rules, prediction, encoder)]
+        warnings += _mask_warnings(rules, truth, scored)
+        return score_of_masks(self, counts, prediction, truth.points, wanted, warnings)
 
 
 @dataclass(frozen=True)
@@ -199,34 +199,24 @@ def encode_without_classes(
 
 
 def score_of_masks(
-    rules: ProtocolRules,
-    counts: Counts,
+    metric: Metric[C],
+    counts: C,
     prediction: Instances | Partition,
     targets: transfer.Points,
     wanted: BoolArray,
-    warnings: Sequence[str],
+    warnings: Sequence[str | None],
 ) -> SceneScore:
     """The score, with how far the ``wanted`` (P,) of ``targets`` (P, 3) are from the nearest point of any mask."""
     covered = np.full(len(prediction.points), -1, np.int64)
     covered[transfer.masks_of(prediction).indices] = 0
     reach = max(transfer.COVERAGE_RADII_M)
     _, distance = transfer.transfer_values(prediction.points, covered, covered, targets, wanted, reach)
-    return SceneScore(
-        protocol=rules.name,
-        version=rules.version,
-        counts=counts,
-        n_predictions=n_predictions(prediction),
-        n_scored=int(wanted.sum()),
-        n_farther=transfer.n_farther(distance[wanted]),
-        warnings=tuple(warnings),
-    )
+    return metric.score(counts, prediction, distance[wanted], warnings)
 
 
-def _instance_warnings(
-    rules: ProtocolRules, truth: GroundTruth, scored: ScoredMasks, encoder: str | None
-) -> tuple[str, ...]:
+def _mask_warnings(rules: ProtocolRules, truth: GroundTruth, scored: ScoredMasks) -> list[str]:
     assert rules.min_region_size is not None
-    warnings, scores = [encoder] if encoder else [], scored.scores
+    warnings, scores = list[str](), scored.scores
     if rules.confidence == "prediction" and len(scores) > 1 and (scores == scores[0]).all():
         warnings.append(f"every confidence is {scores[0]:g}: AP of a class is then recall (1 + precision) / 2")
     large = np.flatnonzero(scored.masks.sizes >= rules.min_region_size)
@@ -237,7 +227,7 @@ def _instance_warnings(
         warnings.append(
             f"{what} with IoU above {DUPLICATE_IOU} (first {first} and {second}); duplicates can raise or lower AP"
         )
-    return tuple(warnings)
+    return warnings
 
 
 @dataclass(frozen=True)

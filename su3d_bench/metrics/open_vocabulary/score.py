@@ -24,7 +24,7 @@ from su3d_bench.metrics.instance.score import CurveMetric, score_of_masks
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, has_every_label, text_features
 from su3d_bench.metrics.matching.votes import transfer_each_mask
-from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, n_predictions
+from su3d_bench.metrics.metric import Metric, Pooled, SceneScore
 from su3d_bench.metrics.open_vocabulary import object_means, openlex3d, query_ap
 from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
@@ -60,15 +60,8 @@ class CategoriesMetric(Metric[ObjectCounts]):
             unit[distance > cap_m] = -1
         count = _count_ranks if is_ranking else _count_categories
         warnings = (encoder_warning(rules, prediction, encoder), _shared_points_warning(prediction))
-        return SceneScore(
-            protocol=rules.name,
-            version=rules.version,
-            counts=count(rules, truth, prediction, encoder, ids, object_row, unit),
-            n_predictions=n_predictions(prediction),
-            n_scored=int(scored.sum()),
-            n_farther=transfer.n_farther(distance[scored]),
-            warnings=tuple(warning for warning in warnings if warning),
-        )
+        counts = count(rules, truth, prediction, encoder, ids, object_row, unit)
+        return self.score(counts, prediction, distance[scored], warnings)
 
     @property
     def sizes(self) -> dict[str, int]:
@@ -248,8 +241,8 @@ class QueryMetric(CurveMetric):
         )
         asked_for = np.unique(np.array([each for query in truth.queries for each in query.object_ids], np.int64))
         wanted = np.isin(truth.object_of_point, asked_for[asked_for >= 0])
-        warning = encoder_warning(rules, prediction, encoder)
-        return score_of_masks(rules, counts, prediction, truth.points, wanted, (warning,) if warning else ())
+        warnings = [encoder_warning(rules, prediction, encoder)]
+        return score_of_masks(self, counts, prediction, truth.points, wanted, warnings)
 
 
 def _moved(rules: ProtocolRules, points: Float32Array, masks: Masks, targets: Float32Array) -> Masks:

@@ -51,7 +51,7 @@ class ShareMetric(Metric[ShareCounts]):
         object_ids: Sequence[int],
         prediction: Instances | Partition,
         rows: Mapping[str, BoolArray],
-        warnings: Sequence[str],
+        warnings: Sequence[str | None],
     ) -> SceneScore:
         """The score, ``rows`` telling what is right, with the coverage of the objects on which that rests."""
         judged = [rows[name] for name in self.rules.value_names]
@@ -59,7 +59,7 @@ class ShareMetric(Metric[ShareCounts]):
             np.array([len(row) for row in judged], np.int64), np.array([int(row.sum()) for row in judged], np.int64)
         )
         wanted = np.isin(truth.instance, np.array([*object_ids], np.int64))
-        return score_of_masks(self.rules, counts, prediction, truth.points, wanted, warnings)
+        return score_of_masks(self, counts, prediction, truth.points, wanted, warnings)
 
 
 class RetrievalMetric(ShareMetric):
@@ -78,9 +78,9 @@ class RetrievalMetric(ShareMetric):
         rows = {kind: is_right[kinds == kind] for kind in self.rules.value_names[:4]}
         rows["all"] = is_right
         rows["reachable"] = np.array([not in_map.isdisjoint(asked.answers) for asked in truth.asked], bool)
-        warning = encoder_warning(self.rules, prediction, encoder)
+        warnings = [encoder_warning(self.rules, prediction, encoder)]
         asked_for = [answer for asked in truth.asked for answer in asked.answers]
-        return self._score(truth.scene, asked_for, prediction, rows, [warning] if warning else [])
+        return self._score(truth.scene, asked_for, prediction, rows, warnings)
 
 
 def first_instances(

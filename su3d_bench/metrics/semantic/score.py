@@ -18,7 +18,7 @@ from su3d_bench.metrics.matching.labelling import (
     encoder_warning,
     scored_classes,
 )
-from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, Values, n_predictions, present
+from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, Values, present
 from su3d_bench.metrics.protocols import ClassEntry, ProtocolRules
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, SemanticMetrics
@@ -49,15 +49,8 @@ class SemanticMetric(Metric[SemanticCounts]):
             warnings.append(
                 f"the ground truth has {names}, but no scored point does; such a class counts 0 in this scene"
             )
-        return SceneScore(
-            protocol=rules.name,
-            version=rules.version,
-            counts=semantic.per_scene(called.true_class, called.predicted, called.is_counted),
-            n_predictions=n_predictions(prediction),
-            n_scored=int(called.is_scored.sum()),
-            n_farther=transfer.n_farther(called.distance_m[called.is_scored]),
-            warnings=tuple(warning for warning in warnings if warning),
-        )
+        counts = semantic.per_scene(called.true_class, called.predicted, called.is_counted)
+        return self.score(counts, prediction, called.distance_m[called.is_scored], warnings)
 
     @property
     def sizes(self) -> dict[str, int]:
