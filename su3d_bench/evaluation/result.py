@@ -88,22 +88,21 @@ class ProtocolEvaluation:
     @property
     def n_duplicates(self) -> tuple[int, int]:
         """Pairs of masks with IoU above 0.9, and the identical ones among them, over all scenes."""
-        facts = self.facts.values()
-        return sum(len(one.near or ()) for one in facts), sum(len(one.identical) for one in facts)
+        scenes = self.facts.values()
+        return sum(len(facts.near or ()) for facts in scenes), sum(len(facts.identical) for facts in scenes)
 
     @property
     def confidences(self) -> tuple[float, float] | None:
         """The lowest and the highest confidence in the files; None where there is none."""
-        known = [one for one in self.facts.values() if one.lowest_score is not None and one.highest_score is not None]
-        lows = [one.lowest_score for one in known if one.lowest_score is not None]
-        highs = [one.highest_score for one in known if one.highest_score is not None]
-        return (min(lows), max(highs)) if known else None
+        lows = [facts.lowest_score for facts in self.facts.values() if facts.lowest_score is not None]
+        highs = [facts.highest_score for facts in self.facts.values() if facts.highest_score is not None]
+        return (min(lows), max(highs)) if lows else None
 
     @property
     def contested(self) -> float | None:
         """Of the points in masks, the share that is in several; None where no mask has a point."""
-        n_covered = sum(one.n_covered for one in self.facts.values())
-        return sum(one.n_contested for one in self.facts.values()) / n_covered if n_covered else None
+        n_covered = sum(facts.n_covered for facts in self.facts.values())
+        return sum(facts.n_contested for facts in self.facts.values()) / n_covered if n_covered else None
 
     def to_json(self) -> dict[str, Any]:
         result = self.result
@@ -153,7 +152,7 @@ class Evaluation:
             "schema": SCHEMA,
             "formats": list(self.formats),
             "ground_truth": self.ground_truth,
-            "protocols": {one.result.protocol: one.to_json() for one in self.protocols},
+            "protocols": {protocol.result.protocol: protocol.to_json() for protocol in self.protocols},
             "not_scored": dict(self.not_scored),
             "remarks": list(self.remarks),
         }
@@ -199,7 +198,7 @@ class Tally:
 
 def _form(rules: ProtocolRules, kept: SceneOutcomes, file_confidences: bool) -> ProtocolEvaluation:
     result = combine(rules, kept.scores)
-    ceilings = {scene: one for scene, one in kept.ceilings.items() if one is not None}
+    ceilings = {scene: ceiling for scene, ceiling in kept.ceilings.items() if ceiling is not None}
     is_whole = len(ceilings) == len(kept.scores)
     covered = {radius: 1.0 - share for radius, share in result.coverage.items()}
     evaluation = ProtocolEvaluation(
@@ -228,9 +227,9 @@ def _with_ones(rules: ProtocolRules, kept: SceneOutcomes) -> dict[str, float] | 
     if rules.kind != "instance" or rules.confidence != "ones":
         return None
     counts = [cast("InstanceCounts", score.counts) for score in kept.scores.values()]
-    if all((one.score == 1).all() for one in counts):
+    if all((of_scene.score == 1).all() for of_scene in counts):
         return None
-    ones = [replace(one, score=np.ones(len(one.score))) for one in counts]
+    ones = [replace(of_scene, score=np.ones(len(of_scene.score))) for of_scene in counts]
     return metric_of(rules).combine(ones)
 
 
@@ -248,8 +247,8 @@ def _scene_warnings(kept: SceneOutcomes) -> list[str]:
 
 
 def _confidence_warnings(rules: ProtocolRules, evaluation: ProtocolEvaluation, file_confidences: bool) -> list[str]:
-    found = evaluation.confidences
-    if rules.kind != "instance" or found is None:
+    confidences = evaluation.confidences
+    if rules.kind != "instance" or confidences is None:
         return []
     if evaluation.with_ones is not None:
         shown = ", ".join(f"{name} {100 * evaluation.with_ones[name]:.1f}" for name in rules.headline)
@@ -258,10 +257,14 @@ def _confidence_warnings(rules: ProtocolRules, evaluation: ProtocolEvaluation, f
             f"protocol have 1 for every mask, which gives {shown}"
         ]
     if rules.confidence == "ones" and not file_confidences:
-        differ = f"; those of the files, {found[0]:g} to {found[1]:g}, do not count" if found[0] < found[1] else ""
+        differ = (
+            f"; those of the files, {confidences[0]:g} to {confidences[1]:g}, do not count"
+            if confidences[0] < confidences[1]
+            else ""
+        )
         return [f"the protocol has 1 for every confidence{differ}: AP of a class is then recall (1 + precision) / 2"]
-    if found[0] == found[1] and sum(one.n_masks for one in evaluation.facts.values()) > 1:
-        return [f"{EVERY_CONFIDENCE} {found[0]:g}: AP of a class is then recall (1 + precision) / 2"]
+    if confidences[0] == confidences[1] and sum(facts.n_masks for facts in evaluation.facts.values()) > 1:
+        return [f"{EVERY_CONFIDENCE} {confidences[0]:g}: AP of a class is then recall (1 + precision) / 2"]
     return []
 
 
@@ -275,5 +278,5 @@ def _once(lines: Sequence[str]) -> list[str]:
 
 def _renamed(values: Mapping[str, Any]) -> dict[str, Any]:
     """Values under the names that the file has for them, without counts of classes."""
-    plain = {KEYS.get(name, name.lower().replace("-", "_")): plain_json(one) for name, one in values.items()}
-    return {name: one for name, one in plain.items() if not name.startswith("n_") and "conceptgraphs" not in name}
+    plain = {KEYS.get(name, name.lower().replace("-", "_")): plain_json(value) for name, value in values.items()}
+    return {name: value for name, value in plain.items() if not name.startswith("n_") and "conceptgraphs" not in name}

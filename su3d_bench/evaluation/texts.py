@@ -49,7 +49,7 @@ class GivenTexts:
         self.dim = given.dim
         self._given = given
         self._row_of = {name: row for row, name in enumerate(given.names)}
-        self._class_of = {text: one.name for one in rules.classes for text in rules.texts_of(one.name)}
+        self._class_of = {text: entry.name for entry in rules.classes for text in rules.texts_of(entry.name)}
 
     @property
     def digest(self) -> str:
@@ -87,10 +87,10 @@ def read_text_features(path: Path | None) -> TextFeatures | None:
     if len(set(texts)) < len(texts):
         twice = next(text for k, text in enumerate(texts) if text in texts[:k])
         raise DataError(f"{where}: '{printable(twice, 80)}' stands there twice; give each name once")
-    said = arrays.get("encoder")
-    if said is not None and (said.ndim != 0 or said.dtype.kind != "U"):
-        raise DataError(f"{where}: 'encoder' is {said.shape} {said.dtype.kind}; expected one text")
-    encoder = f"of {path.name}" if said is None else printable(str(said), 80)
+    maker = arrays.get("encoder")
+    if maker is not None and (maker.ndim != 0 or maker.dtype.kind != "U"):
+        raise DataError(f"{where}: 'encoder' is {maker.shape} {maker.dtype.kind}; expected one text")
+    encoder = f"of {path.name}" if maker is None else printable(str(maker), 80)
     return TextFeatures(path, texts, features.astype(np.float32), encoder)
 
 
@@ -130,8 +130,8 @@ def _real_encoder(name: str) -> Encoder | None:
     from su3d_bench.perception.models.inspection import model_state
 
     entry = encoder_known_as(name)
-    found = () if entry is None else model_state(entry).found
-    folder = next((files.folder for files in found if files.form.form == "transformers"), None)
+    forms = () if entry is None else model_state(entry).found
+    folder = next((files.folder for files in forms if files.form.form == "transformers"), None)
     return None if entry is None or folder is None else _loaded(entry.name, folder)
 
 

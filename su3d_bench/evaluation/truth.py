@@ -110,8 +110,8 @@ class DatasetTruths(SceneTruths):
         self._dataset = open_dataset(request.dataset or _dataset_of(sources))
         self.where = self.dataset_name = name = str(self._dataset.name)
         known = list(self._dataset.scenes())
-        asked = choose_scenes(request.scenes, known, name) if _are_all(request.scenes, known) else []
-        matches, self.remarks = match_scenes(sources, known, name, name, asked)
+        requested = choose_scenes(request.scenes, known, name) if _are_all(request.scenes, known) else []
+        matches, self.remarks = match_scenes(sources, known, name, name, requested)
         matched = [match.scene for match in matches]
         if request.scenes:
             scenes = choose_scenes(request.scenes, list(dict.fromkeys([*known, *matched])), name)
@@ -180,15 +180,15 @@ def _is_of_one_scene(path: Path) -> bool:
     return path.is_file() or (path / "prediction.npz").is_file()
 
 
-def _are_all(asked: Sequence[str], known: Sequence[str]) -> bool:
-    """Whether every one of ``asked`` names a scene of the list, and not one that is made on demand."""
-    return bool(asked) and all(word.rpartition("/")[2] in known for word in asked)
+def _are_all(words: Sequence[str], known: Sequence[str]) -> bool:
+    """Whether every one of ``words`` names a scene of the list, and not one that is made on demand."""
+    return bool(words) and all(word.rpartition("/")[2] in known for word in words)
 
 
-def choose_scenes(asked: Sequence[str], known: Sequence[str], where: str) -> list[str]:
-    """The scenes of ``known`` that names or patterns in ``asked`` mean; a dataset before a slash is passed over."""
+def choose_scenes(words: Sequence[str], known: Sequence[str], where: str) -> list[str]:
+    """The scenes of ``known`` that ``words``, names or patterns, mean; a dataset before a slash is passed over."""
     chosen: dict[str, None] = {}
-    for word in asked:
+    for word in words:
         pattern = word.rpartition("/")[2]
         matching = [scene for scene in known if fnmatch.fnmatchcase(scene, pattern)]
         if not matching:
@@ -209,8 +209,8 @@ class OpenLexTruths(SceneTruths):
         self._release = OpenLexRelease(request.ground_truth, data_root())
         self.where, self.dataset_name, known = shown(request.ground_truth), None, self._release.scenes()
         self.scenes = tuple(choose_scenes(request.scenes, known, self.where)) if request.scenes else known
-        asked = self.scenes if request.scenes else ()
-        matches, self.remarks = match_scenes(sources, known, None, self.where, asked)
+        requested = self.scenes if request.scenes else ()
+        matches, self.remarks = match_scenes(sources, known, None, self.where, requested)
         self.matches = [match for match in matches if match.scene in self.scenes]
 
     def why_not(self, rules: ProtocolRules, *, is_named: bool) -> str | None:
@@ -239,9 +239,11 @@ class TextTruths(SceneTruths):
         if request.dataset is not None:
             self.dataset_name = str(registry.load("dataset", request.dataset).name)
         left_out = set(every_file) - set(chosen)
-        sources = [replace(one, scenes=tuple(name for name in one.scenes if name not in left_out)) for one in sources]
-        asked = chosen if request.scenes else ()
-        self.matches, self.remarks = match_scenes(sources, chosen, self.dataset_name, self.where, asked)
+        sources = [
+            replace(source, scenes=tuple(name for name in source.scenes if name not in left_out)) for source in sources
+        ]
+        requested = chosen if request.scenes else ()
+        self.matches, self.remarks = match_scenes(sources, chosen, self.dataset_name, self.where, requested)
         self._values = {match.scene: read_values(self._files[match.scene]) for match in self.matches}
         largest = max((int(values.max(initial=0)) for values in self._values.values()), default=0)
         self._has_instances = largest > LARGEST_LABEL
@@ -324,5 +326,7 @@ def dataset_of_names(scenes: Iterable[str]) -> str | None:
     ('scannet', None)
     """
     names = list(scenes)
-    fitting = [one for one, form in SCENE_NAMES.items() if names and all(form.fullmatch(name) for name in names)]
+    fitting = [
+        dataset for dataset, form in SCENE_NAMES.items() if names and all(form.fullmatch(name) for name in names)
+    ]
     return fitting[0] if fitting else None

@@ -39,7 +39,7 @@ def read_rows(path: Path, n_columns: int, where: str) -> Float32Array:
 
 def largest_column(path: Path, n_columns: int, where: str) -> Int32Array:
     """The column (N,) of the first maximum of each row; a row of zeros gives 0, a NaN is a ``DataError``."""
-    found: list[Int32Array] = []
+    columns: list[Int32Array] = []
     n_rows = 0
     for block in row_blocks(path, n_columns, where):
         best = block.argmax(axis=1)
@@ -48,9 +48,9 @@ def largest_column(path: Path, n_columns: int, where: str) -> Int32Array:
         if is_nan.any():
             row = n_rows + int(np.flatnonzero(is_nan)[0])
             raise DataError(f"{where}: row {row} holds NaN; copy the file again")
-        found.append(best.astype(np.int32))
+        columns.append(best.astype(np.int32))
         n_rows += len(block)
-    return np.concatenate([np.zeros(0, np.int32), *found])
+    return np.concatenate([np.zeros(0, np.int32), *columns])
 
 
 def n_columns_of(path: Path, where: str) -> int:
@@ -116,7 +116,7 @@ def _check_form(table: Any, n_columns: int, file_bytes: int, where: str) -> None
             f"{file_bytes}; it is cut short or damaged"
         )
     if chunks is not None:
-        chunk_bytes = int(np.prod([int(one) for one in chunks], dtype=object)) * dtype.itemsize
+        chunk_bytes = int(np.prod([int(side) for side in chunks], dtype=object)) * dtype.itemsize
         if len(chunks) != 2 or not 0 < chunk_bytes <= MOST_CHUNK_BYTES:
             raise DataError(
                 f"{where}: is stored in chunks of {str(chunks)[:60]}; expected at most {MOST_CHUNK_BYTES} bytes each"
@@ -132,8 +132,8 @@ def _check_form(table: Any, n_columns: int, file_bytes: int, where: str) -> None
 def _filters(table: Any) -> list[tuple[int, tuple[int, ...]]]:
     """Code and parameters of each filter, in the order in which they were applied."""
     pipeline = table.id.get_create_plist()
-    found = [pipeline.get_filter(index) for index in range(pipeline.get_nfilters())]
-    return [(int(code), tuple(values)) for code, _, values, _ in found]
+    filters = [pipeline.get_filter(index) for index in range(pipeline.get_nfilters())]
+    return [(int(code), tuple(values)) for code, _, values, _ in filters]
 
 
 def _chunked_blocks(table: Any, where: str) -> Iterator[FloatArray]:

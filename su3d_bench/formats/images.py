@@ -32,11 +32,11 @@ PORTABLE_MAP = re.compile(rb"(P[56])\s+(?:#[^\n]*\s+)*(\d{1,6})\s+(\d{1,6})\s+(\
 def read_bytes(path: Path, where: str, advice: str = "copy the file again") -> bytes:
     """The content of a file; ``advice`` says what to do where it is missing."""
     try:
-        found = path.stat()
-        if not stat.S_ISREG(found.st_mode):
+        status = path.stat()
+        if not stat.S_ISREG(status.st_mode):
             raise DataError(f"{where} is not a file; {advice}")
-        if found.st_size > MAX_BYTES:
-            raise DataError(f"{where} has {found.st_size} bytes; expected an image of at most {MAX_BYTES}")
+        if status.st_size > MAX_BYTES:
+            raise DataError(f"{where} has {status.st_size} bytes; expected an image of at most {MAX_BYTES}")
         return path.read_bytes()
     except FileNotFoundError as error:
         raise DataError(f"{where} is missing; {advice}") from error
@@ -103,10 +103,10 @@ def sized_depth(content: bytes, size: tuple[int, int], where: str, reason: str) 
     return values
 
 
-def _check_size(found: tuple[int, int] | None, size: tuple[int, int], where: str, reason: str) -> None:
+def _check_size(actual: tuple[int, int] | None, size: tuple[int, int], where: str, reason: str) -> None:
     """Nothing where no size was found: the decoder says what is wrong with such an image."""
-    if found is not None and found != size:
-        raise DataError(f"{where} is {found[0]}x{found[1]}; expected {size[0]}x{size[1]}, {reason}")
+    if actual is not None and actual != size:
+        raise DataError(f"{where} is {actual[0]}x{actual[1]}; expected {size[0]}x{size[1]}, {reason}")
 
 
 def _portable_map(content: bytes, magic: bytes, where: str) -> NDArray[Any]:

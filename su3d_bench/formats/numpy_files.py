@@ -93,15 +93,15 @@ def npy_header(content: bytes) -> NpyHeader | None:
     width = 2 if content[6] == 1 else 4
     start = 8 + width + int.from_bytes(content[8 : 8 + width], "little")
     text = content[8 + width : start]
-    found = DESCR.search(text), ORDER.search(text), SHAPE.search(text)
-    if start > min(len(content), MOST_HEADER) or found[0] is None or found[1] is None or found[2] is None:
+    matches = DESCR.search(text), ORDER.search(text), SHAPE.search(text)
+    if start > min(len(content), MOST_HEADER) or matches[0] is None or matches[1] is None or matches[2] is None:
         return None
-    code = found[0][1].decode("latin1")
-    sizes = SIZE.findall(found[2][1])
+    code = matches[0][1].decode("latin1")
+    sizes = SIZE.findall(matches[2][1])
     is_odd = len(sizes) > MOST_DIMENSIONS or any(len(size) > MOST_DIGITS for size in sizes)
     if SIMPLE_TYPE.fullmatch(code) is None or is_odd:
         return None
-    return NpyHeader(code, found[1][1] == b"True", tuple(map(int, sizes)), start)
+    return NpyHeader(code, matches[1][1] == b"True", tuple(map(int, sizes)), start)
 
 
 def npy_header_of(path: Path) -> NpyHeader | None:

@@ -65,15 +65,15 @@ def read_pcd_points(path: Path, where: str | None = None) -> Float64Array:
         content = path.read_bytes()
     header = read_header(content, where)
     axes = [next((field for field in header.fields if field.name == axis), None) for axis in AXES]
-    found = [field for field in axes if field is not None and field.count == 1]
-    if len(found) != len(AXES):
+    coordinates = [field for field in axes if field is not None and field.count == 1]
+    if len(coordinates) != len(AXES):
         names = printable(", ".join(field.name for field in header.fields), 120)
         raise DataError(f"{where}: has the fields {names}; expected x, y and z, one value each")
     if header.form == "ascii":
-        return _text_points(content, header, found, where)
+        return _text_points(content, header, coordinates, where)
     if header.form == "binary":
-        return _binary_points(content, header, found, where)
-    return _compressed_points(content, header, found, where)
+        return _binary_points(content, header, coordinates, where)
+    return _compressed_points(content, header, coordinates, where)
 
 
 def read_header(content: bytes, where: str) -> Header:

@@ -103,7 +103,7 @@ def read_ply(path: Path, where: str | None = None) -> PlyFile:
 def _read_element(promise: Promise, body: Body, at: int, where: str) -> tuple[PlyElement, int]:
     """The element whose first row is at ``at``, and where the next element begins."""
     where = f"{where}: element '{clip(promise.name)}'"
-    smallest = sum(body.size(one.count_type or one.type) for one in promise.properties)
+    smallest = sum(body.size(column.count_type or column.type) for column in promise.properties)
     if promise.n_rows * smallest > body.n_units - at:
         raise DataError(
             f"{where}: the header promises {promise.n_rows} rows of {smallest} or more {body.unit}, but only "
@@ -119,42 +119,46 @@ def _equal_columns(promise: Promise, body: Body, at: int) -> tuple[dict[str, Col
     """The columns where each list is in all rows as long as in the first; None where one is not or a value is unfit."""
     columns: dict[str, Column] = {}
     n, lengths = promise.n_rows, _first_lengths(promise, body, at)
-    stride = sum(_n_units(one, body, length) for one, length in zip(promise.properties, lengths, strict=False))
+    stride = sum(_n_units(column, body, length) for column, length in zip(promise.properties, lengths, strict=False))
     if len(lengths) < len(promise.properties) or n * stride > body.n_units - at:
         return None
     offset = at
     try:
-        for one, length in zip(promise.properties, lengths, strict=True):
-            if one.count_type is None:
-                columns[one.name] = body.strided(offset, stride, n, 1, one.type)[:, 0]
-            elif (body.strided(offset, stride, n, 1, one.count_type) != length).any():
+        for column, length in zip(promise.properties, lengths, strict=True):
+            if column.count_type is None:
+                columns[column.name] = body.strided(offset, stride, n, 1, column.type)[:, 0]
+            elif (body.strided(offset, stride, n, 1, column.count_type) != length).any():
                 return None
             else:
-                values = body.strided(offset + body.size(one.count_type), stride, n, length, one.type)
-                columns[one.name] = ListColumn(np.arange(n + 1) * length, values.reshape(-1), one.count_type)
-            offset += _n_units(one, body, length)
+                values = body.strided(offset + body.size(column.count_type), stride, n, length, column.type)
+                columns[column.name] = ListColumn(np.arange(n + 1) * length, values.reshape(-1), column.count_type)
+            offset += _n_units(column, body, length)
     except UnfitValueError:
         return None
     return columns, at + n * stride
 
 
-def _n_units(one: Property, body: Body, length: int) -> int:
+def _n_units(column: Property, body: Body, length: int) -> int:
     """Units that a property takes up in a row, a list of ``length`` items."""
-    return body.size(one.type) if one.count_type is None else body.size(one.count_type) + length * body.size(one.type)
+    return (
+        body.size(column.type)
+        if column.count_type is None
+        else body.size(column.count_type) + length * body.size(column.type)
+    )
 
 
 def _first_lengths(promise: Promise, body: Body, at: int) -> list[int]:
     """Items of each list (0 for scalars) in the row at ``at``; fewer entries where they cannot be read."""
     lengths: list[int] = []
-    for one in promise.properties:
+    for column in promise.properties:
         length = 0
-        if one.count_type is not None and promise.n_rows > 0:
-            is_there = at + body.size(one.count_type) <= body.n_units
-            length = body.count(at, one.count_type) if is_there else -1
+        if column.count_type is not None and promise.n_rows > 0:
+            is_there = at + body.size(column.count_type) <= body.n_units
+            length = body.count(at, column.count_type) if is_there else -1
         if length < 0:
             break
         lengths.append(length)
-        at += _n_units(one, body, length)
+        at += _n_units(column, body, length)
     return lengths
 
 
@@ -162,23 +166,23 @@ def _walked_columns(promise: Promise, body: Body, at: int, where: str) -> tuple[
     """The columns of rows that differ in size, found by going through them one by one."""
     starts, lengths, end = _walk(promise, body, at, where)
     columns: dict[str, Column] = {}
-    for one, n_items in zip(promise.properties, lengths, strict=True):
+    for column, n_items in zip(promise.properties, lengths, strict=True):
         try:
-            if one.count_type is None:
+            if column.count_type is None:
                 indptr = np.arange(promise.n_rows + 1)
-                columns[one.name] = body.gathered(starts, one.type)
-                starts = starts + body.size(one.type)
+                columns[column.name] = body.gathered(starts, column.type)
+                starts = starts + body.size(column.type)
                 continue
             indptr = np.concatenate([[0], np.cumsum(n_items)])
-            starts = starts + body.size(one.count_type)
-            step = body.size(one.type)
+            starts = starts + body.size(column.count_type)
+            step = body.size(column.type)
             items = np.repeat(starts - indptr[:-1] * step, n_items) + np.arange(indptr[-1]) * step
-            columns[one.name] = ListColumn(indptr, body.gathered(items, one.type), one.count_type)
+            columns[column.name] = ListColumn(indptr, body.gathered(items, column.type), column.count_type)
             starts = starts + n_items * step
         except UnfitValueError as error:
             row = int(np.searchsorted(indptr, error.index, side="right")) - 1
             raise DataError(
-                f"{where} row {row}: '{clip(one.name)}' is {error}, which {one.type} cannot hold"
+                f"{where} row {row}: '{clip(column.name)}' is {error}, which {column.type} cannot hold"
             ) from error
     return columns, end
 
@@ -187,17 +191,19 @@ def _walk(promise: Promise, body: Body, at: int, where: str) -> tuple[Int64Array
     """Where each row begins, the list lengths of each property (none for scalars), and where the last row ends."""
     starts = array("q")
     lengths = [array("q") for _ in promise.properties]
-    sizes = [body.size(one.type) for one in promise.properties]
+    sizes = [body.size(column.type) for column in promise.properties]
     for row in range(promise.n_rows):
         starts.append(at)
-        for one, size, known in zip(promise.properties, sizes, lengths, strict=True):
-            if one.count_type is None:
+        for column, size, known in zip(promise.properties, sizes, lengths, strict=True):
+            if column.count_type is None:
                 at += size
                 continue
-            behind = at + body.size(one.count_type)
-            length = body.count(at, one.count_type) if behind <= body.n_units else 0
+            behind = at + body.size(column.count_type)
+            length = body.count(at, column.count_type) if behind <= body.n_units else 0
             if length < 0:
-                raise DataError(f"{where} row {row}: list '{clip(one.name)}' has no valid length; the file is damaged")
+                raise DataError(
+                    f"{where} row {row}: list '{clip(column.name)}' has no valid length; the file is damaged"
+                )
             known.append(length)
             at = behind + length * size
         if at > body.n_units:

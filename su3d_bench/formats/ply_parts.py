@@ -92,7 +92,7 @@ def _known_format(words: Sequence[str], where: str) -> str:
 def _read_promise(words: Sequence[str], elements: list[Promise], where: str, line: str) -> None:
     """Add what one ``element`` or ``property`` line promises to ``elements``."""
     match words:
-        case ["element", name, count] if _COUNT.fullmatch(count) and all(name != one.name for one in elements):
+        case ["element", name, count] if _COUNT.fullmatch(count) and all(name != known.name for known in elements):
             elements.append(Promise(name, int(count), []))
             return
         case ["property", kind, name] if kind in TYPES and elements:
@@ -103,7 +103,7 @@ def _read_promise(words: Sequence[str], elements: list[Promise], where: str, lin
             raise DataError(f"{where}: header line '{clip(line)}' is not PLY; the file is damaged")
     if new.count_type is not None and new.count_type.kind == "f":
         raise DataError(f"{where}: list '{clip(new.name)}' counts its items in '{words[2]}'; expected an integer type")
-    if any(new.name == one.name for one in elements[-1].properties):
+    if any(new.name == known.name for known in elements[-1].properties):
         raise DataError(f"{where}: property '{clip(new.name)}' of '{clip(elements[-1].name)}' stands there twice")
     elements[-1].properties.append(new)
 

@@ -161,7 +161,7 @@ class _Storages:
         if name not in self._found:
             content = read_member(self._archive, f"{self._prefix}data/{name}", str(self._path))
             self._found[name] = content
-            if sum(len(one) for one in self._found.values()) > self._n_file:
+            if sum(len(content) for content in self._found.values()) > self._n_file:
                 raise RefusedError("its storages are larger than the file; torch.save does not compress them")
         code = CODES.get(key[1].name.removesuffix("Storage"))
         content = self._found[name]
@@ -191,7 +191,7 @@ def _view(storage: Storage, code: str, place: tuple[object, ...]) -> NDArray[Any
         raise RefusedError("a tensor without a valid place in its storage")
     width = int(code[-1])
     n_stored = len(storage.content) // width
-    end = offset + sum((one - 1) * stride for one, stride in zip(size, strides, strict=True)) + 1
+    end = offset + sum((n_items - 1) * stride for n_items, stride in zip(size, strides, strict=True)) + 1
     if n and (end > n_stored or n > n_stored):
         raise RefusedError(f"a tensor of shape {size} lies beyond the {n_stored} values of its storage")
     if not n:

@@ -245,8 +245,8 @@ class SceneFolders(Reader):
         return named_once([(self.scene_of(folder, path), folder) for folder in self._folders(path)], path)
 
     def _folders(self, path: Path) -> list[Path]:
-        found = first_found(path, ["*/" * n + self.first for n in range(self.n_above + 1)])
-        return [file.parent for file in found if (file.parent / self.second).exists()]
+        files = first_found(path, ["*/" * n + self.first for n in range(self.n_above + 1)])
+        return [file.parent for file in files if (file.parent / self.second).exists()]
 
     @abstractmethod
     def scene_of(self, folder: Path, path: Path) -> str:
@@ -257,27 +257,27 @@ def scene_files(path: Path, suffixes: Sequence[str]) -> dict[str, Path]:
     """The files with one of ``suffixes`` in a folder by their names without it, in alphabetical order; or one file."""
     with reading(shown(path)):
         files = [path] if path.is_file() else sorted(file for file in path.iterdir() if file.is_file())
-    found = {}
+    of_scene = {}
     for file in files:
-        suffix = next((one for one in suffixes if file.name.endswith(one) and file.name != one), None)
+        suffix = next((suffix for suffix in suffixes if file.name.endswith(suffix) and file.name != suffix), None)
         if suffix is not None and not file.name.startswith("."):
-            found[file.name.removesuffix(suffix)] = file
-    return found
+            of_scene[file.name.removesuffix(suffix)] = file
+    return of_scene
 
 
 def first_found(path: Path, patterns: Sequence[str]) -> list[Path]:
     """What the first of ``patterns`` that matches anything below ``path`` matches, in alphabetical order."""
     with reading(shown(path)):
-        return next((found for pattern in patterns if (found := sorted(path.glob(pattern)))), [])
+        return next((matches for pattern in patterns if (matches := sorted(path.glob(pattern)))), [])
 
 
 def named_once(pairs: Sequence[tuple[str, Path]], path: Path) -> Mapping[str, Path]:
     """``pairs`` as a table; ``PredictionError`` where two paths claim one scene."""
     table: dict[str, Path] = {}
-    for name, found in pairs:
-        if table.setdefault(name, found) != found:
+    for name, place in pairs:
+        if table.setdefault(name, place) != place:
             raise PredictionError(
-                f"{printable(str(path), 120)}: {printable(str(table[name]), 120)} and {printable(str(found), 120)} are "
+                f"{printable(str(path), 120)}: {printable(str(table[name]), 120)} and {printable(str(place), 120)} are "
                 f"both of scene '{printable(name, 80)}'; give one of them"
             )
     return table

@@ -40,7 +40,7 @@ class ConceptGraphs(Reader):
     def scenes(self, path: Path) -> Mapping[str, Path]:
         if path.is_file():
             return {_scene_of(path): path}
-        return named_once([(_scene_of(one), one.parent) for one in _maps(path)], path)
+        return named_once([(_scene_of(file), file.parent) for file in _maps(path)], path)
 
     def read_scene(self, place: Path, scene: str) -> ScenePrediction:
         file, remarks = (place, []) if place.is_file() else _chosen(place)
@@ -57,7 +57,7 @@ def _maps(path: Path) -> list[Path]:
     """The map files of one scene or several, at whatever level of the layout ``path`` is."""
     full = [f"{above}{FULL}" for above in ("", "pcd_saves/", "*/pcd_saves/")]
     streamlined = [f"{above}{STREAMLINED}" for above in ("", "*/", "exps/*/", "*/exps/*/")]
-    return [one for one in first_found(path, [*full, *streamlined]) if one.is_file()]
+    return [file for file in first_found(path, [*full, *streamlined]) if file.is_file()]
 
 
 def _scene_of(file: Path) -> str:
@@ -86,7 +86,7 @@ def _class_names(value: object) -> tuple[str, ...]:
     texts = value.tolist() if isinstance(value, np.ndarray) and value.dtype.kind == "U" else value
     if not isinstance(texts, list | tuple):
         return ()
-    return tuple(printable(one[:MOST_TEXT], 80) if isinstance(one, str) else "" for one in texts[:MOST_MASKS])
+    return tuple(printable(text[:MOST_TEXT], 80) if isinstance(text, str) else "" for text in texts[:MOST_MASKS])
 
 
 def _instances(
@@ -101,13 +101,13 @@ def _instances(
     if len(everything) > MOST_MASKS:
         raise PredictionError(f"{where}: holds {len(everything)} objects; is it damaged?")
     clouds, names, captions = [], [], []
-    for k, one in enumerate(everything):
+    for k, entry in enumerate(everything):
         at = f"{where}: object {k}"
-        if not isinstance(one, dict) or "pcd_np" not in one:
-            raise PredictionError(f"{at}: is {kind_of(one)} without 'pcd_np'; expected an object of ConceptGraphs")
-        clouds.append(checked_points(one["pcd_np"], at))
-        names.append(_name(one, _majority(one.get("class_id")), class_names))
-        caption = one.get("consolidated_caption")
+        if not isinstance(entry, dict) or "pcd_np" not in entry:
+            raise PredictionError(f"{at}: is {kind_of(entry)} without 'pcd_np'; expected an object of ConceptGraphs")
+        clouds.append(checked_points(entry["pcd_np"], at))
+        names.append(_name(entry, _majority(entry.get("class_id")), class_names))
+        caption = entry.get("consolidated_caption")
         captions.append(printable(caption[:MOST_TEXT], MOST_TEXT) if isinstance(caption, str) else "")
     features, remarks = _features(objects, where)
     if features is not None and any(name != NAME_OF_NONE for name in names[: len(objects)]):
@@ -138,8 +138,8 @@ def _instances(
 def _rows_like(background: Sequence[Mapping[str, Any]], n: int) -> Float32Array:
     """The features (K, n) of background objects, zeros where one has none of that length; labels come before them."""
     rows = np.zeros((len(background), n), np.float32)
-    for k, one in enumerate(background):
-        row = one.get("clip_ft")
+    for k, entry in enumerate(background):
+        row = entry.get("clip_ft")
         if isinstance(row, np.ndarray) and row.shape == (n,) and row.dtype.kind == "f" and np.isfinite(row).all():
             with np.errstate(over="ignore"):
                 rows[k] = row
@@ -152,29 +152,31 @@ def _majority(value: object) -> int | None:
     numbers = value.tolist() if isinstance(value, np.ndarray) and value.ndim == 1 else value
     if not isinstance(numbers, list | tuple):
         return None
-    whole = [int(one) for one in numbers if isinstance(one, int | np.integer) and abs(int(one)) < 1 << 31]
+    whole = [int(number) for number in numbers if isinstance(number, int | np.integer) and abs(int(number)) < 1 << 31]
     if not whole:
         return None
     values, counts = np.unique(np.array(whole, np.int64), return_counts=True)
     return int(values[np.argmax(counts)])
 
 
-def _name(one: Mapping[str, Any], number: int | None, class_names: Sequence[str]) -> str:
+def _name(entry: Mapping[str, Any], number: int | None, class_names: Sequence[str]) -> str:
     """The name of class ``number``, else what the object says itself."""
     if number is not None and 0 <= number < len(class_names) and class_names[number]:
         return class_names[number]
-    said = one.get("class_name")
-    said = said[0] if isinstance(said, list) and said else said
-    return printable(said[:MOST_TEXT], 80) if isinstance(said, str) and said.strip() else NAME_OF_NONE
+    name = entry.get("class_name")
+    name = name[0] if isinstance(name, list) and name else name
+    return printable(name[:MOST_TEXT], 80) if isinstance(name, str) and name.strip() else NAME_OF_NONE
 
 
 def _features(objects: Sequence[Mapping[str, Any]], where: str) -> tuple[Float32Array | None, list[str]]:
     """The features (K, D) of the objects; None where no object has one."""
-    found = [one.get("clip_ft") for one in objects]
-    if not any(one is not None for one in found):
-        return None, ["the objects have no 'clip_ft': the names of their detections decide their classes"] * bool(found)
+    rows_of_file = [entry.get("clip_ft") for entry in objects]
+    if not any(entry is not None for entry in rows_of_file):
+        return None, ["the objects have no 'clip_ft': the names of their detections decide their classes"] * bool(
+            rows_of_file
+        )
     rows: list[Float32Array] = []
-    for k, row in enumerate(found):
+    for k, row in enumerate(rows_of_file):
         is_row = isinstance(row, np.ndarray) and row.ndim == 1 and row.dtype.kind == "f" and row.size > 0
         if not isinstance(row, np.ndarray) or not is_row or (rows and row.shape != rows[0].shape):
             beside = f" of {len(rows[0])} numbers, as object 0 has" if rows else ""
@@ -189,4 +191,4 @@ def _background(value: object, where: str) -> list[Any]:
     """Walls, floor and ceiling, which the Detect variant keeps apart; a class that was never seen is None there."""
     if value is not None and not isinstance(value, list):
         raise PredictionError(f"{where}: 'bg_objects' is {kind_of(value)}; expected a list")
-    return [one for one in value or () if one is not None]
+    return [entry for entry in value or () if entry is not None]

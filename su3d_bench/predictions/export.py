@@ -198,8 +198,8 @@ def masks_on_truth(
     if isinstance(content, VertexMasks) and content.class_numbers is not None:
         return LabelledMasks(moved, len(truth.points), content.class_ids(rules), scores, remarks)
     class_ids = named_classes(rules, truth.semantic, named, encoder)
-    if (told := encoder_warning(rules, named, encoder)) is not None:
-        remarks = (*remarks, told)
+    if (warning := encoder_warning(rules, named, encoder)) is not None:
+        remarks = (*remarks, warning)
     return LabelledMasks(moved, len(truth.points), class_ids, scores, remarks)
 
 

@@ -34,11 +34,6 @@ _ALL: tuple[Reader, ...] = (
 READERS: dict[str, Reader] = {reader.name: reader for reader in _ALL}
 
 
-def format_names() -> tuple[str, ...]:
-    """Every format, in the order of the lists."""
-    return tuple(READERS)
-
-
 def recognise(path: Path, format: str | None = None) -> Reader:
     """The reader for ``path``: the one that ``format`` names, otherwise the only one that knows the path as its own.
 

@@ -34,7 +34,7 @@ class Gradslam(SceneFolders):
     def scene_of(self, folder: Path, path: Path) -> str:
         """The first name upwards that is no folder of the map's own."""
         absolute = folder.absolute()
-        names = [one.name for one in (absolute, *absolute.parents) if one.name not in FOLDERS_OF_A_MAP]
+        names = [above.name for above in (absolute, *absolute.parents) if above.name not in FOLDERS_OF_A_MAP]
         return names[0] or "scene"
 
     def read_scene(self, place: Path, scene: str) -> ScenePrediction:
@@ -53,7 +53,7 @@ class Gradslam(SceneFolders):
 
 def _in_world(points: Float32Array, folder: Path) -> tuple[Float32Array, str]:
     """``points`` moved by the first pose beside them, or as they are; and the remark that says so."""
-    file = next((one for name in POSE_FILES if (one := folder / name).is_file()), None)
+    file = next((candidate for name in POSE_FILES if (candidate := folder / name).is_file()), None)
     if file is None:
         return points, (
             "points are taken as they are; gradslam leaves them in the frame of the first camera: to bring them to the "

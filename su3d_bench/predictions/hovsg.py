@@ -67,10 +67,10 @@ def read_cloud(file: Path) -> np.ndarray:
         vertices = read_ply(file, where).element("vertex")
     columns = {} if vertices is None else vertices.columns
     axes = [columns.get(axis) for axis in "xyz"]
-    found = [axis for axis in axes if isinstance(axis, np.ndarray)]
-    if len(found) != len(axes):
+    coordinates = [axis for axis in axes if isinstance(axis, np.ndarray)]
+    if len(coordinates) != len(axes):
         raise PredictionError(f"{where}: its vertices have no x, y and z; expected a cloud of points")
-    return np.stack([axis.astype(np.float64) for axis in found], axis=1)
+    return np.stack([axis.astype(np.float64) for axis in coordinates], axis=1)
 
 
 def _object_files(folder: Path) -> dict[int, Path]:

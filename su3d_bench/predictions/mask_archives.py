@@ -82,7 +82,9 @@ class Open3dis(TorchFiles):
         if not isinstance(value, dict) or "ins" not in value:
             raise PredictionError(f"{where}: holds {kind_of(value)} without 'ins'; expected a dict of Open3DIS")
         scores, classes = value.get("conf"), value.get("final_class")
-        n_known = next((len(one) for one in (classes, scores) if isinstance(one, np.ndarray) and one.ndim == 1), None)
+        n_known = next(
+            (len(column) for column in (classes, scores) if isinstance(column, np.ndarray) and column.ndim == 1), None
+        )
         members, n_points = _instances(value["ins"], n_known, where)
         remarks = [NO_SCORES if scores is None else "Open3DIS's own evaluator puts 1 for every confidence"]
         if classes is None:
@@ -107,13 +109,13 @@ def _instances(value: object, n_known: int | None, where: str) -> tuple[list[Int
         raise PredictionError(f"{where}: 'ins' is {kind_of(value)}; expected a list of run lengths or a tensor")
     members: list[Int32Array] = []
     length = None
-    for k, one in enumerate(value):
-        if not isinstance(one, dict) or "length" not in one or "counts" not in one:
-            raise PredictionError(f"{where}: mask {k} is {kind_of(one)}; expected a dict of length and counts")
-        members.append(run_members(one["length"], one["counts"], f"{where}: mask {k}"))
-        if length not in {None, int(one["length"])}:
-            raise PredictionError(f"{where}: mask {k} is of {one['length']} points, mask 0 of {length}")
-        length = int(one["length"])
+    for k, mask in enumerate(value):
+        if not isinstance(mask, dict) or "length" not in mask or "counts" not in mask:
+            raise PredictionError(f"{where}: mask {k} is {kind_of(mask)}; expected a dict of length and counts")
+        members.append(run_members(mask["length"], mask["counts"], f"{where}: mask {k}"))
+        if length not in {None, int(mask["length"])}:
+            raise PredictionError(f"{where}: mask {k} is of {mask['length']} points, mask 0 of {length}")
+        length = int(mask["length"])
     return members, length
 
 

@@ -40,7 +40,7 @@ class OpenMask3d(TorchFiles):
 
 def _features(folder: Path, scene: str, n_masks: int) -> tuple[Float32Array | None, tuple[str, ...]]:
     """The features (masks, D) that lie beside the masks, as they are; a row with NaN is one without a feature."""
-    file = next((one for end in FEATURES_SUFFIXES if (one := folder / f"{scene}{end}").is_file()), None)
+    file = next((candidate for end in FEATURES_SUFFIXES if (candidate := folder / f"{scene}{end}").is_file()), None)
     if file is None:
         return None, (f"no '{scene}{FEATURES_SUFFIXES[0]}' lies beside the masks: they have no features",)
     values = read_npy(file)

@@ -93,17 +93,17 @@ def _files(path: Path) -> dict[str, Path]:
     """
     if path.is_file():
         return {_scene_of(path): path} if path.suffix == ".npz" else {}
-    above, found = next(
+    above, files = next(
         ((above, files) for above in ("scenes/*/", "*/", "") if (files := sorted(path.glob(f"{above}*/{FILE}")))),
         ("", sorted(path.glob(FILE))),
     )
-    methods = sorted({file.parent.name for file in found})
+    methods = sorted({file.parent.name for file in files})
     if len(methods) > 1:
         raise PredictionError(
             f"{shown(path)}: holds predictions of {len(methods)} methods ({printable(', '.join(methods), 120)}); "
             f"give the folders of one: {shown(path)}/{above}{printable(methods[0], 60)}"
         )
-    return {_scene_of(file): file for file in found}
+    return {_scene_of(file): file for file in files}
 
 
 def _scene_of(file: Path) -> str:

@@ -50,12 +50,12 @@ def open_sources(paths: Sequence[Path], format: str | None) -> list[Source]:
 
 
 def match_scenes(
-    sources: Sequence[Source], known: Sequence[str], dataset: str | None, where: str, asked: Sequence[str] = ()
+    sources: Sequence[Source], known: Sequence[str], dataset: str | None, where: str, requested: Sequence[str] = ()
 ) -> tuple[list[Match], list[str]]:
     """The prediction of each scene of ``known`` that has one, in that order, and remarks.
 
     Names agree when they are equal without case, ``_`` and ``-``; otherwise the only name that goes on after the
-    scene's is taken, and said. A single prediction is that of the single scene that was ``asked`` for, whatever its
+    scene's is taken, and said. A single prediction is that of the single scene that was ``requested``, whatever its
     name. Raises ``PredictionError`` where several fit or one fits no scene.
     """
     names = {name: source for source in sources for name in source.scenes}
@@ -63,14 +63,14 @@ def match_scenes(
         twice = next(n for k, s in enumerate(sources) for n in s.scenes if any(n in t.scenes for t in sources[:k]))
         raise PredictionError(f"scene '{printable(twice, 80)}' is predicted in several of the paths; give each once")
     foreign = [
-        name for name, one in names.items() if dataset is not None and one.dataset_of(name) not in {None, dataset}
+        name for name, source in names.items() if dataset is not None and source.dataset_of(name) not in {None, dataset}
     ]
     remarks = [f"left out, of another dataset: {printable(', '.join(foreign), 200)}"] if foreign else []
     own = {name: _plain(name.rpartition("/")[2]) for name in names if name not in foreign}
-    if len(asked) == 1 and len(own) == 1 and not _is_known(next(iter(own)), known):
+    if len(requested) == 1 and len(own) == 1 and not _is_known(next(iter(own)), known):
         name = next(iter(own))
-        said = f"{asked[0]}: the prediction '{printable(name, 80)}' is taken for it, as the only one"
-        return [Match(asked[0], name, names[name])], [*remarks, said]
+        remark = f"{requested[0]}: the prediction '{printable(name, 80)}' is taken for it, as the only one"
+        return [Match(requested[0], name, names[name])], [*remarks, remark]
     taken: dict[str, list[str]] = {}
     for name, plain in own.items():
         taken.setdefault(_scene_of(name, plain, known, where), []).append(name)

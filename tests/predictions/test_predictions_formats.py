@@ -39,7 +39,7 @@ from su3d_bench.formats.arrays import run_members
 from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file
 from su3d_bench.predictions.base import ScenePrediction, VertexLabels, VertexMasks
-from su3d_bench.predictions.formats import READERS, format_names, recognise
+from su3d_bench.predictions.formats import READERS, recognise
 from su3d_bench.store.predictions import write_prediction
 
 MASK_CASES = sorted(p.stem for kind in ("inst", "replica", "scannet200") for p in CASES.glob(f"{kind}*.npz"))
@@ -294,14 +294,14 @@ def test_our_own_run_folders_and_files_are_read(tmp_path: Path) -> None:
 def test_each_format_is_recognised_as_itself_alone(tmp_path: Path, format: str) -> None:
     folder = written_in(tmp_path, format)
     assert recognise(folder).name == format
-    assert [name for name in format_names() if READERS[name].recognise(folder) is not None] == [format]
+    assert [name for name in READERS if READERS[name].recognise(folder) is not None] == [format]
     (file,) = recognise(folder).scenes(folder).values()
     assert recognise(file).name == format
     assert recognise(folder, format).name == format
 
 
 def test_every_format_has_a_name_and_one_line(tmp_path: Path) -> None:
-    assert set(OURS) <= set(format_names())
+    assert set(OURS) <= set(READERS)
     for name, reader in READERS.items():
         assert reader.name == name and "\n" not in reader.summary and len(reader.summary) < 120
 
