@@ -79,7 +79,7 @@ def test_a_sheet_is_answered_by_keyboard_kept_over_a_reload_and_exported(tmp_pat
     assert shown(browser) == "2 of 4 answered, item 3 of 4"
     browser.press("ArrowLeft", "ArrowLeft", "2", "n")
     assert shown(browser) == "2 of 4 answered, item 3 of 4"
-    browser.open(page)
+    browser.reload()
     assert shown(browser) == "2 of 4 answered, item 3 of 4"
     browser.press("u", "1", "n", "3", "1", "9", "x")
     assert shown(browser) == "4 of 4 answered, item 4 of 4"

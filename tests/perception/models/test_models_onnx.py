@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Mapping
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -26,9 +27,10 @@ from su3d_bench.perception.models.onnx import export as onnx_export
 from su3d_bench.perception.models.onnx.export import Parity, compare_outputs, export_onnx, measure_parity
 from su3d_bench.perception.models.onnx.session import Provider, open_session
 
-torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'su3d-bench[models]'")
-pytest.importorskip("transformers", reason="transformers is not installed: pip install 'su3d-bench[models]'")
-pytest.importorskip("onnx", reason="onnx is not installed: pip install 'su3d-bench[models]'")
+pytestmark = pytest.mark.skipif(
+    any(find_spec(name) is None for name in ("torch", "transformers", "onnx")),
+    reason="torch, transformers and onnx are not installed: pip install 'su3d-bench[models]'",
+)
 
 TEXTS = ("chair", "a red cup on the table", "tv-screen")
 
@@ -140,17 +142,25 @@ def test_an_encoder_that_was_not_exported_is_one_line_with_the_command(folder: P
 # ---- the exporter itself
 
 
-class _Affine(torch.nn.Module):  # type: ignore[misc, name-defined, unused-ignore]
-    def __init__(self) -> None:
-        super().__init__()
-        self.layer = torch.nn.Linear(64, 32)  # 8 kB: weights below 1 kB stay in the model's own file
+def _affine() -> Any:
+    import torch
 
-    def forward(self, rows: Any, shift: Any) -> tuple[Any, Any]:
-        made = self.layer(rows)
-        return made + shift, made.sum(1)
+    class Affine(torch.nn.Module):  # type: ignore[misc, name-defined, unused-ignore]
+        def __init__(self) -> None:
+            super().__init__()
+            self.layer = torch.nn.Linear(64, 32)  # 8 kB: weights below 1 kB stay in the model's own file
+
+        def forward(self, rows: Any, shift: Any) -> tuple[Any, Any]:
+            made = self.layer(rows)
+            return made + shift, made.sum(1)
+
+    torch.manual_seed(0)
+    return Affine().eval()
 
 
 def _inputs(n: int) -> Mapping[str, Any]:
+    import torch
+
     generator = torch.Generator().manual_seed(n)
     return {"rows": torch.randn(n, 64, generator=generator), "shift": torch.randn(32, generator=generator)}
 
@@ -160,8 +170,7 @@ def test_any_module_is_exported_also_where_its_weights_need_a_file_of_their_own(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, largest_single_file: int
 ) -> None:
     monkeypatch.setattr(onnx_export, "LARGEST_SINGLE_FILE", largest_single_file)
-    torch.manual_seed(0)
-    module = _Affine().eval()
+    module = _affine()
     axes = {"rows": {0: "n"}, "sum": {0: "n"}, "sums": {0: "n"}}
     path = tmp_path / "made" / "affine.onnx"
     written = export_onnx(module, _inputs(2), path, ["sum", "sums"], axes)
@@ -175,15 +184,17 @@ def test_any_module_is_exported_also_where_its_weights_need_a_file_of_their_own(
 
 def test_an_export_over_an_older_one_leaves_no_weights_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(onnx_export, "LARGEST_SINGLE_FILE", 1000)
-    export_onnx(_Affine().eval(), _inputs(2), tmp_path / "a.onnx", ["sum", "sums"])
+    export_onnx(_affine(), _inputs(2), tmp_path / "a.onnx", ["sum", "sums"])
     monkeypatch.setattr(onnx_export, "LARGEST_SINGLE_FILE", 2**31)
-    export_onnx(_Affine().eval(), _inputs(2), tmp_path / "a.onnx", ["sum", "sums"])
+    export_onnx(_affine(), _inputs(2), tmp_path / "a.onnx", ["sum", "sums"])
     assert [file.name for file in tmp_path.iterdir()] == ["a.onnx"]
 
 
 def test_the_fused_attention_is_on_again_after_an_export(tmp_path: Path) -> None:
+    import torch
+
     assert torch.backends.mha.get_fastpath_enabled()
-    export_onnx(_Affine().eval(), _inputs(2), tmp_path / "a.onnx", ["sum", "sums"])
+    export_onnx(_affine(), _inputs(2), tmp_path / "a.onnx", ["sum", "sums"])
     assert torch.backends.mha.get_fastpath_enabled()
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 import types
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +19,18 @@ from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.encoders.image_transform import ImageTransform
 from su3d_bench.perception.models.loading import load_encoder
 
-torch = pytest.importorskip("torch", reason="torch is not installed: pip install 'su3d-bench[models]'")
-pytest.importorskip("safetensors", reason="safetensors is not installed: pip install 'su3d-bench[models]'")
+pytestmark = pytest.mark.skipif(
+    any(find_spec(name) is None for name in ("torch", "safetensors")),
+    reason="torch and safetensors are not installed: pip install 'su3d-bench[models]'",
+)
 
 SIZE, DIM, WORDS = 8, 6, 300
 
 
 def _tiny(seed: int) -> Any:
     """A linear tower for pixels and a sum of word vectors for texts, with open_clip's methods."""
+    import torch
+
     torch.manual_seed(seed)
 
     class TwoTowers(torch.nn.Module):  # type: ignore[misc, name-defined, unused-ignore]
@@ -44,6 +49,8 @@ def _tiny(seed: int) -> Any:
 
 
 def _tokens(texts: Sequence[str]) -> Any:
+    import torch
+
     return torch.tensor([[ord(letter) % WORDS for letter in text.ljust(77)[:77]] for text in texts])
 
 
@@ -73,6 +80,7 @@ def made(monkeypatch: pytest.MonkeyPatch) -> list[str]:
 
 
 def _write(folder: Path, name: str, seed: int = 0, file: str = "open_clip_model.safetensors") -> Any:
+    import torch
     from safetensors.torch import save_file
 
     model = _tiny(seed)
@@ -90,6 +98,8 @@ def _encoder(folder: Path, name: str = "clip-vit-h-14", **settings: Any) -> Enco
 
 @pytest.mark.parametrize("file", ["open_clip_model.safetensors", "open_clip_pytorch_model.bin"])
 def test_features_are_those_of_the_weights_in_the_file(tmp_path: Path, made: list[str], file: str) -> None:
+    import torch
+
     model = _write(tmp_path, "clip-vit-h-14", file=file)
     encoder = _encoder(tmp_path)
     pixels = torch.from_numpy(ImageTransform(SIZE).pixels(noise_images(3)))
@@ -108,9 +118,11 @@ def test_openais_weights_are_run_with_the_activation_they_were_trained_with(tmp_
 
 
 def test_a_checkpoint_of_another_architecture_is_refused(tmp_path: Path, made: list[str]) -> None:
+    import torch
+    from safetensors.torch import save_file
+
     _write(tmp_path, "clip-vit-h-14")
     weights = tmp_path / "clip-vit-h-14" / "open_clip_model.safetensors"
-    from safetensors.torch import save_file
 
     save_file({"visual.weight": torch.zeros(DIM, 3)}, weights)
     with pytest.raises(DataError, match=r"open_clip_model\.safetensors: is no ViT-H-14"):

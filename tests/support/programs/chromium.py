@@ -103,8 +103,15 @@ class Chromium:
 
     def open(self, path: Path) -> None:
         """Open a file, as a person does who double-clicks on it."""
+        self._arrive("Page.navigate", {"url": path.resolve().as_uri()})
+
+    def reload(self) -> None:
+        """Load the page again; unlike ``open`` in the same process, which has what the page has just kept."""
+        self._arrive("Page.reload", {})
+
+    def _arrive(self, method: str, values: Mapping[str, Any]) -> None:
         self.run("window.isOfThePageBefore = true")
-        self.call("Page.navigate", {"url": path.resolve().as_uri()})
+        self.call(method, values)
         self.until("!window.isOfThePageBefore && document.readyState === 'complete' && location.protocol === 'file:'")
 
     def run(self, script: str) -> Any:
