@@ -54,7 +54,7 @@ class UpdateTimes:
 
 def pooled(times: Sequence[UpdateTimes], stage: str, warm_up: int) -> Float64Array:
     """Milliseconds of ``stage`` over all scenes, without the first ``warm_up`` updates of each."""
-    return np.concatenate([one.ms(stage)[warm_up:] for one in times]) if times else np.zeros(0)
+    return np.concatenate([updates.ms(stage)[warm_up:] for updates in times]) if times else np.zeros(0)
 
 
 @dataclass(frozen=True)
@@ -101,24 +101,24 @@ class MethodSummary:
 def summarise(times: Sequence[UpdateTimes], warm_up: int = WARM_UP) -> MethodSummary:
     """The costs of one method over ``times``, at least one scene; ``warm_up`` updates of each scene stand apart."""
     pool = _Pool(times, warm_up)
-    stages = tuple(dict.fromkeys(stage for one in times for stage in one.stages))
+    stages = tuple(dict.fromkeys(stage for updates in times for stage in updates.stages))
     seconds = float(pool.total_ms.sum()) / 1e3
     n_updates = len(pool.total_ms)
-    n_frames = sum(_frames_covered(one) for one in times)
-    last = [one.maps[-1].finish_ms for one in times if one.maps]
+    n_frames = sum(_frames_covered(updates) for updates in times)
+    last = [updates.maps[-1].finish_ms for updates in times if updates.maps]
     return MethodSummary(
         run=times[0].run,
         method=times[0].method,
-        scenes=tuple(one.scene for one in times),
+        scenes=tuple(updates.scene for updates in times),
         n_updates=n_updates,
         stages=tuple(pool.stage(name) for name in (*stages, MAP, TOTAL)),
         updates_per_s=n_updates / seconds if seconds else float("nan"),
         frames_per_s=n_frames / seconds if seconds else float("nan"),
         finish_ms=max(last) if last else None,
-        n_points=_largest([one.columns["n_points"].max() for one in times if "n_points" in one.columns]),
-        map_bytes=_largest([one.columns["map_bytes"].max() for one in times if "map_bytes" in one.columns]),
-        peak_rss_bytes=_largest([one.peak_rss_bytes for one in times if one.peak_rss_bytes is not None]),
-        device_bytes=_largest([one.device_bytes for one in times if one.device_bytes is not None]),
+        n_points=_largest([updates.columns["n_points"].max() for updates in times if "n_points" in updates.columns]),
+        map_bytes=_largest([updates.columns["map_bytes"].max() for updates in times if "map_bytes" in updates.columns]),
+        peak_rss_bytes=_largest([updates.peak_rss_bytes for updates in times if updates.peak_rss_bytes is not None]),
+        device_bytes=_largest([updates.device_bytes for updates in times if updates.device_bytes is not None]),
     )
 
 
@@ -128,12 +128,12 @@ class _Pool:
     def __init__(self, times: Sequence[UpdateTimes], warm_up: int) -> None:
         self._times = times
         self.total_ms = self._ms(TOTAL)
-        self._number = np.concatenate([np.arange(1.0, len(one) + 1) for one in times])
-        self._points = np.concatenate([one.columns.get("n_points", np.zeros(len(one))) for one in times])
+        self._number = np.concatenate([np.arange(1.0, len(updates) + 1) for updates in times])
+        self._points = np.concatenate([updates.columns.get("n_points", np.zeros(len(updates))) for updates in times])
         self._is_steady = self._number > warm_up
 
     def _ms(self, stage: str) -> Float64Array:
-        return np.concatenate([one.ms(stage) for one in self._times])
+        return np.concatenate([updates.ms(stage) for updates in self._times])
 
     def stage(self, name: str) -> StageSummary:
         ms = self._ms(name)

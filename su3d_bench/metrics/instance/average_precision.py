@@ -254,13 +254,13 @@ def _match(over: BoolArray, takes_part: BoolArray, scores: Float64Array) -> tupl
     n_missed = 0
     visited = np.zeros(len(scores), bool)
     for column in np.flatnonzero(takes_part):
-        found = np.flatnonzero(over[:, column] & ~visited)
-        if not len(found):
+        matching = np.flatnonzero(over[:, column] & ~visited)
+        if not len(matching):
             n_missed += 1
             continue
         # only the first in line is used up; the best score of all stays with the true positive
-        visited[found[0]] = True
-        *lower, best = np.sort(scores[found]).tolist()
+        visited[matching[0]] = True
+        *lower, best = np.sort(scores[matching]).tolist()
         hits.append(best)
         duplicates += lower
     return hits, duplicates, n_missed

@@ -43,18 +43,18 @@ def _dot(left, right, n):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def areas(score, is_true, bounds, n_missed, is_wanted, found):  # type: ignore[no-untyped-def]
+def areas(score, is_true, bounds, n_missed, is_wanted, area_of_cell):  # type: ignore[no-untyped-def]
     """Writes ``average_precision`` of each wanted cell, whose rows come with rising score between its ``bounds``."""
     most = 0
-    for cell in range(len(found)):
+    for cell in range(len(area_of_cell)):
         most = max(most, bounds[cell + 1] - bounds[cell])
     precision, recall, width = np.empty(most + 1), np.empty(most + 3), np.empty(most + 1)
-    for cell in range(len(found)):
+    for cell in range(len(area_of_cell)):
         start, end = bounds[cell], bounds[cell + 1]
         if not is_wanted[cell]:
             continue
         if start == end:
-            found[cell] = 0.0
+            area_of_cell[cell] = 0.0
             continue
         n_true = 0
         for row in range(start, end):
@@ -72,11 +72,11 @@ def areas(score, is_true, bounds, n_missed, is_wanted, found):  # type: ignore[n
         recall[n_vertices + 1] = recall[n_vertices + 2] = 0.0
         for i in range(n_vertices + 1):
             width[i] = 0.5 * (recall[i] - recall[i + 2])
-        found[cell] = _dot(precision, width, n_vertices + 1)
+        area_of_cell[cell] = _dot(precision, width, n_vertices + 1)
 
 
 @njit(cache=True, nogil=True, error_model="numpy")
-def resampled_areas(scene, is_true, is_last, bounds, class_of_cell, n_truth, drawn, found):  # type: ignore[no-untyped-def]
+def resampled_areas(scene, is_true, is_last, bounds, class_of_cell, n_truth, drawn, area_of_cell):  # type: ignore[no-untyped-def]
     """Writes the area (cells, R) of each resample; rows of a cell come with falling score.
 
     ``is_last`` marks the last row of a score, ``n_truth`` (C, R) counts the instances of the drawn scenes, ``drawn``
@@ -88,7 +88,7 @@ def resampled_areas(scene, is_true, is_last, bounds, class_of_cell, n_truth, dra
     n_counted_before, n_hit_before = np.empty(n_resamples, np.int32), np.empty(n_resamples, np.int32)
     recall_before = np.empty(n_resamples)
     for cell in range(len(class_of_cell)):
-        area, n_instances = found[cell], n_truth[class_of_cell[cell]]
+        area, n_instances = area_of_cell[cell], n_truth[class_of_cell[cell]]
         area[:] = n_counted[:] = n_hit[:] = n_counted_before[:] = n_hit_before[:] = recall_before[:] = 0
         has_hit = False
         for row in range(bounds[cell], bounds[cell + 1]):

@@ -120,13 +120,13 @@ def average_precisions(
     order = np.lexsort((score, cell))
     bounds = np.searchsorted(cell[order], np.arange(len(n_missed) + 1))
     score, is_true = score[order], is_true[order]
-    found = np.full(len(n_missed), np.nan)
+    values = np.full(len(n_missed), np.nan)
     if len(cell) >= MANY_ROWS:
         from su3d_bench.metrics.instance import kernels as kernels
 
-        kernels.areas(score, is_true, bounds, n_missed, is_wanted, found)
-        return found
+        kernels.areas(score, is_true, bounds, n_missed, is_wanted, values)
+        return values
     for index in np.flatnonzero(is_wanted):
         rows = slice(bounds[index], bounds[index + 1])
-        found[index] = average_precision(score[rows], is_true[rows], int(n_missed[index]))
-    return found
+        values[index] = average_precision(score[rows], is_true[rows], int(n_missed[index]))
+    return values

@@ -84,9 +84,9 @@ def _compiled_areas(rows: _Rows, bounds: Int64Array, n_truth: Int64Array, weight
         own = slice(start, start + AT_ONCE)
         drawn = np.ascontiguousarray(weights[own].T, np.int32)
         instances = np.ascontiguousarray(np.maximum(n_truth[own], 1).T, np.int32)
-        found = np.empty((len(areas), drawn.shape[1]))
-        resampled_areas(scene, rows.is_true, is_last, bounds, class_of_cell, instances, drawn, found)
-        areas[:, own] = found
+        areas_of_block = np.empty((len(areas), drawn.shape[1]))
+        resampled_areas(scene, rows.is_true, is_last, bounds, class_of_cell, instances, drawn, areas_of_block)
+        areas[:, own] = areas_of_block
 
     with ThreadPoolExecutor(os.cpu_count()) as threads:
         list(threads.map(fill, range(0, len(weights), AT_ONCE)))  # raises what a thread raised

@@ -69,8 +69,8 @@ def duplicate_warnings(scene: str, facts: MaskFacts, keys: Sequence[str]) -> lis
     lines = []
     for pairs, what in ((facts.identical, "identical masks"), (_only(facts.near, facts.identical), "near-duplicates")):
         if pairs:
-            one, other = pairs[0]
-            names = f"{one}{_key(keys, one)} and {other}{_key(keys, other)}"
+            first, other = pairs[0]
+            names = f"{first}{_key(keys, first)} and {other}{_key(keys, other)}"
             lines.append(f"{scene}: {_number(len(pairs), 'pair')} of {what}, the first is {names}; they can move AP")
     if facts.near is None:
         lines.append(f"{scene}: the masks overlap so much that duplicates were not looked for")
@@ -102,7 +102,7 @@ def class_warnings(scene: str, rules: ProtocolRules, numbers: Int32Array | None,
         return []
     scored = {entry.id for entry in rules.scored}
     name_of = {entry.id: entry.name for entry in rules.classes}
-    is_dropped = np.array([int(one) not in scored for one in ids], bool)
+    is_dropped = np.array([int(class_id) not in scored for class_id in ids], bool)
     if not is_dropped.any():
         return []
     values, counts = np.unique(np.asarray(numbers)[is_dropped], return_counts=True)

@@ -42,18 +42,18 @@ def nearest(candidates: Points, queries: Points, cap_m: float = np.inf) -> tuple
     from scipy.spatial import cKDTree
 
     order, asking_order = _along_curve(candidates, queries)
-    held, asked = np.asarray(candidates, np.float64)[order], np.asarray(queries, np.float64)[asking_order]
+    held, ordered_queries = np.asarray(candidates, np.float64)[order], np.asarray(queries, np.float64)[asking_order]
     tree = cKDTree(held, balanced_tree=False, compact_nodes=False)
     # the tree takes only neighbours nearer than its bound; the cap itself still counts
     bound = np.nextafter(cap_m, np.inf)
-    distances, indices = tree.query(asked, k=min(2, n), distance_upper_bound=bound, workers=1)
-    distances, indices = distances.reshape(len(asked), -1), indices.reshape(len(asked), -1)
-    found = np.append(order, -1)[indices[:, 0]]  # the tree says n where it found none
+    distances, indices = tree.query(ordered_queries, k=min(2, n), distance_upper_bound=bound, workers=1)
+    distances, indices = distances.reshape(len(ordered_queries), -1), indices.reshape(len(ordered_queries), -1)
+    nearest_index = np.append(order, -1)[indices[:, 0]]  # the tree says n where it found none
     if n > 1:
         tied = np.flatnonzero((distances[:, 0] == distances[:, 1]) & np.isfinite(distances[:, 0]))
-        found[tied] = _lowest_of_equals(tree, held, asked[tied], order)
-    distance, index = np.empty(len(asked)), np.empty(len(asked), np.int64)
-    distance[asking_order], index[asking_order] = distances[:, 0], found
+        nearest_index[tied] = _lowest_of_equals(tree, held, ordered_queries[tied], order)
+    distance, index = np.empty(len(ordered_queries)), np.empty(len(ordered_queries), np.int64)
+    distance[asking_order], index[asking_order] = distances[:, 0], nearest_index
     too_far = ~np.isfinite(distance) | (distance > cap_m)
     distance[too_far], index[too_far] = np.inf, -1
     return distance, index
@@ -90,11 +90,11 @@ def _lowest_of_equals(tree: Any, candidates: Float64Array, queries: Float64Array
         step = max(1, _MAX_NEIGHBOURS // k)
         for start in range(0, len(open_rows), step):
             rows = open_rows[start : start + step]
-            _, found = tree.query(queries[rows], k=k, workers=1)
-            offset = candidates[found] - queries[rows][:, None, :]
+            _, neighbours = tree.query(queries[rows], k=k, workers=1)
+            offset = candidates[neighbours] - queries[rows][:, None, :]
             squared = offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2
             is_nearest = squared == squared.min(axis=1, keepdims=True)
-            answer[rows] = np.where(is_nearest, order[found], len(candidates)).min(axis=1)
+            answer[rows] = np.where(is_nearest, order[neighbours], len(candidates)).min(axis=1)
             # more equals may lie beyond the last neighbour that was asked for
             unfinished.append(rows[is_nearest[:, -1]] if k < len(candidates) else rows[:0])
         open_rows = np.concatenate(unfinished)
@@ -148,14 +148,14 @@ def transfer_masks(
     if are_same_points(points, targets):
         return masks
     kept = reduce_to_voxels(points, masks, voxel_m) if voxel_m > 0 else np.arange(len(points))
-    _, found = nearest(points[kept], targets, np.inf if cap_m is None else cap_m)
-    reached = np.flatnonzero(found >= 0)
+    _, nearest_index = nearest(points[kept], targets, np.inf if cap_m is None else cap_m)
+    reached = np.flatnonzero(nearest_index >= 0)
     from scipy.sparse import csr_array
 
     of_point = csr_array(
         (np.ones(len(masks.indices), np.int8), masks.indices, masks.indptr), shape=(len(masks), len(points))
     ).tocsc()
-    moved = of_point[:, kept[found[reached]]].tocsr()
+    moved = of_point[:, kept[nearest_index[reached]]].tocsr()
     moved.sort_indices()
     return Masks(moved.indptr.astype(np.int64), reached[moved.indices].astype(np.int32))
 
@@ -194,10 +194,10 @@ def transfer_values(
         own = wanted & (rank >= 0)
         value[own], distance[own] = values[own], 0.0
         missing = wanted & ~own
-    asked = np.flatnonzero(missing)
-    distance[asked], found = nearest(points[order], targets[asked], cap_m)
-    reached = asked[found >= 0]
-    value[reached] = values[order][found[found >= 0]]
+    rows = np.flatnonzero(missing)
+    distance[rows], nearest_index = nearest(points[order], targets[rows], cap_m)
+    reached = rows[nearest_index >= 0]
+    value[reached] = values[order][nearest_index[nearest_index >= 0]]
     return value, distance
 
 
@@ -220,8 +220,8 @@ def duplicate_pairs(masks: Masks, n_points: int, iou: float) -> list[tuple[int, 
     shared = (member @ member.T).tocoo()
     size = masks.sizes
     union = size[shared.row] + size[shared.col] - shared.data
-    found = (shared.row < shared.col) & (shared.data > iou * union)
-    return sorted(zip(shared.row[found].tolist(), shared.col[found].tolist(), strict=True))
+    is_pair = (shared.row < shared.col) & (shared.data > iou * union)
+    return sorted(zip(shared.row[is_pair].tolist(), shared.col[is_pair].tolist(), strict=True))
 
 
 def select(masks: Masks, keep: IntArray) -> Masks:

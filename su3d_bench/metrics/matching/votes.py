@@ -31,19 +31,19 @@ def transfer_votes(
     ([7], [0.0])
     """
     value, distance = np.full(len(targets), -1, np.int64), np.full(len(targets), np.inf)
-    asked = np.flatnonzero(wanted)
-    if not len(points) or not len(asked):
+    wanted_rows = np.flatnonzero(wanted)
+    if not len(points) or not len(wanted_rows):
         return value, distance
-    places, place_of_target = _distinct_places(targets[asked])
+    places, place_of_target = _distinct_places(targets[wanted_rows])
     of_place, nearest_m = np.empty(len(places), np.int64), np.empty(len(places))
     search = _Search(points, neighbours)
     step = max(1, _MAX_CELLS // (neighbours + 1))
     for start in range(0, len(places), step):
         rows = slice(start, start + step)
-        distances, found = search.nearest(places[rows])
-        votes = np.where(distances <= cap_m, values[found], -1)
+        distances, indices = search.nearest(places[rows])
+        votes = np.where(distances <= cap_m, values[indices], -1)
         of_place[rows], nearest_m[rows] = _most_votes(votes), distances.min(axis=1)
-    value[asked], distance[asked] = of_place[place_of_target], nearest_m[place_of_target]
+    value[wanted_rows], distance[wanted_rows] = of_place[place_of_target], nearest_m[place_of_target]
     distance[distance > cap_m] = np.inf
     return value, distance
 
@@ -84,13 +84,13 @@ class _Search:
     def nearest(self, queries: Float64Array) -> tuple[Float64Array, Int64Array]:
         """Distances in metres and indices (Q, k), in no set order."""
         k, n = self.k, len(self.points)
-        distances, found = self.tree.query(queries, k=min(k + 1, n), workers=1)
-        distances, found = distances.reshape(len(queries), -1), found.reshape(len(queries), -1).astype(np.int64)
+        distances, indices = self.tree.query(queries, k=min(k + 1, n), workers=1)
+        distances, indices = distances.reshape(len(queries), -1), indices.reshape(len(queries), -1).astype(np.int64)
         if k < n:
             tied = np.flatnonzero(distances[:, k - 1] == distances[:, k])
-            found = found[:, :k]
-            found[tied] = self._lowest_of_equals(queries[tied])
-        return distances[:, :k], found
+            indices = indices[:, :k]
+            indices[tied] = self._lowest_of_equals(queries[tied])
+        return distances[:, :k], indices
 
     def _lowest_of_equals(self, queries: Float64Array) -> Int64Array:
         """Indices (Q, k) where the k-th neighbour has equals beyond it; their distances are those of the tree."""
@@ -103,11 +103,11 @@ class _Search:
             step = max(1, _MAX_CELLS // n_asked)
             for start in range(0, len(open_rows), step):
                 rows = open_rows[start : start + step]
-                _, found = self.tree.query(queries[rows], k=n_asked, workers=1)
-                offset = self.points[found] - queries[rows][:, None, :]
+                _, indices = self.tree.query(queries[rows], k=n_asked, workers=1)
+                offset = self.points[indices] - queries[rows][:, None, :]
                 squared = offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2
-                order = np.lexsort((found, squared), axis=-1)
-                answer[rows] = np.take_along_axis(found, order, axis=1)[:, : self.k]
+                order = np.lexsort((indices, squared), axis=-1)
+                answer[rows] = np.take_along_axis(indices, order, axis=1)[:, : self.k]
                 if n_asked < len(self.points):
                     ranked = np.take_along_axis(squared, order, axis=1)
                     unfinished.append(rows[ranked[:, self.k - 1] == ranked[:, -1]])
@@ -148,9 +148,9 @@ def _within(own: Float64Array, places: Float64Array, along_x: Int64Array, x: Flo
     low, high = own.min(axis=0) - cap_m, own.max(axis=0) + cap_m
     near = along_x[np.searchsorted(x, low[0], "left") : np.searchsorted(x, high[0], "right")]
     near = np.sort(near[((places[near, 1:] >= low[1:]) & (places[near, 1:] <= high[1:])).all(axis=1)])
-    _, found = cKDTree(own).query(places[near], distance_upper_bound=np.nextafter(cap_m, np.inf), workers=1)
-    near, found = near[found < len(own)], found[found < len(own)]
-    offset = own[found] - places[near]
+    _, own_index = cKDTree(own).query(places[near], distance_upper_bound=np.nextafter(cap_m, np.inf), workers=1)
+    near, own_index = near[own_index < len(own)], own_index[own_index < len(own)]
+    offset = own[own_index] - places[near]
     squared = offset[:, 0] ** 2 + offset[:, 1] ** 2 + offset[:, 2] ** 2
     within: Int64Array = near[squared < cap_m * cap_m]
     return within

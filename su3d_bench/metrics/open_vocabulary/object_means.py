@@ -29,7 +29,8 @@ class ObjectCounts(Counts):
 def concatenate(counts: Sequence[ObjectCounts]) -> ObjectCounts:
     """The counts of several scenes as one: rows one after another."""
     return ObjectCounts(
-        np.concatenate([one.n_points for one in counts]), np.concatenate([one.totals for one in counts])
+        np.concatenate([of_scene.n_points for of_scene in counts]),
+        np.concatenate([of_scene.totals for of_scene in counts]),
     )
 
 
@@ -61,6 +62,6 @@ def resampled(counts: Sequence[ObjectCounts], weights: Int64Array) -> Float64Arr
     >>> resampled([a, b], np.array([[2, 0], [1, 1]])).tolist()
     [[1.0], [0.75]]
     """
-    per_scene = [_sums(one) for one in counts]
+    per_scene = [_sums(of_scene) for of_scene in counts]
     sums: Float64Array = weights.astype(np.float64) @ np.stack([total for total, _ in per_scene])
     return _means(sums, weights @ np.stack([n for _, n in per_scene]))

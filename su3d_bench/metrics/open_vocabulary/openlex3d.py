@@ -74,7 +74,9 @@ def scored_objects(objects: Mapping[int, ObjectLabels], excluded: Sequence[str])
     """Ids, ascending, of the objects whose points have a category: with synonyms, none of them ``excluded``."""
     without = _bare_set(excluded)
     return sorted(
-        one for one, labels in objects.items() if labels.synonyms and not _bare_set(labels.synonyms) & without
+        object_id
+        for object_id, labels in objects.items()
+        if labels.synonyms and not _bare_set(labels.synonyms) & without
     )
 
 
@@ -89,8 +91,8 @@ def category_table(
     """
     words = [bare(word) for word in vocabulary]
     table = np.full((len(object_ids), len(words)), _INCORRECT, np.int64)
-    for row, one in enumerate(object_ids):
-        labels = objects[one]
+    for row, object_id in enumerate(object_ids):
+        labels = objects[object_id]
         near = [objects[other] for other in labels.clutter if other in objects]
         # the nearest category last: it overwrites the others
         for category, known in (

@@ -98,14 +98,14 @@ def per_scene(
     size = masks.sizes
     shared = instance_ap.intersections(segment_of_point, len(ids), masks.indptr, masks.indices, np.arange(n_masks))
     iou = shared / (size_of_object[None, :] + size[:, None] - shared)
-    column_of = {int(one): column for column, one in enumerate(ids) if one >= 0}
+    column_of = {int(object_id): column for column, object_id in enumerate(ids) if object_id >= 0}
     order = np.argsort(-confidence, axis=0, kind="stable")[:top_k]
     parts = [_no_counts(len(thresholds))]
     for q, query in enumerate(queries):
-        columns = [column_of[one] for one in query.object_ids if one in column_of]
+        columns = [column_of[object_id] for object_id in query.object_ids if object_id in column_of]
         takes_part = size_of_object[columns] >= min_region_size
         rows = order[size[order[:, q]] >= min_region_size, q]
-        one = instance_ap.count_class(
+        of_query = instance_ap.count_class(
             0,
             iou=iou[np.ix_(rows, np.array(columns, np.int64)[takes_part])],
             takes_part=np.ones(int(takes_part.sum()), bool),
@@ -113,7 +113,7 @@ def per_scene(
             ignored_share=np.zeros(len(rows)),
             thresholds=thresholds,
         )
-        parts.append(one)
+        parts.append(of_query)
     return instance_ap.concatenate(parts)
 
 

@@ -96,8 +96,8 @@ def _units(prediction: Prediction, voxel_m: float) -> _Units:
     if not len(points) or voxel_m <= 0:
         return _Units(points, unit)
     means = voxel_means(points, voxel_m)
-    _, found = transfer.nearest(points, means)
-    return _Units(means, unit[found])
+    _, nearest = transfer.nearest(points, means)
+    return _Units(means, unit[nearest])
 
 
 def voxel_means(points: Float64Array, voxel_m: float) -> Float64Array:
@@ -134,7 +134,7 @@ def _count_categories(
         vocabulary, top = list[str](), np.zeros((0, 1), np.int64)
     elif labels is not None and has_every_label(prediction):
         vocabulary = sorted(set(labels))
-        top = np.array([[vocabulary.index(labels[one])] for one in used], np.int64).reshape(-1, 1)
+        top = np.array([[vocabulary.index(labels[row])] for row in used], np.int64).reshape(-1, 1)
     else:
         vocabulary = list(truth.prompts)
         n_top = min(rules.top_k, len(vocabulary))
@@ -157,7 +157,7 @@ def _count_ranks(
     unit: Int64Array,
 ) -> ObjectCounts:
     used, of_point = _used_units(unit)
-    labels = [openlex3d.ranked_labels(truth.objects[one], truth.prompts) for one in ids]
+    labels = [openlex3d.ranked_labels(truth.objects[object_id], truth.prompts) for object_id in ids]
     rows, units, _ = openlex3d.distinct_pairs(object_row, of_point)
     scores = np.full((len(rows), 3), np.nan)
     start = 0
@@ -175,7 +175,7 @@ def _count_ranks(
 
 def _nothing_ranked(labels: list[openlex3d.RankedLabels], object_row: Int64Array) -> ObjectCounts:
     n_points = np.bincount(object_row[object_row >= 0], minlength=len(labels))
-    has = np.array([(len(one.synonyms) > 0, len(one.secondary) > 0) for one in labels])
+    has = np.array([(len(ranked.synonyms) > 0, len(ranked.secondary) > 0) for ranked in labels])
     totals = np.where(np.stack([has.any(axis=1), has[:, 0], has[:, 1]], axis=1), 0.0, np.nan)
     return ObjectCounts(n_points[n_points > 0].astype(np.int64), totals[n_points > 0])
 

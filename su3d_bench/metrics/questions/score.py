@@ -71,15 +71,15 @@ class RetrievalMetric(ShareMetric):
         self, truth: RetrievalTruth, prediction: Instances | Partition, encoder: Encoder | None
     ) -> SceneScore:
         covered = covered_objects(self.rules.transfer, truth.scene, prediction)
-        first = first_instances(self.rules, [asked.text for asked in truth.asked], prediction, encoder)
+        first = first_instances(self.rules, [question.text for question in truth.asked], prediction, encoder)
         is_right = judge_retrieval(covered.main_object, first, truth.asked)
         in_map = set(covered.main_object.tolist()) - {NO_OBJECT}
-        kinds = np.array([asked.kind for asked in truth.asked])
+        kinds = np.array([question.kind for question in truth.asked])
         rows = {kind: is_right[kinds == kind] for kind in self.rules.value_names[:4]}
         rows["all"] = is_right
-        rows["reachable"] = np.array([not in_map.isdisjoint(asked.answers) for asked in truth.asked], bool)
+        rows["reachable"] = np.array([not in_map.isdisjoint(question.answers) for question in truth.asked], bool)
         warnings = [encoder_warning(self.rules, prediction, encoder)]
-        asked_for = [answer for asked in truth.asked for answer in asked.answers]
+        asked_for = [answer for question in truth.asked for answer in question.answers]
         return self._score(truth.scene, asked_for, prediction, rows, warnings)
 
 
@@ -96,15 +96,15 @@ def first_instances(
     return first
 
 
-def judge_retrieval(main_object: Int64Array, first: Int64Array, asked: Sequence[AskedText]) -> BoolArray:
+def judge_retrieval(main_object: Int64Array, first: Int64Array, questions: Sequence[AskedText]) -> BoolArray:
     """Whether (Q,) the instance ``first`` (Q,) of each question stands for an object that answers it.
 
     >>> chair = AskedText("instance", "chair", (4, 5))
     >>> judge_retrieval(np.array([5, 9]), np.array([0, 1, -1]), [chair, chair, chair]).tolist()
     [True, False, False]
     """
-    rows = zip(first, asked, strict=True)
-    return np.array([bool(k >= 0 and int(main_object[k]) in one.answers) for k, one in rows], bool)
+    rows = zip(first, questions, strict=True)
+    return np.array([bool(k >= 0 and int(main_object[k]) in question.answers) for k, question in rows], bool)
 
 
 class AnnotationMetric(ShareMetric):
@@ -154,13 +154,13 @@ def judge_merging(rules: MergeRules, covered: Covered) -> tuple[str, ...]:
     main = covered.main_object
     n_objects = covered.n_shared.sum(axis=1)
     answers = []
-    for k, one in enumerate(main):
-        if one == NO_OBJECT:
+    for k, object_id in enumerate(main):
+        if object_id == NO_OBJECT:
             answers.append(WELL_MERGED)
             continue
-        column = int(np.searchsorted(covered.object_ids, one))
+        column = int(np.searchsorted(covered.object_ids, object_id))
         n_own = int(covered.n_shared[k, column])
-        n_of_all = int(covered.n_shared[main == one, column].sum())
+        n_of_all = int(covered.n_shared[main == object_id, column].sum())
         if n_objects[k] - n_own >= rules.over_merged_share * n_objects[k]:
             answers.append(OVER_MERGED)
         else:
@@ -180,12 +180,12 @@ class ReasoningMetric(ShareMetric):
         answers = truth.solve(prediction, encoder)
         pairs = list(zip(truth.asked, answers, strict=True))
         rows = {
-            "answer": np.array([is_answer_right(rules, asked, given, main) for asked, given in pairs], bool),
+            "answer": np.array([is_answer_right(rules, question, given, main) for question, given in pairs], bool),
             "objects": np.array([are_objects_right(*pair, main) for pair in pairs if pair[0].object_ids], bool),
         }
         is_open = any(not given.is_settled for given in answers)
         warnings = ["questions that the solver could not settle count as wrong"] if is_open else []
-        named = [object_id for asked in truth.asked for object_id in asked.object_ids]
+        named = [object_id for question in truth.asked for object_id in question.object_ids]
         return self._score(truth.scene, named, prediction, rows, warnings)
 
 

@@ -31,7 +31,8 @@ def combine(counts: Sequence[ShareCounts]) -> ShareCounts:
     ShareCounts(n_judged=array([4]), n_right=array([3]))
     """
     return ShareCounts(
-        np.sum([one.n_judged for one in counts], axis=0), np.sum([one.n_right for one in counts], axis=0)
+        np.sum([of_scene.n_judged for of_scene in counts], axis=0),
+        np.sum([of_scene.n_right for of_scene in counts], axis=0),
     )
 
 
@@ -52,8 +53,8 @@ def resampled(counts: Sequence[ShareCounts], weights: Int64Array) -> Float64Arra
     [[0.5], [1.0]]
     """
     drawn = weights.astype(np.float64)
-    n_right = drawn @ np.stack([one.n_right for one in counts]).astype(np.float64)
-    return _ratio(n_right, drawn @ np.stack([one.n_judged for one in counts]).astype(np.float64))
+    n_right = drawn @ np.stack([of_scene.n_right for of_scene in counts]).astype(np.float64)
+    return _ratio(n_right, drawn @ np.stack([of_scene.n_judged for of_scene in counts]).astype(np.float64))
 
 
 def _ratio(n_right: Float64Array, n_judged: Float64Array) -> Float64Array:
