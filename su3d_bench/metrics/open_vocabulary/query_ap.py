@@ -100,7 +100,7 @@ def per_scene(
     iou = shared / (size_of_object[None, :] + size[:, None] - shared)
     column_of = {int(object_id): column for column, object_id in enumerate(ids) if object_id >= 0}
     order = np.argsort(-confidence, axis=0, kind="stable")[:top_k]
-    parts = [_no_counts(len(thresholds))]
+    parts = [_no_counts(thresholds)]
     for q, query in enumerate(queries):
         columns = [column_of[object_id] for object_id in query.object_ids if object_id in column_of]
         takes_part = size_of_object[columns] >= min_region_size
@@ -117,15 +117,6 @@ def per_scene(
     return instance_ap.concatenate(parts)
 
 
-def _no_counts(n_thresholds: int) -> InstanceCounts:
+def _no_counts(thresholds: Sequence[float]) -> InstanceCounts:
     none = np.zeros(0)
-    return InstanceCounts(
-        class_index=none.astype(np.int32),
-        threshold_index=none.astype(np.int32),
-        score=none,
-        is_true=none.astype(bool),
-        n_missed=np.zeros((1, n_thresholds), np.int64),
-        n_truth=np.zeros(1, np.int64),
-        n_small_truth=np.zeros(1, np.int64),
-        n_predictions=np.zeros(1, np.int64),
-    )
+    return instance_ap.count_class(0, np.zeros((0, 0)), none.astype(bool), none, none, thresholds)

@@ -116,9 +116,8 @@ def conceptgraphs_metrics(
     iou = (hit / np.maximum(one, n_true + n_predicted - hit)).astype(np.float64)
     both = precision + recall
     f1 = np.divide(2 * precision * recall, both, out=np.zeros_like(both), where=both > 0)
-    quirk = 2 * precision * recall / np.maximum(1.0, both)
     n_points = n_true.astype(np.float64)
-    metrics = _with_means(kept, recall, precision, iou, f1, quirk, n_points)
+    metrics = _with_means(kept, recall, precision, iou, f1, n_points)
     if dtype is np.float32 and n_points.sum() > 0:
         # the original rounds each weight, and a perfect prediction may then end in 0.9999999999999999
         return replace(metrics, frequency_weighted_iou=float((n_points / n_points.sum() * iou).sum()))
@@ -144,8 +143,7 @@ def scannet_metrics(confusion: IntArray) -> SemanticMetrics:
     recall = _ratio(hit, n_true)
     precision = _ratio(hit, n_predicted)
     f1 = _ratio(2 * hit, n_true + n_predicted)
-    quirk = 2 * precision * recall / np.maximum(1.0, precision + recall)
-    return _with_means(np.arange(n_classes), recall, precision, iou, f1, quirk, n_true)
+    return _with_means(np.arange(n_classes), recall, precision, iou, f1, n_true)
 
 
 def hovsg_metrics(confusion: IntArray, is_scored: BoolArray) -> SemanticMetrics:
@@ -169,8 +167,7 @@ def hovsg_metrics(confusion: IntArray, is_scored: BoolArray) -> SemanticMetrics:
     precision = hit / np.maximum(1.0, n_predicted)
     iou = _ratio(hit, n_true + n_predicted - hit)
     f1 = _ratio(2 * hit, n_true + n_predicted)
-    quirk = 2 * precision * recall / np.maximum(1.0, precision + recall)
-    return _with_means(keep, recall, precision, iou, f1, quirk, n_true)
+    return _with_means(keep, recall, precision, iou, f1, n_true)
 
 
 def _with_means(
@@ -179,9 +176,9 @@ def _with_means(
     precision: Float64Array,
     iou: Float64Array,
     f1: Float64Array,
-    f1_conceptgraphs: Float64Array,
     n_true: Float64Array,
 ) -> SemanticMetrics:
+    f1_conceptgraphs = 2 * precision * recall / np.maximum(1.0, precision + recall)
     n_points = float(n_true.sum())
     weighted = (n_true * np.nan_to_num(iou)).sum() / n_points if n_points > 0 else np.nan
     if len(class_index) and n_points == 0 and not np.isnan(iou).any():
