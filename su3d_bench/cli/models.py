@@ -182,7 +182,7 @@ def _answer_check(row: dict[str, Any]) -> None:
 
 def call_export(arguments: argparse.Namespace) -> int:
     from su3d_bench.perception.models.catalogue import model_entry
-    from su3d_bench.perception.models.onnx.exporting import export_model
+    from su3d_bench.perception.models.onnx.export_model import export_model
 
     config = _perception_config(arguments).models
     entry = model_entry(arguments.name)

@@ -1,4 +1,4 @@
-"""Names of image regions by zero-shot classification, and captions from a template."""
+"""Names of image regions by zero-shot classification, words in a prompt, and captions from a template."""
 
 from __future__ import annotations
 

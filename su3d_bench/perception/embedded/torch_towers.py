@@ -1,4 +1,4 @@
-"""The towers of the embedded encoder in torch, with the weights of their ONNX files: what runs them on a GPU."""
+"""The towers of the embedded encoder in torch: what is trained, and what runs the ONNX files' weights on a GPU."""
 
 from __future__ import annotations
 

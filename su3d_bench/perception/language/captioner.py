@@ -1,4 +1,7 @@
-"""Names and captions of image crops by a vision-language model; the tagger's where the model gives none."""
+"""Names and captions of image crops by a vision-language model; the tagger's where the model gives none.
+
+And the paper's own words to its models, those of other tasks too.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Which foundation models a run loads, and how they run."""
+"""Which foundation models a run loads, how they run, and how the profile ``paper`` makes tags, boxes and masks."""
 
 from __future__ import annotations
 

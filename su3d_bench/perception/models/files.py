@@ -1,4 +1,4 @@
-"""Where the files of a model lie on this machine, and their digests; nothing is ever fetched.
+"""Where the files of a model lie on this machine, their digests, and what is read from them; nothing is ever fetched.
 
 A model is looked for, in this order: at the path that the configuration names; below the configured folder or
 ``$SU3D_MODELS`` (``~/.cache/su3d-bench/models`` where it is not set); in the Hugging Face cache
@@ -24,6 +24,8 @@ from su3d_bench.store.atomic import make_folder, read_json, write_json
 
 DEFAULT_FOLDER = "~/.cache/su3d-bench/models"
 DIGEST_FOLDER = "model-digests"
+LARGEST_SETTINGS = 2**24  # bytes; a tokenizer.json of 256,000 words has 2**23
+PICKLED = {".bin", ".pt", ".pth", ".ckpt"}
 # Beside the weights, what may move an answer.
 _SETTINGS = (
     "config.json",
@@ -224,10 +226,6 @@ def _noted(note: Path, key: str) -> str | None:
 def _check(key: str, digest: str) -> str:
     """A digest of a note, so that a damaged one counts as absent."""
     return digest_bytes(f"{key}\n{digest}".encode())
-
-
-LARGEST_SETTINGS = 2**24  # bytes; a tokenizer.json of 256,000 words has 2**23
-PICKLED = {".bin", ".pt", ".pth", ".ckpt"}
 
 
 def read_weights(path: Path, device: str = "cpu") -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""SAM and GroundingDINO from the files of a model folder, or from SAM's original checkpoint."""
+"""SAM and GroundingDINO from a model folder or SAM's original checkpoint, kept in memory from scene to scene."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The profile of detections that were made elsewhere."""
+"""The profile of detections that were made elsewhere, in whatever format."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Pixel loops of the segmenter, compiled; import this module only where a frame is segmented."""
+"""Loops of the segmenter over pixels and its graph, compiled; import this module only where a frame is segmented."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is in an image, as words: RAM++, or the words of a list that an encoder finds likeliest."""
+"""What is in an image, as words: RAM++, or the words of a list that an encoder finds likeliest; which are asked for."""
 
 from __future__ import annotations
 
@@ -23,6 +23,17 @@ RAM_TAG_LIST = "ram_tag_list.txt"
 WORDS_CAVEAT = "tags: RAM++ is not here; the words of a list that the encoder finds likeliest stand in for its tags"
 MAX_WORDS, MAX_WORD_LENGTH = 20_000, 100
 MAX_LIST_BYTES = 1 << 21
+# Words that taggers give and that name no object, as ConceptGraphs sorts them (generate_gsa_results.py, 5c4da70): a tag
+# that contains one of these is left out.
+STOP_WORDS = (
+    "room", "kitchen", "office", "house", "home", "building", "corner", "shadow", "carpet", "photo", "shade", "stall",
+    "space", "aquarium", "apartment", "image", "city", "blue", "skylight", "hallway", "bureau", "modern", "salon",
+    "doorway", "wall lamp", "wood floor",
+)  # fmt: skip
+# Asked for in every image besides its tags.
+ADDED_TAGS = ("other item",)
+# Added with --add_bg_classes.
+BACKGROUND_TAGS = ("wall", "floor", "ceiling")
 
 
 class Tagger(Protocol):
@@ -187,16 +198,3 @@ def fill_ram(model: Any, tensors: dict[str, Any], files: ModelFiles) -> None:
             f"{files.weights}: lacks {len(missing)} tensors, such as {missing[0][:80]}; fetch it from "
             f"{files.form.source}"
         )
-
-
-# A tag that contains one of these is left out.
-# Words that taggers give and that name no object, as ConceptGraphs sorts them (generate_gsa_results.py, 5c4da70).
-STOP_WORDS = (
-    "room", "kitchen", "office", "house", "home", "building", "corner", "shadow", "carpet", "photo", "shade", "stall",
-    "space", "aquarium", "apartment", "image", "city", "blue", "skylight", "hallway", "bureau", "modern", "salon",
-    "doorway", "wall lamp", "wood floor",
-)  # fmt: skip
-# Asked for in every image besides its tags.
-ADDED_TAGS = ("other item",)
-# Added with --add_bg_classes.
-BACKGROUND_TAGS = ("wall", "floor", "ceiling")

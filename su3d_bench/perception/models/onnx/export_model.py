@@ -1,4 +1,4 @@
-"""Any model of the catalogue that comes as ONNX: what its export wrote, and how far it is from torch."""
+"""Any model of the catalogue that can be exported, written as ONNX files."""
 
 from __future__ import annotations
 
