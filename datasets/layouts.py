@@ -5,16 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from su3d_bench.datasets.replica.writing import ReplicaLayout
-from su3d_bench.datasets.scannet.writing.exports import CppRecording, PythonRecording
-from su3d_bench.datasets.scannet.writing.layout import ScannetLayout, SensRecording
+from su3d_bench.datasets.scannet.writing.exports import CppExportLayout, PythonExportLayout
+from su3d_bench.datasets.scannet.writing.layout import SensLayout
 from su3d_bench.datasets.tum.writing import TumLayout
 from su3d_bench.datasets.writing import Layout
 
-_ALL: tuple[Layout, ...] = (
-    ReplicaLayout(),
-    ScannetLayout(SensRecording()),
-    ScannetLayout(PythonRecording()),
-    ScannetLayout(CppRecording()),
-    TumLayout(),
-)
+_ALL: tuple[Layout, ...] = (ReplicaLayout(), SensLayout(), PythonExportLayout(), CppExportLayout(), TumLayout())
 LAYOUTS: Mapping[str, Layout] = {layout.name: layout for layout in _ALL}

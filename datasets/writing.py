@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any, Protocol
 from su3d_bench.core.digests import digest_json
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, UInt8Array
-from su3d_bench.datasets.replica.folders import MARKER, read_marker
+from su3d_bench.datasets.recordings.made_rooms import MARKER, read_marker
 from su3d_bench.store.atomic import make_folder, write_bytes, write_json, write_text
 
 FRAMES_PER_SECOND = 30.0
@@ -97,51 +98,48 @@ class SceneTarget:
         return all(path.exists() for path in (self.folder / self.frames, *self.truth))
 
 
-class Layout(Protocol):
+class Layout(ABC):
     """How the scenes of one dataset are named, and how their frames and their truth are written.
 
     ``name`` is that of ``--layout``, ``reader`` the dataset that reads it. ``settings`` is what moves a byte of a scene
     besides the scene itself, the layout's version first.
     """
 
-    @property
-    def name(self) -> str: ...
-    @property
-    def reader(self) -> str: ...
-    @property
-    def settings(self) -> Sequence[Any]: ...
+    name: str
+    reader: str
+    settings: Sequence[Any]
 
+    @abstractmethod
     def scenes_folder(self, out: Path) -> Path: ...
 
     def scene_name(self, scene: str) -> str:
         """What the scene is called in the layout; a ``DataError`` where it has no name for it."""
-        ...
+        return scene
 
+    @abstractmethod
     def target(self, scene: str, key: str, out: Path) -> SceneTarget: ...
 
     def marker_extras(self, names: Sequence[str]) -> dict[str, Any]:
         """What else the marker says of the scenes, by their names in the layout."""
-        ...
+        return {}
 
-    def write_shared(self, dataset: ScannedDataset, scene: str, out: Path) -> None:
+    def write_shared(self, dataset: ScannedDataset, scene: str, out: Path) -> None:  # noqa: B027 - none for some
         """Write what all scenes share; a ``StoreError`` where there is another."""
-        ...
 
+    @abstractmethod
     def frame_names(self, index: int) -> Sequence[str]:
         """The files of a frame, by their names in the folder in which the scene is built."""
-        ...
 
+    @abstractmethod
     def frame_files(self, frame: Frame) -> Sequence[bytes]:
         """The content of each of ``frame_names``."""
-        ...
 
+    @abstractmethod
     def write_truth(self, dataset: ScannedDataset, target: SceneTarget) -> None:
         """Write all files but those of the frames into ``target.partial``."""
-        ...
 
-    def join(self, dataset: ScannedDataset, target: SceneTarget) -> None:
+    def join(self, dataset: ScannedDataset, target: SceneTarget) -> None:  # noqa: B027 - most have a file a frame
         """Make in ``target.partial`` what takes all frames at once; called when the rest is written."""
-        ...
 
 
 def plan_scenes(layout: Layout, dataset: ScannedDataset, scenes: Sequence[str], out: Path) -> list[SceneTarget]:

@@ -5,9 +5,12 @@ frames that are read from one colour and one depth file each.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterable, Sequence
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +37,28 @@ def read_text(path: Path, where: str, advice: str = "copy the file again") -> st
         raise DataError(f"{where} cannot be read: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise DataError(f"{where}: not a text file; {advice}") from error
+
+
+def parsed_json(content: bytes, where: str) -> Any:
+    """What a JSON file holds."""
+    try:
+        return json.loads(content)
+    except (ValueError, RecursionError) as error:
+        raise DataError(f"{where}: not JSON ({error}); copy the file again") from error
+
+
+@contextmanager
+def reading(where: str) -> Iterator[None]:
+    """A file that cannot be read in the block is a ``DataError``."""
+    try:
+        yield
+    except OSError as error:
+        raise DataError(f"{where}: {error.filename} cannot be read: {error.strerror}") from error
+
+
+def depth_m_of_values(units_per_metre: float) -> Float32Array:
+    """Metres (65536,) of every value that a depth image can hold."""
+    return (np.arange(N_DEPTH_VALUES) / units_per_metre).astype(np.float32)
 
 
 def numbers(words: Sequence[str], where: str) -> list[float]:
@@ -117,13 +142,11 @@ class Recording:
         the last frame: an image in the middle that was changed and kept its size goes unseen."""
         total = hashlib.sha256(" ".join(str(word) for word in words).encode())
         images = self.images()
-        try:
+        with reading(self.where):
             for path in (*self.files, *images[:2], *images[-2:]):
                 total.update(f"{path.name} {digest_file(path)}\n".encode())
             for path in images:
                 total.update(f"{path.name} {path.stat().st_size}\n".encode())
-        except OSError as error:
-            raise DataError(f"{self.where}: {error.filename} cannot be read: {error.strerror}") from error
         return total.hexdigest()
 
 

@@ -16,6 +16,7 @@ import numpy as np
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, OrientedBox
 from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, AnnotatedMesh, read_objects, shown, whole_number
+from su3d_bench.numerics.geometry import rotations_of
 
 SLACK_M = 0.05
 UNIT_TOLERANCE = 1e-2  # the release writes unit quaternions in single precision
@@ -51,7 +52,7 @@ def _box(content: Any, where: str) -> OrientedBox:
         raise DataError(f"{where}: 'rotation' has the length {length:g}; expected a unit quaternion x y z w")
     if (sizes < 0).any():
         raise DataError(f"{where}: 'sizes' are {sizes.tolist()}; expected 0 m or more")
-    rotation = rotation_of(quaternion / length)
+    rotation = rotations_of((quaternion / length)[None])[0]
     return OrientedBox(rotation @ centre + translation, sizes, rotation)
 
 
@@ -64,22 +65,6 @@ def _numbers(values: Any, n: int, where: str) -> Float64Array:
     if unfit is not None:
         raise DataError(f"{where} holds {shown(unfit)}; expected numbers within {MOST_M:g} m")
     return np.array([float(one) for one in numbers])
-
-
-def rotation_of(quaternion: Float64Array) -> Float64Array:
-    """The rotation matrix (3, 3) of a unit quaternion x y z w.
-
-    >>> rotation_of(np.array([0.0, 0.0, 0.6, 0.8]))[:, 0].round(12).tolist()
-    [0.28, 0.96, 0.0]
-    """
-    x, y, z, w = quaternion
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
 
 
 def objects_outside_boxes(mesh: AnnotatedMesh, boxes: Mapping[int, OrientedBox]) -> dict[int, float]:

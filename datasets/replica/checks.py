@@ -11,6 +11,7 @@ from pathlib import Path
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError
+from su3d_bench.datasets.recordings.recorded_frames import reading
 from su3d_bench.datasets.replica.boxes import SLACK_M, objects_outside_boxes, read_boxes
 from su3d_bench.datasets.replica.frames import (
     Camera,
@@ -130,13 +131,11 @@ PNG_TAIL_BYTES = 1024  # the end of the pixels, and what little writers put behi
 def digest_of(parts: Iterable[str], files: Sequence[Path], images: Sequence[Path], where: str) -> str:
     """A key of ``parts``, the content of ``files``, and the names, sizes and content of ``images``."""
     total = hashlib.sha256("\n".join(parts).encode())
-    try:
+    with reading(where):
         for path in files:
             total.update(f"{path.name} {digest_file(path)}\n".encode())
         for path in images:
             total.update(f"{path.name} {image_key(path)}\n".encode())
-    except OSError as error:
-        raise DataError(f"{where}: {error.filename} cannot be read: {error.strerror}") from error
     return total.hexdigest()
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, GroundTruth
+from su3d_bench.datasets.recordings.meshes import check_finite
 from su3d_bench.datasets.replica.folders import FUSED_CLOUD, replica_label_set
 from su3d_bench.formats.hdf5 import largest_column, read_rows
 from su3d_bench.formats.poses import moved, read_first_pose
@@ -59,10 +60,7 @@ def conceptgraphs_truth(sequence: Path, reference: Path, where: str) -> GroundTr
 def read_points(path: Path, where: str) -> Float32Array:
     """The finite points (N, 3) of a ``pc_points.h5``, at least one."""
     points = read_rows(path, 3, where)
-    is_finite = np.isfinite(points).all(axis=1)
-    if not is_finite.all():
-        row = int(np.argmin(is_finite))
-        raise DataError(f"{where}: point {row} is at {points[row].tolist()}; copy the file again")
+    check_finite(points, where, "point")
     if not len(points):
         raise DataError(f"{where}: holds no point; make or copy it again")
     return points

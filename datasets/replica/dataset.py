@@ -10,6 +10,8 @@ from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
 from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, SceneInfo, Surface
+from su3d_bench.datasets.recordings.made_rooms import read_marker
+from su3d_bench.datasets.recordings.meshes import read_surface
 from su3d_bench.datasets.replica.boxes import read_boxes
 from su3d_bench.datasets.replica.checks import digest_of, original_problems, render_problems
 from su3d_bench.datasets.replica.cloud_truth import cloud_files, conceptgraphs_truth
@@ -30,7 +32,6 @@ from su3d_bench.datasets.replica.folders import (
     find_semantic_sequence,
     no_render_tree,
     original_name,
-    read_marker,
 )
 from su3d_bench.datasets.replica.frames import (
     ReplicaFrames,
@@ -47,7 +48,6 @@ from su3d_bench.datasets.replica.mesh_truth import (
     AnnotatedMesh,
     corner_truth,
     read_annotated_mesh,
-    read_surface,
     triangle_mesh,
     vertex_truth,
 )

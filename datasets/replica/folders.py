@@ -56,7 +56,6 @@ HOW_TO_GET_LABELS = {
     "scripts/get_replica_dataset.sh of Open-YOLO 3D downloads; replica-openmask3d scores without them",
     "ovo-51": "they are in https://github.com/opennerf/opennerf, datasets/replica_gt_semantics",
 }
-MARKER = "rooms.json"  # stands beside cam_params.json where scenes were made by `datasets make`
 
 
 @dataclass(frozen=True)
@@ -141,21 +140,6 @@ def no_render_tree(root: Path) -> DataError:
         f"results/); unpack {RENDER_URL} there, set SU3D_DATA to where it is, or make rooms in this layout: "
         f"su3d-bench datasets make rooms --layout replica --out {root}"
     )
-
-
-def read_marker(folder: Path) -> dict[str, str]:
-    """Scene -> content key of the scenes in a render tree that ``datasets make`` rendered; empty without a marker."""
-    path = folder / MARKER
-    if not path.is_file():
-        return {}
-    try:
-        scenes = json.loads(path.read_text(encoding="utf-8"))["scenes"]
-        return {str(scene): str(key) for scene, key in scenes.items()}
-    except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise DataError(
-            f"{path}: not the marker that `su3d-bench datasets make` writes ({error}); delete it if the scenes were "
-            "not made by it, otherwise make them again"
-        ) from error
 
 
 LABEL_SPACE = "replica"

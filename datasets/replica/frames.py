@@ -7,7 +7,6 @@ complete, so a gap or a NaN means a damaged copy, and a number computed around i
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,13 +17,13 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
+from su3d_bench.datasets.recordings.recorded_frames import depth_m_of_values, parsed_json
 from su3d_bench.datasets.replica.mesh_truth import shown
 from su3d_bench.formats.images import decode_colour, decode_depth, read_bytes
 from su3d_bench.formats.poses import poses_of_lines
 
 CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
 FRAMES_PER_SECOND = 30.0  # the release has no timestamps
-N_DEPTH_VALUES = 1 << 16
 MOST_OF_CAMERA = 1e9  # pixels, focal lengths and depth units stay far below
 
 
@@ -42,11 +41,9 @@ def read_camera(path: Path, where: str) -> Camera:
     """The camera of ``cam_params.json``; ``where`` begins each message."""
     where = f"{where}: {path.name}"
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parsed_json(path.read_bytes(), where)
     except OSError as error:
         raise DataError(f"{where} cannot be read: {error.strerror}; it belongs into {path.parent}") from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{where}: not JSON ({error}); copy the file again") from error
     table = content.get("camera") if isinstance(content, dict) else None
     if not isinstance(table, dict):
         raise DataError(f"{where}: has no table 'camera'; expected {{'camera': {{{', '.join(CAMERA_KEYS)}}}}}")
@@ -127,7 +124,7 @@ class ReplicaFrames(Sequence[Frame]):
     def __init__(self, folder: Path, where: str, camera: Camera, poses: Float64Array, indices: range) -> None:
         self._folder, self._where, self._camera = folder, where, camera
         self._poses, self._indices = poses, indices
-        self._depth_m_of_value = (np.arange(N_DEPTH_VALUES) / camera.scale).astype(np.float32)
+        self._depth_m_of_value = depth_m_of_values(camera.scale)
 
     def __len__(self) -> int:
         return len(self._indices)

@@ -20,8 +20,8 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float32Array, GroundTruth, Int32Array
+from su3d_bench.datasets.recordings.meshes import vertex_positions
 from su3d_bench.datasets.replica.folders import replica_label_set
-from su3d_bench.datasets.replica.mesh_truth import vertex_positions
 from su3d_bench.formats.ply import read_ply
 from su3d_bench.formats.ply_parts import MAX_HEADER_BYTES, read_header
 

@@ -9,7 +9,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -17,16 +16,16 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import Float32Array, GroundTruth, InstanceMesh, Int32Array, Int64Array, Surface
+from su3d_bench.core.types import Float32Array, GroundTruth, InstanceMesh, Int32Array, Int64Array
+from su3d_bench.datasets.recordings.meshes import face_corners, fans, scalar_column, vertex_positions
+from su3d_bench.datasets.recordings.recorded_frames import parsed_json
 from su3d_bench.datasets.replica.folders import replica_label_set
-from su3d_bench.formats.ply import ListColumn, PlyElement, PlyFile, read_ply
+from su3d_bench.formats.ply import ListColumn, read_ply
 
 MESH_NAME = "habitat/mesh_semantic.ply"
 INFO_NAME = "habitat/info_semantic.json"
-CORNER_NAMES = ("vertex_indices", "vertex_index")
 UNDEFINED_CLASSES = (-2, -1, 0, 256)  # what the release writes where an object has no class
 MAX_OBJECT_ID = 2**31 - 2
 logger = logging.getLogger(__name__)
@@ -77,11 +76,9 @@ def read_objects(path: Path, where: str) -> list[dict[str, Any]]:
     """The rows of ``objects`` of an ``info_semantic.json`` whose classes are Replica's."""
     where = f"{where}: {INFO_NAME}"
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = parsed_json(path.read_bytes(), where)
     except OSError as error:
         raise DataError(f"{where} cannot be read: {error.strerror}") from error
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{where}: not JSON ({error}); copy the file again") from error
     objects = _list_of_tables(content, "objects", where)
     _check_class_names(_list_of_tables(content, "classes", where), where)
     return objects
@@ -149,44 +146,10 @@ def _read_mesh(path: Path, where: str) -> tuple[Float32Array, ListColumn, Int64A
         raise DataError(
             f"{where}: faces have no 'object_id'; a program that drops it has saved this file, take the original"
         )
-    objects = _scalar(face, "object_id", where)
+    objects = scalar_column(face, "object_id", where)
     if objects.dtype.kind == "f":
         raise DataError(f"{where}: 'object_id' is of type {objects.dtype}; expected a type of whole numbers")
     return vertices, corners, objects.astype(np.int64)
-
-
-def face_corners(face: PlyElement, n_vertices: int, where: str) -> ListColumn:
-    """The vertices of each polygon, all of them there."""
-    corners = next((face.columns[name] for name in CORNER_NAMES if name in face.columns), None)
-    if not isinstance(corners, ListColumn) or corners.values.dtype.kind == "f":
-        raise DataError(f"{where}: faces have no list 'vertex_indices' of whole numbers")
-    is_outside = (corners.values < 0) | (corners.values >= n_vertices)
-    if is_outside.any():
-        first = int(np.flatnonzero(is_outside)[0])
-        row = int(np.searchsorted(corners.indptr, first, side="right")) - 1
-        raise DataError(
-            f"{where}: face {row} names vertex {corners.values[first]}, the mesh has {n_vertices} (0..{n_vertices - 1})"
-        )
-    return corners
-
-
-def vertex_positions(file: PlyFile, where: str) -> Float32Array:
-    """The finite positions (V, 3) of a mesh's vertices, in the order of the file."""
-    vertex = file.element("vertex")
-    if vertex is None or vertex.n_rows == 0:
-        raise DataError(f"{where}: no mesh; expected an element 'vertex' with rows")
-    vertices = np.stack([_scalar(vertex, axis, where) for axis in "xyz"], axis=1).astype(np.float32)
-    if not np.isfinite(vertices).all():
-        row = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
-        raise DataError(f"{where}: vertex {row} is at {vertices[row].tolist()}; copy the file again")
-    return vertices
-
-
-def _scalar(element: PlyElement, name: str, where: str) -> NDArray[Any]:
-    column = element.columns.get(name)
-    if column is None or isinstance(column, ListColumn):
-        raise DataError(f"{where}: element '{element.name}' has no property '{name}'")
-    return column
 
 
 def object_of_vertex(n_vertices: int, corners: ListColumn, object_of_face: Int64Array) -> Int64Array:
@@ -243,21 +206,3 @@ def triangle_mesh(mesh: AnnotatedMesh) -> InstanceMesh:
         mesh.class_of_instance,
         replica_label_set(),
     )
-
-
-def fans(corners: ListColumn) -> tuple[Int32Array, Int64Array]:
-    """Polygons as triangles (T, 3), and the polygon of each: a quad is (0, 1, 2), (0, 2, 3), as habitat-sim has it."""
-    n_triangles = np.maximum(corners.lengths - 2, 0)
-    first = np.repeat(corners.indptr[:-1], n_triangles)
-    step = np.arange(len(first)) - np.repeat(np.cumsum(n_triangles) - n_triangles, n_triangles)
-    rows = np.stack([first, first + step + 1, first + step + 2], axis=1)
-    return corners.values[rows].astype(np.int32), np.repeat(np.arange(len(n_triangles)), n_triangles)
-
-
-def read_surface(path: Path, where: str) -> Surface:
-    """The mesh in a file without regard to labels; ``where`` names the file and begins each message."""
-    file = read_ply(path, where)
-    vertices, face = vertex_positions(file, where), file.element("face")
-    if face is None or face.n_rows == 0:
-        raise DataError(f"{where}: has no faces; expected a mesh")
-    return Surface(vertices, fans(face_corners(face, len(vertices), where))[0])

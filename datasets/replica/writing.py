@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +13,7 @@ from su3d_bench.core.types import Float64Array, Frame
 from su3d_bench.datasets.replica.folders import original_name, replica_label_set
 from su3d_bench.datasets.replica.frames import colour_name, depth_name
 from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, MESH_NAME
-from su3d_bench.datasets.writing import Scan, ScannedDataset, ScannedObject, SceneTarget, write_shared_text
+from su3d_bench.datasets.writing import Layout, Scan, ScannedDataset, ScannedObject, SceneTarget, write_shared_text
 from su3d_bench.formats.images import (
     JPEG_QUALITY,
     depth_in_units,
@@ -32,28 +31,21 @@ RENDER_FOLDER, ORIGINAL_FOLDER = "Replica", "replica_v1"
 STAGED_ORIGINAL, STAGED_MESH = ".original", ".mesh.ply"
 
 
-@dataclass(frozen=True)
-class ReplicaLayout:
+class ReplicaLayout(Layout):
     """``Replica/<scene>/`` with the frames, the annotated mesh in ``replica_v1``; one camera for all scenes."""
 
-    name: str = "replica"
-    reader: str = "replica"
-    settings: Sequence[Any] = (LAYOUT_VERSION, DEPTH_SCALE, JPEG_QUALITY)
+    name = "replica"
+    reader = "replica"
+    settings = (LAYOUT_VERSION, DEPTH_SCALE, JPEG_QUALITY)
 
     def scenes_folder(self, out: Path) -> Path:
         return out / RENDER_FOLDER
-
-    def scene_name(self, scene: str) -> str:
-        return scene
 
     def target(self, scene: str, key: str, out: Path) -> SceneTarget:
         folder, mesh = out / RENDER_FOLDER / scene, out / RENDER_FOLDER / f"{scene}_mesh.ply"
         original = out / ORIGINAL_FOLDER / original_name(scene)
         truth = (mesh, original / MESH_NAME, original / INFO_NAME)
         return SceneTarget(scene, key, folder, "results", truth, ((STAGED_ORIGINAL, original), (STAGED_MESH, mesh)))
-
-    def marker_extras(self, names: Sequence[str]) -> dict[str, Any]:
-        return {}
 
     def write_shared(self, dataset: ScannedDataset, scene: str, out: Path) -> None:
         make_folder(out / ORIGINAL_FOLDER)
@@ -81,9 +73,6 @@ class ReplicaLayout:
         poses = dataset.trajectory(target.scene)
         lines = [" ".join(repr(float(value)) for value in pose.reshape(-1)) for pose in poses]
         write_text(target.partial / "traj.txt", "\n".join(lines) + "\n")
-
-    def join(self, dataset: ScannedDataset, target: SceneTarget) -> None:
-        """Nothing: every frame has files of its own."""
 
 
 def _vertex_element(scan: Scan) -> PlyElement:

@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, field_validator
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, GroundTruth, InstanceMesh, SceneInfo, Surface
+from su3d_bench.datasets.recordings.meshes import read_surface
 from su3d_bench.datasets.recordings.pose_convention import ROTATED, judge_convention
 from su3d_bench.datasets.recordings.recorded_frames import (
     N_DEPTH_VALUES,
@@ -28,7 +29,6 @@ from su3d_bench.datasets.recordings.recorded_frames import (
     left_out,
     pinhole,
 )
-from su3d_bench.datasets.replica.mesh_truth import read_surface
 from su3d_bench.datasets.rgbd.description import FILE_NAME, INDEX, RgbdDescription, read_description
 from su3d_bench.datasets.rgbd.files import (
     Pose,

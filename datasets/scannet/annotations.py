@@ -7,7 +7,6 @@ belongs to the last of them; one that none claims is not annotated.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Int64Array
+from su3d_bench.datasets.recordings.recorded_frames import parsed_json
 from su3d_bench.formats.images import read_bytes
 
 PREFIX = "scannet."  # before scene ids and file names of the second release, not of the first
@@ -88,10 +88,7 @@ def object_of_vertex(segments: Int64Array, objects: Sequence[AnnotatedObject]) -
 
 def _read_table(path: Path, scan: str, where: str) -> dict[str, Any]:
     """The JSON object in a file that says of itself that it belongs to ``scan``."""
-    try:
-        content = json.loads(read_bytes(path, where))
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{where}: not JSON ({error}); copy the file again") from error
+    content = parsed_json(read_bytes(path, where), where)
     if not isinstance(content, dict):
         raise DataError(f"{where}: is no JSON object; copy the file again")
     scene = content.get("sceneId")

@@ -14,6 +14,7 @@ from pydantic import BaseModel, ConfigDict
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
 from su3d_bench.core.types import Float64Array, Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo, Surface
+from su3d_bench.datasets.recordings.recorded_frames import reading
 from su3d_bench.datasets.recordings.registration import Grid, make_registration
 from su3d_bench.datasets.recordings.source import RgbdSource
 from su3d_bench.datasets.scannet.annotations import segments_name
@@ -130,11 +131,9 @@ class ScanNet:
         total = hashlib.sha256(" ".join(str(word) for word in words).encode())
         source, walk = self._open(scene)
         total.update(digest_recording(source, walk.poses).encode())
-        try:
+        with reading(self._where(scene)):
             for path in self._small_files(scene):
                 total.update(f"{path.name} {digest_file(path)}\n".encode())
-        except OSError as error:
-            raise DataError(f"{self._where(scene)}: {error.filename} cannot be read: {error.strerror}") from error
         return total.hexdigest()
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:

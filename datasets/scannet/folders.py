@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.datasets.replica.folders import read_marker
+from su3d_bench.datasets.recordings.made_rooms import read_marker
 from su3d_bench.datasets.scannet.labels import TABLE_NAME
 
 # The scenes of OpenSU3D's evaluation, in the order of its section IV-A.

@@ -9,11 +9,10 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int64Array
+from su3d_bench.datasets.recordings.recorded_frames import depth_m_of_values
 from su3d_bench.datasets.recordings.registration import Registration
 from su3d_bench.datasets.recordings.source import RgbdSource
 from su3d_bench.numerics.geometry import are_rigid
-
-N_DEPTH_VALUES = 1 << 16
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ class ScannetFrames(Sequence[Frame]):
     ) -> None:
         self._source, self._registration, self._walk = source, registration, walk
         self._records, self._motion = records, motion
-        self._depth_m_of_value = (np.arange(N_DEPTH_VALUES) / source.camera.depth_shift).astype(np.float32)
+        self._depth_m_of_value = depth_m_of_values(source.camera.depth_shift)
 
     def __len__(self) -> int:
         return len(self._records)

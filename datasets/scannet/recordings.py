@@ -31,7 +31,7 @@ from su3d_bench.datasets.recordings.exported_frames import (
     read_size,
     square,
 )
-from su3d_bench.datasets.recordings.recorded_frames import numbers, read_text
+from su3d_bench.datasets.recordings.recorded_frames import numbers, read_text, reading
 from su3d_bench.datasets.recordings.source import RgbdSource, SensorPair, Size
 from su3d_bench.datasets.scannet.sens.header import MAX_HEADER_BYTES, header_bytes, parse_header
 from su3d_bench.datasets.scannet.sens.read import SensSource
@@ -40,7 +40,7 @@ SourceKind = Literal["auto", "sens", "python", "cpp"]
 DEPTH_SHIFT = 1000.0  # of every recording of ScanNet; the Python reader does not export it
 COLOUR_SIZE, DEPTH_SIZE = (1296, 968), (640, 480)  # of ScanNet's cameras; OpenMask3D's intrinsic_resolution
 OFF_CENTRE = 0.1  # of the image; ScanNet's principal points are within 0.02 of the middle
-INFO = "_info.txt"
+INFO, TEXT = "_info.txt", ".txt"
 COUNT_KEY, SHIFT_KEY = "m_frames.size", "m_depthShift"
 SIZE_KEYS = ("m_colorWidth", "m_colorHeight", "m_depthWidth", "m_depthHeight")
 MATRIX_KEYS = tuple(
@@ -90,15 +90,26 @@ def find_source(folder: Path, scene: str, where: str, kind: SourceKind = "auto")
 
 
 def _first_source(folder: Path, scene: str, where: str, kind: SourceKind) -> RgbdSource | None:
-    sens, places = folder / f"{scene}.sens", [folder / name for name in ("", "exported", scene)]
+    form, place = _find(folder, scene, kind) or (None, folder)
+    if form == "sens":
+        return SensSource(place, where)
+    if form == "python":
+        return open_python_export(place, where)
+    return open_cpp_export(place, where) if form == "cpp" else None
+
+
+def _find(folder: Path, scene: str, kind: SourceKind) -> tuple[SourceKind, Path] | None:
+    """The form of the recording in a scan's folder, and where it is: the ``.sens`` file or the folder of the export."""
+    sens = folder / f"{scene}.sens"
     if kind in ("auto", "sens") and sens.exists():
-        return SensSource(sens, where)
+        return "sens", sens
+    places = [folder / name for name in ("", "exported", scene)]
     for place in places if kind in ("auto", "python") else ():
         if python_layout(place) is not None:
-            return open_python_export(place, where)
+            return "python", place
     for place in places if kind in ("auto", "cpp") else ():
         if (place / INFO).exists():
-            return open_cpp_export(place, where)
+            return "cpp", place
     return None
 
 
@@ -245,44 +256,28 @@ def _count(words: Sequence[str], key: str, where: str) -> int:
     return int(text)
 
 
-TEXT = ".txt"
-
-
 def folder_of_recording(folders: Sequence[Path], scene: str, kind: SourceKind) -> Path:
     """The first of a scan's folders that holds a recording of that kind; the first of all where none does."""
-    return next((folder for folder in folders if _recording_in(folder, scene, kind) is not None), folders[0])
-
-
-def _recording_in(folder: Path, scene: str, kind: SourceKind) -> Path | None:
-    """The ``.sens`` file, else what one of the exports is known by: its folder of poses, or ``_info.txt``."""
-    sens = folder / f"{scene}.sens"
-    if kind in ("auto", "sens") and sens.exists():
-        return sens
-    places = [folder / name for name in ("", "exported", scene)]
-    for place in places if kind in ("auto", "python") else ():
-        if (layout := python_layout(place)) is not None:
-            return place / layout.pose
-    for place in places if kind in ("auto", "cpp") else ():
-        if (place / INFO).exists():
-            return place / INFO
-    return None
+    return next((folder for folder in folders if _find(folder, scene, kind) is not None), folders[0])
 
 
 def describe_recording(folder: Path, scene: str, where: str, kind: SourceKind) -> str:
     """How many frames there are, lost ones among them, without reading more than a header or a list of names."""
-    found = _recording_in(folder, scene, kind)
-    if found is None:
+    form, place = _find(folder, scene, kind) or (None, folder)
+    if form is None:
         return "no recording"
+    layout = python_layout(place)
+    path = place / layout.pose if form == "python" and layout is not None else place
     try:
-        if found.suffix == ".sens":
-            with found.open("rb") as stream:
-                _, n_frames, _ = parse_header(stream.read(MAX_HEADER_BYTES), f"{where}: {found.name}")
+        if form == "sens":
+            with path.open("rb") as stream:
+                _, n_frames, _ = parse_header(stream.read(MAX_HEADER_BYTES), f"{where}: {path.name}")
             return f"{n_frames} frames"
-        if found.name == INFO:
-            return f"{read_info(found, where)[1]} exported frames"
-        return f"{sum(name.endswith(TEXT) for name in os.listdir(found))} exported frames"
+        if form == "cpp":
+            return f"{read_info(path / INFO, where)[1]} exported frames"
+        return f"{sum(name.endswith(TEXT) for name in os.listdir(path))} exported frames"
     except OSError as error:
-        raise DataError(f"{where}: {found.name} cannot be read: {error.strerror}") from error
+        raise DataError(f"{where}: {path.name} cannot be read: {error.strerror}") from error
 
 
 def digest_recording(source: RgbdSource, poses: Float64Array) -> str:
@@ -299,11 +294,9 @@ def digest_recording(source: RgbdSource, poses: Float64Array) -> str:
     matrices = camera.colour_intrinsics, camera.depth_intrinsics, camera.colour_extrinsic, camera.depth_extrinsic
     total.update(f"{camera.colour_size} {camera.depth_size} {camera.depth_shift!r}\n".encode())
     total.update(b"".join(matrix.astype(np.float64).tobytes() for matrix in (*matrices, poses)))
-    try:
+    with reading(source.where):
         for path in source.files():
             total.update(f"{path.parent.name}/{path.name} {path.stat().st_size}\n".encode())
         for path in (*images[:2], *images[-2:]):
             total.update(digest_file(path).encode())
-    except OSError as error:
-        raise DataError(f"{source.where}: {error.filename} cannot be read: {error.strerror}") from error
     return f"export {total.hexdigest()}"

@@ -21,6 +21,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, InstanceMesh, Int32Array, Int64Array, Surface
+from su3d_bench.datasets.recordings.meshes import CORNER_NAMES, check_corners, check_finite
 from su3d_bench.datasets.scannet.annotations import (
     AnnotatedObject,
     aggregation_name,
@@ -34,7 +35,6 @@ from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.ply import ListColumn, PlyFile, read_ply
 from su3d_bench.numerics.geometry import are_rigid
 
-CORNER_NAMES = ("vertex_indices", "vertex_index")
 SAME_PLACE_M = 1e-3  # both files hold one mesh; text formats round its coordinates
 logger = logging.getLogger(__name__)
 
@@ -128,9 +128,7 @@ def _vertices(file: PlyFile, where: str) -> Float32Array:
         raise DataError(f"{where}: vertices have no 'x', 'y', 'z'; expected the decimated mesh of the release")
     with np.errstate(over="ignore"):
         vertices = np.stack([np.asarray(column) for column in columns], axis=1).astype(np.float32)
-    if not np.isfinite(vertices).all():
-        row = int(np.flatnonzero(~np.isfinite(vertices).all(axis=1))[0])
-        raise DataError(f"{where}: vertex {row} is at {vertices[row].tolist()}; copy the file again")
+    check_finite(vertices, where)
     return vertices
 
 
@@ -165,12 +163,7 @@ def _triangles(file: PlyFile, n_vertices: int, where: str) -> Int32Array:
     corners = next((element.columns[name] for name in CORNER_NAMES if name in element.columns), None)
     if not isinstance(corners, ListColumn) or corners.values.dtype.kind == "f" or (corners.lengths != 3).any():
         raise DataError(f"{where}: faces are no triangles of 'vertex_indices'; expected the mesh of the release")
-    if corners.values.min() < 0 or corners.values.max() >= n_vertices:
-        first = int(np.flatnonzero((corners.values < 0) | (corners.values >= n_vertices))[0])
-        raise DataError(
-            f"{where}: face {first // 3} names vertex {corners.values[first]}, the mesh has {n_vertices} (0.."
-            f"{n_vertices - 1})"
-        )
+    check_corners(corners, n_vertices, where)
     return corners.values.reshape(-1, 3).astype(np.int32)
 
 

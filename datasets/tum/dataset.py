@@ -25,12 +25,13 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
 from su3d_bench.core.types import Float64Array, Frame, GroundTruth, ImageDomain, InstanceMesh, SceneInfo
+from su3d_bench.datasets.recordings.made_rooms import MARKER
 from su3d_bench.datasets.recordings.recorded_frames import (
-    N_DEPTH_VALUES,
     Folder,
     RecordedFrame,
     RecordedFrames,
     Recording,
+    depth_m_of_values,
     left_out,
     numbers,
     pinhole,
@@ -42,7 +43,7 @@ logger = logging.getLogger(__name__)
 READER_VERSION = 1  # raise it whenever the same files come out as other frames
 FOLDERS = (".", "tum", "TUM")
 UNITS_PER_METRE = 5000.0  # the benchmark's page "file formats"
-DEPTH_M_OF_VALUE = (np.arange(N_DEPTH_VALUES) / UNITS_PER_METRE).astype(np.float32)
+DEPTH_M_OF_VALUE = depth_m_of_values(UNITS_PER_METRE)
 MAX_CANDIDATES = 2_000_000  # pairs of images near in time; a recording has about two an image
 # fx fy cx cy of the colour cameras: the benchmark's page "file formats", section "intrinsic camera calibration".
 CAMERAS = {
@@ -100,7 +101,7 @@ class Tum:
 
     def info(self, scene: str, stride: int) -> SceneInfo:
         frames = RecordedFrames(self._recording(scene), stride)
-        domain: ImageDomain = "rendered-rooms" if (self._folder(scene) / "rooms.json").is_file() else "camera"
+        domain: ImageDomain = "rendered-rooms" if (self._folder(scene) / MARKER).is_file() else "camera"
         return SceneInfo(self.name, scene, len(frames), stride, domain)
 
     def frames(self, scene: str, stride: int) -> Sequence[Frame]:

@@ -10,6 +10,7 @@ import numpy as np
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.recordings.recorded_frames import numbers, read_text
+from su3d_bench.numerics.geometry import rotations_of
 
 
 def rows_of(path: Path, where: str, n_words: int, form: str) -> list[tuple[int, list[str]]]:
@@ -70,13 +71,8 @@ def pose_at(
 
 def quaternion_poses(translations: Float64Array, quaternions: Float64Array) -> Float64Array:
     """Poses (n, 4, 4) of translations (n, 3) and unit quaternions (n, 4) in the order x y z w."""
-    x, y, z, w = quaternions.T
-    poses = np.zeros((len(quaternions), 4, 4))
-    poses[:, 0, :3] = np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], axis=1)
-    poses[:, 1, :3] = np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], axis=1)
-    poses[:, 2, :3] = np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=1)
-    poses[:, :3, 3] = translations
-    poses[:, 3, 3] = 1
+    poses = np.tile(np.eye(4), (len(quaternions), 1, 1))
+    poses[:, :3, :3], poses[:, :3, 3] = rotations_of(quaternions), translations
     return poses
 
 

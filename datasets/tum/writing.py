@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from su3d_bench.core.types import Frame
-from su3d_bench.datasets.replica.folders import MARKER
-from su3d_bench.datasets.writing import FRAMES_PER_SECOND, ScannedDataset, SceneTarget
+from su3d_bench.datasets.recordings.made_rooms import MARKER
+from su3d_bench.datasets.writing import FRAMES_PER_SECOND, Layout, ScannedDataset, SceneTarget
 from su3d_bench.formats.images import depth_in_units, png_bytes
 from su3d_bench.store.atomic import make_folder, write_json, write_text
 
@@ -18,30 +16,23 @@ UNITS_PER_METRE = 5000.0  # the benchmark's page "file formats"
 FOLDER = "tum"
 
 
-@dataclass(frozen=True)
-class TumLayout:
-    """``tum/<scene>/`` with ``rgb``, ``depth``, their lists, ``groundtruth.txt`` and ``associate.txt``."""
+class TumLayout(Layout):
+    """``tum/<scene>/`` with ``rgb``, ``depth``, their lists, ``groundtruth.txt`` and ``associate.txt``.
 
-    name: str = "tum"
-    reader: str = "tum"
-    settings: Sequence[Any] = (LAYOUT_VERSION, "tum", UNITS_PER_METRE)
+    The scenes share nothing: each has a camera of its own.
+    """
+
+    name = "tum"
+    reader = "tum"
+    settings = (LAYOUT_VERSION, "tum", UNITS_PER_METRE)
 
     def scenes_folder(self, out: Path) -> Path:
         return out / FOLDER
-
-    def scene_name(self, scene: str) -> str:
-        return scene
 
     def target(self, scene: str, key: str, out: Path) -> SceneTarget:
         folder = out / FOLDER / scene
         names = ("rgb.txt", "depth.txt", "associate.txt", "groundtruth.txt", "camera.txt", MARKER)
         return SceneTarget(scene, key, folder, "rgb", tuple(folder / name for name in names))
-
-    def marker_extras(self, names: Sequence[str]) -> dict[str, Any]:
-        return {}
-
-    def write_shared(self, dataset: ScannedDataset, scene: str, out: Path) -> None:
-        """Nothing: each sequence has a camera of its own."""
 
     def frame_names(self, index: int) -> Sequence[str]:
         return _image_names(_time(index))
@@ -75,9 +66,6 @@ class TumLayout:
             write_text(target.partial / name, text)
         marker = {"generator": f"su3d-bench {dataset.name}", "version": LAYOUT_VERSION}
         write_json(target.partial / MARKER, marker | {"scenes": {target.folder.name: target.key}})
-
-    def join(self, dataset: ScannedDataset, target: SceneTarget) -> None:
-        """Nothing: every frame has files of its own."""
 
 
 def _time(index: int) -> str:

@@ -58,3 +58,18 @@ def are_rigid(matrices: Float64Array) -> BoolArray:
         is_affine = np.abs(last_rows - (0, 0, 0, 1)).max(axis=1) < RIGID_TOLERANCE
     result: BoolArray = is_orthogonal & is_proper & is_affine
     return result
+
+
+def rotations_of(quaternions: Float64Array) -> Float64Array:
+    """The rotation matrices (n, 3, 3) of unit quaternions (n, 4) in the order x y z w.
+
+    >>> rotations_of(np.array([[0.0, 0.0, 0.6, 0.8]]))[0, :, 0].round(12).tolist()
+    [0.28, 0.96, 0.0]
+    """
+    x, y, z, w = quaternions.T
+    rows = (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
+    )
+    return np.stack([np.stack(row, axis=1) for row in rows], axis=1)

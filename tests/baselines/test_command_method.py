@@ -24,7 +24,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Instances, Surface
-from su3d_bench.datasets.replica.mesh_truth import read_surface
+from su3d_bench.datasets.recordings.meshes import read_surface
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.predictions.base import VertexLabels, vertex_masks
 from su3d_bench.runs import scene as scene_run

@@ -7,8 +7,9 @@ from __future__ import annotations
 
 import math
 import struct
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, TypeVar
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from su3d_bench.formats.images import MAX_PIXELS
 
 ColourCompression = Literal["raw", "png", "jpeg"]
 DepthCompression = Literal["raw", "zlib"]
+Name = TypeVar("Name", bound=str)
 
 COLOUR_CODES: dict[int, ColourCompression] = {0: "raw", 1: "png", 2: "jpeg"}
 DEPTH_CODES: dict[int, DepthCompression] = {0: "raw", 1: "zlib"}
@@ -85,6 +87,12 @@ def parse_header(start: bytes, where: str) -> tuple[SensHeader, int, int]:
     except UnicodeDecodeError as error:
         raise DataError(f"{where}: byte {START.size}: the sensor's name is not text; the file is damaged") from error
     values = REST.unpack_from(start, START.size + n_name)
+    colour_compression = _compression(values[64], COLOUR_CODES, "colour", where)
+    if values[65] == OCCI:
+        raise DataError(
+            f"{where}: depth is compressed with OCCI (code {OCCI}), which only the recording program can undo; "
+            "export the frames with it and use the export"
+        )
     matrices = np.array(values[:64], np.float64).reshape(4, 4, 4)
     colour_width, colour_height, depth_width, depth_height = values[66:70]
     header = SensHeader(
@@ -93,8 +101,8 @@ def parse_header(start: bytes, where: str) -> tuple[SensHeader, int, int]:
         extrinsic_colour=matrices[1],
         intrinsic_depth=matrices[2],
         extrinsic_depth=matrices[3],
-        colour_compression=_colour_compression(values[64], where),
-        depth_compression=_depth_compression(values[65], where),
+        colour_compression=colour_compression,
+        depth_compression=_compression(values[65], DEPTH_CODES, "depth", where),
         colour_width=colour_width,
         colour_height=colour_height,
         depth_width=depth_width,
@@ -114,23 +122,11 @@ def _check_images(header: SensHeader, where: str) -> None:
         raise DataError(f"{where}: the depth shift is {header.depth_shift:g}; expected units per metre, above 0")
 
 
-def _colour_compression(code: int, where: str) -> ColourCompression:
-    if code not in COLOUR_CODES:
-        known = ", ".join(f"{known} ({name})" for known, name in COLOUR_CODES.items())
-        raise DataError(f"{where}: colour compression {code}; known: {known}")
-    return COLOUR_CODES[code]
-
-
-def _depth_compression(code: int, where: str) -> DepthCompression:
-    if code == OCCI:
-        raise DataError(
-            f"{where}: depth is compressed with OCCI (code {code}), which only the recording program can undo; "
-            "export the frames with it and use the export"
-        )
-    if code not in DEPTH_CODES:
-        known = ", ".join(f"{known} ({name})" for known, name in DEPTH_CODES.items())
-        raise DataError(f"{where}: depth compression {code}; known: {known}")
-    return DEPTH_CODES[code]
+def _compression(code: int, names: Mapping[int, Name], what: str, where: str) -> Name:
+    if code not in names:
+        known = ", ".join(f"{known} ({name})" for known, name in names.items())
+        raise DataError(f"{where}: {what} compression {code}; known: {known}")
+    return names[code]
 
 
 def header_bytes(header: SensHeader, n_frames: int) -> bytes:

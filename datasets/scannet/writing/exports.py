@@ -8,12 +8,11 @@ the recording, byte by byte.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 import numpy as np
 
 from su3d_bench.core.types import Float64Array, Frame
-from su3d_bench.datasets.scannet.writing.layout import DEPTH_SHIFT, SENSOR_NAME, intrinsics_4x4, size_of
+from su3d_bench.datasets.scannet.writing.layout import DEPTH_SHIFT, SENSOR_NAME, ScannetLayout, intrinsics_4x4, size_of
 from su3d_bench.datasets.writing import ScannedDataset, SceneTarget
 from su3d_bench.formats.images import UInt16Array, depth_in_units, jpeg_bytes, png_bytes
 from su3d_bench.store.atomic import make_folder, write_text
@@ -21,11 +20,10 @@ from su3d_bench.store.atomic import make_folder, write_text
 INFO = "_info.txt"
 
 
-@dataclass(frozen=True)
-class PythonRecording:
+class PythonExportLayout(ScannetLayout):
     """``color/<i>.jpg``, ``depth/<i>.png``, ``pose/<i>.txt``, ``intrinsic/``."""
 
-    name: str = "scannet-python"
+    name = "scannet-python"
 
     def holder(self, scan: str) -> str:
         return "color"
@@ -45,11 +43,10 @@ class PythonRecording:
             write_text(folder / f"extrinsic_{sensor}.txt", matrix_text(np.eye(4), "f"))
 
 
-@dataclass(frozen=True)
-class CppRecording:
+class CppExportLayout(ScannetLayout):
     """``frame-000000.color.jpg``, ``.depth.pgm``, ``.pose.txt`` and so on, and ``_info.txt``."""
 
-    name: str = "scannet-cpp"
+    name = "scannet-cpp"
 
     def holder(self, scan: str) -> str:
         return INFO

@@ -1,15 +1,15 @@
 """Scenes in the exact layout of ScanNet: ``scans/<scan>/`` with recording, mesh and annotation, the label table above.
 
-The recording is a ``.sens`` file here; the exports of the two original readers are in ``scannet_export_layout``.
+The recording is a ``.sens`` file here; the exports of the two original readers are in ``exports``.
 """
 
 from __future__ import annotations
 
 import shutil
+from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from su3d_bench.datasets.scannet.sens.write import SensFrame, depth_content, wri
 from su3d_bench.datasets.scannet.truth import meta_name, truth_names
 from su3d_bench.datasets.scannet.writing.categories import label_table_text, room_of, scan_name
 from su3d_bench.datasets.scannet.writing.truth import write_scan_truth
-from su3d_bench.datasets.writing import ScannedDataset, SceneTarget, write_shared_text
+from su3d_bench.datasets.writing import Layout, ScannedDataset, SceneTarget, write_shared_text
 from su3d_bench.formats.images import JPEG_QUALITY, depth_in_units, image_size, jpeg_bytes
 
 LAYOUT_VERSION = 1  # raise it whenever the same scene is written as other bytes
@@ -31,38 +31,18 @@ SENSOR_NAME = "StructureSensor"  # as the release has it, readers may know it
 PIECES = ".frames"
 
 
-class Recording(Protocol):
-    """How the frames of a scan are stored; ``name`` is the layout's."""
+class ScannetLayout(Layout):
+    """Rooms as scans ``scene9000_00`` and so on (see ``categories``); how frames are stored is for each to say."""
+
+    reader = "scannet"
 
     @property
-    def name(self) -> str: ...
+    def settings(self) -> Sequence[Any]:  # type: ignore[override]
+        return LAYOUT_VERSION, self.name, DEPTH_SHIFT, JPEG_QUALITY
 
+    @abstractmethod
     def holder(self, scan: str) -> str:
         """What holds the frames in the folder of the scan: ``SceneTarget.frames``."""
-        ...
-
-    def frame_names(self, index: int) -> Sequence[str]: ...
-    def frame_files(self, frame: Frame) -> Sequence[bytes]: ...
-
-    def join(self, dataset: ScannedDataset, target: SceneTarget) -> None:
-        """Write what is more than a frame, the holder last where it is a file."""
-        ...
-
-
-@dataclass(frozen=True)
-class ScannetLayout:
-    """Rooms as scans ``scene9000_00`` and so on (see ``scannet_rooms``), frames as ``recording`` stores them."""
-
-    recording: Recording
-    reader: str = "scannet"
-
-    @property
-    def name(self) -> str:
-        return self.recording.name
-
-    @property
-    def settings(self) -> Sequence[Any]:
-        return LAYOUT_VERSION, self.name, DEPTH_SHIFT, JPEG_QUALITY
 
     def scenes_folder(self, out: Path) -> Path:
         return out / SCANS_FOLDER
@@ -74,7 +54,7 @@ class ScannetLayout:
         scan = scan_name(scene)
         folder = out / SCANS_FOLDER / scan
         names = (*truth_names(scan), meta_name(scan))
-        return SceneTarget(scene, key, folder, self.recording.holder(scan), tuple(folder / name for name in names))
+        return SceneTarget(scene, key, folder, self.holder(scan), tuple(folder / name for name in names))
 
     def marker_extras(self, names: Sequence[str]) -> dict[str, Any]:
         return {"rooms": {scan: room for scan in names if (room := room_of(scan)) is not None}}
@@ -82,27 +62,17 @@ class ScannetLayout:
     def write_shared(self, dataset: ScannedDataset, scene: str, out: Path) -> None:
         write_shared_text(out / TABLE_NAME, label_table_text(), "is another label table than that of the rooms")
 
-    def frame_names(self, index: int) -> Sequence[str]:
-        return self.recording.frame_names(index)
-
-    def frame_files(self, frame: Frame) -> Sequence[bytes]:
-        return self.recording.frame_files(frame)
-
     def write_truth(self, dataset: ScannedDataset, target: SceneTarget) -> None:
         write_scan_truth(dataset, target.scene, target.folder.name, target.partial)
 
-    def join(self, dataset: ScannedDataset, target: SceneTarget) -> None:
-        self.recording.join(dataset, target)
 
-
-@dataclass(frozen=True)
-class SensRecording:
+class SensLayout(ScannetLayout):
     """One ``.sens`` file: JPEG colour, zlib depth, no motion data; joined of the records that were written one by one.
 
     Time stamps are microseconds from the first frame.
     """
 
-    name: str = "scannet"
+    name = "scannet"
 
     def holder(self, scan: str) -> str:
         return f"{scan}.sens"

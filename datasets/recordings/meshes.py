@@ -1,0 +1,79 @@
+"""Meshes in PLY files of any dataset: vertices, faces and surfaces, checked to fit each other."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from su3d_bench.core.errors import DataError
+from su3d_bench.core.types import Float32Array, Int32Array, Int64Array, Surface
+from su3d_bench.formats.ply import ListColumn, PlyElement, PlyFile, read_ply
+
+CORNER_NAMES = ("vertex_indices", "vertex_index")
+
+
+def face_corners(face: PlyElement, n_vertices: int, where: str) -> ListColumn:
+    """The vertices of each polygon, all of them there."""
+    corners = next((face.columns[name] for name in CORNER_NAMES if name in face.columns), None)
+    if not isinstance(corners, ListColumn) or corners.values.dtype.kind == "f":
+        raise DataError(f"{where}: faces have no list 'vertex_indices' of whole numbers")
+    check_corners(corners, n_vertices, where)
+    return corners
+
+
+def check_corners(corners: ListColumn, n_vertices: int, where: str) -> None:
+    """Raise ``DataError`` where a face names a vertex that is not there."""
+    is_outside = (corners.values < 0) | (corners.values >= n_vertices)
+    if is_outside.any():
+        first = int(np.flatnonzero(is_outside)[0])
+        row = int(np.searchsorted(corners.indptr, first, side="right")) - 1
+        raise DataError(
+            f"{where}: face {row} names vertex {corners.values[first]}, the mesh has {n_vertices} (0..{n_vertices - 1})"
+        )
+
+
+def vertex_positions(file: PlyFile, where: str) -> Float32Array:
+    """The finite positions (V, 3) of a mesh's vertices, in the order of the file."""
+    vertex = file.element("vertex")
+    if vertex is None or vertex.n_rows == 0:
+        raise DataError(f"{where}: no mesh; expected an element 'vertex' with rows")
+    vertices = np.stack([scalar_column(vertex, axis, where) for axis in "xyz"], axis=1).astype(np.float32)
+    check_finite(vertices, where)
+    return vertices
+
+
+def check_finite(points: Float32Array, where: str, noun: str = "vertex") -> None:
+    """Raise ``DataError`` where a point (N, 3) is nowhere."""
+    is_finite = np.isfinite(points).all(axis=1)
+    if not is_finite.all():
+        row = int(np.argmin(is_finite))
+        raise DataError(f"{where}: {noun} {row} is at {points[row].tolist()}; copy the file again")
+
+
+def scalar_column(element: PlyElement, name: str, where: str) -> NDArray[Any]:
+    """One number a row of the element."""
+    column = element.columns.get(name)
+    if column is None or isinstance(column, ListColumn):
+        raise DataError(f"{where}: element '{element.name}' has no property '{name}'")
+    return column
+
+
+def fans(corners: ListColumn) -> tuple[Int32Array, Int64Array]:
+    """Polygons as triangles (T, 3), and the polygon of each: a quad is (0, 1, 2), (0, 2, 3), as habitat-sim has it."""
+    n_triangles = np.maximum(corners.lengths - 2, 0)
+    first = np.repeat(corners.indptr[:-1], n_triangles)
+    step = np.arange(len(first)) - np.repeat(np.cumsum(n_triangles) - n_triangles, n_triangles)
+    rows = np.stack([first, first + step + 1, first + step + 2], axis=1)
+    return corners.values[rows].astype(np.int32), np.repeat(np.arange(len(n_triangles)), n_triangles)
+
+
+def read_surface(path: Path, where: str) -> Surface:
+    """The mesh in a file without regard to labels; ``where`` names the file and begins each message."""
+    file = read_ply(path, where)
+    vertices, face = vertex_positions(file, where), file.element("face")
+    if face is None or face.n_rows == 0:
+        raise DataError(f"{where}: has no faces; expected a mesh")
+    return Surface(vertices, fans(face_corners(face, len(vertices), where))[0])
