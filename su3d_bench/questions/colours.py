@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.types import Float64Array, Frame, GroundTruth, Int64Array
+from su3d_bench.questions.known_objects import instance_rows
 
 N_FRAMES = 24  # ours: spread evenly, enough to see nearly everything of a room
 MOST_VERTICES = 300  # of one object
@@ -41,12 +42,9 @@ def colour_words(dataset: Any, scene: str, truth: GroundTruth, min_vertices: int
 
 def _sampled_vertices(truth: GroundTruth, min_vertices: int) -> Int64Array:
     """Rows of the truth: up to 300 of each instance that is large enough, spread evenly in its order."""
-    order = np.argsort(truth.instance, kind="stable")
-    ids, starts = np.unique(truth.instance[order], return_index=True)
     parts = [
-        mine[np.linspace(0, len(mine) - 1, min(len(mine), MOST_VERTICES)).astype(np.int64)]
-        for one, mine in zip(ids.tolist(), np.split(order, starts[1:]), strict=True)
-        if one > 0 and len(mine) >= min_vertices
+        rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_VERTICES)).astype(np.int64)]
+        for _, rows in instance_rows(truth, min_vertices)
     ]
     return np.concatenate([np.zeros(0, np.int64), *parts])
 

@@ -29,7 +29,7 @@ from su3d_bench.questions.reasoning.relations import (
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
 
 SOURCE = "generated"
-MAX_ANSWER_SHARE = 1 / 3  # rooms_truth.MAX_ANSWER_SHARE
+MAX_ANSWER_SHARE = 1 / 3  # as the built-in rooms have it
 MOST_SYNONYMS = 2  # of a class, so that common classes do not fill the set
 LARGE = 1.5  # ours: volume of the box, as a multiple of the median of its name, from which a thing is called large
 BETWEEN_M = 2.0  # ours: nobody looks farther for what something is between
@@ -46,13 +46,17 @@ def generate(scene: str, objects: SceneMap, per_kind: int | None = None) -> tupl
     kept = [
         new_question(scene, kind, text, tuple(ids), SOURCE) for (kind, text), ids in found.items() if len(ids) <= limit
     ]
-    return tuple(one for kind in KINDS for one in chosen([each for each in kept if each.kind == kind], per_kind))
+    return chosen(kept, per_kind)
 
 
-def chosen(questions: Sequence[Question], n: int | None) -> list[Question]:
-    """At most ``n`` questions by a digest of their text, sorted by text."""
-    drawn = sorted(questions, key=lambda one: hashlib.sha256(one.text.encode()).digest())[:n]
-    return sorted(drawn, key=lambda one: one.text)
+def chosen(questions: Sequence[Question], per_kind: int | None) -> tuple[Question, ...]:
+    """At most ``per_kind`` questions of each kind by a digest of their text, sorted by kind and text."""
+    drawn: list[Question] = []
+    for kind in KINDS:
+        of_kind = [question for question in questions if question.kind == kind]
+        of_kind.sort(key=lambda question: hashlib.sha256(question.text.encode()).digest())
+        drawn += sorted(of_kind[:per_kind], key=lambda question: question.text)
+    return tuple(drawn)
 
 
 def _texts(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:

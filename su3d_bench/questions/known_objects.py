@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 
-from su3d_bench.core.types import GroundTruth
+from su3d_bench.core.types import GroundTruth, Int64Array
 from su3d_bench.perception.embedded.lexicon import GROUPS
 from su3d_bench.perception.embedded.text import words
 from su3d_bench.questions.reasoning.named_objects import meant_by
@@ -22,12 +22,10 @@ def known_objects(truth: GroundTruth, min_vertices: int, captions: Mapping[int, 
     An object's class is that of most of its vertices. ``captions``: words on an object, such as its colour.
     """
     found = []
-    order = np.argsort(truth.instance, kind="stable")
-    ids, starts = np.unique(truth.instance[order], return_index=True)
-    for one, rows in zip(ids.tolist(), np.split(order, starts[1:]), strict=True):
+    for one, rows in instance_rows(truth, min_vertices):
         classes = np.bincount(truth.semantic[rows].clip(min=0))
         class_id = int(classes.argmax())
-        if one <= 0 or class_id == 0 or len(rows) < min_vertices:
+        if class_id == 0:
             continue
         name = plain_name(truth.labels.name_of(class_id))
         if not is_room_surface(name):
@@ -35,6 +33,15 @@ def known_objects(truth: GroundTruth, min_vertices: int, captions: Mapping[int, 
             box = np.percentile(points, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
             found.append(MapObject(one, name, (captions or {}).get(one, ""), points.mean(axis=0), box))
     return SceneMap(tuple(found))
+
+
+def instance_rows(truth: GroundTruth, min_vertices: int) -> Iterator[tuple[int, Int64Array]]:
+    """Id and rows, both ascending, of each instance of the truth with at least ``min_vertices`` vertices."""
+    order = np.argsort(truth.instance, kind="stable")
+    ids, starts = np.unique(truth.instance[order], return_index=True)
+    for instance, rows in zip(ids.tolist(), np.split(order, starts[1:]), strict=True):
+        if instance > 0 and len(rows) >= min_vertices:
+            yield instance, rows
 
 
 def plain_name(name: str) -> str:

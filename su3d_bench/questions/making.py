@@ -8,7 +8,7 @@ from su3d_bench.core.errors import GroundTruthMissing
 from su3d_bench.questions.colours import colour_words
 from su3d_bench.questions.generator import chosen, generate
 from su3d_bench.questions.known_objects import known_objects
-from su3d_bench.questions.model import KINDS, Question
+from su3d_bench.questions.model import Question
 from su3d_bench.questions.truths import has_own_queries, own_questions
 
 MIN_VERTICES = 100  # ScanNet's smallest instance that counts
@@ -24,8 +24,7 @@ def questions_of(
     Raises ``GroundTruthMissing`` where the scene has no truth to make them from.
     """
     if own and has_own_queries(dataset):
-        found = own_questions(dataset, scene)
-        return tuple(one for kind in KINDS for one in chosen([each for each in found if each.kind == kind], per_kind))
+        return chosen(own_questions(dataset, scene), per_kind)
     if not dataset.variants:
         raise GroundTruthMissing(f"{dataset.name}/{scene}: the dataset has no ground truth to make questions from")
     variant = next((one for one in FULLEST if one in dataset.variants), dataset.variants[0])

@@ -10,7 +10,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -41,10 +41,12 @@ def read_foreign(path: Path) -> tuple[Question, ...]:
     where = printable(str(path), 200)
     text = _text_of(path, where)
     if path.suffix.lower() == ".csv":
-        return tuple(_utterances(text, where))
+        rows = _placed(_csv_rows(text, where), where, "row", 2)
+        return tuple(_sentences(rows, ("scan_id", "utterance", "target_id"), "Nr3D"))
     content = _json_of(text, where)
     if isinstance(content, list):
-        return tuple(_descriptions(content, where))
+        rows = _placed(content, where, "entry")
+        return tuple(_sentences(rows, ("scene_id", "description", "object_id"), "ScanRefer"))
     if isinstance(content, dict) and isinstance(content.get("questions"), list):
         return tuple(_situated(content["questions"], _replies(path), where))
     raise DataError(f"{where}: is neither a list of descriptions (ScanRefer) nor has it 'questions' (SQA3D)")
@@ -69,27 +71,22 @@ def _json_of(text: str, where: str) -> Any:
         raise DataError(f"{where}: not JSON ({printable(str(error), 120)})") from error
 
 
-def _descriptions(rows: list[Any], where: str) -> Iterator[Question]:
-    for number, row in enumerate(_bounded(rows, where), 1):
-        at = f"{where}: entry {number}"
-        scene, text = _word(row, "scene_id", at), _sentence(row, "description", at)
-        yield new_question(f"{DATASET}/{scene}", "relative", text, _answer(row, "object_id", at), "ScanRefer")
+def _sentences(rows: Iterable[tuple[str, Any]], keys: tuple[str, str, str], source: str) -> Iterator[Question]:
+    """A question for each row, which comes with its place; ``keys``: those of scene, sentence and object."""
+    for at, row in rows:
+        scene, text = _word(row, keys[0], at), _sentence(row, keys[1], at)
+        yield new_question(f"{DATASET}/{scene}", "relative", text, _answer(row, keys[2], at), source)
 
 
-def _utterances(text: str, where: str) -> Iterator[Question]:
+def _csv_rows(text: str, where: str) -> list[Any]:
     try:
-        rows = list(csv.DictReader(io.StringIO(text, newline=""), strict=True))
+        return list(csv.DictReader(io.StringIO(text, newline=""), strict=True))
     except csv.Error as error:
         raise DataError(f"{where}: not CSV ({printable(str(error), 120)})") from error
-    for number, row in enumerate(_bounded(rows, where), 2):
-        at = f"{where}: row {number}"
-        scene, sentence = _word(row, "scan_id", at), _sentence(row, "utterance", at)
-        yield new_question(f"{DATASET}/{scene}", "relative", sentence, _answer(row, "target_id", at), "Nr3D")
 
 
 def _situated(rows: list[Any], replies: Mapping[str, str], where: str) -> Iterator[Question]:
-    for number, row in enumerate(_bounded(rows, where), 1):
-        at = f"{where}: question {number}"
+    for at, row in _placed(rows, where, "question"):
         scene, asked = _word(row, "scene_id", at), _sentence(row, "question", at)
         situation = _sentence(row, "situation", at) if row.get("situation") else ""
         text = f"{situation} {asked}".strip()
@@ -108,18 +105,20 @@ def _replies(path: Path) -> dict[str, str]:
     if not isinstance(rows, list):
         raise DataError(f"{where}: has no 'annotations'")
     found = {}
-    for number, row in enumerate(_bounded(rows, where), 1):
+    for at, row in _placed(rows, where, "annotation"):
         answers = row.get("answers") if isinstance(row, Mapping) else None
         if not isinstance(answers, list) or not answers:
-            raise DataError(f"{where}: annotation {number}: has no answers")
-        found[str(row.get("question_id"))] = _sentence(answers[0], "answer", f"{where}: annotation {number}")
+            raise DataError(f"{at}: has no answers")
+        found[str(row.get("question_id"))] = _sentence(answers[0], "answer", at)
     return found
 
 
-def _bounded(rows: list[Any], where: str) -> list[Any]:
+def _placed(rows: list[Any], where: str, noun: str, first: int = 1) -> Iterator[tuple[str, Any]]:
+    """Each row with the words that say where it stands."""
     if not rows or len(rows) > MOST_QUESTIONS:
         raise DataError(f"{where}: has {len(rows)} entries; expected 1 to {MOST_QUESTIONS}")
-    return rows
+    for number, row in enumerate(rows, first):
+        yield f"{where}: {noun} {number}", row
 
 
 def _value(row: Any, key: str, at: str) -> Any:

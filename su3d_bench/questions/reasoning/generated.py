@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.types import Float64Array
+from su3d_bench.perception.embedded.naming import with_article
 from su3d_bench.questions.reasoning.answers import Answer
 from su3d_bench.questions.reasoning.relations import PairRelation, is_between, is_room_surface, relations_of
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
@@ -55,9 +56,9 @@ def _texts(scene: SceneMap, random: np.random.Generator, with_sides: bool) -> di
     single = [one for one in things if n_of[one.name] == 1]
     single = [single[k] for k in sorted(random.permutation(len(single))[:MOST_SINGLE])]
     kinds: dict[str, list[str]] = {
-        "closer": list(_closer(things, single, n_of)),
+        "closer": list(_extreme(things, single, n_of, 1, "closer to")),
         "nearest": list(_nearest(things, single)),
-        "farthest": list(_farthest(things, single, n_of)),
+        "farthest": list(_extreme(things, single, n_of, -1, "farthest from")),
         "distance": [f"What is the distance between the {a.name} and the {b.name}?" for a, b in _pairs(single)],
         "count": [f"How many {_plural(name)} are there?" for name in n_of],
         "largest": list(_largest(things, n_of)),
@@ -79,18 +80,14 @@ def _leads(distances: list[float]) -> bool:
     return len(distances) > 1 and distances[1] - distances[0] >= MARGIN_M
 
 
-def _closer(things: list[MapObject], single: list[MapObject], n_of: Counter[str]) -> Iterator[str]:
+def _extreme(
+    things: list[MapObject], single: list[MapObject], n_of: Counter[str], sign: int, words: str
+) -> Iterator[str]:
+    """Which of several is nearest to (``sign`` 1) or farthest from (-1) a reference."""
     for reference in single:
         for name in (name for name, n in n_of.items() if n > 1):
-            if _leads(sorted(_away_m(one, reference) for one in things if one.name == name)):
-                yield f"Which {name} is closer to the {reference.name}?"
-
-
-def _farthest(things: list[MapObject], single: list[MapObject], n_of: Counter[str]) -> Iterator[str]:
-    for reference in single:
-        for name in (name for name, n in n_of.items() if n > 1):
-            if _leads(sorted(-_away_m(one, reference) for one in things if one.name == name)):
-                yield f"Which {name} is farthest from the {reference.name}?"
+            if _leads(sorted(sign * _away_m(one, reference) for one in things if one.name == name)):
+                yield f"Which {name} is {words} the {reference.name}?"
 
 
 def _nearest(things: list[MapObject], single: list[MapObject]) -> Iterator[str]:
@@ -138,7 +135,7 @@ def _related(
         objects = sorted({b for _, b in pairs})
         found[f"what {relation}"] = [f"What is {relation} the {b}?" for b in objects]
         turned = [(b, a) for a, b in pairs if n_of[a] == 1 and (b, a) not in held[relation]]
-        found[f"is {relation}"] = [f"Is there {_article(a)} {relation} the {b}?" for a, b in [*pairs, *turned]]
+        found[f"is {relation}"] = [f"Is there {with_article(a)} {relation} the {b}?" for a, b in [*pairs, *turned]]
     return found
 
 
@@ -153,9 +150,3 @@ def _plural(name: str) -> str:
     if name.endswith("y") and name[-2:-1] not in "aeiou":
         return f"{name[:-1]}ies"
     return f"{name[:-1]}ves" if name.endswith("lf") else f"{name}s"
-
-
-def _article(name: str) -> str:
-    from su3d_bench.perception.embedded.naming import with_article
-
-    return with_article(name)
