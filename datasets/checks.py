@@ -82,7 +82,7 @@ class Inspection:
     elapsed_s: float
 
     def count(self, severity: Severity) -> int:
-        return sum(one.severity == severity for one in self.findings)
+        return sum(finding.severity == severity for finding in self.findings)
 
 
 Progress = Callable[[int, int], None]
@@ -101,37 +101,37 @@ def inspect(
     All frames are read, from ``n_threads`` threads, or ``SAMPLED_FRAMES`` evenly spaced ones where ``is_quick`` or
     where the scene is made on demand and has no file that could be damaged.
     """
-    started = time.perf_counter()
-    found = _Findings(f"{dataset.name}/{scene}")
-    with _warnings_as_findings(found):
-        return _inspect(dataset, scene, found, is_quick, n_threads, progress, started)
+    findings = _Findings(f"{dataset.name}/{scene}")
+    with _warnings_as_findings(findings):
+        return _inspect(dataset, scene, findings, is_quick, n_threads, progress)
 
 
 def _inspect(
-    dataset: Dataset, scene: str, found: _Findings, is_quick: bool, n_threads: int, progress: Progress, started: float
+    dataset: Dataset, scene: str, findings: _Findings, is_quick: bool, n_threads: int, progress: Progress
 ) -> Inspection:
-    n_problems = _ask_for_problems(dataset, scene, found)
-    listed = found.attempt("file", lambda: tuple(dataset.files(scene)))
+    started = time.perf_counter()
+    n_problems = _ask_for_problems(dataset, scene, findings)
+    listed = findings.attempt("file", lambda: tuple(dataset.files(scene)))
     files, is_made_on_demand = listed or (), listed == () and not n_problems
-    frames = found.attempt("frame", lambda: _counted_frames(dataset, scene))
+    frames = findings.attempt("frame", lambda: _counted_frames(dataset, scene))
     facts: list[FrameFacts] = []
     if frames is not None:
         positions = _positions(len(frames), is_quick or is_made_on_demand)
-        facts, broken = _read_frames(frames, positions, found, 1 if is_made_on_demand else n_threads, progress)
-    _look_at_files(files, found, decode=frames is None)
+        facts, broken = _read_frames(frames, positions, findings, 1 if is_made_on_demand else n_threads, progress)
+    _look_at_files(files, findings, decode=frames is None)
     for finding in check_frames(facts):
-        found.add(finding)
+        findings.add(finding)
     if frames is not None and not is_made_on_demand:
-        _look_at_convention(_Readable(frames, broken), facts, found)
-    truth, points = _look_at_truth(dataset, scene, found)
+        _look_at_convention(_Readable(frames, broken), facts, findings)
+    truth, points = _look_at_truth(dataset, scene, findings)
     meeting = None
     if points is not None and facts:
-        meeting, findings = check_truth(facts, points)
-        for finding in findings:
-            found.add(finding)
-    digest = found.attempt("digest", lambda: dataset.digest(scene))
+        meeting, meeting_findings = check_truth(facts, points)
+        for finding in meeting_findings:
+            findings.add(finding)
+    digest = findings.attempt("digest", lambda: dataset.digest(scene))
     return Inspection(
-        scene=found.scene,
+        scene=findings.scene,
         n_frames=None if frames is None else len(frames),
         n_read=len(facts),
         n_files=len(files),
@@ -140,7 +140,7 @@ def _inspect(
         truth=truth,
         meeting=meeting,
         digest=digest,
-        findings=found.sorted(),
+        findings=findings.sorted(),
         elapsed_s=time.perf_counter() - started,
     )
 
@@ -186,20 +186,20 @@ class _Findings:
         return any(path.name in text and named.search(text) for _, text in self._findings)
 
     def has_error(self, checks: Container[str]) -> bool:
-        return any(one.severity == "error" and one.check in checks for one in self._findings.values())
+        return any(finding.severity == "error" and finding.check in checks for finding in self._findings.values())
 
     def sorted(self) -> tuple[Finding, ...]:
         """Errors first, then warnings, then notes, each in the order found."""
-        return tuple(sorted(self._findings.values(), key=lambda one: SEVERITIES.index(one.severity)))
+        return tuple(sorted(self._findings.values(), key=lambda finding: SEVERITIES.index(finding.severity)))
 
 
 @contextmanager
-def _warnings_as_findings(found: _Findings) -> Iterator[None]:
+def _warnings_as_findings(findings: _Findings) -> Iterator[None]:
     """What readers warn of in the block becomes findings, as it becomes part of a run's record."""
 
     class Listener(logging.Handler):
         def emit(self, record: logging.LogRecord) -> None:
-            found.add(Finding("warning", "reader", "", record.getMessage()))
+            findings.add(Finding("warning", "reader", "", record.getMessage()))
 
     listener, package = Listener(logging.WARNING), logging.getLogger("su3d_bench")
     package.addHandler(listener)
@@ -226,7 +226,7 @@ def _positions(n_frames: int, is_sampled: bool) -> Sequence[int]:
 
 
 def _read_frames(
-    frames: Sequence[Frame], positions: Sequence[int], found: _Findings, n_threads: int, progress: Progress
+    frames: Sequence[Frame], positions: Sequence[int], findings: _Findings, n_threads: int, progress: Progress
 ) -> tuple[list[FrameFacts], set[int]]:
     """Facts of the frames that can be read, and the positions of those that cannot; each of these is named."""
 
@@ -245,23 +245,23 @@ def _read_frames(
                 facts.append(outcome)
             else:
                 broken.add(position)
-                found.add_fault("frame", f"frame {position}", outcome)
+                findings.add_fault("frame", f"frame {position}", outcome)
             progress(n_done, len(positions))
     finally:
         pool.shutdown(cancel_futures=True)
     return facts, broken
 
 
-def _ask_for_problems(dataset: Dataset, scene: str, found: _Findings) -> int:
+def _ask_for_problems(dataset: Dataset, scene: str, findings: _Findings) -> int:
     """Take over what the dataset itself names, and count it."""
     if not isinstance(dataset, HasProblems):
         return 0
     try:
         for line in dataset.problems(scene):
-            found.add(Finding("error", "file", "", line))
+            findings.add(Finding("error", "file", "", line))
     except (Su3dError, OSError) as error:
-        found.add_fault("file", "", error)
-    return found.n
+        findings.add_fault("file", "", error)
+    return findings.n
 
 
 class _Readable(Sequence[Frame]):
@@ -278,22 +278,22 @@ class _Readable(Sequence[Frame]):
         return self._frames[self._positions[position]]
 
 
-def _look_at_convention(frames: Sequence[Frame], facts: Sequence[FrameFacts], found: _Findings) -> None:
+def _look_at_convention(frames: Sequence[Frame], facts: Sequence[FrameFacts], findings: _Findings) -> None:
     """Whether depth and poses agree between frames; asked only where each of them is usable by itself."""
-    if not facts or found.has_error(("pose", "intrinsics", "size")):
+    if not facts or findings.has_error(("pose", "intrinsics", "size")):
         return
-    line = found.attempt("convention", lambda: check_convention(frames, found.scene))
+    line = findings.attempt("convention", lambda: check_convention(frames, findings.scene))
     if line is not None:
-        found.add(Finding("error", "convention", "", line))
+        findings.add(Finding("error", "convention", "", line))
 
 
-def _look_at_files(files: Sequence[Path], found: _Findings, *, decode: bool) -> None:
+def _look_at_files(files: Sequence[Path], findings: _Findings, *, decode: bool) -> None:
     """Name every file that is missing, empty or unreadable, and with ``decode`` every damaged image."""
     for path in files:
         name = f"{path.parent.name}/{path.name}"
         reason = _fault_of_file(path, name, decode)
-        if reason is not None and not found.mentions(path):
-            found.add(Finding("error", "file", "", reason))
+        if reason is not None and not findings.mentions(path):
+            findings.add(Finding("error", "file", "", reason))
 
 
 def _fault_of_file(path: Path, name: str, decode: bool) -> str | None:
@@ -314,7 +314,7 @@ def _fault_of_file(path: Path, name: str, decode: bool) -> str | None:
 
 
 def _look_at_truth(
-    dataset: Dataset, scene: str, found: _Findings
+    dataset: Dataset, scene: str, findings: _Findings
 ) -> tuple[tuple[TruthVariant, ...], Float32Array | None]:
     """What there is of every variant, and the points of the first one that is here."""
     rows: list[TruthVariant] = []
@@ -323,17 +323,17 @@ def _look_at_truth(
         try:
             truth = dataset.ground_truth(scene, variant)
         except GroundTruthMissing as error:
-            rows.append(TruthVariant(variant, printable(str(error).removeprefix(f"{found.scene}: "))))
+            rows.append(TruthVariant(variant, printable(str(error).removeprefix(f"{findings.scene}: "))))
             continue
         except DataError as error:
-            found.add_fault("truth", "", error)
-            rows.append(TruthVariant(variant, printable(str(error).removeprefix(f"{found.scene}: "))))
+            findings.add_fault("truth", "", error)
+            rows.append(TruthVariant(variant, printable(str(error).removeprefix(f"{findings.scene}: "))))
             continue
         points = truth.points if points is None else points
         n_objects, n_classes = (len(np.unique(ids[ids != 0])) for ids in (truth.instance, truth.semantic))
         rows.append(TruthVariant(variant, None, len(truth.points), n_objects, n_classes))
     if points is not None:
-        found.attempt("truth", lambda: _instance_mesh(dataset, scene))
+        findings.attempt("truth", lambda: _instance_mesh(dataset, scene))
     return tuple(rows), points
 
 
@@ -346,12 +346,12 @@ def _instance_mesh(dataset: Dataset, scene: str) -> InstanceMesh | None:
 
 
 def _depth_statistics(facts: Sequence[FrameFacts]) -> DepthStatistics | None:
-    with_depth = [one for one in facts if one.valid_share > 0]
+    with_depth = [frame for frame in facts if frame.valid_share > 0]
     if not with_depth:
         return None
     return DepthStatistics(
-        near_m=min(one.near_m for one in with_depth),
-        median_m=float(np.median([one.median_m for one in with_depth])),
-        far_m=max(one.far_m for one in with_depth),
-        valid_share=float(np.mean([one.valid_share for one in facts])),
+        near_m=min(frame.near_m for frame in with_depth),
+        median_m=float(np.median([frame.median_m for frame in with_depth])),
+        far_m=max(frame.far_m for frame in with_depth),
+        valid_share=float(np.mean([frame.valid_share for frame in facts])),
     )

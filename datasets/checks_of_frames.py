@@ -120,19 +120,19 @@ def check_frames(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
     yield from _poses(frames)
     yield from _sizes(frames)
     yield from _depth(frames)
-    for one in frames:
-        if one.is_black:
-            yield Finding("warning", "colour", f"frame {one.index}", "colour is black; the frame shows nothing")
+    for frame in frames:
+        if frame.is_black:
+            yield Finding("warning", "colour", f"frame {frame.index}", "colour is black; the frame shows nothing")
     yield from _motion(frames)
 
 
 def _poses(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
-    for one in frames:
-        if not np.isfinite(one.camera_to_world).all():
-            yield Finding("error", "pose", f"frame {one.index}", "the pose is not finite; mend the trajectory")
-        elif (reason := _why_not_rigid(one.camera_to_world)) is not None:
+    for frame in frames:
+        if not np.isfinite(frame.camera_to_world).all():
+            yield Finding("error", "pose", f"frame {frame.index}", "the pose is not finite; mend the trajectory")
+        elif (reason := _why_not_rigid(frame.camera_to_world)) is not None:
             text = f"the pose is no rigid motion: {reason}; expected camera-to-world with last row 0 0 0 1"
-            yield Finding("error", "pose", f"frame {one.index}", text)
+            yield Finding("error", "pose", f"frame {frame.index}", text)
 
 
 def _why_not_rigid(pose: Float64Array) -> str | None:
@@ -149,45 +149,45 @@ def _why_not_rigid(pose: Float64Array) -> str | None:
 
 
 def _sizes(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
-    (common, _), *others = Counter((one.width, one.height) for one in frames).most_common()
-    for one in frames if others else ():
-        if (one.width, one.height) != common:
-            text = f"is {one.width}x{one.height}, most frames are {common[0]}x{common[1]}; all must have one size"
-            yield Finding("error", "size", f"frame {one.index}", text)
+    (common, _), *others = Counter((frame.width, frame.height) for frame in frames).most_common()
+    for frame in frames if others else ():
+        if (frame.width, frame.height) != common:
+            text = f"is {frame.width}x{frame.height}, most frames are {common[0]}x{common[1]}; all must have one size"
+            yield Finding("error", "size", f"frame {frame.index}", text)
     yield from _intrinsics(frames)
 
 
 def _intrinsics(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
-    for one in frames:
-        fx, fy, cx, cy = one.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]]
-        where = f"frame {one.index}"
+    for frame in frames:
+        fx, fy, cx, cy = frame.intrinsics[[0, 1, 0, 1], [0, 1, 2, 2]]
+        where = f"frame {frame.index}"
         if not (fx > 0 and fy > 0):
             text = f"the focal lengths are {fx:g} and {fy:g} pixels; they must be above 0"
             yield Finding("error", "intrinsics", where, text)
-        elif not (0 <= cx <= one.width and 0 <= cy <= one.height):
-            text = f"the principal point ({cx:g}, {cy:g}) lies outside the image of {one.width}x{one.height}"
+        elif not (0 <= cx <= frame.width and 0 <= cy <= frame.height):
+            text = f"the principal point ({cx:g}, {cy:g}) lies outside the image of {frame.width}x{frame.height}"
             yield Finding("error", "intrinsics", where, text)
-    n_odd = sum(not np.allclose(one.intrinsics, frames[0].intrinsics) for one in frames)
+    n_odd = sum(not np.allclose(frame.intrinsics, frames[0].intrinsics) for frame in frames)
     if n_odd:
         yield Finding("note", "intrinsics", "", f"{n_odd} of {len(frames)} frames have intrinsics of their own")
 
 
 def _depth(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
-    for one in frames:
-        where = f"frame {one.index}"
-        if one.has_odd_depth:
+    for frame in frames:
+        where = f"frame {frame.index}"
+        if frame.has_odd_depth:
             yield Finding("error", "depth", where, "depth holds values that are negative or not finite; 0 is invalid")
-        if one.valid_share == 0:
+        if frame.valid_share == 0:
             yield Finding("error", "depth", where, "depth is empty, no pixel is above 0 m; drop the frame")
-        elif one.valid_share < LITTLE_DEPTH:
-            yield Finding("warning", "depth", where, f"only {one.valid_share:.1%} of the pixels have a depth")
-    with_depth = [one for one in frames if one.valid_share > 0]
+        elif frame.valid_share < LITTLE_DEPTH:
+            yield Finding("warning", "depth", where, f"only {frame.valid_share:.1%} of the pixels have a depth")
+    with_depth = [frame for frame in frames if frame.valid_share > 0]
     if not with_depth:
         return
-    share = float(np.median([one.valid_share for one in with_depth]))
+    share = float(np.median([frame.valid_share for frame in with_depth]))
     if share < LITTLE_DEPTH_OF_SCENE:
         yield Finding("warning", "depth", "", f"in most frames less than {share:.0%} of the pixels have a depth")
-    median, (low, high) = float(np.median([one.median_m for one in with_depth])), PLAUSIBLE_MEDIAN_DEPTH_M
+    median, (low, high) = float(np.median([frame.median_m for frame in with_depth])), PLAUSIBLE_MEDIAN_DEPTH_M
     if not low <= median <= high:
         text = f"the median depth is {median:.3g} m, indoors it is {low:g} to {high:g} m; is the depth scale right?"
         yield Finding("error", "depth-scale", "", text)
@@ -195,7 +195,7 @@ def _depth(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
 
 def _motion(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
     """Cameras that do not move, images that repeat, walks of a length that no room has."""
-    poses = np.array([one.camera_to_world for one in frames if np.isfinite(one.camera_to_world).all()])
+    poses = np.array([frame.camera_to_world for frame in frames if np.isfinite(frame.camera_to_world).all()])
     if len(poses) > 1 and (poses == poses[0]).all():
         yield Finding("warning", "motion", "", f"all {len(poses)} frames have one pose; the camera stands still")
     repeats = [b.index for a, b in itertools.pairwise(frames) if a.image_key == b.image_key]
@@ -209,12 +209,12 @@ def _motion(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
 
 def check_truth(frames: Sequence[FrameFacts], truth_points: Float32Array) -> tuple[Meeting | None, list[Finding]]:
     """How far frames and truth meet, and what does not; nothing is held against a truth without points."""
-    usable = [one for one in frames if np.isfinite(one.camera_to_world).all()]
+    usable = [frame for frame in frames if np.isfinite(frame.camera_to_world).all()]
     if not len(truth_points):
         return None, [Finding("error", "truth", "", "the ground truth has no points")]
     if not np.isfinite(truth_points).all():
         return None, [Finding("error", "truth", "", "the ground truth holds points that are not finite")]
-    meeting = _meeting([one for one in usable if len(one.seen)], truth_points)
+    meeting = _meeting([frame for frame in usable if len(frame.seen)], truth_points)
     do_meet = meeting is not None and meeting.share >= POINTS_MEETING[0]
     findings = list(_cameras(usable, truth_points, do_meet))
     if meeting is not None and not do_meet:
@@ -233,7 +233,7 @@ def _cameras(frames: Sequence[FrameFacts], truth_points: Float32Array, do_meet: 
         return
     low = truth_points.min(axis=0).astype(np.float64) - CAMERA_SLACK_M
     high = truth_points.max(axis=0).astype(np.float64) + CAMERA_SLACK_M
-    places = np.array([one.camera_to_world[:3, 3] for one in frames])
+    places = np.array([frame.camera_to_world[:3, 3] for frame in frames])
     is_outside = ((places < low) | (places > high)).any(axis=1)
     share = float(is_outside.mean())
     if share < CAMERAS_OUTSIDE[0]:
@@ -310,12 +310,12 @@ def _inverse(pose: Float64Array) -> Float64Array:
 
 def _placed(frames: Sequence[FrameFacts], pose_of: Any, factors: Float64Array) -> Float64Array:
     """World points (n, 3) of what the frames see, their camera coordinates multiplied by ``factors``."""
-    frames = [one for one in frames if len(one.seen)]
+    frames = [frame for frame in frames if len(frame.seen)]
     if not frames:
         return np.zeros((1, 3))
-    step = max(1, sum(len(one.seen) for one in frames) // SEARCHED_SEEN_POINTS)
+    step = max(1, sum(len(frame.seen) for frame in frames) // SEARCHED_SEEN_POINTS)
     parts = []
-    for one in frames:
-        pose = pose_of(one)
-        parts.append(np.einsum("ij,kj->ki", pose[:3, :3], one.seen[::step] * factors) + pose[:3, 3])
+    for frame in frames:
+        pose = pose_of(frame)
+        parts.append(np.einsum("ij,kj->ki", pose[:3, :3], frame.seen[::step] * factors) + pose[:3, 3])
     return np.concatenate(parts)

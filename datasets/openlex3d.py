@@ -120,11 +120,11 @@ def categories_truth(files: OpenLexFiles, corners: Corners) -> OpenLexTruth:
     A point without a corner nearer than 5 cm has no object.
     """
     points = files.visible_points()
-    distance, found = nearest(corners.points, points, VISIBLE_RADIUS_M)
-    found[distance >= VISIBLE_RADIUS_M] = -1
+    distance, nearest_rows = nearest(corners.points, points, VISIBLE_RADIUS_M)
+    nearest_rows[distance >= VISIBLE_RADIUS_M] = -1
     return OpenLexTruth(
         points,
-        np.append(corners.object_of_point, -1)[found],
+        np.append(corners.object_of_point, -1)[nearest_rows],
         files.objects(),
         files.prompts(),
         VISIBLE,
@@ -194,10 +194,10 @@ def read_prompts(path: Path, where: str) -> tuple[str, ...]:
 def read_categories(path: Path, where: str) -> dict[int, ObjectLabels]:
     """Object id -> labels, from ``dataset.samples`` of a ``gt_categories.json``."""
     samples = _entry(_entry(_read_json(path, where), "dataset", dict, where), "samples", list, where)
-    found: dict[int, ObjectLabels] = {}
+    labels_of: dict[int, ObjectLabels] = {}
     for number, sample in enumerate(samples):
         at = f"{where}: sample {number}"
-        one = _whole_number(_entry(sample, "object_id", int, at), at)
+        object_id = _whole_number(_entry(sample, "object_id", int, at), at)
         attributes = _entry(_entry(sample, "labels", dict, at), "image_attributes", dict, at)
         labels = ObjectLabels(
             _texts(attributes, "synonyms", at),
@@ -205,9 +205,9 @@ def read_categories(path: Path, where: str) -> dict[int, ObjectLabels]:
             _texts(attributes, "vis_sim", at),
             _ids(attributes.get("clutter") or [], f"{at}: 'clutter'"),
         )
-        if found.setdefault(one, labels) != labels:
-            raise DataError(f"{at}: object {one} stands there twice with other labels; keep one of them")
-    return found
+        if labels_of.setdefault(object_id, labels) != labels:
+            raise DataError(f"{at}: object {object_id} stands there twice with other labels; keep one of them")
+    return labels_of
 
 
 def read_queries(path: Path, where: str) -> tuple[TextQuery, ...]:

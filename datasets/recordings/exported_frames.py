@@ -95,8 +95,8 @@ class ExportedFrames:
         return self._frames[i].number
 
     def files(self) -> Sequence[Path]:
-        names = [*self._camera_files, *(name for one in self._frames for name in (one.colour, one.depth, one.pose))]
-        return [self._folder / name for name in names]
+        images = (name for frame in self._frames for name in (frame.colour, frame.depth, frame.pose))
+        return [self._folder / name for name in (*self._camera_files, *images)]
 
     def _read(self, name: str) -> tuple[str, bytes]:
         where = f"{self.where}: {name}"
@@ -136,17 +136,17 @@ def list_folder(folder: Path, name: str, where: str) -> list[str]:
 
 def by_number(names: Sequence[str], pattern: str, where: str) -> NumberedNames:
     """The names that match ``pattern`` by its first group, the number of the frame; another name is an error."""
-    found: dict[int, str] = {}
+    name_of: dict[int, str] = {}
     extra = []
     for name in names:
         match = re.fullmatch(pattern, name, re.ASCII)
-        if match is None or int(match[1]) in found:
+        if match is None or int(match[1]) in name_of:
             extra.append(name)
         else:
-            found[int(match[1])] = name
+            name_of[int(match[1])] = name
     if extra:
         raise DataError(f"{where} holds {extra[0][:60]!r}{_more(len(extra))}, which belongs to no frame; move it away")
-    return found
+    return name_of
 
 
 def every_kth(known: set[int]) -> range:

@@ -27,9 +27,9 @@ def read_boxes(path: Path, where: str) -> dict[int, OrientedBox]:
     """Object id -> its box in the world; objects without ``oriented_bbox`` are left out."""
     boxes: dict[int, OrientedBox] = {}
     for row in read_objects(path, where):
-        one = whole_number(row, "id", f"{where}: {INFO_NAME}")
+        object_id = whole_number(row, "id", f"{where}: {INFO_NAME}")
         if row.get("oriented_bbox") is not None:
-            boxes[one] = _box(row["oriented_bbox"], f"{where}: {INFO_NAME}: object {one}")
+            boxes[object_id] = _box(row["oriented_bbox"], f"{where}: {INFO_NAME}: object {object_id}")
     return boxes
 
 
@@ -58,13 +58,13 @@ def _box(content: Any, where: str) -> OrientedBox:
 
 def _numbers(values: Any, n: int, where: str) -> Float64Array:
     numbers = values if isinstance(values, list) else []
-    if len(numbers) != n or any(isinstance(one, bool) or not isinstance(one, int | float) for one in numbers):
+    if len(numbers) != n or any(isinstance(value, bool) or not isinstance(value, int | float) for value in numbers):
         raise DataError(f"{where} is {shown(values)} of length {len(numbers)}; expected {n} numbers")
     # an integer in JSON may have any length; comparing it does not overflow
-    unfit = next((one for one in numbers if not -MOST_M <= one <= MOST_M), None)
+    unfit = next((value for value in numbers if not -MOST_M <= value <= MOST_M), None)
     if unfit is not None:
         raise DataError(f"{where} holds {shown(unfit)}; expected numbers within {MOST_M:g} m")
-    return np.array([float(one) for one in numbers])
+    return np.array([float(value) for value in numbers])
 
 
 def objects_outside_boxes(mesh: AnnotatedMesh, boxes: Mapping[int, OrientedBox]) -> dict[int, float]:
@@ -80,8 +80,8 @@ def objects_outside_boxes(mesh: AnnotatedMesh, boxes: Mapping[int, OrientedBox])
     centres = sums[has_corners] / lengths[has_corners, None]
     objects = mesh.object_of_face[has_corners]
     outside: dict[int, float] = {}
-    for one, box in sorted(boxes.items()):
-        excess = box.distance_outside(centres[objects == one])
+    for object_id, box in sorted(boxes.items()):
+        excess = box.distance_outside(centres[objects == object_id])
         if len(excess) and excess.max() > SLACK_M:
-            outside[one] = float(excess.max() - SLACK_M)
+            outside[object_id] = float(excess.max() - SLACK_M)
     return outside

@@ -117,9 +117,9 @@ def original_problems(original: Path | None, where: str) -> Iterator[str]:
         yield str(error)
         return
     lines = (
-        f"{where}: {INFO_NAME}: object {one} has faces {beyond_m:.2f} m beyond its box and the slack of {SLACK_M} m; "
-        "the boxes are of another mesh"
-        for one, beyond_m in outside.items()
+        f"{where}: {INFO_NAME}: object {object_id} has faces {beyond_m:.2f} m beyond its box and the slack of "
+        f"{SLACK_M} m; the boxes are of another mesh"
+        for object_id, beyond_m in outside.items()
     )
     yield from _shortened(lines, f"{where}: {INFO_NAME}")
 

@@ -199,12 +199,12 @@ class Replica:
         """The render's mesh and every file of ground truth that is here, of whatever variant."""
         original = find_original_scene(self.root, scene)
         names = (MESH_NAME, INFO_NAME)
-        found = [self._render_mesh(scene)] + ([] if original is None else [original / name for name in names])
+        paths = [self._render_mesh(scene)] + ([] if original is None else [original / name for name in names])
         released = self._released_truths(scene)
-        found += [path for files in released.values() for path in files]
+        paths += [path for files in released.values() for path in files]
         if released["openmask3d"] or released["ovo-51"]:
-            found += [mesh.path for mesh in self._labelled_meshes(scene)]
-        return tuple(path for path in dict.fromkeys(found) if path.exists())
+            paths += [mesh.path for mesh in self._labelled_meshes(scene)]
+        return tuple(path for path in dict.fromkeys(paths) if path.exists())
 
     def _released_truths(self, scene: str) -> dict[str, tuple[Path, ...]]:
         """Variant -> its files, of what others than Replica's makers released; none where nothing of it is here."""

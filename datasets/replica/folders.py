@@ -72,10 +72,10 @@ def find_render_tree(root: Path) -> RenderTree | None:
         folder = root / name
         # The data root itself holds other datasets too, whose folders are not scenes of this one.
         parts = ("traj.txt", "results") if name == "." else ()
-        found = [child.name for child in _folders(folder) if _is_scene(child, parts)]
-        if found:
-            official = [scene for scene in OFFICIAL_SCENES if scene in found]
-            others = sorted(set(found) - set(official), key=_natural_order)
+        scenes = [child.name for child in _folders(folder) if _is_scene(child, parts)]
+        if scenes:
+            official = [scene for scene in OFFICIAL_SCENES if scene in scenes]
+            others = sorted(set(scenes) - set(official), key=_natural_order)
             return RenderTree(folder, (*official, *others))
     return None
 

@@ -48,13 +48,13 @@ def read_annotated_mesh(folder: Path, where: str) -> AnnotatedMesh:
     """The mesh of the scene in ``folder``; ``where`` begins each message. Void objects are counted in a warning."""
     class_of_object = read_object_classes(folder / INFO_NAME, where)
     vertices, corners, objects = _read_mesh(folder / MESH_NAME, f"{where}: {MESH_NAME}")
-    known = {one: class_id for one, class_id in class_of_object.items() if class_id in replica_label_set().ids}
+    known = {number: class_id for number, class_id in class_of_object.items() if class_id in replica_label_set().ids}
     ids, face_rows = np.unique(objects, return_inverse=True)
-    semantic = np.array([known.get(int(one), 0) for one in ids], np.int32)[face_rows]
-    instance = np.array([int(one) + 1 if int(one) in known else 0 for one in ids], np.int32)[face_rows]
+    semantic = np.array([known.get(int(number), 0) for number in ids], np.int32)[face_rows]
+    instance = np.array([int(number) + 1 if int(number) in known else 0 for number in ids], np.int32)[face_rows]
     _say_what_is_void(ids, np.bincount(face_rows, minlength=len(ids)), class_of_object, where)
     return AnnotatedMesh(
-        vertices, corners, objects, semantic, instance, {one + 1: class_id for one, class_id in sorted(known.items())}
+        vertices, corners, objects, semantic, instance, {number + 1: known[number] for number in sorted(known)}
     )
 
 
@@ -62,14 +62,17 @@ def read_object_classes(path: Path, where: str) -> dict[int, int]:
     """Object id -> class id as ``info_semantic.json`` has it, undefined classes included."""
     objects = read_objects(path, where)
     where = f"{where}: {INFO_NAME}"
-    found: dict[int, int] = {}
+    class_of_object: dict[int, int] = {}
     for row in objects:
-        one, class_id = whole_number(row, "id", where), whole_number(row, "class_id", where)
-        if not 0 <= one <= MAX_OBJECT_ID:
-            raise DataError(f"{where}: an object has the id {one}; expected 0 to {MAX_OBJECT_ID}")
-        if found.setdefault(one, class_id) != class_id:
-            raise DataError(f"{where}: object {one} stands there twice, as class {found[one]} and as class {class_id}")
-    return found
+        object_id, class_id = whole_number(row, "id", where), whole_number(row, "class_id", where)
+        if not 0 <= object_id <= MAX_OBJECT_ID:
+            raise DataError(f"{where}: an object has the id {object_id}; expected 0 to {MAX_OBJECT_ID}")
+        if class_of_object.setdefault(object_id, class_id) != class_id:
+            raise DataError(
+                f"{where}: object {object_id} stands there twice, as class {class_of_object[object_id]} and as class "
+                f"{class_id}"
+            )
+    return class_of_object
 
 
 def read_objects(path: Path, where: str) -> list[dict[str, Any]]:
@@ -117,14 +120,14 @@ def _check_class_names(classes: list[dict[str, Any]], where: str) -> None:
 
 
 def _say_what_is_void(ids: Int64Array, n_faces: Int64Array, class_of_object: Mapping[int, int], where: str) -> None:
-    missing = [row for row, one in enumerate(ids) if int(one) not in class_of_object]
+    missing = [row for row, object_id in enumerate(ids) if int(object_id) not in class_of_object]
     if missing:
         logger.warning(
             "%s: object ids without entry in %s: %d (the first: %d); faces made void: %d",
             where, INFO_NAME, len(missing), ids[missing[0]], n_faces[missing].sum(),
         )  # fmt: skip
     allowed = {*replica_label_set().ids, *UNDEFINED_CLASSES}
-    strange = sorted(one for one, class_id in class_of_object.items() if class_id not in allowed)
+    strange = sorted(object_id for object_id, class_id in class_of_object.items() if class_id not in allowed)
     if strange:
         logger.warning(
             "%s: objects with an unknown class id in %s: %d (the first: object %d, class %d; known: 1 to %d); "
@@ -165,9 +168,9 @@ def object_of_vertex(n_vertices: int, corners: ListColumn, object_of_face: Int64
     groups, first, counts = np.unique(vertex * len(ids) + rows[face], return_index=True, return_counts=True)
     order = np.lexsort((groups, -counts, groups // len(ids)))
     owners, best = np.unique(groups[order] // len(ids), return_index=True)
-    found = np.full(n_vertices, -1, np.int64)
-    found[owners] = face[first[order[best]]]
-    return found
+    face_of_vertex = np.full(n_vertices, -1, np.int64)
+    face_of_vertex[owners] = face[first[order[best]]]
+    return face_of_vertex
 
 
 def vertex_truth(mesh: AnnotatedMesh) -> GroundTruth:

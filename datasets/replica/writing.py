@@ -103,20 +103,22 @@ def _plain_mesh(scan: Scan) -> list[PlyElement]:
 def _info(objects: Sequence[ScannedObject]) -> dict[str, Any]:
     """The content of ``info_semantic.json``."""
     labels = replica_label_set()
-    class_of_id = {one.id: one.class_id for one in objects}
+    class_of_id = {known.id: known.class_id for known in objects}
     return {
         "classes": [{"id": i, "name": name} for i, name in zip(labels.ids, labels.names, strict=True)],
         "gravity_center": [0.0, 0.0, 0.0],
         "gravity_dir": [0.0, 0.0, -1.0],
-        "id_to_label": [class_of_id.get(one, -1) for one in range(max(class_of_id, default=-1) + 1)],
+        "id_to_label": [class_of_id.get(object_id, -1) for object_id in range(max(class_of_id, default=-1) + 1)],
         "objects": [
             {
-                "class_id": one.class_id,
-                "class_name": one.class_name,
-                "id": one.id,
-                "oriented_bbox": _oriented_box(np.array(one.box_min, np.float64), np.array(one.box_max, np.float64)),
+                "class_id": known.class_id,
+                "class_name": known.class_name,
+                "id": known.id,
+                "oriented_bbox": _oriented_box(
+                    np.array(known.box_min, np.float64), np.array(known.box_max, np.float64)
+                ),
             }
-            for one in objects
+            for known in objects
         ],
     }
 

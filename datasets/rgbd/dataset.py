@@ -74,13 +74,13 @@ class Rgbd:
 
     def scenes(self) -> Sequence[str]:
         """The scenes of the option ``files`` in its order, then those below the data root."""
-        found = tuple(self._descriptions())
-        if not found:
+        scenes = tuple(self._descriptions())
+        if not scenes:
             raise DataError(
                 f"rgbd: no scene in {self.root / 'rgbd'} (a scene is a folder with {FILE_NAME}); describe a folder of "
                 "images in such a file there, or name the file: --set rgbd.files=path/to/rgbd.toml"
             )
-        return found
+        return scenes
 
     def places(self) -> Sequence[Path]:
         """What is searched for descriptions."""
@@ -128,20 +128,20 @@ class Rgbd:
         place = self.root / "rgbd"
         below = [folder / FILE_NAME for folder in (sorted(place.iterdir()) if place.is_dir() else ())]
         named = [path / FILE_NAME if path.is_dir() else path for path in self.options.files]
-        found: dict[str, Path] = {}
+        path_of: dict[str, Path] = {}
         for path in (*named, *(path for path in below if path.is_file())):
             name = path.resolve().parent.name if path.name == FILE_NAME else path.stem
-            if name in found and found[name] != path:
-                raise DataError(f"rgbd: scene '{name}' is described twice, in {found[name]} and {path}; rename one")
-            found[name] = path
-        return found
+            if name in path_of and path_of[name] != path:
+                raise DataError(f"rgbd: scene '{name}' is described twice, in {path_of[name]} and {path}; rename one")
+            path_of[name] = path
+        return path_of
 
     def _description(self, scene: str) -> Path:
-        found = self._descriptions()
-        if scene not in found:
+        descriptions = self._descriptions()
+        if scene not in descriptions:
             known = self.scenes()
             raise DataError(f"rgbd: no scene '{scene}'{suggest(scene, known) or '; known: ' + ', '.join(known[:8])}")
-        return found[scene]
+        return descriptions[scene]
 
     def _recording(self, scene: str) -> Recording:
         return self._open(scene)[1]
@@ -205,12 +205,12 @@ class _Poses:
 
 def _poses(folder: Folder, description: RgbdDescription, images: list[int], where: str, place: str) -> _Poses:
     if description.pose is not None:
-        found = {}
+        pose_of = {}
         names = files_of(folder, description.pose, place)
         for number, name in names.items():
             values = read_pose_file(folder.path / name, f"{where}: {name}")
-            found[number] = camera_to_world(values, description, f"{where}: {name}")
-        return _Poses(found, {}, tuple(folder.path / name for name in names.values()))
+            pose_of[number] = camera_to_world(values, description, f"{where}: {name}")
+        return _Poses(pose_of, {}, tuple(folder.path / name for name in names.values()))
     assert description.trajectory is not None
     path, where = folder.file(description.trajectory, place), f"{where}: {description.trajectory}"
     matrices, times_s = read_trajectory_file(path, description.trajectory_format, where)
@@ -225,8 +225,8 @@ def _poses(folder: Folder, description: RgbdDescription, images: list[int], wher
             )
         )
     rows = zip(numbers, matrices, strict=True)
-    found = {n: camera_to_world(values, description, f"{where}, pose {k}") for k, (n, values) in enumerate(rows)}
-    return _Poses(found, dict(zip(numbers, times_s or (), strict=False)), (path,))
+    pose_of = {n: camera_to_world(values, description, f"{where}, pose {k}") for k, (n, values) in enumerate(rows)}
+    return _Poses(pose_of, dict(zip(numbers, times_s or (), strict=False)), (path,))
 
 
 def _intrinsics(

@@ -70,9 +70,9 @@ class RgbdDescription(BaseModel):
 
     @model_validator(mode="after")
     def _check_pairs(self) -> RgbdDescription:
-        for one, other in (("pose", "trajectory"), ("intrinsics", "intrinsics_file")):
-            if (getattr(self, one) is None) == (getattr(self, other) is None):
-                raise ValueError(f"give '{one}' or '{other}', one of the two")
+        for key, other in (("pose", "trajectory"), ("intrinsics", "intrinsics_file")):
+            if (getattr(self, key) is None) == (getattr(self, other) is None):
+                raise ValueError(f"give '{key}' or '{other}', one of the two")
         patterns = [pattern for pattern in (self.colour, self.depth, self.pose) if pattern is not None]
         if len({INDEX in pattern for pattern in patterns}) > 1:
             raise ValueError("some patterns have {index} and some have not; give it to all of them or to none")
@@ -106,11 +106,11 @@ def read_description(path: Path, where: str) -> RgbdDescription:
 
 def _lines_of(text: str) -> dict[str, int]:
     """The line on which each key stands first."""
-    found: dict[str, int] = {}
+    line_of: dict[str, int] = {}
     for number, line in enumerate(text.split("\n"), start=1):
         if match := ASSIGNMENT.match(line):
-            found.setdefault(match[1], number)
-    return found
+            line_of.setdefault(match[1], number)
+    return line_of
 
 
 def _check_keys(table: dict[str, Any], lines: dict[str, int], where: str) -> None:

@@ -36,13 +36,13 @@ def files_of(folder: Folder, pattern: str, where: str) -> dict[int, str]:
         raise DataError(f"{where}: {pattern[:80]!r}: {parent.name}/ cannot be read: {error.strerror}") from error
     prefix = f"{directory}/" if directory else ""
     if INDEX in name_pattern:
-        found = _numbered(names, name_pattern, where)
+        name_of = _numbered(names, name_pattern, where)
     else:
         matching = sorted((name for name in names if fnmatchcase(name, name_pattern)), key=_numeric_order)
-        found = dict(enumerate(matching))
-    if not found:
+        name_of = dict(enumerate(matching))
+    if not name_of:
         raise DataError(f"{where}: no file matches {pattern[:80]!r}")
-    return {number: _checked(folder, prefix + found[number], where) for number in sorted(found)}
+    return {number: _checked(folder, prefix + name_of[number], where) for number in sorted(name_of)}
 
 
 def _checked(folder: Folder, name: str, where: str) -> str:
@@ -53,7 +53,7 @@ def _checked(folder: Folder, name: str, where: str) -> str:
 def _numbered(names: Sequence[str], pattern: str, where: str) -> dict[int, str]:
     before, _, behind = pattern.partition(INDEX)
     form = re.compile(re.escape(before) + r"(\d{1,18})" + re.escape(behind), re.ASCII)
-    found: dict[int, str] = {}
+    name_of: dict[int, str] = {}
     for name in sorted(names):
         if match := form.fullmatch(name):
             number = int(match[1])
@@ -61,12 +61,12 @@ def _numbered(names: Sequence[str], pattern: str, where: str) -> dict[int, str]:
                 raise DataError(
                     f"{where}: {name[:60]}: the number is above {MAX_NUMBER}; name the files with * instead"
                 )
-            if number in found:
+            if number in name_of:
                 raise DataError(
-                    f"{where}: {found[number][:60]} and {name[:60]} have one number; expected one file each"
+                    f"{where}: {name_of[number][:60]} and {name[:60]} have one number; expected one file each"
                 )
-            found[number] = name
-    return found
+            name_of[number] = name
+    return name_of
 
 
 def _numeric_order(name: str) -> tuple[list[int], str]:

@@ -221,12 +221,12 @@ class Rooms:
         from su3d_bench.datasets.rooms.scan import read_scan, scan_room, write_scan
 
         path = self.root / "rooms" / self._scan_key(scene) / f"{scene}.npz"
-        found = read_scan(path)
-        if found is None:
+        scan = read_scan(path)
+        if scan is None:
             room = self._room(scene)
-            found = scan_room(room.patches, room.mesh, room.trajectory, self.options.mesh_spacing_m)
-            write_scan(path, found)
-        return found
+            scan = scan_room(room.patches, room.mesh, room.trajectory, self.options.mesh_spacing_m)
+            write_scan(path, scan)
+        return scan
 
     def _scan_key(self, scene: str) -> str:
         """What a scan depends on: not the size of the images nor their noise."""
@@ -268,12 +268,12 @@ class Rooms:
         return GroundTruth(points, self._class_of_object(scene)[owner], owner, label_set(), variant, source)
 
     def _class_of_object(self, scene: str) -> Int32Array:
-        return np.array([0, *[one.class_id for one in self.objects(scene)]], np.int32)
+        return np.array([0, *[room_object.class_id for room_object in self.objects(scene)]], np.int32)
 
     def instance_mesh(self, scene: str) -> InstanceMesh:
         """The rendered mesh itself, whole: hidden sides included."""
         mesh = self._room(scene).mesh
-        classes = {one.id: one.class_id for one in self.objects(scene)}
+        classes = {room_object.id: room_object.class_id for room_object in self.objects(scene)}
         return InstanceMesh(mesh.vertices, mesh.triangles, mesh.instance_of_triangle, classes, label_set())
 
     def surface(self, scene: str) -> Surface:

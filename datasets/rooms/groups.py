@@ -141,8 +141,8 @@ def long_walls(plan: Plan) -> list[int]:
 def opposite(plan: Plan, item: Item, other: Placed) -> Placed | None:
     wall, along = plan.wall_of(other)
     facing = (wall + 2) % 4
-    found = plan.try_at_wall(item, facing, along, item.size[1] / 2 + 0.006, None, 0.04)
-    return found or plan.against_wall(item, [facing, (wall + 1) % 4, (wall + 3) % 4])
+    placed = plan.try_at_wall(item, facing, along, item.size[1] / 2 + 0.006, None, 0.04)
+    return placed or plan.against_wall(item, [facing, (wall + 1) % 4, (wall + 3) % 4])
 
 
 def television(plan: Plan, sofa: Placed | None) -> None:
@@ -225,11 +225,11 @@ def before_screen(plan: Plan, desk: Placed, item: Item, local_x: float, from_fro
     """On a desk, at a place along it, near its front edge; elsewhere on it where that place is taken or beyond it."""
     spot = desk.item.spots[0]
     half = item.size[0] / 2
-    found = None
+    placed = None
     if spot.x0 + half < local_x < spot.x1 - half:
         x, y, z = desk.to_world(np.array([local_x, spot.y0 + from_front, spot.z]))
-        found = plan.try_on(item, desk, (x, y, z + GAP_M), desk.yaw, 0.005)
-    if found is None:
+        placed = plan.try_on(item, desk, (x, y, z + GAP_M), desk.yaw, 0.005)
+    if placed is None:
         plan.on(item, desk, turn=3.0)
 
 

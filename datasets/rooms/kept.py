@@ -56,9 +56,9 @@ def _kept(path: Path | None, make: Callable[[], Arrays], fits: Callable[[Arrays]
     if path is None:
         return make()
     with suppress(*DAMAGE):
-        found = read_arrays(path)
-        if fits(found):
-            return found
+        kept = read_arrays(path)
+        if fits(kept):
+            return kept
     made = make()
     with suppress(OSError), filling(path) as stream:
         if stream is not None:

@@ -128,10 +128,10 @@ class Plan:
     ) -> Placed | None:  # fmt: skip
         """At a place (x, y, z) of the world on ``holder``, and held by it."""
         x, y, z = (float(value) for value in place)
-        found = self.try_at(item, x, y, yaw, z, gap, "object", ignore=self._chain(holder.id))
-        if found:
-            self.parent[found.id] = (holder.id, relation)
-        return found
+        placed = self.try_at(item, x, y, yaw, z, gap, "object", ignore=self._chain(holder.id))
+        if placed:
+            self.parent[placed.id] = (holder.id, relation)
+        return placed
 
     def _flat(self, placed_id: int) -> bool:
         return self.placed[placed_id - 1].item.class_name in FLAT
@@ -148,9 +148,9 @@ class Plan:
             along = float(self.rng.uniform(half + 0.01, length - half - 0.01))
             if corner:
                 along = half + 0.02 if self.rng.random() < 0.5 else length - half - 0.02
-            found = self.try_at_wall(item, wall, along, item.size[1] / 2 + 0.006, None, gap)
-            if found:
-                return found
+            placed = self.try_at_wall(item, wall, along, item.size[1] / 2 + 0.006, None, gap)
+            if placed:
+                return placed
         return None
 
     def hang(self, item: Item, wall: int, along: float, z: float, gap: float = 0.03) -> Placed | None:
@@ -164,9 +164,9 @@ class Plan:
         for wall in self.shuffled(walls) * 10:
             half = item.size[0] / 2 + 0.05
             along = float(self.rng.uniform(half, self.wall_length(wall) - half))
-            found = self.hang(item, wall, along, z)
-            if found:
-                return found
+            placed = self.hang(item, wall, along, z)
+            if placed:
+                return placed
         return None
 
     def wall_of(self, placed: Placed) -> tuple[int, float]:
@@ -183,9 +183,9 @@ class Plan:
         y = (anchor.item.size[1] - item.size[1]) / 2 if back else 0.0
         for side in self.shuffled((-1, 1)):
             x = side * (anchor.item.size[0] / 2 + gap + item.size[0] / 2)
-            found = self.try_by(item, anchor, x, y, anchor.yaw)
-            if found:
-                return found
+            placed = self.try_by(item, anchor, x, y, anchor.yaw)
+            if placed:
+                return placed
         return None
 
     def facing(self, item: Item, anchor: Placed, distance: float, shift: float = 0.0, turn: float = 180.0,
@@ -204,9 +204,9 @@ class Plan:
             along = float(self.rng.uniform(reach, max(reach + 0.01, self.wall_length(wall) - reach)))
             x, y = self.wall_point(wall, along, reach + float(self.rng.uniform(0, 0.25)))
             yaw = WALL_YAW[wall] + float(self.rng.uniform(-20, 20))
-            found = self.try_at(item, x, y, yaw, None, gap)
-            if found:
-                return found
+            placed = self.try_at(item, x, y, yaw, None, gap)
+            if placed:
+                return placed
         return None
 
     def on(
@@ -222,9 +222,9 @@ class Plan:
                     break
                 x, y, z = anchor.to_world(np.array([*local, spot.z]))
                 relation = "in" if role == "inside" else "on"
-                found = self.try_on(item, anchor, (x, y, z + GAP_M), anchor.yaw + yaw, gap, relation)
-                if found:
-                    return found
+                placed = self.try_on(item, anchor, (x, y, z + GAP_M), anchor.yaw + yaw, gap, relation)
+                if placed:
+                    return placed
         return None
 
     def _chain(self, placed_id: int) -> list[int]:

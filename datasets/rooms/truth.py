@@ -73,7 +73,7 @@ class RoomTruth:
         Apart from ``relations``, for it is the only relation that depends on where one stands.
         """
         if eye is None:
-            eye = next(one.centre for one in self.objects if one.class_name == "floor")
+            eye = next(room_object.centre for room_object in self.objects if room_object.class_name == "floor")
         pairs = {(link.subject, link.object) for link in self.relations if link.relation == "next to"}
         return tuple(
             Relation(a, "left of", b)
@@ -157,35 +157,35 @@ def queries(truth: RoomTruth, n_visible_vertices: Mapping[int, int] | None = Non
     third of the objects answer is left out, and so are the walls, the floor and the ceiling.
     """
     shown = [
-        one
-        for one in truth.objects
-        if one.class_name not in STRUCTURE
-        and (n_visible_vertices is None or n_visible_vertices.get(one.id, 0) >= MIN_VISIBLE_VERTICES)
+        room_object
+        for room_object in truth.objects
+        if room_object.class_name not in STRUCTURE
+        and (n_visible_vertices is None or n_visible_vertices.get(room_object.id, 0) >= MIN_VISIBLE_VERTICES)
     ]
     answers: dict[tuple[str, str], set[int]] = {}
-    for one in shown:
-        for kind, text in _texts(one):
-            answers.setdefault((kind, text), set()).add(one.id)
-    counted = {one.id for one in shown}
+    for room_object in shown:
+        for kind, text in _texts(room_object):
+            answers.setdefault((kind, text), set()).add(room_object.id)
+    counted = {room_object.id for room_object in shown}
     for link in truth.relations:
         if link.subject in counted and link.object in counted:
             subject, holder = truth.by_id(link.subject).class_name, truth.by_id(link.object).class_name
             text = f"{subject} {link.relation} {_article(holder)}"
             answers.setdefault(("relative", text), set()).add(link.subject)
     limit = max(1, int(len(shown) * MAX_ANSWER_SHARE))
-    found = [Query(text, kind, tuple(sorted(ids))) for (kind, text), ids in answers.items() if len(ids) <= limit]
-    return tuple(sorted(found, key=lambda query: (query.kind, query.text)))
+    kept = [Query(text, kind, tuple(sorted(ids))) for (kind, text), ids in answers.items() if len(ids) <= limit]
+    return tuple(sorted(kept, key=lambda query: (query.kind, query.text)))
 
 
 def _article(name: str) -> str:
     return ("an " if name[0] in "aeiou" else "a ") + name
 
 
-def _texts(one: RoomObject) -> Iterator[tuple[str, str]]:
-    yield "instance", one.class_name
-    for phrase in AFFORDANCES[one.class_name]:
+def _texts(room_object: RoomObject) -> Iterator[tuple[str, str]]:
+    yield "instance", room_object.class_name
+    for phrase in AFFORDANCES[room_object.class_name]:
         yield "affordance", phrase
-    yield "property", f"{one.colour} {one.class_name}"
-    yield "property", f"{one.material} {one.class_name}"
-    if one.size_word != "medium":
-        yield "property", f"{one.size_word} {one.class_name}"
+    yield "property", f"{room_object.colour} {room_object.class_name}"
+    yield "property", f"{room_object.material} {room_object.class_name}"
+    if room_object.size_word != "medium":
+        yield "property", f"{room_object.size_word} {room_object.class_name}"

@@ -68,11 +68,11 @@ def read_objects(path: Path, scan: str, where: str) -> list[AnnotatedObject]:
         raise DataError(f"{where}: has no list 'segGroups'; copy the file again")
     objects = [_read_object(group, f"{where}: group {row}") for row, group in enumerate(groups)]
     category_of: dict[int, str] = {}
-    for one in objects:
-        if category_of.setdefault(one.id, one.category) != one.category:
+    for entry in objects:
+        if category_of.setdefault(entry.id, entry.category) != entry.category:
             raise DataError(
-                f"{where}: object {one.id} stands there twice, as {_clip(category_of[one.id])} and as "
-                f"{_clip(one.category)}"
+                f"{where}: object {entry.id} stands there twice, as {_clip(category_of[entry.id])} and as "
+                f"{_clip(entry.category)}"
             )
     return objects
 
@@ -81,8 +81,8 @@ def object_of_vertex(segments: Int64Array, objects: Sequence[AnnotatedObject]) -
     """Row in ``objects`` of each vertex; -1 where its segment is in none."""
     ids, segment_rows = np.unique(segments, return_inverse=True)
     owner = np.full(len(ids), -1, np.int64)
-    for row, one in enumerate(objects):
-        owner[np.isin(ids, one.segments)] = row
+    for row, entry in enumerate(objects):
+        owner[np.isin(ids, entry.segments)] = row
     return owner[segment_rows.reshape(-1)] if len(ids) else np.zeros(0, np.int64)
 
 

@@ -62,10 +62,10 @@ def annotation_problems(files: Mapping[str, Path], scan: str, where: str) -> Ite
         mesh_name(scan): lambda path: read_ply(path, f"{where}: {path.name}"),
         labels_name(scan): lambda path: read_ply(path, f"{where}: {path.name}"),
     }
-    found = [line for name, read in readers.items() if name in files for line in _fault(read, files[name])]
-    yield from found
+    faults = [line for name, read in readers.items() if name in files for line in _fault(read, files[name])]
+    yield from faults
     if set(truth_names(scan)) <= set(files):
-        yield from (line for line in _fault(read_annotated_scan, files, scan, where) if line not in found)
+        yield from (line for line in _fault(read_annotated_scan, files, scan, where) if line not in faults)
 
 
 def _fault(read: Callable[..., object], *arguments: object) -> list[str]:

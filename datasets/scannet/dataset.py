@@ -211,20 +211,20 @@ class ScanNet:
 
     def _small_files(self, scene: str) -> tuple[Path, ...]:
         """What is read of the scene beside its recording, as far as it is there."""
-        found = [self.tree.find_file(scene, name) for name in (meta_name(scene), *truth_names(scene))]
-        return tuple(path for path in (*found, self.tree.find_label_table()) if path is not None)
+        paths = [self.tree.find_file(scene, name) for name in (meta_name(scene), *truth_names(scene))]
+        return tuple(path for path in (*paths, self.tree.find_label_table()) if path is not None)
 
     def _truth_files(self, scene: str) -> dict[str, Path]:
         """The path of each file of the truth."""
         self._folder(scene)
-        found = {name: self.tree.find_file(scene, name) for name in truth_names(scene)}
-        missing = [name for name, path in found.items() if path is None]
+        path_of = {name: self.tree.find_file(scene, name) for name in truth_names(scene)}
+        missing = [name for name, path in path_of.items() if path is None]
         if missing:
             reason = f"; expected in {self.tree.folders[scene][0]}"
             if scene in split_scenes("test"):
                 reason = "; the benchmark keeps that of its test scans to itself"
             raise GroundTruthMissing(f"{self._where(scene)}: no ground truth, {missing[0]} is missing{reason}")
-        return {name: path for name, path in found.items() if path is not None}
+        return {name: path for name, path in path_of.items() if path is not None}
 
     def _annotated_scan(self, scene: str) -> AnnotatedScan:
         """The annotated mesh of ``scene``; the last one is kept, because every protocol asks for it anew."""

@@ -63,7 +63,7 @@ class ScanFolders:
 
     def table_folders(self) -> list[Path]:
         """Where the label table is looked for, the nearest to the scans first."""
-        near = [one for place in self.places for one in (place, *place.parents) if one.is_relative_to(self.root)]
+        near = [path for place in self.places for path in (place, *place.parents) if path.is_relative_to(self.root)]
         near += [self.root, *(self.root / base for base in BASES if base)]
         return list(dict.fromkeys(folder / name for folder in near for name in (".", *TABLE_FOLDERS)))
 
@@ -88,7 +88,7 @@ def find_scans(root: Path) -> ScanFolders:
             made |= {scan.name for scan in scans if scan.name in rooms}
         for scan in scans:
             folders.setdefault(scan.name, []).append(scan)
-    return ScanFolders(root, tuple(places), {scan: tuple(found) for scan, found in folders.items()}, frozenset(made))
+    return ScanFolders(root, tuple(places), {scan: tuple(paths) for scan, paths in folders.items()}, frozenset(made))
 
 
 def _is_scan(folder: Path, rooms: Mapping[str, str]) -> bool:

@@ -115,9 +115,11 @@ def _find(folder: Path, scene: str, kind: SourceKind) -> tuple[SourceKind, Path]
 
 def python_layout(folder: Path) -> PythonLayout | None:
     """The layout in which frames lie in ``folder``; None where none do."""
-    found = [one for one in PYTHON_LAYOUTS if (folder / one.colour).is_dir() or (folder / one.pose).is_dir()]
-    with_cameras = [one for one in found if (folder / one.cameras).is_dir()]
-    return next(iter(with_cameras or found), None)
+    layouts = [
+        layout for layout in PYTHON_LAYOUTS if (folder / layout.colour).is_dir() or (folder / layout.pose).is_dir()
+    ]
+    with_cameras = [layout for layout in layouts if (folder / layout.cameras).is_dir()]
+    return next(iter(with_cameras or layouts), None)
 
 
 def open_python_export(folder: Path, where: str) -> ExportedFrames:

@@ -67,11 +67,12 @@ class AnnotatedScan:
     @property
     def instance(self) -> Int32Array:
         """Instance id of each vertex, 0 for none."""
-        return np.array([*(one.id + 1 for one in self.objects), 0], np.int32)[self.object_of_vertex]
+        return np.array([*(entry.id + 1 for entry in self.objects), 0], np.int32)[self.object_of_vertex]
 
     def of_category(self, value_of: Mapping[str, int]) -> Int32Array:
         """What ``value_of`` says of each vertex's category; 0 where no object or no entry is."""
-        return np.array([*(value_of.get(one.category, 0) for one in self.objects), 0], np.int32)[self.object_of_vertex]
+        values = [*(value_of.get(entry.category, 0) for entry in self.objects), 0]
+        return np.array(values, np.int32)[self.object_of_vertex]
 
 
 def read_annotated_scan(files: Mapping[str, Path], scan: str, where: str) -> AnnotatedScan:
@@ -221,7 +222,7 @@ def _holds_raw_ids(scan: AnnotatedScan, table: LabelTable | None) -> bool:
 
 def _say_what_is_unknown(scan: AnnotatedScan, table: LabelTable) -> None:
     """A warning that counts the categories without a row; their vertices are void."""
-    unknown = [row for row, one in enumerate(scan.objects) if one.category not in table.nyu40_of]
+    unknown = [row for row, entry in enumerate(scan.objects) if entry.category not in table.nyu40_of]
     if unknown:
         categories = sorted({scan.objects[row].category for row in unknown})
         logger.warning(
@@ -250,7 +251,7 @@ def instance_mesh(scan: AnnotatedScan, table: LabelTable | None) -> InstanceMesh
         scan.vertices,
         scan.triangles,
         of_triangle.astype(np.int32),
-        {int(one): int(class_id) for one, class_id in zip(ids, classes, strict=True) if class_id > 0},
+        {int(instance_id): int(class_id) for instance_id, class_id in zip(ids, classes, strict=True) if class_id > 0},
         nyu40_label_set(),
     )
 

@@ -87,13 +87,13 @@ class Tum:
 
     def scenes(self) -> Sequence[str]:
         folders = [folder for place in self.places() if place.is_dir() for folder in sorted(place.iterdir())]
-        found = [folder.name for folder in folders if _is_sequence(folder)]
-        if not found:
+        sequences = [folder.name for folder in folders if _is_sequence(folder)]
+        if not sequences:
             raise DataError(
                 f"tum: no sequence in {self.root} or in its folder tum (a sequence is a folder with rgb.txt and "
                 "depth.txt); unpack one there or set SU3D_DATA to where they are"
             )
-        return tuple(dict.fromkeys(found))
+        return tuple(dict.fromkeys(sequences))
 
     def places(self) -> Sequence[Path]:
         """The folders that are searched for sequences."""

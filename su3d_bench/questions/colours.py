@@ -34,10 +34,10 @@ def colour_words(dataset: Any, scene: str, truth: GroundTruth, min_vertices: int
     pixels: dict[int, list[Float64Array]] = {}
     for k in range(min(len(frames), N_FRAMES)):
         seen, rgb = _seen(frames[k], points)
-        for one in np.unique(owner[seen]).tolist():
-            pixels.setdefault(one, []).append(rgb[owner[seen] == one])
-    words = {one: colour_word(np.concatenate(parts)) for one, parts in pixels.items()}
-    return {one: word for one, word in sorted(words.items()) if word}
+        for instance in np.unique(owner[seen]).tolist():
+            pixels.setdefault(instance, []).append(rgb[owner[seen] == instance])
+    words = {instance: colour_word(np.concatenate(parts)) for instance, parts in pixels.items()}
+    return {instance: word for instance, word in sorted(words.items()) if word}
 
 
 def _sampled_vertices(truth: GroundTruth, min_vertices: int) -> Int64Array:

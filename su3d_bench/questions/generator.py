@@ -39,12 +39,12 @@ _RESTING: tuple[PairRelation, ...] = ("on", "in")
 
 def generate(scene: str, objects: SceneMap, per_kind: int | None = None) -> tuple[Question, ...]:
     """The questions of all four kinds, ``per_kind`` of each at most, drawn by a digest of the text: always the same."""
-    found: dict[tuple[str, str], set[int]] = {}
+    right: dict[tuple[str, str], set[int]] = {}
     for kind, text, answers in _texts(objects):
-        found.setdefault((kind, text), set()).update(answers)
+        right.setdefault((kind, text), set()).update(answers)
     limit = max(1, int(len(objects) * MAX_ANSWER_SHARE))
     kept = [
-        new_question(scene, kind, text, tuple(ids), SOURCE) for (kind, text), ids in found.items() if len(ids) <= limit
+        new_question(scene, kind, text, tuple(ids), SOURCE) for (kind, text), ids in right.items() if len(ids) <= limit
     ]
     return chosen(kept, per_kind)
 
@@ -61,7 +61,7 @@ def chosen(questions: Sequence[Question], per_kind: int | None) -> tuple[Questio
 
 def _texts(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
     """Kind, text and answers; the same text may come several times with some of its answers each."""
-    names = sorted({one.name for one in objects.objects})
+    names = sorted({thing.name for thing in objects.objects})
     for name in names:
         yield "instance", name, _ids(objects, name)
     for name, others in SYNONYMS.items():
@@ -69,7 +69,7 @@ def _texts(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
             for other in others[:MOST_SYNONYMS]:
                 yield "instance", other, _ids(objects, other)
     for phrase, classes in AFFORDANCES.items():
-        answers = tuple(one for name in classes for one in _ids(objects, name))
+        answers = tuple(object_id for name in classes for object_id in _ids(objects, name))
         if answers:
             yield "affordance", phrase, answers
     yield from _sizes(objects)
@@ -79,16 +79,16 @@ def _texts(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
 
 
 def _ids(objects: SceneMap, name: str) -> tuple[int, ...]:
-    return tuple(one.id for one in meant_by(name, objects).objects)
+    return tuple(thing.id for thing in meant_by(name, objects).objects)
 
 
 def _sizes(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
     """Large and small things among those of one name, by the volume of the box."""
-    for name, n in Counter(one.name for one in objects.objects).items():
+    for name, n in Counter(thing.name for thing in objects.objects).items():
         if n < 2:
             continue
-        named = [one for one in objects.objects if one.name == name]
-        volume = np.array([float(np.prod(one.size)) for one in named])
+        named = [thing for thing in objects.objects if thing.name == name]
+        volume = np.array([float(np.prod(thing.size)) for thing in named])
         middle = float(np.median(volume))
         for word, is_so in (("large", volume >= LARGE * middle), ("small", volume * LARGE <= middle)):
             if is_so.any():
@@ -97,15 +97,15 @@ def _sizes(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
 
 def _attributes(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
     """The words that are known of an object before its name: "red chair"."""
-    for one in objects.objects:
-        for word in one.caption.split():
-            yield "property", f"{word} {one.name}", (one.id,)
+    for thing in objects.objects:
+        for word in thing.caption.split():
+            yield "property", f"{word} {thing.name}", (thing.id,)
 
 
 def _relations(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
     things = objects.objects
-    boxes = np.array([one.box for one in things]).reshape(-1, 2, 3)
-    links = list(relations_of(boxes, [one.name for one in things]))
+    boxes = np.array([thing.box for thing in things]).reshape(-1, 2, 3)
+    links = list(relations_of(boxes, [thing.name for thing in things]))
     held = {(link.subject, link.relation, link.object) for link in links}
     resting = {link.subject for link in links if link.relation in ("on", "in")}
     for link in links:
@@ -126,27 +126,27 @@ def _is_said(
     if link.relation == "under":
         bears = (b, "on", a) in held
         is_flat = float(things[a].size[2]) < FLAT_M
-        return not any((a, one, b) in held for one in _RESTING) and (is_flat if bears else b not in resting)
+        return not any((a, relation, b) in held for relation in _RESTING) and (is_flat if bears else b not in resting)
     return True
 
 
 def _between(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
     """What stands between two things of which the scene has one each, on one level with both."""
-    n_of = Counter(one.name for one in objects.objects)
-    single = [one for one in objects.objects if n_of[one.name] == 1]
+    n_of = Counter(thing.name for thing in objects.objects)
+    single = [thing for thing in objects.objects if n_of[thing.name] == 1]
     for k, first in enumerate(single):
         for second in single[k + 1 :]:
             if float(np.linalg.norm(first.centroid - second.centroid)) > BETWEEN_M or _touch(first, second):
                 continue
-            for one in objects.objects:
-                if one is not first and one is not second and _stands_between(one, first, second):
-                    yield "relative", f"{one.name} between the {first.name} and the {second.name}", (one.id,)
+            for thing in objects.objects:
+                if thing is not first and thing is not second and _stands_between(thing, first, second):
+                    yield "relative", f"{thing.name} between the {first.name} and the {second.name}", (thing.id,)
 
 
-def _stands_between(one: MapObject, first: MapObject, second: MapObject) -> bool:
-    if any(min(one.box[1][2], other.box[1][2]) <= max(one.box[0][2], other.box[0][2]) for other in (first, second)):
+def _stands_between(thing: MapObject, first: MapObject, second: MapObject) -> bool:
+    if any(min(thing.box[1][2], other.box[1][2]) <= max(thing.box[0][2], other.box[0][2]) for other in (first, second)):
         return False
-    return is_between(one.centroid, first.centroid, second.centroid)
+    return is_between(thing.centroid, first.centroid, second.centroid)
 
 
 def _touch(a: MapObject, b: MapObject) -> bool:

@@ -21,8 +21,8 @@ def known_objects(truth: GroundTruth, min_vertices: int, captions: Mapping[int, 
 
     An object's class is that of most of its vertices. ``captions``: words on an object, such as its colour.
     """
-    found = []
-    for one, rows in instance_rows(truth, min_vertices):
+    objects = []
+    for instance, rows in instance_rows(truth, min_vertices):
         classes = np.bincount(truth.semantic[rows].clip(min=0))
         class_id = int(classes.argmax())
         if class_id == 0:
@@ -31,8 +31,8 @@ def known_objects(truth: GroundTruth, min_vertices: int, captions: Mapping[int, 
         if not is_room_surface(name):
             points = truth.points[rows].astype(np.float64)
             box = np.percentile(points, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
-            found.append(MapObject(one, name, (captions or {}).get(one, ""), points.mean(axis=0), box))
-    return SceneMap(tuple(found))
+            objects.append(MapObject(instance, name, (captions or {}).get(instance, ""), points.mean(axis=0), box))
+    return SceneMap(tuple(objects))
 
 
 def instance_rows(truth: GroundTruth, min_vertices: int) -> Iterator[tuple[int, Int64Array]]:
@@ -62,12 +62,12 @@ def is_called(label: str, class_name: str) -> bool:
     >>> is_called("couch", "sofa"), is_called("paper towel", "towel"), is_called("furniture", "sofa")
     (True, False, False)
     """
-    asked, known = words(label), words(class_name)
-    if not asked or not known:
+    label_words, class_words = words(label), words(class_name)
+    if not label_words or not class_words:
         return False
-    if asked == known:
+    if label_words == class_words:
         return True
-    if " ".join(asked) in GROUPS:
+    if " ".join(label_words) in GROUPS:
         return False
     return bool(meant_by(class_name, _only(label)).objects) or bool(meant_by(label, _only(class_name)).objects)
 

@@ -27,7 +27,7 @@ def questions_of(
         return chosen(own_questions(dataset, scene), per_kind)
     if not dataset.variants:
         raise GroundTruthMissing(f"{dataset.name}/{scene}: the dataset has no ground truth to make questions from")
-    variant = next((one for one in FULLEST if one in dataset.variants), dataset.variants[0])
+    variant = next((name for name in FULLEST if name in dataset.variants), dataset.variants[0])
     truth = dataset.ground_truth(scene, variant)
     words = colour_words(dataset, scene, truth, MIN_VERTICES) if colours else None
     return generate(f"{dataset.name}/{scene}", known_objects(truth, MIN_VERTICES, words), per_kind)

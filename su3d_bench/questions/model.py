@@ -45,7 +45,7 @@ class Question:
             raise DataError(f"{where}: unknown kind '{printable(self.kind, 40)}'; known: {', '.join(ALL_KINDS)}")
         if self.id != question_id(self.scene, self.kind, self.text):
             raise DataError(f"{where}: its id '{printable(self.id, 40)}' is not that of its scene, kind and text")
-        if self.answers is not None and list(self.answers) != sorted({one for one in self.answers if one > 0}):
+        if self.answers is not None and list(self.answers) != sorted({answer for answer in self.answers if answer > 0}):
             raise DataError(f"{where}: answers must be instance ids above 0, ascending, each once")
 
     @property
@@ -58,5 +58,5 @@ def new_question(
     scene: str, kind: str, text: str, answers: tuple[int, ...] | None, source: str, reply: str = ""
 ) -> Question:
     """A question with the id that its scene, kind and text give it."""
-    found = None if answers is None else tuple(sorted(set(answers)))
-    return Question(question_id(scene, kind, text), scene, kind, text, found, source, reply)
+    ascending = None if answers is None else tuple(sorted(set(answers)))
+    return Question(question_id(scene, kind, text), scene, kind, text, ascending, source, reply)

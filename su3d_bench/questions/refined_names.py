@@ -51,7 +51,7 @@ class NameRecords(BaseModel):
 
     @property
     def refined(self) -> tuple[str, ...]:
-        return tuple(one.refined for one in self.names)
+        return tuple(record.refined for record in self.names)
 
 
 def records_of(
@@ -68,13 +68,13 @@ def records_of(
         NameRecord(
             id=int(one_id),
             label=top.label,
-            refined=one.name,
-            source=one.source,
-            reason=one.reason,
+            refined=name.name,
+            source=name.source,
+            reason=name.reason,
             candidates=top.names,
-            request=one.key,
+            request=name.key,
         )
-        for one_id, top, one in zip(ids, tops, refined, strict=True)
+        for one_id, top, name in zip(ids, tops, refined, strict=True)
     )
     return NameRecords(
         schema_version=SCHEMA,

@@ -44,15 +44,15 @@ def top_names(instances: Instances, m: int) -> list[TopNames]:
     """Names of the ``m`` views of highest prediction score of each instance; ties: the earlier view."""
     if instances.view_names is None or instances.view_scores is None:
         raise PredictionError("this map keeps no names of its views; make it anew with a method that does (opensu3d)")
-    found = []
+    tops = []
     for k, label in enumerate(instances.names):
         first, last = int(instances.view_indptr[k]), int(instances.view_indptr[k + 1])
         scores = np.asarray(instances.view_scores[first:last], np.float64)
         order = [first + int(row) for row in np.argsort(-scores, kind="stable")[:m]]
         names = [(instances.view_names[row].strip(), float(instances.view_scores[row])) for row in order]
         named = [(name, score) for name, score in names if name]
-        found.append(TopNames(label, tuple(name for name, _ in named), tuple(score for _, score in named)))
-    return found
+        tops.append(TopNames(label, tuple(name for name, _ in named), tuple(score for _, score in named)))
+    return tops
 
 
 def vote(top: TopNames) -> RefinedName:

@@ -41,8 +41,8 @@ def own_questions(dataset: Any, scene: str) -> tuple[Question, ...]:
     """The questions that the dataset itself knows of a scene, with all right answers."""
     address = f"{dataset.name}/{scene}"
     return tuple(
-        new_question(address, one.kind, one.text, one.answers, f"{dataset.name} truth")
-        for one in dataset.queries(scene)
+        new_question(address, query.kind, query.text, query.answers, f"{dataset.name} truth")
+        for query in dataset.queries(scene)
     )
 
 
@@ -53,45 +53,50 @@ def question_truth(
     assert rules.min_region_size is not None
     if rules.kind == "retrieval":
         if rules.questions == "dataset":
-            asked = own_questions(dataset, scene)
+            questions = own_questions(dataset, scene)
         else:
-            asked = generate(f"{dataset.name}/{scene}", known_objects(truth, rules.min_region_size), rules.per_kind)
-        return RetrievalTruth(truth, tuple(AskedText(one.kind, one.text, one.answers or ()) for one in asked))
+            questions = generate(f"{dataset.name}/{scene}", known_objects(truth, rules.min_region_size), rules.per_kind)
+        return RetrievalTruth(
+            truth, tuple(AskedText(question.kind, question.text, question.answers or ()) for question in questions)
+        )
     if rules.kind == "annotation":
         return _annotation_truth(rules.min_region_size, truth, refine or voted_names)
     return _reasoning_truth(rules, truth, refine or voted_names)
 
 
 def _annotation_truth(min_vertices: int, truth: GroundTruth, refine: Refine) -> AnnotationTruth:
-    name_of = {one.id: one.name for one in known_objects(truth, min_vertices).objects}
-    return AnnotationTruth(truth, tuple(name_of), lambda label, one: is_called(label, name_of[one]), refine)
+    name_of = {known.id: known.name for known in known_objects(truth, min_vertices).objects}
+    return AnnotationTruth(truth, tuple(name_of), lambda label, object_id: is_called(label, name_of[object_id]), refine)
 
 
 def _reasoning_truth(rules: ProtocolRules, truth: GroundTruth, refine: Refine) -> ReasoningTruth:
     assert rules.min_region_size is not None
     objects = known_objects(truth, rules.min_region_size)
-    asked = generate_questions(objects, n_each=rules.per_kind or len(objects) ** 2)
-    texts = [one.text for one in asked]
+    questions = generate_questions(objects, n_each=rules.per_kind or len(objects) ** 2)
+    texts = [question.text for question in questions]
 
     def solve(instances: Instances, encoder: Encoder | None) -> Sequence[GivenAnswer]:
         refined = refine(instances)
         scene = map_of(instances, None if refined is None else refined.names)
         solver = Solver(scene, None, None if encoder is None else nearest_by(encoder))
-        return [_given(solver.answer(text), {one.id: one.row for one in scene.objects}) for text in texts]
+        return [_given(solver.answer(text), {thing.id: thing.row for thing in scene.objects}) for text in texts]
 
-    known = {one.id for one in objects.objects}
+    known = {thing.id for thing in objects.objects}
     true = [
         TrueAnswer(
-            one.text, one.kind, one.answer.value, tuple(sorted(set(one.answer.object_ids) & known))
+            question.text, question.kind, question.answer.value,
+            tuple(sorted(set(question.answer.object_ids) & known)),
         )
-        for one in asked
+        for question in questions
     ]  # fmt: skip
     return ReasoningTruth(truth, tuple(true), solve)
 
 
 def _given(answer: Any, row_of: dict[int, int]) -> GivenAnswer:
     return GivenAnswer(
-        answer.value, np.array([row_of[one] for one in answer.object_ids], np.int64), bool(answer.is_settled)
+        answer.value,
+        np.array([row_of[object_id] for object_id in answer.object_ids], np.int64),
+        bool(answer.is_settled),
     )
 
 

@@ -33,10 +33,10 @@ def cabinet_row(plan: Plan, wall: int, start: float, colour: str) -> tuple[list[
         item = plan.new("base-cabinet", colour=colour)
         centre, half = along + item.size[0] / 2, item.size[0] / 2
         fits = centre + half < plan.wall_length(wall)
-        found = plan.try_at_wall(item, wall, centre, item.size[1] / 2 + 0.006) if fits else None
-        if found is None:
+        placed = plan.try_at_wall(item, wall, centre, item.size[1] / 2 + 0.006) if fits else None
+        if placed is None:
             break
-        run.append(found)
+        run.append(placed)
         along = centre + half + 0.004
     return run, along
 

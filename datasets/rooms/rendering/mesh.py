@@ -72,14 +72,14 @@ def gather_patches(placed: Sequence[Placed]) -> Patches:
     """All parts in world coordinates; the texture stays in each object's own frame."""
     corners, normals, texture, ids, rows = [], [], [], [], []
     materials: list[Material] = []
-    for one in placed:
-        turn = rotation("z", one.yaw).T
-        for part in one.item.parts:
+    for piece in placed:
+        turn = rotation("z", piece.yaw).T
+        for part in piece.item.parts:
             shape = _wound(part.shape)
-            corners.append(shape.quads @ turn + one.position)
+            corners.append(shape.quads @ turn + piece.position)
             normals.append(shape.normals @ turn)
             texture.append(shape.quads)
-            ids.append(np.full(len(part.shape.quads), one.id, np.int32))
+            ids.append(np.full(len(part.shape.quads), piece.id, np.int32))
             rows.append(np.full(len(part.shape.quads), len(materials), np.int32))
             materials.append(part.material)
     return Patches(
@@ -153,7 +153,7 @@ def build_mesh(patches: Patches, lights: Sequence[Light], exposure: float) -> Ro
     solid = np.linalg.norm(np.cross(b - a, c - a), axis=1) > 1e-10
     triangles, quad = triangles[solid], quad[solid]
     light = _bake(grid, patches, points, normals, triangles, lights, exposure)
-    sources = np.array([[*one.position, max(one.colour)] for one in lights], np.float32)
+    sources = np.array([[*source.position, max(source.colour)] for source in lights], np.float32)
     return RoomMesh(
         points.astype(np.float32), normals.astype(np.float32), texture.astype(np.float32), light,
         triangles.astype(np.int32), patches.object_id[quad], patches.material[quad], patches.materials, sources,
@@ -185,8 +185,8 @@ def _bake(
     far = np.linalg.norm(inward, axis=1, keepdims=True)
     start = where + facing * 0.004 + inward * np.minimum(0.1, 0.015 / np.maximum(far, 1e-9))  # off the edges
     total = np.zeros((len(first), 3))
-    for one in lights:
-        total += _direct(scene, start, facing, one)[:, None] * np.array(one.colour)
+    for source in lights:
+        total += _direct(scene, start, facing, source)[:, None] * np.array(source.colour)
     share = _open_sky(scene, start, facing)
     up = 0.86 + 0.14 * facing[:, 2:]
     total += AMBIENT * (0.4 + 0.6 * share[:, None]) * up * np.array([1.0, 0.985, 0.96])

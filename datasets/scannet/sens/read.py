@@ -83,9 +83,9 @@ class SensFile:
 
     def record(self, i: int) -> SensRecord:
         """Pose and time stamps of frame ``i``."""
-        one = self._records[i]
-        pose = one["camera_to_world"].astype(np.float64)
-        return SensRecord(pose, int(one["colour_timestamp"]), int(one["depth_timestamp"]))
+        stored = self._records[i]
+        pose = stored["camera_to_world"].astype(np.float64)
+        return SensRecord(pose, int(stored["colour_timestamp"]), int(stored["depth_timestamp"]))
 
     def poses(self) -> Float64Array:
         """The poses (n, 4, 4) of all frames, as stored."""

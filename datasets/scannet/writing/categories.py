@@ -73,8 +73,8 @@ def scene_type(room: str) -> str:
 def label_table_text() -> str:
     """``scannetv2-labels.combined.tsv`` with the categories of the rooms; columns of other vocabularies are empty."""
     rows = ["\t".join(TABLE_COLUMNS)]
-    for one in sorted(set(categories().values()), key=lambda one: one.id):
-        known = {"id": one.id, "raw_category": one.raw_category, "category": one.raw_category, "count": 0}
-        known |= {"nyu40id": one.nyu40id, "nyu40class": one.nyu40class}
+    for row in sorted(set(categories().values()), key=lambda row: row.id):
+        known = {"id": row.id, "raw_category": row.raw_category, "category": row.raw_category, "count": 0}
+        known |= {"nyu40id": row.nyu40id, "nyu40class": row.nyu40class}
         rows.append("\t".join(str(known.get(column, "")) for column in TABLE_COLUMNS))
     return "\n".join(rows) + "\n"

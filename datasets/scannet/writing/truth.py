@@ -29,9 +29,9 @@ def write_scan_truth(dataset: ScannedDataset, scene: str, scan: str, folder: Pat
     make_folder(folder)
     surface, objects = dataset.scan(scene), dataset.objects(scene)
     owner, segments = object_of_vertex(surface), segment_of_vertex(surface)
-    category_of = {one.id: categories()[one.class_name] for one in objects}
+    category_of = {known.id: categories()[known.class_name] for known in objects}
     nyu40_of = np.zeros(max(category_of, default=0) + 1, np.uint16)
-    nyu40_of[list(category_of)] = [one.nyu40id for one in category_of.values()]
+    nyu40_of[list(category_of)] = [category.nyu40id for category in category_of.values()]
     labels = nyu40_of[owner]
     faces = triangles_of(surface.faces)
     face_element = PlyElement("face", len(faces), {"vertex_indices": list_column(faces)})
@@ -41,9 +41,9 @@ def write_scan_truth(dataset: ScannedDataset, scene: str, scan: str, folder: Pat
     params = {"minCosine": str(MIN_COSINE)}
     _write_json(folder / segments_name(scan), {"params": params, "sceneId": scan, "segIndices": segments.tolist()})
     groups = [
-        {"id": one - 1, "objectId": one - 1, "segments": np.unique(segments[owner == one]).tolist(),
+        {"id": object_id - 1, "objectId": object_id - 1, "segments": np.unique(segments[owner == object_id]).tolist(),
          "label": category.raw_category}
-        for one, category in category_of.items() if (owner == one).any()
+        for object_id, category in category_of.items() if (owner == object_id).any()
     ]  # fmt: skip
     aggregation = {"sceneId": f"scannet.{scan}", "appId": "su3d-bench", "segGroups": groups}
     _write_json(folder / aggregation_name(scan), aggregation | {"segmentsFile": f"scannet.{segments_name(scan)}"})

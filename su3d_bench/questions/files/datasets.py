@@ -87,9 +87,9 @@ def _csv_rows(text: str, where: str) -> list[Any]:
 
 def _situated(rows: list[Any], replies: Mapping[str, str], where: str) -> Iterator[Question]:
     for at, row in _placed(rows, where, "question"):
-        scene, asked = _word(row, "scene_id", at), _sentence(row, "question", at)
+        scene, question = _word(row, "scene_id", at), _sentence(row, "question", at)
         situation = _sentence(row, "situation", at) if row.get("situation") else ""
-        text = f"{situation} {asked}".strip()
+        text = f"{situation} {question}".strip()
         reply = replies.get(str(row.get("question_id")), "")
         yield new_question(f"{DATASET}/{scene}", REASONING, text, None, "SQA3D", reply)
 
@@ -104,13 +104,13 @@ def _replies(path: Path) -> dict[str, str]:
     rows = content.get("annotations") if isinstance(content, dict) else None
     if not isinstance(rows, list):
         raise DataError(f"{where}: has no 'annotations'")
-    found = {}
+    reply_of = {}
     for at, row in _placed(rows, where, "annotation"):
         answers = row.get("answers") if isinstance(row, Mapping) else None
         if not isinstance(answers, list) or not answers:
             raise DataError(f"{at}: has no answers")
-        found[str(row.get("question_id"))] = _sentence(answers[0], "answer", at)
-    return found
+        reply_of[str(row.get("question_id"))] = _sentence(answers[0], "answer", at)
+    return reply_of
 
 
 def _placed(rows: list[Any], where: str, noun: str, first: int = 1) -> Iterator[tuple[str, Any]]:

@@ -9,6 +9,7 @@ import csv
 import io
 import tomllib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from su3d_bench.core.config import toml_value
@@ -30,7 +31,7 @@ def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ..
     """
     if is_foreign(path):
         return _each_once(read_foreign(path))
-    found: dict[str, Question] = {}
+    questions: dict[str, Question] = {}
     for row in read_query_rows(path):
         kind = row.kind or KINDS[0]
         if kind not in ALL_KINDS:
@@ -39,33 +40,30 @@ def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ..
             raise DataError(f"{row.at}: of which dataset is scene '{printable(row.scene, 60)}'? write dataset/scene")
         scene = f"{dataset}/{row.scene}" if dataset and "/" not in row.scene else row.scene
         source = row.source or printable(path.name, 100)
-        one = new_question(scene, kind, row.text, row.objects or None, source)
-        if one.id in found:
+        question = new_question(scene, kind, row.text, row.objects or None, source)
+        if question.id in questions:
             raise DataError(f"{row.at}: '{printable(row.text, 60)}' stands there twice for {printable(scene, 60)}")
-        found[one.id] = one
-    return tuple(found.values())
+        questions[question.id] = question
+    return tuple(questions.values())
 
 
 def _each_once(questions: Sequence[Question]) -> tuple[Question, ...]:
     """The first of each id: people wrote some sentences twice; where their objects differ, all are right."""
     answers: dict[str, set[int]] = {}
-    for one in questions:
-        answers.setdefault(one.id, set()).update(one.answers or ())
-    first = {one.id: one for one in reversed(questions)}
-    return tuple(
-        new_question(one.scene, one.kind, one.text, tuple(answers[one.id]) or None, one.source, one.reply)
-        for one in (first[key] for key in dict.fromkeys(each.id for each in questions))
-    )
+    for question in questions:
+        answers.setdefault(question.id, set()).update(question.answers or ())
+    first = {question.id: question for question in reversed(questions)}
+    return tuple(replace(first[key], answers=tuple(sorted(ids)) or None) for key, ids in answers.items())
 
 
 def paper_queries() -> tuple[Question, ...]:
     """The queries that the paper's page shows, for each of its 13 scenes; no answers are published."""
     content = tomllib.loads(PAPER.read_text(encoding="utf-8"))
-    asked = [(kind, text) for kind in KINDS for text in content["queries"][kind]]
+    kinds_and_texts = [(kind, text) for kind in KINDS for text in content["queries"][kind]]
     return tuple(
         new_question(scene, kind, text, None, "opensu3d.github.io")
         for scene in content["scenes"]
-        for kind, text in asked
+        for kind, text in kinds_and_texts
     )
 
 
@@ -84,9 +82,9 @@ def write_questions(path: Path, questions: Sequence[Question]) -> None:
 def toml_text(questions: Sequence[Question]) -> str:
     """The set as ``[[query]]`` tables."""
     blocks = []
-    for one in questions:
-        values = {"scene": one.scene, "kind": one.kind, "text": one.text}
-        values_more = {"objects": list(one.answers or ()), "source": one.source}
+    for question in questions:
+        values = {"scene": question.scene, "kind": question.kind, "text": question.text}
+        values_more = {"objects": list(question.answers or ()), "source": question.source}
         lines = [f"{key} = {toml_value(value)}" for key, value in (values | values_more).items()]
         blocks.append("\n".join(["[[query]]", *lines]))
     return "\n\n".join(blocks) + "\n"
@@ -97,6 +95,8 @@ def csv_text(questions: Sequence[Question]) -> str:
     text = io.StringIO(newline="")
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow((*COLUMNS, *MORE_COLUMNS))
-    for one in questions:
-        rows.writerow((one.scene, one.text, " ".join(map(str, one.answers or ())), one.kind, one.source))
+    for question in questions:
+        rows.writerow(
+            (question.scene, question.text, " ".join(map(str, question.answers or ())), question.kind, question.source)
+        )
     return text.getvalue()

@@ -60,27 +60,27 @@ def read_query_rows(path: Path) -> list[QueryRow]:
 
 def read_query_file(path: Path) -> dict[str, tuple[TextQuery, ...]]:
     """The queries of each scene, in the order of the file; scenes are called without the dataset."""
-    found: dict[str, list[TextQuery]] = {}
+    queries_of_scene: dict[str, list[TextQuery]] = {}
     for row in read_query_rows(path):
         if not row.objects:
             raise DataError(f"{row.at}: 'objects' must name at least one instance id above 0")
-        queries = found.setdefault(row.scene.rpartition("/")[2], [])
-        if any(one.text == row.text for one in queries):
+        queries = queries_of_scene.setdefault(row.scene.rpartition("/")[2], [])
+        if any(query.text == row.text for query in queries):
             raise DataError(
                 f"{row.at}: the query '{printable(row.text, 60)}' stands there twice for {printable(row.scene, 60)}"
             )
         queries.append(TextQuery(row.text, row.objects))
-    return {scene: tuple(queries) for scene, queries in found.items()}
+    return {scene: tuple(queries) for scene, queries in queries_of_scene.items()}
 
 
 def query_truth(truth: GroundTruth, queries: tuple[TextQuery, ...], where: str) -> QueryTruth:
     """The queries of a scene over the instances of its ground truth; an object that is not there is an error."""
     known = set(np.unique(truth.instance[truth.instance > 0]).tolist())
     for query in queries:
-        for one in query.object_ids:
-            if one not in known:
+        for object_id in query.object_ids:
+            if object_id not in known:
                 raise DataError(
-                    f"{where}: query '{printable(query.text, 60)}' names object {one}; the ground truth has "
+                    f"{where}: query '{printable(query.text, 60)}' names object {object_id}; the ground truth has "
                     f"{len(known)} objects, {min(known, default=0)} to {max(known, default=0)}"
                 )
     owner = truth.instance.astype(np.int64)
@@ -101,7 +101,7 @@ def _toml_rows(text: str, where: str) -> Iterator[QueryRow]:
         if not isinstance(table, Mapping) or not set(COLUMNS) <= set(table) <= {*COLUMNS, *MORE_COLUMNS}:
             raise DataError(f"{at}: expected the keys {', '.join(COLUMNS)}, and kind or source where they are known")
         objects = table["objects"]
-        if not isinstance(objects, list) or not all(type(one) is int for one in objects):
+        if not isinstance(objects, list) or not all(type(object_id) is int for object_id in objects):
             raise DataError(f"{at}: 'objects' must be a list of instance ids")
         yield _row(at, table, objects)
 
@@ -128,7 +128,7 @@ def _csv_rows(text: str, where: str) -> Iterator[QueryRow]:
 
 
 def _row(at: str, values: Mapping[str, Any], objects: Sequence[int]) -> QueryRow:
-    if not all(0 < one <= MOST_OBJECTS_ID for one in objects):
+    if not all(0 < object_id <= MOST_OBJECTS_ID for object_id in objects):
         raise DataError(f"{at}: 'objects' must name instance ids above 0")
     scene, text = (_text(values[name], at) for name in ("scene", "text"))
     kind, source = (_text(values[name], at) if values.get(name) else "" for name in MORE_COLUMNS)
@@ -147,4 +147,4 @@ def is_text(value: str) -> bool:
     >>> is_text("\u202eright to left \U0001f600"), is_text("\x1b[2J")
     (True, False)
     """
-    return len(value) <= MOST_CHARACTERS and not any(unicodedata.category(one) in ("Cc", "Cs") for one in value)
+    return len(value) <= MOST_CHARACTERS and not any(unicodedata.category(sign) in ("Cc", "Cs") for sign in value)

@@ -41,19 +41,19 @@ def generate_questions(
     """Up to ``n_each`` questions of each kind, drawn with ``seed``; the built-in solver supplies the truth."""
     random = np.random.default_rng(seed)
     solver = Solver(scene, eye)
-    found: list[GeneratedQuestion] = []
+    questions: list[GeneratedQuestion] = []
     for kind, texts in _texts(scene, random, eye is not None).items():
         distinct = sorted(dict.fromkeys(texts))
         chosen = [distinct[k] for k in sorted(random.permutation(len(distinct))[:n_each])]
         answers = [(text, solver.answer(text)) for text in chosen]
-        found += [GeneratedQuestion(text, kind, answer) for text, answer in answers if answer.is_settled]
-    return tuple(found)
+        questions += [GeneratedQuestion(text, kind, answer) for text, answer in answers if answer.is_settled]
+    return tuple(questions)
 
 
 def _texts(scene: SceneMap, random: np.random.Generator, with_sides: bool) -> dict[str, list[str]]:
-    things = [one for one in scene.objects if one.name and not is_room_surface(one.name)]
-    n_of = Counter(one.name for one in things)
-    single = [one for one in things if n_of[one.name] == 1]
+    things = [thing for thing in scene.objects if thing.name and not is_room_surface(thing.name)]
+    n_of = Counter(thing.name for thing in things)
+    single = [thing for thing in things if n_of[thing.name] == 1]
     single = [single[k] for k in sorted(random.permutation(len(single))[:MOST_SINGLE])]
     kinds: dict[str, list[str]] = {
         "closer": list(_extreme(things, single, n_of, 1, "closer to")),
@@ -86,33 +86,33 @@ def _extreme(
     """Which of several is nearest to (``sign`` 1) or farthest from (-1) a reference."""
     for reference in single:
         for name in (name for name, n in n_of.items() if n > 1):
-            if _leads(sorted(sign * _away_m(one, reference) for one in things if one.name == name)):
+            if _leads(sorted(sign * _away_m(thing, reference) for thing in things if thing.name == name)):
                 yield f"Which {name} is {words} the {reference.name}?"
 
 
 def _nearest(things: list[MapObject], single: list[MapObject]) -> Iterator[str]:
     for reference in single:
-        if _leads(sorted(_away_m(one, reference) for one in things if one is not reference)):
+        if _leads(sorted(_away_m(thing, reference) for thing in things if thing is not reference)):
             yield f"Which object is closest to the {reference.name}?"
 
 
 def _compared(single: list[MapObject]) -> Iterator[str]:
     for reference in single:
-        for a, b in _pairs([one for one in single if one is not reference]):
+        for a, b in _pairs([thing for thing in single if thing is not reference]):
             if abs(_away_m(a, reference) - _away_m(b, reference)) >= MARGIN_M:
                 yield f"Which is closer to the {reference.name}, the {a.name} or the {b.name}?"
 
 
 def _between(things: list[MapObject], single: list[MapObject]) -> Iterator[str]:
     for a, b in _pairs(single):
-        n_between = sum(is_between(one.centroid, a.centroid, b.centroid) for one in things if one not in (a, b))
+        n_between = sum(is_between(thing.centroid, a.centroid, b.centroid) for thing in things if thing not in (a, b))
         if 0 < n_between <= FEW_BETWEEN:
             yield f"What is between the {a.name} and the {b.name}?"
 
 
 def _largest(things: list[MapObject], n_of: Counter[str]) -> Iterator[str]:
     for name in (name for name, n in n_of.items() if n > 1):
-        sizes = sorted((float(np.prod(one.size)) for one in things if one.name == name), reverse=True)
+        sizes = sorted((float(np.prod(thing.size)) for thing in things if thing.name == name), reverse=True)
         if sizes[0] >= SIZE_MARGIN * sizes[1]:
             yield f"Which {name} is the largest?"
 
@@ -121,22 +121,22 @@ def _related(
     scene: SceneMap, things: list[MapObject], single: list[MapObject], n_of: Counter[str]
 ) -> dict[str, list[str]]:
     """Questions on relations, as many with the answer no as with the answer yes."""
-    boxes = np.array([one.box for one in things]).reshape(-1, 2, 3)
-    names = [one.name for one in things]
-    is_single = {one.id for one in single}
+    boxes = np.array([thing.box for thing in things]).reshape(-1, 2, 3)
+    names = [thing.name for thing in things]
+    is_single = {thing.id for thing in single}
     held: dict[str, set[tuple[str, str]]] = {relation: set() for relation in ASKED_RELATIONS}
     for link in relations_of(boxes, names):
         if things[link.object].id in is_single:
             held[link.relation].add((names[link.subject], names[link.object]))
     held["in"] -= held["on"]  # a cushion is within the box of a sofa, and on it
-    found: dict[str, list[str]] = {}
+    questions: dict[str, list[str]] = {}
     for relation in ASKED_RELATIONS:
         pairs = sorted(held[relation])
         objects = sorted({b for _, b in pairs})
-        found[f"what {relation}"] = [f"What is {relation} the {b}?" for b in objects]
+        questions[f"what {relation}"] = [f"What is {relation} the {b}?" for b in objects]
         turned = [(b, a) for a, b in pairs if n_of[a] == 1 and (b, a) not in held[relation]]
-        found[f"is {relation}"] = [f"Is there {with_article(a)} {relation} the {b}?" for a, b in [*pairs, *turned]]
-    return found
+        questions[f"is {relation}"] = [f"Is there {with_article(a)} {relation} the {b}?" for a, b in [*pairs, *turned]]
+    return questions
 
 
 def _sides(single: list[MapObject]) -> dict[str, list[str]]:

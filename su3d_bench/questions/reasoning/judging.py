@@ -25,13 +25,13 @@ def box_iou(a: Float64Array, b: Float64Array) -> float:
 
 def same_objects(scene: SceneMap, truth: SceneMap) -> dict[int, int]:
     """Id in ``scene`` -> id in ``truth`` of the box that it overlaps most, where that is enough."""
-    found = {}
-    for one in scene.objects:
-        overlaps = [(box_iou(one.box, other.box), -other.id) for other in truth.objects]
+    same = {}
+    for thing in scene.objects:
+        overlaps = [(box_iou(thing.box, other.box), -other.id) for other in truth.objects]
         iou, negative_id = max(overlaps, default=(0.0, 0))
         if iou >= LEAST_IOU:
-            found[one.id] = -negative_id
-    return found
+            same[thing.id] = -negative_id
+    return same
 
 
 def is_right(question: GeneratedQuestion, answer: Answer, same: Mapping[int, int]) -> bool:
@@ -44,16 +44,16 @@ def is_right(question: GeneratedQuestion, answer: Answer, same: Mapping[int, int
         return False
     true = question.answer.value
     if true is None:
-        ids = [same.get(one) for one in answer.object_ids]
+        ids = [same.get(object_id) for object_id in answer.object_ids]
         if question.kind.startswith(("what ", "between")):
             return set(ids) == set(question.answer.object_ids)
         return ids[:1] == list(question.answer.object_ids[:1])
-    said = said_value(answer, true)
-    if said is None:
+    value = said_value(answer, true)
+    if value is None:
         return False
     if isinstance(true, float):
-        return abs(said - true) <= max(DISTANCE_M, DISTANCE_SHARE * true)
-    return said == true
+        return abs(value - true) <= max(DISTANCE_M, DISTANCE_SHARE * true)
+    return value == true
 
 
 def said_value(answer: Answer, like: float | int | bool) -> float | int | bool | None:

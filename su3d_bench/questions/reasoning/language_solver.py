@@ -33,23 +33,23 @@ class LanguageSolver:
 
     def answers(self, questions: Sequence[str]) -> list[Answer]:
         """The answers in the order of ``questions``, several of which may be under way at once."""
-        contexts = [context_for(self._scene, one, self._config) for one in questions]
+        contexts = [context_for(self._scene, question, self._config) for question in questions]
         requests = [ask_request(*both, self._config) for both in zip(contexts, questions, strict=True)]
         replies = self._model.ask_all(requests)
         return [self._answer(*both) for both in zip(contexts, replies, strict=True)]
 
     def _answer(self, context: Context, reply: Reply) -> Answer:
         notes = tuple(note for note in (context.note, _dropped(reply.dropped)) if note)
-        said = None if reply.failure else answered(reply.text, [one.id for one in context.objects])
-        if said is None or (not said.object_ids and is_refusal(said.text)):
+        parsed = None if reply.failure else answered(reply.text, [thing.id for thing in context.objects])
+        if parsed is None or (not parsed.object_ids and is_refusal(parsed.text)):
             return replace(unsettled(f"{self._config.text_model}: {reason_of(reply)}", notes), solver="llm")
         if reply.finish_reason == "length":
             notes += ("the answer was cut at max_answer_tokens",)
-        if not said.object_ids:
+        if not parsed.object_ids:
             notes += ("the answer names no object of the map",)
-        if said.reasons:
-            notes += (f"reasoning: {said.reasons}",)
-        return Answer(said.text, said.object_ids, kind="llm", notes=notes, solver="llm")
+        if parsed.reasons:
+            notes += (f"reasoning: {parsed.reasons}",)
+        return Answer(parsed.text, parsed.object_ids, kind="llm", notes=notes, solver="llm")
 
 
 def _dropped(names: tuple[str, ...]) -> str:

@@ -41,66 +41,69 @@ class Meant:
 @cache
 def _class_of_words() -> dict[Words, str]:
     """Every known name -> the class that it names."""
-    found = {words(name): name for name in vocabulary()}
+    class_of = {words(name): name for name in vocabulary()}
     for name, others in SYNONYMS.items():
         for other in (name, *others):
-            found.setdefault(words(other), name)
-    return found
+            class_of.setdefault(words(other), name)
+    return class_of
 
 
 def meant_by(noun: str, scene: SceneMap, nearest: NearestName | None = None) -> Meant:
     """The objects that ``noun`` means; without relation words in it."""
-    asked = words(noun)
-    if not asked:
+    noun_words = words(noun)
+    if not noun_words:
         return Meant(())
-    if len(asked) == 1 and asked[0] in ANYTHING:
-        return Meant(tuple(one for one in scene.objects if not is_room_surface(one.name)))
-    for n_adjectives in range(min(MOST_ADJECTIVES, len(asked) - 1) + 1):
-        adjectives, rest = asked[:n_adjectives], asked[n_adjectives:]
+    if len(noun_words) == 1 and noun_words[0] in ANYTHING:
+        return Meant(tuple(thing for thing in scene.objects if not is_room_surface(thing.name)))
+    for n_adjectives in range(min(MOST_ADJECTIVES, len(noun_words) - 1) + 1):
+        adjectives, rest = noun_words[:n_adjectives], noun_words[n_adjectives:]
         named = _named(rest, scene.objects)
-        held = tuple(one for one in named if _has(one, adjectives))
+        held = tuple(thing for thing in named if _has(thing, adjectives))
         if held:
             return Meant(held)
-    if asked in _class_of_words():
+    if noun_words in _class_of_words():
         return Meant(())  # a word that is known, for a thing that is not there
     return _by_encoder(noun, scene, nearest)
 
 
-def _named(asked: Words, objects: Iterable[MapObject]) -> list[MapObject]:
-    group = GROUPS.get(" ".join(asked))
+def _named(noun_words: Words, objects: Iterable[MapObject]) -> list[MapObject]:
+    group = GROUPS.get(" ".join(noun_words))
+    class_of = _class_of_words()
     if group is not None:
-        return [one for one in objects if _class_of_words().get(words(one.name)) in group or words(one.name) == asked]
-    kind = _class_of_words().get(asked)
-    return [one for one in objects if _means(words(one.name), asked, kind)]
+        return [
+            thing for thing in objects if class_of.get(words(thing.name)) in group or words(thing.name) == noun_words
+        ]
+    kind = class_of.get(noun_words)
+    return [thing for thing in objects if _means(words(thing.name), noun_words, kind)]
 
 
-def _means(name: Words, asked: Words, kind: str | None) -> bool:
+def _means(name: Words, noun_words: Words, kind: str | None) -> bool:
     """Whether an object called ``name`` is what ``asked`` (of class ``kind``) asks for: a coffee table is a table."""
-    if name == asked:
+    if name == noun_words:
         return True
     own = _class_of_words().get(name)
     if own is not None:
         # A name of its own class: a paper towel is no towel.
         return own == kind
-    is_kind_of = len(name) > len(asked) and name[len(name) - len(asked) :] == asked
+    is_kind_of = len(name) > len(noun_words) and name[len(name) - len(noun_words) :] == noun_words
     return is_kind_of or (kind is not None and _class_of_words().get(name[-1:]) == kind)
 
 
-def _has(one: MapObject, adjectives: Words) -> bool:
-    told = {*words(one.name), *words(one.caption)}
-    return all(COLOUR_SPELLINGS.get(word, word) in told or word in told for word in adjectives)
+def _has(thing: MapObject, adjectives: Words) -> bool:
+    known = {*words(thing.name), *words(thing.caption)}
+    return all(COLOUR_SPELLINGS.get(word, word) in known or word in known for word in adjectives)
 
 
 def _by_encoder(noun: str, scene: SceneMap, nearest: NearestName | None) -> Meant:
-    names = sorted({one.name for one in scene.objects if one.name and not is_room_surface(one.name)})
+    names = sorted({thing.name for thing in scene.objects if thing.name and not is_room_surface(thing.name)})
     if nearest is None or not names:
         return Meant(())
     name, likeness = nearest(noun, names)
     if likeness < LEAST_LIKENESS:
         return Meant(())
-    found = tuple(one for one in scene.objects if one.name == name)
+    things = tuple(thing for thing in scene.objects if thing.name == name)
     note = f"the map has no '{noun}'; taken for '{name}', the nearest name by the text encoder (cosine {likeness:.2f})"
-    return Meant(found, (note,))
+    return Meant(things, (note,))
 
 
 def nearest_by(encoder: Encoder) -> NearestName:

@@ -55,14 +55,14 @@ def system_prompt() -> str:
     return "\n".join((_INTRODUCTION, *(f"- {rule}" for rule in STRATEGY), _FORM))
 
 
-def object_line(one: MapObject) -> str:
+def object_line(thing: MapObject) -> str:
     """One object as the model reads it, lengths to a millimetre."""
     entry = {
-        "ID": one.id,
-        "Name": one.name,
-        "Description": one.caption,
-        "Centroid": _rounded(one.centroid),
-        "Bounding Box": [_rounded(one.box[0]), _rounded(one.box[1])],
+        "ID": thing.id,
+        "Name": thing.name,
+        "Description": thing.caption,
+        "Centroid": _rounded(thing.centroid),
+        "Bounding Box": [_rounded(thing.box[0]), _rounded(thing.box[1])],
     }
     return json.dumps(entry, ensure_ascii=False)
 
@@ -74,30 +74,30 @@ def _rounded(values: Float64Array) -> list[float]:
 def context_for(scene: SceneMap, question: str, config: LanguageConfig) -> Context:
     """The objects that fit into the model's context, the most relevant to ``question`` where not all do."""
     room = config.context_tokens - config.max_answer_tokens - n_tokens(system_prompt()) - n_tokens(question) - 100
-    costs = {one.id: n_tokens(object_line(one)) + 1 for one in scene.objects}
+    costs = {thing.id: n_tokens(object_line(thing)) + 1 for thing in scene.objects}
     if sum(costs.values()) <= room:
         return Context(scene.objects, len(scene))
     chosen: set[int] = set()
-    for one in by_relevance(scene, question):
-        if costs[one.id] <= room or len(chosen) < FEW_OBJECTS:
-            chosen.add(one.id)
-            room -= costs[one.id]
-    return Context(tuple(one for one in scene.objects if one.id in chosen), len(scene))
+    for thing in by_relevance(scene, question):
+        if costs[thing.id] <= room or len(chosen) < FEW_OBJECTS:
+            chosen.add(thing.id)
+            room -= costs[thing.id]
+    return Context(tuple(thing for thing in scene.objects if thing.id in chosen), len(scene))
 
 
 def by_relevance(scene: SceneMap, question: str) -> list[MapObject]:
     """Objects in the order in which they matter: those that the question names, those whose name or caption shares a
     word with it, then by how near they are to the former; large before small where none is named."""
-    named = {one.id for phrase in _phrases(question) for one in meant_by(phrase, scene).objects}
-    asked = set(_every_word(question))
-    sharing = {one.id for one in scene.objects if asked & {*words(one.name), *words(one.caption)}}
-    centres = np.array([one.centroid for one in scene.objects if one.id in named]).reshape(-1, 3)
+    named = {thing.id for phrase in _phrases(question) for thing in meant_by(phrase, scene).objects}
+    question_words = set(_every_word(question))
+    sharing = {thing.id for thing in scene.objects if question_words & {*words(thing.name), *words(thing.caption)}}
+    centres = np.array([thing.centroid for thing in scene.objects if thing.id in named]).reshape(-1, 3)
 
-    def rank(one: MapObject) -> tuple[int, float, int]:
-        group = 0 if one.id in named else 1 if one.id in sharing else 2
+    def rank(thing: MapObject) -> tuple[int, float, int]:
+        group = 0 if thing.id in named else 1 if thing.id in sharing else 2
         if not len(centres):
-            return group, -float(np.prod(one.size)), one.id
-        return group, float(np.linalg.norm(centres - one.centroid, axis=1).min()), one.id
+            return group, -float(np.prod(thing.size)), thing.id
+        return group, float(np.linalg.norm(centres - thing.centroid, axis=1).min()), thing.id
 
     return sorted(scene.objects, key=rank)
 
@@ -108,12 +108,12 @@ def _phrases(question: str) -> list[str]:
     if read is None:
         return []
     waiting: list[Phrase] = [read.subject, *([read.other] if read.other else []), *read.options]
-    found: list[str] = []
+    nouns: list[str] = []
     while waiting:
         phrase = waiting.pop()
-        found.append(phrase.head)
+        nouns.append(phrase.head)
         waiting += phrase.others
-    return [noun for noun in found if noun != "object"]
+    return [noun for noun in nouns if noun != "object"]
 
 
 # Words that say nothing of what a question is about.
@@ -129,7 +129,7 @@ def _every_word(question: str) -> list[str]:
 
 def ask_request(context: Context, question: str, config: LanguageConfig) -> ChatRequest:
     """The request for one question over a map."""
-    lines = "\n".join(object_line(one) for one in context.objects)
+    lines = "\n".join(object_line(thing) for thing in context.objects)
     return ChatRequest(
         "ask",
         config.text_model,

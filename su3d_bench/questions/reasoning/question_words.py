@@ -85,39 +85,39 @@ def read_question(text: str) -> Question | None:
     >>> read_question("Which sink is closer to bed?").subject
     Phrase(head='sink', relation=None, others=())
     """
-    said = _plain(text)
-    if not said:
+    plain = _plain(text)
+    if not plain:
         return None
     for reader in (_closer, _extreme, _distance, _count, _size, _where, _holds_or_exists, _list):
-        found = reader(said)
-        if found is not None:
-            return found
+        question = reader(plain)
+        if question is not None:
+            return question
     return None
 
 
 def _plain(text: str) -> str:
-    said = " ".join(text[: MOST_CHARACTERS + 1].lower().replace("’", "'").split())
-    if len(said) > MOST_CHARACTERS:
+    plain = " ".join(text[: MOST_CHARACTERS + 1].lower().replace("’", "'").split())
+    if len(plain) > MOST_CHARACTERS:
         return ""
-    said = said.rstrip(" ?.!")
-    while (shorter := _POLITE.sub("", said)) != said:
-        said = shorter
-    said = re.sub(r"\b(what|which|where|how|who)'s\b", r"\1 is", said)
-    said = re.sub(r"\b(near|on|under|in|above|to|from|beside),\s", r"\1 ", said)
-    return " ".join(_HERE.sub("", said).split()).strip(" ,?.!")
+    plain = plain.rstrip(" ?.!")
+    while (shorter := _POLITE.sub("", plain)) != plain:
+        plain = shorter
+    plain = re.sub(r"\b(what|which|where|how|who)'s\b", r"\1 is", plain)
+    plain = re.sub(r"\b(near|on|under|in|above|to|from|beside),\s", r"\1 ", plain)
+    return " ".join(_HERE.sub("", plain).split()).strip(" ,?.!")
 
 
 def read_phrase(text: str) -> Phrase:
     """The noun phrase ``text``: "the lamp on a desk" is "lamp", on, "desk"."""
-    said = re.sub(r"^(?:the|a|an|any|some|all|another|other|my|that|this)\s+", "", text.strip(" ,"))
-    said = re.sub(r"^(?:the|a|an|other)\s+", "", said)
-    found = next((match for match in _RELATION.finditer(said) if match.start() > 0), None)
-    if found is None:
-        return Phrase(said.strip())
+    phrase = re.sub(r"^(?:the|a|an|any|some|all|another|other|my|that|this)\s+", "", text.strip(" ,"))
+    phrase = re.sub(r"^(?:the|a|an|other)\s+", "", phrase)
+    relation_match = next((match for match in _RELATION.finditer(phrase) if match.start() > 0), None)
+    if relation_match is None:
+        return Phrase(phrase.strip())
     head = re.sub(r"\s+(?:that|which|who)?\s*(?:is|are|lies|stands|hangs|hanging|lying|standing|sitting)?$", "",
-                  said[: found.start()].strip())  # fmt: skip
-    relation, rest = _relation_of(found), said[found.end() :].strip()
-    return Phrase(head.strip(), relation, _operands(relation, rest)) if rest and head else Phrase(said.strip())
+                  phrase[: relation_match.start()].strip())  # fmt: skip
+    relation, rest = _relation_of(relation_match), phrase[relation_match.end() :].strip()
+    return Phrase(head.strip(), relation, _operands(relation, rest)) if rest and head else Phrase(phrase.strip())
 
 
 def _operands(relation: Relation, text: str) -> tuple[Phrase, ...]:
@@ -136,15 +136,15 @@ def _options(text: str) -> tuple[Phrase, ...]:
     return tuple(read_phrase(re.sub(r"^(?:either|is it|the)\s+", "", part)) for part in parts if part.strip())
 
 
-def _closer(said: str) -> Question | None:
-    match = re.fullmatch(rf"(?:is|are) (?P<a>.+?) {_HOW} {_ENDS} (?P<ref>.+?) than (?:to )?(?P<b>.+)", said)
+def _closer(plain: str) -> Question | None:
+    match = re.fullmatch(rf"(?:is|are) (?P<a>.+?) {_HOW} {_ENDS} (?P<ref>.+?) than (?:to )?(?P<b>.+)", plain)
     if match is None:
         return None
     options = (read_phrase(match["b"]),)
     return Question("closer", read_phrase(match["a"]), read_phrase(match["ref"]), options, farthest=bool(match["far"]))
 
 
-def _extreme(said: str) -> Question | None:
+def _extreme(plain: str) -> Question | None:
     patterns = (
         rf"(?:which|what)(?: one)?(?: of the)?(?: (?P<a>(?!is |are ).+?))? {_ARE} {_HOW}(?: one| {_EVERYTHING})?"
         rf" {_ENDS} (?P<ref>.+)",
@@ -155,7 +155,7 @@ def _extreme(said: str) -> Question | None:
         rf"(?:is|are) (?P<options>.+? or .+?) {_HOW} {_ENDS} (?P<ref>.+)",
     )
     for pattern in patterns:
-        match = re.fullmatch(pattern, said)
+        match = re.fullmatch(pattern, plain)
         if match is None:
             continue
         groups = match.groupdict()
@@ -168,7 +168,7 @@ def _extreme(said: str) -> Question | None:
     return None
 
 
-def _distance(said: str) -> Question | None:
+def _distance(plain: str) -> Question | None:
     patterns = (
         r"(?:what|how (?:large|big|long|much)) is the distance (?:between|from) (?P<a>.+?) (?:and|to) (?P<b>.+)",
         r"(?:distance (?:between|from)) (?P<a>.+?) (?:and|to) (?P<b>.+)",
@@ -176,16 +176,16 @@ def _distance(said: str) -> Question | None:
         r"(?: apart)?",
     )
     for pattern in patterns:
-        if match := re.fullmatch(pattern, said):
+        if match := re.fullmatch(pattern, plain):
             return Question("distance", read_phrase(match["a"]), read_phrase(match["b"]))
     return None
 
 
-def _count(said: str) -> Question | None:
+def _count(plain: str) -> Question | None:
     match = re.fullmatch(
         r"(?:how many (?P<a>.+?)(?: are| is| do| can)(?: there)?(?: you see| i have| we have)?(?P<rest> .+)?"
         r"|(?:how many|count(?: all)?|what is the number of|number of) (?P<b>.+))",
-        said,
+        plain,
     )
     if match is None:
         return None
@@ -193,29 +193,29 @@ def _count(said: str) -> Question | None:
     return Question("count", read_phrase(named))
 
 
-def _size(said: str) -> Question | None:
+def _size(plain: str) -> Question | None:
     patterns = (
         rf"(?:which|what|where) (?:is|are) (?:the )?(?P<size>{_SIZE})(?: of the| of all)?(?P<a> .+)?",
         rf"(?:which|what)(?: of the)? (?P<a>.+?) {_ARE} (?:the )?(?P<size>{_SIZE})(?: one)?",
         rf"(?:find |show )?(?:the )?(?P<size>{_SIZE}) (?P<a>.+)",
     )
     for pattern in patterns:
-        if match := re.fullmatch(pattern, said):
+        if match := re.fullmatch(pattern, plain):
             size = next(name for name, spelt in _SIZES if re.fullmatch(spelt, match["size"]))
             named, _, listed = (match["a"] or "object").partition(", ")
             return Question("size", read_phrase(named), options=_options(listed), size=size)
     return None
 
 
-def _where(said: str) -> Question | None:
-    match = re.fullmatch(r"(?:where (?:is|are|can i find|do i find)|locate|find|show) (?P<a>.+)", said)
+def _where(plain: str) -> Question | None:
+    match = re.fullmatch(r"(?:where (?:is|are|can i find|do i find)|locate|find|show) (?P<a>.+)", plain)
     return None if match is None else Question("where", read_phrase(match["a"]))
 
 
-def _holds_or_exists(said: str) -> Question | None:
-    if match := re.fullmatch(r"(?:is|are) there (?P<a>.+)|(?:do|can) (?:i|you|we) (?:have|see|find) (?P<b>.+)", said):
+def _holds_or_exists(plain: str) -> Question | None:
+    if match := re.fullmatch(r"(?:is|are) there (?P<a>.+)|(?:do|can) (?:i|you|we) (?:have|see|find) (?P<b>.+)", plain):
         return Question("exists", read_phrase(match["a"] or match["b"]))
-    match = re.fullmatch(r"(?:is|are) (?P<a>.+)", said)
+    match = re.fullmatch(r"(?:is|are) (?P<a>.+)", plain)
     if match is None:
         return None
     phrase = read_phrase(match["a"])
@@ -226,11 +226,11 @@ def _holds_or_exists(said: str) -> Question | None:
     return Question("holds", Phrase(phrase.head), options=phrase.others, relation=phrase.relation)
 
 
-def _list(said: str) -> Question | None:
+def _list(plain: str) -> Question | None:
     match = re.fullmatch(
         rf"(?:what|which)(?: (?P<a>(?!is |are ).+?))?(?: {_ARE}| there is| can be found| can i find)(?: there)?"
         r" (?P<rest>.+)",
-        said,
+        plain,
     )
     if match is None:
         return None

@@ -47,22 +47,22 @@ class SceneMap:
 
     @cached_property
     def _by_id(self) -> dict[int, MapObject]:
-        return {one.id: one for one in self.objects}
+        return {thing.id: thing for thing in self.objects}
 
     def by_id(self, object_id: int) -> MapObject:
         return self._by_id[object_id]
 
     @property
     def ids(self) -> tuple[int, ...]:
-        return tuple(one.id for one in self.objects)
+        return tuple(thing.id for thing in self.objects)
 
     @property
     def middle(self) -> Float64Array:
         """The middle of the box around all objects."""
         if not self.objects:
             return np.zeros(3)
-        low = np.min([one.box[0] for one in self.objects], axis=0)
-        high = np.max([one.box[1] for one in self.objects], axis=0)
+        low = np.min([thing.box[0] for thing in self.objects], axis=0)
+        high = np.max([thing.box[1] for thing in self.objects], axis=0)
         centre: Float64Array = (low + high) / 2
         return centre
 

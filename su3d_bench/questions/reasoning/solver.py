@@ -29,12 +29,12 @@ MOST_LISTED = 12
 Objects = tuple[MapObject, ...]
 
 _MEASURES: dict[Size, tuple[str, Callable[[MapObject], float], bool]] = {
-    "largest": ("m³ of its box", lambda one: float(np.prod(one.size)), True),
-    "smallest": ("m³ of its box", lambda one: float(np.prod(one.size)), False),
-    "tallest": ("m tall", lambda one: float(one.size[2]), True),
-    "longest": ("m at its longest", lambda one: float(one.size[:2].max()), True),
-    "highest": ("m up", lambda one: float(one.centroid[2]), True),
-    "lowest": ("m up", lambda one: float(one.centroid[2]), False),
+    "largest": ("m³ of its box", lambda thing: float(np.prod(thing.size)), True),
+    "smallest": ("m³ of its box", lambda thing: float(np.prod(thing.size)), False),
+    "tallest": ("m tall", lambda thing: float(thing.size[2]), True),
+    "longest": ("m at its longest", lambda thing: float(thing.size[:2].max()), True),
+    "highest": ("m up", lambda thing: float(thing.centroid[2]), True),
+    "lowest": ("m up", lambda thing: float(thing.centroid[2]), False),
 }
 
 
@@ -88,10 +88,10 @@ class Solver:
         others = [self._some(other) for other in phrase.others]
         kept: list[MapObject] = []
         held: dict[int, MapObject] = {}
-        for one in meant.objects:
-            witnesses = self._witnesses(one, phrase.relation, others)
+        for thing in meant.objects:
+            witnesses = self._witnesses(thing, phrase.relation, others)
             if witnesses:
-                kept.append(one)
+                kept.append(thing)
                 held |= {other.id: other for other in witnesses}
         return tuple(kept), tuple(held.values())
 
@@ -101,31 +101,31 @@ class Solver:
             raise _Unsettled(f"the map has no '{_shown(phrase)}'")
         return objects
 
-    def _witnesses(self, one: MapObject, relation: Relation, others: Sequence[Objects]) -> Objects:
+    def _witnesses(self, thing: MapObject, relation: Relation, others: Sequence[Objects]) -> Objects:
         """Objects to which ``one`` stands in ``relation``."""
         if relation == "between":
             if len(others) == 1 and len(others[0]) == 2:
                 others = [others[0][:1], others[0][1:]]
             if len(others) != 2:
                 raise _Unsettled("'between' needs two things, such as: between the bed and the door")
-            pairs = ((a, b) for a in others[0] for b in others[1] if len({a.id, b.id, one.id}) == 3)
-            return next(((a, b) for a, b in pairs if is_between(one.centroid, a.centroid, b.centroid)), ())
-        return tuple(other for other in others[0] if other.id != one.id and self._stands(one, relation, other))
+            pairs = ((a, b) for a in others[0] for b in others[1] if len({a.id, b.id, thing.id}) == 3)
+            return next(((a, b) for a, b in pairs if is_between(thing.centroid, a.centroid, b.centroid)), ())
+        return tuple(other for other in others[0] if other.id != thing.id and self._stands(thing, relation, other))
 
-    def _stands(self, one: MapObject, relation: Relation, other: MapObject) -> bool:
+    def _stands(self, thing: MapObject, relation: Relation, other: MapObject) -> bool:
         if relation == "left of" or relation == "right of":  # two comparisons narrow the type
             self._note_eye()
-            a, b = (one, other) if relation == "left of" else (other, one)
+            a, b = (thing, other) if relation == "left of" else (other, thing)
             return is_left_of(a.centroid, b.centroid, self._eye)
         holder = is_container(other.name)
         if relation == "with":
             return (
-                holds("on", other.box, one.box, b_is_container=is_container(one.name))
-                or holds("in", other.box, one.box, b_is_container=is_container(one.name))
-                or holds("next to", one.box, other.box)
+                holds("on", other.box, thing.box, b_is_container=is_container(thing.name))
+                or holds("in", other.box, thing.box, b_is_container=is_container(thing.name))
+                or holds("next to", thing.box, other.box)
             )
         assert relation != "between", "between has two others"
-        return holds(relation, one.box, other.box, b_is_container=holder)
+        return holds(relation, thing.box, other.box, b_is_container=holder)
 
     def _note_eye(self) -> None:
         x, y = self._eye[:2]
@@ -138,26 +138,26 @@ class Solver:
         assert question.other is not None
         references = self._some(question.other)
         if question.options:
-            candidates = tuple(one for option in question.options for one in self._option(option, question.subject))
+            candidates = tuple(thing for option in question.options for thing in self._option(option, question.subject))
         else:
             candidates = self._some(question.subject)
-        is_reference = {one.id for one in references}
-        others = {one.id: one for one in candidates if one.id not in is_reference}
+        is_reference = {thing.id for thing in references}
+        others = {thing.id: thing for thing in candidates if thing.id not in is_reference}
         if question.subject == ANYTHING and not question.options:
-            others = {key: one for key, one in others.items() if not is_room_surface(one.name)}
+            others = {key: thing for key, thing in others.items() if not is_room_surface(thing.name)}
         if not others:
             raise _Unsettled(f"the map has nothing else to hold against '{question.other.head}'")
         self._note_several(references, question.other)
         ranked = sorted(
-            (_nearest_pair((one,), references) for one in others.values()),
-            key=lambda found: ((-found[0] if question.farthest else found[0]), found[1].id),
+            (_nearest_pair((thing,), references) for thing in others.values()),
+            key=lambda pair: ((-pair[0] if question.farthest else pair[0]), pair[1].id),
         )
         distance_m, best, reference = ranked[0]
         if len(ranked) == 1:
             self._notes.append(f"there is one '{_shown(question.subject)}' only")
         elif abs(ranked[1][0] - distance_m) < CLOSE_CALL_M:
             self._notes.append(f"a close call: {ranked[1][1].shown} is {ranked[1][0]:.2f} m away")
-        rest = "".join(f"; {one.shown} {away_m:.2f} m" for away_m, one, _ in ranked[1:4])
+        rest = "".join(f"; {thing.shown} {away_m:.2f} m" for away_m, thing, _ in ranked[1:4])
         end = "farthest from" if question.farthest else "closest to"
         text = f"{best.shown} is {end} {reference.shown}: {distance_m:.2f} m{rest}"
         return text, (best,), (reference,), None
@@ -193,15 +193,15 @@ class Solver:
         return f"{distance_m:.2f} m between the centroids of {a.shown} and {b.shown}", (a, b), (), distance_m
 
     def _count(self, question: Question) -> _Solved:
-        found, held = self._found_or_none(question.subject)
-        text = f"{len(found)}: {_listed(found)}" if found else f"0: the map has no '{_shown(question.subject)}'"
-        return text, found, held, len(found)
+        things, held = self._found_or_none(question.subject)
+        text = f"{len(things)}: {_listed(things)}" if things else f"0: the map has no '{_shown(question.subject)}'"
+        return text, things, held, len(things)
 
     def _exists(self, question: Question) -> _Solved:
-        found, held = self._found_or_none(question.subject)
-        if not found:
+        things, held = self._found_or_none(question.subject)
+        if not things:
             return f"no: the map has no '{_shown(question.subject)}'", (), (), False
-        return f"yes: {_listed(found)}", found, held, True
+        return f"yes: {_listed(things)}", things, held, True
 
     def _found_or_none(self, phrase: Phrase) -> tuple[Objects, Objects]:
         """As ``_objects``, but a noun that the map does not have means nothing, which answers the question."""
@@ -212,38 +212,38 @@ class Solver:
     def _holds(self, question: Question) -> _Solved:
         assert question.relation is not None
         others = question.options or ((question.other,) if question.other else ())
-        found, held = self._objects(Phrase(question.subject.head, question.relation, others))
+        things, held = self._objects(Phrase(question.subject.head, question.relation, others))
         shown = _shown(Phrase(question.subject.head, question.relation, others))
-        if not found:
+        if not things:
             return f"no: no {shown}", self._some(question.subject), (), False
-        return f"yes: {_listed(found)} {question.relation} {_listed(held)}", found, held, True
+        return f"yes: {_listed(things)} {question.relation} {_listed(held)}", things, held, True
 
     def _list(self, question: Question) -> _Solved:
-        found, held = self._objects(question.subject)
+        things, held = self._objects(question.subject)
         if question.subject.relation in ("left of", "right of"):
-            found = tuple(one for one in found if any(holds("near", one.box, other.box) for other in held))
+            things = tuple(thing for thing in things if any(holds("near", thing.box, other.box) for other in held))
             self._notes.append(f"no farther than {NEAR_M:g} m from it")
-        if not found:
+        if not things:
             return f"nothing: the map has no '{_shown(question.subject)}'", (), (), None
-        return _listed(found), found, held, None
+        return _listed(things), things, held, None
 
     def _size(self, question: Question) -> _Solved:
         assert question.size is not None
         phrases = question.options or (question.subject,)
-        candidates = {one.id: one for phrase in phrases for one in self._some(phrase)}
+        candidates = {thing.id: thing for phrase in phrases for thing in self._some(phrase)}
         unit, measure, is_most = _MEASURES[question.size]
-        ranked = sorted(candidates.values(), key=lambda one: ((-1 if is_most else 1) * measure(one), one.id))
+        ranked = sorted(candidates.values(), key=lambda thing: ((-1 if is_most else 1) * measure(thing), thing.id))
         best = ranked[0]
-        rest = "".join(f"; {one.shown} {measure(one):.3g}" for one in ranked[1:4])
+        rest = "".join(f"; {thing.shown} {measure(thing):.3g}" for thing in ranked[1:4])
         return f"{best.shown}: {measure(best):.3g} {unit}{rest}", (best,), (), None
 
     def _where(self, question: Question) -> _Solved:
-        found, held = self._objects(question.subject)
-        if not found:
+        things, held = self._objects(question.subject)
+        if not things:
             raise _Unsettled(f"the map has no '{_shown(question.subject)}'")
-        places = [f"{one.shown} at ({', '.join(f'{value:.2f}' for value in one.centroid)}) m" for one in found]
-        more = f" and {len(found) - MOST_LISTED} more" if len(found) > MOST_LISTED else ""
-        return "; ".join(places[:MOST_LISTED]) + more, found, held, None
+        places = [f"{thing.shown} at ({', '.join(f'{value:.2f}' for value in thing.centroid)}) m" for thing in things]
+        more = f" and {len(things) - MOST_LISTED} more" if len(things) > MOST_LISTED else ""
+        return "; ".join(places[:MOST_LISTED]) + more, things, held, None
 
     def _note_several(self, objects: Objects, phrase: Phrase) -> None:
         if len(objects) > 1:
@@ -258,12 +258,12 @@ def _nearest_pair(first: Objects, second: Objects) -> tuple[float, MapObject, Ma
     pairs = [(a, b) for a in first for b in second if a.id != b.id] or [(first[0], second[0])]
     return min(
         ((float(np.linalg.norm(a.centroid - b.centroid)), a, b) for a, b in pairs),
-        key=lambda found: (found[0], found[1].id, found[2].id),
+        key=lambda pair: (pair[0], pair[1].id, pair[2].id),
     )
 
 
 def _ids(objects: Objects) -> tuple[int, ...]:
-    return tuple(one.id for one in objects)
+    return tuple(thing.id for thing in objects)
 
 
 def _yes(is_so: bool) -> str:
@@ -277,5 +277,5 @@ def _shown(phrase: Phrase) -> str:
 
 
 def _listed(objects: Objects) -> str:
-    shown = ", ".join(one.shown for one in objects[:MOST_LISTED])
+    shown = ", ".join(thing.shown for thing in objects[:MOST_LISTED])
     return shown if len(objects) <= MOST_LISTED else f"{shown} and {len(objects) - MOST_LISTED} more"
