@@ -1,6 +1,7 @@
 """Everything that is wrong with the files of a Replica scene, one line each, where a reader stops at the first fault.
 
-Images are judged by their first and last bytes; decoding them is the reader's part.
+Images are judged by their first and last bytes; decoding them is the reader's part. Beside it the key of a scene's
+files, which looks at images in the same way.
 """
 
 from __future__ import annotations
@@ -27,6 +28,8 @@ from su3d_bench.formats.poses import poses_of_lines
 
 MOST_LINES = 20  # of one kind of fault; the rest is counted
 HEAD_BYTES = (4096, 1 << 18)  # a JPEG may carry its size behind the blocks of its camera, each below 64 KB
+PNG_HEAD_BYTES = 64  # signature, and the chunk with the size
+PNG_TAIL_BYTES = 1024  # the end of the pixels, and what little writers put behind it
 PNG_END = b"IEND\xaeB`\x82"  # the last chunk with its checksum
 
 
@@ -122,10 +125,6 @@ def original_problems(original: Path | None, where: str) -> Iterator[str]:
         for object_id, beyond_m in outside.items()
     )
     yield from _shortened(lines, f"{where}: {INFO_NAME}")
-
-
-PNG_HEAD_BYTES = 64  # signature, and the chunk with the size
-PNG_TAIL_BYTES = 1024  # the end of the pixels, and what little writers put behind it
 
 
 def digest_of(parts: Iterable[str], files: Sequence[Path], images: Sequence[Path], where: str) -> str:

@@ -1,4 +1,4 @@
-"""Where the two trees of Replica are below the data root, and what their scenes are called.
+"""Where the two trees of Replica are below the data root, and what scenes and classes are called.
 
 The *render tree* is the RGB-D render of NICE-SLAM (``Replica/room0/...``), the *original tree* the release with the
 annotated meshes (``replica_v1/room_0/habitat/...``).
@@ -15,6 +15,7 @@ from pathlib import Path
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import LabelSet
 
+LABEL_SPACE = "replica"
 OFFICIAL_SCENES = ("room0", "room1", "room2", "office0", "office1", "office2", "office3", "office4")
 RENDER_FOLDERS = ("Replica", "replica", ".")
 ORIGINAL_FOLDERS = (
@@ -140,9 +141,6 @@ def no_render_tree(root: Path) -> DataError:
         f"results/); unpack {RENDER_URL} there, set SU3D_DATA to where it is, or make rooms in this layout: "
         f"su3d-bench datasets make rooms --layout replica --out {root}"
     )
-
-
-LABEL_SPACE = "replica"
 
 
 @cache

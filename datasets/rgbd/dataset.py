@@ -1,4 +1,4 @@
-"""Any folder of colour, depth and pose files, described by one ``rgbd.toml`` (see ``rgbd_description.py``).
+"""Any folder of colour, depth and pose files, described by one ``rgbd.toml`` (see ``description.py``).
 
 A scene is ``rgbd/<scene>/rgbd.toml`` below the data root, or a TOML file or a folder with ``rgbd.toml`` that the option
 ``files`` names. Frames that lack an image or a pose are said once and left out. There is no ground truth.

@@ -1,5 +1,7 @@
 """ScanNet recordings in whichever form they lie in a scan's folder: the ``.sens`` file, or what a reader exported.
 
+Finding one, opening it, describing it at a glance, and its key.
+
 Sources: ScanNet, SensReader/python/SensorData.py and SensReader/c++/sensorData.h at commit 3830fce; OpenMask3D, README
 and openmask3d/configs at commit 3bc3fc5.
 """

@@ -35,6 +35,7 @@ from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.ply import ListColumn, PlyFile, read_ply
 from su3d_bench.numerics.geometry import are_rigid
 
+ALIGNMENT = "axisAlignment"  # in the facts of a scan, ``<scan>.txt``
 SAME_PLACE_M = 1e-3  # both files hold one mesh; text formats round its coordinates
 logger = logging.getLogger(__name__)
 
@@ -254,9 +255,6 @@ def instance_mesh(scan: AnnotatedScan, table: LabelTable | None) -> InstanceMesh
         {int(instance_id): int(class_id) for instance_id, class_id in zip(ids, classes, strict=True) if class_id > 0},
         nyu40_label_set(),
     )
-
-
-ALIGNMENT = "axisAlignment"
 
 
 def meta_name(scan: str) -> str:

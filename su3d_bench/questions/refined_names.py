@@ -18,6 +18,7 @@ from su3d_bench.questions.truths import voted_names
 from su3d_bench.store.atomic import read_json, write_json
 from su3d_bench.store.run_folder import JobFolder
 
+log = logging.getLogger(__name__)
 FILE_NAME = "refined_names.json"
 SCHEMA = 1
 Refiner = Literal["vote", "model"]
@@ -105,9 +106,6 @@ def read_records(job: JobFolder) -> NameRecords | None:
     if records.schema_version != SCHEMA or records.prediction_sha256 != digest_file(job.prediction):
         raise StoreError(f"{path}: belongs to another map than {job.prediction.name}; give su3d-bench refine again")
     return records
-
-
-log = logging.getLogger(__name__)
 
 
 def refined_digest(job: JobFolder) -> dict[str, str]:

@@ -1,4 +1,4 @@
-"""Builders of what is fitted to a room: doors, windows, kitchen and bathroom fixtures, devices."""
+"""Builders of what is fitted to a room: doors, windows, kitchen and bathroom fixtures."""
 
 from __future__ import annotations
 

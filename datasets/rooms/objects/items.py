@@ -1,4 +1,6 @@
-"""What an object of a room is made of, before it has a place: parts, and spots that hold other objects."""
+"""What an object of a room is made of, before it has a place: parts, spots that hold other objects, size; and how it
+is built.
+"""
 
 from __future__ import annotations
 
@@ -14,6 +16,7 @@ from su3d_bench.datasets.rooms.objects.materials import Material, Rgb, of_kind, 
 from su3d_bench.datasets.rooms.objects.shapes import Shape, bounds
 
 USUAL_VOLUME_L: Mapping[str, float] = {model: litres for known in CLASSES for model, litres in known.models.items()}
+FOOT_HEIGHT_M = 0.025
 SMALL_BELOW, LARGE_ABOVE = 0.78, 1.28  # of the usual volume: about the outer quarters of the models that vary
 
 
@@ -21,9 +24,6 @@ def size_word(model: str, size: Float64Array) -> str:
     """small, medium or large, for a box of sides ``size`` metres."""
     share = 1000.0 * float(np.prod(size)) / USUAL_VOLUME_L[model]
     return "small" if share < SMALL_BELOW else "large" if share > LARGE_ABOVE else "medium"
-
-
-FOOT_HEIGHT_M = 0.025
 
 
 @dataclass(frozen=True)

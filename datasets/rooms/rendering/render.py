@@ -1,4 +1,4 @@
-"""Colour, depth and instance images of a room by ray casting."""
+"""Colour, depth and instance images of a room by ray casting, and the noise of a sensor on them."""
 
 from __future__ import annotations
 

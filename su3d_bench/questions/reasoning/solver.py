@@ -27,6 +27,7 @@ from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
 CLOSE_CALL_M = 0.05  # a lead smaller than this is said
 MOST_LISTED = 12
 Objects = tuple[MapObject, ...]
+_Solved = tuple[str, Objects, Objects, float | int | bool | None]  # text, objects, references, value
 
 _MEASURES: dict[Size, tuple[str, Callable[[MapObject], float], bool]] = {
     "largest": ("m³ of its box", lambda thing: float(np.prod(thing.size)), True),
@@ -248,9 +249,6 @@ class Solver:
     def _note_several(self, objects: Objects, phrase: Phrase) -> None:
         if len(objects) > 1:
             self._notes.append(f"there are {len(objects)} of '{_shown(phrase)}'; the nearest one counts")
-
-
-_Solved = tuple[str, Objects, Objects, float | int | bool | None]
 
 
 def _nearest_pair(first: Objects, second: Objects) -> tuple[float, MapObject, MapObject]:
