@@ -15,8 +15,8 @@ from damage import damages, outcomes, truncations
 from replica_scene import QUADS, TWO_OBJECTS, info_table, write_original, write_render
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.datasets.replica import boxes as replica_boxes
 from su3d_bench.datasets.replica.dataset import Replica
+from su3d_bench.numerics import geometry
 
 Change = Callable[[Path], object]
 
@@ -68,7 +68,7 @@ def test_a_box_is_turned_and_then_shifted_without_the_mesh(tmp_path: Path) -> No
 
 
 def test_the_example_of_the_rotation_holds() -> None:
-    assert doctest.testmod(replica_boxes) == (0, 1)
+    assert doctest.testmod(geometry) == (0, 1)
 
 
 def test_without_the_table_there_are_no_boxes(tmp_path: Path) -> None:
