@@ -27,6 +27,7 @@ from su3d_bench.datasets.rooms.objects.materials import (
 from su3d_bench.datasets.rooms.objects.shapes import (
     Shape,
     block,
+    both,
     cylinder,
     ellipsoid,
     join,
@@ -216,7 +217,7 @@ def picture(build: Assembly) -> None:
     width, height = build.size(0.42, 0.7), build.size(0.38, 0.56)
     bar = build.rng.uniform(0.02, 0.04)
     frame = wood(build.rgb, build.rng) if build.colour == "brown" else paint(build.rgb, 0.25)
-    build.add(frame, *[block(bar, 0.026, height, sx * (width - bar) / 2) for sx in (-1, 1)])
+    build.add(frame, *[block(bar, 0.026, height, x / 2) for x in both(width - bar)])
     build.add(frame, *[block(width - 2 * bar, 0.026, bar, 0, 0, z) for z in (0.0, height - bar)])
     margin = bar + (0.045 if build.chance(0.5) else 0.0)
     build.add(paper(tone("white")), block(width - 2 * bar, 0.01, height - 2 * bar, 0, 0.004, bar))

@@ -23,6 +23,7 @@ from su3d_bench.datasets.rooms.objects.materials import (
 from su3d_bench.datasets.rooms.objects.shapes import (
     Shape,
     block,
+    both,
     box,
     cylinder,
     ellipsoid,
@@ -36,7 +37,7 @@ from su3d_bench.datasets.rooms.objects.shapes import (
 def door(build: Assembly) -> None:
     width, height = build.rng.uniform(0.84, 0.95), build.rng.uniform(2.02, 2.1)
     frame = paint(shade(build.rgb, 0.82)) if build.colour == "white" else build.main(axis=2)
-    build.add(frame, *[block(0.07, 0.06, height + 0.07, sx * (width / 2 + 0.035)) for sx in (-1, 1)])
+    build.add(frame, *[block(0.07, 0.06, height + 0.07, x) for x in both(width / 2 + 0.035)])
     build.add(frame, block(width, 0.06, 0.07, 0, 0, height))
     leaf = paint(build.rgb) if build.colour == "white" else build.main(axis=2)
     build.add(leaf, block(width - 0.006, 0.03, height - 0.01, 0, 0.015, 0.005))
@@ -93,7 +94,7 @@ def curtain(build: Assembly) -> None:
     build.add(build.main(), sheet(grid, 0.008))
     rod = metal(tone("black"), build.rng)
     build.add(rod, tube([(-width / 2 - 0.03, 0, height + 0.02), (width / 2 + 0.03, 0, height + 0.02)], 0.014))
-    build.add(rod, *[ellipsoid(0.025, 0.025, 0.025).moved(sx * (width / 2 + 0.04), 0, height + 0.02) for sx in (-1, 1)])
+    build.add(rod, *[ellipsoid(0.025, 0.025, 0.025).moved(x, 0, height + 0.02) for x in both(width / 2 + 0.04)])
 
 
 def blinds(build: Assembly) -> None:
@@ -106,7 +107,7 @@ def blinds(build: Assembly) -> None:
         build.add(slat, tilted.moved(0, 0, height - 0.05 - i * 0.042))
     build.add(slat, block(width, 0.03, 0.022))
     cord = paint(shade(build.rgb, 0.55))
-    build.add(cord, *[block(0.006, 0.006, height - 0.06, sx * width * 0.32, -0.03, 0.01) for sx in (-1, 1)])
+    build.add(cord, *[block(0.006, 0.006, height - 0.06, x, -0.03, 0.01) for x in both(width * 0.32)])
 
 
 def switch(build: Assembly) -> None:
@@ -133,7 +134,7 @@ def vent(build: Assembly) -> None:
     width, height = build.size(0.32, 0.45), build.size(0.2, 0.28)
     frame = paint(build.rgb)
     build.add(frame, block(width, 0.016, 0.025), block(width, 0.016, 0.025, z=height - 0.025))
-    build.add(frame, *[block(0.025, 0.016, height - 0.05, sx * (width / 2 - 0.0125), 0, 0.025) for sx in (-1, 1)])
+    build.add(frame, *[block(0.025, 0.016, height - 0.05, x, 0, 0.025) for x in both(width / 2 - 0.0125)])
     build.add(paint(shade(tone("grey"), 0.25)), block(width - 0.05, 0.006, height - 0.05, 0, 0.005, 0.025))
     n = int((height - 0.06) / 0.03)
     for i in range(n):
@@ -222,10 +223,10 @@ def bathtub(build: Assembly) -> None:
     white = ceramic(build.rgb)
     w, d, rim = length / 2, depth / 2, 0.075
     build.add(white, box(-w + 0.01, w - 0.01, -d + 0.01, d - 0.01, 0, 0.14))
-    build.add(white, *[soft_block(rim, depth, tall - 0.141, sx * (w - rim / 2), 0, 0.141, 0.03) for sx in (-1, 1)])
+    build.add(white, *[soft_block(rim, depth, tall - 0.141, x, 0, 0.141, 0.03) for x in both(w - rim / 2)])
     build.add(
         white,
-        *[soft_block(length - 2 * rim + 0.04, rim, tall - 0.141, 0, sy * (d - rim / 2), 0.141, 0.03) for sy in (-1, 1)],
+        *[soft_block(length - 2 * rim + 0.04, rim, tall - 0.141, 0, y, 0.141, 0.03) for y in both(d - rim / 2)],
     )
     build.add(chrome(build.rng), cylinder(0.03, 0.005, -w * 0.6, 0, 0.141))
     steel = chrome(build.rng)

@@ -15,7 +15,7 @@ from su3d_bench.datasets.rooms.objects.materials import (
     tone,
     wood,
 )
-from su3d_bench.datasets.rooms.objects.shapes import Shape, block, box, cylinder, lathe, soft_block, tube
+from su3d_bench.datasets.rooms.objects.shapes import Shape, block, both, box, cylinder, lathe, soft_block, tube
 
 
 def _legs(width: float, depth: float, height: float, thick: float, inset: float = 0.02) -> list[Shape]:
@@ -45,7 +45,7 @@ def chair(build: Assembly) -> None:
         cover = cloth(build.other("red", "blue", "beige", "green"), build.rng)
         build.add(cover, soft_block(width * 0.92, depth * 0.9, 0.045, 0, -0.01, seat + 0.005, 0.02))
     y = depth / 2 - 0.021
-    build.add(frame, *[block(0.042, 0.042, back + 0.0, sx * (width / 2 - 0.021), y, seat) for sx in (-1, 1)])
+    build.add(frame, *[block(0.042, 0.042, back + 0.0, x, y, seat) for x in both(width / 2 - 0.021)])
     build.add(frame, block(width, 0.036, 0.075, 0, y, seat + back - 0.07))
     if kind == 0:
         n = int(build.rng.integers(3, 6))
@@ -105,9 +105,7 @@ def bench(build: Assembly) -> None:
     for sx in (-1, 1):
         x = sx * (width / 2 - 0.12)
         build.add(build.main(axis=2), block(0.06, depth * 0.9, 0.06, x, 0, height - 0.1))
-        build.add(
-            build.main(axis=2), *[block(0.06, 0.06, height - 0.1, x, sy * (depth * 0.45 - 0.03)) for sy in (-1, 1)]
-        )
+        build.add(build.main(axis=2), *[block(0.06, 0.06, height - 0.1, x, y) for y in both(depth * 0.45 - 0.03)])
     build.add(build.main(axis=0), block(width - 0.25, 0.04, 0.05, 0, 0, 0.14))
     build.spot((-width / 2, width / 2), (-depth / 2, depth / 2), height, role="seat")
 
@@ -222,7 +220,7 @@ def desk(build: Assembly) -> None:
         )
     build.add(
         build.main(axis=2),
-        *[block(0.05, 0.05, height - 0.036, -side * (width / 2 - 0.045), sy * (depth / 2 - 0.045)) for sy in (-1, 1)],
+        *[block(0.05, 0.05, height - 0.036, -side * (width / 2 - 0.045), y) for y in both(depth / 2 - 0.045)],
     )
     build.add(build.main(axis=0), block(width - 0.55, 0.018, 0.3, -side * 0.2, depth / 2 - 0.06, height - 0.36))
     build.spot((-width / 2 + 0.02, width / 2 - 0.02), (-depth / 2 + 0.02, depth / 2 - 0.02), height)
@@ -298,7 +296,7 @@ def shelf(build: Assembly) -> None:
     if build.material == "metal":
         build.add(build.main(), *_legs(width, depth, height, 0.03, 0.0))
     else:
-        build.add(build.main(axis=2), *[block(thick, depth, height, sx * (width / 2 - thick / 2)) for sx in (-1, 1)])
+        build.add(build.main(axis=2), *[block(thick, depth, height, x) for x in both(width / 2 - thick / 2)])
         build.add(build.main(axis=2), block(width - 2 * thick, 0.01, height - 0.06, 0, depth / 2 - 0.006, 0.05))
     step = (height - 0.06 - thick) / (n - 1)
     for i in range(n):

@@ -17,7 +17,7 @@ from su3d_bench.datasets.rooms.objects.materials import (
     tone,
     wicker,
 )
-from su3d_bench.datasets.rooms.objects.shapes import block, cylinder, ellipsoid, lathe, soft_block, tube
+from su3d_bench.datasets.rooms.objects.shapes import block, both, cylinder, ellipsoid, lathe, soft_block, tube
 
 
 def books(build: Assembly) -> None:
@@ -76,15 +76,13 @@ def cardboard_box(build: Assembly) -> None:
         build.add(side, block(width, depth, height))
         tape = plastic(mix(build.rgb, linear((226, 206, 150)), 0.75))
         build.add(tape, block(width * 1.002, 0.055, 0.002, 0, 0, height + 0.001))
-        build.add(tape, *[block(0.002, 0.055, 0.07, sx * (width / 2 + 0.0015), 0, height - 0.07) for sx in (-1, 1)])
+        build.add(tape, *[block(0.002, 0.055, 0.07, x, 0, height - 0.07) for x in both(width / 2 + 0.0015)])
         build.add(paper(tone("white")), block(0.11, 0.002, 0.075, width * 0.2, -depth / 2 - 0.0015, height * 0.4))
         build.spot((-width / 2 + 0.02, width / 2 - 0.02), (-depth / 2 + 0.02, depth / 2 - 0.02), height + 0.002, 0.4)
         return
     build.add(side, block(width, depth, 0.006))
-    build.add(side, *[block(0.006, depth, height - 0.007, sx * (width / 2 - 0.003), 0, 0.007) for sx in (-1, 1)])
-    build.add(
-        side, *[block(width - 0.014, 0.006, height - 0.007, 0, sy * (depth / 2 - 0.003), 0.007) for sy in (-1, 1)]
-    )
+    build.add(side, *[block(0.006, depth, height - 0.007, x, 0, 0.007) for x in both(width / 2 - 0.003)])
+    build.add(side, *[block(width - 0.014, 0.006, height - 0.007, 0, y, 0.007) for y in both(depth / 2 - 0.003)])
     for sx in (-1, 1):
         flap = block(0.13, depth * 0.96, 0.004, sx * 0.065, 0, 0).turned("y", sx * 28)
         build.add(side, flap.moved(sx * (width / 2 + 0.002), 0, height + 0.002))

@@ -74,6 +74,11 @@ def block(width: float, depth: float, height: float, x: float = 0.0, y: float = 
     return box(x - width / 2, x + width / 2, y - depth / 2, y + depth / 2, z, z + height)
 
 
+def both(x: float) -> tuple[float, float]:
+    """Where a thing stands that there is on either side."""
+    return -x, x
+
+
 def soft_block(
     width: float, depth: float, height: float, x: float = 0.0, y: float = 0.0, z: float = 0.0, radius: float = 0.03
 ) -> Shape:

@@ -17,7 +17,7 @@ from su3d_bench.datasets.rooms.objects.materials import (
     tone,
     wood,
 )
-from su3d_bench.datasets.rooms.objects.shapes import block, cylinder, lathe, puff, sheet, soft_block, tube
+from su3d_bench.datasets.rooms.objects.shapes import block, both, cylinder, lathe, puff, sheet, soft_block, tube
 
 
 def cushion(build: Assembly) -> None:
@@ -128,7 +128,7 @@ def mat(build: Assembly) -> None:
     pile = Material(Texture.CARPET, build.rgb, shade(build.rgb, 0.55), 0.012)
     build.add(pile, soft_block(width, depth, 0.026, 0, 0, 0, 0.012))
     edge = plain_cloth(mix(build.rgb, (0.85, 0.85, 0.82), 0.6), build.rng)
-    build.add(edge, *[block(width * 0.86, 0.03, 0.003, 0, sy * depth * 0.38, 0.0262) for sy in (-1, 1)])
+    build.add(edge, *[block(width * 0.86, 0.03, 0.003, 0, y, 0.0262) for y in both(depth * 0.38)])
 
 
 def backpack(build: Assembly) -> None:
