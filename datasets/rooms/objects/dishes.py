@@ -110,14 +110,7 @@ def bottle(build: Assembly) -> None:
         (0, h * 0.95),
     ]
     build.add(build.main(), lathe(outline, 20))
-    label = Material(
-        Texture.LABEL,
-        tone("white"),
-        build.other("red", "blue", "green", "yellow"),
-        h * 0.3,
-        0.05,
-        seed=5,
-    )
+    label = Material(Texture.LABEL, tone("white"), build.other("red", "blue", "green", "yellow"), h * 0.3, 0.05, seed=5)
     build.add(label, lathe([(r, h * 0.16), (r + 0.0015, h * 0.16), (r + 0.0015, h * 0.46), (r, h * 0.46)], 20))
     cap = build.other("red", "white", "black", "yellow")
     build.add(plastic(cap), cylinder(r * 0.42, h * 0.07, z=h * 0.94))

@@ -225,8 +225,7 @@ def bathtub(build: Assembly) -> None:
     build.add(white, box(-w + 0.01, w - 0.01, -d + 0.01, d - 0.01, 0, 0.14))
     build.add(white, *[soft_block(rim, depth, tall - 0.141, x, 0, 0.141, 0.03) for x in both(w - rim / 2)])
     build.add(
-        white,
-        *[soft_block(length - 2 * rim + 0.04, rim, tall - 0.141, 0, y, 0.141, 0.03) for y in both(d - rim / 2)],
+        white, *[soft_block(length - 2 * rim + 0.04, rim, tall - 0.141, 0, y, 0.141, 0.03) for y in both(d - rim / 2)]
     )
     build.add(chrome(build.rng), cylinder(0.03, 0.005, -w * 0.6, 0, 0.141))
     steel = chrome(build.rng)

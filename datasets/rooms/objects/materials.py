@@ -167,26 +167,12 @@ def light(rgb: tuple[float, float, float], glow: float = 1.0) -> Material:
     return Material(Texture.PLAIN, linear(rgb), linear(rgb), glow=glow)
 
 
+_OF_ONE_LOOK = {"plastic": plastic, "ceramic": ceramic, "glass": glass, "paper": paper}
+_DRAWN = {"metal": metal, "fabric": cloth, "leather": leather, "stone": stone, "wicker": wicker}
+
+
 def of_kind(material: str, rgb: Rgb, rng: np.random.Generator, axis: int = 0) -> Material:
     """The usual look of a material named as in ``MATERIALS``."""
-    match material:
-        case "wooden":
-            return wood(rgb, rng, axis)
-        case "metal":
-            return metal(rgb, rng)
-        case "plastic":
-            return plastic(rgb)
-        case "fabric":
-            return cloth(rgb, rng)
-        case "leather":
-            return leather(rgb, rng)
-        case "ceramic":
-            return ceramic(rgb)
-        case "glass":
-            return glass(rgb)
-        case "stone":
-            return stone(rgb, rng)
-        case "wicker":
-            return wicker(rgb, rng)
-        case _:
-            return paper(rgb)
+    if material == "wooden":
+        return wood(rgb, rng, axis)
+    return _OF_ONE_LOOK[material](rgb) if material in _OF_ONE_LOOK else _DRAWN[material](rgb, rng)
