@@ -27,8 +27,7 @@ from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.metric import Counts, SceneScore
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.metrics.results import ProtocolResult
-from su3d_bench.metrics.scoring import combine, metric_of
+from su3d_bench.metrics.scoring import ProtocolResult, combine, metric_of
 from su3d_bench.numerics.statistics import SignFlipTest, percentile_interval, resample_weights, sign_flip_test
 from su3d_bench.runs.finished import FinishedRun
 

@@ -11,8 +11,7 @@ from pathlib import Path
 from su3d_bench.analysis.sides import Side, refuse_unlike, rules_of
 from su3d_bench.core.errors import ConfigError, Su3dError, printable, suggest
 from su3d_bench.core.registry import CEILING_METHOD
-from su3d_bench.metrics.results import ProtocolResult
-from su3d_bench.metrics.scoring import combine
+from su3d_bench.metrics.scoring import ProtocolResult, combine
 from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.model import BY_PEOPLE, Measured, Origin, is_count
 from su3d_bench.runs.finished import FinishedRun, read_run

@@ -13,8 +13,7 @@ from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.matching.checks import MaskFacts
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols import RULES_OF_KIND, ProtocolRules
-from su3d_bench.metrics.results import ProtocolResult, plain_json
-from su3d_bench.metrics.scoring import combine, combined_metrics, metric_of
+from su3d_bench.metrics.scoring import ProtocolResult, combine, combined_metrics, metric_of, plain_json
 
 SCHEMA = 1
 EVERY_CONFIDENCE = "every confidence is"

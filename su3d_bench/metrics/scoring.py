@@ -1,14 +1,15 @@
-"""One scene under one protocol to additive counts, and counts of scenes to numbers.
+"""One scene under one protocol to additive counts, counts of scenes to what is reported, and counts in files.
 
-The steps around a metric: which points are scored, what the prediction is called there, and what a reader must know to
-trust the number. Ratios are formed in ``combine`` alone.
+``METRICS`` is the one table of the kinds of metrics; everything else asks the metric that ``metric_of`` gives.
 """
 
 from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping
+import math
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -21,15 +22,15 @@ from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partiti
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance.score import InstanceMetric
 from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.metric import Counts, Metric, SceneScore
+from su3d_bench.metrics.metric import Counts, Metric, SceneScore, scene_mean
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
 from su3d_bench.metrics.open_vocabulary.score import CategoriesMetric, QueryMetric
 from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.metrics.questions.score import AnnotationMetric, ReasoningMetric, RetrievalMetric
 from su3d_bench.metrics.questions.truths import AnnotationTruth, ReasoningTruth, RetrievalTruth
-from su3d_bench.metrics.results import ProtocolResult, form_result
 from su3d_bench.metrics.semantic.score import SemanticMetric
+from su3d_bench.numerics.statistics import percentile_interval, resample_weights
 from su3d_bench.store.atomic import read_arrays
 
 __all__ = ["SceneScore", "Truth", "combine", "metric_of", "pack_scores", "score_scene", "unpack_scores"]
@@ -91,31 +92,89 @@ def _check_points(rules: ProtocolRules, prediction: Prediction) -> None:
         )
 
 
+@dataclass(frozen=True)
+class ProtocolResult:
+    """The numbers of one method under one protocol, as fractions, NaN where undefined.
+
+    ``metrics`` is ``pooled`` or ``scene_mean``, whichever the protocol reports; ``intervals`` belong to it, for the
+    headline metrics, and are ``None`` for a single scene. ``coverage``: by radius in metres, the share of scored points
+    without a predicted point that near. ``groups`` holds head, common and tail where the protocol has them.
+    """
+
+    protocol: str
+    version: int
+    headline: tuple[str, ...]
+    scenes: tuple[str, ...]
+    metrics: Mapping[str, float]
+    pooled: Mapping[str, float]
+    scene_mean: Mapping[str, float]
+    intervals: Mapping[str, tuple[float, float] | None]
+    per_scene: Mapping[str, Mapping[str, float]]
+    per_class: Mapping[str, Mapping[str, float]]
+    groups: Mapping[str, Mapping[str, float]]
+    coverage: Mapping[str, float]
+    n_predictions: Mapping[str, int]
+    warnings: tuple[str, ...]
+
+    @property
+    def n_scenes(self) -> int:
+        return len(self.scenes)
+
+    def to_json(self) -> dict[str, Any]:
+        """Plain values for a JSON file, NaN as null."""
+        names = (
+            "protocol version headline n_scenes scenes metrics intervals pooled scene_mean per_scene per_class groups "
+            "coverage n_predictions warnings"
+        )
+        return {name: plain_json(getattr(self, name)) for name in names.split()}
+
+
+def plain_json(value: Any) -> Any:
+    """``value`` with None for what is no finite number, and tuples as lists."""
+    if isinstance(value, Mapping):
+        return {key: plain_json(item) for key, item in value.items()}
+    if isinstance(value, tuple | list):
+        return [plain_json(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
 def combine(rules: ProtocolRules, scores: Mapping[str, SceneScore], *, with_intervals: bool = True) -> ProtocolResult:
-    """The protocol's numbers over the scenes of ``scores``, whose order does not matter."""
-    ordered = _ordered(rules, scores)
-    n_scored = sum(score.n_scored for _, score in ordered)
-    n_beyond = np.sum([score.n_farther for _, score in ordered], axis=0)
-    return form_result(
-        metric_of(rules),
-        [scene for scene, _ in ordered],
-        [score.counts for _, score in ordered],
-        coverage={
-            f"{radius:g}": float(n_beyond[i] / n_scored) if n_scored else float("nan")
-            for i, radius in enumerate(transfer.COVERAGE_RADII_M)
-        },
-        n_predictions={scene: score.n_predictions for scene, score in ordered},
-        warnings=_gathered({scene: score.warnings for scene, score in ordered}),
-        with_intervals=with_intervals,
+    """The protocol's numbers over the scenes of ``scores``, whose order does not matter.
+
+    ``intervals`` are None where they are not wanted.
+    """
+    metric, ordered = metric_of(rules), _ordered(rules, scores)
+    counts = [score.counts for score in ordered.values()]
+    pooled, rows = metric.pooled(counts), metric.combine_each(counts)
+    mean = scene_mean(rows)
+    intervals: dict[str, tuple[float, float] | None] = dict.fromkeys(rules.headline)
+    if with_intervals and len(ordered) > 1:
+        resampled = metric.resampled_headline(counts, rows, resample_weights(len(ordered)))
+        intervals = {name: percentile_interval(resampled[name]) for name in rules.headline}
+    return ProtocolResult(
+        protocol=rules.name,
+        version=rules.version,
+        headline=rules.headline,
+        scenes=tuple(ordered),
+        metrics=pooled.values if rules.aggregate == "pooled" else mean,
+        pooled=pooled.values,
+        scene_mean=mean,
+        intervals=intervals,
+        per_scene=dict(zip(ordered, rows, strict=True)),
+        per_class=pooled.classes,
+        groups=pooled.groups,
+        coverage=_coverage(ordered.values()),
+        n_predictions={scene: score.n_predictions for scene, score in ordered.items()},
+        warnings=(*_gathered({scene: score.warnings for scene, score in ordered.items()}), *pooled.warnings),
     )
 
 
 def combined_metrics(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> Mapping[str, float]:
     """The ``metrics`` of ``combine`` alone, without intervals, classes and scenes."""
-    return metric_of(rules).reported([score.counts for _, score in _ordered(rules, scores)])
+    return metric_of(rules).reported([score.counts for score in _ordered(rules, scores).values()])
 
 
-def _ordered(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> list[tuple[str, SceneScore]]:
+def _ordered(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> dict[str, SceneScore]:
     """The scenes by name; a ``DataError`` where there is none, or one that was scored by other rules."""
     if not scores:
         raise DataError(f"{rules.name}: no scene was scored; nothing to combine")
@@ -127,7 +186,15 @@ def _ordered(rules: ProtocolRules, scores: Mapping[str, SceneScore]) -> list[tup
                 f"{rules.version}; score it again"
             )
         metric.check(scene, score.counts)
-    return [(scene, scores[scene]) for scene in sorted(scores)]
+    return {scene: scores[scene] for scene in sorted(scores)}
+
+
+def _coverage(scores: Collection[SceneScore]) -> dict[str, float]:
+    """By radius, the share of scored points without a predicted point that near."""
+    n_scored = sum(score.n_scored for score in scores)
+    n_beyond = np.sum([score.n_farther for score in scores], axis=0)
+    shares = n_beyond / n_scored if n_scored else np.full(len(n_beyond), np.nan)
+    return {f"{radius:g}": float(share) for radius, share in zip(transfer.COVERAGE_RADII_M, shares, strict=True)}
 
 
 def _gathered(warnings: Mapping[str, tuple[str, ...]]) -> list[str]:

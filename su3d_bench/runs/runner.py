@@ -21,8 +21,7 @@ from su3d_bench.core.errors import StoreError
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.timing import hardware_line, processor_digest
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.metrics.results import plain_json
-from su3d_bench.metrics.scoring import SceneScore, combine, combined_metrics, unpack_scores
+from su3d_bench.metrics.scoring import SceneScore, combine, combined_metrics, plain_json, unpack_scores
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.runs.executors.choose import ELSEWHERE, run_units
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from su3d_bench.core.types import Masks
-from su3d_bench.metrics import results, scoring
+from su3d_bench.metrics import scoring
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import precision_recall, resampling
 from su3d_bench.metrics.instance import precision_recall as dot_product
@@ -23,7 +23,7 @@ from su3d_bench.metrics.semantic import confusion as semantic
 
 @pytest.mark.parametrize(
     "module",
-    [dot_product, instance_ap, labelling, precision_recall, resampling, results, scoring, semantic, transfer],
+    [dot_product, instance_ap, labelling, precision_recall, resampling, scoring, semantic, transfer],
     ids=lambda m: m.__name__,
 )
 def test_the_examples_in_the_docstrings_run(module: object) -> None:
