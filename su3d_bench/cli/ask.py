@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import re
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -12,12 +11,14 @@ from su3d_bench.cli.common import (
     add_verb,
     add_whose_map,
     answer,
+    answer_estimate,
     answer_json,
     chat_client,
+    file_name_of,
     language_config,
     remark,
 )
-from su3d_bench.cli.query import latest_run, no_map
+from su3d_bench.cli.query import asked_map
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError
 
 if TYPE_CHECKING:
@@ -67,18 +68,16 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.executors.local import limit_threads
-
-    limit_threads()
+    from su3d_bench.core.types import Instances
     from su3d_bench.questions.reasoning.scene_map import map_of
 
     if not arguments.question.strip():
         raise ConfigError(
             'the question is empty; ask such as: su3d-bench ask rooms/living0 "How many lamps are there?"'
         )
-    run = _run_of(arguments)
-    job = run.job(arguments.scene, arguments.method)
-    instances = _map(run, arguments)
+    run, job, instances = asked_map(arguments)
+    if not isinstance(instances, Instances):
+        raise PredictionError(f"{job.prediction}: holds no instances, so there is nothing to ask about")
     refined, note = _refined(job, arguments.names)
     scene = map_of(instances, refined)
     if arguments.dry_run:
@@ -98,25 +97,6 @@ def call(arguments: argparse.Namespace) -> int:
     if picture is not None:
         remark(f"picture: {picture}", quiet=arguments.quiet)
     return EXIT_DONE
-
-
-def _run_of(arguments: argparse.Namespace) -> RunFolder:
-    from su3d_bench.store.run_folder import RunFolder
-
-    return latest_run(arguments.scene, arguments.method) if arguments.run is None else RunFolder(arguments.run)
-
-
-def _map(run: RunFolder, arguments: argparse.Namespace) -> Instances:
-    from su3d_bench.core.types import Instances
-    from su3d_bench.store.predictions import read_prediction
-
-    job = run.job(arguments.scene, arguments.method)
-    if not job.prediction.is_file():
-        raise no_map(run, arguments.scene, arguments.method)
-    prediction = read_prediction(job.prediction)
-    if not isinstance(prediction, Instances):
-        raise PredictionError(f"{job.prediction}: holds no instances, so there is nothing to ask about")
-    return prediction
 
 
 def _refined(job: JobFolder, wanted: str) -> tuple[Sequence[str] | None, str]:
@@ -139,12 +119,8 @@ def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) ->
         return EXIT_DONE
     config = language_config(arguments)
     client = chat_client(arguments, run, config)
-    estimate = client.estimate([LanguageSolver(scene, client, config).request(arguments.question)])
-    if arguments.json:
-        answer_json(estimate.to_json())
-    else:
-        answer(estimate.line())
-    return EXIT_DONE
+    request = LanguageSolver(scene, client, config).request(arguments.question)
+    return answer_estimate(arguments, client, [request])
 
 
 def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> Answer:
@@ -180,7 +156,7 @@ def _draw(
         if arguments.out is not None:
             remark(f"{arguments.out}: not drawn, for the answer names no object", quiet=arguments.quiet)
         return None
-    picture: Path = arguments.out or job.pictures / f"ask-{_file_name(arguments.question)}.png"
+    picture: Path = arguments.out or job.pictures / f"ask-{file_name_of(arguments.question, 'question')}.png"
     rows = [tuple(scene.by_id(one).row for one in ids) for ids in (found.object_ids, found.reference_ids)]
     names = [""] * len(instances)
     for one in scene.objects:
@@ -188,7 +164,3 @@ def _draw(
     title = f"{arguments.scene}: {arguments.question}"
     draw_reasoning(instances, SpokenOf(*rows), names, picture, title, (found.text, *found.notes))
     return picture
-
-
-def _file_name(text: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60] or "question"

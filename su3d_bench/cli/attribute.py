@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer, answer_json, formatted, remark
+from su3d_bench.cli.common import add_table_format, add_verb, answer_either, formatted, remark
 from su3d_bench.core.errors import EXIT_DONE
 
 
@@ -39,9 +39,6 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.executors.local import limit_threads
-
-    limit_threads()
     from su3d_bench.analysis.attribution import attribute
     from su3d_bench.reports.pictures.attribution import draw_attribution
     from su3d_bench.reports.tables.attribution import attribution_tables
@@ -55,8 +52,5 @@ def call(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         draw_attribution(found, arguments.out)
         remark(f"plot: {arguments.out}", quiet=arguments.quiet)
-    if arguments.json:
-        answer_json(found)
-    else:
-        answer(formatted(attribution_tables(found), arguments))
+    answer_either(arguments, found, formatted(attribution_tables(found), arguments))
     return EXIT_DONE

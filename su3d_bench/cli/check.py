@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_json, remark
+from su3d_bench.cli.common import add_verb, answer, answer_json, remark, written
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def call(arguments: argparse.Namespace) -> int:
 def _learn(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.gate import ACROSS_MACHINES, COST_LIMIT, learn
     from su3d_bench.runs.finished import read_run
-    from su3d_bench.store.atomic import make_folder, write_json
+    from su3d_bench.store.atomic import json_text
 
     if arguments.runs or arguments.against or arguments.out is None:
         raise ConfigError("check: --learn takes the runs and needs --out FILE; it checks nothing")
@@ -67,8 +67,7 @@ def _learn(arguments: argparse.Namespace) -> int:
     if not cost_limit > 1 or not 0 <= across <= 1:
         raise ConfigError("check: --cost-limit is a factor above 1, --across-machines from 0 to 100 points")
     reference = learn([read_run(path) for path in arguments.learn], across, cost_limit)
-    make_folder(arguments.out.parent)
-    write_json(arguments.out, reference.model_dump(mode="json", exclude_defaults=True))
+    written(arguments.out, json_text(reference.model_dump(mode="json", exclude_defaults=True)))
     n_exact = sum(one.tolerance == 0 for each in reference.results for one in each.metrics.values())
     n_values = sum(len(each.metrics) for each in reference.results)
     answer(f"{arguments.out}: {n_values} headline values from {reference.n_runs} runs, {n_exact} of them exact")
@@ -100,9 +99,7 @@ def _check(arguments: argparse.Namespace) -> int:
 
 def _write(verdict: Verdict, arguments: argparse.Namespace) -> None:
     from su3d_bench.reports.gate import junit_xml, markdown
-    from su3d_bench.store.atomic import make_folder, write_text
 
     for path, text in ((arguments.markdown, markdown), (arguments.junit, junit_xml)):
         if path is not None:
-            make_folder(path.parent)
-            write_text(path, text(verdict))
+            written(path, text(verdict))

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from su3d_bench.core.errors import EXIT_DONE
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
 
 if TYPE_CHECKING:
+    from su3d_bench.perception.language.chat import ChatRequest
     from su3d_bench.perception.language.client import ChatClient
     from su3d_bench.perception.language.config import LanguageConfig
     from su3d_bench.reports.tables.model import Prose, Table
@@ -29,19 +32,15 @@ def add_verb(
     call: Callable[[argparse.Namespace], int],
     *,
     json_to_file: bool = False,
+    uses_all_cores: bool = False,
 ) -> argparse.ArgumentParser:
     """A verb's parser: help that ends with two examples, ``--json``, ``--quiet`` and ``--debug``.
 
-    ``json_to_file``: ``--json`` takes a file to write the answer to, instead of answering in JSON.
+    ``json_to_file``: ``--json`` takes a file to write the answer to, instead of answering in JSON. Numerical libraries
+    are held to one thread unless the verb ``uses_all_cores``.
     """
-    parser: argparse.ArgumentParser = verbs.add_parser(
-        name,
-        help=summary[:1].lower() + summary[1:].rstrip("."),
-        description=summary,
-        epilog="examples:\n" + "\n".join(f"  {example}" for example in examples),
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.set_defaults(call=call)
+    parser = _parser(verbs, name, summary, examples)
+    parser.set_defaults(call=call, uses_all_cores=uses_all_cores)
     if json_to_file:
         parser.add_argument("--json", type=Path, metavar="FILE", help="write the answer to a JSON file too")
     else:
@@ -55,17 +54,19 @@ def add_group(
     verbs: Any, name: str, summary: str, actions: str, examples: tuple[str, str]
 ) -> argparse._SubParsersAction[argparse.ArgumentParser]:
     """The sub-verbs' parsers of a verb such as ``datasets``; ``actions`` names them, ``list|check``."""
-    parser = verbs.add_parser(
+    parser = _parser(verbs, name, summary, examples)
+    return parser.add_subparsers(dest="action", metavar=actions, required=True)
+
+
+def _parser(verbs: Any, name: str, summary: str, examples: tuple[str, str]) -> argparse.ArgumentParser:
+    parser: argparse.ArgumentParser = verbs.add_parser(
         name,
         help=summary[:1].lower() + summary[1:].rstrip("."),
         description=summary,
         epilog="examples:\n" + "\n".join(f"  {example}" for example in examples),
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    group: argparse._SubParsersAction[argparse.ArgumentParser] = parser.add_subparsers(
-        dest="action", metavar=actions, required=True
-    )
-    return group
+    return parser
 
 
 def add_settings(parser: argparse.ArgumentParser, description: str) -> None:
@@ -103,6 +104,44 @@ def answer(text: str) -> None:
 def answer_json(value: Any) -> None:
     """Print ``value`` as JSON to stdout."""
     answer(json.dumps(value, indent=2, ensure_ascii=False))
+
+
+def answer_either(arguments: argparse.Namespace, value: Any, text: str) -> None:
+    """Print ``value`` where ``--json`` asks for it, else ``text``."""
+    answer(json.dumps(value, indent=2, ensure_ascii=False) if arguments.json else text)
+
+
+def answer_estimate(arguments: argparse.Namespace, client: ChatClient, requests: Sequence[ChatRequest]) -> int:
+    """Print what asking a language model all ``requests`` would cost; the exit code."""
+    estimate = client.estimate(requests)
+    answer_either(arguments, estimate.to_json(), estimate.line())
+    return EXIT_DONE
+
+
+def written(path: Path, text: str) -> Path:
+    """Write ``text`` to a file that a flag named, with its folder; its path."""
+    from su3d_bench.store.atomic import make_folder, write_text
+
+    make_folder(path.parent)
+    write_text(path, text)
+    return path
+
+
+def answer_or_write(arguments: argparse.Namespace, text: str) -> None:
+    """Print ``text``, or write it to the file that ``--out`` names."""
+    if arguments.out is None:
+        answer(text)
+    else:
+        remark(f"written: {written(arguments.out, text)}", quiet=arguments.quiet)
+
+
+def file_name_of(text: str, default: str) -> str:
+    """What a picture of the answer to ``text`` is called.
+
+    >>> file_name_of("Where is it?", "text"), file_name_of("?", "text")
+    ('where-is-it', 'text')
+    """
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60] or default
 
 
 def remark(text: str, *, quiet: bool = False) -> None:

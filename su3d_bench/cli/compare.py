@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer, answer_json, formatted
+from su3d_bench.cli.common import add_table_format, add_verb, answer_either, formatted
 from su3d_bench.core.errors import EXIT_DONE
 
 
@@ -36,9 +36,6 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.executors.local import limit_threads
-
-    limit_threads()
     from su3d_bench.analysis.comparison import compare
     from su3d_bench.reports.tables.comparison import comparison_tables
 
@@ -49,8 +46,5 @@ def call(arguments: argparse.Namespace) -> int:
         protocols=arguments.protocol,
         per_class=arguments.per_class,
     ).to_json()
-    if arguments.json:
-        answer_json(found)
-    else:
-        answer(formatted(comparison_tables(found), arguments))
+    answer_either(arguments, found, formatted(comparison_tables(found), arguments))
     return EXIT_DONE

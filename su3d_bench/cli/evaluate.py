@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer, formatted, remark
+from su3d_bench.cli.common import add_table_format, add_verb, answer, formatted, remark, written
 from su3d_bench.core.errors import EXIT_DONE
 
 
@@ -72,12 +71,9 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.executors.local import limit_threads
-
-    limit_threads()  # before numerical libraries are loaded
     from su3d_bench.evaluation.evaluate import NOT_MEANT, Request, evaluate
     from su3d_bench.reports.tables.evaluation import evaluation_tables
-    from su3d_bench.store.atomic import make_folder, write_text
+    from su3d_bench.store.atomic import json_text
 
     result = evaluate(
         Request(
@@ -94,8 +90,7 @@ def call(arguments: argparse.Namespace) -> int:
     )
     document = result.to_json()
     if arguments.json is not None:
-        make_folder(arguments.json.parent)
-        write_text(arguments.json, json.dumps(document, indent=2, ensure_ascii=False, allow_nan=False) + "\n")
+        written(arguments.json, json_text(document))
     answer(formatted(evaluation_tables(document, per_class=arguments.per_class), arguments))
     remark(f"format: {', '.join(result.formats)}; ground truth: {result.ground_truth}", quiet=arguments.quiet)
     for line in result.remarks:

@@ -72,9 +72,6 @@ class Source:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.executors.local import limit_threads
-
-    limit_threads()
     from su3d_bench.predictions.export import whole_folder, write_openlex, write_scannet
 
     for flag, value in {"--protocol": arguments.protocol, "--text-features": arguments.text_features}.items():

@@ -37,6 +37,7 @@ from su3d_bench.core.errors import (
     printable,
     suggest,
 )
+from su3d_bench.runs.executors.local import limit_threads
 
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 DESCRIPTION = "Evaluate and benchmark open-vocabulary, instance-level 3D scene understanding from RGB-D."
@@ -112,6 +113,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     is_debug = "--debug" in words
     try:
         arguments = build_parser().parse_args(words)
+        if not arguments.uses_all_cores:
+            limit_threads()  # before numerical libraries are loaded
         code: int = arguments.call(arguments)
         sys.stdout.flush()
     except BrokenPipeError:

@@ -6,7 +6,8 @@ import argparse
 import textwrap
 from typing import Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_json
+from su3d_bench.cli.common import add_verb, answer, answer_either, answer_json
+from su3d_bench.core.errors import EXIT_DONE
 
 WIDTH = 118
 
@@ -28,11 +29,8 @@ def call(arguments: argparse.Namespace) -> int:
     if arguments.name is not None:
         return _show(arguments)
     rows = [_about(name, registry.load("method", name)) for name in registry.names("method")]
-    if arguments.json:
-        answer_json(rows)
-    else:
-        answer("\n\n".join("\n".join(_lines(row)) for row in rows))
-    return 0
+    answer_either(arguments, rows, "\n\n".join("\n".join(_lines(row)) for row in rows))
+    return EXIT_DONE
 
 
 def _about(name: str, method: Any) -> dict[str, Any]:
@@ -69,14 +67,14 @@ def _show(arguments: argparse.Namespace) -> int:
     figures = [figure.model_dump(mode="json", exclude_none=True) for figure in figures_of(method.name)]
     if arguments.json:
         answer_json({**row, "settings": defaults, "published": figures})
-        return 0
+        return EXIT_DONE
     leaves = [(("method", method.name, *path), value, _remark(method, path)) for path, value in flatten(defaults)]
     answer("\n".join(f"# {line}" for line in _lines(row)))
     answer("\n" + write_toml(leaves) if leaves else f"# {method.name} has no settings")
     if figures:
         answer("\n# as reported, each in its own set-up; no two need be comparable")
         answer("\n".join(f"# {line}" for figure in figures for line in _figure_lines(figure)))
-    return 0
+    return EXIT_DONE
 
 
 def _figure_lines(figure: dict[str, Any]) -> list[str]:

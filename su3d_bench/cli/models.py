@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_group, add_settings, add_verb, answer, answer_json, remark
+from su3d_bench.cli.common import add_group, add_settings, add_verb, answer, answer_either, answer_json, remark
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
@@ -58,6 +58,7 @@ def _add_export(actions: Any) -> None:
             "su3d-bench models export siglip-base-224 --out siglip --json",
         ),
         call_export,
+        uses_all_cores=True,
     )
     parser.add_argument("name", metavar="MODEL", help="short name, such as clip-vit-h-14")
     parser.add_argument("--out", type=Path, required=True, metavar="DIR", help="folder that the files go to")
@@ -147,11 +148,7 @@ def call_check(arguments: argparse.Namespace) -> int:
     rows += [_absent(state) for state in states if names and not state.found]
     if not rows:
         raise ConfigError("models check: none of the models is here; su3d-bench models list names them all")
-    if arguments.json:
-        answer_json(rows)
-    else:
-        for row in rows:
-            _answer_check(row)
+    answer_either(arguments, rows, "\n".join(line for row in rows for line in _check_lines(row)))
     return EXIT_CHECK_FAILED if any(row["problems"] for row in rows) else EXIT_DONE
 
 
@@ -171,13 +168,12 @@ def _absent(state: ModelState) -> dict[str, Any]:
     return {"name": state.entry.name, "form": None, "folder": None, "sha256": {}, "problems": [state.missing]}
 
 
-def _answer_check(row: dict[str, Any]) -> None:
-    if row["form"] is not None:
-        answer(f"{row['name']} ({row['form']}): {row['folder']}: {'wrong' if row['problems'] else 'whole'}")
-    for name, digest in row["sha256"].items():
-        answer(f"  {digest}  {name}")
-    for problem in row["problems"]:
-        answer(f"  {problem}" if row["form"] else problem)
+def _check_lines(row: dict[str, Any]) -> list[str]:
+    if row["form"] is None:
+        return list(row["problems"])
+    state = "wrong" if row["problems"] else "whole"
+    digests = [f"  {digest}  {name}" for name, digest in row["sha256"].items()]
+    return [f"{row['name']} ({row['form']}): {row['folder']}: {state}", *digests, *(f"  {p}" for p in row["problems"])]
 
 
 def call_export(arguments: argparse.Namespace) -> int:
@@ -187,31 +183,23 @@ def call_export(arguments: argparse.Namespace) -> int:
     config = _perception_config(arguments).models
     entry = model_entry(arguments.name)
     export = export_model(entry, arguments.out, path=config.path_of(entry.name), folder=config.folder)
-    if arguments.json:
-        answer_json({"folder": str(arguments.out), "files": export.files, "parity": [asdict(p) for p in export.parity]})
-        return EXIT_DONE
-    for name, digest in export.files.items():
-        answer(f"{digest}  {arguments.out / name}")
-    for one in export.parity:
-        answer(
-            f"{one.output}: torch and ONNX Runtime differ by at most {one.max_abs_difference:.1e} over {one.n_values} "
-            f"values, cosine at least {one.min_cosine:.9f}"
-        )
+    value = {"folder": str(arguments.out), "files": export.files, "parity": [asdict(p) for p in export.parity]}
+    lines = [f"{digest}  {arguments.out / name}" for name, digest in export.files.items()]
+    lines += [
+        f"{one.output}: torch and ONNX Runtime differ by at most {one.max_abs_difference:.1e} over {one.n_values} "
+        f"values, cosine at least {one.min_cosine:.9f}"
+        for one in export.parity
+    ]
+    answer_either(arguments, value, "\n".join(lines))
     return EXIT_DONE
 
 
 def call_warm(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.executors.local import limit_threads
-
-    limit_threads()  # before numerical libraries are loaded
     result = _warm(arguments)
-    if arguments.json:
-        answer_json(asdict(result))
-        return EXIT_DONE
-    answer(f"{result.what}: loaded and first run {result.load_s:.1f} s, next run {result.run_s:.3f} s")
-    for name, ms in result.stages_ms.items():
-        answer(f"  {name:<10} {ms:>10.1f} ms")
-    answer(f"memory: {result.memory_mb:.0f} MB at most ({result.memory_of}); digest {result.digest[:12]}")
+    lines = [f"{result.what}: loaded and first run {result.load_s:.1f} s, next run {result.run_s:.3f} s"]
+    lines += [f"  {name:<10} {ms:>10.1f} ms" for name, ms in result.stages_ms.items()]
+    lines.append(f"memory: {result.memory_mb:.0f} MB at most ({result.memory_of}); digest {result.digest[:12]}")
+    answer_either(arguments, asdict(result), "\n".join(lines))
     return EXIT_DONE
 
 

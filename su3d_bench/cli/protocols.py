@@ -8,8 +8,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_json
-from su3d_bench.core.errors import ConfigError, suggest
+from su3d_bench.cli.common import add_verb, answer_either
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.metrics.protocols import ProtocolRules
@@ -45,19 +45,15 @@ def call(arguments: argparse.Namespace) -> int:
         if arguments.name is None:
             raise ConfigError(f"protocols show: name one of {', '.join(protocol_names())}")
         rules = load_protocol(arguments.name)
-        if arguments.json:
-            answer_json(rules.model_dump(mode="json") | {"digest": rules.digest})
-        else:
-            answer(_rules_text(rules, rules_files(arguments.name)))
-        return 0
+        value = rules.model_dump(mode="json") | {"digest": rules.digest}
+        answer_either(arguments, value, _rules_text(rules, rules_files(arguments.name)))
+        return EXIT_DONE
     rows = [load_protocol(name) for name in protocol_names()]
-    if arguments.json:
-        fields = {"name", "version", "summary", "kind", "datasets", "headline", "ground_truth", "label_space"}
-        answer_json([one.model_dump(mode="json", include=fields) for one in rows])
-    else:
-        width = max(len(one.name) for one in rows)
-        answer("\n".join(f"{one.name:<{width}}  {one.summary}" for one in rows))
-    return 0
+    fields = {"name", "version", "summary", "kind", "datasets", "headline", "ground_truth", "label_space"}
+    width = max(len(one.name) for one in rows)
+    text = "\n".join(f"{one.name:<{width}}  {one.summary}" for one in rows)
+    answer_either(arguments, [one.model_dump(mode="json", include=fields) for one in rows], text)
+    return EXIT_DONE
 
 
 def _rules_text(rules: ProtocolRules, files: Sequence[Path]) -> str:

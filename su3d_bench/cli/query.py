@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import argparse
-import re
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, add_whose_map, answer, answer_json, remark
+from su3d_bench.cli.common import add_verb, add_whose_map, answer, answer_json, file_name_of, remark
 from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, suggest
 
 if TYPE_CHECKING:
-    from su3d_bench.core.types import Instances
+    from su3d_bench.core.types import Instances, Prediction
     from su3d_bench.questions.retrieval import Ranking
-    from su3d_bench.store.run_folder import RunFolder
+    from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 
 def add_parser(verbs: Any) -> None:
@@ -37,29 +36,20 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.executors.local import limit_threads
-
-    limit_threads()
     from su3d_bench.core.types import DenseFeatures, Instances
     from su3d_bench.questions.retrieval import rank
     from su3d_bench.reports.pictures.maps import draw_heat_map
     from su3d_bench.runs.finished import encoder_of
-    from su3d_bench.store.predictions import read_prediction
-    from su3d_bench.store.run_folder import RunFolder
 
     if arguments.top < 1:
         raise ConfigError(f"--top {arguments.top}: at least 1 instance must be listed")
-    run = RunFolder(arguments.run) if arguments.run is not None else latest_run(arguments.scene, arguments.method)
-    job = run.job(arguments.scene, arguments.method)
-    if not job.prediction.is_file():
-        raise no_map(run, arguments.scene, arguments.method)
-    prediction = read_prediction(job.prediction)
+    run, job, prediction = asked_map(arguments)
     if not isinstance(prediction, Instances):
         what = "one feature a point and no instances" if isinstance(prediction, DenseFeatures) else "no instances"
         raise PredictionError(f"{job.prediction}: has {what}, so there is nothing to rank; choose another --method")
     ranking = rank(prediction, arguments.text, encoder_of(run, arguments.device))
     rows = _rows(prediction, ranking, arguments.top)
-    picture = arguments.out or job.pictures / f"query-{_file_name(arguments.text)}.png"
+    picture = arguments.out or job.pictures / f"query-{file_name_of(arguments.text, 'text')}.png"
     lines = [f"{row['rank']}. {row['name']}  {row['similarity']:.3f}" for row in rows]
     draw_heat_map(prediction, ranking.similarity, picture, f'{arguments.scene}: "{arguments.text}"', lines)
     if arguments.json:
@@ -89,6 +79,18 @@ def _rows(instances: Instances, ranking: Ranking, top: int) -> list[dict[str, An
     return rows
 
 
+def asked_map(arguments: argparse.Namespace) -> tuple[RunFolder, JobFolder, Prediction]:
+    """The map that ``add_whose_map`` and the scene name, with its place and its run."""
+    from su3d_bench.store.predictions import read_prediction
+    from su3d_bench.store.run_folder import RunFolder
+
+    run = RunFolder(arguments.run) if arguments.run is not None else latest_run(arguments.scene, arguments.method)
+    job = run.job(arguments.scene, arguments.method)
+    if not job.prediction.is_file():
+        raise no_map(run, arguments.scene, arguments.method)
+    return run, job, read_prediction(job.prediction)
+
+
 def latest_run(scene: str, method: str) -> RunFolder:
     """The run folder below ``runs/`` whose map of the scene is the youngest."""
     from su3d_bench.store.run_folder import RunFolder
@@ -115,7 +117,3 @@ def no_map(run: RunFolder, scene: str, method: str) -> StoreError:
         hint = suggest(method, methods) or f"; it has {', '.join(methods)}"
     hint = hint or f"; run: su3d-bench run --scenes {scene} --methods {method} --out {run.path}"
     return StoreError(f"{run.path}: holds no map of {scene} by {method}{hint}")
-
-
-def _file_name(text: str) -> str:
-    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60] or "text"

@@ -12,6 +12,7 @@ from su3d_bench.cli.common import (
     add_language_flags,
     add_verb,
     answer,
+    answer_estimate,
     answer_json,
     chat_client,
     language_config,
@@ -53,9 +54,6 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.executors.local import limit_threads
-
-    limit_threads()
     from su3d_bench.questions.refined_names import records_of, write_records
     from su3d_bench.questions.refinement import top_names
 
@@ -132,12 +130,8 @@ def _estimate(tops: dict[str, list[TopNames]], arguments: argparse.Namespace) ->
     config = language_config(arguments)
     client = chat_client(arguments, RunFolder(arguments.run), config)
     refiner = ModelRefiner(client, config)
-    estimate = client.estimate([request for of_scene in tops.values() for request in refiner.requests(of_scene)])
-    if arguments.json:
-        answer_json(estimate.to_json())
-    else:
-        answer(estimate.line())
-    return EXIT_DONE
+    requests = [request for of_scene in tops.values() for request in refiner.requests(of_scene)]
+    return answer_estimate(arguments, client, requests)
 
 
 def _refine(

@@ -120,9 +120,6 @@ def call(arguments: argparse.Namespace) -> int:
 
 def plan_of(arguments: argparse.Namespace) -> Plan:
     """The plan of what was asked for, in a process that leaves the cores to the scenes side by side."""
-    from su3d_bench.runs.executors.local import limit_threads
-
-    limit_threads()  # before numerical libraries are loaded
     from su3d_bench.runs.plan import make_plan
 
     return make_plan(settings_of(arguments), arguments.set, arguments.out)

@@ -12,7 +12,7 @@ from typing import Any
 from su3d_bench.cli.common import answer, answer_json, progress, remark
 from su3d_bench.core import registry
 from su3d_bench.core.config import read_assignments, resolve
-from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, printable, printable_json
+from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable, printable_json
 from su3d_bench.datasets.checks import Inspection, TruthVariant, inspect
 from su3d_bench.datasets.checks_of_frames import Finding
 from su3d_bench.runs.executors.local import Event
@@ -44,7 +44,7 @@ def check(arguments: argparse.Namespace) -> int:
             }
         )
     else:
-        answer(f"\n{_count(len(found), 'scene')}, {n_with_errors} with errors")
+        answer(f"\n{counted(len(found), 'scene')}, {n_with_errors} with errors")
     return EXIT_CHECK_FAILED if n_with_errors else EXIT_DONE
 
 
@@ -100,7 +100,9 @@ def lines_of(one: Inspection) -> list[str]:
     for _, group in groupby(one.findings, key=lambda finding: (finding.severity, finding.check)):
         lines += _finding_lines(list(group))
     n_errors, n_warnings = one.count("error"), one.count("warning")
-    verdict = f"{_count(n_errors, 'error')}, {_count(n_warnings, 'warning')}" if one.findings else "nothing found wrong"
+    verdict = (
+        f"{counted(n_errors, 'error')}, {counted(n_warnings, 'warning')}" if one.findings else "nothing found wrong"
+    )
     return [*lines, f"  {'checked':<13} {one.elapsed_s:.1f} s: {verdict}"]
 
 
@@ -126,10 +128,6 @@ def _truth_text(variant: TruthVariant) -> str:
         reason = variant.reason.removeprefix(f"no ground truth '{variant.variant}'; ")
         return f"{variant.variant}: not here; {reason}"
     return (
-        f"{variant.variant}: {variant.n_points:,} points, {_count(variant.n_objects, 'object')}, "
-        f"{_count(variant.n_classes, 'class', 'classes')}"
+        f"{variant.variant}: {variant.n_points:,} points, {counted(variant.n_objects, 'object')}, "
+        f"{variant.n_classes} {'class' if variant.n_classes == 1 else 'classes'}"
     )
-
-
-def _count(n: int, noun: str, plural: str | None = None) -> str:
-    return f"{n} {noun if n == 1 else plural or noun + 's'}"

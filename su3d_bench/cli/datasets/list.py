@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import argparse
 import os
+from collections.abc import Callable
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_group, add_settings, add_verb, answer, answer_json
+from su3d_bench.cli.common import add_group, add_settings, add_verb, answer_either
 from su3d_bench.core.errors import EXIT_DONE, DataError, Su3dError
 
 LAYOUTS = ("native", "replica", "scannet", "scannet-python", "scannet-cpp", "tum")
@@ -37,6 +39,17 @@ def add_parser(verbs: Any) -> None:
     _add_make(actions)
 
 
+def _later(name: str) -> Callable[[argparse.Namespace], int]:
+    """The function ``name`` of the module of that name, which takes long to load."""
+
+    def call(arguments: argparse.Namespace) -> int:
+        module = import_module(f"su3d_bench.cli.datasets.{name}")
+        code: int = getattr(module, name)(arguments)
+        return code
+
+    return call
+
+
 def _add_check(actions: Any) -> None:
     parser = add_verb(
         actions,
@@ -46,7 +59,7 @@ def _add_check(actions: Any) -> None:
             "su3d-bench datasets check 'replica/*'",
             "su3d-bench datasets check rooms/living0 --set rooms.n_frames=40 --json",
         ),
-        call_check,
+        _later("check"),
     )
     parser.add_argument("scenes", nargs="+", metavar="SCENE", help="addresses or patterns, such as 'replica/*'")
     parser.add_argument(
@@ -67,7 +80,7 @@ def _add_show(actions: Any) -> None:
             "su3d-bench datasets show rooms/living0 --set rooms.n_frames=40",
             "su3d-bench datasets show replica/room0 --out room0.png --stride 50",
         ),
-        call_show,
+        _later("show"),
     )
     parser.add_argument("scene", metavar="SCENE", help="the scene's address, such as rooms/living0")
     parser.add_argument("--out", type=Path, metavar="FILE", help="the PNG to write (default: DATASET-SCENE.png here)")
@@ -88,7 +101,7 @@ def _add_make(actions: Any) -> None:
             "su3d-bench datasets make rooms --layout replica --out data --scenes 'rooms/*'",
             "su3d-bench datasets make rooms --layout scannet --out small --scenes living0 --set n_frames=200",
         ),
-        call_make,
+        _later("make"),
     )
     parser.add_argument("dataset", help="what to make scenes of: rooms")
     parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="names or patterns (default: 'DATASET/*')")
@@ -112,10 +125,8 @@ def call_list(arguments: argparse.Namespace) -> int:
 
     root = data_root()
     rows = [_row(name, registry.load("dataset", name), root) for name in registry.names("dataset")]
-    if arguments.json:
-        answer_json({"data_root": str(root), "datasets": rows})
-    else:
-        answer("\n".join([f"data root: {root}", *(line for row in rows for line in _lines(row))]))
+    lines = [f"data root: {root}", *(line for row in rows for line in _lines(row))]
+    answer_either(arguments, {"data_root": str(root), "datasets": rows}, "\n".join(lines))
     return EXIT_DONE
 
 
@@ -165,30 +176,3 @@ def _lines(row: dict[str, Any]) -> list[str]:
     lines += [f"  {one['scene']:<{width}}  {one['status']}" for one in scenes]
     n_more = len(row["scenes"]) - len(scenes)
     return [*lines, f"  and {n_more} more; --json lists all"] if n_more else lines
-
-
-def call_check(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.executors.local import limit_threads
-
-    limit_threads()  # before numerical libraries are loaded
-    from su3d_bench.cli.datasets.check import check
-
-    return check(arguments)
-
-
-def call_show(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.executors.local import limit_threads
-
-    limit_threads()
-    from su3d_bench.cli.datasets.show import show
-
-    return show(arguments)
-
-
-def call_make(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.executors.local import limit_threads
-
-    limit_threads()  # before numerical libraries are loaded
-    from su3d_bench.cli.datasets.make import make
-
-    return make(arguments)

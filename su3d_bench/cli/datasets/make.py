@@ -13,7 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn
 
-from su3d_bench.cli.common import answer, answer_json, remark
+from su3d_bench.cli.common import answer_either, remark
 from su3d_bench.core import registry
 from su3d_bench.core.config import read_assignments, resolve
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, suggest
@@ -70,10 +70,8 @@ def make(arguments: argparse.Namespace) -> int:
         }
         for scene in scenes
     ]
-    if arguments.json:
-        answer_json({"out": str(out), "layout": arguments.layout, "scenes": rows})
-    else:
-        answer("\n".join(f"{row['scene']:<16} {row['status']:<17} {row['address']}" for row in rows))
+    text = "\n".join(f"{row['scene']:<16} {row['status']:<17} {row['address']}" for row in rows)
+    answer_either(arguments, {"out": str(out), "layout": arguments.layout, "scenes": rows}, text)
     remark(f"to use them: SU3D_DATA={out} su3d-bench run --scenes '{reader}/*'", quiet=arguments.quiet)
     return EXIT_DONE
 

@@ -6,8 +6,8 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_json, remark
-from su3d_bench.core.errors import EXIT_DONE, ConfigError
+from su3d_bench.cli.common import add_verb, answer_either, remark, written
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted, printable
 
 NAME = "html"
 MEGABYTE = 10**6
@@ -40,14 +40,9 @@ def add_parser(actions: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.executors.local import limit_threads
-
-    limit_threads()
     from su3d_bench.analysis.page_maps import MOST_POINTS, QUERIES, page_scenes, points_of_each
     from su3d_bench.analysis.page_numbers import page_numbers, scored_maps
-    from su3d_bench.core.errors import printable
     from su3d_bench.reports.page.page import page_html
-    from su3d_bench.store.atomic import make_folder, write_text
 
     if not 0 < arguments.most_megabytes <= 1000:
         raise ConfigError(f"--most-megabytes {arguments.most_megabytes:g}: must be above 0 and at most 1000")
@@ -68,12 +63,8 @@ def call(arguments: argparse.Namespace) -> int:
         [scene.listed() for scene in scenes],
         [one.content for one in shown],
     )
-    make_folder(arguments.out.parent)
-    write_text(arguments.out, page)
+    written(arguments.out, page)
     n_bytes = len(page.encode())
     about = {"page": str(arguments.out), "n_bytes": n_bytes, "n_maps": len(shown), "most_points": most_points}
-    if arguments.json:
-        answer_json(about)
-    else:
-        answer(f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {len(shown)} map{'s' if len(shown) != 1 else ''}")
+    answer_either(arguments, about, f"{arguments.out}: {n_bytes / MEGABYTE:.1f} MB, {counted(len(shown), 'map')}")
     return EXIT_DONE

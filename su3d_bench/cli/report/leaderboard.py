@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer, answer_json, formatted, remark
+from su3d_bench.cli.common import add_table_format, add_verb, answer_json, answer_or_write, formatted, remark
 from su3d_bench.core.errors import EXIT_DONE
 
 NAME = "leaderboard"
@@ -34,19 +34,13 @@ def call(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from su3d_bench.analysis.leaderboard import leaderboard, tables
-    from su3d_bench.store.atomic import make_folder, write_text
 
     found = leaderboard(arguments.folder, arguments.protocols)
     if arguments.json:
         answer_json(asdict(found))
         return EXIT_DONE
     text = formatted(tables(found, intervals=arguments.intervals), arguments)
-    if arguments.out is None:
-        answer(text)
-    else:
-        make_folder(arguments.out.parent)
-        write_text(arguments.out, text)
-        remark(f"written: {arguments.out}", quiet=arguments.quiet)
+    answer_or_write(arguments, text)
     n_entries = sum(map(len, found.boards))
     remark(f"{n_entries} entries in {len(found.boards)} rankings, {len(found.refused)} left out", quiet=arguments.quiet)
     return EXIT_DONE

@@ -7,7 +7,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer, formatted, remark
+from su3d_bench.cli.common import add_table_format, add_verb, answer_or_write, formatted
 from su3d_bench.core.errors import EXIT_DONE
 
 if TYPE_CHECKING:
@@ -63,16 +63,11 @@ def add_parser(actions: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.store.atomic import json_text, make_folder, write_text
+    from su3d_bench.store.atomic import json_text
 
     tables = _tables(arguments)
     text = json_text([asdict(one) for one in tables]) if arguments.json else formatted(tables, arguments)
-    if arguments.out is None:
-        answer(text)
-        return EXIT_DONE
-    make_folder(arguments.out.parent)
-    write_text(arguments.out, text)
-    remark(f"written: {arguments.out}", quiet=arguments.quiet)
+    answer_or_write(arguments, text)
     return EXIT_DONE
 
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer, answer_json, formatted, remark
+from su3d_bench.cli.common import add_table_format, add_verb, answer_either, formatted, remark
 
 if TYPE_CHECKING:
     from su3d_bench.metrics.costs import UpdateTimes
@@ -44,22 +44,21 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.metrics.costs import summarise
     from su3d_bench.reports.tables.formats import markdown
     from su3d_bench.reports.tables.timing import csv_text, methods_csv, timing_tables
-    from su3d_bench.runs.finished import read_run
+    from su3d_bench.runs.finished import read_run, read_update_times
 
     if arguments.warm_up < 0 or not arguments.camera_rate > 0:
         raise ConfigError("--warm-up is a count from 0, --camera-rate a number above 0")
     runs = [read_run(path) for path in arguments.runs]
-    times = [found for run in runs for method in _methods(run, arguments.methods) if (found := _times(run, method))]
+    timed = [read_update_times(run, method) for run in runs for method in arguments.methods or run.methods]
+    times = [each for each in timed if each]
     if not times:
         raise ConfigError("no update was timed in these runs: their methods look at no frame")
     summaries = [summarise(each, arguments.warm_up) for each in times]
     anytime = [point for each in times for point in _anytime(next(r for r in runs if r.name == each[0].run), each)]
     hardware = {run.name: run.record.hardware for run in runs}
     tables = timing_tables(summaries, anytime, hardware, arguments.camera_rate)
-    if arguments.json:
-        answer_json({"hardware": hardware, "methods": [asdict(one) for one in summaries]})
-    else:
-        answer(formatted(tables, arguments))
+    value = {"hardware": hardware, "methods": [asdict(one) for one in summaries]}
+    answer_either(arguments, value, formatted(tables, arguments))
     if arguments.out is not None:
         files = {
             "timing.md": markdown(tables),
@@ -68,16 +67,6 @@ def call(arguments: argparse.Namespace) -> int:
         }
         _write(arguments, files, times, anytime)
     return 0
-
-
-def _methods(run: FinishedRun, asked: list[str] | None) -> list[str]:
-    return list(run.methods) if asked is None else asked
-
-
-def _times(run: FinishedRun, method: str) -> list[UpdateTimes]:
-    from su3d_bench.runs.finished import read_update_times
-
-    return read_update_times(run, method)
 
 
 def _anytime(run: FinishedRun, times: list[UpdateTimes]) -> list[Any]:

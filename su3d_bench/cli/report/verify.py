@@ -7,8 +7,8 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_json
-from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE
+from su3d_bench.cli.common import add_verb, answer_either
+from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, counted
 
 NAME = "verify"
 
@@ -28,17 +28,12 @@ def add_parser(actions: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.executors.local import limit_threads
-
-    limit_threads()
     from su3d_bench.analysis.tables import check_paper
 
     checks = [check for file in arguments.files for check in check_paper(file, arguments.root)]
     differing = [check for check in checks if check.fault is not None]
-    if arguments.json:
-        answer_json({"n_cells": len(checks), "n_differing": len(differing), "differing": [*map(asdict, differing)]})
-    else:
-        lines = [f"{check.file}:{check.line}: {check.fault}" for check in differing]
-        n = len(checks)
-        answer("\n".join([*lines, f"{n} cell{'s' if n != 1 else ''} checked, {len(differing)} differ"]))
+    value = {"n_cells": len(checks), "n_differing": len(differing), "differing": [*map(asdict, differing)]}
+    lines = [f"{check.file}:{check.line}: {check.fault}" for check in differing]
+    lines.append(f"{counted(len(checks), 'cell')} checked, {len(differing)} differ")
+    answer_either(arguments, value, "\n".join(lines))
     return EXIT_CHECK_FAILED if differing else EXIT_DONE

@@ -11,12 +11,13 @@ from su3d_bench.cli.common import (
     add_language_flags,
     add_verb,
     answer,
+    answer_estimate,
     answer_json,
     chat_client,
     language_config,
     remark,
 )
-from su3d_bench.core.errors import EXIT_DONE, ConfigError
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -85,9 +86,6 @@ def add_parser(actions: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.executors.local import limit_threads
-
-    limit_threads()
     from su3d_bench.runs.finished import read_run
     from su3d_bench.sheets.run_source import RunSource
 
@@ -103,15 +101,11 @@ def call(arguments: argparse.Namespace) -> int:
         answer_json({"sets": told})
         return EXIT_DONE
     for one in told:
-        answer(f"{one['sheet_id']}: {_n(one['n_items'], 'item')}, {_n(one['n_questions'], 'question')}")
+        answer(f"{one['sheet_id']}: {counted(one['n_items'], 'item')}, {counted(one['n_questions'], 'question')}")
         for path in one["files"]:
             answer(path)
         remark(f"key, which annotators must not see: {one['key']}", quiet=arguments.quiet)
     return EXIT_DONE
-
-
-def _n(count: int, what: str) -> str:
-    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def _check(arguments: argparse.Namespace) -> None:
@@ -204,12 +198,7 @@ def _estimate(source: RunSource, arguments: argparse.Namespace) -> int:
     for scene in source.scenes:
         n_most = arguments.per_kind or PER_KIND["reasoning"]
         reasoning_drafts(source, scene, given, n_most, requests_into(requests, client, config))
-    estimate = client.estimate(requests)
-    if arguments.json:
-        answer_json(estimate.to_json())
-    else:
-        answer(estimate.line())
-    return EXIT_DONE
+    return answer_estimate(arguments, client, requests)
 
 
 def _given(source: RunSource, arguments: argparse.Namespace) -> Sequence[Question] | None:

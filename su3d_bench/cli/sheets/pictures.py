@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_json
+from su3d_bench.cli.common import add_verb, answer_either
 from su3d_bench.core.errors import EXIT_DONE, ConfigError
 
 NAME = "pictures"
@@ -38,9 +38,6 @@ def add_parser(actions: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.executors.local import limit_threads
-
-    limit_threads()
     from su3d_bench.reports.pictures.figures import draw_grid
     from su3d_bench.reports.pictures.heat_scales import scale_stops
     from su3d_bench.runs.finished import read_run
@@ -68,8 +65,6 @@ def call(arguments: argparse.Namespace) -> int:
         rows = figures.similarity(texts, run.encoder(arguments.device), arguments.colours)
         scale = scale_stops(arguments.colours)
     draw_grid(arguments.out, columns, rows, scale)
-    if arguments.json:
-        answer_json({"picture": str(arguments.out), "columns": columns, "rows": [row.title for row in rows]})
-    else:
-        answer(str(arguments.out))
+    value = {"picture": str(arguments.out), "columns": columns, "rows": [row.title for row in rows]}
+    answer_either(arguments, value, str(arguments.out))
     return EXIT_DONE
