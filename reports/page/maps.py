@@ -21,7 +21,6 @@ from su3d_bench.core.types import (
     DenseFeatures,
     Float32Array,
     Float64Array,
-    Instances,
     Int32Array,
     Int64Array,
     Prediction,
@@ -29,6 +28,7 @@ from su3d_bench.core.types import (
 )
 from su3d_bench.metrics.matching.nearest import nearest, row_ids
 from su3d_bench.numerics.geometry import voxel_coordinates
+from su3d_bench.reports.pictures.maps import map_cloud
 
 LEAST_SPACING_M = 0.015  # of the drawn points; a finer one shows nothing more on a screen
 COARSER = 1.15  # from one spacing that is tried to the next
@@ -86,13 +86,7 @@ def point_owners(prediction: Prediction, rows: Int64Array) -> Int32Array:
     """
     if isinstance(prediction, DenseFeatures):
         return np.full(len(rows), -1, np.int32)
-    if not isinstance(prediction, Instances):
-        return prediction.instance[rows]
-    owner = np.full(len(prediction.points), -1, np.int32)
-    sizes = prediction.sizes
-    for k in np.argsort(-sizes, kind="stable"):
-        owner[prediction.mask(int(k))] = k
-    return owner[rows]
+    return map_cloud(prediction).owner[rows]
 
 
 def nearest_colours(points: Float32Array, seen: Float32Array, seen_rgb: UInt8Array) -> UInt8Array | None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -13,19 +12,17 @@ import numpy as np
 
 from su3d_bench.core.errors import printable
 from su3d_bench.core.types import BoolArray, Float64Array, Instances, UInt8Array
-from su3d_bench.reports.pictures.maps import DRAWN_SPACING_M, NO_INSTANCE, Cloud, Colour, instance_colours, thinned
-from su3d_bench.reports.pictures.render import OVERSAMPLING, Camera, View, colour, render, room_bounds, view_cameras
-from su3d_bench.reports.pictures.scene import drawable
-from su3d_bench.store.atomic import make_folder, write_bytes
+from su3d_bench.reports.pictures.canvas import DARK, GREY, Canvas, drawable, hex_of
+from su3d_bench.reports.pictures.maps import NO_INSTANCE, SQUARE_M, Cloud, Colour, instance_colours, map_cloud, thinned
+from su3d_bench.reports.pictures.render import Camera, View, colour, project, render, room_bounds, view_cameras
 
-DPI, PANEL_WIDTH, PANEL_HEIGHT, MARGIN = 100, 760, 640, 14
+PANEL_WIDTH, PANEL_HEIGHT, MARGIN = 760, 640, 14
 LINE_HEIGHT, CHARACTERS_A_LINE, MOST_LINES = 22, 165, 5
 ANSWER, REFERENCE = (222, 74, 22), (32, 98, 196)
 MOST_LABELS, LABEL_HEIGHT = 14, 20
 MOST_CHARACTERS = 40  # of a label
 FEW = 4  # more boxes than these are drawn with thin lines
 PALE = 0.22  # how much of its colour an object keeps that is not spoken of
-DARK, GREY = "#222222", "#666666"
 # The corners of a box, bit i for axis i, that its twelve edges join.
 EDGES = tuple((a, a | 1 << axis) for a in range(8) for axis in range(3) if not a >> axis & 1)
 
@@ -49,47 +46,25 @@ def draw_reasoning(
     instances: Instances, spoken_of: SpokenOf, names: Sequence[str], path: Path, question: str, lines: Sequence[str]
 ) -> None:
     """Write the picture of an answer: ``names`` label the instances, ``lines`` stand under the ``question``."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     names = [drawable(printable(name, MOST_CHARACTERS)) for name in names]
     written = [part for line in lines for part in textwrap.wrap(printable(line), CHARACTERS_A_LINE)][:MOST_LINES]
     header = 52 + LINE_HEIGHT * len(written)
     width, height = 2 * PANEL_WIDTH + 3 * MARGIN, header + PANEL_HEIGHT + MARGIN
-    figure = Figure(figsize=(width / DPI, height / DPI), dpi=DPI, facecolor="white")
-    FigureCanvasAgg(figure)
-    _write(figure, MARGIN / width, 1 - 14 / height, printable(question, 110), 15, DARK, weight="bold")
+    page = Canvas(width, height)
+    page.text(MARGIN, 14, printable(question, 110), 15, weight="bold")
     for k, line in enumerate(written):
-        _write(figure, MARGIN / width, 1 - (46 + LINE_HEIGHT * k) / height, line, 11, DARK if k == 0 else GREY)
-    cloud = thinned(_cloud(instances))
+        page.text(MARGIN, 46 + LINE_HEIGHT * k, line, 11, colour=DARK if k == 0 else GREY)
+    cloud = thinned(map_cloud(instances))
     palette = _palette(names, spoken_of)
     for column, (camera, view, title) in enumerate(_two_views(cloud, spoken_of)):
         left = MARGIN + column * (PANEL_WIDTH + MARGIN)
-        box = (left / width, MARGIN / height, PANEL_WIDTH / width, PANEL_HEIGHT / height)
-        axes = figure.add_axes(box)
-        axes.set_axis_off()
+        axes = page.axes(left, header, PANEL_WIDTH, PANEL_HEIGHT)
         axes.imshow(colour(view, palette[cloud.owner]), interpolation="nearest", aspect="auto")
         axes.set_xlim(-0.5, PANEL_WIDTH - 0.5)
         axes.set_ylim(PANEL_HEIGHT - 0.5, -0.5)
         _draw_spoken_of(axes, camera, instances, spoken_of, names)
         axes.text(10, PANEL_HEIGHT - 10, title, fontsize=10, color=GREY, va="bottom")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
-    make_folder(path.parent)
-    write_bytes(path, buffer.getvalue())
-
-
-def _write(figure: Any, x: float, y: float, text: str, size: float, shade: str, **more: Any) -> None:
-    figure.text(x, y, drawable(text), fontsize=size, color=shade, va="top", parse_math=False, **more)
-
-
-def _cloud(instances: Instances) -> Cloud:
-    """Of masks that overlap, the smaller one is seen."""
-    owner = np.full(len(instances.points), -1, np.int32)
-    sizes = instances.sizes
-    for k in np.argsort(-sizes, kind="stable"):
-        owner[instances.mask(int(k))] = k
-    return Cloud(instances.points, owner)
+    page.write(path)
 
 
 def _palette(names: Sequence[str], spoken_of: SpokenOf) -> UInt8Array:
@@ -103,9 +78,8 @@ def _palette(names: Sequence[str], spoken_of: SpokenOf) -> UInt8Array:
 
 def _two_views(cloud: Cloud, spoken_of: SpokenOf) -> list[tuple[Camera, View, str]]:
     """The view from above, and that from the corner where most of what is spoken of is seen."""
-    spacing = 2.6 * DRAWN_SPACING_M  # as pictures.py draws surfaces without gaps
     cameras = view_cameras(room_bounds(cloud.points), PANEL_WIDTH, PANEL_HEIGHT)
-    above, *corners = [(camera, render(cloud.points, spacing, camera)) for camera in cameras]
+    above, *corners = [(camera, render(cloud.points, SQUARE_M, camera)) for camera in cameras]
     wanted = np.isin(cloud.owner, spoken_of.rows)
     camera, view = max(corners, key=lambda pair: _n_seen(pair[1], wanted))
     return [(*above, "from above"), (camera, view, "from the corner that shows most of it")]
@@ -113,16 +87,6 @@ def _two_views(cloud: Cloud, spoken_of: SpokenOf) -> list[tuple[Camera, View, st
 
 def _n_seen(view: View, wanted: BoolArray) -> int:
     return int(wanted[view.point[view.point >= 0]].sum())
-
-
-def project(camera: Camera, points: Float64Array) -> Float64Array:
-    """Columns and rows (N, 2) in the picture of ``camera``; NaN for what lies behind it."""
-    relative = (points - camera.eye) @ camera.rotation.T
-    depth = np.where(relative[:, 2] > 0, relative[:, 2], np.nan)
-    scale = camera.focal / depth if camera.is_perspective else np.full(len(points), camera.focal)
-    middle = np.array([camera.width, camera.height]) / 2
-    pixels: Float64Array = (relative[:, :2] * scale[:, None] + middle) / OVERSAMPLING
-    return pixels
 
 
 def _draw_spoken_of(axes: Any, camera: Camera, instances: Instances, spoken_of: SpokenOf, names: Sequence[str]) -> None:
@@ -142,7 +106,7 @@ def _draw_spoken_of(axes: Any, camera: Camera, instances: Instances, spoken_of: 
         {"linewidth": 1.4, "path_effects": halo} if len(spoken_of.rows) <= FEW else {"linewidth": 0.9}
     )
     for row in spoken_of.rows[:MOST_LABELS]:
-        shade = "#{:02x}{:02x}{:02x}".format(*spoken_of.colour(row))
+        shade = hex_of(spoken_of.colour(row))
         low, high = instances.boxes[row].astype(np.float64)
         corners = np.array([[high[i] if k >> i & 1 else low[i] for i in range(3)] for k in range(8)])
         pixels = project(camera, corners)

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.reports.pictures.canvas import write_figure
 from su3d_bench.reports.tables.attribution import n_text
 from su3d_bench.reports.tables.model import signed
-from su3d_bench.store.atomic import make_folder, write_bytes
 
 DPI = 100
 PANEL_WIDTH, ROW_HEIGHT, PANEL_EXTRA = 4.6, 0.34, 1.25  # inches
@@ -37,10 +36,7 @@ def draw_attribution(attribution: Mapping[str, Any], path: Path) -> None:
         for column, name in enumerate(one["values"]):
             _draw_panel(figure.add_subplot(grid[row, column]), one, name, has_names=column == 0)
     figure.tight_layout(rect=(0, 0, 1, 0.98))
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
-    make_folder(path.parent)
-    write_bytes(path, buffer.getvalue())
+    write_figure(figure, path)
 
 
 Bar = tuple[str, float, str, str]  # name, length, style, what stands beside it

@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import io
 import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.types import UInt8Array
+from su3d_bench.reports.pictures.canvas import Canvas, drawable, figure_bytes, hex_of
 from su3d_bench.reports.pictures.items import Tag
-from su3d_bench.reports.pictures.scene import drawable
 from su3d_bench.store.atomic import make_folder, write_bytes
 
 FORMATS = ("pdf", "png", "svg")
@@ -22,7 +20,7 @@ DPI = 200  # of pictures within the figure
 CAPTION_IN, CAPTION_LINE, CAPTION_LINES = 0.13, 47, 3  # height of a line, its characters, how many of them
 MOST_ROW_TITLE, MOST_TAGS = 110, 40
 FEW_TAGS, AWAY = 6, 0.11  # so few names stand beside what they name, this share of the height away
-DARK, GREY = "#1a1a1a", "#606060"
+INK, GREY = "#1a1a1a", "#606060"
 
 
 @dataclass(frozen=True)
@@ -60,9 +58,6 @@ def draw_grid(path: Path, columns: Sequence[str], rows: Sequence[GridRow], scale
 
 
 def _figure_bytes(suffix: str, columns: Sequence[str], rows: Sequence[GridRow], scale: UInt8Array | None) -> bytes:
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     aspect = max(cell.picture.shape[0] / cell.picture.shape[1] for row in rows for cell in row.cells)
     cell_height = CELL_WIDTH_IN * aspect
     width = len(columns) * (CELL_WIDTH_IN + GAP_IN) + GAP_IN
@@ -71,9 +66,7 @@ def _figure_bytes(suffix: str, columns: Sequence[str], rows: Sequence[GridRow], 
     for lines in captions:
         tops.append(tops[-1] + ROW_IN + cell_height + CAPTION_IN * max(map(len, lines), default=0) + GAP_IN)
     height = tops[-1] + (LEGEND_IN if scale is not None else 0.1)
-    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
-    FigureCanvasAgg(figure)
-    page = _Page(figure, width, height)
+    page = _Page(width, height, per_inch=1, dpi=DPI)
     for c, title in enumerate(columns):
         left = GAP_IN + c * (CELL_WIDTH_IN + GAP_IN)
         page.text(
@@ -81,13 +74,14 @@ def _figure_bytes(suffix: str, columns: Sequence[str], rows: Sequence[GridRow], 
             0.06,
             textwrap.shorten(printable(title, 60), 34, placeholder="..."),
             9,
+            colour=INK,
             ha="center",
         )
     for r, row in enumerate(rows):
         top = tops[r]
         room = int(width * 13)
         title = printable(row.title, min(MOST_ROW_TITLE, room))
-        page.text(GAP_IN, top + 0.03, title, 8.5, weight="bold")
+        page.text(GAP_IN, top + 0.03, title, 8.5, colour=INK, weight="bold")
         if len(title) + len(row.note) < room:
             page.text(width - GAP_IN, top + 0.04, printable(row.note, 60), 7, colour=GREY, ha="right")
         for c, cell in enumerate(row.cells):
@@ -97,10 +91,7 @@ def _figure_bytes(suffix: str, columns: Sequence[str], rows: Sequence[GridRow], 
                 page.text(left, top + ROW_IN + cell_height + 0.02 + CAPTION_IN * k, line, 6.5, colour=GREY)
     if scale is not None:
         page.scale(height - LEGEND_IN + 0.06, scale)
-    buffer = io.BytesIO()
-    metadata = {"pdf": {"CreationDate": None}, "svg": {"Date": None}, "png": {"Software": None}}[suffix]
-    figure.savefig(buffer, format=suffix, dpi=DPI, metadata=metadata)
-    return buffer.getvalue()
+    return figure_bytes(page.figure, suffix, DPI)
 
 
 def _caption_lines(row: GridRow) -> list[list[str]]:
@@ -116,21 +107,8 @@ def _covers(taken: Sequence[tuple[float, float, float]], x: float, row: float, h
     return any(abs(row - other[1]) < 0.045 and abs(x - other[0]) < half + other[2] for other in taken)
 
 
-class _Page:
-    """A figure measured in inches from its upper left corner."""
-
-    def __init__(self, figure: Any, width: float, height: float) -> None:
-        self.figure, self.width, self.height = figure, width, height
-
-    def text(self, x: float, y: float, text: str, size: float, *, colour: str = DARK, **more: Any) -> None:
-        place = (x / self.width, 1 - y / self.height)
-        self.figure.text(*place, drawable(text), fontsize=size, color=colour, va="top", parse_math=False, **more)
-
-    def axes(self, x: float, y: float, width: float, height: float) -> Any:
-        box = (x / self.width, 1 - (y + height) / self.height, width / self.width, height / self.height)
-        axes = self.figure.add_axes(box)
-        axes.set_axis_off()
-        return axes
+class _Page(Canvas):
+    """A figure of a paper, measured in inches."""
 
     def cell(self, x: float, y: float, cell_height: float, cell: Cell) -> None:
         axes = self.axes(x, y, CELL_WIDTH_IN, cell_height)
@@ -147,7 +125,7 @@ class _Page:
             if _covers(taken, tag.x, row, half):
                 continue  # a name that covers another tells nothing
             taken.append((tag.x, row, half))
-            shade = "#{:02x}{:02x}{:02x}".format(*tag.colour)
+            shade = hex_of(tag.colour)
             if is_beside:
                 places = [tag.x * width] * 2, [tag.y * height, row * height]
                 axes.plot(*places, color=shade, linewidth=0.7, marker="o", markersize=1.4, markevery=[0])
@@ -159,7 +137,7 @@ class _Page:
                 "linewidth": 0.5,
             }
             axes.text(
-                tag.x * width, row * height, text, fontsize=4.6, color=DARK, ha="center", va="center", bbox=box,
+                tag.x * width, row * height, text, fontsize=4.6, color=INK, ha="center", va="center", bbox=box,
                 parse_math=False, clip_on=True,
             )  # fmt: skip
         axes.set_xlim(-0.5, width - 0.5)

@@ -17,6 +17,7 @@ import numpy as np
 from su3d_bench.core.errors import printable
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, UInt8Array
 from su3d_bench.numerics.geometry import back_project, valid_depth
+from su3d_bench.reports.pictures.canvas import drawable
 
 WIDTH, MARGIN, CAPTION = 960, 10, 24
 PHOTO_WIDTH, ZOOM_WIDTH = 560, 370
@@ -239,8 +240,6 @@ def _title_lines(title: tuple[str, ...]) -> list[tuple[str, int]]:
 
 
 def _write(draw: Any, at: tuple[int, int], text: str, size: int, shade: tuple[int, ...], is_bold: bool = False) -> None:
-    from su3d_bench.reports.pictures.scene import drawable
-
     draw.text(at, drawable(text), font=_font(size, is_bold), fill=shade)
 
 

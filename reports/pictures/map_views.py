@@ -8,10 +8,18 @@ from functools import cached_property
 
 import numpy as np
 
-from su3d_bench.core.types import BoolArray, Float64Array, Instances, Int32Array, UInt8Array
-from su3d_bench.reports.pictures.answers import project
-from su3d_bench.reports.pictures.maps import DRAWN_SPACING_M, NO_INSTANCE, Cloud, thinned
-from su3d_bench.reports.pictures.render import OVERSAMPLING, Camera, View, colour, render, room_bounds, view_cameras
+from su3d_bench.core.types import BoolArray, Float64Array, Instances, Int32Array, Int64Array, UInt8Array
+from su3d_bench.reports.pictures.maps import NO_INSTANCE, SQUARE_M, map_cloud, thinned_rows
+from su3d_bench.reports.pictures.render import (
+    OVERSAMPLING,
+    Camera,
+    View,
+    colour,
+    project,
+    render,
+    room_bounds,
+    view_cameras,
+)
 
 PALE_GREY = 232
 RENDERED = 1.5  # times the size of the picture, for the room fills only a part of a view from a corner
@@ -54,7 +62,7 @@ class DrawnMap:
     """A map thinned for drawing: ``rows`` of its points that are drawn, ``owner`` the smallest instance of each."""
 
     instances: Instances
-    rows: Int32Array
+    rows: Int64Array
     owner: Int32Array
 
     def members(self, instance_rows: Sequence[int]) -> BoolArray:
@@ -66,8 +74,7 @@ class DrawnMap:
         return members
 
     def view(self, camera: Camera) -> MapView:
-        # 2.6: no gaps in a surface whose points lie up to two cells apart, as pictures.py draws it
-        view = render(self.instances.points[self.rows], 2.6 * DRAWN_SPACING_M, camera)
+        view = render(self.instances.points[self.rows], SQUARE_M, camera)
         return MapView(camera, view, _filled_part(view, camera.width / camera.height))
 
     def cameras(self, width: int, height: int) -> tuple[Camera, Camera, Camera]:
@@ -86,12 +93,8 @@ class DrawnMap:
 
 def drawn_map(instances: Instances) -> DrawnMap:
     """The map of ``instances`` thinned to what a picture shows; of masks that overlap, the smaller one is seen."""
-    owner = np.full(len(instances.points), -1, np.int32)
-    sizes = instances.sizes
-    for k in np.argsort(-sizes, kind="stable"):
-        owner[instances.mask(int(k))] = k
-    rows = thinned(Cloud(instances.points, np.arange(len(instances.points), dtype=np.int32))).owner
-    return DrawnMap(instances, rows, owner[rows])
+    rows = thinned_rows(instances.points)
+    return DrawnMap(instances, rows, map_cloud(instances).owner[rows])
 
 
 def _filled_part(view: View, aspect: float) -> tuple[int, int, int, int]:

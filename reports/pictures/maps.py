@@ -6,6 +6,7 @@ import colorsys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 
@@ -16,15 +17,19 @@ from su3d_bench.core.types import (
     GroundTruth,
     Instances,
     Int32Array,
+    Int64Array,
     Prediction,
     UInt8Array,
 )
 from su3d_bench.numerics.geometry import voxel_coordinates
+from su3d_bench.reports.pictures.canvas import Canvas, hex_of
 from su3d_bench.reports.pictures.render import Camera, View, colour, render, room_bounds, view_cameras
-from su3d_bench.store.atomic import make_folder, write_bytes
+from su3d_bench.store.atomic import make_folder
 
 VIEW_WIDTH, VIEW_HEIGHT = 640, 560
 DRAWN_SPACING_M = 0.015  # one point a cell of this size is drawn
+SQUARE_M = 2.6 * DRAWN_SPACING_M  # no gaps in a surface whose points lie up to two cells apart
+PALE = "#555555"
 NO_INSTANCE = (214, 214, 210)
 # Surfaces of the room stay pale, so that the things in it stand out.
 ROOM_SURFACES = {"wall": (226, 222, 214), "floor": (208, 203, 196), "ceiling": (236, 236, 232)}
@@ -36,6 +41,9 @@ HEAT_STOPS = np.array(
 )
 
 Colour = tuple[int, int, int]
+Scale = Literal["paper", "cividis"]
+SCALES: tuple[Scale, ...] = ("paper", "cividis")
+STEPS = 256
 
 
 @dataclass(frozen=True)
@@ -62,7 +70,7 @@ def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, 
     if isinstance(prediction, DenseFeatures) or len(prediction.points) == 0:
         return []
     make_folder(folder)
-    cloud = thinned(_cloud_of(prediction))
+    cloud = thinned(map_cloud(prediction))
     cameras = _cameras(cloud.points if truth is None else truth.points)
     views = _views(cloud, cameras)
     names = _names_of(prediction)
@@ -87,7 +95,7 @@ def draw_scene(prediction: Prediction, truth: GroundTruth | None, folder: Path, 
 def draw_heat_map(instances: Instances, similarity: Float64Array, path: Path, title: str, top: Sequence[str]) -> None:
     """Write the picture of a query: each instance in the colour of its similarity; ``top`` are lines of the legend."""
     make_folder(path.parent)
-    cloud = thinned(_cloud_of(instances))
+    cloud = thinned(map_cloud(instances))
     colours = heat_colours(similarity)
     pictures = _paint(_views(cloud, _cameras(cloud.points)), cloud, colours)
     order = np.argsort(-similarity, kind="stable")[: len(top)]
@@ -98,11 +106,38 @@ def heat_colours(similarity: Float64Array) -> list[Colour]:
     """Dark blue for the least, dark red for the greatest of ``similarity``; all alike: the middle."""
     if len(similarity) == 0:
         return []
-    low, high = float(similarity.min()), float(similarity.max())
-    place = np.full(len(similarity), 0.5) if high == low else (similarity - low) / (high - low)
+    place = _places(similarity)
     stops = np.linspace(0.0, 1.0, len(HEAT_STOPS))
     channels = [np.rint(np.interp(place, stops, HEAT_STOPS[:, c])).astype(int) for c in range(3)]
     return [(int(r), int(g), int(b)) for r, g, b in zip(*channels, strict=True)]
+
+
+def _places(similarity: Float64Array) -> Float64Array:
+    """Where each value lies between the least and the greatest of them; all alike: in the middle."""
+    low, high = float(similarity.min()), float(similarity.max())
+    return np.full(len(similarity), 0.5) if high == low else (similarity - low) / (high - low)
+
+
+def scale_stops(scale: Scale) -> UInt8Array:
+    """The colours (256, 3) of a scale, the least similar first."""
+    if scale == "cividis":  # Nunez, Anderton, Renslow 2018
+        from matplotlib import colormaps
+
+        colours: UInt8Array = (colormaps["cividis"](np.arange(STEPS), bytes=True))[:, :3].astype(np.uint8)
+        return colours
+    return np.array(heat_colours(np.linspace(0.0, 1.0, STEPS)), np.uint8)
+
+
+def similarity_colours(similarity: Float64Array, scale: Scale = "paper") -> UInt8Array:
+    """A colour (K, 3) a value, from the least to the greatest of them; all alike: the middle.
+
+    >>> similarity_colours(np.array([0.2, 0.1, 0.3]))[1:].tolist()
+    [[0, 0, 128], [128, 0, 0]]
+    """
+    if len(similarity) == 0:
+        return np.zeros((0, 3), np.uint8)
+    colours: UInt8Array = scale_stops(scale)[np.rint(_places(similarity) * (STEPS - 1)).astype(np.int64)]
+    return colours
 
 
 def instance_colours(names: Sequence[str]) -> list[Colour]:
@@ -131,14 +166,13 @@ def _names_of(prediction: Prediction) -> tuple[str, ...]:
     return ("",) * len(prediction.features)
 
 
-def _cloud_of(prediction: Prediction) -> Cloud:
-    """Of masks that overlap, the smaller one is seen."""
+def map_cloud(prediction: Prediction) -> Cloud:
+    """The points of a map with their instances; of masks that overlap, the smaller one is seen."""
+    assert not isinstance(prediction, DenseFeatures)
     if not isinstance(prediction, Instances):
-        assert not isinstance(prediction, DenseFeatures)
         return Cloud(prediction.points, prediction.instance)
     owner = np.full(len(prediction.points), -1, np.int32)
-    sizes = prediction.sizes
-    for k in np.argsort(-sizes, kind="stable"):
+    for k in np.argsort(-prediction.sizes, kind="stable"):
         owner[prediction.mask(int(k))] = k
     return Cloud(prediction.points, owner)
 
@@ -153,14 +187,19 @@ def truth_owner(truth: GroundTruth) -> Int32Array:
 
 def thinned(cloud: Cloud) -> Cloud:
     """One point of each cell of ``DRAWN_SPACING_M``, which is all that a picture can show."""
-    cells = voxel_coordinates(cloud.points, DRAWN_SPACING_M)
+    rows = thinned_rows(cloud.points)
+    return Cloud(cloud.points[rows], cloud.owner[rows])
+
+
+def thinned_rows(points: Float32Array) -> Int64Array:
+    """The rows of ``points`` that are drawn."""
+    cells = voxel_coordinates(points, DRAWN_SPACING_M)
     if len(cells) == 0:
-        return cloud
+        return np.zeros(0, np.int64)
     cells -= cells.min(axis=0)
     extent = cells.max(axis=0) + 1
-    flat = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
-    _, first = np.unique(flat, return_index=True)
-    return Cloud(cloud.points[first], cloud.owner[first])
+    _, first = np.unique((cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2], return_index=True)
+    return first
 
 
 def _cameras(points: Float32Array) -> tuple[Camera, ...]:
@@ -168,8 +207,7 @@ def _cameras(points: Float32Array) -> tuple[Camera, ...]:
 
 
 def _views(cloud: Cloud, cameras: Sequence[Camera]) -> tuple[View, ...]:
-    spacing = 2.6 * DRAWN_SPACING_M  # no gaps in a surface whose points lie up to two cells apart
-    return tuple(render(cloud.points, spacing, camera) for camera in cameras)
+    return tuple(render(cloud.points, SQUARE_M, camera) for camera in cameras)
 
 
 def _paint(views: Sequence[View], cloud: Cloud, row_colours: Sequence[Colour]) -> tuple[UInt8Array, ...]:
@@ -188,34 +226,20 @@ def _by_size(cloud: Cloud, names: Sequence[str]) -> list[str]:
 
 def _write_picture(path: Path, title: str, rows: Sequence[Row], legend: Mapping[str, Colour]) -> None:
     """Compose views and legend into a PNG; a legend that is too long ends with how many it leaves out."""
-    import io
-
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    dpi, header, side = 100, 46, 250 if legend else 0
-    width, height = 3 * VIEW_WIDTH + side, len(rows) * VIEW_HEIGHT + header
-    figure = Figure(figsize=(width / dpi, height / dpi), dpi=dpi, facecolor="white")
-    FigureCanvasAgg(figure)
-    figure.text(14 / width, 1 - 16 / height, title, va="top", fontsize=14, fontweight="bold", color="#222222")
+    header, side = 46, 250 if legend else 0
+    page = Canvas(3 * VIEW_WIDTH + side, len(rows) * VIEW_HEIGHT + header)
+    page.text(14, 16, title, 14, fontweight="bold")
     for r, row in enumerate(rows):
-        bottom = (len(rows) - 1 - r) * VIEW_HEIGHT / height
         for c, picture in enumerate(row.pictures):
-            axes = figure.add_axes((c * VIEW_WIDTH / width, bottom, VIEW_WIDTH / width, VIEW_HEIGHT / height))
+            axes = page.axes(c * VIEW_WIDTH, header + r * VIEW_HEIGHT, VIEW_WIDTH, VIEW_HEIGHT)
             axes.imshow(picture, interpolation="nearest", aspect="auto")
-            axes.set_axis_off()
             label = f"{row.title} {VIEW_TITLES[c]}".strip()
-            axes.text(14, VIEW_HEIGHT - 14, label, fontsize=10, color="#555555", va="bottom")
-    entries = list(legend.items())[:LEGEND_ROWS]
-    for k, (name, rgb) in enumerate(entries):
-        y = 1 - (header + 22 * k + 12) / height
-        x = 3 * VIEW_WIDTH / width
-        figure.text((3 * VIEW_WIDTH + 8) / width, y, "\u25a0", color=[c / 255 for c in rgb], fontsize=15, va="center")
-        figure.text(x + 30 / width, y, name, fontsize=10, color="#222222", va="center")
-    if len(legend) > len(entries):
-        y = 1 - (header + 22 * len(entries) + 12) / height
-        rest = f"and {len(legend) - len(entries)} more"
-        figure.text((3 * VIEW_WIDTH + 30) / width, y, rest, fontsize=10, color="#555555", va="center")
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
-    write_bytes(path, buffer.getvalue())
+            axes.text(14, VIEW_HEIGHT - 14, label, fontsize=10, color=PALE, va="bottom")
+    left = 3 * VIEW_WIDTH
+    for k, (name, rgb) in enumerate(list(legend.items())[:LEGEND_ROWS]):
+        page.text(left + 8, header + 22 * k + 12, "\u25a0", 15, colour=hex_of(rgb), va="center")
+        page.text(left + 30, header + 22 * k + 12, name, 10, va="center")
+    if len(legend) > LEGEND_ROWS:
+        rest = f"and {len(legend) - LEGEND_ROWS} more"
+        page.text(left + 30, header + 22 * LEGEND_ROWS + 12, rest, 10, colour=PALE, va="center")
+    page.write(path)

@@ -121,6 +121,16 @@ def render(points: Float32Array, spacing_m: float, camera: Camera) -> View:
     return View(point, _shade(depth_image))
 
 
+def project(camera: Camera, points: Float64Array) -> Float64Array:
+    """Columns and rows (N, 2) in the picture of ``camera``; NaN for what lies behind it."""
+    relative = (points - camera.eye) @ camera.rotation.T
+    depth = np.where(relative[:, 2] > 0, relative[:, 2], np.nan)
+    scale = camera.focal / depth if camera.is_perspective else np.full(len(points), camera.focal)
+    middle = np.array([camera.width, camera.height]) / 2
+    pixels: Float64Array = (relative[:, :2] * scale[:, None] + middle) / OVERSAMPLING
+    return pixels
+
+
 def _spread(image: Float64Array, size: int) -> Float64Array:
     """The least value within a square of ``size`` pixels around each pixel."""
     from scipy.ndimage import minimum_filter

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,20 +10,19 @@ import numpy as np
 
 from su3d_bench.core.errors import printable
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, UInt8Array
+from su3d_bench.reports.pictures.canvas import DARK, GREY, Canvas, hex_of
 from su3d_bench.reports.pictures.maps import (
     NO_INSTANCE,
-    Cloud,
     Colour,
     class_colours,
     instance_colours,
-    thinned,
+    thinned_rows,
     truth_owner,
 )
-from su3d_bench.reports.pictures.render import OVERSAMPLING, Camera, colour, render, room_bounds, view_cameras
+from su3d_bench.reports.pictures.render import OVERSAMPLING, Camera, colour, project, render, room_bounds, view_cameras
 from su3d_bench.reports.pictures.scene_look import SceneLook
-from su3d_bench.store.atomic import make_folder, write_bytes
 
-WIDTH, DPI = 1920, 100
+WIDTH = 1920
 MARGIN, HEADER, CAPTION = 16, 76, 26
 PANEL_WIDTH, PANEL_HEIGHT = 536, 500
 LEGEND_WIDTH = WIDTH - 3 * PANEL_WIDTH - 5 * MARGIN
@@ -35,7 +33,6 @@ SEEN_WITHIN_M = 0.12  # a point of the truth has the colour of what a camera saw
 LEAST_DRAWN_M = 0.012
 UNSEEN = (214, 214, 210)
 SCALE_LENGTHS_M = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
-DARK, PALE = "#222222", "#666666"
 WALK, START, END = "#d6246e", "#1a9850", "#111111"
 # Walks outside the truth are drawn where they are, up to this far; farther ones would leave no room for the scene.
 MOST_BEYOND_M = 10.0
@@ -52,16 +49,11 @@ class Panel:
 
 def draw_scene_picture(look: SceneLook, path: Path) -> None:
     """Write the picture of ``look`` as a PNG of ``WIDTH`` pixels."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     frame_height = _frame_height(look)
     height = HEADER + CAPTION + PANEL_HEIGHT + 2 * (CAPTION + frame_height) + MARGIN
-    figure = Figure(figsize=(WIDTH / DPI, height / DPI), dpi=DPI, facecolor="white")
-    FigureCanvasAgg(figure)
-    page = _Page(figure, height)
+    page = Canvas(WIDTH, height)
     page.text(MARGIN, 14, _shortened(look.scene, 90), size=17, weight="bold")
-    page.text(MARGIN, 46, facts_line(look), size=11, colour=PALE)
+    page.text(MARGIN, 46, facts_line(look), size=11, colour=GREY)
     for column, panel in enumerate(_panels(look)):
         left = MARGIN + column * (PANEL_WIDTH + MARGIN)
         page.text(left, HEADER, panel.caption, size=11)
@@ -78,10 +70,7 @@ def draw_scene_picture(look: SceneLook, path: Path) -> None:
     else:
         _draw_reason(page, look.no_truth)
     _draw_frames(page, look, HEADER + CAPTION + PANEL_HEIGHT, frame_height)
-    buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
-    make_folder(path.parent)
-    write_bytes(path, buffer.getvalue())
+    page.write(path)
 
 
 def facts_line(look: SceneLook) -> str:
@@ -100,25 +89,6 @@ def facts_line(look: SceneLook) -> str:
     return " \u00b7 ".join(words)
 
 
-class _Page:
-    """A figure addressed in pixels from its top left corner."""
-
-    def __init__(self, figure: Any, height: int) -> None:
-        self.figure, self.height = figure, height
-
-    def text(self, x: float, y: float, text: str, size: float, colour: str = DARK, **more: Any) -> None:
-        place = x / WIDTH, 1 - y / self.height
-        style = {"va": "top", "fontsize": size, "color": colour, "parse_math": False} | more
-        self.figure.text(*place, drawable(printable(text)), **style)
-
-    def axes(self, x: float, y: float, width: float, height: float) -> Any:
-        """Axes without a frame at this place."""
-        box = (x / WIDTH, 1 - (y + height) / self.height, width / WIDTH, height / self.height)
-        axes = self.figure.add_axes(box)
-        axes.set_axis_off()
-        return axes
-
-
 def _panels(look: SceneLook) -> tuple[Panel, ...]:
     if look.truth is None:
         points = look.seen if len(look.seen) else look.poses[:, :3, 3].astype(np.float32)
@@ -132,7 +102,7 @@ def _panels(look: SceneLook) -> tuple[Panel, ...]:
             Panel("the same points, from one corner", pictures[1]),
             Panel("from the other corner", pictures[2]),
         )
-    rows = thinned(Cloud(look.truth.points, np.arange(len(look.truth.points), dtype=np.int32))).owner
+    rows = thinned_rows(look.truth.points)
     points, above = look.truth.points[rows], _camera_above(look, look.truth.points)
     view = render(points, _drawn_size(points), above)
     by_class, by_instance = _class_palette(look.truth)[rows], _instance_palette(look.truth)[rows]
@@ -204,39 +174,39 @@ def _classes(truth: GroundTruth) -> list[tuple[str, int, int]]:
     return [(truth.labels.names[row], int(n_objects[row]), int(n_points[row])) for row in order]
 
 
-def _draw_legend(page: _Page, truth: GroundTruth) -> None:
+def _draw_legend(page: Canvas, truth: GroundTruth) -> None:
     """The largest classes with their numbers of objects and points; the rest as a count."""
     left, top = 3 * PANEL_WIDTH + 4 * MARGIN, HEADER + CAPTION
     objects, points = left + LEGEND_WIDTH - 62, left + LEGEND_WIDTH
-    page.text(left, HEADER, "class", size=10, colour=PALE)
-    page.text(objects, HEADER, "objects", size=10, colour=PALE, ha="right")
-    page.text(points, HEADER, "points", size=10, colour=PALE, ha="right")
+    page.text(left, HEADER, "class", size=10, colour=GREY)
+    page.text(objects, HEADER, "objects", size=10, colour=GREY, ha="right")
+    page.text(points, HEADER, "points", size=10, colour=GREY, ha="right")
     classes = _classes(truth)
     palette: dict[str, Colour] = class_colours([name for name, _, _ in classes])
     for k, (name, n_objects, n_points) in enumerate(classes[:LEGEND_ROWS]):
         y = top + LEGEND_STEP * k + LEGEND_STEP / 2
-        page.text(left, y, "\u25a0", size=15, colour=_hex(palette[name]), va="center")
+        page.text(left, y, "\u25a0", size=15, colour=hex_of(palette[name]), va="center")
         page.text(left + 23, y, _shortened(name, 15), size=10, va="center")
         page.text(objects, y, f"{n_objects}", size=10, va="center", ha="right")
         page.text(points, y, _thousands(n_points), size=10, va="center", ha="right")
     if len(classes) > LEGEND_ROWS:
         y = top + LEGEND_STEP * LEGEND_ROWS + LEGEND_STEP / 2
-        page.text(left + 23, y, f"and {len(classes) - LEGEND_ROWS} more classes", size=10, colour=PALE, va="center")
+        page.text(left + 23, y, f"and {len(classes) - LEGEND_ROWS} more classes", size=10, colour=GREY, va="center")
 
 
-def _draw_reason(page: _Page, reason: str) -> None:
+def _draw_reason(page: Canvas, reason: str) -> None:
     import textwrap
 
     left = 3 * PANEL_WIDTH + 4 * MARGIN
     page.text(left, HEADER, "no ground truth", size=11)
     for k, line in enumerate(textwrap.wrap(printable(reason), 29)[:LEGEND_ROWS]):
-        page.text(left, HEADER + CAPTION + 18 * k, line, size=9, colour=PALE)
+        page.text(left, HEADER + CAPTION + 18 * k, line, size=9, colour=GREY)
 
 
 def _draw_walk(axes: Any, camera: Camera, poses: Float64Array) -> None:
     """The way of the cameras, short strokes where they look, start and end."""
-    x, y = _pixels(camera, poses[:, :3, 3])
-    ahead_x, ahead_y = _pixels(camera, poses[:, :3, 3] + 0.25 * poses[:, :3, 2])
+    x, y = project(camera, poses[:, :3, 3]).T
+    ahead_x, ahead_y = project(camera, poses[:, :3, 3] + 0.25 * poses[:, :3, 2]).T
     axes.plot(x, y, color="white", linewidth=4.0, solid_capstyle="round")
     axes.plot(np.stack([x, ahead_x]), np.stack([y, ahead_y]), color=WALK, linewidth=1.3)
     axes.plot(x, y, color=WALK, linewidth=2.0, solid_capstyle="round")
@@ -257,14 +227,6 @@ def _draw_walk(axes: Any, camera: Camera, poses: Float64Array) -> None:
         )
 
 
-def _pixels(camera: Camera, points: Float64Array) -> tuple[Float64Array, Float64Array]:
-    """Columns and rows in the picture of a camera that looks from above."""
-    relative = (points - camera.eye) @ camera.rotation.T * camera.focal
-    x: Float64Array = (relative[:, 0] + camera.width / 2) / OVERSAMPLING
-    y: Float64Array = (relative[:, 1] + camera.height / 2) / OVERSAMPLING
-    return x, y
-
-
 def _draw_scale(axes: Any, camera: Camera) -> None:
     """A bar of a round length in the lower left corner."""
     pixels_a_metre = camera.focal / OVERSAMPLING
@@ -281,7 +243,7 @@ def _frame_height(look: SceneLook) -> int:
     return int(np.clip(round((FRAME_WIDTH - 4) * height / width), 60, 420))
 
 
-def _draw_frames(page: _Page, look: SceneLook, top: int, height: int) -> None:
+def _draw_frames(page: Canvas, look: SceneLook, top: int, height: int) -> None:
     """Colour above depth, the scale of depth at the right."""
     from matplotlib import colormaps
     from matplotlib.cm import ScalarMappable
@@ -305,22 +267,11 @@ def _draw_frames(page: _Page, look: SceneLook, top: int, height: int) -> None:
     bar.tick_params(labelsize=9)
 
 
-def drawable(text: str) -> str:
-    """``text`` with what the font cannot draw written as its escape."""
-    from matplotlib.font_manager import findfont, get_font
-
-    known = get_font(findfont("DejaVu Sans")).get_charmap()
-    return "".join(c if ord(c) in known else c.encode("unicode_escape").decode("ascii") for c in text)
-
-
-def _hex(rgb: Colour) -> str:
-    return "#{:02x}{:02x}{:02x}".format(*rgb)
-
-
 def _thousands(n: int) -> str:
     """A count in at most six characters."""
     return f"{n:,}" if n < 10_000 else f"{n / 1e3:.0f} k" if n < 1_000_000 else f"{n / 1e6:.1f} M"
 
 
 def _shortened(text: str, most: int) -> str:
+    text = printable(text)
     return text if len(text) <= most else text[: most - 1] + "\u2026"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,6 +12,7 @@ from su3d_bench.core.errors import printable
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.costs import MAP, UpdateTimes, pooled
 from su3d_bench.numerics.statistics import growth_exponent
+from su3d_bench.reports.pictures.canvas import figure_bytes
 from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.store.atomic import write_bytes
 
@@ -29,6 +29,7 @@ MAX_DRAWN = 2000  # points a method; more only make the file large
 N_SIZES = 10  # markers a method along the axis of sizes
 PANELS_A_ROW, LEGEND_COLUMNS = 3, 3
 LETTERS_AN_INCH = 15  # of a legend's type
+DPI = 150
 MIB = 2**20
 POINTS, UPDATES = "points of the map", "updates so far"
 
@@ -73,19 +74,12 @@ def _style(index: int) -> dict[str, Any]:
 
 def draw_update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, kind: str) -> bytes:
     """The cost of an update against the points of the map, as a ``png`` or ``pdf`` file."""
-    return _rendered(_update_cost(times, warm_up, POINTS), kind)
+    return figure_bytes(_update_cost(times, warm_up, POINTS), kind, DPI)
 
 
 def _save(figure: Figure, path: Path) -> Path:
-    write_bytes(path, _rendered(figure, path.suffix[1:]))
+    write_bytes(path, figure_bytes(figure, path.suffix[1:], DPI))
     return path
-
-
-def _rendered(figure: Figure, kind: str) -> bytes:
-    buffer = io.BytesIO()
-    # Without dates, so that one run gives one file.
-    figure.savefig(buffer, format=kind, dpi=150, metadata={"CreationDate": None} if kind == "pdf" else None)
-    return buffer.getvalue()
 
 
 def _label(times: Sequence[UpdateTimes], several_runs: bool) -> str:

@@ -11,7 +11,6 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, Instances, UInt8Array
-from su3d_bench.reports.pictures.heat_scales import Scale, scale_stops, similarity_colours
 from su3d_bench.reports.pictures.items import (
     LOW_HEIGHT,
     PHOTO_WIDTH,
@@ -25,7 +24,7 @@ from su3d_bench.reports.pictures.items import (
     png_bytes,
 )
 from su3d_bench.reports.pictures.map_views import DrawnMap, MapView, drawn_map, pale
-from su3d_bench.reports.pictures.maps import instance_colours
+from su3d_bench.reports.pictures.maps import Scale, instance_colours, scale_stops, similarity_colours
 from su3d_bench.runs.executors.local import Event, Report, run_inline, run_processes
 from su3d_bench.runs.finished import read_run
 from su3d_bench.sheets.drafts import Draft

@@ -18,10 +18,9 @@ from su3d_bench.questions.reasoning.solver import Solver
 from su3d_bench.questions.refined_names import refined_names
 from su3d_bench.questions.retrieval import rank_all
 from su3d_bench.reports.pictures.figures import Cell, GridRow
-from su3d_bench.reports.pictures.heat_scales import Scale, similarity_colours
 from su3d_bench.reports.pictures.items import Tag, seen_in
 from su3d_bench.reports.pictures.map_views import DrawnMap, MapView, drawn_map, pale
-from su3d_bench.reports.pictures.maps import ROOM_SURFACES, class_colours
+from su3d_bench.reports.pictures.maps import ROOM_SURFACES, Scale, class_colours, similarity_colours
 from su3d_bench.sheets.drawing import ANSWER_COLOUR, OTHER_COLOUR
 from su3d_bench.sheets.run_source import RunSource
 

@@ -20,7 +20,6 @@ from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.core.types import Frame
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.questions.model import new_question
-from su3d_bench.reports.pictures.heat_scales import SCALES, scale_stops, similarity_colours
 from su3d_bench.reports.pictures.items import (
     ItemParts,
     Panel,
@@ -32,6 +31,7 @@ from su3d_bench.reports.pictures.items import (
     zoomed,
 )
 from su3d_bench.runs import finished as finished_run
+from su3d_bench.reports.pictures.maps import SCALES, scale_stops, similarity_colours
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.executors.local import run_processes
 from su3d_bench.runs.finished import read_run

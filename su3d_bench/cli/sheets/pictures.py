@@ -39,7 +39,7 @@ def add_parser(actions: Any) -> None:
 
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.reports.pictures.figures import draw_grid
-    from su3d_bench.reports.pictures.heat_scales import scale_stops
+    from su3d_bench.reports.pictures.maps import scale_stops
     from su3d_bench.runs.finished import read_run
     from su3d_bench.sheets.figures import Figures
     from su3d_bench.sheets.run_source import RunSource
