@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -82,9 +83,7 @@ def _stage_data(one: StageSummary) -> dict[str, Any]:
 
 
 def _growth_data(growth: Growth | None) -> dict[str, Any] | None:
-    if growth is None:
-        return None
-    return {"exponent": growth.exponent, "low": growth.low, "high": growth.high, "words": growth.words}
+    return None if growth is None else {**asdict(growth), "words": growth.words}
 
 
 def _number(value: float | None) -> float | None:

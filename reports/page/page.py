@@ -27,25 +27,28 @@ TEMPLATE = "page.html.j2"
 
 def page_html(title: str, numbers: Mapping[str, Any], scenes: Sequence[Mapping[str, Any]], maps: Sequence[str]) -> str:
     """The page. ``numbers`` and ``scenes`` are plain values; ``maps`` are in base64, in the order of ``numbers``."""
+    script = "(() => {\n'use strict';\n" + "\n".join(_file(HERE / name) for name in SCRIPTS) + "\n})();\n"
+    return rendered(
+        HERE,
+        script,
+        title=title,
+        data=embedded_json(numbers),
+        scenes=[embedded_json(scene) for scene in scenes],
+        maps=maps,
+    )
+
+
+def rendered(folder: Path, script: str, **values: Any) -> str:
+    """The template of ``folder`` with its style: nothing loads, goes out or runs but what stands in it, by digest."""
     from jinja2 import Environment
 
-    style = _file(STYLE)
-    script = "(() => {\n'use strict';\n" + "\n".join(_file(name) for name in SCRIPTS) + "\n})();\n"
-    # Nothing is loaded, sent or run but what stands in the page itself, by its digest.
+    style = _file(folder / STYLE)
     policy = (
         f"default-src 'none'; script-src '{_digest(script)}'; style-src '{_digest(style)}'; img-src data:; "
         "base-uri 'none'; form-action 'none'"
     )
-    template = Environment(autoescape=True, keep_trailing_newline=True).from_string(_file(TEMPLATE))
-    return template.render(
-        policy=policy,
-        title=title,
-        style=style,
-        script=script,
-        data=embedded_json(numbers),
-        scenes=[embedded_json(one) for one in scenes],
-        maps=maps,
-    )
+    template = Environment(autoescape=True, keep_trailing_newline=True).from_string(_file(folder / TEMPLATE))
+    return template.render(policy=policy, style=style, script=script, **values)
 
 
 def embedded_json(value: Any) -> str:
@@ -58,8 +61,8 @@ def embedded_json(value: Any) -> str:
     return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
 
 
-def _file(name: str) -> str:
-    return (HERE / name).read_text(encoding="utf-8")
+def _file(path: Path) -> str:
+    return path.read_text(encoding="utf-8")
 
 
 def _digest(text: str) -> str:

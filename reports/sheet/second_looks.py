@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import csv
 import html
-import io
 from collections.abc import Mapping, Sequence
 from typing import Any
 from urllib.parse import quote
 
 from su3d_bench.core.errors import printable
-from su3d_bench.reports.tables.formats import harmless
+from su3d_bench.reports.tables.formats import csv_lines, harmless
 
 COLUMNS = ("item_id", "question", "reason", "answers", "truth", "scene", "methods", "text", "pictures")
 STYLE = (
@@ -24,14 +22,12 @@ POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src 'self' file:"
 
 def second_looks_csv(looks: Sequence[Mapping[str, Any]]) -> str:
     """One line an item and question."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow(COLUMNS)
+    rows: list[Sequence[Any]] = [COLUMNS]
     for one in looks:
         row = [one["item_id"], one["ask"], one["reason"], _answers(one), one["automatic"], one["scene"]]
         row += [", ".join(one["methods"]), one["text"], ", ".join(one["pictures"])]
-        writer.writerow([harmless(cell) for cell in row])
-    return text.getvalue()
+        rows.append([harmless(cell) for cell in row])
+    return csv_lines(rows)
 
 
 def second_looks_page(looks: Sequence[Mapping[str, Any]], pictures: str, sheet_id: str) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import html
 import io
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from su3d_bench.core.errors import printable
 from su3d_bench.reports.tables.latex import latex
@@ -103,6 +103,13 @@ def csv_text(parts: Sequence[Table | Prose]) -> str:
                 writer.writerow({key: harmless(value) for key, value in values.items()})
         for note in table.notes:
             writer.writerow({"table": harmless(table.name), "kind": "note", "text": harmless(note)})
+    return text.getvalue()
+
+
+def csv_lines(rows: Iterable[Iterable[object]]) -> str:
+    """Rows of cells as CSV."""
+    text = io.StringIO()
+    csv.writer(text, lineterminator="\n").writerows(rows)
     return text.getvalue()
 
 

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 from su3d_bench.core.errors import counted
 from su3d_bench.metrics.costs import MethodSummary, StageSummary
 from su3d_bench.numerics.statistics import Growth
+from su3d_bench.reports.tables.formats import csv_lines
 from su3d_bench.reports.tables.model import NOT_MEASURED, Prose, Table, percent, text_table
 
 MIB = 2**20
@@ -53,32 +53,28 @@ def timing_tables(
 
 def csv_text(summaries: Sequence[MethodSummary], hardware: Mapping[str, str]) -> str:
     """One row a run, method and stage, in full precision."""
-    text = io.StringIO()
     growth = [f"{name}_{part}" for name in ("points", "frames") for part in ("exponent", "low", "high", "words")]
     head = ["run", "hardware", "method", "n_scenes", "stage", "n", "first_ms", "p50_ms", "p95_ms", "max_ms", "share"]
-    writer = csv.writer(text, lineterminator="\n")
-    writer.writerow([*head, *growth])
+    rows: list[list[Any]] = [[*head, *growth]]
     for one in summaries:
         for stage in one.stages:
             numbers = [stage.n, stage.first, stage.p50, stage.p95, stage.worst, stage.share]
             grown = [cell for each in (stage.against_points, stage.against_frames) for cell in _growth_cells(each)]
             scenes = len(one.scenes)
-            writer.writerow([one.run, hardware[one.run], one.method, scenes, stage.name, *numbers, *grown])
-    return text.getvalue()
+            rows.append([one.run, hardware[one.run], one.method, scenes, stage.name, *numbers, *grown])
+    return csv_lines(rows)
 
 
 def methods_csv(summaries: Sequence[MethodSummary], hardware: Mapping[str, str], camera_rate: float) -> str:
     """One row a run and method, in full precision: speed, the map, memory."""
-    text = io.StringIO()
-    writer = csv.writer(text, lineterminator="\n")
     speeds = ("updates_per_s", "frames_per_s", "camera_rate", "real_time_factor")
     sizes = ("finish_ms", "n_points", "map_bytes", "peak_rss_bytes", "device_bytes")
-    writer.writerow(["run", "hardware", "method", "n_scenes", "n_updates", *speeds, *sizes])
+    rows: list[list[Any]] = [["run", "hardware", "method", "n_scenes", "n_updates", *speeds, *sizes]]
     for one in summaries:
         speed = [one.updates_per_s, one.frames_per_s, camera_rate, one.frames_per_s / camera_rate]
         values = [getattr(one, name) for name in sizes]
-        writer.writerow([one.run, hardware[one.run], one.method, len(one.scenes), one.n_updates, *speed, *values])
-    return text.getvalue()
+        rows.append([one.run, hardware[one.run], one.method, len(one.scenes), one.n_updates, *speed, *values])
+    return csv_lines(rows)
 
 
 def _growth_cells(growth: Growth | None) -> list[float | str]:

@@ -15,6 +15,8 @@ from su3d_bench.core.errors import EXIT_DONE
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
 
 if TYPE_CHECKING:
+    from rich.progress import Progress, TaskID
+
     from su3d_bench.perception.language.chat import ChatRequest
     from su3d_bench.perception.language.client import ChatClient
     from su3d_bench.perception.language.config import LanguageConfig
@@ -199,31 +201,37 @@ def progress(n_scenes: int, *, is_quiet: bool, last_step: str = "scoring") -> It
 
     ``last_step`` is what a scene does after its last frame.
     """
+    with drawn_bars(is_quiet=is_quiet) as bars:
+        yield _Board(bars, n_scenes, last_step).report if bars is not None else lambda event: None
+
+
+@contextmanager
+def drawn_bars(*, is_quiet: bool, tells_time_left: bool = False) -> Iterator[Progress | None]:
+    """Bars on stderr while the block runs, each with a field ``remark``; None where stderr is no terminal."""
     if is_quiet or not sys.stderr.isatty():
-        yield lambda event: None
+        yield None
         return
     from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[remark]}"),
-        TimeElapsedColumn(),
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
     )
+
+    remarks = TextColumn("{task.fields[remark]}")
+    time = TimeRemainingColumn() if tells_time_left else TimeElapsedColumn()
+    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), remarks, time)
     with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
-        board = _Board(bars, n_scenes, last_step)
-        yield board.report
+        yield bars
 
 
 class _Board:
     """Turns events into bars: one for all scenes, one for the current method of each scene under way."""
 
-    def __init__(self, bars: object, n_scenes: int, last_step: str) -> None:
-        from rich.progress import Progress, TaskID
-
-        assert isinstance(bars, Progress)
+    def __init__(self, bars: Progress, n_scenes: int, last_step: str) -> None:
         self._bars = bars
         self._last_step = last_step
         self._scenes = bars.add_task("scenes", total=n_scenes, remark="")
@@ -245,9 +253,7 @@ class _Board:
             self._bars.update(task, description=f"  {event.unit} {event.label}: {self._last_step}")
 
     def _remark(self, event: Event) -> str:
-        speed = self._bars.tasks[0].speed
-        for task in self._bars.tasks:
-            if task.id == self._tasks[event.unit, event.label]:
-                speed = task.speed
+        own = self._tasks[event.unit, event.label]
+        speed = next(task.speed for task in self._bars.tasks if task.id == own)
         rate = f"{speed:.1f} frames/s" if speed else ""
         return rate if event.n_instances is None else f"{rate} {event.n_instances} instances"

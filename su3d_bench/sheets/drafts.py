@@ -31,9 +31,8 @@ from su3d_bench.questions.reasoning.answers import Answer, unsettled
 from su3d_bench.questions.reasoning.judging import said_value
 from su3d_bench.questions.reasoning.language_solver import LanguageSolver
 from su3d_bench.questions.reasoning.named_objects import nearest_by
-from su3d_bench.questions.reasoning.scene_map import SceneMap, map_of
+from su3d_bench.questions.reasoning.scene_map import SceneMap
 from su3d_bench.questions.reasoning.solver import Solver
-from su3d_bench.questions.refined_names import refined_names
 from su3d_bench.questions.retrieval import rank_all
 from su3d_bench.questions.truths import own_questions, question_truth
 from su3d_bench.sheets.items import RIGHT, WRONG, SheetKind
@@ -140,9 +139,8 @@ def annotation_drafts(source: RunSource, scene: str, n_most: int, random: np.ran
     found: dict[bytes, Draft] = {}
     for method in source.methods:
         instances = source.instances(scene, method)
-        refined = refined_names(source.run.folder.job(scene, method), instances)
         judge = _annotation_judge(source, scene, rules, truth, instances)
-        labels = [labels_n(instances), None if refined is None else refined.names]
+        labels = [labels_n(instances), source.refined(scene, method)]
         for row in range(len(instances)):
             names = [printable(one[row], MOST_TEXT) or NO_LABEL for one in labels if one is not None]
             key = mask_digest(instances, [row]) + "\0".join(names).encode()
@@ -269,8 +267,7 @@ def reasoning_drafts(
     groups: dict[bytes, Draft] = {}
     for method in source.methods:
         instances = source.instances(scene, method)
-        refined = refined_names(source.run.folder.job(scene, method), instances)
-        a_map = map_of(instances, None if refined is None else refined.names)
+        a_map = source.scene_map(scene, method)
         covered = source.covered(scene, rules, instances) if known else None
         shown = _Shown(scene, method, instances, a_map)
         for place, (text, answer) in enumerate(zip(texts, ask(a_map, texts), strict=True)):

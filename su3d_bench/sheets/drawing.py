@@ -171,10 +171,22 @@ def _tags(draft: Draft, instances: Instances, view: MapView) -> tuple[Tag, ...]:
     if not draft.names:
         return ()
     rows = tuple(dict.fromkeys((*draft.rows, *draft.others)))
+    shades = [ANSWER_COLOUR if row in draft.rows else OTHER_COLOUR for row in rows]
+    return tags_of(instances, view, rows, [draft.names[row] for row in rows], shades)
+
+
+def tags_of(
+    instances: Instances,
+    view: MapView,
+    rows: Sequence[int],
+    names: Sequence[str],
+    shades: Sequence[tuple[int, int, int]],
+) -> tuple[Tag, ...]:
+    """A name at the middle of each of ``rows``, as far as it lies before the camera."""
     places = view.project(instances.centroids[list(rows)].astype(np.float64).reshape(-1, 3))
     return tuple(
-        Tag(draft.names[row], float(x), float(y), ANSWER_COLOUR if row in draft.rows else OTHER_COLOUR)
-        for row, (x, y) in zip(rows, places, strict=True)
+        Tag(name, float(x), float(y), shade)
+        for name, shade, (x, y) in zip(names, shades, places, strict=True)
         if np.isfinite([x, y]).all()
     )
 

@@ -12,16 +12,13 @@ from su3d_bench.core.errors import printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float64Array, Frame, Instances, UInt8Array
 from su3d_bench.metrics.questions.score import labels_n
-from su3d_bench.questions.reasoning.named_objects import nearest_by
-from su3d_bench.questions.reasoning.scene_map import map_of
-from su3d_bench.questions.reasoning.solver import Solver
-from su3d_bench.questions.refined_names import refined_names
 from su3d_bench.questions.retrieval import rank_all
 from su3d_bench.reports.pictures.figures import Cell, GridRow
 from su3d_bench.reports.pictures.items import Tag, seen_in
 from su3d_bench.reports.pictures.map_views import DrawnMap, MapView, drawn_map, pale
 from su3d_bench.reports.pictures.maps import ROOM_SURFACES, Scale, class_colours, similarity_colours
-from su3d_bench.sheets.drawing import ANSWER_COLOUR, OTHER_COLOUR
+from su3d_bench.sheets.drafts import built_in
+from su3d_bench.sheets.drawing import ANSWER_COLOUR, OTHER_COLOUR, tags_of
 from su3d_bench.sheets.run_source import RunSource
 
 Subject = Literal["similarity", "labels", "reasoning"]
@@ -73,9 +70,8 @@ class Figures:
             views = self._views(maps, [])
             cells: list[Cell] = []
             for method, shown, view in zip(self._source.methods, maps, views, strict=True):
-                refined = refined_names(self._source.run.folder.job(scene, method), shown.instances)
-                both: list[Labels] = [labels_n(shown.instances)]
-                both.append(both[0] if refined is None else refined.names)
+                own: Labels = labels_n(shown.instances)
+                both = [own, self._source.refined(scene, method) or own]
                 palette = class_colours(list(dict.fromkeys(name for names in both for name in names)))
                 for names in both:
                     colours = np.array([palette[name] for name in names], np.uint8).reshape(-1, 3)
@@ -91,9 +87,8 @@ class Figures:
             for question in questions:
                 cells, views = [], self._views(maps, [])
                 for k, (method, shown) in enumerate(zip(self._source.methods, maps, strict=True)):
-                    refined = refined_names(self._source.run.folder.job(scene, method), shown.instances)
-                    a_map = map_of(shown.instances, None if refined is None else refined.names)
-                    answer = Solver(a_map, None, None if encoder is None else nearest_by(encoder)).answer(question)
+                    a_map = self._source.scene_map(scene, method)
+                    answer = built_in(encoder)(a_map, [question])[0]
                     row_of = {one.id: one.row for one in a_map.objects}
                     rows_of = [[row_of[one] for one in ids] for ids in (answer.object_ids, answer.reference_ids)]
                     view = self._views([shown], [*rows_of[0], *rows_of[1]])[0]
@@ -153,16 +148,12 @@ def _name_tags(shown: DrawnMap, view: MapView, names: Labels, colours: UInt8Arra
     seen = set(shown.owner[view.view.point[view.view.point >= 0]].tolist())
     largest = [int(k) for k in np.argsort(-sizes, kind="stable") if int(k) in seen]
     rows = [k for k in largest if names[k] and names[k] not in ROOM_SURFACES]
-    shades = [tuple(int(v) for v in colours[row]) for row in rows]
+    shades = [(int(red), int(green), int(blue)) for red, green, blue in colours[rows]]
     return tuple(_tags_of(shown.instances, view, rows, [names[row] for row in rows], shades))
 
 
 def _tags_of(
-    instances: Instances, view: MapView, rows: Sequence[int], names: Labels, shades: Sequence[tuple[int, ...]]
+    instances: Instances, view: MapView, rows: Sequence[int], names: Labels, shades: Sequence[tuple[int, int, int]]
 ) -> list[Tag]:
-    places = view.project(instances.centroids[list(rows)].astype(np.float64).reshape(-1, 3))
-    return [
-        Tag(name, float(x), float(y), (shade[0], shade[1], shade[2]))
-        for name, shade, (x, y) in zip(names, shades, places, strict=True)
-        if np.isfinite([x, y]).all() and 0 < x < 1 and 0 < y < 1
-    ]
+    tags = tags_of(instances, view, rows, names, shades)
+    return [tag for tag in tags if 0 < tag.x < 1 and 0 < tag.y < 1]

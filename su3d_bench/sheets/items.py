@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, Protocol, TypeVar
 
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
@@ -215,7 +215,7 @@ def write_key(folder: Path, key: Key) -> Path:
 
 def read_sheet(path: Path) -> Sheet:
     """The set in a ``sheet.json``; a ``DataError`` where the file is not as ``sheets make`` writes it."""
-    sheet = _read(path, Sheet)
+    sheet = read_record(path, Sheet, SCHEMA, "sheets make", "make them again")
     where = printable(str(path), 200)
     known = [one.id for one in sheet.items]
     if len(set(known)) != len(known):
@@ -234,7 +234,7 @@ def read_sheet(path: Path) -> Sheet:
 
 def read_key(path: Path) -> Key:
     """The key in a ``key.json``; a ``DataError`` where the file is not as ``sheets make`` writes it."""
-    key = _read(path, Key)
+    key = read_record(path, Key, SCHEMA, "sheets make", "make them again")
     for one in key.items:
         if len(one.methods) != len(one.instance_ids):
             raise DataError(
@@ -244,22 +244,30 @@ def read_key(path: Path) -> Key:
     return key
 
 
-_Read = TypeVar("_Read", Sheet, Key)
+Read = TypeVar("Read", bound="_Versioned")
 
 
-def _read(path: Path, kind: type[_Read]) -> _Read:
+class _Versioned(Protocol):
+    """What a file holds says of which form it is."""
+
+    @property
+    def schema_version(self) -> int: ...
+
+
+def read_record(path: Path, kind: type[Read], schema: int, maker: str, again: str) -> Read:
+    """The value of a JSON file as the verb ``maker`` writes it; ``DataError`` where it is another."""
     where = printable(str(path), 200)
     try:
         if path.stat().st_size > MOST_BYTES:
-            raise DataError(f"{where}: has more than {MOST_BYTES >> 20} MiB; it is no file of su3d-bench sheets make")
+            raise DataError(f"{where}: has more than {MOST_BYTES >> 20} MiB; it is no file of su3d-bench {maker}")
         content = path.read_bytes()
     except OSError as error:
         raise DataError(f"{where}: cannot be read: {error.strerror}") from error
     try:
-        found = TypeAdapter(kind).validate_json(content)
+        found = TypeAdapter(kind).validate_json(content, strict=True)
     except ValidationError as error:
         place = printable(".".join(map(str, error.errors()[0]["loc"])), 120) or "it"
-        raise DataError(f"{where}: {place} is not as su3d-bench sheets make writes it; make them again") from error
-    if found.schema_version != SCHEMA:
-        raise DataError(f"{where}: has schema {found.schema_version}, this version reads {SCHEMA}; make them again")
+        raise DataError(f"{where}: {place} is not as su3d-bench {maker} writes it; {again}") from error
+    if found.schema_version != schema:
+        raise DataError(f"{where}: has schema {found.schema_version}, this version reads {schema}; {again}")
     return found

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import base64
-import csv
-import io
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +13,7 @@ import numpy as np
 from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.reports.sheet.page import page_html
+from su3d_bench.reports.tables.formats import FORMULA_STARTS, csv_lines
 from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import (
     ANSWER_COLUMNS,
@@ -36,7 +35,6 @@ from su3d_bench.store.atomic import make_folder, remove_file, write_bytes, write
 
 MOST_ANNOTATORS = 100
 PAGE, WORKBOOK, TABLE = "sheet.html", "sheet.xlsx", "sheet.csv"
-FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
 TITLES = {
     "retrieval": "Is the outlined object what is asked for?",
     "annotation": "Are the labels right, and is the mask one object?",
@@ -94,16 +92,7 @@ def make_sheets(
     shares = dealt([one.id for one in items], annotators, overlap, random)
     sheet = Sheet(set_id, kind, seed, ASKS[kind], items, shares)
     key_items = tuple(_key_item(ids[k], drafts[k]) for k in order)
-    key = Key(
-        set_id,
-        kind,
-        origin.run,
-        origin.run_digest,
-        origin.methods,
-        origin.automatic_rule,
-        key_items,
-        origin.answered_by,
-    )
+    key = Key(sheet_id=set_id, kind=kind, items=key_items, **asdict(origin))
     return MadeSheets(sheet, key, pictures)
 
 
@@ -180,10 +169,7 @@ def page_data(made: MadeSheets, share: AnnotatorShare) -> dict[str, Any]:
         "id": made.sheet.id,
         "annotator": share.name,
         "columns": list(ANSWER_COLUMNS),
-        "asks": [
-            {"name": one.name, "text": one.text, "choices": list(one.choices), "meanings": list(one.meanings)}
-            for one in made.sheet.asks
-        ],
+        "asks": [asdict(ask) for ask in made.sheet.asks],
         "items": [
             {
                 "id": one.id,
@@ -205,15 +191,13 @@ def items_of(sheet: Sheet, share: AnnotatorShare) -> list[SheetItem]:
 
 def table_csv(sheet: Sheet, share: AnnotatorShare) -> str:
     """The table of one annotator, answers to be filled in; text that a spreadsheet would compute begins with ``'``."""
-    text = io.StringIO(newline="")
-    rows = csv.writer(text, lineterminator="\n")
-    rows.writerow((*ANSWER_COLUMNS, "picture", "text", "asked", "choices"))
+    rows: list[tuple[str, ...]] = [(*ANSWER_COLUMNS, "picture", "text", "asked", "choices")]
     for item in items_of(sheet, share):
         for name in item.asks:
             ask = sheet.ask(name)
             told = (f"../{PICTURES}/{item.pictures[0]}", as_text(" / ".join(item.text.split("\n"))), ask.text)
-            rows.writerow((sheet.id, item.id, share.name, name, "", item.check, *told, " | ".join(ask.choices)))
-    return text.getvalue()
+            rows.append((sheet.id, item.id, share.name, name, "", item.check, *told, " | ".join(ask.choices)))
+    return csv_lines(rows)
 
 
 def as_text(text: str) -> str:

@@ -23,10 +23,21 @@ from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.instance.score import Covered, covered_objects
 from su3d_bench.metrics.protocol_files import protocol_names
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.questions.reasoning.scene_map import SceneMap, map_of
+from su3d_bench.questions.refined_names import refined_names
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.predictions import read_prediction
 
 MOST_FRAMES = 32  # of a scene, among which the best view of an object is looked for
+
+
+def _chosen(run: FinishedRun, what: str, wanted: Sequence[str], known: tuple[str, ...]) -> tuple[str, ...]:
+    """Those that are ``wanted``, which the run must have; all without any."""
+    for name in wanted:
+        if name not in known:
+            hint = suggest(name, known) or f"; it has {', '.join(known)}"
+            raise ConfigError(f"{run.name}: has no {what} '{printable(name, 80)}'{hint}")
+    return tuple(dict.fromkeys(wanted)) or known
 
 
 class RunSource:
@@ -34,16 +45,8 @@ class RunSource:
 
     def __init__(self, run: FinishedRun, methods: Sequence[str] = (), scenes: Sequence[str] = ()) -> None:
         self.run = run
-        self.methods = tuple(dict.fromkeys(methods)) or run.methods
-        for method in self.methods:
-            if method not in run.methods:
-                hint = suggest(method, run.methods) or f"; it has {', '.join(run.methods)}"
-                raise ConfigError(f"{run.name}: has no method '{printable(method, 80)}'{hint}")
-        self.scenes = tuple(dict.fromkeys(scenes)) or run.scenes
-        for scene in self.scenes:
-            if scene not in run.scenes:
-                hint = suggest(scene, run.scenes) or f"; it has {', '.join(run.scenes)}"
-                raise ConfigError(f"{run.name}: has no scene '{printable(scene, 80)}'{hint}")
+        self.methods = _chosen(run, "method", methods, run.methods)
+        self.scenes = _chosen(run, "scene", scenes, run.scenes)
         self.instances = lru_cache(maxsize=len(self.methods))(self._instances)
         self._covered: dict[tuple[str, str, bytes], Covered] = {}
         self._truths = lru_cache(maxsize=2)(self._read_truth)
@@ -74,6 +77,15 @@ class RunSource:
     def dataset(self, scene: str) -> Any:
         """The dataset of a scene, whose data are those of the run."""
         return self.run.dataset(scene)
+
+    def refined(self, scene: str, method: str) -> tuple[str, ...] | None:
+        """Labels n' of the map's instances; None where nobody made them."""
+        found = refined_names(self.run.folder.job(scene, method), self.instances(scene, method))
+        return None if found is None else tuple(found.names)
+
+    def scene_map(self, scene: str, method: str) -> SceneMap:
+        """The map as questions are put to it, under labels n' where it has them."""
+        return map_of(self.instances(scene, method), self.refined(scene, method))
 
     def frames(self, scene: str, method: str) -> tuple[Frame, ...]:
         """Some of the frames that the map was made from, spread over the scene."""

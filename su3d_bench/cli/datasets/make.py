@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -13,7 +12,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NoReturn
 
-from su3d_bench.cli.common import answer_either, remark
+from su3d_bench.cli.common import answer_either, drawn_bars, remark
 from su3d_bench.core import registry
 from su3d_bench.core.config import read_assignments, resolve
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, suggest
@@ -170,16 +169,12 @@ def _label(unit: Unit) -> str:
 @contextmanager
 def _progress(units: Sequence[Unit], *, is_quiet: bool) -> Iterator[Report]:
     """A ``Report`` that moves one bar over all steps; it draws nothing where stderr is no terminal."""
-    if is_quiet or not sys.stderr.isatty():
-        yield lambda event: None
-        return
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     n_done: dict[tuple[str, str], int] = {}
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
-        task = bars.add_task("making", total=sum(unit.n_steps for unit in units))
+    with drawn_bars(is_quiet=is_quiet, tells_time_left=True) as bars:
+        if bars is None:
+            yield lambda event: None
+            return
+        task = bars.add_task("making", total=sum(unit.n_steps for unit in units), remark="")
 
         def report(event: Event) -> None:
             n_done[event.unit, event.label] = event.done
