@@ -9,6 +9,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.core.errors import EXIT_DONE
@@ -50,6 +51,13 @@ def add_verb(
     parser.add_argument("--quiet", action="store_true", help="no progress and no remarks on stderr")
     parser.add_argument("--debug", action="store_true", help="show the traceback of an error")
     return parser
+
+
+def add_modules(verbs: Any, name: str, summary: str, modules: Sequence[ModuleType], examples: tuple[str, str]) -> None:
+    """A verb whose sub-verbs are ``modules`` with ``NAME`` and ``add_parser(actions)``."""
+    actions = add_group(verbs, name, summary, "|".join(module.NAME for module in modules), examples)
+    for module in modules:
+        module.add_parser(actions)
 
 
 def add_group(

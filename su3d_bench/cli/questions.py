@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_json, remark
+from su3d_bench.cli.common import add_verb, answer, answer_either, answer_json, remark
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, suggest
 
 if TYPE_CHECKING:
@@ -74,34 +74,21 @@ def _make(arguments: argparse.Namespace) -> int:
 
 
 def _made(arguments: argparse.Namespace) -> list[Question]:
+    from su3d_bench.cli.datasets.check import chosen_scenes
     from su3d_bench.questions.making import questions_of
-    from su3d_bench.runs.job import Part, build_dataset
-    from su3d_bench.runs.scenes import data_root, dataset_targets, expand_scenes
 
-    parts = {target: _part(target, Part) for target in dataset_targets(arguments.scenes)}
-    scenes, notes = expand_scenes(arguments.scenes, parts)
-    for note in notes:
-        remark(note, quiet=arguments.quiet)
     made: list[Question] = []
-    datasets = {target: build_dataset(part, data_root()) for target, part in parts.items()}
-    for target, scene in scenes:
+    for dataset, scene in chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet):
         found = questions_of(
-            datasets[target],
+            dataset,
             scene,
             per_kind=arguments.per_kind,
             own=arguments.source == "auto",
             colours=arguments.colours,
         )
-        remark(f"{target}/{scene}: {len(found)} questions", quiet=arguments.quiet)
+        remark(f"{dataset.name}/{scene}: {len(found)} questions", quiet=arguments.quiet)
         made += found
     return made
-
-
-def _part(target: str, part_class: Any) -> Any:
-    from su3d_bench.core import registry
-
-    dataset_class = registry.load("dataset", target)
-    return part_class(target, str(dataset_class.name), dataset_class.Options().model_dump_json())
 
 
 def _show(arguments: argparse.Namespace) -> int:
@@ -144,9 +131,7 @@ def _printable_row(one: Question) -> tuple[str, ...]:
 def _answer_counts(found: Sequence[Question], arguments: argparse.Namespace) -> None:
     counts = Counter(one.kind for one in found)
     n_known = sum(one.is_known for one in found)
-    if arguments.json:
-        answer_json({"n": len(found), "n_known": n_known, "kinds": dict(counts)})
-        return
     kinds = ", ".join(f"{n} {kind}" for kind, n in counts.items())
     n_scenes = len({one.scene for one in found})
-    answer(f"{len(found)} questions on {n_scenes} scenes ({kinds}); {n_known} with known answers")
+    text = f"{len(found)} questions on {n_scenes} scenes ({kinds}); {n_known} with known answers"
+    answer_either(arguments, {"n": len(found), "n_known": n_known, "kinds": dict(counts)}, text)

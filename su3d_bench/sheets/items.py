@@ -22,7 +22,6 @@ SHEET_FILE, KEY_FILE = "sheet.json", "key.json"
 PICTURES = "pictures"  # folder of the pictures, beside sheet.json
 MOST_BYTES = 64 << 20  # of sheet.json or key.json: a hundred thousand items
 SheetKind = Literal["retrieval", "annotation", "reasoning"]
-SHEET_KINDS: tuple[SheetKind, ...] = ("retrieval", "annotation", "reasoning")
 # Columns of a file of answers; others may follow and are for the reader alone.
 ANSWER_COLUMNS = ("sheet_id", "item_id", "annotator", "question", "answer", "check")
 RIGHT, WRONG, CANNOT_TELL = "right", "wrong", "cannot tell"

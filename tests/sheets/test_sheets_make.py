@@ -30,8 +30,8 @@ from su3d_bench.reports.pictures.items import (
     seen_in,
     zoomed,
 )
-from su3d_bench.runs import finished as finished_run
 from su3d_bench.reports.pictures.maps import SCALES, scale_stops, similarity_colours
+from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.executors.local import run_processes
 from su3d_bench.runs.finished import read_run
@@ -213,11 +213,11 @@ def test_labels_are_asked_in_drawn_order_and_equal_ones_once(
     judged = [one for one in same if one.automatic]
     assert judged and all(one.automatic["label 1"] == "right" for one in judged)
     from su3d_bench.metrics.questions.truths import RefinedNames
-    from su3d_bench.sheets import drafts
+    from su3d_bench.sheets import run_source
 
     names = {"refined_names": lambda job, found: RefinedNames(("<b>lamp</b>",) * len(found), "test")}
     for name, value in names.items():
-        monkeypatch.setattr(drafts, name, value)
+        monkeypatch.setattr(run_source, name, value)
     two = annotation_drafts(source, "painted/a", 50, np.random.default_rng(1))
     assert {one.asks for one in two} == {("label 1", "label 2", "merging")}
     assert {one.stands_for["label 1"] for one in two} == {("n",), ("n'",)}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import ModuleType
 from typing import Any
 
-from su3d_bench.cli.common import add_group
+from su3d_bench.cli.common import add_modules
 from su3d_bench.cli.report import html as report_html
 from su3d_bench.cli.report import leaderboard as report_leaderboard
 from su3d_bench.cli.report import tables as report_tables
@@ -17,16 +17,13 @@ SUB_VERBS: tuple[ModuleType, ...] = (report_tables, report_timing, report_html, 
 
 
 def add_parser(verbs: Any) -> None:
-    names = "|".join(module.NAME for module in SUB_VERBS)
-    actions = add_group(
+    add_modules(
         verbs,
         "report",
         "Make tables and pages from finished runs, and check a paper against them.",
-        names,
+        SUB_VERBS,
         (
             "su3d-bench report tables runs/my-run --format latex --table II",
             "su3d-bench report verify paper.tex",
         ),
     )
-    for module in SUB_VERBS:
-        module.add_parser(actions)

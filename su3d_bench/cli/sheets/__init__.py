@@ -5,7 +5,7 @@ from __future__ import annotations
 from types import ModuleType
 from typing import Any
 
-from su3d_bench.cli.common import add_group
+from su3d_bench.cli.common import add_modules
 from su3d_bench.cli.sheets import make as sheets_make
 from su3d_bench.cli.sheets import pictures as sheets_pictures
 from su3d_bench.cli.sheets import score as sheets_score
@@ -15,16 +15,13 @@ SUB_VERBS: tuple[ModuleType, ...] = (sheets_make, sheets_score, sheets_pictures)
 
 
 def add_parser(verbs: Any) -> None:
-    names = "|".join(module.NAME for module in SUB_VERBS)
-    actions = add_group(
+    add_modules(
         verbs,
         "sheets",
         "Make sheets for people to judge a run, and score their answers.",
-        names,
+        SUB_VERBS,
         (
             "su3d-bench sheets make runs/my-run --kind retrieval --out sheets",
             "su3d-bench sheets score ann.csv bob.xlsx --key key/key.json",
         ),
     )
-    for module in SUB_VERBS:
-        module.add_parser(actions)

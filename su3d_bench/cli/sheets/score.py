@@ -126,7 +126,7 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
     from dataclasses import asdict
 
     from su3d_bench.reports.sheet.second_looks import second_looks_csv, second_looks_page
-    from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
+    from su3d_bench.reports.tables.formats import FORMATS
     from su3d_bench.reports.tables.judged import sheet_tables
     from su3d_bench.sheets.items import PICTURES
     from su3d_bench.sheets.score_file import write_scores
@@ -136,12 +136,8 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
     content = asdict(scores)
     write_scores(folder, scores)
     tables = sheet_tables(content)
-    for name, text in (
-        ("tables.md", markdown(tables)),
-        ("tables.csv", csv_text(tables)),
-        ("tables.html", html_page(tables)),
-    ):
-        write_text(folder / name, text)
+    for suffix, form in (("md", "markdown"), ("csv", "csv"), ("html", "html")):
+        write_text(folder / f"tables.{suffix}", FORMATS[form](tables))
     pictures = Path(os.path.relpath((sheet_folder / PICTURES).resolve(), folder.resolve())).as_posix()
     write_text(folder / "second_looks.csv", second_looks_csv(content["second_looks"]))
     write_text(folder / "second_looks.html", second_looks_page(content["second_looks"], pictures, scores.sheet_id))
