@@ -31,18 +31,10 @@ def voxel_average(points: Float64Array, voxel_m: float) -> Float64Array:
 
 
 def density_clusters(points: Float64Array, eps_m: float, min_points: int) -> Int64Array:
-    """DBSCAN's cluster (N,) of each point, -1 for none; the labels of Open3D's ``cluster_dbscan``.
+    """DBSCAN's cluster (N,) of each point, -1 for none; the labels of Open3D's ``cluster_dbscan``."""
+    from su3d_bench.numerics import clusters
 
-    A point is a neighbour of itself.
-    """
-    from su3d_bench.numerics import clusters as kernels
-
-    labels = np.full(len(points), kernels.NOISE, np.int64)
-    if len(points):
-        nearer = float(np.nextafter(eps_m * eps_m, 0.0))  # a point at eps itself is no neighbour to Open3D
-        own = np.require(points, np.float64, ["C", "W"])
-        kernels.dbscan(own, eps_m, nearer, min_points, kernels.STEPS, labels)
-    return labels
+    return clusters.density_clusters(points, eps_m, min_points, holds_eps=False)
 
 
 def largest_cluster(points: Float64Array, eps_m: float, min_points: int) -> Float64Array:

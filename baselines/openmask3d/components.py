@@ -69,24 +69,9 @@ def density_clusters(points: Float32Array, eps_m: float, min_points: int) -> Int
         return np.zeros(0, np.int64)
     if min_points <= 1:
         return linked_within(points.astype(np.float64), eps_m)
-    from scipy.sparse import coo_array
-    from scipy.sparse.csgraph import connected_components
-    from scipy.spatial import cKDTree
+    from su3d_bench.numerics import clusters
 
-    n = len(points)
-    pairs = cKDTree(points.astype(np.float64)).query_pairs(eps_m, output_type="ndarray")
-    is_core = 1 + np.bincount(pairs.reshape(-1), minlength=n) >= min_points  # a point is a neighbour of itself
-    first, second = pairs[is_core[pairs].all(axis=1)].T
-    _, group = connected_components(coo_array((np.ones(len(first), np.int8), (first, second)), shape=(n, n)), False)
-    cores = np.flatnonzero(is_core)
-    _, where, row = np.unique(group[cores], return_index=True, return_inverse=True)
-    labels = np.full(n, n, np.int64)
-    labels[cores] = np.argsort(np.argsort(where))[row.reshape(-1)]
-    # What is no core joins the first cluster with a core beside it.
-    for end, core in (pairs.T, pairs.T[::-1]):
-        beside = is_core[core] & ~is_core[end]
-        np.minimum.at(labels, end[beside], labels[core[beside]])
-    return np.where(labels == n, NOISE, labels)
+    return clusters.density_clusters(points.astype(np.float64), eps_m, min_points)
 
 
 def linked_within(points: Float64Array, gap_m: float) -> Int64Array:

@@ -12,6 +12,7 @@ import math
 
 import numpy as np
 
+from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.numerics.cells import ABSENT, slot_of
 from su3d_bench.numerics.compiled import njit
 
@@ -21,6 +22,19 @@ _STEPS = np.array(
     sorted(np.ndindex(5, 5, 5), key=lambda step: sum(max(abs(axis - 2) - 1, 0) ** 2 for axis in step)), np.int64
 )
 STEPS = _STEPS[np.argsort((_STEPS != 2).any(axis=1), kind="stable")] - 2
+
+
+def density_clusters(points: Float64Array, eps: float, min_points: int, *, holds_eps: bool = True) -> Int64Array:
+    """The cluster (N,) of each of ``points`` (N, 3): 0, 1, ... or NOISE; a point is near to itself.
+
+    ``holds_eps``: a point at eps itself is near, as in scikit-learn; to Open3D it is not.
+    """
+    labels = np.full(len(points), NOISE, np.int64)
+    if len(points):
+        most_squared = eps * eps if holds_eps else float(np.nextafter(eps * eps, 0.0))
+        own = np.require(points, np.float64, ["C", "W"])
+        dbscan(own, eps, most_squared, min_points, STEPS, labels)
+    return labels
 
 
 @njit(cache=True)

@@ -48,14 +48,9 @@ def caption_of(name: str) -> str:
 
 def cluster(points: Float64Array, config: OpenSU3DConfig) -> Int64Array:
     """DBSCAN label (N,) of each point: 0, 1, ... or NOISE."""
-    from su3d_bench.numerics import clusters as kernels
+    from su3d_bench.numerics.clusters import density_clusters
 
-    labels = np.full(len(points), NOISE, np.int64)
-    if len(points) >= config.dbscan_min_points:
-        own = np.require(points, np.float64, ["C", "W"])
-        eps = config.dbscan_eps
-        kernels.dbscan(own, eps, eps * eps, config.dbscan_min_points, kernels.STEPS, labels)
-    return labels
+    return density_clusters(points, config.dbscan_eps, config.dbscan_min_points)
 
 
 def kept_clusters(labels: Int64Array, split_fraction: float) -> list[int]:
