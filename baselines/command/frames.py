@@ -69,7 +69,7 @@ class FrameFolder:
         if not self._numbers:
             raise DataError(f"{self.scene.dataset}/{self.scene.scene}: no frame to hand to the program")
         write_text(self.path / "intrinsics.txt", matrix_text(self._intrinsics[0]))
-        differ = any(not np.array_equal(one, self._intrinsics[0]) for one in self._intrinsics)
+        differ = any(not np.array_equal(matrix, self._intrinsics[0]) for matrix in self._intrinsics)
         if differ:
             make_folder(self.path / "intrinsics")
             for number, matrix in zip(self._numbers, self._intrinsics, strict=True):

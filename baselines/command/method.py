@@ -285,8 +285,8 @@ def _program_file(word: str) -> Path | None:
         return None
     path = Path(word).expanduser()
     if not path.is_file() and "/" not in word:
-        found = shutil.which(word)
-        path = Path(found) if found else path
+        program = shutil.which(word)
+        path = Path(program) if program else path
     try:
         return path if path.is_file() else None
     except OSError:

@@ -19,7 +19,7 @@ def read_output(folder: Path, scene: str, format: str | None) -> ScenePrediction
     """The only prediction in ``folder``, or the one of ``scene`` where there are several."""
     from su3d_bench.predictions.formats import recognise  # every format there is: not for a list of methods
 
-    files = [one for one in folder.iterdir() if not one.name.startswith(".")]
+    files = [path for path in folder.iterdir() if not path.name.startswith(".")]
     if not files:
         raise PredictionError("it ended without an error and left nothing in {output}")
     reader = recognise(folder, format)
@@ -78,7 +78,7 @@ def _masks_of_labels(content: VertexLabels) -> VertexMasks:
         n_points=len(content.class_ids),
         scores=np.ones(len(kept)),
         class_numbers=kept,
-        keys=tuple(f"class {one}" for one in kept),
+        keys=tuple(f"class {number}" for number in kept),
     )
 
 
@@ -86,8 +86,8 @@ def _labels(masks: VertexMasks, names: ClassNames | None) -> tuple[str, ...] | N
     if masks.class_numbers is None:
         return None
     assert names is not None, "whoever asks for labels has found the classes"
-    told = names.by_place if masks.numbering == "index" else names.by_id
-    return tuple(told.get(number, f"class {number}") for number in masks.class_numbers.tolist())
+    name_of = names.by_place if masks.numbering == "index" else names.by_id
+    return tuple(name_of.get(number, f"class {number}") for number in masks.class_numbers.tolist())
 
 
 def needs_classes(content: Content) -> bool:
@@ -109,7 +109,7 @@ def class_names(content: Content, dataset: str, protocol: str | None) -> ClassNa
     if numbering == "index":
         scored = dict.fromkeys(tuple(entry.name for entry in rules.scored) for rules in own if rules.kind == "instance")
         lists = [list(enumerate(names)) for names in scored]
-    pairs = {pair for one in lists for pair in one}
+    pairs = {pair for listed in lists for pair in listed}
     if not pairs or len(pairs) > len({number for number, _ in pairs}):
         known = ", ".join(rules.name for rules in own) or "any that has classes"
         raise PredictionError(f"whose are its class numbers? name a protocol in classes_of (known: {known})")

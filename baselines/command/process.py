@@ -90,13 +90,13 @@ class TreeWatch(Watch):
         except self._errors:
             return
         together = 0
-        for one in processes:
-            self._seen[one.pid] = one
+        for process in processes:
+            self._seen[process.pid] = process
             try:
-                together += int(one.memory_info().rss)
+                together += int(process.memory_info().rss)
             except self._errors:
                 continue
-            self._peak = max(self._peak, _own_peak_bytes(one.pid))
+            self._peak = max(self._peak, _own_peak_bytes(process.pid))
         self._peak = max(self._peak, together)
 
     @property
@@ -104,10 +104,10 @@ class TreeWatch(Watch):
         return self._peak or None
 
     def end(self, *, was_stopped: bool) -> None:
-        for one in self._seen.values():
+        for process in self._seen.values():
             try:
-                if one != self._root and one.is_running():
-                    one.kill()
+                if process != self._root and process.is_running():
+                    process.kill()
             except self._errors:
                 continue
 

@@ -32,12 +32,12 @@ def box_iou(detections: Sequence[MapObject], objects: Sequence[MapObject]) -> Fl
     Where one box of the frame or the map is not flat-sided enough for PyTorch3D, that of the clouds' axis-aligned
     extents for all pairs, as the original does on PyTorch3D's error.
     """
-    of_detections = grown([one.box for one in detections], LEAST_SIDE_M)
-    of_objects = grown([one.box for one in objects], LEAST_SIDE_M)
+    of_detections = grown([item.box for item in detections], LEAST_SIDE_M)
+    of_objects = grown([item.box for item in objects], LEAST_SIDE_M)
     if are_coplanar([*of_detections, *of_objects]):
         return oriented_iou(of_detections, of_objects)
     return axis_aligned_iou(
-        extents_of_clouds([one.points for one in detections]), extents_of_clouds([one.points for one in objects])
+        extents_of_clouds([item.points for item in detections]), extents_of_clouds([item.points for item in objects])
     )
 
 
@@ -56,7 +56,7 @@ def geometric_similarity(
     if config.spatial_sim_type == "overlap":
         return overlap_similarity(detections, objects, config.downsample_voxel_size)
     return axis_aligned_iou(
-        extents_of_boxes([one.box for one in detections]), extents_of_boxes([one.box for one in objects])
+        extents_of_boxes([item.box for item in detections]), extents_of_boxes([item.box for item in objects])
     )
 
 
@@ -64,7 +64,9 @@ def semantic_similarity(
     detections: Sequence[MapObject], objects: Sequence[MapObject], config: MappingConfig
 ) -> Float64Array:
     """s_sem (M, N): the cosine as the code has it, or the paper's phi_sem = cosine / 2 + 1 / 2."""
-    cosine: Float64Array = np.stack([one.feature for one in detections]) @ np.stack([one.feature for one in objects]).T
+    cosine: Float64Array = (
+        np.stack([item.feature for item in detections]) @ np.stack([item.feature for item in objects]).T
+    )
     return cosine if config.association == "code" else cosine / 2 + 0.5
 
 

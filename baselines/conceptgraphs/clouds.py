@@ -43,11 +43,11 @@ def largest_cluster(points: Float64Array, eps_m: float, min_points: int) -> Floa
     Of clusters of equal size the one whose first point comes first, as Python's ``Counter`` counts them.
     """
     labels = density_clusters(points, eps_m, min_points)
-    found, first, sizes = np.unique(labels[labels >= 0], return_index=True, return_counts=True)
-    if not len(found) or sizes.max() < LEAST_CLUSTER:
+    distinct, first, sizes = np.unique(labels[labels >= 0], return_index=True, return_counts=True)
+    if not len(distinct) or sizes.max() < LEAST_CLUSTER:
         return points
     largest = np.flatnonzero(sizes == sizes.max())
-    is_inside: BoolArray = labels == found[largest[np.argmin(first[largest])]]
+    is_inside: BoolArray = labels == distinct[largest[np.argmin(first[largest])]]
     return points[is_inside]
 
 

@@ -42,22 +42,22 @@ class ObjectMap:
         self._feature_size = 0
 
     def __len__(self) -> int:
-        return len(self._objects) + sum(one is not None for one in self._background.values())
+        return len(self._objects) + sum(item is not None for item in self._background.values())
 
     @property
     def n_points(self) -> int:
         """Points of all objects, background included."""
-        return sum(len(one.points) for one in self._everything)
+        return sum(len(item.points) for item in self._everything)
 
     @property
     def n_bytes(self) -> int:
         """What points and features of all objects take, their KD-trees apart."""
-        arrays = [(one.points, one.feature, one.text_feature) for one in self._everything]
+        arrays = [(item.points, item.feature, item.text_feature) for item in self._everything]
         return sum(array.nbytes for of_object in arrays for array in of_object)
 
     @property
     def _everything(self) -> list[MapObject]:
-        return [one for one in (*self._objects, *self._background.values()) if one is not None]
+        return [item for item in (*self._objects, *self._background.values()) if item is not None]
 
     def update(self, frame: Frame, detections: Detections, text_features: Float32Array, timer: StageTimer) -> None:
         """Take in one frame; ``text_features`` (K, T) are those of the detections' names."""
@@ -71,11 +71,11 @@ class ObjectMap:
             masks = subtract_contained(detections.boxes[rows], detections.masks[rows])
         with timer.stage("backproject"):
             lifted = list(lift(frame, rows, masks, self._config, self._seed))
-        found = [self._object_of(region, detections, text_features) for region in lifted]
+        fresh = [self._object_of(region, detections, text_features) for region in lifted]
         if self._background:
             with timer.stage("background"):
-                self._merge_background(found)
-        foreground = [one for one in found if one.sightings[0].name not in self._background]
+                self._merge_background(fresh)
+        foreground = [item for item in fresh if item.sightings[0].name not in self._background]
         if not foreground:  # the original goes on to the next frame here, past the periodic steps too
             return
         if not self._objects:
@@ -99,30 +99,32 @@ class ObjectMap:
             sightings=(seen,),
         )
 
-    def _merge_background(self, found: Sequence[MapObject]) -> None:
-        for one in found:
-            name = one.sightings[0].name
+    def _merge_background(self, fresh: Sequence[MapObject]) -> None:
+        for item in fresh:
+            name = item.sightings[0].name
             if name in self._background:
                 before = self._background[name]
-                self._background[name] = one if before is None else merged(before, one, self._config, with_dbscan=False)
+                self._background[name] = (
+                    item if before is None else merged(before, item, self._config, with_dbscan=False)
+                )
 
-    def _associate(self, found: Sequence[MapObject], timer: StageTimer) -> None:
+    def _associate(self, fresh: Sequence[MapObject], timer: StageTimer) -> None:
         """All similarities are those before the first merge; no clustering here."""
         with timer.stage("match"):
-            joins = assign(total_similarity(found, self._objects, self._config), self._config.association_threshold)
+            joins = assign(total_similarity(fresh, self._objects, self._config), self._config.association_threshold)
         with timer.stage("merge"):
-            for one, j in zip(found, joins, strict=True):
+            for item, j in zip(fresh, joins, strict=True):
                 if j == NEW_OBJECT:
-                    self._objects.append(one)
+                    self._objects.append(item)
                 else:
-                    self._objects[j] = merged(self._objects[j], one, self._config, with_dbscan=False)
+                    self._objects[j] = merged(self._objects[j], item, self._config, with_dbscan=False)
 
     def _tidy_up(self, timer: StageTimer) -> None:
         """What happens at every so many frames."""
         config = self._config
         if self._is_due(config.denoise_interval):
             with timer.stage("denoise"):
-                self._objects = [denoised(one, config) for one in self._objects]
+                self._objects = [denoised(item, config) for item in self._objects]
         if self._is_due(config.filter_interval):
             self._objects = seen_enough(self._objects, config)
         if self._is_due(config.merge_interval):
@@ -134,42 +136,42 @@ class ObjectMap:
 
     def finish(self) -> Instances:
         """The map so far after its last clean-up, background objects last and labelled with their names."""
-        background = [denoised(one, self._config) for one in self._background.values() if one is not None]
-        objects = [denoised(one, self._config) for one in self._objects]
+        background = [denoised(item, self._config) for item in self._background.values() if item is not None]
+        objects = [denoised(item, self._config) for item in self._objects]
         objects = merge_overlapping(seen_enough(objects, self._config), self._config)
         everything = [*objects, *background]
-        told = [_told(one) for one in everything]
-        names, captions = tuple(name for name, _ in told), tuple(caption for _, caption in told)
-        features = np.array([one.feature for one in everything], np.float32)
-        seen = [one for each in everything for one in each.sightings]
+        descriptions = [_description(item) for item in everything]
+        names, captions = tuple(name for name, _ in descriptions), tuple(caption for _, caption in descriptions)
+        features = np.array([item.feature for item in everything], np.float32)
+        seen = [sighting for each in everything for sighting in each.sightings]
         instances = instances_of(
-            [one.points.astype(np.float32) for one in everything],
+            [item.points.astype(np.float32) for item in everything],
             "conceptgraphs",
             features=features.reshape(len(everything), self._feature_size),
             labels=("",) * len(objects) + names[len(objects) :] if background else None,
             names=names,
             captions=captions,
-            ids=[one.number for one in everything],
+            ids=[item.number for item in everything],
         )
         return replace(
             instances,
-            scores=np.array([_score(one, self._config.instance_score) for one in everything], np.float64),
-            views=np.array([(one.frame_index, one.detection) for one in seen], np.int32).reshape(-1, 2),
-            view_indptr=np.cumsum([0, *(one.n_detections for one in everything)]).astype(np.int64),
-            view_names=tuple(one.name for one in seen),
-            view_scores=np.array([one.score for one in seen], np.float64),
+            scores=np.array([_score(item, self._config.instance_score) for item in everything], np.float64),
+            views=np.array([(sighting.frame_index, sighting.detection) for sighting in seen], np.int32).reshape(-1, 2),
+            view_indptr=np.cumsum([0, *(item.n_detections for item in everything)]).astype(np.int64),
+            view_names=tuple(sighting.name for sighting in seen),
+            view_scores=np.array([sighting.score for sighting in seen], np.float64),
         )
 
 
-def _told(one: MapObject) -> tuple[str, str]:
+def _description(item: MapObject) -> tuple[str, str]:
     """The name of most of its detections, the first seen of equals, and the caption of the surest one of that name."""
-    names = Counter(seen.name for seen in one.sightings)
+    names = Counter(seen.name for seen in item.sightings)
     name = max(names, key=lambda name: names[name])
-    best = max((seen for seen in one.sightings if seen.name == name), key=lambda seen: seen.score)
+    best = max((seen for seen in item.sightings if seen.name == name), key=lambda seen: seen.score)
     return name, best.caption
 
 
-def _score(one: MapObject, rule: InstanceScore) -> float:
+def _score(item: MapObject, rule: InstanceScore) -> float:
     if rule == "ones":
         return 1.0
-    return float(one.n_detections if rule == "num-detections" else max(seen.score for seen in one.sightings))
+    return float(item.n_detections if rule == "num-detections" else max(seen.score for seen in item.sightings))

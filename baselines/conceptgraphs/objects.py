@@ -99,20 +99,20 @@ def merged(into: MapObject, other: MapObject, config: MappingConfig, *, with_dbs
     )
 
 
-def denoised(one: MapObject, config: MappingConfig) -> MapObject:
-    """``one`` averaged anew and reduced to its largest cluster."""
-    points = cleaned(one.points, config)
+def denoised(item: MapObject, config: MappingConfig) -> MapObject:
+    """``item`` averaged anew and reduced to its largest cluster."""
+    points = cleaned(item.points, config)
     if len(points) < LEAST_AFTER_DENOISING:
-        return one
-    return replace(one, points=points, box=box_of(points, config))
+        return item
+    return replace(item, points=points, box=box_of(points, config))
 
 
 def seen_enough(objects: Sequence[MapObject], config: MappingConfig) -> list[MapObject]:
     """The objects of enough points and detections."""
     return [
-        one
-        for one in objects
-        if len(one.points) >= config.obj_min_points and one.n_detections >= config.obj_min_detections
+        item
+        for item in objects
+        if len(item.points) >= config.obj_min_points and item.n_detections >= config.obj_min_detections
     ]
 
 
@@ -121,7 +121,7 @@ def overlap_ratios(objects: Sequence[MapObject], radius_m: float) -> Float64Arra
 
     0 on the diagonal and where the axis-aligned extents of the two boxes share no volume.
     """
-    extents = extents_of_boxes([one.box for one in objects])
+    extents = extents_of_boxes([item.box for item in objects])
     has_shared_volume = shared_volume(extents, extents) > 0
     np.fill_diagonal(has_shared_volume, False)
     ratios = np.zeros((len(objects), len(objects)))
@@ -160,7 +160,7 @@ def merge_overlapping(objects: Sequence[MapObject], config: MappingConfig) -> li
         if looks_alike and is_called_alike and is_kept[j]:
             result[j] = merged(result[j], result[i], config, with_dbscan=True)
             is_kept[i] = False
-    return [one for one, stays in zip(result, is_kept, strict=True) if stays]
+    return [item for item, stays in zip(result, is_kept, strict=True) if stays]
 
 
 def _cosine(a: Float64Array, b: Float64Array) -> float:

@@ -99,11 +99,11 @@ def joined(n_vertices, edges, weights, threshold, min_vertices):  # type: ignore
 
 @njit(cache=True)
 def _root(parent, vertex):  # type: ignore[no-untyped-def]
-    found = vertex
-    while found != parent[found]:
-        found = parent[found]
-    parent[vertex] = found
-    return found
+    root = vertex
+    while root != parent[root]:
+        root = parent[root]
+    parent[vertex] = root
+    return root
 
 
 @njit(cache=True)

@@ -109,8 +109,8 @@ def _cells(vertices: Float32Array, n_segments: int, patch_m: float) -> tuple[Int
 
 def _distinct(keys: Int64Array, base: int) -> tuple[Int64Array, Int64Array, Int64Array]:
     """Cube and segment of each distinct key, ascending, and which of them each key is."""
-    found, inverse = np.unique(keys, return_inverse=True)
-    return found // base, found % base, inverse.reshape(-1)
+    distinct, inverse = np.unique(keys, return_inverse=True)
+    return distinct // base, distinct % base, inverse.reshape(-1)
 
 
 def _sums(group: Int32Array | Int64Array, values: Float32Array | Float64Array, n: int) -> Float64Array:

@@ -96,6 +96,6 @@ def count_pixels(pixels: Int32Array, proposals: Proposals, n_image: int) -> Int6
 
 def pixels_of_mask(pixels: Int32Array, members: Int32Array, width: int) -> Int64Array:
     """The distinct pixels (P, 2), x y, of the points ``members``, row by row."""
-    found = np.unique(pixels[members])
-    found = found[found >= 0].astype(np.int64)
-    return np.stack([found % width, found // width], axis=1)
+    seen = np.unique(pixels[members])
+    seen = seen[seen >= 0].astype(np.int64)
+    return np.stack([seen % width, seen // width], axis=1)

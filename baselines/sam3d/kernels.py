@@ -61,7 +61,7 @@ def _gap(x, c, own, cell):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def nearest(queries, cap, cell, starts, order, held, lower, upper, found, squared):  # type: ignore[no-untyped-def]
+def nearest(queries, cap, cell, starts, order, held, lower, upper, index, squared):  # type: ignore[no-untyped-def]
     """Writes the nearest point of each query and its squared distance (float32, summed x, y, z), the lowest index of
     equals; -1 where none is within ``cap``, give or take a rounding.
 
@@ -69,7 +69,7 @@ def nearest(queries, cap, cell, starts, order, held, lower, upper, found, square
     """
     n_buckets = len(starts) - 1
     for i in range(len(queries)):
-        found[i] = -1
+        index[i] = -1
         best = np.float32(np.inf)
         limit = (cap * SLACK) ** 2
         x, y, z = np.float64(queries[i, 0]), np.float64(queries[i, 1]), np.float64(queries[i, 2])
@@ -102,9 +102,9 @@ def nearest(queries, cap, cell, starts, order, held, lower, upper, found, square
                             dy = queries[i, 1] - held[place, 1]
                             dz = queries[i, 2] - held[place, 2]
                             distance = dx * dx + dy * dy + dz * dz
-                            if distance < best or (distance == best and order[place] < found[i]):
+                            if distance < best or (distance == best and order[place] < index[i]):
                                 best = distance
-                                found[i] = order[place]
+                                index[i] = order[place]
                                 limit = min(limit, np.float64(best) * SLACK + 1e-12)
             shell += 1
         squared[i] = best

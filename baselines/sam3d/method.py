@@ -209,9 +209,9 @@ class SAM3D:
         visible = np.flatnonzero(n_pixels)[::-1]
         first_view = len(self._views)
         for k in visible.tolist():
-            told = detections.names[k], detections.captions[k], float(detections.scores[k])
+            description = detections.names[k], detections.captions[k], float(detections.scores[k])
             self._views.append(
-                _View(detections.frame_index, k, int(n_pixels[k]), detections.crop_features[k, 0], *told)
+                _View(detections.frame_index, k, int(n_pixels[k]), detections.crop_features[k, 0], *description)
             )
         rows = np.arange(len(visible))
         return GroupedCloud(points, group, rows, rows + first_view)

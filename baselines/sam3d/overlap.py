@@ -119,17 +119,17 @@ def nearest_points(
     Distances are float32, of float32 coordinates, as on the original's GPU; among equals the lowest index wins.
     ``cell_m``, the side of the grid's cells, moves no result.
     """
-    found, squared = np.full(len(queries), -1, np.int64), np.full(len(queries), np.inf, np.float32)
+    index, squared = np.full(len(queries), -1, np.int64), np.full(len(queries), np.inf, np.float32)
     if len(queries) and len(points):
         from su3d_bench.baselines.sam3d import kernels as kernels
 
-        asked, given = _float32(queries), _float32(points)
+        wanted, given = _float32(queries), _float32(points)
         starts = np.zeros((1 << (len(given) - 1).bit_length()) + 1, np.int64)
         order, held = np.empty(len(given), np.int64), np.empty_like(given)
         kernels.fill(given, cell_m, starts, order, held)
         lower, upper = given.min(axis=0).astype(np.float64), given.max(axis=0).astype(np.float64)
-        kernels.nearest(asked, cap_m, cell_m, starts, order, held, lower, upper, found, squared)
-    return found, np.sqrt(squared)
+        kernels.nearest(wanted, cap_m, cell_m, starts, order, held, lower, upper, index, squared)
+    return index, np.sqrt(squared)
 
 
 def _float32(points: Float64Array | Float32Array) -> Float32Array:
@@ -141,9 +141,9 @@ def _float32(points: Float64Array | Float32Array) -> Float32Array:
 
 def match_pairs(queries: Float64Array, points: Float64Array, radius_m: float) -> Pairs:
     """Each query that has a point nearer than ``radius_m``, with the nearest one."""
-    found, distance = nearest_points(queries, points, radius_m, radius_m * 1.001)
-    matched = np.flatnonzero((found >= 0) & (distance < np.float32(radius_m)))
-    return Pairs(matched, found[matched])
+    index, distance = nearest_points(queries, points, radius_m, radius_m * 1.001)
+    matched = np.flatnonzero((index >= 0) & (distance < np.float32(radius_m)))
+    return Pairs(matched, index[matched])
 
 
 def cal_group(other: Int64Array, group: Int64Array, pairs: Pairs, ratio: float) -> Relabelled:
@@ -239,9 +239,9 @@ def next_level(clouds: Sequence[GroupedCloud], rules: MergeRules, timer: StageTi
 
 def groups_on_surface(cloud: GroupedCloud, vertices: Float32Array, cap_m: float) -> Int64Array:
     """The group (V,) of the point nearest to each vertex, NO_GROUP beyond ``cap_m``."""
-    found, distance = nearest_points(vertices, cloud.points, cap_m, SURFACE_CELL_M)
-    is_near = (found >= 0) & (distance <= np.float32(cap_m))
-    return np.where(is_near, np.append(cloud.group, NO_GROUP)[found], NO_GROUP)
+    index, distance = nearest_points(vertices, cloud.points, cap_m, SURFACE_CELL_M)
+    is_near = (index >= 0) & (distance <= np.float32(cap_m))
+    return np.where(is_near, np.append(cloud.group, NO_GROUP)[index], NO_GROUP)
 
 
 def ensemble(group: Int64Array, segments: Int32Array | Int64Array, min_points: int, ratio: float) -> Int64Array:

@@ -141,13 +141,13 @@ def _syntax(source: bytes) -> str:
 @cache
 def package_versions(names: tuple[str, ...] = RECORDED_PACKAGES) -> dict[str, str]:
     """Versions of the packages that a result depends on, and of Python; those not installed are left out."""
-    found = {"python": ".".join(str(part) for part in sys.version_info[:3])}
+    versions = {"python": ".".join(str(part) for part in sys.version_info[:3])}
     for name in names:
         try:
-            found[name] = version(name)
+            versions[name] = version(name)
         except PackageNotFoundError:
             continue
-    return found
+    return versions
 
 
 def git_state() -> dict[str, Any] | None:

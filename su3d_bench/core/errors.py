@@ -43,9 +43,9 @@ def shown(path: Path) -> str:
 def printable_json(value: Any) -> Any:
     """A JSON-like value with every text in it made printable; paths become texts."""
     if isinstance(value, dict):
-        return {printable(str(key)): printable_json(one) for key, one in value.items()}
+        return {printable(str(key)): printable_json(item) for key, item in value.items()}
     if isinstance(value, list | tuple):
-        return [printable_json(one) for one in value]
+        return [printable_json(item) for item in value]
     return printable(str(value)) if isinstance(value, str | Path) else value
 
 

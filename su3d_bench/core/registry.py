@@ -44,12 +44,12 @@ LEAST_LIKENESS = 0.84  # of a name to the one that was meant: a letter missing, 
 
 def names(kind: str) -> list[str]:
     """Every name of ``kind`` (``dataset`` or ``method``) that can be used without a path."""
-    found = list(BUILT_IN[kind])
+    known = list(BUILT_IN[kind])
     for entry in entry_points(group=GROUPS[kind]):
         if entry.name in BUILT_IN[kind]:
             raise ConfigError(f"plug-in {entry.value}: the {kind} name '{entry.name}' is built in; choose another name")
-        found.append(entry.name)
-    return found
+        known.append(entry.name)
+    return known
 
 
 def load(kind: str, name: str) -> Any:

@@ -337,9 +337,11 @@ class Instances(Masks):
             raise PredictionError(f"instances: {k} masks and {len(self.features)} features")
         if self.labels is not None and len(self.labels) != k:
             raise PredictionError(f"instances: {k} masks and {len(self.labels)} labels")
-        for told in (self.view_names, self.view_scores):
-            if told is not None and len(told) != len(self.views):
-                raise PredictionError(f"instances: {len(self.views)} views and {len(told)} names or scores of views")
+        for of_views in (self.view_names, self.view_scores):
+            if of_views is not None and len(of_views) != len(self.views):
+                raise PredictionError(
+                    f"instances: {len(self.views)} views and {len(of_views)} names or scores of views"
+                )
 
     @classmethod
     def of(
