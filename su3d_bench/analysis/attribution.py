@@ -7,7 +7,7 @@ the kinds of errors are is said in ``metrics.attribution`` and ``metrics.attribu
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from su3d_bench.metrics.attribution.arrays import scored_masks, scored_points
 from su3d_bench.metrics.attribution.overlaps import measure_overlaps
 from su3d_bench.metrics.metric import Counts
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.metrics.scoring import SceneScore, metric_of
+from su3d_bench.metrics.scoring import SceneScore, metric_of, plain_json
 from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.store.predictions import read_prediction
 
@@ -76,7 +76,7 @@ class RunAttribution:
             "run": self.run,
             "method": self.method,
             "remarks": list(self.remarks),
-            "protocols": [_protocol_json(one) for one in self.protocols],
+            "protocols": [plain_json(asdict(protocol)) for protocol in self.protocols],
         }
 
 
@@ -285,22 +285,3 @@ def _remarks(run: FinishedRun) -> list[str]:
     if run.is_incomplete:
         lines.append("INCOMPLETE: scenes that failed are not in these numbers")
     return lines
-
-
-def _protocol_json(one: ProtocolAttribution) -> dict[str, Any]:
-    return {
-        "protocol": one.protocol,
-        "version": one.version,
-        "kind": one.kind,
-        "scenes": list(one.scenes),
-        "values": _plain(one.values),
-        "causes": {name: {"n": cause.n, "gains": _plain(cause.gains)} for name, cause in one.causes.items()},
-        "overlap": _plain(one.overlap),
-        "rest": _plain(one.rest),
-        "stages": {name: _plain(values) for name, values in one.stages.items()},
-        "n_scored": one.n_scored,
-    }
-
-
-def _plain(values: Values) -> dict[str, float | None]:
-    return {name: None if np.isnan(value) else value for name, value in values.items()}

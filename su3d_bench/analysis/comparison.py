@@ -7,7 +7,7 @@ the test flips the signs of the differences of single scenes.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence, Set
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,7 @@ from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.metric import Counts, SceneScore
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.metrics.scoring import ProtocolResult, combine, metric_of
+from su3d_bench.metrics.scoring import ProtocolResult, combine, metric_of, plain_json
 from su3d_bench.numerics.statistics import SignFlipTest, percentile_interval, resample_weights, sign_flip_test
 from su3d_bench.runs.finished import FinishedRun
 
@@ -85,7 +85,7 @@ class Comparison:
             "left": self.left,
             "right": self.right,
             "remarks": list(self.remarks),
-            "protocols": [_protocol_json(one) for one in self.protocols],
+            "protocols": [plain_json(_protocol_json(protocol)) for protocol in self.protocols],
         }
 
 
@@ -312,37 +312,19 @@ def _more(n: int) -> str:
     return f" and {n} more" if n > 0 else ""
 
 
-def _protocol_json(one: ProtocolComparison) -> dict[str, Any]:
+def _protocol_json(protocol: ProtocolComparison) -> dict[str, Any]:
     return {
-        "protocol": one.protocol,
-        "version": one.version,
-        "aggregate": one.aggregate,
-        "left": one.left,
-        "right": one.right,
-        "scenes": list(one.scenes),
-        "metrics": {name: _difference_json(value) for name, value in one.metrics.items()},
+        **asdict(protocol),
+        "metrics": {name: _difference_json(value) for name, value in protocol.metrics.items()},
         "classes": {
             name: {column: _difference_json(value) for column, value in columns.items()}
-            for name, columns in one.classes.items()
+            for name, columns in protocol.classes.items()
         },
-        "remarks": list(one.remarks),
     }
 
 
-def _difference_json(one: Difference) -> dict[str, Any]:
-    return {
-        "left": _number(one.left),
-        "right": _number(one.right),
-        "difference": _number(one.difference),
-        "interval": None if one.interval is None else list(one.interval),
-        "per_scene": dict(one.per_scene),
-        "mean_of_scenes": _number(one.mean_of_scenes),
-        "p": None if one.test is None else one.test.p,
-        "smallest_p": None if one.test is None else one.test.smallest_p,
-        "n_pairs": 0 if one.test is None else one.test.n_pairs,
-        "is_exact": None if one.test is None else one.test.is_exact,
-    }
-
-
-def _number(value: float) -> float | None:
-    return None if np.isnan(value) else value
+def _difference_json(difference: Difference) -> dict[str, Any]:
+    """A test that there is none of has no pairs."""
+    values = asdict(difference)
+    test = values.pop("test") or {"p": None, "smallest_p": None, "n_pairs": 0, "is_exact": None}
+    return {**values, **test}

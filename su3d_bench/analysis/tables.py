@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -171,16 +171,6 @@ class CellCheck:
     fault: str | None
 
 
-@dataclass(frozen=True)
-class _Numbers:
-    """What a cell is held against."""
-
-    version: int
-    n_scenes: int
-    metrics: Mapping[str, float | None]
-    intervals: Mapping[str, tuple[float, float] | None]
-
-
 class _Recomputed:
     """Numbers from the counts of runs, each run and protocol scored once."""
 
@@ -196,23 +186,19 @@ class _Recomputed:
             self._runs[name] = read_run(path)
         return self._runs[name]
 
-    def numbers(self, origin: Origin) -> _Numbers:
+    def numbers(self, origin: Origin) -> ProtocolResult | Measured:
         """Raises ``Su3dError`` where they cannot be had, or are of another version than the cell."""
-        if origin.protocol.endswith(BY_PEOPLE):
-            found = self._of_people(origin)
-        else:
-            result = self._result(origin)
-            found = _Numbers(result.version, result.n_scenes, result.metrics, result.intervals)
-        if found.version != origin.version:
-            raise ConfigError(f"the cell is of version {origin.version} of {origin.protocol}, the run {found.version}")
-        return found
+        result = self._of_people(origin) if origin.protocol.endswith(BY_PEOPLE) else self._result(origin)
+        if result.version != origin.version:
+            raise ConfigError(f"the cell is of version {origin.version} of {origin.protocol}, the run {result.version}")
+        return result
 
-    def _of_people(self, origin: Origin) -> _Numbers:
+    def _of_people(self, origin: Origin) -> Measured:
         places = [root / origin.run for root in self._roots]
         path = next((place for place in places if is_file(place) or is_file(place / SCORES_FILE)), places[0])
         for one in _judged_by_people(path):
             if (one.protocol, one.method) == (origin.protocol, origin.method):
-                return _Numbers(one.version, len(one.scenes), one.metrics, one.intervals)
+                return one
         raise ConfigError(f"{path}: holds no scores of '{printable(origin.method, 80)}' by people")
 
     def _result(self, origin: Origin) -> ProtocolResult:
@@ -306,10 +292,10 @@ def _check(cell: PrintedCell, file: str, recomputed: _Recomputed) -> CellCheck:
     return CellCheck(file, cell.line, text, found, None)
 
 
-def _numbers(origin: Origin, result: _Numbers) -> list[float] | None:
+def _numbers(origin: Origin, result: ProtocolResult | Measured) -> list[float] | None:
     """What the cell should show: per cent or a count, then its interval where shown; None where the run lacks it."""
     if origin.what == "scenes":
-        return [float(result.n_scenes)]
+        return [float(len(result.scenes))]
     value = result.metrics.get(origin.metric)
     if value is None or value != value:
         return None
