@@ -26,15 +26,17 @@ def draw_attribution(attribution: Mapping[str, Any], path: Path) -> None:
     from matplotlib.figure import Figure
 
     protocols = attribution["protocols"]
-    n_columns = max(len(one["values"]) for one in protocols)
-    heights = [ROW_HEIGHT * len(_bars(one, next(iter(one["values"])))) + PANEL_EXTRA for one in protocols]
+    n_columns = max(len(protocol["values"]) for protocol in protocols)
+    heights = [
+        ROW_HEIGHT * len(_bars(protocol, next(iter(protocol["values"])))) + PANEL_EXTRA for protocol in protocols
+    ]
     figure = Figure(figsize=(1.6 + PANEL_WIDTH * n_columns, sum(heights) + 0.5), dpi=DPI, facecolor="white")
     FigureCanvasAgg(figure)
     figure.suptitle(f"{attribution['run']}: {attribution['method']}", fontsize=13, fontweight="bold")
     grid = figure.add_gridspec(len(protocols), n_columns, height_ratios=heights)
-    for row, one in enumerate(protocols):
-        for column, name in enumerate(one["values"]):
-            _draw_panel(figure.add_subplot(grid[row, column]), one, name, has_names=column == 0)
+    for row, protocol in enumerate(protocols):
+        for column, name in enumerate(protocol["values"]):
+            _draw_panel(figure.add_subplot(grid[row, column]), protocol, name, has_names=column == 0)
     figure.tight_layout(rect=(0, 0, 1, 0.98))
     write_figure(figure, path)
 
@@ -42,22 +44,24 @@ def draw_attribution(attribution: Mapping[str, Any], path: Path) -> None:
 Bar = tuple[str, float, str, str]  # name, length, style, what stands beside it
 
 
-def _bars(one: Mapping[str, Any], metric: str) -> list[Bar]:
-    value = one["values"][metric] or 0.0
+def _bars(protocol: Mapping[str, Any], metric: str) -> list[Bar]:
+    value = protocol["values"][metric] or 0.0
     bars = []
-    for kind, cause in one["causes"].items():
+    for kind, cause in protocol["causes"].items():
         gain = cause["gains"][metric]
-        bars.append((kind, gain or 0.0, "gain", f"{signed(gain)}  ({n_text(cause['n'], one['n_scored'])})"))
-    bars += [(name, one[name][metric] or 0.0, "left", signed(one[name][metric])) for name in ("overlap", "rest")]
-    for stage, values in one["stages"].items():
+        bars.append((kind, gain or 0.0, "gain", f"{signed(gain)}  ({n_text(cause['n'], protocol['n_scored'])})"))
+    bars += [
+        (name, protocol[name][metric] or 0.0, "left", signed(protocol[name][metric])) for name in ("overlap", "rest")
+    ]
+    for stage, values in protocol["stages"].items():
         change = None if values[metric] is None else values[metric] - value
         bars.append((f"true {stage}", change or 0.0, "stage", signed(change)))
     return bars
 
 
-def _draw_panel(axes: Any, one: Mapping[str, Any], metric: str, *, has_names: bool) -> None:
-    value = 100 * (one["values"][metric] or 0.0)
-    bars = _bars(one, metric)
+def _draw_panel(axes: Any, protocol: Mapping[str, Any], metric: str, *, has_names: bool) -> None:
+    value = 100 * (protocol["values"][metric] or 0.0)
+    bars = _bars(protocol, metric)
     places = range(len(bars))
     for place, (_, length, style, text) in zip(places, bars, strict=True):
         axes.barh(place, 100 * length, left=value, height=0.62, linewidth=0.8, **STYLES[style])
@@ -71,7 +75,7 @@ def _draw_panel(axes: Any, one: Mapping[str, Any], metric: str, *, has_names: bo
     axes.set_xticks([tick for tick in axes.get_xticks() if lowest - 0.04 * _span(value) <= tick <= 100])
     axes.set_ylim(len(bars) - 0.4, -0.6)
     axes.set_yticks(list(places), [name for name, *_ in bars] if has_names else [""] * len(bars), fontsize=9.5)
-    axes.set_title(f"{one['protocol']}: {metric} {value:.1f}", fontsize=10.5, loc="left")
+    axes.set_title(f"{protocol['protocol']}: {metric} {value:.1f}", fontsize=10.5, loc="left")
     axes.set_xlabel("value with this alone mended", fontsize=8.5, color="#444444")
     axes.tick_params(axis="y", length=0)
     axes.tick_params(axis="x", labelsize=8.5)

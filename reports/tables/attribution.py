@@ -45,19 +45,19 @@ def attribution_tables(attribution: Mapping[str, Any]) -> list[Table | Prose]:
     ]
 
 
-def _protocol_table(one: Mapping[str, Any]) -> Table:
-    names, n_scored = list(one["values"]), one["n_scored"]
-    title = f"{one['protocol']} (version {one['version']}): {counted(len(one['scenes']), 'scene')}"
+def _protocol_table(protocol: Mapping[str, Any]) -> Table:
+    names, n_scored = list(protocol["values"]), protocol["n_scored"]
+    title = f"{protocol['protocol']} (version {protocol['version']}): {counted(len(protocol['scenes']), 'scene')}"
     header = ["", "errors" if n_scored is None else "points", *names, "what it is"]
-    rows = [["as it is", "", *(percent(one["values"][name]) for name in names), ""]]
-    for kind, cause in one["causes"].items():
+    rows = [["as it is", "", *(percent(protocol["values"][name]) for name in names), ""]]
+    for kind, cause in protocol["causes"].items():
         gains = [signed(cause["gains"][name]) for name in names]
-        rows.append([kind, n_text(cause["n"], n_scored), *gains, MEANINGS[one["kind"]][kind]])
-    rows.append(["overlap", "", *(signed(one["overlap"][name]) for name in names), OVERLAP])
-    rows.append(["rest", "", *(signed(one["rest"][name]) for name in names), REST[one["kind"]]])
-    for stage, values in one["stages"].items():
+        rows.append([kind, n_text(cause["n"], n_scored), *gains, MEANINGS[protocol["kind"]][kind]])
+    rows.append(["overlap", "", *(signed(protocol["overlap"][name]) for name in names), OVERLAP])
+    rows.append(["rest", "", *(signed(protocol["rest"][name]) for name in names), REST[protocol["kind"]]])
+    for stage, values in protocol["stages"].items():
         rows.append([f"with true {stage}", "", *(percent(values[name]) for name in names), STAGES[stage]])
-    return text_table(one["protocol"], [header, *rows], heading=title)
+    return text_table(protocol["protocol"], [header, *rows], heading=title)
 
 
 def n_text(n: int, n_scored: int | None) -> str:

@@ -57,10 +57,10 @@ def _probability(value: float | None) -> str:
     return NOT_MEASURED if value is None else f"{value:.3g}"
 
 
-def _notes(one: Mapping[str, Any]) -> Sequence[str]:
-    tests = [value for value in one["metrics"].values() if value["p"] is not None]
+def _notes(compared: Mapping[str, Any]) -> Sequence[str]:
+    tests = [value for value in compared["metrics"].values() if value["p"] is not None]
     notes = []
-    if len(one["scenes"]) < 2:
+    if len(compared["scenes"]) < 2:
         notes.append("a single scene says nothing of other scenes: no interval, and p is 1 whatever the difference")
     elif tests:
         how = "all patterns of signs" if all(value["is_exact"] for value in tests) else "100000 drawn patterns of signs"
@@ -68,8 +68,8 @@ def _notes(one: Mapping[str, Any]) -> Sequence[str]:
             f"[..]: 95 % over resampled scenes, the same on both sides; p: two-sided sign-flip test of the mean over "
             f"scenes, {how}"
         )
-    if one["classes"]:
-        n_equal = sum(not any(v["per_scene"].values()) for each in one["classes"].values() for v in each.values())
+    if compared["classes"]:
+        n_equal = sum(not any(v["per_scene"].values()) for each in compared["classes"].values() for v in each.values())
         notes.append(f"{n_equal} values of classes that no scene changes are left out")
         notes.append(MANY_CLASSES)
     return notes

@@ -45,8 +45,8 @@ def _protocol_table(rows: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any
     if metrics["is_partial"]:
         title += f": PARTIAL, only the first {metrics['limit']} frames of each scene"
     header = ["method", *names, f"ceiling ({' / '.join(names)})", "scenes", "covered at 2.5 / 5 / 10 cm"]
-    body = [[one["method"], *(_value_text(one, name) for name in names), *_context(one, names)] for one in rows]
-    notes = [line for one in rows for line in _notes(one)]
+    body = [[row["method"], *(_value_text(row, name) for name in names), *_context(row, names)] for row in rows]
+    notes = [line for row in rows for line in _notes(row)]
     return text_table(str(first["protocol"]), [header, *body], heading=title, notes=notes)
 
 

@@ -43,14 +43,14 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.reports.pictures.attribution import draw_attribution
     from su3d_bench.reports.tables.attribution import attribution_tables
 
-    found = attribute(
+    attribution = attribute(
         arguments.run,
         method=arguments.method,
         protocols=arguments.protocol,
         oracle=arguments.oracle,
     ).to_json()
     if arguments.out is not None:
-        draw_attribution(found, arguments.out)
+        draw_attribution(attribution, arguments.out)
         remark(f"plot: {arguments.out}", quiet=arguments.quiet)
-    answer_either(arguments, found, formatted(attribution_tables(found), arguments))
+    answer_either(arguments, attribution, formatted(attribution_tables(attribution), arguments))
     return EXIT_DONE

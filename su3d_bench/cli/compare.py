@@ -39,12 +39,12 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.analysis.comparison import compare
     from su3d_bench.reports.tables.comparison import comparison_tables
 
-    found = compare(
+    comparison = compare(
         arguments.left,
         arguments.right,
         method=arguments.method,
         protocols=arguments.protocol,
         per_class=arguments.per_class,
     ).to_json()
-    answer_either(arguments, found, formatted(comparison_tables(found), arguments))
+    answer_either(arguments, comparison, formatted(comparison_tables(comparison), arguments))
     return EXIT_DONE

@@ -96,11 +96,11 @@ def call(arguments: argparse.Namespace) -> int:
     if arguments.dry_run:
         return _estimate(sources["reasoning"], arguments)
     drafts, answered_by = _drafts(sources, arguments)
-    told = _write(sources, drafts, _drawn(source, drafts, arguments), answered_by, arguments)
+    written_sets = _write(sources, drafts, _drawn(source, drafts, arguments), answered_by, arguments)
     if arguments.json:
-        answer_json({"sets": told})
+        answer_json({"sets": written_sets})
         return EXIT_DONE
-    for one in told:
+    for one in written_sets:
         answer(f"{one['sheet_id']}: {counted(one['n_items'], 'item')}, {counted(one['n_questions'], 'question')}")
         for path in one["files"]:
             answer(path)
@@ -250,7 +250,7 @@ def _write(
     from su3d_bench.sheets.making import Origin, make_sheets, write_sheets
 
     apart = arguments.key or arguments.out.with_name(f"{arguments.out.name}-key")
-    told = []
+    written_sets = []
     for kind, source in sources.items():
         rules = {rules.name for scene in source.scenes if (rules := source.rules(scene, kind)) is not None}
         by = answered_by if kind == "reasoning" else ""
@@ -266,7 +266,7 @@ def _write(
         )
         folder, key = (arguments.out, apart) if len(sources) == 1 else (arguments.out / kind, apart / kind)
         files = write_sheets(made, folder, key)
-        told.append(
+        written_sets.append(
             {
                 "kind": kind,
                 "sheet_id": made.sheet.id,
@@ -276,4 +276,4 @@ def _write(
                 "key": str(key),
             }
         )
-    return told
+    return written_sets
