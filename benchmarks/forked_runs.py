@@ -111,7 +111,7 @@ def false_seals(folder: Path, expected: dict[str, Any]) -> list[str]:
     wrong = []
     for done in folder.rglob("done.json"):
         for seal in JobFolder(done.parent).seals().values():
-            files = {done.parent / name: sha for name, sha in seal["files"].items()}
+            files = {done.parent / name: sha for name, sha in seal.files.items()}
             if all(path.is_file() and digest_file(path) == sha for path, sha in files.items()):
                 names = [path.relative_to(folder).as_posix() for path in files]
                 wrong += [name for name in names if _timeless(folder / name) != expected.get(name)]
