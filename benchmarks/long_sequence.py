@@ -121,7 +121,7 @@ def main() -> None:
             feeding.up_to(n_fed, reading, arguments.frames)
             scratch_mib[n_fed] = method._scratch.n_bytes / 2**20
             print(f"{n_fed} frames after {time.perf_counter() - start:.0f} s", flush=True)
-    updates = list(csv.DictReader(io.StringIO(feeding.csv_text())))
+    updates = list(csv.DictReader(io.StringIO(feeding.updates_text())))
     rows = [
         [
             f"{n:,}",
