@@ -39,6 +39,7 @@ from su3d_bench.core.types import (
 )
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
+from su3d_bench.runs.feeding import warm_up
 from su3d_bench.store.predictions import read_prediction, write_prediction
 
 SIDE_PX = 500
@@ -128,6 +129,7 @@ def work(n_points: int, n_dimensions: int, features_in: str, folder: Path) -> No
     n_images = -(-n_points // SIDE_PX**2)
     config: Callable[..., ConceptFusionConfig] = ConceptFusionConfig
     method = ConceptFusion(config(height=SIDE_PX, width=SIDE_PX, sigma=2.0, features_in=features_in))
+    warm_up(ConceptFusion(config(height=SIDE_PX, width=SIDE_PX, sigma=2.0, features_in="memory")))  # as a run does
     method.start(SceneInfo("made", "wall", 2 * n_images, 1, "rendered-rooms"))
     with reported("start"):
         pass
