@@ -95,18 +95,24 @@ def checked(kind: str, target: str, plug_in: Any) -> Any:
     if not isinstance(plug_in, type):
         return plug_in
     interface = INTERFACES[kind]
-    own = {name for base in plug_in.__mro__[:-1] for name in (*vars(base), *vars(base).get("__annotations__", ()))}
-    required = {*OF_THE_CLASS[kind], *(name for name in _members(interface) if callable(vars(interface).get(name)))}
-    absent = required.union(*map(_members, (interface, *ABILITIES[kind]))) - own
-    for name in sorted(name for name in own if not name.startswith("_")):
+    own = {name: is_called for base in plug_in.__mro__[:-1] for name, is_called in _members(base).items()}
+    known = {name: called for each in (interface, *ABILITIES[kind]) for name, called in _members(each).items()}
+    required = {*OF_THE_CLASS[kind], *(name for name, called in _members(interface).items() if called)}
+    for name, called in sorted(own.items()):
+        absent = [other for other in known if other not in own and known[other] == called]
         meant = difflib.get_close_matches(name, absent, 1, LEAST_LIKENESS)
-        # ``points`` is a name of its own beside ``n_points``
+        # ``points`` is a name of its own beside ``n_points``, and a value ``closed`` beside a function ``close``
         if meant and meant[0].count("_") == name.count("_"):
             raise ConfigError(f"{kind} '{target}': a {kind} has no '{name}'; did you mean '{meant[0]}'?")
-    if missing := sorted(required - own):
+    if missing := sorted(required - set(own)):
         raise ConfigError(f"{kind} '{target}': lacks '{missing[0]}'; a {kind} has {', '.join(sorted(required))}")
     return plug_in
 
 
-def _members(protocol: type) -> list[str]:
-    return [name for name in (*vars(protocol), *protocol.__annotations__) if not name.startswith("_")]
+def _members(plug_in: type) -> dict[str, bool]:
+    """The public members of a class, without those of its bases, and whether each is called."""
+    members = dict.fromkeys(vars(plug_in).get("__annotations__", ()), False)
+    for name in vars(plug_in):
+        value = getattr(plug_in, name)
+        members[name] = callable(value) and not isinstance(value, type)
+    return {name: is_called for name, is_called in members.items() if not name.startswith("_")}

@@ -90,6 +90,7 @@ def test_a_required_member_that_is_misspelt_is_told_apart(tmp_path: Path) -> Non
         ("dataset", ["def tree(self): ...", "def object_boxes(self): ...", "image_domain = 'camera'", "surface = 1"]),
         ("method", ["points = ()", "instances = ()", "def reset(self): ...", "thresholds = 3", "_presest = {}"]),
         ("method", ["presets = {}", "presest = {}"]),
+        ("method", ["closed = False", "def preset(self): ..."]),
     ],
 )
 def test_names_of_ones_own_are_left_alone(tmp_path: Path, kind: str, lines: list[str]) -> None:
