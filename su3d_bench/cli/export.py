@@ -226,11 +226,13 @@ def _labelled(content: Content, source: Source, arguments: argparse.Namespace) -
 def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
     """The dataset and the scene of a prediction, with the options and the data of the run that it lies in."""
     from su3d_bench.cli.datasets.check import chosen_scenes
-    from su3d_bench.runs.finished import read_data
+    from su3d_bench.runs.finished import data_of_map
 
     if source.run is None:
         return chosen_scenes([source.address], [], is_quiet=is_quiet)[0]
-    return read_data(source.run).dataset(source.address), source.address.partition("/")[2]
+    return data_of_map(source.run, source.address, source.path).dataset(source.address), source.address.partition("/")[
+        2
+    ]
 
 
 def _rules(name: str | None, dataset: Any) -> ProtocolRules:

@@ -30,7 +30,7 @@ from su3d_bench.store.records import (
     read_record,
     read_updates,
 )
-from su3d_bench.store.run_folder import RunFolder
+from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 if TYPE_CHECKING:
     from su3d_bench.core.interfaces import Encoder
@@ -165,10 +165,10 @@ def read_run(path: Path) -> FinishedRun:
     )
 
 
-def read_data(path: Path) -> RunData:
-    """The data of the run in the folder ``path``, which need not be finished."""
-    record = read_record(RequestRecord, path / "run.json", printable(str(path), 200))
-    return RunData(read_file(path / "run.toml"), record.data_digests)
+def data_of_map(run: Path, scene: str, map_file: Path) -> RunData:
+    """The data from which ``map_file`` was made, a sealed map of ``scene`` in the folder ``run``, finished or not."""
+    seal = JobFolder(map_file.parent).seals().get("predict")
+    return RunData(read_file(run / "run.toml"), {} if seal is None else {scene: seal.key.get("data", "")})
 
 
 def encoder_of(run: RunFolder, device: str = "cpu") -> Encoder:

@@ -99,7 +99,6 @@ class RequestRecord:
 
     encoder: str | None = None
     encoder_digest: str | None = None
-    data_digests: Mapping[str, str] = field(default_factory=dict)
     methods: tuple[str, ...] = ()
     scenes: tuple[str, ...] = ()
 

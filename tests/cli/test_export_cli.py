@@ -77,6 +77,26 @@ def test_a_run_is_exported_for_scannet(run_folder: str, capsys: pytest.CaptureFi
     assert collected.class_numbers is not None and set(collected.class_numbers.tolist()) == ids
 
 
+def test_maps_of_an_interrupted_run_are_exported_too(run_folder: str, capsys: pytest.CaptureFixture[str]) -> None:
+    Path("r/metrics.json").unlink()
+    record = json.loads(Path("r/run.json").read_text())
+    Path("r/run.json").write_text(json.dumps({**record, "status": "running", "data_digests": {}}))
+    words = ["export", run_folder, "--to", "scannet", "--protocol", "rooms-instance", "--method", "oracle"]
+    assert main([*words, "--out", "oracle"]) == 0
+    assert sorted(file.name for file in Path("oracle").glob("*.txt")) == ["a.txt", "b.txt"]
+
+
+def test_a_map_is_not_labelled_by_data_from_which_it_was_not_made(
+    run_folder: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    seal = Path("r/scenes/painted.b/oracle/done.json")
+    record = json.loads(seal.read_text())
+    record["steps"]["predict"]["key"]["data"] = "another"
+    seal.write_text(json.dumps(record))
+    words = ("--to", "scannet", "--protocol", "rooms-instance", "--method", "oracle")
+    assert "painted/b: its data are not those of the run; run it again" in error_of(capsys, run_folder, *words)
+
+
 def test_the_only_method_of_a_limited_run_is_meant_and_called_partial(
     run_folder: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
