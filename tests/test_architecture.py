@@ -5,13 +5,14 @@ from __future__ import annotations
 import ast
 import re
 import subprocess
+import sys
 import tomllib
 from fnmatch import fnmatch
 from pathlib import Path
 
 import pytest
 from house import FLOORS, LINKED, PACKAGE, PURPOSE, climbs, code_files, room_of
-from places import ROOT
+from places import ROOT, SUPPORT
 
 CODE = code_files()
 HEAVY = {"open3d", "torch", "onnxruntime", "sklearn", "pandas", "matplotlib", "numba"}
@@ -92,3 +93,10 @@ def test_the_harness_names_no_dataset_and_no_baseline() -> None:
     rooms = {"core", "numerics", "store", "runs", "sheets", "analysis"}
     named = [path for path in CODE if room_of(path) in rooms and names.search(path.read_text())]
     assert named == [PACKAGE / "core" / "registry.py"]
+
+
+def test_the_page_of_the_house_is_what_the_code_is() -> None:
+    """In a process of its own: a trip shows the first call into each module, which a process makes once."""
+    words = [sys.executable, str(SUPPORT / "house.py"), "--check"]
+    done = subprocess.run(words, capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stdout + done.stderr

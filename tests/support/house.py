@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import ast
 import io
+import os
 import re
 import sys
 import tempfile
 from collections.abc import Callable
 from contextlib import redirect_stdout
 from pathlib import Path
-from types import FrameType
+from types import CodeType, FrameType
 from typing import Any
 
 from places import ROOT
@@ -103,14 +104,20 @@ def first_calls(call: Callable[[], Any]) -> list[str]:
     Calls of this thread; what runs while a module is imported does not count, nor do ``core``, ``cli`` and the door.
     """
     visited: dict[str, None] = {}
+    passed: set[CodeType] = set()  # what needs no second look: this stands in the way of every call
 
     def visit(frame: FrameType, event: str, _: Any) -> None:
-        name = str(frame.f_globals.get("__name__", "")) if event == "call" else ""
+        if event != "call" or frame.f_code in passed:
+            return
+        name = str(frame.f_globals.get("__name__", ""))
         room, _, module = name.removeprefix("su3d_bench.").partition(".")
         place = f"{room}/{module.replace('.', '/')}"
-        is_new = name.startswith("su3d_bench.") and place not in visited and room in PURPOSE
-        if is_new and room not in ("core", "cli") and not _is_importing(frame):
+        is_met = name.startswith("su3d_bench.") and room in PURPOSE and room not in ("core", "cli")
+        if is_met and place not in visited:
+            if _is_importing(frame):
+                return
             visited[place] = None
+        passed.add(frame.f_code)
 
     sys.setprofile(visit)
     try:
@@ -185,6 +192,7 @@ def _trips() -> dict[str, str]:
         small = ["rooms.width=160", "rooms.height=120", "rooms.n_frames=40", "perception.cache=false"]
         words = ["run", "--scenes", "rooms/bathroom7", "--methods", "opensu3d", "--limit", "2", "--set", *small]
         words += ["--profile", "embedded", "--no-pictures", "--quiet", "--jobs", "1", "--out", out]
+        os.environ |= {"SU3D_DATA": f"{folder}/data", "SU3D_CACHE": f"{folder}/cache"}  # a first run, whoever draws
         frame = first_calls(lambda: main(words))
         run = first_calls(lambda: main(["report", "tables", out, "--table", "II", "--quiet"]))
         prediction = prediction_trip(Path(folder))
