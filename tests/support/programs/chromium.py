@@ -29,6 +29,14 @@ def find_chromium() -> str | None:
     return next((found for name in NAMES if (found := shutil.which(name)) is not None), None)
 
 
+# What the browser answers where the page that was asked goes away.
+LEAVES = ("navigated or closed", "context was destroyed")
+
+
+class PageLeftError(Exception):
+    """The page went away before it answered."""
+
+
 class Chromium:
     """A browser with one page; its profile is in ``folder`` and stays there, so that a second one finds it again."""
 
@@ -85,6 +93,8 @@ class Chromium:
         while True:
             answer = self._next(end)
             if answer.get("id") == self._number:
+                if any(words in str(answer.get("error", "")) for words in LEAVES):
+                    raise PageLeftError(answer["error"])
                 assert "error" not in answer, answer["error"]
                 result: dict[str, Any] = answer["result"]
                 return result
@@ -112,7 +122,15 @@ class Chromium:
     def _arrive(self, method: str, values: Mapping[str, Any]) -> None:
         self.run("window.isOfThePageBefore = true")
         self.call(method, values)
-        self.until("!window.isOfThePageBefore && document.readyState === 'complete' && location.protocol === 'file:'")
+        there = "!window.isOfThePageBefore && document.readyState === 'complete' && location.protocol === 'file:'"
+
+        def has_arrived() -> bool:
+            try:
+                return bool(self.run(there))
+            except PageLeftError:  # the page before went while it was asked
+                return False
+
+        wait_until(has_arrived, f"the page never came: {method}", WAIT_S)
 
     def run(self, script: str) -> Any:
         """The value of an expression in the page."""
