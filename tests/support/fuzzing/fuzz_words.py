@@ -105,7 +105,10 @@ def _joined(parts: list[list[str]]) -> list[str]:
 
 
 def vectors(words: tuple[str, ...], parser: argparse.ArgumentParser) -> st.SearchStrategy[list[str]]:
-    """Arguments of one verb: some of its flags, some words in their places."""
+    """Arguments of one verb: some of its flags, some words in their places; never ``--debug``, which shows tracebacks.
+
+    Hypothesis draws texts from the constants of the code too, so that it would come as a word.
+    """
     flags = [one for one in parser._actions if one.option_strings and one.dest not in ("help", "version", "debug")]
     placed = [one for one in parser._actions if not one.option_strings]
     parts: list[st.SearchStrategy[list[str]]] = []
@@ -114,4 +117,5 @@ def vectors(words: tuple[str, ...], parser: argparse.ArgumentParser) -> st.Searc
         parts.append(st.lists(known | values() if action.choices else known, max_size=2))
     parts += [st.lists(st.one_of(*map(given_flag, flags)), max_size=4).map(_joined)]
     tail = HELD_BACK.get(words, [])
-    return st.tuples(*parts).map(lambda found: [*words, *_joined(list(found)), *tail])
+    drawn = st.tuples(*parts).map(lambda found: [word for word in _joined(list(found)) if word != "--debug"])
+    return drawn.map(lambda found: [*words, *found, *tail])
