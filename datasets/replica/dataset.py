@@ -66,6 +66,7 @@ class Replica:
 
     name = "replica"
     reads_made_rooms = True
+    scene_names = r"(room_?[0-2]|office_?[0-4])"  # those of made rooms are among them
     label_space = "replica"
     variants: tuple[str, ...] = ("mesh-vertices", "face-corners", "conceptgraphs", "openmask3d", "ovo-51")
     Options = ReplicaOptions

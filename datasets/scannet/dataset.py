@@ -64,6 +64,7 @@ class ScanNet:
 
     name = "scannet"
     reads_made_rooms = True
+    scene_names = r"scene\d{4}_\d\d"
     label_space = "scannet"
     variants: tuple[str, ...] = ("nyu40-vertices", "scannet200-vertices")
     Options = ScannetOptions

@@ -153,6 +153,13 @@ class ReadsMadeRooms(Protocol):
     reads_made_rooms: bool
 
 
+@runtime_checkable
+class NamesScenes(Protocol):
+    """The regular expression of names that only its scenes have, by which files of predictions are known."""
+
+    scene_names: str
+
+
 class StageTimer(Protocol):
     def stage(self, name: str) -> Any:
         """A context manager that adds the time inside it to stage ``name`` of the current update."""
@@ -313,7 +320,17 @@ class Closes(Protocol):
 
 INTERFACES = {"dataset": Dataset, "method": Method}
 ABILITIES = {
-    "dataset": (HasPlaces, HasStatus, HasGroups, HasProblems, HasSurface, HasQueries, RendersFrames, ReadsMadeRooms),
+    "dataset": (
+        HasPlaces,
+        HasStatus,
+        HasGroups,
+        HasProblems,
+        HasSurface,
+        HasQueries,
+        RendersFrames,
+        ReadsMadeRooms,
+        NamesScenes,
+    ),
     "method": (
         HasAbout,
         HasPresets,

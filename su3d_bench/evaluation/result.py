@@ -12,7 +12,7 @@ from su3d_bench.core.errors import PredictionError
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.matching.checks import MaskFacts
 from su3d_bench.metrics.metric import SceneScore
-from su3d_bench.metrics.protocols import RULES_OF_KIND, ProtocolRules
+from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.metrics.scoring import ProtocolResult, combine, combined_metrics, metric_of, plain_json
 
 SCHEMA = 1
@@ -22,9 +22,6 @@ KEYS = {
     "AP": "ap", "AP50": "ap50", "AP25": "ap25", "mAcc": "macc", "mIoU": "miou", "F-mIoU": "fmiou", "pAcc": "pacc",
     "recall": "acc", "precision": "precision", "IoU": "iou", "F1": "f1", "mPrecision": "mprecision", "mF1": "mf1",
 }  # fmt: skip
-# Kinds all of whose metrics are reported.
-OWN_NAMES = ("categories", *(kind for kind, rules in RULES_OF_KIND.items() if rules.is_judged))
-MAIN = ("ap", "ap50", "ap25", "macc", "miou", "fmiou")
 
 
 @dataclass(frozen=True)
@@ -73,7 +70,7 @@ class ProtocolEvaluation:
     coordinates.
     """
 
-    kind: str
+    rules: ProtocolRules
     result: ProtocolResult
     ceiling: Mapping[str, float] | None
     every_class: Mapping[str, float] | None
@@ -107,12 +104,11 @@ class ProtocolEvaluation:
         result = self.result
         near, identical = self.n_duplicates
         confidences = self.confidences
-        metrics = _renamed(result.metrics)
         return {
             "version": result.version,
-            "kind": self.kind,
+            "kind": self.rules.kind,
             "n_scenes": result.n_scenes,
-            "metrics": {key: value for key, value in metrics.items() if key in MAIN or self.kind in OWN_NAMES},
+            "metrics": _renamed({k: value for k, value in result.metrics.items() if k in self.rules.value_names}),
             "intervals": _renamed(result.intervals),
             "pooled": _renamed(result.pooled),
             "scene_mean": _renamed(result.scene_mean),
@@ -201,7 +197,7 @@ def _form(rules: ProtocolRules, kept: SceneOutcomes, file_confidences: bool) -> 
     is_whole = len(ceilings) == len(kept.scores)
     covered = {radius: 1.0 - share for radius, share in result.coverage.items()}
     evaluation = ProtocolEvaluation(
-        kind=rules.kind,
+        rules=rules,
         result=result,
         ceiling=combined_metrics(rules, ceilings) if is_whole else None,
         every_class=metric_of(rules).combine(kept.bounds) if len(kept.bounds) == len(kept.scores) else None,
@@ -223,7 +219,7 @@ def _with_ones(rules: ProtocolRules, kept: SceneOutcomes) -> dict[str, float] | 
     Which predictions hit does not depend on confidences, but a hit that is met twice takes the better one; with 1 for
     all there is no better one.
     """
-    if rules.kind != "instance" or rules.confidence != "ones":
+    if rules.confidence != "ones":
         return None
     counts = [cast("InstanceCounts", score.counts) for score in kept.scores.values()]
     if all((of_scene.score == 1).all() for of_scene in counts):
@@ -247,7 +243,7 @@ def _scene_warnings(kept: SceneOutcomes) -> list[str]:
 
 def _confidence_warnings(rules: ProtocolRules, evaluation: ProtocolEvaluation, file_confidences: bool) -> list[str]:
     confidences = evaluation.confidences
-    if rules.kind != "instance" or confidences is None:
+    if not rules.needs_instances or confidences is None:
         return []
     if evaluation.with_ones is not None:
         shown = ", ".join(f"{name} {100 * evaluation.with_ones[name]:.1f}" for name in rules.headline)

@@ -19,7 +19,6 @@ from su3d_bench.core.types import (
     Partition,
     Prediction,
 )
-from su3d_bench.datasets.openlex3d import FACE_CORNERS, VISIBLE
 from su3d_bench.evaluation.request import Request
 from su3d_bench.evaluation.result import SceneOutcome, Tally
 from su3d_bench.evaluation.texts import encoder_for, read_text_features
@@ -57,16 +56,11 @@ from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
 from su3d_bench.metrics.protocol_files import protocol_names
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.metrics.scoring import QuestionTruth, score_scene
+from su3d_bench.metrics.scoring import QuestionTruth, metric_of, score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
 from su3d_bench.predictions.own_runs import OwnRuns
 
-NO_CEILING = (
-    "no ceiling is known: masks grow by the threshold, over their neighbours too, and each query's best mask has "
-    "confidence 1, so that perfect masks with perfect features need not reach 1"
-)
-NO_QUERY_CEILING = "no ceiling is known: how well perfect masks are ranked is up to the encoder"
 NOTHING = Instances.of(np.zeros((0, 3), np.float32), [], labels=())
 
 
@@ -148,7 +142,7 @@ class Scoring:
                 kept.unscored[scene] = str(error)
                 return None
             return str(error)
-        changes = self.tally.counts_file_confidences and rules.kind == "instance" and rules.confidence == "ones"
+        changes = self.tally.counts_file_confidences and rules.confidence == "ones"
         used = rules.model_copy(update={"confidence": "prediction"}) if changes else rules
         if isinstance(truth, VertexTruth):
             if (reason := why_not_length(facts, len(truth.values))) is not None:
@@ -173,9 +167,12 @@ def _is_empty(content: Content) -> bool:
 def skips_missing_scenes(rules: ProtocolRules) -> bool:
     """Whether the original leaves scenes without a prediction out, so that their objects never count as missed.
 
-    evaluate_semantic_instance.py, evaluate_semantic_label.py and those made after them walk the prediction files.
+    evaluate_semantic_instance.py, evaluate_semantic_label.py and those made after them walk the prediction files. A
+    protocol of a user, or of rooms that are made here, has no original.
     """
-    return rules.metric == "scannet" and rules.name in protocol_names() and "rooms" not in rules.name
+    if rules.metric != "scannet" or rules.name not in protocol_names():
+        return False
+    return not any(getattr(registry.load("dataset", name), "renders_frames", False) for name in rules.datasets)
 
 
 def facts_of(content: Content) -> ContentFacts:
@@ -315,7 +312,7 @@ def score_on_truth(
         if not isinstance(content, VertexLabels):
             facts = mask_facts(masks, scores, len(prediction.points))
             warnings += empty_warnings(scene, facts, masks, getattr(prediction, "names", ()))
-        if rules.kind == "instance" and rules.class_agnostic is None:
+        if rules.names_masks:
             cap_m, voxel_m = rules.transfer.cap_m, rules.transfer.evaluation_voxel_m
             moved = transfer.transfer_masks(prediction.points, masks, truth.points, cap_m, voxel_m)
             values = instance_ap.encode_ground_truth(truth.semantic, truth.instance)
@@ -352,6 +349,6 @@ def score_on_objects(
     if isinstance(prediction, Instances):
         facts = mask_facts(prediction, np.asarray(prediction.scores, np.float64), len(prediction.points))
         warnings += empty_warnings(scene, facts, prediction, prediction.names)
-    if rules.kind == "queries":
-        warnings.append(NO_CEILING if base.variant in (VISIBLE, FACE_CORNERS) else NO_QUERY_CEILING)
+    if (remark := metric_of(rules).ceiling_remark) is not None:
+        warnings.append(remark)
     return SceneOutcome(score_scene(rules, truth, prediction, encoder), facts=facts, warnings=tuple(warnings))

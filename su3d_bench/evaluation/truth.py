@@ -32,7 +32,7 @@ from su3d_bench.datasets.openlex3d import FACE_CORNERS, VISIBLE, OpenLexRelease
 from su3d_bench.evaluation.request import Request
 from su3d_bench.formats.arrays import MOST_POINTS
 from su3d_bench.formats.text_integers import integer_lines
-from su3d_bench.metrics.fitness import LARGEST_NYU40_ID, TruthFacts, why_not_truth
+from su3d_bench.metrics.fitness import ID_LISTS, LARGEST_NYU40_ID, TruthFacts, list_of_ids, why_not_truth
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
 from su3d_bench.metrics.protocols import ProtocolRules
@@ -47,8 +47,6 @@ from su3d_bench.runs.scenes import data_root
 NOT_MEANT = "is not meant for"
 LARGEST_LABEL = 1357  # of scannetv2-labels.combined.tsv; values above it are label * 1000 + instance
 LARGEST_VALUE = 10_000 * INSTANCES_PER_CLASS  # as the instance metric has it
-# Scenes by whose names alone text files are known; the built-in rooms share names with Replica.
-SCENE_NAMES = {"scannet": re.compile(r"scene\d{4}_\d\d"), "replica": re.compile(r"(room_?[0-2]|office_?[0-4])")}
 
 
 @dataclass(frozen=True)
@@ -264,9 +262,8 @@ class TextTruths(SceneTruths):
             return reason
         if self.dataset_name not in rules.datasets:
             return f"{NOT_MEANT} {self.dataset_name}"
-        # The label space of ScanNet alone has several forms of ground truth.
-        variant = "nyu40-vertices" if self._largest_label <= LARGEST_NYU40_ID else "scannet200-vertices"
-        fits = rules.label_space != "scannet" or variant == rules.ground_truth
+        variant = list_of_ids(self._largest_label)
+        fits = variant == rules.ground_truth or rules.ground_truth not in ID_LISTS
         return None if fits else f"the labels of the ground truth are '{variant}'"
 
     def of_scene(self, rules: ProtocolRules, scene: str) -> VertexTruth:
@@ -326,7 +323,8 @@ def dataset_of_names(scenes: Iterable[str]) -> str | None:
     ('scannet', None)
     """
     names = list(scenes)
-    fitting = [
-        dataset for dataset, form in SCENE_NAMES.items() if names and all(form.fullmatch(name) for name in names)
-    ]
-    return fitting[0] if fitting else None
+    for dataset in registry.names("dataset"):
+        form = getattr(registry.load("dataset", dataset), "scene_names", None)
+        if form is not None and names and all(re.fullmatch(form, name) for name in names):
+            return dataset
+    return None

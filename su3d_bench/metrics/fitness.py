@@ -92,7 +92,7 @@ def why_not_truth(rules: ProtocolRules, truth: TruthFacts) -> str | None:
     """Why no prediction at all can be scored under a protocol against a truth."""
     if rules.is_judged and not truth.has_points:
         return "needs the objects of a dataset; name one with --dataset"
-    if rules.kind == "instance" and not truth.has_instances:
+    if rules.needs_instances and not truth.has_instances:
         return "needs instances, the ground truth holds class ids alone (expected class id * 1000 + instance)"
     if truth.label_space is None:
         return None
@@ -116,11 +116,11 @@ def why_not_content(rules: ProtocolRules, content: ContentFacts, *, has_points: 
             return "the prediction has points of its own, the ground truth has no coordinates; name a --dataset"
         return why_not_map(rules, content) or _why_not_named(rules, content)
     if content.form == "vertex-labels":
-        if rules.kind == "instance":
+        if rules.needs_instances:
             return "needs instances, the prediction has one class a point"
         can_count = has_points or rules.metric == "scannet"
         return None if can_count else "needs the coordinates of the points; name a --dataset"
-    if rules.kind == "semantic" and not has_points:
+    if rules.names_points and not has_points:
         return "needs a class for every point, the prediction has masks; name a --dataset to make them a map"
     return _why_not_named(rules, content)
 
@@ -139,7 +139,7 @@ def why_not_map(rules: ProtocolRules, content: ContentFacts) -> str | None:
         if content.form != "instances":
             return "needs instances with names, and the method gives a partition"
         return "needs names, and the method gives its instances none" if content.n and not content.has_names else None
-    return NEEDS_FEATURES if _compares_texts(rules) and content.n_dimensions is None and content.n else None
+    return NEEDS_FEATURES if rules.compares_texts and content.n_dimensions is None and content.n else None
 
 
 def _why_not_named(rules: ProtocolRules, content: ContentFacts) -> str | None:
@@ -161,10 +161,15 @@ def why_not_numbers(rules: ProtocolRules, content: ContentFacts) -> str | None:
     if rules.class_agnostic is not None or rules.ground_truth not in ID_LISTS or ids is None or not len(ids):
         return None
     largest = int(ids.max())
-    list_of_ids = "nyu40-vertices" if largest <= LARGEST_NYU40_ID else "scannet200-vertices"
-    if list_of_ids == rules.ground_truth:
-        return None
-    return f"the predicted classes go up to {largest}, as {ID_LISTS[list_of_ids]}"
+    variant = list_of_ids(largest)
+    return (
+        None if variant == rules.ground_truth else f"the predicted classes go up to {largest}, as {ID_LISTS[variant]}"
+    )
+
+
+def list_of_ids(largest: int) -> str:
+    """The ground truth whose class ids go up to such a one."""
+    return "nyu40-vertices" if largest <= LARGEST_NYU40_ID else "scannet200-vertices"
 
 
 def why_not_length(content: ContentFacts, n_points: int) -> str | None:
@@ -183,9 +188,4 @@ def n_feature_dimensions(rules: ProtocolRules, content: ContentFacts) -> int | N
     if rules.class_agnostic is not None or rules.goes_by_names or not content.n:
         return None
     has_names = content.has_labels if content.form == "vertex-masks" else content.has_every_label
-    return None if has_names and not (content.has_own_points and _compares_texts(rules)) else content.n_dimensions
-
-
-def _compares_texts(rules: ProtocolRules) -> bool:
-    """Whether features are compared with texts whatever labels there are."""
-    return rules.kind in ("queries", "retrieval") or rules.metric == "openlex3d-ranking"
+    return None if has_names and not (content.has_own_points and rules.compares_texts) else content.n_dimensions

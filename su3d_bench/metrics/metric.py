@@ -112,6 +112,11 @@ class Metric(ABC, Generic[C]):
         )
 
     @property
+    def ceiling_remark(self) -> str | None:
+        """Why it is not known what perfect masks would score; None where it is, or where nobody would ask."""
+        return None
+
+    @property
     @abstractmethod
     def sizes(self) -> dict[str, int]:
         """How long the axes of the counts are that the rules fix."""

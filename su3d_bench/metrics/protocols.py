@@ -162,6 +162,11 @@ class ProtocolRules(_Strict):
     goes_by_names: ClassVar[bool] = False  # of instances, without features
     needs_own_points: ClassVar[bool] = False  # objects are found by the points of the map itself
     is_judged: ClassVar[bool] = False  # its counts are how many were judged and how many are right
+    names_points: ClassVar[bool] = False  # a class for every point
+    needs_instances: ClassVar[bool] = False  # in the truth and in the prediction
+    takes_votes: ClassVar[bool] = False  # of several neighbours
+    text_metrics: ClassVar[tuple[str, ...]] = ()  # compare features with texts whatever labels there are
+    ignores_classes: ClassVar[bool] = True  # ``ignore`` and ``prompt_names`` speak of ``classes``
     needs: ClassVar[tuple[str, ...]] = ()  # those of _OWN_FIELDS that must be there
     takes: ClassVar[tuple[str, ...]] = ()  # those that may be there
 
@@ -182,19 +187,17 @@ class ProtocolRules(_Strict):
                 is_size = field == "min_region_size" and self.is_judged
                 raise ValueError(_NEEDS_QUESTIONS if is_size else message)
         unknown = [name for name in (*self.ignore, *self.prompt_names) if not any(name in known for known in names)]
-        if unknown and self.kind != "categories":
+        if unknown and self.ignores_classes:
             raise ValueError(f"ignore or prompt_names: '{unknown[0]}' is no class{suggest(unknown[0], names)}")
         self._check_metric()
         self._check_transfer()
-        if self.kind == "reasoning" and self.questions != "generated":
-            raise ValueError("questions: kind 'reasoning' takes 'generated'")
         if self.per_kind is not None and self.questions != "generated":
             raise ValueError("per_kind: belongs to generated questions")
         return self
 
     def _check_texts(self) -> None:
         texts = self.prompts if self.prompt is None else (self.prompt, *self.prompts)
-        if self.class_agnostic is not None and self.kind == "instance":
+        if self.class_agnostic is not None and self.needs_instances:
             if texts or self.vocabulary or self.encoder:
                 raise ValueError("class_agnostic: takes no prompt, vocabulary or encoder")
         elif self.goes_by_names:
@@ -227,7 +230,7 @@ class ProtocolRules(_Strict):
             raise ValueError(f"transfer.candidates: kind '{self.kind}' takes {names}")
         if transfer.candidates == "each-mask" and (transfer.cap_m is None or transfer.evaluation_voxel_m > 0):
             raise ValueError("transfer.cap_m: 'each-mask' needs one, and no evaluation_voxel_m")
-        if transfer.neighbours > 1 and self.kind != "semantic":
+        if transfer.neighbours > 1 and not self.takes_votes:
             raise ValueError("transfer.neighbours: belongs to kind 'semantic'")
         if self.is_judged and transfer.cap_m is None:
             raise ValueError(f"transfer.cap_m: kind '{self.kind}' needs one")
@@ -249,8 +252,17 @@ class ProtocolRules(_Strict):
     @property
     def curve_names(self) -> tuple[str, ...]:
         """What the precision-recall curves are named after: the scored classes, or ``object`` where labels are none."""
-        has_labels = self.class_agnostic is None and self.kind != "queries"
-        return tuple(entry.name for entry in self.scored) if has_labels else ("object",)
+        return tuple(entry.name for entry in self.scored) if self.names_masks else ("object",)
+
+    @property
+    def names_masks(self) -> bool:
+        """Whether masks must have the right class too."""
+        return self.needs_instances and self.class_agnostic is None
+
+    @property
+    def compares_texts(self) -> bool:
+        """Whether features are compared with texts whatever labels there are."""
+        return self.metric in self.text_metrics
 
     def texts_of(self, name: str) -> tuple[str, ...]:
         """The texts that stand for the class, label or query ``name``; their mean feature counts."""
@@ -271,6 +283,8 @@ class SemanticRules(ProtocolRules):
     )
     candidates = ("object-points", "map-points")
     takes_dense = True
+    names_points = True
+    takes_votes = True
     needs = ("classes", "vocabulary")
 
 
@@ -278,6 +292,7 @@ class InstanceRules(ProtocolRules):
     """Masks with a class."""
 
     values_of_metric: ClassVar[ValuesOfMetric] = {"scannet": AP_NAMES}
+    needs_instances = True
     confidences = ("ones", "prediction")
     takes = ("class_agnostic", *_CURVE_FIELDS)
 
@@ -293,6 +308,7 @@ class QueryRules(ProtocolRules):
     values_of_metric: ClassVar[ValuesOfMetric] = {"query-ap": AP_NAMES}
     candidates = ("each-mask", "map-points")
     needs_own_points = True
+    text_metrics = ("query-ap",)
     confidences = ("similarity", "similarity-min-max")
     takes = ("top_k", *_CURVE_FIELDS)
 
@@ -307,6 +323,8 @@ class CategoryRules(ProtocolRules):
     candidates = ("object-points",)
     takes_dense = True
     needs_own_points = True
+    ignores_classes = False
+    text_metrics = ("openlex3d-ranking",)
 
     def _needed(self) -> tuple[str, ...]:
         return ("top_k",) if self.metric == "openlex3d-topn" else ()
@@ -325,6 +343,7 @@ class RetrievalRules(_JudgedRules):
     values_of_metric: ClassVar[ValuesOfMetric] = {
         "retrieval": ("instance", "affordance", "property", "relative", "all", "reachable")
     }
+    text_metrics = ("retrieval",)
     needs = ("questions", "min_region_size")
     takes = ("per_kind",)
 
@@ -349,6 +368,11 @@ class ReasoningRules(_JudgedRules):
     goes_by_names = True
     needs = ("questions", "min_region_size", "synonyms", "answers")
     takes = ("per_kind",)
+
+    def _needed(self) -> tuple[str, ...]:
+        if self.questions == "dataset":
+            raise ValueError("questions: kind 'reasoning' takes 'generated'")
+        return self.needs
 
 
 RULES_OF_KIND: dict[str, type[ProtocolRules]] = {

@@ -34,6 +34,11 @@ from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.store.scratch import release_pages
 
+NO_CEILING = (
+    "no ceiling is known: masks grow by the threshold, over their neighbours too, and each query's best mask has "
+    "confidence 1, so that perfect masks with perfect features need not reach 1"
+)
+NO_QUERY_CEILING = "no ceiling is known: how well perfect masks are ranked is up to the encoder"
 NEEDS_FEATURES = "needs features to compare with texts, and the prediction has none"
 _BLOCK_UNITS = 2048  # 2048 units x 3407 prompts of float64 are 56 MB
 
@@ -219,6 +224,10 @@ class QueryMetric(CurveMetric):
     """Masks ranked by their similarity to each text."""
 
     truth = QueryTruth
+
+    @property
+    def ceiling_remark(self) -> str:
+        return NO_CEILING if self.rules.transfer.candidates == "each-mask" else NO_QUERY_CEILING
 
     def per_scene(self, truth: QueryTruth, prediction: Instances | Partition, encoder: Encoder | None) -> SceneScore:
         rules = self.rules
