@@ -225,17 +225,3 @@ def _add_files(source: Path, folder: Path) -> None:
         place = folder / path.relative_to(source)
         place.parent.mkdir(parents=True, exist_ok=True)
         os.replace(path, place)
-
-
-def write_scene(
-    layout: Layout,
-    dataset: ScannedDataset,
-    scene: str,
-    out: Path,
-    report: Callable[[int], None] = lambda n_done: None,
-) -> None:
-    """Write one scene whole; nothing is done where it is there already."""
-    for target in plan_scenes(layout, dataset, [scene], out):
-        write_frames(layout, dataset, target, range(len(dataset.frames(scene, 1))), report)
-        layout.write_truth(dataset, target)
-        finish_scene(layout, dataset, target)

@@ -7,8 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.damage import DAMAGE
-from su3d_bench.core.errors import DataError
+from su3d_bench.core.errors import DAMAGE, DataError
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
 from su3d_bench.datasets.rooms.rendering.mesh import Grid, Patches, RoomMesh, at_rows, caster, cut, merge_equal
 from su3d_bench.datasets.rooms.rendering.render import Renderer, camera_intrinsics

@@ -19,7 +19,6 @@ from su3d_bench.numerics.boxes import (
     shared_ground,
 )
 
-RELATIONS = ("on", "under", "next to", "in", "above")
 STRUCTURE = frozenset(("wall", "floor", "ceiling"))
 OPENINGS = frozenset(("door", "window"))
 WALL_REACH_M = 1.0  # what hangs on a wall is above what stands no lower than this under it

@@ -75,7 +75,7 @@ def _make(arguments: argparse.Namespace) -> int:
 
 def _made(arguments: argparse.Namespace) -> list[Question]:
     from su3d_bench.cli.datasets.check import chosen_scenes
-    from su3d_bench.questions.making import questions_of
+    from su3d_bench.questions.truths import questions_of
 
     made: list[Question] = []
     for dataset, scene in chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet):

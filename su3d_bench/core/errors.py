@@ -7,11 +7,20 @@ in lower case, without a full stop.
 from __future__ import annotations
 
 import difflib
+import struct
+import tokenize
+import zipfile
+import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+# Of a damaged file, an .npz above all; a compression that there is none of is a NotImplementedError, a RuntimeError.
+DAMAGE = (
+    OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, RuntimeError,
+    SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error, struct.error,
+)  # fmt: skip
 MESSAGE_CHARACTERS = 500  # of one message: a hostile file may hold a line of any length
 
 

@@ -1,4 +1,4 @@
-"""What a scene's ground truth says to the questions of a protocol: the truth that scoring takes."""
+"""The questions of a scene: a dataset's own, or made from its ground truth, and what the truth says to a protocol's."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from su3d_bench.core.errors import GroundTruthMissing
 from su3d_bench.core.interfaces import Encoder, HasQueries
 from su3d_bench.core.types import GroundTruth, Instances
 from su3d_bench.metrics.protocols import ProtocolRules
@@ -20,7 +21,8 @@ from su3d_bench.metrics.questions.truths import (
     TrueAnswer,
 )
 from su3d_bench.metrics.scoring import QuestionTruth
-from su3d_bench.questions.generator import generate
+from su3d_bench.questions.colours import colour_words
+from su3d_bench.questions.generator import chosen, generate
 from su3d_bench.questions.known_objects import is_called, known_objects
 from su3d_bench.questions.model import Question, new_question
 from su3d_bench.questions.reasoning.generated import generate_questions
@@ -29,6 +31,9 @@ from su3d_bench.questions.reasoning.scene_map import map_of
 from su3d_bench.questions.reasoning.solver import Solver
 
 Refine = Callable[[Instances], RefinedNames | None]
+MIN_VERTICES = 100  # ScanNet's smallest instance that counts
+# The truth with the most classes, where it is not the first that a dataset gives.
+FULLEST = ("scannet200-vertices",)
 MOST_NAMES = 5  # the paper's m: n' comes from the names of so many best views
 
 
@@ -108,3 +113,20 @@ def voted_names(instances: Instances) -> RefinedNames | None:
         return None
     names = tuple(vote(top).name for top in top_names(instances, MOST_NAMES))
     return RefinedNames(names, f"the vote of the names of {MOST_NAMES} views, no language model")
+
+
+def questions_of(
+    dataset: Any, scene: str, *, per_kind: int | None = None, own: bool = True, colours: bool = False
+) -> tuple[Question, ...]:
+    """The questions of a scene, ``per_kind`` at most of each kind; ``colours``: look up those of objects in its frames.
+
+    Raises ``GroundTruthMissing`` where the scene has no truth to make them from.
+    """
+    if own and has_own_queries(dataset):
+        return chosen(own_questions(dataset, scene), per_kind)
+    if not dataset.variants:
+        raise GroundTruthMissing(f"{dataset.name}/{scene}: the dataset has no ground truth to make questions from")
+    variant = next((name for name in FULLEST if name in dataset.variants), dataset.variants[0])
+    truth = dataset.ground_truth(scene, variant)
+    words = colour_words(dataset, scene, truth, MIN_VERTICES) if colours else None
+    return generate(f"{dataset.name}/{scene}", known_objects(truth, MIN_VERTICES, words), per_kind)

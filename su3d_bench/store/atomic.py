@@ -26,8 +26,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.damage import DAMAGE
-from su3d_bench.core.errors import StoreError
+from su3d_bench.core.errors import DAMAGE, StoreError
 
 MAGIC_1_0 = b"\x93NUMPY\x01\x00"
 SMALL_BYTES = 1 << 16  # of an array that is read whole before its header is looked at

@@ -14,12 +14,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from scanned_stage import N_FRAMES, Stage, files_below
+from scanned_stage import N_FRAMES, Stage, files_below, write_scene
 
 from su3d_bench.core import registry
 from su3d_bench.core.errors import DataError, StoreError
 from su3d_bench.datasets.layouts import LAYOUTS
-from su3d_bench.datasets.writing import finish_scene, plan_scenes, write_frames, write_scene
+from su3d_bench.datasets.writing import finish_scene, plan_scenes, write_frames
 
 ROOM = "living7"
 SCANNET = ("scannet", "scannet-python", "scannet-cpp")
@@ -130,9 +130,8 @@ def test_a_recording_that_was_joined_is_not_made_again_when_its_pieces_are_half_
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from scanned_stage import Stage, StageFrames
+from scanned_stage import Stage, StageFrames, write_scene
 from su3d_bench.datasets.layouts import LAYOUTS
-from su3d_bench.datasets.writing import write_scene
 
 class Killed(StageFrames):
     def __getitem__(self, index):

@@ -10,8 +10,7 @@ from bedroom_map import bedroom, box, thing
 
 from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.perception.language.config import LanguageConfig
-from su3d_bench.questions.reasoning.language_solver import LanguageSolver
-from su3d_bench.questions.reasoning.prompting import by_relevance, context_for, system_prompt
+from su3d_bench.questions.reasoning.language_solver import LanguageSolver, by_relevance, context_for, system_prompt
 from su3d_bench.questions.reasoning.question_words import Phrase, read_question
 from su3d_bench.questions.reasoning.scene_map import SceneMap
 

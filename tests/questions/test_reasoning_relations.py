@@ -12,7 +12,7 @@ from su3d_bench.core.types import Float64Array
 from su3d_bench.numerics.boxes import bearing_rad, gap_m, is_left_of, shared_ground
 from su3d_bench.questions.reasoning.answers import Answer
 from su3d_bench.questions.reasoning.generated import GeneratedQuestion
-from su3d_bench.questions.reasoning.judging import box_iou, is_right, same_objects
+from su3d_bench.questions.reasoning.judging import box_iou, is_right
 from su3d_bench.questions.reasoning.relations import (
     holds,
     is_above,
@@ -32,6 +32,20 @@ def moved(bounds: Float64Array, x: float, y: float, z: float) -> Float64Array:
 @pytest.fixture(scope="module")
 def solver() -> Solver:
     return Solver(bedroom())
+
+
+LEAST_IOU = 0.25  # the loosest overlap at which ScanNet's benchmark takes two instances for one
+
+
+def same_objects(scene: SceneMap, truth: SceneMap) -> dict[int, int]:
+    """Id in ``scene`` -> id in ``truth`` of the box that it overlaps most, where that is enough."""
+    same = {}
+    for own in scene.objects:
+        overlaps = [(box_iou(own.box, other.box), -other.id) for other in truth.objects]
+        iou, negative_id = max(overlaps, default=(0.0, 0))
+        if iou >= LEAST_IOU:
+            same[own.id] = -negative_id
+    return same
 
 
 def test_relations_of_two_boxes() -> None:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.types import Float64Array, UInt8Array
 from su3d_bench.datasets.scannet.sens.header import COUNT, ColourCompression, DepthCompression, SensHeader, header_bytes
-from su3d_bench.datasets.scannet.sens.read import FRAME_RECORD, MOTION_RECORD, SensFile
+from su3d_bench.datasets.scannet.sens.read import FRAME_RECORD, MOTION_RECORD
 from su3d_bench.formats.images import UInt16Array
 
 JPEG_QUALITY = 95  # OpenCV's own choice
@@ -50,18 +50,6 @@ def depth_content(values: UInt16Array, compression: DepthCompression) -> bytes:
     """A depth image (H, W) as a ``.sens`` file stores it."""
     raw = values.astype("<u2").tobytes()
     return zlib.compress(raw) if compression == "zlib" else raw
-
-
-def stored_frame(file: SensFile, i: int) -> SensFrame:
-    """Frame ``i`` of a recording with its images as stored: written again, it is the same to the byte."""
-    record = file.record(i)
-    return SensFrame(
-        record.camera_to_world,
-        record.colour_timestamp,
-        record.depth_timestamp,
-        file.colour_bytes(i),
-        file.depth_bytes(i),
-    )
 
 
 def write_sens(path: Path, header: SensHeader, frames: Iterable[SensFrame], motion: NDArray[Any] | None = None) -> None:

@@ -10,9 +10,7 @@ import numpy as np
 from su3d_bench.core.types import Float64Array
 from su3d_bench.questions.reasoning.answers import Answer
 from su3d_bench.questions.reasoning.generated import GeneratedQuestion
-from su3d_bench.questions.reasoning.scene_map import SceneMap
 
-LEAST_IOU = 0.25  # the loosest overlap at which ScanNet's benchmark takes two instances for one
 DISTANCE_M, DISTANCE_SHARE = 0.1, 0.1  # ours: a distance is right within 0.1 m or a tenth
 
 
@@ -21,17 +19,6 @@ def box_iou(a: Float64Array, b: Float64Array) -> float:
     shared = float(np.prod(np.clip(np.minimum(a[1], b[1]) - np.maximum(a[0], b[0]), 0.0, None)))
     union = float(np.prod(a[1] - a[0]) + np.prod(b[1] - b[0])) - shared
     return shared / union if union > 0 else 0.0
-
-
-def same_objects(scene: SceneMap, truth: SceneMap) -> dict[int, int]:
-    """Id in ``scene`` -> id in ``truth`` of the box that it overlaps most, where that is enough."""
-    same = {}
-    for thing in scene.objects:
-        overlaps = [(box_iou(thing.box, other.box), -other.id) for other in truth.objects]
-        iou, negative_id = max(overlaps, default=(0.0, 0))
-        if iou >= LEAST_IOU:
-            same[thing.id] = -negative_id
-    return same
 
 
 def is_right(question: GeneratedQuestion, answer: Answer, same: Mapping[int, int]) -> bool:

@@ -25,7 +25,7 @@ from places import CASES
 from su3d_bench.core.errors import DataError, StoreError
 from su3d_bench.datasets.scannet.sens.header import SensHeader
 from su3d_bench.datasets.scannet.sens.read import MOTION_RECORD, SensFile, SensSource
-from su3d_bench.datasets.scannet.sens.write import SensFrame, colour_content, depth_content, stored_frame, write_sens
+from su3d_bench.datasets.scannet.sens.write import SensFrame, colour_content, depth_content, write_sens
 
 TOY, RAW_TOY = CASES / "sens01_toy.sens", CASES / "sens02_toy_raw.sens"
 WHERE = "scannet/scene0000_00"
@@ -80,6 +80,18 @@ def frames(header: SensHeader, n: int) -> Iterator[SensFrame]:
 
 
 # ---------------------------------------------------------------- what the original readers found
+
+
+def stored_frame(file: SensFile, i: int) -> SensFrame:
+    """Frame ``i`` of a recording with its images as stored: written again, it is the same to the byte."""
+    record = file.record(i)
+    return SensFrame(
+        record.camera_to_world,
+        record.colour_timestamp,
+        record.depth_timestamp,
+        file.colour_bytes(i),
+        file.depth_bytes(i),
+    )
 
 
 def test_the_toy_recording_is_read_as_the_original_readers_did(expected: dict[str, np.ndarray]) -> None:

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from su3d_bench.core.types import Frame
+from su3d_bench.datasets.writing import Layout, ScannedDataset, finish_scene, plan_scenes, write_frames
 
 CHAIR, WALL = 20, 93
 WIDTH, HEIGHT, N_FRAMES = 16, 12, 5
@@ -91,3 +92,17 @@ class StageFrames(Sequence[Frame]):
 
 def files_below(folder: Path) -> set[str]:
     return {path.relative_to(folder).as_posix() for path in folder.rglob("*") if path.is_file()}
+
+
+def write_scene(
+    layout: Layout,
+    dataset: ScannedDataset,
+    scene: str,
+    out: Path,
+    report: Callable[[int], None] = lambda n_done: None,
+) -> None:
+    """Write one scene whole; nothing is done where it is there already."""
+    for target in plan_scenes(layout, dataset, [scene], out):
+        write_frames(layout, dataset, target, range(len(dataset.frames(scene, 1))), report)
+        layout.write_truth(dataset, target)
+        finish_scene(layout, dataset, target)
