@@ -15,7 +15,7 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from su3d_bench.baselines.command.frames import ColourFormat, FrameFolder
-from su3d_bench.baselines.command.prediction import as_prediction, class_names, needs_classes, read_output
+from su3d_bench.baselines.command.prediction import as_prediction, class_names, read_output
 from su3d_bench.baselines.command.process import ContainerWatch, Finished, TreeWatch, Watch, run_program
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError, printable
@@ -125,8 +125,8 @@ class Command:
         self._frames: FrameFolder | None = None
         self._surface: Surface | None = None
         self._scratch: TemporaryFolder | None = None
-        self._root: Path | None = None
-        self._costs: dict[str, float | int] = {}
+        # What the last run of the program took: ``program_s`` and, where it was measured, ``program_peak_bytes``.
+        self.finish_costs: dict[str, float | int] = {}
 
     @property
     def needs(self) -> PerceptionNeeds:
@@ -142,11 +142,6 @@ class Command:
         files = {word: _program_file(word) for word in words}
         return {f"file {word}": digest_file(path) for word, path in files.items() if path is not None}
 
-    @property
-    def finish_costs(self) -> Mapping[str, float | int]:
-        """What the last run of the program took: ``program_s`` and, where it was measured, ``program_peak_bytes``."""
-        return self._costs
-
     def receive_tools(self, tools: SceneTools) -> None:
         self._tools = tools
 
@@ -159,8 +154,7 @@ class Command:
             except DataError as error:
                 logger.info("no mesh.ply for the program: %s", error)
         self._scratch = TemporaryFolder("su3d-command-")
-        self._root = self._scratch.path
-        self._frames = FrameFolder(self._root / "frames", scene, self.config.colour, self._surface)
+        self._frames = FrameFolder(self._scratch.path / "frames", scene, self.config.colour, self._surface)
         self._frames.open()
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
@@ -171,10 +165,10 @@ class Command:
 
     def finish(self) -> Prediction:
         """What the program makes of the frames so far."""
-        assert self._frames is not None and self._root is not None and self._scene is not None, "finish before start"
+        assert self._frames is not None and self._scratch is not None and self._scene is not None, "finish before start"
         self._frames.close()
         where = f"{self._scene.dataset}/{self._scene.scene}: command"
-        folders = {name: self._root / name for name in INSIDE}
+        folders = {name: self._scratch.path / name for name in INSIDE}
         for name in ("output", "work"):
             shutil.rmtree(folders[name], ignore_errors=True)
             folders[name].mkdir()
@@ -183,11 +177,8 @@ class Command:
             prediction = read_output(folders["output"], self._scene.scene, self.config.format)
             for remark in prediction.remarks:
                 logger.warning("%s", printable(remark))
-            content = prediction.content
-            names = None
-            if needs_classes(content):
-                names = class_names(content, self._scene.dataset, self.config.classes_of)
-            return as_prediction(content, self._surface, names)
+            names = class_names(prediction.content, self._scene.dataset, self.config.classes_of)
+            return as_prediction(prediction.content, self._surface, names)
         except Su3dError as error:
             text = str(error).replace(str(folders["output"]), "{output}")
             raise PredictionError(f"{where}: {text}") from error
@@ -196,7 +187,7 @@ class Command:
         """Remove the folders that the program worked in."""
         if self._scratch is not None:
             self._scratch.close()
-        self._scratch = self._root = self._frames = None
+        self._scratch = self._frames = None
 
     def __del__(self) -> None:
         if getattr(self, "_scratch", None) is not None:
@@ -245,12 +236,8 @@ class Command:
         return [str(Path(w).absolute()) if (k or "/" in w) and Path(w).is_file() else w for k, w in enumerate(words)]
 
     def _docker_words(self, container: str, id_file: Path, folders: Mapping[str, Path]) -> list[str]:
-        mounts = [
-            f"{folders['frames']}:{INSIDE['frames']}:ro",
-            f"{folders['output']}:{INSIDE['output']}",
-            f"{folders['work']}:{INSIDE['work']}",
-            *(f"{mount}:ro" for mount in self.config.mounts),
-        ]
+        mounts = [f"{folders[name]}:{INSIDE[name]}{':ro' if name == 'frames' else ''}" for name in INSIDE]
+        mounts += [f"{mount}:ro" for mount in self.config.mounts]
         words = ["docker", "run", "--rm", "--init", "--name", container, "--cidfile", str(id_file)]
         words += ["--user", f"{os.getuid()}:{os.getgid()}", "--workdir", INSIDE["work"]]
         words += [] if self.config.network else ["--network", "none"]
@@ -268,10 +255,10 @@ class Command:
         run_program(["docker", "kill", container], folder=Path("/"), environment=environment, timeout_s=STOP_S)
 
     def _record(self, done: Finished) -> None:
-        self._costs = {"program_s": round(done.wall_s, 3)}
+        self.finish_costs = {"program_s": round(done.wall_s, 3)}
         memory = f"peak memory {done.memory_source}"
         if done.peak_memory_bytes is not None:
-            self._costs["program_peak_bytes"] = done.peak_memory_bytes
+            self.finish_costs["program_peak_bytes"] = done.peak_memory_bytes
             memory = f"peak memory {done.peak_memory_bytes / 2**20:.0f} MiB ({done.memory_source})"
         logger.info("the program took %.1f s, %s", done.wall_s, memory)
         for name, text in (("stdout", done.stdout), ("stderr", done.stderr)):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -32,18 +31,10 @@ def read_output(folder: Path, scene: str, format: str | None) -> ScenePrediction
     return reader.read(folder, scene if scene in names else names[0])
 
 
-@dataclass(frozen=True)
-class ClassNames:
-    """What class numbers mean: as ids of the label space, and as places in the list of the scored classes."""
-
-    by_id: Mapping[int, str]
-    by_place: Mapping[int, str]
-
-
-def as_prediction(content: Content, surface: Surface | None, names: ClassNames | None) -> Prediction:
+def as_prediction(content: Content, surface: Surface | None, names: Mapping[int, str]) -> Prediction:
     """``content`` as a map; masks and labels without points stand on the vertices of ``surface``.
 
-    ``names`` are those of the class numbers of such masks, needed where there are any.
+    ``names`` are those of the class numbers of such masks.
     """
     if not isinstance(content, VertexMasks | VertexLabels):
         return content
@@ -52,9 +43,9 @@ def as_prediction(content: Content, surface: Surface | None, names: ClassNames |
             "its masks have no points of their own and the dataset has no mesh; write points too, in another format"
         )
     n = len(surface.vertices)
-    n_said = len(content.class_ids) if isinstance(content, VertexLabels) else content.n_points
-    if n_said not in {None, n}:
-        raise PredictionError(f"its masks are over {n_said} points, the mesh has {n} vertices; they must be the same")
+    n_points = len(content.class_ids) if isinstance(content, VertexLabels) else content.n_points
+    if n_points not in {None, n}:
+        raise PredictionError(f"its masks are over {n_points} points, the mesh has {n} vertices; they must be the same")
     masks = _masks_of_labels(content) if isinstance(content, VertexLabels) else content
     return Instances.of(
         surface.vertices,
@@ -82,35 +73,28 @@ def _masks_of_labels(content: VertexLabels) -> VertexMasks:
     )
 
 
-def _labels(masks: VertexMasks, names: ClassNames | None) -> tuple[str, ...] | None:
+def _labels(masks: VertexMasks, names: Mapping[int, str]) -> tuple[str, ...] | None:
     if masks.class_numbers is None:
         return None
-    assert names is not None, "whoever asks for labels has found the classes"
-    name_of = names.by_place if masks.numbering == "index" else names.by_id
-    return tuple(name_of.get(number, f"class {number}") for number in masks.class_numbers.tolist())
+    return tuple(names.get(number, f"class {number}") for number in masks.class_numbers.tolist())
 
 
-def needs_classes(content: Content) -> bool:
-    """Whether the prediction has class numbers, which need a list of classes to become names."""
-    return isinstance(content, VertexLabels) or (
-        isinstance(content, VertexMasks) and content.class_numbers is not None and len(content) > 0
-    )
-
-
-def class_names(content: Content, dataset: str, protocol: str | None) -> ClassNames:
+def class_names(content: Content, dataset: str, protocol: str | None) -> dict[int, str]:
     """The names of the class numbers of ``content``: in ``protocol``, else in all that score the dataset by default.
 
-    Raises ``PredictionError`` where these give one number different names.
+    Empty where it has none. Raises ``PredictionError`` where the protocols give one number different names.
     """
+    has_numbers = isinstance(content, VertexMasks) and content.class_numbers is not None and len(content) > 0
+    if not (has_numbers or isinstance(content, VertexLabels)):
+        return {}
     own = [load_protocol(protocol)] if protocol is not None else list(map(load_protocol, protocols_for(dataset)))
     own = [rules for rules in own if rules.classes]
-    numbering = content.numbering if isinstance(content, VertexMasks) else "id"
     lists = [[(entry.id, entry.name) for entry in rules.classes] for rules in own]
-    if numbering == "index":
+    if isinstance(content, VertexMasks) and content.numbering == "index":
         scored = dict.fromkeys(tuple(entry.name for entry in rules.scored) for rules in own if rules.kind == "instance")
         lists = [list(enumerate(names)) for names in scored]
     pairs = {pair for listed in lists for pair in listed}
     if not pairs or len(pairs) > len({number for number, _ in pairs}):
         known = ", ".join(rules.name for rules in own) or "any that has classes"
         raise PredictionError(f"whose are its class numbers? name a protocol in classes_of (known: {known})")
-    return ClassNames(dict(pairs), {}) if numbering == "id" else ClassNames({}, dict(pairs))
+    return dict(pairs)

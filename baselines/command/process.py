@@ -46,19 +46,16 @@ class Finished:
 
 
 class Watch:
-    """The most memory that something held; ``look`` is called again and again while it runs."""
+    """The most memory that something held; ``look`` is called again and again while it runs.
 
-    @property
-    def source(self) -> str:
-        """How the memory was measured, or that it was not."""
-        return "not measured"
+    ``source``: how the memory was measured, or that it was not.
+    """
+
+    source = "not measured"
+    peak_bytes: int | None = None
 
     def look(self) -> None:
         """Note what is held now."""
-
-    @property
-    def peak_bytes(self) -> int | None:
-        return None
 
     def end(self, *, was_stopped: bool) -> None:
         """End what is left running; ``was_stopped``: the program did not end by itself."""
@@ -67,20 +64,17 @@ class Watch:
 class TreeWatch(Watch):
     """A process and all its descendants; pages that several share count once for each."""
 
+    source = "resident memory of all processes together, sampled"
+
     def __init__(self, pid: int) -> None:
         import psutil
 
         self._errors: type[Exception] = psutil.Error
         self._seen: dict[int, Any] = {}
-        self._peak = 0
         try:
             self._root: Any = psutil.Process(pid)
         except psutil.Error:
             self._root = None
-
-    @property
-    def source(self) -> str:
-        return "resident memory of all processes together, sampled"
 
     def look(self) -> None:
         if self._root is None:
@@ -89,19 +83,15 @@ class TreeWatch(Watch):
             processes = [self._root, *self._root.children(recursive=True)]
         except self._errors:
             return
-        together = 0
+        together, peak = 0, self.peak_bytes or 0
         for process in processes:
             self._seen[process.pid] = process
             try:
                 together += int(process.memory_info().rss)
             except self._errors:
                 continue
-            self._peak = max(self._peak, _own_peak_bytes(process.pid))
-        self._peak = max(self._peak, together)
-
-    @property
-    def peak_bytes(self) -> int | None:
-        return self._peak or None
+            peak = max(peak, _own_peak_bytes(process.pid))
+        self.peak_bytes = max(peak, together) or None
 
     def end(self, *, was_stopped: bool) -> None:
         for process in self._seen.values():
@@ -124,16 +114,13 @@ def _own_peak_bytes(pid: int) -> int:
 class ContainerWatch(Watch):
     """A docker container, by the peak that its cgroup keeps; files that it caches in memory count too."""
 
+    source = "not measured: the cgroup cannot be read here"
+
     def __init__(self, name: str, id_file: Path, end: Callable[[str], None], cgroups: Path = CGROUPS) -> None:
         self._name = name
         self._id_file = id_file
         self._end = end
         self._cgroups = cgroups
-        self._peak: int | None = None
-
-    @property
-    def source(self) -> str:
-        return "the container's cgroup" if self._peak is not None else "not measured: the cgroup cannot be read here"
 
     def look(self) -> None:
         try:
@@ -144,14 +131,11 @@ class ContainerWatch(Watch):
             return
         for pattern in PEAK_FILES:
             try:
-                self._peak = int((self._cgroups / pattern.format(id=identity)).read_text())
+                self.peak_bytes = int((self._cgroups / pattern.format(id=identity)).read_text())
             except (OSError, ValueError):
                 continue
+            self.source = "the container's cgroup"
             return
-
-    @property
-    def peak_bytes(self) -> int | None:
-        return self._peak
 
     def end(self, *, was_stopped: bool) -> None:
         if was_stopped:  # otherwise docker has removed it

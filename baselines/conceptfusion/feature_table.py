@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import StoreError
-from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
+from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array
 from su3d_bench.store.scratch import release_pages, scratch_folder
 
 Place = Literal["memory", "disk"]
@@ -47,10 +47,10 @@ class FeatureTable:
     def append(self, features: HalfArray, row: Int32Array, confidences: Float64Array) -> None:
         """Add ``features[row]`` with their ``confidences``, zero rows included."""
         end = self._n + len(row)
-        self._confidences = _with_room(self._confidences, self._n, end)
+        self._confidences = with_room(self._confidences, self._n, end)
         self._confidences[self._n : end] = confidences
         if self._file is None:
-            self._held = _with_room(self._held, self._n, end)
+            self._held = with_room(self._held, self._n, end)
         for start in range(0, len(row), BLOCK_ROWS):
             block = features[row[start : start + BLOCK_ROWS]]
             if self._file is None:
@@ -107,18 +107,6 @@ class FeatureTable:
             self._file.close()
 
 
-def has_no_zero_channel(features: HalfArray) -> BoolArray:
-    """Which rows (C,) have no channel that is exactly zero."""
-    answer: BoolArray = (features != 0).all(axis=1)
-    return answer
-
-
-def has_any_channel(features: HalfArray) -> BoolArray:
-    """Which rows (C,) are not all zero."""
-    answer: BoolArray = (features != 0).any(axis=1)
-    return answer
-
-
 def _nameless_file() -> IO[bytes]:
     try:
         file: IO[bytes] = tempfile.TemporaryFile(dir=scratch_folder())  # noqa: SIM115  (closed by the table)
@@ -134,7 +122,7 @@ def _disk_error(error: OSError) -> StoreError:
     )
 
 
-def _with_room(array: NDArray[Any], used: int, needed: int) -> NDArray[Any]:
+def with_room(array: NDArray[Any], used: int, needed: int) -> NDArray[Any]:
     """``array`` with room for ``needed`` rows, growing by a half so that appending stays cheap."""
     if needed <= len(array):
         return array

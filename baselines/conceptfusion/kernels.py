@@ -12,28 +12,15 @@ BEFORE_FIRST, BEFORE_LAST = -1e-3, 0.999
 
 
 @njit(cache=True)
-def associate(  # type: ignore[no-untyped-def]
-    points,
-    normals,
-    counts,
-    camera_to_world,
-    intrinsics,
-    height,
-    width,
-    view_points,
-    view_normals,
-    has_depth,
-    distance_m,
-    least_cosine,
-    matched,
-):
-    """Writes the map point that each pixel is associated with into ``matched`` (height * width), ABSENT for none.
+def associate(points, normals, counts, view, distance_m, least_cosine):  # type: ignore[no-untyped-def]
+    """The map point that each pixel (height * width) of a ``View`` is associated with, ABSENT for none.
 
     Goes through all points once. Of several points the one with the highest count wins, then the nearest, then the
-    first. Gives the number of points that project into the image.
+    first.
     """
+    camera_to_world, intrinsics, width = view.camera_to_world, view.intrinsics, view.width
+    matched = np.full(view.height * width, ABSENT, np.int64)
     best_count, best_squared = np.zeros(len(matched)), np.zeros(len(matched))
-    n_inside = 0
     for i in range(len(counts)):
         dx = points[i, 0] - camera_to_world[0, 3]
         dy = points[i, 1] - camera_to_world[1, 3]
@@ -45,24 +32,23 @@ def associate(  # type: ignore[no-untyped-def]
         y = camera_to_world[0, 1] * dx + camera_to_world[1, 1] * dy + camera_to_world[2, 1] * dz
         u = (intrinsics[0, 0] * x + intrinsics[0, 1] * y) / z + intrinsics[0, 2]
         v = intrinsics[1, 1] * y / z + intrinsics[1, 2]
-        if not (BEFORE_FIRST < u < width - BEFORE_LAST and BEFORE_FIRST < v < height - BEFORE_LAST):
+        if not (BEFORE_FIRST < u < width - BEFORE_LAST and BEFORE_FIRST < v < view.height - BEFORE_LAST):
             continue
-        n_inside += 1
         column = min(max(int(np.rint(u)), 0), width - 1)
-        row = min(max(int(np.rint(v)), 0), height - 1)
+        row = min(max(int(np.rint(v)), 0), view.height - 1)
         pixel = row * width + column
-        if not has_depth[pixel]:
+        if not view.has_depth[pixel]:
             continue
-        dx = points[i, 0] - view_points[pixel, 0]
-        dy = points[i, 1] - view_points[pixel, 1]
-        dz = points[i, 2] - view_points[pixel, 2]
+        dx = points[i, 0] - view.points[pixel, 0]
+        dy = points[i, 1] - view.points[pixel, 1]
+        dz = points[i, 2] - view.points[pixel, 2]
         squared = dx * dx + dy * dy + dz * dz
         if not np.sqrt(squared) < distance_m:
             continue
         cosine = (
-            normals[i, 0] * view_normals[pixel, 0]
-            + normals[i, 1] * view_normals[pixel, 1]
-            + normals[i, 2] * view_normals[pixel, 2]
+            normals[i, 0] * view.normals[pixel, 0]
+            + normals[i, 1] * view.normals[pixel, 1]
+            + normals[i, 2] * view.normals[pixel, 2]
         )
         if not cosine > least_cosine:
             continue
@@ -72,4 +58,4 @@ def associate(  # type: ignore[no-untyped-def]
             or (counts[i] == best_count[pixel] and squared < best_squared[pixel])
         ):
             matched[pixel], best_count[pixel], best_squared[pixel] = i, counts[i], squared
-    return n_inside
+    return matched

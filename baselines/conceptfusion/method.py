@@ -7,7 +7,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.baselines.conceptfusion.feature_table import FeatureTable, Place, has_any_channel, has_no_zero_channel
+from su3d_bench.baselines.conceptfusion.feature_table import FeatureTable, Place
 from su3d_bench.baselines.conceptfusion.pixel_features import (
     Overlaps,
     PixelFeatures,
@@ -23,7 +23,6 @@ from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.types import DenseFeatures, Detections, Frame, Int64Array, PerceptionNeeds, SceneInfo
 
 Positive = Annotated[float, Field(gt=0, allow_inf_nan=False)]
-VALID = {"no-zero-channel": has_no_zero_channel, "any-channel": has_any_channel}
 PAPER = "Jatavallabhula et al.: ConceptFusion: Open-set Multimodal 3D Mapping, RSS 2023"
 SOURCE = (
     "https://github.com/concept-fusion/concept-fusion, commit 4457c1f (its branch fastsam: 668c26c); "
@@ -155,7 +154,8 @@ class ConceptFusion:
         return paint(detections.masks, detections.boxes, mixed, config.overlaps, config.height, config.width)
 
     def _average(self, features: FeatureTable, view: View, field: PixelFeatures, matched: Int64Array) -> None:
-        is_valid = VALID[self.config.valid_features](field.features)
+        is_set = np.all if self.config.valid_features == "no-zero-channel" else np.any
+        is_valid = is_set(field.features != 0, axis=1)
         pixel = np.flatnonzero((matched != ABSENT) & is_valid[field.row.ravel()])
         features.average(matched[pixel], field.features, field.row.ravel()[pixel], view.alpha[pixel])
 

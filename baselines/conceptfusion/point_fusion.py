@@ -6,10 +6,11 @@ nothing that is scored reads them.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
+from su3d_bench.baselines.conceptfusion.feature_table import with_room
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int64Array
 from su3d_bench.numerics.geometry import valid_depth
@@ -18,9 +19,8 @@ LEAST_ALPHA, MOST_ALPHA = 1e-7, 1.01  # get_alpha
 ABSENT = -1
 
 
-@dataclass(frozen=True)
-class View:
-    """One image at the size of fusion, a row a pixel in row-major order, P = height * width.
+class View(NamedTuple):
+    """One image at the size of fusion, a row a pixel in row-major order, P = height * width; kernels take it as it is.
 
     ``points`` (P, 3) m and ``normals`` (P, 3) in the world, both zero without depth; ``has_depth`` (P,); ``alpha`` (P,)
     confidence; ``intrinsics`` (3, 3) at this size.
@@ -141,23 +141,10 @@ class PointFusion:
         and its normal within the angle. Of several the highest count wins, then the smallest distance to the pixel's
         point (which gradslam calls the distance to the ray), then the older point.
         """
-        from su3d_bench.baselines.conceptfusion import kernels as point_fusion_kernels
+        from su3d_bench.baselines.conceptfusion.kernels import associate
 
-        matched = np.full(view.height * view.width, ABSENT, np.int64)
-        point_fusion_kernels.associate(
-            self.points,
-            self.normals,
-            self.counts,
-            view.camera_to_world,
-            view.intrinsics,
-            view.height,
-            view.width,
-            view.points,
-            view.normals,
-            view.has_depth,
-            self._distance_m,
-            self._least_cosine,
-            matched,
+        matched: Int64Array = associate(
+            self.points, self.normals, self.counts, view, self._distance_m, self._least_cosine
         )
         return matched
 
@@ -175,15 +162,11 @@ class PointFusion:
         """Append the pixels with depth that found no point; those pixels, in the order of their new points."""
         pixel = np.flatnonzero(view.has_depth & (matched == ABSENT))
         start, end = self._n, self._n + len(pixel)
-        if end > len(self._counts):
-            self._reserve(max(end, len(self._counts) * 3 // 2))
+        self._points = with_room(self._points, start, end)
+        self._normals = with_room(self._normals, start, end)
+        self._counts = with_room(self._counts, start, end)
         self._points[start:end] = view.points[pixel]
         self._normals[start:end] = view.normals[pixel]
         self._counts[start:end] = view.alpha[pixel]
         self._n = end
         return pixel
-
-    def _reserve(self, capacity: int) -> None:
-        points, normals, counts = np.empty((capacity, 3)), np.empty((capacity, 3)), np.empty(capacity)
-        points[: self._n], normals[: self._n], counts[: self._n] = self.points, self.normals, self.counts
-        self._points, self._normals, self._counts = points, normals, counts

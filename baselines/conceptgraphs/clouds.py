@@ -5,11 +5,9 @@ Source: concept-graphs at commit 5c4da70, ``conceptgraph/slam/utils.py``, whose 
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
-from su3d_bench.core.types import BoolArray, Float64Array, Int32Array, Int64Array, OrientedBox
+from su3d_bench.core.types import BoolArray, Float64Array, Int64Array, OrientedBox
 
 LEAST_CLUSTER = 5  # points; a smaller largest cluster is not trusted and the whole cloud stays
 LEAST_FOR_ORIENTED_BOX = 4  # points that span a volume
@@ -23,10 +21,9 @@ def voxel_average(points: Float64Array, voxel_m: float) -> Float64Array:
     """
     if not len(points):
         return points
-    from su3d_bench.baselines.conceptgraphs import kernels as kernels
+    from su3d_bench.baselines.conceptgraphs.kernels import means_of_cells
 
-    grid = _grid(points, points.min(axis=0) - voxel_m / 2, voxel_m)
-    averaged: Float64Array = kernels.means(points, grid.cell_of_point, grid.n_cells)
+    averaged: Float64Array = means_of_cells(points, points.min(axis=0) - voxel_m / 2, voxel_m)
     return averaged
 
 
@@ -64,24 +61,3 @@ def bounding_box(points: Float64Array, *, oriented: bool) -> OrientedBox:
             pass
     low, high = points.min(axis=0), points.max(axis=0)
     return OrientedBox((low + high) / 2, high - low, np.eye(3))
-
-
-@dataclass(frozen=True)
-class _Grid:
-    """Which cell each point lies in, and the hash that finds the cells."""
-
-    table: Int32Array
-    cells: Int64Array
-    cell_of_point: Int64Array
-    n_cells: int
-
-
-def _grid(points: Float64Array, origin: Float64Array, side_m: float) -> _Grid:
-    from su3d_bench.baselines.conceptgraphs import kernels as kernels
-    from su3d_bench.numerics.cells import ABSENT
-
-    n = len(points)
-    table = np.full(1 << (2 * n).bit_length(), ABSENT, np.int32)
-    cells, cell_of_point = np.empty((n, 3), np.int64), np.empty(n, np.int64)
-    n_cells = kernels.cells_of(points, origin, side_m, table, cells, cell_of_point)
-    return _Grid(table, cells, cell_of_point, n_cells)

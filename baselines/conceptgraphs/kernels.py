@@ -1,4 +1,4 @@
-"""Compiled intersection of oriented boxes; imported only when boxes are compared."""
+"""Compiled intersection of oriented boxes and averages of a grid's cells; imported only where a map is made."""
 
 from __future__ import annotations
 
@@ -91,12 +91,14 @@ def intersection_volumes(centres_a, halves_a, rotations_a, centres_b, halves_b, 
     return volumes
 
 
-# ``table``: an open-addressing hash of cells of a grid, empty where it holds ABSENT; its length is a power of two above
-# the number of points.
 @njit(cache=True)
-def cells_of(points, origin, side, table, cells, cell_of_point):  # type: ignore[no-untyped-def]
-    """Fills ``cell_of_point`` and the coordinates ``cells``, in the order of their first points; returns how many."""
-    n = 0
+def means_of_cells(points, origin, side):  # type: ignore[no-untyped-def]
+    """The mean point (V, 3) of each cell of a grid, in the order of the cells' first points."""
+    n_slots = 4
+    while n_slots <= 2 * len(points):
+        n_slots *= 2
+    table, cells = np.full(n_slots, ABSENT, np.int32), np.empty((len(points), 3), np.int64)
+    sums, counts, n = np.zeros((len(points), 3)), np.zeros(len(points), np.int64), 0
     for i in range(len(points)):
         x = np.int64(math.floor((points[i, 0] - origin[0]) / side))
         y = np.int64(math.floor((points[i, 1] - origin[1]) / side))
@@ -106,20 +108,8 @@ def cells_of(points, origin, side, table, cells, cell_of_point):  # type: ignore
             table[slot] = n
             cells[n, 0], cells[n, 1], cells[n, 2] = x, y, z
             n += 1
-        cell_of_point[i] = table[slot]
-    return n
-
-
-@njit(cache=True)
-def means(points, cell_of_point, n_cells):  # type: ignore[no-untyped-def]
-    """The mean point (n_cells, 3) of each cell."""
-    sums, counts = np.zeros((n_cells, 3)), np.zeros(n_cells, np.int64)
-    for i in range(len(points)):
-        cell = cell_of_point[i]
+        cell = table[slot]
         for axis in range(3):
             sums[cell, axis] += points[i, axis]
         counts[cell] += 1
-    for cell in range(n_cells):
-        for axis in range(3):
-            sums[cell, axis] /= counts[cell]
-    return sums
+    return sums[:n] / counts[:n].reshape(-1, 1)

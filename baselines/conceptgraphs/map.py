@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 
@@ -25,8 +24,7 @@ from su3d_bench.baselines.conceptgraphs.objects import (
 from su3d_bench.baselines.conceptgraphs.regions import LiftedRegion, kept_regions, lift, subtract_contained
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import StageTimer
-from su3d_bench.core.types import Detections, Float32Array, Frame, Instances
-from su3d_bench.predictions.base import instances_of
+from su3d_bench.core.types import Detections, Float32Array, Frame, Instances, Masks, starts_of
 
 
 class ObjectMap:
@@ -143,23 +141,21 @@ class ObjectMap:
         descriptions = [_description(item) for item in everything]
         names, captions = tuple(name for name, _ in descriptions), tuple(caption for _, caption in descriptions)
         features = np.array([item.feature for item in everything], np.float32)
+        clouds = [item.points.astype(np.float32) for item in everything]
+        points = np.concatenate([np.zeros((0, 3), np.float32), *clouds])
         seen = [sighting for each in everything for sighting in each.sightings]
-        instances = instances_of(
-            [item.points.astype(np.float32) for item in everything],
-            "conceptgraphs",
-            features=features.reshape(len(everything), self._feature_size),
+        return Instances.of(
+            points,
+            Masks(starts_of(map(len, clouds)), np.arange(len(points), dtype=np.int32)),
+            np.array([_score(item, self._config.instance_score) for item in everything], np.float64),
+            features.reshape(len(everything), self._feature_size),
             labels=("",) * len(objects) + names[len(objects) :] if background else None,
             names=names,
             captions=captions,
-            ids=[item.number for item in everything],
-        )
-        return replace(
-            instances,
-            scores=np.array([_score(item, self._config.instance_score) for item in everything], np.float64),
-            views=np.array([(sighting.frame_index, sighting.detection) for sighting in seen], np.int32).reshape(-1, 2),
-            view_indptr=np.cumsum([0, *(item.n_detections for item in everything)]).astype(np.int64),
+            views=[[(sighting.frame_index, sighting.detection) for sighting in item.sightings] for item in everything],
             view_names=tuple(sighting.name for sighting in seen),
             view_scores=np.array([sighting.score for sighting in seen], np.float64),
+            ids=[item.number for item in everything],
         )
 
 

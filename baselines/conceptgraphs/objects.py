@@ -155,14 +155,10 @@ def merge_overlapping(objects: Sequence[MapObject], config: MappingConfig) -> li
         i, j = rows[k], columns[k]
         if ratios[i, j] <= config.merge_overlap_thresh:
             break
-        looks_alike = _cosine(result[i].feature, result[j].feature) > config.merge_visual_sim
-        is_called_alike = _cosine(result[i].text_feature, result[j].text_feature) > config.merge_text_sim
+        # cosines: the features are of length 1, or all zeros
+        looks_alike = result[i].feature @ result[j].feature > config.merge_visual_sim
+        is_called_alike = result[i].text_feature @ result[j].text_feature > config.merge_text_sim
         if looks_alike and is_called_alike and is_kept[j]:
             result[j] = merged(result[j], result[i], config, with_dbscan=True)
             is_kept[i] = False
     return [item for item, stays in zip(result, is_kept, strict=True) if stays]
-
-
-def _cosine(a: Float64Array, b: Float64Array) -> float:
-    """Of two unit vectors, or 0 where one is all zeros."""
-    return float(a @ b)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -11,32 +11,25 @@ from su3d_bench.core.types import Float32Array, Float64Array, Int64Array, Masks,
 NOISE = -1
 
 
-@dataclass(frozen=True)
-class PartRules:
-    """DBSCAN with ``eps_m`` and ``min_points``; parts of at most ``most_dropped`` points go, the best share stays."""
-
-    eps_m: float
-    min_points: int
-    most_dropped: int
-    kept_share: float
-
-
-def split_into_parts(proposals: Proposals, rules: PartRules) -> Proposals:
+def split_into_parts(
+    proposals: Proposals, eps_m: float, min_points: int, most_dropped: int, kept_share: float
+) -> Proposals:
     """Each connected part of each mask as a mask with its score, the best first, of equal ones the earlier.
 
-    Of n parts the first floor(``kept_share`` n) stay; noise of DBSCAN belongs to none.
+    Parts are DBSCAN's with ``eps_m`` and ``min_points``, whose noise belongs to none; those of at most ``most_dropped``
+    points go, and of n others the first floor(``kept_share`` n) stay.
     """
     parts: list[Int64Array] = []
     scores: list[float] = []
     for k in range(len(proposals)):
         members = proposals.mask(k)
-        labels = density_clusters(proposals.points[members], rules.eps_m, rules.min_points)
+        labels = density_clusters(proposals.points[members], eps_m, min_points)
         for label in range(int(labels.max(initial=NOISE)) + 1):
             part = members[labels == label].astype(np.int64)
-            if len(part) > rules.most_dropped:
+            if len(part) > most_dropped:
                 parts.append(part)
                 scores.append(float(proposals.scores[k]))
-    order = np.argsort(-np.array(scores), kind="stable")[: int(rules.kept_share * len(scores))]
+    order = np.argsort(-np.array(scores), kind="stable")[: int(kept_share * len(scores))]
     masks = Masks.of_sets([parts[k] for k in order])
     return replace(proposals, indptr=masks.indptr, indices=masks.indices, scores=np.array(scores, np.float64)[order])
 
@@ -107,5 +100,4 @@ def linked_within(points: Float64Array, gap_m: float) -> Int64Array:
     _, first, group = np.unique(roots, return_index=True, return_inverse=True)
     rank = np.empty(len(first), np.int64)
     rank[np.argsort(first)] = np.arange(len(first))
-    result: Int64Array = rank[group.reshape(-1)]
-    return result
+    return rank[group.reshape(-1)]

@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field
 
-from su3d_bench.baselines.openmask3d.features import FeatureMeans, Looking, crop_boxes, prompted_mask
+from su3d_bench.baselines.openmask3d.features import FeatureMeans, crop_boxes, prompted_mask
 from su3d_bench.baselines.openmask3d.proposals import ProposalConfig, make_proposals
 from su3d_bench.baselines.openmask3d.views import (
     NO_VIEW,
@@ -36,8 +36,10 @@ from su3d_bench.core.types import (
 Pixels = Annotated[int, Field(ge=2, le=65536)]
 
 
-class MaskPipelineConfig(ProposalConfig):
-    """Hyper-parameters of views, prompts and crops with the names and values of OpenMask3D's configuration.
+class OpenMask3DConfig(ProposalConfig):
+    """Hyper-parameters of views, prompts and crops with the names and values of the original's ScanNet200 run.
+
+    The masks are Mask3D's where ``proposals_folder`` names them.
 
     ``intrinsics``: ``as-is`` projects with the frame's own; ``openmask3d`` with what the original's scaling would make
     of them, had the frames been reduced from ``intrinsic_resolution`` (height, width): its centre is about a pixel off.
@@ -55,23 +57,12 @@ class MaskPipelineConfig(ProposalConfig):
     intrinsic_resolution: Annotated[tuple[Pixels, Pixels], Field(strict=False)] = (968, 1296)
     confidence: Literal["ones", "proposal"] = "ones"
 
-    @property
-    def looking(self) -> Looking:
-        """How a view is looked at."""
-        return Looking(
-            self.num_random_rounds, self.num_selected_points, self.num_of_levels, self.multi_level_expansion_ratio
-        )
-
-
-class OpenMask3DConfig(MaskPipelineConfig):
-    """The settings of the original's ScanNet200 run; Mask3D's masks where ``proposals_folder`` names them."""
-
 
 class OpenMask3D:
     """OpenMask3D: 3D proposals of Mask3D's kind, described by CLIP features of their five best views."""
 
     name = "openmask3d"
-    Config: type[MaskPipelineConfig] = OpenMask3DConfig
+    Config: type[OpenMask3DConfig] = OpenMask3DConfig
     about = MethodAbout(
         paper="Takmaz et al.: OpenMask3D: Open-Vocabulary 3D Instance Segmentation, NeurIPS 2023",
         source="https://github.com/OpenMask3D/openmask3d, commit 3bc3fc5",
@@ -82,7 +73,7 @@ class OpenMask3D:
         "of the paper has been reproduced",
     )
 
-    def __init__(self, config: MaskPipelineConfig | None = None) -> None:
+    def __init__(self, config: OpenMask3DConfig | None = None) -> None:
         self.config = config or self.Config()
         self.finish_costs: dict[str, float | int] = {}  # frames read again and views looked at by the last ``finish``
 
@@ -178,10 +169,11 @@ class OpenMask3D:
         pixels = pixels_of_mask(visible, self.proposals.mask(mask), frame.depth_m.shape[1])
         # Each view has a generator of its own, so that neither other masks nor an earlier finish move its prompts.
         rng = np.random.default_rng([self._scene.seed, mask, frame.index])
-        seen = prompted_mask(regions, frame, pixels, config.looking, rng)
+        seen = prompted_mask(regions, frame, pixels, config.num_random_rounds, config.num_selected_points, rng)
         if seen is None:
             return 0
-        means.add(mask, regions.encode_regions(frame, seen, crop_boxes(seen, config.looking)))
+        boxes = crop_boxes(seen, config.num_of_levels, config.multi_level_expansion_ratio)
+        means.add(mask, regions.encode_regions(frame, seen, boxes))
         return 1
 
     def _instances(self, features: Float64Array) -> Instances:
@@ -203,7 +195,7 @@ class OpenMask3D:
 
 # Views, prompts, crops and features are OpenMask3D's. Source of what differs: Segment3D's evaluation script at commit
 # 1861478.
-class OpenMask3DSegment3DConfig(MaskPipelineConfig):
+class OpenMask3DSegment3DConfig(OpenMask3DConfig):
     """OpenMask3D's settings with Segment3D's for proposals: 400 queries, and parts by density instead of by gaps."""
 
     part_eps_m: Annotated[float, Field(gt=0, allow_inf_nan=False)] = 0.05  # general.dbscan_eps
@@ -220,7 +212,7 @@ class OpenMask3DSegment3D(OpenMask3D):
     """OpenMask3D with Segment3D's proposals: many fine parts, small and weak ones dropped."""
 
     name = "openmask3d-segment3d"
-    Config: type[MaskPipelineConfig] = OpenMask3DSegment3DConfig
+    Config = OpenMask3DSegment3DConfig
     about = MethodAbout(
         paper="Huang et al.: Segment3D: Learning Fine-Grained Class-Agnostic 3D Segmentation without Manual Labels, "
         "ECCV 2024, with the features of OpenMask3D (NeurIPS 2023)",

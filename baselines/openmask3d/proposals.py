@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from su3d_bench.baselines.mesh_segments.segments import MIN_VERTICES, THRESHOLD
-from su3d_bench.baselines.openmask3d.components import PartRules, split_into_parts, voted_by_segments
+from su3d_bench.baselines.openmask3d.components import split_into_parts, voted_by_segments
 from su3d_bench.baselines.openmask3d.proposal_files import digest_of_folder, read_proposals
 from su3d_bench.baselines.openmask3d.surface_proposals import SOURCE, NodeChoice, segments_of, surface_proposals
 from su3d_bench.core.errors import DataError
@@ -98,8 +98,9 @@ def _segments(surface: Surface, config: ProposalConfig) -> Int64Array:
 
 
 def _in_parts(proposals: Proposals, segments: Int64Array, config: ProposalConfig) -> Proposals:
-    rules = PartRules(config.part_eps_m, config.part_min_points, config.part_most_dropped, config.part_kept_share)
-    parts = split_into_parts(proposals, rules)
+    parts = split_into_parts(
+        proposals, config.part_eps_m, config.part_min_points, config.part_most_dropped, config.part_kept_share
+    )
     return voted_by_segments(parts, segments) if config.segment_vote else parts
 
 

@@ -39,8 +39,7 @@ def segments_of(surface: Surface, threshold: float = THRESHOLD, min_vertices: in
     segments = surface.segments
     if segments is None:
         segments = mesh_segments(surface.vertices, surface.triangles, threshold, min_vertices)
-    row: Int64Array = np.unique(segments, return_inverse=True)[1].reshape(-1)
-    return row
+    return np.unique(segments, return_inverse=True)[1].reshape(-1)
 
 
 def surface_proposals(surface: Surface, row: Int64Array, choice: NodeChoice) -> Proposals:

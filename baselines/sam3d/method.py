@@ -38,12 +38,12 @@ from su3d_bench.core.types import (
     Float64Array,
     Frame,
     Instances,
-    Int32Array,
     Int64Array,
     PerceptionNeeds,
     SceneInfo,
     Surface,
 )
+from su3d_bench.metrics.matching.nearest import masks_of_partition, select
 from su3d_bench.numerics.geometry import back_project, valid_depth
 
 logger = logging.getLogger(__name__)
@@ -254,13 +254,12 @@ class SAM3D:
 
     def _instances(self, points: Float32Array, group: Int64Array, cloud: GroupedCloud) -> Instances:
         ids = np.intersect1d(group, cloud.view_group)
-        masks = _members(group, ids)
         views = [np.sort(cloud.views[cloud.view_group == key]) for key in ids]
         largest = [max((self._views[v] for v in of), key=lambda view: view.n_pixels) for of in views]
         seen = [[self._views[v] for v in of] for of in views]
         return Instances.of(
             points,
-            masks,
+            select(masks_of_partition(group, int(group.max(initial=NO_GROUP)) + 1), ids),
             None,  # the original has no scores
             self._features(views, largest),
             names=tuple(view.name for view in largest),
@@ -292,13 +291,6 @@ def paint(frame: Frame, masks: BoolArray) -> Int64Array:
     for k in reversed(range(len(masks))):
         detection[masks[k]] = k
     return detection
-
-
-def _members(group: Int64Array, ids: Int64Array) -> list[Int32Array]:
-    """The points of each of ``ids``, ascending."""
-    order = np.argsort(group, kind="stable")
-    first, last = (np.searchsorted(group[order], ids, side=side) for side in ("left", "right"))
-    return [order[a:b].astype(np.int32) for a, b in zip(first, last, strict=True)]
 
 
 _NO_IDS = np.zeros(0, np.int64)

@@ -19,7 +19,7 @@ from places import SCENES
 
 from su3d_bench.baselines.command.frames import FrameFolder, write_mesh
 from su3d_bench.baselines.command.method import Command, CommandConfig
-from su3d_bench.baselines.command.prediction import ClassNames, as_prediction, class_names
+from su3d_bench.baselines.command.prediction import as_prediction, class_names
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, PredictionError
 from su3d_bench.core.timing import Timer
@@ -134,7 +134,7 @@ def test_masks_over_another_number_of_points_are_refused(tmp_path: Path) -> None
 
 
 def test_labels_of_vertices_become_one_mask_a_class_and_none_where_there_is_no_class() -> None:
-    names = ClassNames({4: "chair", 9: "wall"}, {})
+    names = {4: "chair", 9: "wall"}
     found = as_prediction(VertexLabels(np.array([9, 0, 4, 9, -1], np.int32)), SURFACE, names)
     assert isinstance(found, Instances)
     assert found.labels == ("chair", "wall")
@@ -145,9 +145,9 @@ def test_class_numbers_that_two_lists_read_differently_ask_for_a_protocol() -> N
     content = vertex_masks("m", [np.zeros(0, np.int32)], 5, class_numbers=np.array([3], np.int32))
     with pytest.raises(PredictionError, match="whose are its class numbers"):
         class_names(content, "scannet", None)
-    assert class_names(content, "scannet", "scannet-instance").by_id[3] == "cabinet"
+    assert class_names(content, "scannet", "scannet-instance")[3] == "cabinet"
     places = replace(content, numbering="index")
-    assert class_names(places, "scannet", "scannet-instance").by_place[0] == "cabinet"
+    assert class_names(places, "scannet", "scannet-instance")[0] == "cabinet"
 
 
 @pytest.mark.parametrize(

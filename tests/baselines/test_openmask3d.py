@@ -12,7 +12,7 @@ import pytest
 from prediction_files import write_openyolo3d
 from pydantic import ValidationError
 
-from su3d_bench.baselines.openmask3d.features import FeatureMeans, Looking, crop_boxes, prompted_mask
+from su3d_bench.baselines.openmask3d.features import FeatureMeans, crop_boxes, prompted_mask
 from su3d_bench.baselines.openmask3d.method import (
     OpenMask3D,
     OpenMask3DConfig,
@@ -38,7 +38,6 @@ from su3d_bench.runs.feeding import no_detections
 
 WIDTH, HEIGHT, FOCAL = 12, 8, 10.0
 INTRINSICS = np.array([[FOCAL, 0, 0], [0, FOCAL, 0], [0, 0, 1]])
-TIGHT = Looking(10, 5, 3, 0.1)
 
 
 def frame(index: int = 0, depth_m: float = 1.0, x_m: float = 0.0) -> Frame:
@@ -156,7 +155,7 @@ PIXELS = np.array([(x, y) for y in range(3) for x in range(4)])
 class TestPrompts:
     def test_each_round_prompts_with_five_different_pixels_of_the_mask(self) -> None:
         prompts = Prompts([0.5] * 10)
-        prompted_mask(prompts, frame(), PIXELS, TIGHT, np.random.default_rng(0))
+        prompted_mask(prompts, frame(), PIXELS, 10, 5, np.random.default_rng(0))
         assert len(prompts.asked) == 10
         for points in prompts.asked:
             assert len(points) == len({tuple(point) for point in points}) == 5
@@ -165,18 +164,18 @@ class TestPrompts:
 
     def test_a_mask_of_fewer_pixels_is_prompted_with_all_of_them(self) -> None:
         prompts = Prompts([0.5] * 10)
-        prompted_mask(prompts, frame(), PIXELS[:3], TIGHT, np.random.default_rng(0))
+        prompted_mask(prompts, frame(), PIXELS[:3], 10, 5, np.random.default_rng(0))
         assert all(sorted(points) == PIXELS[:3].tolist() for points in prompts.asked)
 
     def test_the_surest_round_wins_and_of_equal_ones_the_first(self) -> None:
         scores = [0.2, 0.7, 0.3, 0.9, 0.9, 0.1, 0.9, 0, 0, 0]
-        best = prompted_mask(Prompts(scores), frame(), PIXELS, TIGHT, np.random.default_rng(0))
+        best = prompted_mask(Prompts(scores), frame(), PIXELS, 10, 5, np.random.default_rng(0))
         assert best is not None and best.sum() == 4  # the fourth round
 
     def test_a_view_whose_rounds_all_fail_is_not_used(self) -> None:
-        assert prompted_mask(Prompts([0.0] * 10), frame(), PIXELS, TIGHT, np.random.default_rng(0)) is None
+        assert prompted_mask(Prompts([0.0] * 10), frame(), PIXELS, 10, 5, np.random.default_rng(0)) is None
         empty = Prompts([0.9] * 10, empty=range(10))
-        assert prompted_mask(empty, frame(), PIXELS, TIGHT, np.random.default_rng(0)) is None
+        assert prompted_mask(empty, frame(), PIXELS, 10, 5, np.random.default_rng(0)) is None
 
 
 class TestCrops:
@@ -185,15 +184,15 @@ class TestCrops:
         mask = np.zeros((60, 60), bool)
         mask[20:49, 10:29] = True
         expected = [[10, 20, 29, 49], [9, 18, 30, 51], [8, 16, 31, 53]]
-        assert crop_boxes(mask, TIGHT).tolist() == expected
+        assert crop_boxes(mask, 3, 0.1).tolist() == expected
 
     def test_below_ten_pixels_nothing_grows_and_the_image_clips(self) -> None:
         small = np.zeros((30, 30), bool)
         small[3:12, 3:12] = True
-        assert crop_boxes(small, TIGHT).tolist() == [[3, 3, 12, 12]] * 3
+        assert crop_boxes(small, 3, 0.1).tolist() == [[3, 3, 12, 12]] * 3
         corner = np.zeros((30, 30), bool)
         corner[:20, 10:] = True
-        assert crop_boxes(corner, TIGHT).tolist() == [[10, 0, 30, 20], [8, 0, 30, 22], [6, 0, 30, 24]]
+        assert crop_boxes(corner, 3, 0.1).tolist() == [[10, 0, 30, 20], [8, 0, 30, 22], [6, 0, 30, 24]]
 
     def test_the_mean_of_unit_features_is_not_of_unit_length(self) -> None:
         means = FeatureMeans(3, 2)
@@ -342,7 +341,8 @@ class TestVariants:
     def test_the_defaults_are_the_published_ones(self) -> None:
         config = OpenMask3DConfig()
         assert (config.stride, config.top_k, config.vis_threshold) == (10, 5, 0.2)
-        assert config.looking == Looking(10, 5, 3, 0.1)
+        assert (config.num_random_rounds, config.num_selected_points) == (10, 5)
+        assert (config.num_of_levels, config.multi_level_expansion_ratio) == (3, 0.1)
         assert (config.part_eps_m, config.part_min_points, config.part_most_dropped) == (0.95, 1, 0)
         other = OpenMask3DSegment3DConfig()
         assert (other.part_eps_m, other.part_min_points, other.part_most_dropped) == (0.05, 5, 15)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from box_room import INTRINSICS, images, pose
@@ -95,7 +93,7 @@ def test_a_match_is_strictly_nearer_than_the_distance_and_within_the_angle() -> 
         assert (a_map((0, 0, z), distance_m=0.05).associate(view)[0] == 0) == matches, z
     for degrees, matches in ((19.9, True), (20.1, False)):
         turned = np.array([np.sin(np.deg2rad(degrees)), 0, np.cos(np.deg2rad(degrees))])
-        seen = replace(view, normals=np.tile(turned, (2, 1)))
+        seen = view._replace(normals=np.tile(turned, (2, 1)))
         assert (a_map((0, 0, 1)).associate(seen)[0] == 0) == matches, degrees
 
 
@@ -110,7 +108,7 @@ def test_of_several_points_the_most_confident_is_matched_then_the_nearest_then_t
 def test_a_matched_point_moves_to_the_weighted_mean_and_its_normal_is_not_normalised() -> None:
     fusion = a_map((0, 0, 1.04), counts=[0.5], distance_m=0.05)
     tilt = np.array([0.28, 0, 0.96])
-    view = replace(row_of_pixels(2), alpha=np.array([0.25, 1.0]), normals=np.tile(tilt, (2, 1)))
+    view = row_of_pixels(2)._replace(alpha=np.array([0.25, 1.0]), normals=np.tile(tilt, (2, 1)))
     matched = fusion.associate(view)
     fusion.fuse(view, matched)
     assert fusion.points[0].tolist() == pytest.approx([0, 0, (0.5 * 1.04 + 0.25 * 1.0) / 0.75])

@@ -14,7 +14,6 @@ from pydantic import ValidationError
 from test_mesh_segments import sheet
 
 from su3d_bench.baselines.openmask3d.components import (
-    PartRules,
     density_clusters,
     linked_within,
     split_into_parts,
@@ -154,16 +153,16 @@ class TestParts:
 
     def test_each_part_is_a_mask_with_its_masks_score_the_best_first(self) -> None:
         proposals = made(self.ROW, [0, 1, 3, 4], [5], [1, 2], scores=[0.2, 0.9, 0.2])
-        parts = split_into_parts(proposals, PartRules(0.95, 1, 0, 1.0))
+        parts = split_into_parts(proposals, 0.95, 1, 0, 1.0)
         assert masks_of(parts) == [[5], [0, 1], [3, 4], [1, 2]] and parts.scores.tolist() == [0.9, 0.2, 0.2, 0.2]
 
     def test_small_parts_go_and_of_five_the_best_four_fifths_stay(self) -> None:
         points = np.array([(x, 0, 0) for x in range(12)])
         masks = [[0, 1], [2, 3], [4, 5], [6, 7], [8, 9], [10]]
         proposals = made(points, *masks, scores=[0.1, 0.6, 0.5, 0.4, 0.3, 0.9])
-        parts = split_into_parts(proposals, PartRules(1.0, 1, 1, 0.8))  # [10] has no more than one point
+        parts = split_into_parts(proposals, 1.0, 1, 1, 0.8)  # [10] has no more than one point
         assert masks_of(parts) == [[2, 3], [4, 5], [6, 7], [8, 9]]
-        assert len(split_into_parts(made(points, [0]), PartRules(1.0, 1, 0, 0.8))) == 0  # floor(0.8)
+        assert len(split_into_parts(made(points, [0]), 1.0, 1, 0, 0.8)) == 0  # floor(0.8)
 
     def test_a_mask_takes_segments_of_which_it_holds_more_than_half(self) -> None:
         segments = np.array([0, 0, 1, 1, 1, 2])

@@ -175,8 +175,7 @@ class Transport:
         kind = response.headers.get("content-type", "")
         if "json" not in kind.lower():
             raise TryAgain(f"the server answered with '{self._shown(kind, 60)}' instead of JSON")
-        text: str = response.text if isinstance(response.text, str) else response.text()
-        return text
+        return response.text if isinstance(response.text, str) else response.text()
 
     def _unconnected(self, error: BaseException) -> Exception:
         chain: list[BaseException] = []

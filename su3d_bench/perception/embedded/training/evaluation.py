@@ -63,8 +63,7 @@ class _HeldOut:
 
     def similarity(self, rows: NDArray[np.intp], texts: Sequence[str]) -> Float32Array:
         """Cosines (R, T) of crops ``rows`` with texts."""
-        cosines: Float32Array = self.features[rows] @ self.encoder.encode_texts(texts).T
-        return cosines
+        return self.features[rows] @ self.encoder.encode_texts(texts).T
 
     def places(self, rows: NDArray[np.intp], names: Sequence[str], field: str) -> Int64Array:
         """Where among ``names`` the truths of crops ``rows`` stand."""

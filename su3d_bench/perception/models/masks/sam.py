@@ -130,8 +130,7 @@ class Sam:
             (self.full_size(image, logits[start : start + FULL_SIZE_AT_ONCE]) > MASK_THRESHOLD).cpu().numpy()
             for start in range(0, len(logits), FULL_SIZE_AT_ONCE)
         ]
-        masks: BoolArray = np.concatenate(parts)
-        return masks
+        return np.concatenate(parts)
 
 
 def _at_seen_size(prompts: Prompts, image: SeenImage) -> Prompts:
