@@ -89,23 +89,16 @@ def _cloud(
     """Points, owners and ranks (0 inside a mask, 1 in a ring, 2 in no mask) of ``pixels`` in row-major order."""
     from su3d_bench.opensu3d.kernels import image as kernels
 
-    of_row, of_column = ray_parts(frame.intrinsics, frame.camera_to_world, *frame.depth_m.shape)
-    n_pixels = int(np.count_nonzero(pixels))
-    points, owner, rank = np.empty((n_pixels, 3)), np.empty(n_pixels, np.int32), np.empty(n_pixels, np.int8)
     rings = {"owner": kernels.OWNED, "background": kernels.BACKGROUND, "drop": kernels.DROPPED}
-    n = kernels.cloud(
+    cloud: tuple[Float64Array, Int32Array, NDArray[np.int8]] = kernels.cloud(
         np.require(frame.depth_m, requirements=["C", "W"]),  # one kind of array: no second compilation
         pixels,
-        of_row,
-        of_column,
+        *ray_parts(frame.intrinsics, frame.camera_to_world, *frame.depth_m.shape),
         np.ascontiguousarray(frame.camera_to_world[:3, 3], np.float64),
         painted.ids,
         painted.owner,
         rings[config.border_pixels],
         config.background_pixels == "drop",
         config.frame_voxel,
-        points,
-        owner,
-        rank,
     )
-    return points[:n], owner[:n], rank[:n]
+    return cloud

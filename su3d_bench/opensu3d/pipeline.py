@@ -59,7 +59,7 @@ class OpenSU3D:
         self._table = TrackingTable()
         self._images: list[ImageRecord] = []
         self._next_id = NO_INSTANCE + 1
-        self._postprocess_ms: float | None = None
+        self.postprocess_ms: float | None = None  # of the last ``finish``
 
     @property
     def needs(self) -> PerceptionNeeds:
@@ -74,11 +74,6 @@ class OpenSU3D:
     def n_instances(self) -> int:
         """Scene ids given so far, before post-processing."""
         return self._next_id - 1 - NO_INSTANCE
-
-    @property
-    def postprocess_ms(self) -> float | None:
-        """Milliseconds that the last ``finish`` took; None before the first."""
-        return self._postprocess_ms
 
     def receive_device(self, device: str) -> None:
         """Has the map held and matched by torch on ``device`` (``cuda:0``), unless that is ``cpu``."""
@@ -137,7 +132,7 @@ class OpenSU3D:
         points, ids = self._map.points, self._map.ids
         segments = segments_of(points, ids, self._table, self._images, self._next_id, self.config)
         instances = to_instances(points, ids, segments, self._images, self.config)
-        self._postprocess_ms = (time.perf_counter() - start) * 1e3
+        self.postprocess_ms = (time.perf_counter() - start) * 1e3
         return instances
 
     def close(self) -> None:

@@ -122,7 +122,7 @@ def to_instances(
     config: OpenSU3DConfig,
 ) -> Instances:
     """The map: points of instances and of no instance; points that clustering dropped as noise are left out."""
-    of_segments = _concatenated([segment.points for segment in segments])
+    of_segments = np.concatenate([np.zeros(0, np.int64), *(segment.points for segment in segments)])
     is_kept = ids == 0
     is_kept[of_segments] = True
     row = np.cumsum(is_kept) - 1
@@ -164,7 +164,3 @@ def _described(segment: Segment, images: Sequence[ImageRecord], config: OpenSU3D
     )
     caption = best.captions[top[0].detection].strip() or caption_of(name)
     return _Description(name, caption, instance_score(scores, config.instance_score, config.top_m), feature)
-
-
-def _concatenated(arrays: Sequence[Int64Array]) -> Int64Array:
-    return np.concatenate(arrays) if arrays else np.zeros(0, np.int64)

@@ -44,6 +44,11 @@ class VoxelMap:
         return int(self._counts[1])
 
     @property
+    def _arrays(self) -> tuple[NDArray[Any], ...]:
+        """What every kernel walks over."""
+        return self._points, self._following, self._keys, self._heads, self._table
+
+    @property
     def n_bytes(self) -> int:
         """What the arrays take, their spare room included."""
         return sum(array.nbytes for array in vars(self).values() if isinstance(array, np.ndarray))
@@ -77,9 +82,7 @@ class VoxelMap:
         answer = np.empty(len(queries), np.int64)
 
         def look_up(part: slice) -> int:
-            part_answer = answer[part]
-            of_map = (self._points, self._following, self._keys, self._heads, self._table)
-            return int(_kernels.nearest(queries[part], self.eps, *of_map, part_answer))
+            return int(_kernels.nearest(queries[part], self.eps, answer[part], *self._arrays))
 
         return answer, sum(in_threads(look_up, len(queries)))
 
@@ -98,20 +101,8 @@ class VoxelMap:
             return counts, 0
         row_of_id = np.full(int(wanted.max()) + 1, -1, np.int64)
         row_of_id[wanted] = np.arange(len(wanted))
-        visited = _kernels.count_inside(
-            np.asarray(lower, np.float64),
-            np.asarray(upper, np.float64),
-            row_of_id,
-            self.eps,
-            self._points,
-            self._ids,
-            self._following,
-            self._keys,
-            self._heads,
-            self._table,
-            self.n_blocks,
-            counts,
-        )
+        ends = np.asarray(lower, np.float64), np.asarray(upper, np.float64)
+        visited = _kernels.count_inside(*ends, row_of_id, self.eps, self.n_blocks, counts, self._ids, *self._arrays)
         return counts, int(visited)
 
     def insert(self, points: Float64Array, ids: Int32Array, *, keep_density: bool, refill: bool) -> Int64Array:
@@ -122,27 +113,13 @@ class VoxelMap:
         """
         from su3d_bench.opensu3d.kernels import voxel_map as _kernels
 
-        points = checked_points(points)
+        points, ids = checked_points(points), np.ascontiguousarray(ids, np.int32)
         self._reserve_points(len(self) + len(points))
         placed = np.empty(len(points), np.int64)
         done = 0
         while True:
-            done = _kernels.insert(
-                points,
-                np.ascontiguousarray(ids, np.int32),
-                done,
-                self.eps,
-                keep_density,
-                refill,
-                self._points,
-                self._ids,
-                self._following,
-                self._keys,
-                self._heads,
-                self._table,
-                self._counts,
-                placed,
-            )
+            rules = self.eps, keep_density, refill
+            done = _kernels.insert(points, ids, done, *rules, placed, self._counts, self._ids, *self._arrays)
             if done == len(points):
                 return placed
             self._double_blocks()

@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from su3d_bench.numerics.cells import ABSENT, slot_of
 from su3d_bench.numerics.compiled import njit
 
-ABSENT = -1
+LABEL_SHIFT = 40  # a view spans fewer voxels than 2**39, at any voxel that a depth image can fill
 OWNED, BACKGROUND, DROPPED = 0, 1, 2  # what the pixels of a ring become
 UNUSED = -9  # no label: those are at least ABSENT * 3 + 2
 
@@ -77,29 +78,11 @@ def paint(mask, k, bounds, reach, ids, owner):  # type: ignore[no-untyped-def]
                 ids[row, column] = ABSENT
 
 
-@njit(cache=True, inline="always")
-def _slot(table, voxels, labels, vx, vy, vz, label):  # type: ignore[no-untyped-def]
-    """Where the voxel and label are in ``table``, or the free slot where they belong."""
-    size = np.uint64(len(table) - 1)
-    mixed = (
-        np.uint64(vx) * np.uint64(0x9E3779B97F4A7C15)
-        ^ np.uint64(vy) * np.uint64(0xC2B2AE3D27D4EB4F)
-        ^ np.uint64(vz) * np.uint64(0x165667B19E3779F9)
-        ^ np.uint64(label) * np.uint64(0xD6E8FEB86659FD93)
-    )
-    slot = (mixed ^ (mixed >> np.uint64(32))) & size
-    while True:
-        j = table[slot]
-        if j == ABSENT or (labels[j] == label and voxels[j, 0] == vx and voxels[j, 1] == vy and voxels[j, 2] == vz):
-            return slot
-        slot = (slot + np.uint64(1)) & size
-
-
 @njit(cache=True)
-def _grown(table, voxels, labels, n):  # type: ignore[no-untyped-def]
+def _grown(table, keys, n):  # type: ignore[no-untyped-def]
     larger = np.full(4 * len(table), ABSENT, np.int32)
     for j in range(n):
-        larger[_slot(larger, voxels, labels, voxels[j, 0], voxels[j, 1], voxels[j, 2], labels[j])] = j
+        larger[slot_of(larger, keys, keys[j, 0], keys[j, 1], keys[j, 2])] = j
     return larger
 
 
@@ -151,9 +134,9 @@ def _mark_new(points, voxel, labels, above_labels, cells, above_cells, is_new): 
 
 @njit(cache=True, nogil=True)
 def cloud(  # type: ignore[no-untyped-def]
-    depth_m, pixels, of_row, of_column, origin, ids, owner, rings, drop_background, voxel, points, owners, ranks
+    depth_m, pixels, of_row, of_column, origin, ids, owner, rings, drop_background, voxel
 ):
-    """Writes points, owners and ranks (0 in a mask, 1 in a ring, 2 in no mask) of ``pixels``; gives their number.
+    """Points, owners and ranks (0 in a mask, 1 in a ring, 2 in no mask) of ``pixels``.
 
     ``rings``: OWNED, BACKGROUND or DROPPED. Rows come first to last; with ``voxel`` above 0 only the first point of
     each voxel, owner and rank is kept.
@@ -163,8 +146,9 @@ def cloud(  # type: ignore[no-untyped-def]
     row_labels, above_labels = np.empty(width, np.int32), np.full(width, UNUSED, np.int32)
     cells, above_cells = np.empty((3, width)), np.zeros((3, width))
     is_new = np.ones(width, np.bool_)
-    voxels = np.empty((len(owners) if voxel > 0 else 0, 3), np.int64)
-    labels = np.empty(len(voxels), np.int32)
+    n_pixels = np.count_nonzero(pixels)
+    points, owners, ranks = np.empty((n_pixels, 3)), np.empty(n_pixels, np.int32), np.empty(n_pixels, np.int8)
+    keys = np.empty((n_pixels if voxel > 0 else 0, 3), np.int64)  # voxels, the label above the bits of the first axis
     table = np.full(1 << 12, ABSENT, np.int32)
     n = 0
     for row in range(height):
@@ -177,19 +161,20 @@ def cloud(  # type: ignore[no-untyped-def]
             if not is_new[column] or label == UNUSED:
                 continue
             if voxel > 0:
-                vx, vy, vz = np.int64(cells[0, column]), np.int64(cells[1, column]), np.int64(cells[2, column])
-                slot = _slot(table, voxels, labels, vx, vy, vz, label)
+                x = (np.int64(label) << LABEL_SHIFT) + np.int64(cells[0, column])
+                y, z = np.int64(cells[1, column]), np.int64(cells[2, column])
+                slot = slot_of(table, keys, x, y, z)
                 if table[slot] != ABSENT:
                     continue
                 if 2 * n >= len(table):
-                    table = _grown(table, voxels, labels, n)
-                    slot = _slot(table, voxels, labels, vx, vy, vz, label)
+                    table = _grown(table, keys, n)
+                    slot = slot_of(table, keys, x, y, z)
                 table[slot] = n
-                voxels[n, 0], voxels[n, 1], voxels[n, 2], labels[n] = vx, vy, vz, label
+                keys[n, 0], keys[n, 1], keys[n, 2] = x, y, z
             for axis in range(3):
                 points[n, axis] = row_points[axis, column]
             owners[n], ranks[n] = label // 3, label % 3
             n += 1
         above_labels, row_labels = row_labels, above_labels
         above_cells, cells = cells, above_cells
-    return n
+    return points[:n], owners[:n], ranks[:n]

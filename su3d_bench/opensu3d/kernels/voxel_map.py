@@ -38,7 +38,7 @@ def rehash(table, keys, n_blocks):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def insert(  # type: ignore[no-untyped-def]
-    new_points, new_ids, start, eps, keep_density, refill, points, ids, following, keys, heads, table, counts, placed
+    new_points, new_ids, start, eps, keep_density, refill, placed, counts, ids, points, following, keys, heads, table
 ):
     """Enters new points from ``start`` on; stops where the blocks run out and gives the point it stopped at.
 
@@ -95,7 +95,7 @@ def _write_gaps(x, voxel, eps, gaps):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def nearest(queries, eps, points, following, keys, heads, table, answer):  # type: ignore[no-untyped-def]
+def nearest(queries, eps, answer, points, following, keys, heads, table):  # type: ignore[no-untyped-def]
     """Writes the nearest map point strictly within ``eps`` of each query into ``answer``, ABSENT where there is none.
 
     Of equally near points the lowest index wins. Gives the number of voxels that were looked into.
@@ -160,9 +160,9 @@ def _count_block(block, lower, upper, points, ids, following, heads, row_of_id, 
 
 @njit(cache=True)
 def count_inside(  # type: ignore[no-untyped-def]
-    lower, upper, row_of_id, eps, points, ids, following, keys, heads, table, n_blocks, counts
+    lower, upper, row_of_id, eps, n_blocks, counts, ids, points, following, keys, heads, table
 ):
-    """Adds to ``found[row_of_id[id]]`` the points of each id in the closed box; gives the number of blocks visited.
+    """Adds to ``counts[row_of_id[id]]`` the points of each id in the closed box; gives the number of blocks visited.
 
     Walks the block coordinates of the box, or the blocks themselves where they are fewer.
     """
