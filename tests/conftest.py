@@ -25,6 +25,15 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
 
+@pytest.fixture(scope="session")
+def rooms_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A data root for the whole session, of all its processes: a room that one test renders is there for the others."""
+    base = tmp_path_factory.getbasetemp()
+    folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "rooms-data"
+    folder.mkdir(exist_ok=True)
+    return folder
+
+
 @pytest.hookimpl(tryfirst=True)
 def pytest_cmdline_main(config: pytest.Config) -> None:
     """Where several processes share the work, each takes whole files: what the tests of a file share is made once."""

@@ -62,12 +62,13 @@ CASES: dict[str, tuple[list[str], int, str]] = {
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _place(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+def _place(tmp_path_factory: pytest.TempPathFactory, rooms_data: Path) -> Iterator[None]:
     """A folder where each verb works on what those before it left."""
     folder = tmp_path_factory.mktemp("verbs")
     with pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
-        for name in ("SU3D_DATA", "SU3D_CACHE", "SU3D_MODELS"):
+        patch.setenv("SU3D_DATA", str(rooms_data))
+        for name in ("SU3D_CACHE", "SU3D_MODELS"):
             patch.setenv(name, str(folder / name.lower()))
         yield
 

@@ -154,8 +154,11 @@ def test_a_mask_that_leaves_the_folder_stops_the_evaluation(capsys: pytest.Captu
     assert "is no path inside the folder of the list" in capsys.readouterr().err
 
 
-def test_the_oracle_of_the_rooms_says_exactly_one(capsys: pytest.CaptureFixture[str]) -> None:
-    run = ["run", "--scenes", "rooms/bathroom0", "--methods", "oracle", "--no-pictures", "--jobs", "1", "--out", "run"]
+def test_the_oracle_of_the_rooms_says_exactly_one(
+    rooms_data: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("SU3D_DATA", str(rooms_data))
+    run = ["run", "--scenes", "rooms/living0", "--methods", "oracle", "--no-pictures", "--jobs", "1", "--out", "run"]
     assert main([*run, "--quiet"]) == 0
     capsys.readouterr()
     assert main(["evaluate", "run", "--json", "out.json"]) == 0

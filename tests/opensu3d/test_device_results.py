@@ -110,14 +110,14 @@ def test_a_run_on_a_gpu_that_is_not_here_ends_before_any_work_in_one_line(
 
 @needs_torch
 def test_a_run_hands_its_device_to_the_method_and_writes_the_same_bytes(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, rooms_data: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from su3d_bench.opensu3d.kernels import voxel_map_torch as device_kernels
 
-    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
+    monkeypatch.setenv("SU3D_DATA", str(rooms_data))
     words = ["run", "--scenes", "rooms/living0", "--profile", "oracle", "--limit", "2", "--no-pictures", "--quiet"]
-    words += ["--protocols", "rooms-semantic", "--jobs", "1", "--set", "rooms.width=96", "rooms.height=72"]
-    words += ["rooms.mesh_spacing_m=0.2", "perception.cache=false"]
+    words += ["--protocols", "rooms-semantic", "--jobs", "1", "--set", "rooms.width=160", "rooms.height=120"]
+    words += ["rooms.mesh_spacing_m=0.1", "perception.cache=false"]
     n_made = 0
 
     class Counted(device_kernels.DeviceVoxelMap):

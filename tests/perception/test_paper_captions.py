@@ -80,10 +80,11 @@ class Finished:
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Finished]:
+def made(tmp_path_factory: pytest.TempPathFactory, rooms_data: Path) -> Iterator[Finished]:
     root = tmp_path_factory.mktemp("captions")
     models = write_models(root / "models")
     with pytest.MonkeyPatch.context() as patch, chat_server() as server:
+        patch.setenv("SU3D_DATA", str(rooms_data))
         patch.setenv("SU3D_CACHE", str(root / "cache"))
         patch.delenv("SU3D_TEST_KEY", raising=False)
         yield Finished(root, models, server)

@@ -280,7 +280,10 @@ def test_a_tagger_that_was_asked_for_is_looked_for_before_any_frame(models: Path
     check_models("embedded", PerceptionConfig())
 
 
-def test_a_room_runs_end_to_end(models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_room_runs_end_to_end(
+    models: Path, tmp_path: Path, rooms_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SU3D_DATA", str(rooms_data))
     monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
     methods = ("opensu3d", "sam3d")  # named masks, and masks of everything
     assert main(paper_words(models, tmp_path / "out", "rooms/living0", (), "--methods", *methods)) == 0
