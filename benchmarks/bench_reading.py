@@ -31,7 +31,8 @@ from su3d_bench.datasets.replica.frames import ReplicaFrames
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 from su3d_bench.datasets.scannet.sens.header import SensHeader, header_bytes
 from su3d_bench.datasets.scannet.sens.read import FRAME_RECORD, SensFile
-from su3d_bench.datasets.scannet.sens.write import SensFrame, colour_content, depth_content, write_sens
+from su3d_bench.datasets.scannet.sens.write import SensFrame, write_sens
+from su3d_bench.formats.images import jpeg_bytes
 from su3d_bench.runs.feeding import ReadAhead
 
 Images = tuple[UInt8Array, np.ndarray]  # colour (H, W, 3) and depth (H, W) of a frame
@@ -194,7 +195,7 @@ class Chosen(Sequence[Images]):
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
     path = tmp_path_factory.mktemp("recording") / "scan.sens"
     images = [stored_images(seed) for seed in range(N_DIFFERENT)]
-    write_sens(path, HEADER, (SensFrame(IDENTITY, i, i, *images[i % N_DIFFERENT]) for i in range(N_SENS)))
+    write_sens(path, HEADER, (SensFrame(IDENTITY, i, i, *images[i % N_DIFFERENT]).stored for i in range(N_SENS)))
     yield path
     path.unlink()
 
@@ -226,8 +227,8 @@ def stored_images(seed: int) -> tuple[bytes, bytes]:
     waves = np.stack([np.sin(x + seed), np.cos(y * x), np.sin(y)], 2) * 90 + 128 + rng.normal(0, 3, (*x.shape, 3))
     x, y = np.meshgrid(np.linspace(0, 6, DEPTH[0]), np.linspace(0, 6, DEPTH[1]))
     depth = 2_000 + 500 * np.sin(x + y) + rng.normal(0, 1, x.shape)
-    colour = colour_content(np.clip(waves, 0, 255).astype(np.uint8), "jpeg")
-    return colour, depth_content(depth.astype(np.uint16), "zlib")
+    colour = jpeg_bytes(np.clip(waves, 0, 255).astype(np.uint8))
+    return colour, zlib.compress(depth.astype("<u2").tobytes())
 
 
 def with_published(path: Path, indices: Iterable[int]) -> None:

@@ -288,10 +288,9 @@ def digest_recording(source: RgbdSource, poses: Float64Array) -> str:
     """A key of a recording's cameras, poses and time stamps, of the sizes of all images, and of the first and last."""
     total = hashlib.sha256()
     if isinstance(source, SensSource):
-        file = source.file
-        total.update(header_bytes(file.header, len(file)) + file.records().tobytes())
-        for i in (0, len(file) - 1):
-            total.update(digest_bytes(file.colour_bytes(i) + file.depth_bytes(i)).encode())
+        total.update(header_bytes(source.header, len(source)) + source.records().tobytes())
+        for i in (0, len(source) - 1):
+            total.update(digest_bytes(source.colour_bytes(i) + source.depth_bytes(i)).encode())
         return f"sens {total.hexdigest()}"
     images = [path for path in source.files() if path.suffix != TEXT]
     camera = source.camera

@@ -67,15 +67,15 @@ class SensFile:
     """
 
     def __init__(self, path: Path, where: str) -> None:
-        self.path, self.where = path, f"{where}: {path.name}"
-        with _opened(path, self.where) as handle:
+        self.path, self.where, self.place = path, where, f"{where}: {path.name}"
+        with _opened(path, self.place) as handle:
             n_bytes = os.fstat(handle).st_size
-            self.header, n_frames, at = parse_header(os.pread(handle, MAX_HEADER_BYTES, 0), self.where)
-            _check_promise(n_frames, n_bytes - at, self.where)
+            self.header, n_frames, at = parse_header(os.pread(handle, MAX_HEADER_BYTES, 0), self.place)
+            _check_promise(n_frames, n_bytes - at, self.place)
             most = _most_bytes(self.header)
-            self._records, self._starts, at = _read_records(handle, n_bytes, n_frames, at, most, self.where)
+            self._records, self._starts, at = _read_records(handle, n_bytes, n_frames, at, most, self.place)
             self.has_motion = n_bytes > at
-            self.n_imu = _count_motion(handle, n_bytes, at, self.where) if self.has_motion else 0
+            self.n_imu = _count_motion(handle, n_bytes, at, self.place) if self.has_motion else 0
         self._motion_start = at + COUNT.size
 
     def __len__(self) -> int:
@@ -129,9 +129,9 @@ class SensFile:
 
     def motion(self) -> NDArray[Any]:
         """The motion data: (n_imu,) of ``MOTION_RECORD``."""
-        with _opened(self.path, self.where) as handle:
+        with _opened(self.path, self.place) as handle:
             content = os.pread(handle, self.n_imu * MOTION_RECORD.itemsize, self._motion_start)
-        _check_length(content, self.n_imu * MOTION_RECORD.itemsize, f"{self.where}: motion data")
+        _check_length(content, self.n_imu * MOTION_RECORD.itemsize, f"{self.place}: motion data")
         return np.frombuffer(content, MOTION_RECORD)
 
     def _colour_span(self, i: int) -> tuple[int, int]:
@@ -142,10 +142,10 @@ class SensFile:
         return start + n_bytes, int(self._records[i]["depth_bytes"])
 
     def _place(self, i: int, at: int) -> str:
-        return f"{self.where}: frame {range(len(self))[i]} at byte {at}"
+        return f"{self.place}: frame {range(len(self))[i]} at byte {at}"
 
     def _read(self, i: int, at: int, n_bytes: int) -> bytes:
-        with _opened(self.path, self.where) as handle:
+        with _opened(self.path, self.place) as handle:
             content = os.pread(handle, n_bytes, at)
         if len(content) != n_bytes:
             raise DataError(f"{self._place(i, at)}: the file became shorter while it was read; copy it again")
@@ -246,12 +246,12 @@ def _inflate(content: bytes, n_bytes: int, where: str) -> bytes:
     return values
 
 
-class SensSource:
+class SensSource(SensFile):
     """A ``.sens`` file as an ``RgbdSource``."""
 
     def __init__(self, path: Path, where: str) -> None:
-        self.where, self.file = where, SensFile(path, where)
-        header = self.file.header
+        super().__init__(path, where)
+        header = self.header
         self.camera = SensorPair(
             colour_size=(header.colour_width, header.colour_height),
             depth_size=(header.depth_width, header.depth_height),
@@ -260,34 +260,22 @@ class SensSource:
             colour_extrinsic=header.extrinsic_colour,
             depth_extrinsic=header.extrinsic_depth,
             depth_shift=header.depth_shift,
-            where=self.file.where,
+            where=self.place,
         )
-        stamps = self.file.records()["colour_timestamp"]
+        stamps = self.records()["colour_timestamp"]
         # Many recordings have zeros or random numbers there.
         self._has_times = len(stamps) > 1 and bool((stamps[1:] > stamps[:-1]).all())
 
-    def __len__(self) -> int:
-        return len(self.file)
-
     def pose(self, i: int) -> Float64Array:
-        return self.file.record(i).camera_to_world
-
-    def poses(self) -> Float64Array:
-        return self.file.poses()
+        return self.record(i).camera_to_world
 
     def timestamp_s(self, i: int) -> float:
         if self._has_times:
-            return self.file.record(i).colour_timestamp / MICROSECONDS
+            return self.record(i).colour_timestamp / MICROSECONDS
         return self.frame_number(i) / FRAMES_PER_SECOND
 
-    def colour(self, i: int) -> UInt8Array:
-        return self.file.colour(i)
-
-    def depth(self, i: int) -> UInt16Array:
-        return self.file.depth(i)
-
     def frame_number(self, i: int) -> int:
-        return range(len(self.file))[i]
+        return range(len(self))[i]
 
     def files(self) -> Sequence[Path]:
-        return [self.file.path]
+        return [self.path]

@@ -6,6 +6,7 @@ The recording is a ``.sens`` file here; the exports of the two original readers 
 from __future__ import annotations
 
 import shutil
+import zlib
 from abc import abstractmethod
 from collections.abc import Sequence
 from pathlib import Path
@@ -17,7 +18,7 @@ from su3d_bench.core.types import Float64Array, Frame
 from su3d_bench.datasets.scannet.labels import TABLE_NAME
 from su3d_bench.datasets.scannet.sens.header import SensHeader
 from su3d_bench.datasets.scannet.sens.read import FRAME_RECORD, MICROSECONDS, MOTION_RECORD
-from su3d_bench.datasets.scannet.sens.write import SensFrame, depth_content, write_sens
+from su3d_bench.datasets.scannet.sens.write import SensFrame, write_sens
 from su3d_bench.datasets.scannet.truth import meta_name, truth_names
 from su3d_bench.datasets.scannet.writing.categories import label_table_text, room_of, scan_name
 from su3d_bench.datasets.scannet.writing.truth import write_scan_truth
@@ -81,30 +82,19 @@ class SensLayout(ScannetLayout):
         return (f"{PIECES}/{index:06d}.record",)
 
     def frame_files(self, frame: Frame) -> Sequence[bytes]:
-        colour, depth = jpeg_bytes(frame.rgb), depth_content(depth_in_units(frame.depth_m, DEPTH_SHIFT), "zlib")
-        record = np.zeros((), FRAME_RECORD)
-        record["camera_to_world"] = frame.camera_to_world
-        record["colour_timestamp"] = record["depth_timestamp"] = round(frame.timestamp_s * MICROSECONDS)
-        record["colour_bytes"], record["depth_bytes"] = len(colour), len(depth)
-        return (record.tobytes() + colour + depth,)
+        time = round(frame.timestamp_s * MICROSECONDS)
+        depth = zlib.compress(depth_in_units(frame.depth_m, DEPTH_SHIFT).astype("<u2").tobytes())
+        return (SensFrame(frame.camera_to_world, time, time, jpeg_bytes(frame.rgb), depth).stored,)
 
     def join(self, dataset: ScannedDataset, target: SceneTarget) -> None:
         if not target.has_frames:
             n_frames = len(dataset.frames(target.scene, 1))
             pieces = [target.partial / name for index in range(n_frames) for name in self.frame_names(index)]
-            header = sens_header(dataset.intrinsics, size_of(_frame_of(pieces[0].read_bytes()).colour))
-            records = (_frame_of(piece.read_bytes()) for piece in pieces)
+            header = sens_header(dataset.intrinsics, size_of(pieces[0].read_bytes()[FRAME_RECORD.itemsize :]))
+            records = (piece.read_bytes() for piece in pieces)
             write_sens(target.partial / target.frames, header, records, np.zeros(0, MOTION_RECORD))
         if (target.partial / PIECES).exists():
             shutil.rmtree(target.partial / PIECES)
-
-
-def _frame_of(piece: bytes) -> SensFrame:
-    record = np.frombuffer(piece, FRAME_RECORD, 1)[0]
-    times = int(record["colour_timestamp"]), int(record["depth_timestamp"])
-    end_of_colour = FRAME_RECORD.itemsize + int(record["colour_bytes"])
-    pose = record["camera_to_world"].astype(np.float64)
-    return SensFrame(pose, *times, piece[FRAME_RECORD.itemsize : end_of_colour], piece[end_of_colour:])
 
 
 def size_of(jpeg: bytes) -> tuple[int, int]:

@@ -9,7 +9,7 @@ import pickle
 import struct
 import tracemalloc
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
@@ -21,11 +21,12 @@ from damage import damages, outcomes, truncations
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from places import CASES
+from scannet_scan import colour_content, depth_content
 
 from su3d_bench.core.errors import DataError, StoreError
 from su3d_bench.datasets.scannet.sens.header import SensHeader
 from su3d_bench.datasets.scannet.sens.read import MOTION_RECORD, SensFile, SensSource
-from su3d_bench.datasets.scannet.sens.write import SensFrame, colour_content, depth_content, write_sens
+from su3d_bench.datasets.scannet.sens.write import SensFrame, write_sens
 
 TOY, RAW_TOY = CASES / "sens01_toy.sens", CASES / "sens02_toy_raw.sens"
 WHERE = "scannet/scene0000_00"
@@ -79,19 +80,18 @@ def frames(header: SensHeader, n: int) -> Iterator[SensFrame]:
         yield SensFrame(pose, 33_333 * i, 33_333 * i + 7, colour, depth_content(values, header.depth_compression))
 
 
-# ---------------------------------------------------------------- what the original readers found
+def stored(frames: Iterable[SensFrame]) -> Iterator[bytes]:
+    return (frame.stored for frame in frames)
 
 
 def stored_frame(file: SensFile, i: int) -> SensFrame:
-    """Frame ``i`` of a recording with its images as stored: written again, it is the same to the byte."""
+    """Frame ``i`` of a recording with its images as stored."""
     record = file.record(i)
-    return SensFrame(
-        record.camera_to_world,
-        record.colour_timestamp,
-        record.depth_timestamp,
-        file.colour_bytes(i),
-        file.depth_bytes(i),
-    )
+    times = record.colour_timestamp, record.depth_timestamp
+    return SensFrame(record.camera_to_world, *times, file.colour_bytes(i), file.depth_bytes(i))
+
+
+# ---------------------------------------------------------------- what the original readers found
 
 
 def test_the_toy_recording_is_read_as_the_original_readers_did(expected: dict[str, np.ndarray]) -> None:
@@ -137,7 +137,7 @@ def test_a_recording_written_again_is_the_same_to_the_byte(
 ) -> None:
     file = SensFile(path, WHERE)
     motion = file.motion() if file.has_motion else None
-    write_sens(tmp_path / "again.sens", file.header, (stored_frame(file, i) for i in range(len(file))), motion)
+    write_sens(tmp_path / "again.sens", file.header, (stored_frame(file, i).stored for i in range(len(file))), motion)
     content = (tmp_path / "again.sens").read_bytes()
     assert content == path.read_bytes()
     if path == TOY:
@@ -158,7 +158,7 @@ def test_every_compression_gives_the_images_back(tmp_path: Path, colour: str, de
     frame = SensFrame(
         np.eye(4), 0, 0, colour_content(rgb, made.colour_compression), depth_content(values, made.depth_compression)
     )
-    write_sens(tmp_path / "a.sens", made, [frame])
+    write_sens(tmp_path / "a.sens", made, [frame.stored])
     file = SensFile(tmp_path / "a.sens", WHERE)
     np.testing.assert_array_equal(file.depth(0), values)
     if colour == "jpeg":
@@ -173,7 +173,7 @@ def test_every_compression_gives_the_images_back(tmp_path: Path, colour: str, de
 @given(order=st.permutations(range(12)), n_imu=st.one_of(st.none(), st.integers(0, 3)))
 def test_frames_in_any_order_are_those_in_order(tmp_path: Path, order: list[int], n_imu: int | None) -> None:
     motion = None if n_imu is None else np.zeros(n_imu, MOTION_RECORD)
-    write_sens(tmp_path / "a.sens", header(), frames(header(), 12), motion)
+    write_sens(tmp_path / "a.sens", header(), stored(frames(header(), 12)), motion)
     file = SensFile(tmp_path / "a.sens", WHERE)
     assert (file.n_imu, file.has_motion, len(file.motion())) == (n_imu or 0, motion is not None, n_imu or 0)
     in_order = list(frames(header(), 12))
@@ -204,10 +204,10 @@ def test_frames_count_from_the_end_and_end_as_a_sequence_does() -> None:
 
 def test_times_are_30_a_second_where_the_stamps_do_not_increase(tmp_path: Path) -> None:
     same = [replace(frame, colour_timestamp=2**64 - 1) for frame in frames(header(), 3)]
-    write_sens(tmp_path / "a.sens", header(), same)
+    write_sens(tmp_path / "a.sens", header(), stored(same))
     source = SensSource(tmp_path / "a.sens", WHERE)
     assert [source.timestamp_s(i) for i in range(3)] == pytest.approx([0, 1 / 30, 2 / 30])
-    assert source.file.record(0).colour_timestamp == 2**64 - 1
+    assert source.record(0).colour_timestamp == 2**64 - 1
 
 
 def test_the_cameras_of_a_source_are_those_of_the_header(expected: dict[str, np.ndarray]) -> None:
@@ -232,7 +232,7 @@ def test_a_writer_that_fails_leaves_the_old_file_and_nothing_else(tmp_path: Path
         raise DataError("a source that breaks")
 
     with pytest.raises(DataError, match="a source that breaks"):
-        write_sens(tmp_path / "a.sens", header(), breaking())
+        write_sens(tmp_path / "a.sens", header(), stored(breaking()))
     assert (os.listdir(tmp_path), (tmp_path / "a.sens").read_bytes()) == (["a.sens"], b"old")
     with pytest.raises(StoreError, match="cannot write"):
         write_sens(tmp_path / "none" / "a.sens", header(), [])
@@ -243,7 +243,7 @@ def test_memory_does_not_grow_with_the_recording(tmp_path: Path) -> None:
     frame = SensFrame(np.eye(4), 0, 0, bytes(3 * 400 * 400), bytes(2 * 4 * 3))
     tracemalloc.start()
     try:
-        write_sens(tmp_path / "a.sens", made, (frame for _ in range(60)))
+        write_sens(tmp_path / "a.sens", made, (frame.stored for _ in range(60)))
         file = SensFile(tmp_path / "a.sens", WHERE)
         for i in range(60):
             file.colour(i)
@@ -299,7 +299,7 @@ def with_frame(tmp_path: Path, **changes: bytes) -> SensFile:
     """A recording of three frames of which the second has other images."""
     all_frames = list(frames(header(), 3))
     all_frames[1] = replace(all_frames[1], **changes)  # type: ignore[arg-type]
-    write_sens(tmp_path / "bad.sens", header(), all_frames)
+    write_sens(tmp_path / "bad.sens", header(), stored(all_frames))
     return SensFile(tmp_path / "bad.sens", WHERE)
 
 
@@ -377,7 +377,7 @@ def test_a_promise_of_too_many_frames_allocates_nothing(tmp_path: Path, n_frames
 
 def test_an_image_that_fills_an_enormous_file_is_refused_before_it_is_read(tmp_path: Path) -> None:
     made = header(colour_compression="raw", depth_compression="raw")
-    write_sens(tmp_path / "bad.sens", made, frames(made, 1))
+    write_sens(tmp_path / "bad.sens", made, stored(frames(made, 1)))
     with (tmp_path / "bad.sens").open("r+b") as stream:
         at = stream.seek(0, os.SEEK_END) - 144 - 24
         stream.seek(at - 16)
@@ -434,7 +434,7 @@ def test_a_recording_cut_short_anywhere_is_refused(tmp_path: Path, path: Path) -
 def test_a_damaged_recording_is_read_or_refused_with_its_name(tmp_path: Path, path: Path) -> None:
     def read(copy: bytes) -> None:
         opened(tmp_path / "damaged.sens", copy)
-        read_whole(SensSource(tmp_path / "damaged.sens", WHERE).file)
+        read_whole(SensSource(tmp_path / "damaged.sens", WHERE))
 
     n_read, n_refused = outcomes(read, damages(path.read_bytes()), must_name=f"{WHERE}: damaged.sens")
     assert n_read + n_refused == 2000 and n_refused > 500

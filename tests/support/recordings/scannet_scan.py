@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,8 +11,9 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.types import Float64Array, UInt8Array
-from su3d_bench.datasets.scannet.sens.header import SensHeader
-from su3d_bench.datasets.scannet.sens.write import SensFrame, colour_content, depth_content, write_sens
+from su3d_bench.datasets.scannet.sens.header import ColourCompression, DepthCompression, SensHeader
+from su3d_bench.datasets.scannet.sens.write import SensFrame, write_sens
+from su3d_bench.formats.images import UInt16Array, jpeg_bytes, png_bytes
 from su3d_bench.formats.ply import ListColumn, PlyElement, write_ply
 
 SCAN = "scene0000_00"
@@ -160,6 +162,19 @@ def positions(n_frames: int) -> Float64Array:
     return np.linspace(1.0, 3.0, n_frames)
 
 
+def colour_content(rgb: UInt8Array, compression: ColourCompression) -> bytes:
+    """A colour image (H, W, 3) RGB as a ``.sens`` file stores it."""
+    if compression == "raw":
+        return rgb.tobytes()
+    return jpeg_bytes(rgb) if compression == "jpeg" else png_bytes(rgb)
+
+
+def depth_content(values: UInt16Array, compression: DepthCompression) -> bytes:
+    """A depth image (H, W) as a ``.sens`` file stores it."""
+    raw = values.astype("<u2").tobytes()
+    return zlib.compress(raw) if compression == "zlib" else raw
+
+
 def write_recording(path: Path, n_frames: int = 5, lost: Sequence[int] = (), head: SensHeader | None = None) -> None:
     """A walk along the floor; frames in ``lost`` have no pose."""
     head = head or header()
@@ -176,7 +191,7 @@ def write_recording(path: Path, n_frames: int = 5, lost: Sequence[int] = (), hea
                 1_000_000 + 33_333 * i,
                 colour_content(floor_image(colour_size, x_m), head.colour_compression),
                 depth_content(depth, head.depth_compression),
-            )
+            ).stored
             for i, x_m in enumerate(positions(n_frames))
         ),
     )
