@@ -8,6 +8,7 @@ belongs to which object comes from the base data. Source: openlex3d at commit 3d
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -18,6 +19,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing, printable
 from su3d_bench.core.types import Float32Array, Int64Array
+from su3d_bench.datasets.recordings.recorded_frames import parsed_json, read_text
 from su3d_bench.datasets.replica.folders import find_original_scene, original_name
 from su3d_bench.datasets.replica.mesh_truth import MESH_NAME, AnnotatedMesh, read_annotated_mesh
 from su3d_bench.formats.pcd import read_pcd_points
@@ -29,7 +31,6 @@ PROMPTS_NAME = "prompt_list.txt"
 CATEGORIES_NAME = "gt_categories.json"
 VISIBLE_NAME = "gt_visible_cloud.pcd"
 VISIBLE_RADIUS_M = 0.05  # how far the face corner may be that says to which object a visible point belongs
-MOST_BYTES = 64 << 20  # of one text file; the largest of the release are some megabytes
 MOST_ID = 2**31 - 1
 
 Level = Literal["l0", "l1", "all"]
@@ -193,7 +194,8 @@ def read_prompts(path: Path, where: str) -> tuple[str, ...]:
 
 def read_categories(path: Path, where: str) -> dict[int, ObjectLabels]:
     """Object id -> labels, from ``dataset.samples`` of a ``gt_categories.json``."""
-    samples = _entry(_entry(_read_json(path, where), "dataset", dict, where), "samples", list, where)
+    content = parsed_json(_read_text(path, where), where)
+    samples = _entry(_entry(content, "dataset", dict, where), "samples", list, where)
     labels_of: dict[int, ObjectLabels] = {}
     for number, sample in enumerate(samples):
         at = f"{where}: sample {number}"
@@ -213,7 +215,7 @@ def read_categories(path: Path, where: str) -> dict[int, ObjectLabels]:
 def read_queries(path: Path, where: str) -> tuple[TextQuery, ...]:
     """The queries of all levels of the file, in its order: level -> text -> object ids."""
     queries = []
-    for level, of_level in _table(_read_json(path, where), where).items():
+    for level, of_level in _table(parsed_json(_read_text(path, where), where), where).items():
         at = f"{where}: '{printable(level, 40)}'"
         for text, ids in _table(of_level, at).items():
             beside = f"{at}: query '{printable(text, 60)}'"
@@ -225,30 +227,13 @@ def read_queries(path: Path, where: str) -> tuple[TextQuery, ...]:
 
 
 def _read_text(path: Path, where: str) -> str:
-    try:
-        with path.open("rb") as file:
-            content = file.read(MOST_BYTES + 1)
-    except FileNotFoundError as error:
-        raise _missing(path, where) from error
-    except OSError as error:
-        raise DataError(f"{where}: cannot be read: {error.strerror}") from error
-    if len(content) > MOST_BYTES:
-        raise DataError(f"{where}: has more than {MOST_BYTES >> 20} MiB; this is no file of OpenLex3D")
-    try:
-        return content.decode("utf-8")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{where}: byte {error.start} is not UTF-8; copy the file again") from error
+    if not os.path.exists(path):  # False, too, where the system refuses to look
+        raise _missing(path, where)
+    return read_text(path, where)
 
 
 def _missing(path: Path, where: str) -> GroundTruthMissing:
     return GroundTruthMissing(f"{where}: is not there; expected {printable(str(path), 200)}")
-
-
-def _read_json(path: Path, where: str) -> Any:
-    try:
-        return json.loads(_read_text(path, where))
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{where}: not JSON ({printable(str(error), 120)}); copy the file again") from error
 
 
 def _table(value: Any, where: str) -> Mapping[str, Any]:

@@ -27,19 +27,12 @@ N_DEPTH_VALUES = 1 << 16
 def read_text(path: Path, where: str, advice: str = "copy the file again") -> str:
     """The text of a file; ``where`` names it and begins each message."""
     try:
-        size = path.stat().st_size
-        if size > MAX_TEXT_BYTES:
-            raise DataError(f"{where} has {size} bytes; expected a text file of at most {MAX_TEXT_BYTES}")
-        return path.read_bytes().decode("utf-8")
-    except FileNotFoundError as error:
-        raise DataError(f"{where} is missing; {advice}") from error
-    except OSError as error:
-        raise DataError(f"{where} cannot be read: {error.strerror}") from error
+        return read_bytes(path, where, advice, MAX_TEXT_BYTES).decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise DataError(f"{where}: not a text file; {advice}") from error
+        raise DataError(f"{where}: not a text file, byte {error.start} is not UTF-8; {advice}") from error
 
 
-def parsed_json(content: bytes, where: str) -> Any:
+def parsed_json(content: bytes | str, where: str) -> Any:
     """What a JSON file holds."""
     try:
         return json.loads(content)
@@ -63,19 +56,13 @@ def depth_m_of_values(units_per_metre: float) -> Float32Array:
 
 def numbers(words: Sequence[str], where: str) -> list[float]:
     """The words as numbers, finite or not."""
-    try:
-        return [float(word) for word in words]
-    except ValueError:
-        bad = next(word for word in words if not _is_number(word))
-        raise DataError(f"{where}: {bad[:20]!r} is no number") from None
-
-
-def _is_number(word: str) -> bool:
-    try:
-        float(word)
-    except ValueError:
-        return False
-    return True
+    values = []
+    for word in words:
+        try:
+            values.append(float(word))
+        except ValueError:
+            raise DataError(f"{where}: {word[:20]!r} is no number") from None
+    return values
 
 
 class Folder:
@@ -153,6 +140,8 @@ class Recording:
 class RecordedFrames(Sequence[Frame]):
     """Every ``stride``-th usable frame, read when it is asked for; a file that cannot be used is a ``DataError``."""
 
+    advice = "copy the recording again"
+
     def __init__(self, recording: Recording, stride: int = 1) -> None:
         self._recording = recording
         self._frames = recording.frames[::stride]
@@ -162,15 +151,14 @@ class RecordedFrames(Sequence[Frame]):
 
     def __getitem__(self, position: int) -> Frame:  # type: ignore[override]
         frame, recording = self._frames[position], self._recording
-        rgb = self._read_colour(frame)
-        values = self._read_depth(frame, rgb)
-        depth_m = recording.depth_m_of_value.take(values)  # half the time of an index
-        return Frame(frame.index, frame.timestamp_s, rgb, depth_m, frame.pose, recording.intrinsics)
-
-    def _read_colour(self, frame: RecordedFrame) -> UInt8Array:
         where, content = self._read(frame.colour)
         rgb = decode_colour(content, where)
-        height, width = rgb.shape[:2]
+        self.check_size(rgb.shape[1], rgb.shape[0], where)
+        depth_m = recording.depth_m_of_value.take(self._depth_values(frame, rgb))  # half the time of an index
+        return Frame(frame.index, frame.timestamp_s, rgb, depth_m, frame.pose, recording.intrinsics)
+
+    def check_size(self, width: int, height: int, where: str) -> None:
+        """A ``DataError`` where a colour image of this size is not of the recording's camera."""
         expected, (cx, cy) = self._recording.image_size, self._recording.intrinsics[:2, 2]
         if expected is not None and expected != (width, height):
             raise DataError(
@@ -182,9 +170,11 @@ class RecordedFrames(Sequence[Frame]):
                 f"{where} is {width}x{height} but the principal point is ({cx:g}, {cy:g}); intrinsics belong to one "
                 "image size"
             )
-        return rgb
 
-    def _read_depth(self, frame: RecordedFrame, rgb: UInt8Array) -> UInt16Array:
+    def check_depth(self, values: UInt16Array, where: str) -> None:
+        """A ``DataError`` where a depth image cannot be right."""
+
+    def _depth_values(self, frame: RecordedFrame, rgb: UInt8Array) -> UInt16Array:
         where, content = self._read(frame.depth)
         values = decode_depth(content, where)
         if values.shape != rgb.shape[:2]:
@@ -192,11 +182,12 @@ class RecordedFrames(Sequence[Frame]):
                 f"{where} is {values.shape[1]}x{values.shape[0]} and {frame.colour} is {rgb.shape[1]}x{rgb.shape[0]}; "
                 "both must have one size, the depth registered to the colour"
             )
+        self.check_depth(values, where)
         return values
 
     def _read(self, name: str) -> tuple[str, bytes]:
         where = f"{self._recording.where}: {name}"
-        return where, read_bytes(self._recording.folder.path / name, where, "copy the recording again")
+        return where, read_bytes(self._recording.folder.path / name, where, self.advice)
 
 
 def left_out(where: str, names: Sequence[str], what: str, n_used: int) -> str:

@@ -8,7 +8,6 @@ complete, so a gap or a NaN means a damaged copy, and a number computed around i
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -16,10 +15,17 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import Float32Array, Float64Array, Frame, UInt8Array
-from su3d_bench.datasets.recordings.recorded_frames import depth_m_of_values, parsed_json
+from su3d_bench.core.types import Float64Array
+from su3d_bench.datasets.recordings.recorded_frames import (
+    Folder,
+    RecordedFrame,
+    RecordedFrames,
+    Recording,
+    depth_m_of_values,
+    parsed_json,
+)
 from su3d_bench.datasets.replica.mesh_truth import shown
-from su3d_bench.formats.images import decode_colour, decode_depth, read_bytes
+from su3d_bench.formats.images import UInt16Array
 from su3d_bench.formats.poses import poses_of_lines
 
 CAMERA_KEYS = ("w", "h", "fx", "fy", "cx", "cy", "scale")
@@ -118,46 +124,27 @@ def depth_name(index: int) -> str:
     return f"results/depth{index:06d}.png"
 
 
-class ReplicaFrames(Sequence[Frame]):
+class ReplicaFrames(RecordedFrames):
     """The frames at ``indices``, each read when it is asked for; a file that cannot be used is a ``DataError``."""
 
+    advice = "copy results/ again"
+
     def __init__(self, folder: Path, where: str, camera: Camera, poses: Float64Array, indices: range) -> None:
-        self._folder, self._where, self._camera = folder, where, camera
-        self._poses, self._indices = poses, indices
-        self._depth_m_of_value = depth_m_of_values(camera.scale)
+        frames = tuple(
+            RecordedFrame(i, i / FRAMES_PER_SECOND, colour_name(i), depth_name(i), poses[i]) for i in indices
+        )
+        self._size = camera.width, camera.height
+        super().__init__(
+            Recording(where, Folder(folder), frames, camera.intrinsics, depth_m_of_values(camera.scale), ())
+        )
 
-    def __len__(self) -> int:
-        return len(self._indices)
-
-    def __getitem__(self, position: int) -> Frame:  # type: ignore[override]
-        index = self._indices[position]
-        rgb = self._read_colour(index)
-        depth_m = self._read_depth(index, rgb)
-        return Frame(index, index / FRAMES_PER_SECOND, rgb, depth_m, self._poses[index], self._camera.intrinsics)
-
-    def _read_colour(self, index: int) -> UInt8Array:
-        where, content = self._read(colour_name(index))
-        rgb = decode_colour(content, where)
-        if rgb.shape[:2] != (self._camera.height, self._camera.width):
+    def check_size(self, width: int, height: int, where: str) -> None:
+        if (width, height) != self._size:
             raise DataError(
-                f"{where} is {rgb.shape[1]}x{rgb.shape[0]} but cam_params.json says {self._camera.width}x"
-                f"{self._camera.height}; it belongs to another render"
+                f"{where} is {width}x{height} but cam_params.json says {self._size[0]}x{self._size[1]}; it belongs to "
+                "another render"
             )
-        return rgb
 
-    def _read_depth(self, index: int, rgb: UInt8Array) -> Float32Array:
-        where, content = self._read(depth_name(index))
-        values = decode_depth(content, where)
-        if values.shape != rgb.shape[:2]:
-            raise DataError(
-                f"{where} is {values.shape[1]}x{values.shape[0]} and {colour_name(index)} is {rgb.shape[1]}x"
-                f"{rgb.shape[0]}; both must have one size"
-            )
+    def check_depth(self, values: UInt16Array, where: str) -> None:
         if not values.any():
             raise DataError(f"{where}: empty depth, no pixel is above 0; copy the file again or leave the scene out")
-        depth_m: Float32Array = self._depth_m_of_value.take(values)  # half the time of an index
-        return depth_m
-
-    def _read(self, name: str) -> tuple[str, bytes]:
-        where = f"{self._where}: {name}"
-        return where, read_bytes(self._folder / name, where, "copy results/ again")

@@ -22,6 +22,7 @@ from su3d_bench.core.types import Float32Array, GroundTruth, InstanceMesh, Int32
 from su3d_bench.datasets.recordings.meshes import face_corners, fans, scalar_column, vertex_positions
 from su3d_bench.datasets.recordings.recorded_frames import parsed_json
 from su3d_bench.datasets.replica.folders import replica_label_set
+from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.ply import ListColumn, read_ply
 
 MESH_NAME = "habitat/mesh_semantic.ply"
@@ -78,10 +79,7 @@ def read_object_classes(path: Path, where: str) -> dict[int, int]:
 def read_objects(path: Path, where: str) -> list[dict[str, Any]]:
     """The rows of ``objects`` of an ``info_semantic.json`` whose classes are Replica's."""
     where = f"{where}: {INFO_NAME}"
-    try:
-        content = parsed_json(path.read_bytes(), where)
-    except OSError as error:
-        raise DataError(f"{where} cannot be read: {error.strerror}") from error
+    content = parsed_json(read_bytes(path, where), where)
     objects = _list_of_tables(content, "objects", where)
     _check_class_names(_list_of_tables(content, "classes", where), where)
     return objects

@@ -15,7 +15,7 @@ from pathlib import Path
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import LabelSet
-from su3d_bench.formats.images import read_bytes
+from su3d_bench.datasets.recordings.recorded_frames import read_text
 
 LABEL_SPACE = "scannet"
 TABLE_NAME = "scannetv2-labels.combined.tsv"
@@ -62,10 +62,7 @@ def read_label_table(path: Path, where: str) -> LabelTable:
     may end in CR, LF or both, even mixed.
     """
     where = f"{where}: {path.name}"
-    try:
-        text = read_bytes(path, where).decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise DataError(f"{where}: not a text file; copy it again") from error
+    text = read_text(path, where)
     lines = [(n, line) for n, line in enumerate(re.split(r"\r\n|\r|\n", text), 1) if line.strip()]
     header = [cell.strip() for cell in lines[0][1].split("\t")] if lines else []
     missing = [name for name in COLUMNS if name not in header]

@@ -22,6 +22,7 @@ import numpy as np
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, InstanceMesh, Int32Array, Int64Array, Surface
 from su3d_bench.datasets.recordings.meshes import CORNER_NAMES, check_corners, check_finite
+from su3d_bench.datasets.recordings.recorded_frames import read_text
 from su3d_bench.datasets.scannet.annotations import (
     AnnotatedObject,
     aggregation_name,
@@ -31,7 +32,6 @@ from su3d_bench.datasets.scannet.annotations import (
     segments_name,
 )
 from su3d_bench.datasets.scannet.labels import MAX_NYU40_ID, TABLE_NAME, LabelTable, nyu40_label_set, raw_label_set
-from su3d_bench.formats.images import read_bytes
 from su3d_bench.formats.ply import ListColumn, PlyFile, read_ply
 from su3d_bench.numerics.geometry import are_rigid
 
@@ -267,12 +267,8 @@ def read_axis_alignment(path: Path, where: str) -> Float64Array:
     The identity where the file has no such line, as that of some scans. Released meshes and poses are not aligned.
     """
     where = f"{where}: {path.name}"
-    try:
-        lines = read_bytes(path, where).decode("utf-8-sig").splitlines()
-    except UnicodeDecodeError as error:
-        raise DataError(f"{where}: not a text file; copy it again") from error
     facts = {}
-    for number, line in enumerate(lines, 1):
+    for number, line in enumerate(read_text(path, where).splitlines(), 1):
         key, equals, value = line.partition("=")
         if line.strip() and not equals:
             raise DataError(f"{where} line {number}: {line.strip()[:40]!r} is no 'key = value'; copy the file again")

@@ -22,21 +22,21 @@ from su3d_bench.formats.ply import ListColumn
 UInt16Array = NDArray[np.uint16]
 MAX_PIXELS = 100_000_000  # no RGB-D camera has more; a damaged header may promise 4 billion
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-MAX_BYTES = 1 << 30  # of one image file; 100 million pixels of 16-bit RGB take 600 MB
+MAX_BYTES = 1 << 30  # of one file; 100 million pixels of 16-bit RGB take 600 MB
 JPEG_START, JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 JPEG_END_WITHIN = 1024  # some writers put a little behind the end of the image
 JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # the markers that carry the size
 PORTABLE_MAP = re.compile(rb"(P[56])\s+(?:#[^\n]*\s+)*(\d{1,6})\s+(\d{1,6})\s+(\d{1,5})\s")
 
 
-def read_bytes(path: Path, where: str, advice: str = "copy the file again") -> bytes:
-    """The content of a file; ``advice`` says what to do where it is missing."""
+def read_bytes(path: Path, where: str, advice: str = "copy the file again", most: int = MAX_BYTES) -> bytes:
+    """The content of a file of at most ``most`` bytes; ``advice`` says what to do where it is missing."""
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
-            raise DataError(f"{where} is not a file; {advice}")
-        if status.st_size > MAX_BYTES:
-            raise DataError(f"{where} has {status.st_size} bytes; expected an image of at most {MAX_BYTES}")
+            raise DataError(f"{where} is not a file and cannot be read; {advice}")
+        if status.st_size > most:
+            raise DataError(f"{where} has {status.st_size} bytes; no such file has more than {most >> 20} MiB")
         return path.read_bytes()
     except FileNotFoundError as error:
         raise DataError(f"{where} is missing; {advice}") from error

@@ -14,7 +14,6 @@ from open_scene import ENCODER, OBJECTS, PROMPTS, instances_with
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.datasets.openlex3d import (
-    MOST_BYTES,
     Corners,
     OpenLexFiles,
     categories_truth,
@@ -24,6 +23,7 @@ from su3d_bench.datasets.openlex3d import (
     read_queries,
     replica_corners,
 )
+from su3d_bench.datasets.recordings.recorded_frames import MAX_TEXT_BYTES
 from su3d_bench.datasets.replica.mesh_truth import AnnotatedMesh
 from su3d_bench.formats.ply import ListColumn
 from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels
@@ -208,7 +208,7 @@ def test_files_that_are_missing_or_too_large_are_told(tmp_path: Path) -> None:
         files.visible_points()
     large = tmp_path / "large"
     with large.open("wb") as file:
-        file.truncate(MOST_BYTES + 1)
+        file.truncate(MAX_TEXT_BYTES + 1)
     with pytest.raises(DataError, match="has more than 64 MiB"):
         read_prompts(large, WHERE)
     (tmp_path / "latin").write_bytes(b"caf\xe9\n")
