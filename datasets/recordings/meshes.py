@@ -40,7 +40,8 @@ def vertex_positions(file: PlyFile, where: str) -> Float32Array:
     vertex = file.element("vertex")
     if vertex is None or vertex.n_rows == 0:
         raise DataError(f"{where}: no mesh; expected an element 'vertex' with rows")
-    vertices = np.stack([scalar_column(vertex, axis, where) for axis in "xyz"], axis=1).astype(np.float32)
+    with np.errstate(over="ignore"):
+        vertices = np.stack([scalar_column(vertex, axis, where) for axis in "xyz"], axis=1).astype(np.float32)
     check_finite(vertices, where)
     return vertices
 

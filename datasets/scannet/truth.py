@@ -21,7 +21,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, InstanceMesh, Int32Array, Int64Array, Surface
-from su3d_bench.datasets.recordings.meshes import CORNER_NAMES, check_corners, check_finite
+from su3d_bench.datasets.recordings.meshes import face_corners, vertex_positions
 from su3d_bench.datasets.recordings.recorded_frames import read_text
 from su3d_bench.datasets.scannet.annotations import (
     AnnotatedObject,
@@ -82,7 +82,7 @@ def read_annotated_scan(files: Mapping[str, Path], scan: str, where: str) -> Ann
     objects = read_objects(files[aggregation_name(scan)], scan, where)
     mesh_where = f"{where}: {mesh_name(scan)}"
     mesh = read_ply(files[mesh_name(scan)], mesh_where)
-    vertices = _vertices(mesh, mesh_where)
+    vertices = vertex_positions(mesh, mesh_where)
     _check_one_mesh(segments, vertices, scan, where)
     labels = _labels(files[labels_name(scan)], vertices, f"{where}: {labels_name(scan)}", mesh_name(scan))
     triangles = _triangles(mesh, len(vertices), mesh_where)
@@ -93,7 +93,7 @@ def read_surface(mesh: Path, segments: Path | None, scan: str, where: str) -> Su
     """The mesh of ``scan`` without labels, with the published segments where their file is there."""
     mesh_where = f"{where}: {mesh.name}"
     file = read_ply(mesh, mesh_where)
-    vertices = _vertices(file, mesh_where)
+    vertices = vertex_positions(file, mesh_where)
     triangles = _triangles(file, len(vertices), mesh_where)
     if segments is None:
         return Surface(vertices, triangles)
@@ -121,23 +121,10 @@ def aligned(scan: AnnotatedScan, motion: Float64Array) -> AnnotatedScan:
     return replace(scan, vertices=moved(scan.vertices, motion))
 
 
-def _vertices(file: PlyFile, where: str) -> Float32Array:
-    element = file.element("vertex")
-    if element is None or element.n_rows == 0:
-        raise DataError(f"{where}: has no vertices; expected the decimated mesh of the release")
-    columns = [element.columns.get(axis) for axis in "xyz"]
-    if any(column is None or isinstance(column, ListColumn) for column in columns):
-        raise DataError(f"{where}: vertices have no 'x', 'y', 'z'; expected the decimated mesh of the release")
-    with np.errstate(over="ignore"):
-        vertices = np.stack([np.asarray(column) for column in columns], axis=1).astype(np.float32)
-    check_finite(vertices, where)
-    return vertices
-
-
 def _labels(path: Path, vertices: Float32Array, where: str, mesh: str) -> Int64Array:
     """The labels of a mesh that must be the one of ``vertices``, vertex by vertex."""
     file = read_ply(path, where)
-    labelled = _vertices(file, where)
+    labelled = vertex_positions(file, where)
     if len(labelled) != len(vertices):
         raise DataError(f"{where}: has {len(labelled)} vertices, {mesh} has {len(vertices)}; they belong to two meshes")
     is_elsewhere = np.abs(labelled.astype(np.float64) - vertices).max(axis=1) > SAME_PLACE_M
@@ -162,10 +149,9 @@ def _triangles(file: PlyFile, n_vertices: int, where: str) -> Int32Array:
     element = file.element("face")
     if element is None or element.n_rows == 0:
         return np.zeros((0, 3), np.int32)
-    corners = next((element.columns[name] for name in CORNER_NAMES if name in element.columns), None)
-    if not isinstance(corners, ListColumn) or corners.values.dtype.kind == "f" or (corners.lengths != 3).any():
+    corners = face_corners(element, n_vertices, where)
+    if (corners.lengths != 3).any():
         raise DataError(f"{where}: faces are no triangles of 'vertex_indices'; expected the mesh of the release")
-    check_corners(corners, n_vertices, where)
     return corners.values.reshape(-1, 3).astype(np.int32)
 
 
