@@ -119,16 +119,14 @@ def _inspect(
         positions = _positions(len(frames), is_quick or is_made_on_demand)
         facts, broken = _read_frames(frames, positions, findings, 1 if is_made_on_demand else n_threads, progress)
     _look_at_files(files, findings, decode=frames is None)
-    for finding in check_frames(facts):
-        findings.add(finding)
+    findings.add(*check_frames(facts))
     if frames is not None and not is_made_on_demand:
         _look_at_convention(_Readable(frames, broken), facts, findings)
     truth, points = _look_at_truth(dataset, scene, findings)
     meeting = None
     if points is not None and facts:
         meeting, meeting_findings = check_truth(facts, points)
-        for finding in meeting_findings:
-            findings.add(finding)
+        findings.add(*meeting_findings)
     digest = findings.attempt("digest", lambda: dataset.digest(scene))
     return Inspection(
         scene=findings.scene,
@@ -156,11 +154,12 @@ class _Findings:
     def n(self) -> int:
         return len(self._findings)
 
-    def add(self, finding: Finding) -> None:
-        text = printable(finding.text.removeprefix(f"{self.scene}: ").removeprefix(f"{finding.where}: "))
-        where = printable(finding.where)
-        if not any((place, text) in self._findings for place in (where, "")):
-            self._findings[where, text] = Finding(finding.severity, finding.check, where, text)
+    def add(self, *findings: Finding) -> None:
+        for finding in findings:
+            text = printable(finding.text.removeprefix(f"{self.scene}: ").removeprefix(f"{finding.where}: "))
+            where = printable(finding.where)
+            if not any((place, text) in self._findings for place in (where, "")):
+                self._findings[where, text] = Finding(finding.severity, finding.check, where, text)
 
     def add_fault(self, check: str, where: str, error: Exception) -> None:
         """A finding of what was raised, unless it is about a file whose fault is known."""
@@ -322,11 +321,9 @@ def _look_at_truth(
     for variant in getattr(dataset, "variants", ()):
         try:
             truth = dataset.ground_truth(scene, variant)
-        except GroundTruthMissing as error:
-            rows.append(TruthVariant(variant, printable(str(error).removeprefix(f"{findings.scene}: "))))
-            continue
         except DataError as error:
-            findings.add_fault("truth", "", error)
+            if not isinstance(error, GroundTruthMissing):
+                findings.add_fault("truth", "", error)
             rows.append(TruthVariant(variant, printable(str(error).removeprefix(f"{findings.scene}: "))))
             continue
         points = truth.points if points is None else points

@@ -20,12 +20,6 @@ def face_corners(face: PlyElement, n_vertices: int, where: str) -> ListColumn:
     corners = next((face.columns[name] for name in CORNER_NAMES if name in face.columns), None)
     if not isinstance(corners, ListColumn) or corners.values.dtype.kind == "f":
         raise DataError(f"{where}: faces have no list 'vertex_indices' of whole numbers")
-    check_corners(corners, n_vertices, where)
-    return corners
-
-
-def check_corners(corners: ListColumn, n_vertices: int, where: str) -> None:
-    """Raise ``DataError`` where a face names a vertex that is not there."""
     is_outside = (corners.values < 0) | (corners.values >= n_vertices)
     if is_outside.any():
         first = int(np.flatnonzero(is_outside)[0])
@@ -33,6 +27,7 @@ def check_corners(corners: ListColumn, n_vertices: int, where: str) -> None:
         raise DataError(
             f"{where}: face {row} names vertex {corners.values[first]}, the mesh has {n_vertices} (0..{n_vertices - 1})"
         )
+    return corners
 
 
 def vertex_positions(file: PlyFile, where: str) -> Float32Array:

@@ -12,13 +12,13 @@ from __future__ import annotations
 
 import re
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError
+from su3d_bench.core.errors import DataError, reading
 from su3d_bench.core.types import Float32Array, GroundTruth, Int32Array
 from su3d_bench.datasets.recordings.meshes import vertex_positions
 from su3d_bench.datasets.replica.folders import replica_label_set
@@ -123,11 +123,9 @@ def _labels_of_mesh(path: Path, meshes: Sequence[LabelledMesh], where: str) -> t
 
 def _n_vertices(mesh: LabelledMesh, where: str) -> int:
     """As the header says it; ``_vertices`` reads and checks the chosen mesh."""
-    try:
-        with mesh.path.open("rb") as file:
-            header = read_header(file.read(MAX_HEADER_BYTES), f"{where}: {mesh.name}")
-    except OSError as error:
-        raise DataError(f"{where}: {mesh.name} cannot be read: {error.strerror}") from error
+    where = f"{where}: {mesh.name}"
+    with reading(where, DataError), mesh.path.open("rb") as file:
+        header = read_header(file.read(MAX_HEADER_BYTES), where)
     return next((element.n_rows for element in header.elements if element.name == "vertex"), 0)
 
 
@@ -136,24 +134,18 @@ def _vertices(mesh: LabelledMesh, where: str) -> Float32Array:
 
 
 def read_whole_numbers(path: Path, at_most: int, where: str) -> tuple[Int32Array, int]:
-    """The numbers of a text, one a line, and how many lines it has; beyond ``at_most`` lines they are only counted."""
+    """The numbers of a text, one a line, and how many lines it has; beyond ``at_most`` lines they are only counted.
+
+    A line may be of any length: one without end is cut at ``BLOCK_BYTES``.
+    """
     values, n_lines = array("i"), 0
-    for line in _lines(path, where):
-        n_lines += 1
-        word = line.strip()
-        if not WHOLE_NUMBER.fullmatch(word):
-            shown = ascii(word[:20].decode("ascii", "replace"))
-            raise DataError(f"{where}: line {n_lines} is {shown}; expected one whole number a line")
-        if n_lines <= at_most:
-            values.append(int(word))
+    with reading(where, DataError), path.open("rb") as file:
+        while line := file.readline(BLOCK_BYTES):
+            n_lines += 1
+            word = line.strip()
+            if not WHOLE_NUMBER.fullmatch(word):
+                shown = ascii(word[:20].decode("ascii", "replace"))
+                raise DataError(f"{where}: line {n_lines} is {shown}; expected one whole number a line")
+            if n_lines <= at_most:
+                values.append(int(word))
     return np.array(values, np.int32), n_lines
-
-
-def _lines(path: Path, where: str) -> Iterator[bytes]:
-    """The lines of a file, whose length does not matter; a line without end is cut at ``BLOCK_BYTES``."""
-    try:
-        with path.open("rb") as file:
-            while line := file.readline(BLOCK_BYTES):
-                yield line
-    except OSError as error:
-        raise DataError(f"{where} cannot be read: {error.strerror}") from error

@@ -131,6 +131,13 @@ class BuiltRoom:
 
         return kept_walk(self._kept_in("walk"), self.options.n_frames, self._walk)
 
+    @property
+    def scan(self) -> RoomScan:
+        """The surface that the walk sees, made anew."""
+        from su3d_bench.datasets.rooms.scan import scan_room
+
+        return scan_room(self.patches, self.mesh, self.trajectory, self.options.mesh_spacing_m)
+
     def _kept_in(self, what: str) -> Path | None:
         return None if self.folder is None else self.folder / f"{self.scene}.{what}.npz"
 
@@ -209,24 +216,17 @@ class Rooms:
         return RoomFrames(self, scene, range(0, self.options.n_frames, stride))
 
     def frame(self, scene: str, index: int) -> Frame:
-        room = self._room(scene)
-        pose = room.trajectory[index]
-        image = room.renderer.render(pose)
+        image = self.render(scene, index)
         rng = _generator("noise", scene, self.options.seed_offset, index)
         rgb, depth_m = add_noise(image.rgb, image.depth_m, self.options.noise, rng)
-        return Frame(index, index / FRAMES_PER_SECOND, rgb, depth_m, pose, self.intrinsics)
+        return Frame(index, index / FRAMES_PER_SECOND, rgb, depth_m, self.trajectory(scene)[index], self.intrinsics)
 
     def scan(self, scene: str) -> RoomScan:
         """The ground-truth surface; made once, then read from the cache."""
-        from su3d_bench.datasets.rooms.scan import read_scan, scan_room, write_scan
+        from su3d_bench.datasets.rooms.kept import kept_scan
 
         path = self.root / "rooms" / self._scan_key(scene) / f"{scene}.npz"
-        scan = read_scan(path)
-        if scan is None:
-            room = self._room(scene)
-            scan = scan_room(room.patches, room.mesh, room.trajectory, self.options.mesh_spacing_m)
-            write_scan(path, scan)
-        return scan
+        return kept_scan(path, lambda: self._room(scene).scan)
 
     def _scan_key(self, scene: str) -> str:
         """What a scan depends on: not the size of the images nor their noise."""

@@ -1,4 +1,4 @@
-"""What is costly to make of a room, kept in the data root: its mesh with the baked light, and the walk through it."""
+"""What is costly to make of a room, kept in the data root: its mesh with the baked light, its walk and its scan."""
 
 from __future__ import annotations
 
@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.errors import DAMAGE
+from su3d_bench.core.errors import DAMAGE, DataError
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.rooms.rendering.mesh import RoomMesh
+from su3d_bench.datasets.rooms.scan import RoomScan
 from su3d_bench.store.atomic import filling, read_arrays
 
 Arrays = dict[str, Any]
@@ -32,12 +33,22 @@ MESH_ARRAYS: dict[str, tuple[Any, tuple[str | int, ...]]] = {
 
 def kept_mesh(path: Path | None, make: Callable[[], RoomMesh]) -> RoomMesh:
     """The mesh in ``path``, byte for byte what ``make`` made; made where it is not there, and then kept there."""
+    return RoomMesh(**_kept(path, lambda: _arrays_of(make()), _is_mesh))
 
-    def arrays() -> Arrays:
-        mesh = make()
-        return {field.name: getattr(mesh, field.name) for field in fields(RoomMesh)}
 
-    return RoomMesh(**_kept(path, arrays, _is_mesh))
+def kept_scan(path: Path, make: Callable[[], RoomScan]) -> RoomScan:
+    """The scan in ``path``; made where it is not there, and then kept there, which must be possible."""
+    names = {field.name for field in fields(RoomScan)}
+    try:
+        return RoomScan(**_kept(path, lambda: _arrays_of(make()), lambda arrays: set(arrays) == names, forgiven=()))
+    except OSError as error:
+        raise DataError(
+            f"rooms: cannot write the scan to {path} ({error.strerror}); set SU3D_DATA to a folder that can be written"
+        ) from error
+
+
+def _arrays_of(kept: RoomMesh | RoomScan) -> Arrays:
+    return {field.name: getattr(kept, field.name) for field in fields(kept)}
 
 
 def kept_walk(path: Path | None, n_frames: int, make: Callable[[], Float64Array]) -> Float64Array:
@@ -51,8 +62,13 @@ def kept_walk(path: Path | None, n_frames: int, make: Callable[[], Float64Array]
     return poses
 
 
-def _kept(path: Path | None, make: Callable[[], Arrays], fits: Callable[[Arrays], bool]) -> Arrays:
-    """A folder that takes no file only means that the next process makes the arrays again."""
+def _kept(
+    path: Path | None,
+    make: Callable[[], Arrays],
+    fits: Callable[[Arrays], bool],
+    forgiven: tuple[type[OSError], ...] = (OSError,),
+) -> Arrays:
+    """A folder that takes no file only means that the next process makes the arrays again, where that is forgiven."""
     if path is None:
         return make()
     with suppress(*DAMAGE):
@@ -60,7 +76,7 @@ def _kept(path: Path | None, make: Callable[[], Arrays], fits: Callable[[Arrays]
         if fits(kept):
             return kept
     made = make()
-    with suppress(OSError), filling(path) as stream:
+    with suppress(*forgiven), filling(path) as stream:
         if stream is not None:
             np.savez(stream, **made)
     return made

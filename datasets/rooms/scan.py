@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.core.errors import DAMAGE, DataError
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
 from su3d_bench.datasets.rooms.rendering.mesh import Grid, Patches, RoomMesh, at_rows, caster, cut, merge_equal
 from su3d_bench.datasets.rooms.rendering.render import Renderer, camera_intrinsics
 from su3d_bench.numerics.open3d_core import compiled_open3d
-from su3d_bench.store.atomic import filling, read_arrays
 
 VIEW_WIDTH, VIEW_HEIGHT = 160, 120  # of the depth images that decide what is visible: 1 cm a pixel at 1 m
 TOUR = 40  # frames are visited at this stride first, so that most faces are settled by the first few
@@ -104,24 +101,3 @@ def surface_colours(mesh: RoomMesh, points: Float32Array) -> UInt8Array:
           np.zeros(3, np.float32), mesh.triangles, mesh.normals, mesh.texture, mesh.light,
           mesh.instance_of_triangle, mesh.material_of_triangle, dull, mesh.lights, rgb, depth, instance)  # fmt: skip
     return rgb
-
-
-def read_scan(path: Path) -> RoomScan | None:
-    """The scan in a cache file; ``None`` where there is none or the file is damaged."""
-    try:
-        stored = read_arrays(path)
-        return RoomScan(*(stored[field.name] for field in fields(RoomScan)))
-    except DAMAGE:
-        return None
-
-
-def write_scan(path: Path, scan: RoomScan) -> None:
-    """Puts the scan where concurrent readers see either nothing or all of it."""
-    try:
-        with filling(path) as stream:
-            if stream is not None:
-                np.savez(stream, **{field.name: getattr(scan, field.name) for field in fields(RoomScan)})
-    except OSError as error:
-        raise DataError(
-            f"rooms: cannot write the scan to {path} ({error.strerror}); set SU3D_DATA to a folder that can be written"
-        ) from error

@@ -73,12 +73,12 @@ def find_source(folder: Path, scene: str, where: str, kind: SourceKind = "auto")
     Exports may lie in the folder itself, in ``exported/`` or in a folder with the name of the scene. ``DataError``
     names all that was looked for where there is none.
     """
-    try:
-        source = _first_source(folder, scene, where, kind)
-    except OSError as error:
-        raise DataError(f"{where}: {folder} cannot be read: {error.strerror}") from error
-    if source is not None:
-        return source
+    with reading(where):
+        form, place = _find(folder, scene, kind) or (None, folder)
+    if form == "sens":
+        return SensSource(place, where)
+    if form is not None:
+        return open_python_export(place, where) if form == "python" else open_cpp_export(place, where)
     looked_for = {
         "sens": f"{scene}.sens",
         "python": "color/, depth/, pose/ and intrinsic/ (or data/ and data_compressed/)",
@@ -89,15 +89,6 @@ def find_source(folder: Path, scene: str, where: str, kind: SourceKind = "auto")
         f"{where}: no recording in {folder}; looked for {'; '.join(wanted)}"
         + ("" if kind == "sens" else f"; exports also in exported/ and {scene}/")
     )
-
-
-def _first_source(folder: Path, scene: str, where: str, kind: SourceKind) -> RgbdSource | None:
-    form, place = _find(folder, scene, kind) or (None, folder)
-    if form == "sens":
-        return SensSource(place, where)
-    if form == "python":
-        return open_python_export(place, where)
-    return open_cpp_export(place, where) if form == "cpp" else None
 
 
 def _find(folder: Path, scene: str, kind: SourceKind) -> tuple[SourceKind, Path] | None:
@@ -272,7 +263,7 @@ def describe_recording(folder: Path, scene: str, where: str, kind: SourceKind) -
         return "no recording"
     layout = python_layout(place)
     path = place / layout.pose if form == "python" and layout is not None else place
-    try:
+    with reading(where):
         if form == "sens":
             with path.open("rb") as stream:
                 _, n_frames, _ = parse_header(stream.read(MAX_HEADER_BYTES), f"{where}: {path.name}")
@@ -280,8 +271,6 @@ def describe_recording(folder: Path, scene: str, where: str, kind: SourceKind) -
         if form == "cpp":
             return f"{read_info(path / INFO, where)[1]} exported frames"
         return f"{sum(name.endswith(TEXT) for name in os.listdir(path))} exported frames"
-    except OSError as error:
-        raise DataError(f"{where}: {path.name} cannot be read: {error.strerror}") from error
 
 
 def digest_recording(source: RgbdSource, poses: Float64Array) -> str:

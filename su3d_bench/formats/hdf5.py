@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import DataError
+from su3d_bench.core.errors import DataError, reading
 from su3d_bench.core.types import Float32Array, Int32Array
 
 FloatArray = NDArray[np.floating[Any]]
@@ -83,10 +83,8 @@ def _open_table(path: Path, where: str) -> Iterator[Any]:
     import h5py
 
     name = path.stem
-    try:
+    with reading(where, DataError):
         path.stat()
-    except OSError as error:
-        raise DataError(f"{where} cannot be read: {error.strerror}") from error
     try:
         with h5py.File(path, "r", locking="best-effort") as file:
             link = file.get(name, getlink=True) if name in file else None

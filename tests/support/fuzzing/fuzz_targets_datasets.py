@@ -134,12 +134,14 @@ def _tum(folder: Path) -> Read:
 
 
 def _rooms(folder: Path) -> Read:
-    from su3d_bench.datasets.rooms.scan import RoomScan, read_scan, write_scan
+    from su3d_bench.datasets.rooms.kept import kept_scan
+    from su3d_bench.datasets.rooms.scan import RoomScan
 
     points = np.zeros((5, 3), np.float32)
     faces = np.array([[0, 1, 2]], np.int32)
-    write_scan(folder / "a.npz", RoomScan(points, points, np.zeros((5, 3), np.uint8), faces, np.zeros(5, np.int32)))
-    return lambda: read_scan(folder / "a.npz")
+    whole = RoomScan(points, points, np.zeros((5, 3), np.uint8), faces, np.zeros(5, np.int32))
+    kept_scan(folder / "a.npz", lambda: whole)
+    return lambda: kept_scan(folder / "a.npz", lambda: whole)
 
 
 def _rooms_mesh(folder: Path) -> Read:
