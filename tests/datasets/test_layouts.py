@@ -12,6 +12,7 @@ from typing import Any
 import cv2
 import numpy as np
 import pytest
+from scanned_stage import write_scene
 
 from su3d_bench.cli.main import main
 from su3d_bench.core import registry
@@ -24,7 +25,6 @@ from su3d_bench.datasets.scannet.recordings import open_cpp_export, open_python_
 from su3d_bench.datasets.scannet.sens.read import SensFile
 from su3d_bench.datasets.scannet.writing.categories import categories, room_of, scan_name
 from su3d_bench.datasets.scannet.writing.truth import segment_of_vertex
-from su3d_bench.datasets.writing import write_scene
 from su3d_bench.formats.ply import read_ply
 
 ROOM, SCAN, N_FRAMES, SIZE = "bathroom0", "scene9400_00", 12, (80, 60)

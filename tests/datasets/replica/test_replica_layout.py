@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scanned_stage import CHAIR, N_FRAMES, WALL, Stage, Surface, files_below
+from scanned_stage import write_scene as write_scene_in
 
 from su3d_bench.core.errors import DataError, StoreError
 from su3d_bench.datasets.replica.dataset import Replica
@@ -17,7 +18,6 @@ from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, MESH_NAME
 from su3d_bench.datasets.replica.writing import DEPTH_SCALE, ReplicaLayout
 from su3d_bench.datasets.rooms.dataset import Rooms
 from su3d_bench.datasets.writing import ScannedDataset, finish_scene, plan_scenes, write_frames
-from su3d_bench.datasets.writing import write_scene as write_scene_in
 from su3d_bench.formats.ply import ListColumn, read_ply
 
 LAYOUT = ReplicaLayout()
