@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 
+from su3d_bench.numerics.clusters import root_of
 from su3d_bench.numerics.compiled import njit
 
 ONE = np.float32(1.0)
@@ -83,27 +84,18 @@ def joined(n_vertices, edges, weights, threshold, min_vertices):  # type: ignore
     size = np.ones(n_vertices, np.int32)
     limit = np.full(n_vertices, threshold, np.float32)
     for k in range(len(edges)):
-        a, b = _root(parent, edges[k, 0]), _root(parent, edges[k, 1])
+        a, b = root_of(parent, edges[k, 0]), root_of(parent, edges[k, 1])
         if a != b and weights[k] <= limit[a] and weights[k] <= limit[b]:
             root = _join(parent, rank, size, a, b)
             limit[root] = np.float32(weights[k] + np.float32(threshold / np.float32(size[root])))
     for k in range(len(edges)):
-        a, b = _root(parent, edges[k, 0]), _root(parent, edges[k, 1])
+        a, b = root_of(parent, edges[k, 0]), root_of(parent, edges[k, 1])
         if a != b and (size[a] < min_vertices or size[b] < min_vertices):
             _join(parent, rank, size, a, b)
     segments = np.empty(n_vertices, np.int32)
     for vertex in range(n_vertices):
-        segments[vertex] = _root(parent, vertex)
+        segments[vertex] = root_of(parent, vertex)
     return segments
-
-
-@njit(cache=True)
-def _root(parent, vertex):  # type: ignore[no-untyped-def]
-    root = vertex
-    while root != parent[root]:
-        root = parent[root]
-    parent[vertex] = root
-    return root
 
 
 @njit(cache=True)

@@ -119,7 +119,7 @@ def _states(arguments: argparse.Namespace, names: tuple[str, ...]) -> list[Model
 
     config = _perception_config(arguments).models
     entries = [model_entry(name) for name in names] or list(MODELS.values())
-    return [model_state(entry, config.path_of(entry.name), config.folder) for entry in entries]
+    return [model_state(entry, config.paths.get(entry.name), config.folder) for entry in entries]
 
 
 def _state_row(state: ModelState) -> dict[str, Any]:
@@ -182,7 +182,7 @@ def call_export(arguments: argparse.Namespace) -> int:
 
     config = _perception_config(arguments).models
     entry = model_entry(arguments.name)
-    export = export_model(entry, arguments.out, path=config.path_of(entry.name), folder=config.folder)
+    export = export_model(entry, arguments.out, path=config.paths.get(entry.name), folder=config.folder)
     value = {"folder": str(arguments.out), "files": export.files, "parity": [asdict(p) for p in export.parity]}
     lines = [f"{digest}  {arguments.out / name}" for name, digest in export.files.items()]
     lines += [

@@ -105,7 +105,7 @@ def _has_neighbours(i, points, starts, around, n_around, most_squared, min_point
 
 
 @njit(cache=True)
-def _root(parents, cell):  # type: ignore[no-untyped-def]
+def root_of(parents, cell):  # type: ignore[no-untyped-def]
     while parents[cell] != cell:
         parents[cell] = parents[parents[cell]]
         cell = parents[cell]
@@ -162,7 +162,7 @@ def dbscan(points, eps, most_squared, min_points, steps, labels):  # type: ignor
     for cell in range(n_cells):
         n_around = _neighbours(cell, table, keys, steps, around)
         for a in range(1, n_around):
-            own, other = _root(parents, cell), _root(parents, around[a])
+            own, other = root_of(parents, cell), root_of(parents, around[a])
             if around[a] > cell and own != other and _touch(ordered, is_core, cell, around[a], starts, most_squared):
                 parents[max(own, other)] = min(own, other)
     number_of = _numbered(order, cell_of, is_core, starts, parents, n_cells)
@@ -187,12 +187,12 @@ def _numbered(order, cell_of, is_core, starts, parents, n_cells):  # type: ignor
     n = 0
     for i in range(len(order)):
         if core_in_order[i]:
-            root = _root(parents, cell_of[i])
+            root = root_of(parents, cell_of[i])
             if number_of_root[root] == NOISE:
                 number_of_root[root] = n
                 n += 1
     number_of = np.full(n_cells, NOISE, np.int64)
     for cell in range(n_cells):
         if is_core[starts[cell] : starts[cell + 1]].any():
-            number_of[cell] = number_of_root[_root(parents, cell)]
+            number_of[cell] = number_of_root[root_of(parents, cell)]
     return number_of

@@ -13,11 +13,10 @@ from su3d_bench.perception.crops import crop_images
 from su3d_bench.perception.detections import Assembler, captioned
 from su3d_bench.perception.language.captioner import Captioner
 from su3d_bench.perception.models.config import PaperConfig
-from su3d_bench.perception.models.masks.automatic_masks import AUTOMATIC_MASKS, AutomaticMaskConfig
+from su3d_bench.perception.models.masks.automatic_masks import AUTOMATIC_MASKS
 from su3d_bench.perception.models.masks.grounded_sam import (
     GROUNDED_MASKS,
     AutomaticSam,
-    GroundedConfig,
     GroundedSam,
     Networks,
     SamRegions,
@@ -44,13 +43,15 @@ class PaperPerception:
         self._captioner = captioner
         self._cache = cache
         self._assembler = Assembler(encoder, cache)
-        self._grounded: Mapping[str, GroundedConfig] = {"paper": config.grounded, **GROUNDED_MASKS}
-        self._automatic: Mapping[str, AutomaticMaskConfig] = {**AUTOMATIC_MASKS, "sam": config.automatic}
-        self._segmenters: dict[tuple[str, str], Segmenter] = {}
+        grounded = {"paper": config.grounded, **GROUNDED_MASKS}
+        automatic = {**AUTOMATIC_MASKS, "sam": config.automatic}
+        self._segmenters: Mapping[str, Mapping[str, Segmenter]] = {
+            "grounded": {kind: GroundedSam(networks, settings) for kind, settings in grounded.items()},
+            "class-agnostic": {kind: AutomaticSam(networks, settings) for kind, settings in automatic.items()},
+        }
         captions = "" if captioner is None else captioner.digest
-        grounded = [GroundedSam(networks, settings).digest for settings in self._grounded.values()]
-        automatic = [AutomaticSam(networks, settings).digest for settings in self._automatic.values()]
-        self.digest = content_key(self.profile, *grounded, *automatic, encoder.digest, captions)
+        digests = [segmenter.digest for known in self._segmenters.values() for segmenter in known.values()]
+        self.digest = content_key(self.profile, *digests, encoder.digest, captions)
 
     def detect(self, frame: Frame, needs: PerceptionNeeds, timer: StageTimer) -> Detections:
         assert needs.masks != "none", "the runner asks nothing for a method that needs no masks"
@@ -71,15 +72,10 @@ class PaperPerception:
 
     def _segmenter(self, needs: PerceptionNeeds) -> Segmenter:
         kind = needs.grounding if needs.masks == "grounded" else needs.automatic
-        if (needs.masks, kind) not in self._segmenters:
-            self._segmenters[needs.masks, kind] = self._new_segmenter(needs.masks, kind)
-        return self._segmenters[needs.masks, kind]
-
-    def _new_segmenter(self, masks: str, kind: str) -> Segmenter:
-        known: Mapping[str, object] = self._grounded if masks == "grounded" else self._automatic
+        known = self._segmenters[needs.masks]
         if kind not in known:
             hint = suggest(kind, list(known)) or "; known: " + ", ".join(known)
-            raise ConfigError(f"profile 'paper': the method asks for {masks} masks '{kind}', there are none{hint}")
-        if masks == "grounded":
-            return GroundedSam(self._networks, self._grounded[kind])
-        return AutomaticSam(self._networks, self._automatic[kind])
+            raise ConfigError(
+                f"profile 'paper': the method asks for {needs.masks} masks '{kind}', there are none{hint}"
+            )
+        return known[kind]

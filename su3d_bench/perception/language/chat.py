@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import base64
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Annotated, Any, Literal
 
@@ -139,6 +139,3 @@ class Reply:
     dropped: tuple[str, ...] = ()
     failure: str = ""
     was_stored: bool = field(default=False, compare=False)
-
-    def from_store(self) -> Reply:
-        return replace(self, was_stored=True)

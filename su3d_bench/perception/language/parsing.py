@@ -138,8 +138,8 @@ def answered(text: str, known_ids: Sequence[int]) -> Answered | None:
         if not isinstance(answer, str | int | float | bool):
             continue
         ids = value.get("object_ids", value.get("ids", ()))
-        given = [value for value in ids if _is_id(value)] if isinstance(ids, list) else []
-        numbers = dict.fromkeys(int(str(value).lstrip("#")) for value in given)
+        given = [str(value) for value in ids if isinstance(value, int | str)] if isinstance(ids, list) else []
+        numbers = dict.fromkeys(int(value.lstrip("#")) for value in given if re.fullmatch(r"#?\d{1,9}", value))
         reasons = value.get("reasoning", "")
         shown = ("yes" if answer else "no") if isinstance(answer, bool) else str(answer)
         return Answered(
@@ -177,12 +177,6 @@ def clean_name(text: str) -> str | None:
 
 def _clean_caption(text: str) -> str:
     return printable(text.strip(_QUOTE + " \n\t,{}"), MOST_CAPTION_CHARACTERS)
-
-
-def _is_id(value: Any) -> bool:
-    if isinstance(value, bool):
-        return False
-    return isinstance(value, int) or (isinstance(value, str) and re.fullmatch(r"#?\d{1,9}", value) is not None)
 
 
 def _unfenced(text: str) -> str:
@@ -289,14 +283,10 @@ def _quoted(text: str) -> list[str]:
 
 def _mentioned(text: str, by_words: Mapping[tuple[str, ...], str]) -> list[str]:
     """Names whose words stand in ``text`` one after the other; of two that overlap the longer one."""
-    all_words = _all_words(text)
+    all_words = tuple(word for part in re.findall(r"[A-Za-z0-9'’\-]+", text) for word in words(part))
     hits = [name_words for name_words in by_words if name_words and _holds(all_words, name_words)]
     longest = [hit for hit in hits if not any(other != hit and _holds(other, hit) for other in hits)]
     return [by_words[hit] for hit in longest]
-
-
-def _all_words(text: str) -> tuple[str, ...]:
-    return tuple(word for line in re.findall(r"[A-Za-z0-9'’\-]+", text) for word in words(line))
 
 
 def _holds(whole: tuple[str, ...], part: tuple[str, ...]) -> bool:

@@ -6,12 +6,12 @@ same at the same time the first to finish is kept, and both get its reply.
 
 from __future__ import annotations
 
+import dataclasses
 import fcntl
 import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -45,11 +45,10 @@ class ReplyStore:
             if not path.is_file() or path.stat().st_size > MOST_ENTRY_BYTES:
                 return None
             entry: Any = json.loads(path.read_text(encoding="utf-8"))
-            if entry["schema"] != SCHEMA or digest_json(entry["request"]) != key:
+            digests = digest_json(entry["request"]), digest_json(entry["reply"])
+            if entry["schema"] != SCHEMA or digests != (key, entry["reply_sha256"]):
                 return None
-            if digest_json(entry["reply"]) != entry["reply_sha256"]:
-                return None
-            return _REPLY.validate_python(entry["reply"]).from_store()
+            return dataclasses.replace(_REPLY.validate_python(entry["reply"]), was_stored=True)
         except (OSError, ValueError, KeyError, TypeError, RecursionError):
             return None
 
@@ -61,9 +60,7 @@ class ReplyStore:
             if earlier is not None:
                 return earlier
             self._save_images(request)
-            answer = asdict(reply)
-            del answer["was_stored"]
-            answer["dropped"] = list(reply.dropped)
+            answer = _REPLY.dump_python(reply, mode="json", exclude={"was_stored"})
             entry = {
                 "schema": SCHEMA,
                 "purpose": request.purpose,

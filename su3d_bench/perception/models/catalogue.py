@@ -24,10 +24,6 @@ _CLIP_FILES = (_HUB_WEIGHTS, "config.json", "preprocessor_config.json", "tokeniz
 _OPEN_CLIP_FILES = ("open_clip_model.safetensors | open_clip_pytorch_model.bin",)  # open_clip brings its own words
 
 
-def _no_digests() -> Mapping[str, str]:
-    return MappingProxyType({})
-
-
 @dataclass(frozen=True)
 class ModelForm:
     """One set of files in which a model comes; the first of ``files`` is the weights.
@@ -42,7 +38,7 @@ class ModelForm:
     size_mb: int
     repository: str | None = None
     architecture: str | None = None
-    sha256: Mapping[str, str] = field(default_factory=_no_digests, hash=False)
+    sha256: Mapping[str, str] = field(default_factory=dict, hash=False)
     is_read: bool = True
 
 
@@ -81,7 +77,7 @@ def _hub(repository: str, size_mb: int, files: tuple[str, ...] = _CLIP_FILES) ->
 
 def _open_clip(architecture: str, repository: str, size_mb: int, sha256: Mapping[str, str] | None = None) -> ModelForm:
     source = f"{HUB}/{repository}"
-    return ModelForm("open_clip", _OPEN_CLIP_FILES, source, size_mb, repository, architecture, sha256 or _no_digests())
+    return ModelForm("open_clip", _OPEN_CLIP_FILES, source, size_mb, repository, architecture, sha256 or {})
 
 
 def _original(

@@ -74,10 +74,6 @@ class ModelsConfig(BaseModel):
             raise ValueError(f"precision '{self.precision}': exported encoders are float32")
         return self
 
-    def path_of(self, name: str) -> Path | None:
-        """The configured folder or file of model ``name``."""
-        return self.paths.get(name)
-
 
 TaggerName = Literal["auto", "ram", "ram-onnx", "words"]
 

@@ -101,7 +101,8 @@ def locate(
         for candidate in _folders(entry, form, folder):
             if (weights := _weights(form, candidate)) is not None and not _lacking(form, candidate):
                 return ModelFiles(entry, form, candidate, weights)
-    raise ModelMissing(_advice(entry, wanted, folder))
+    place = models_folder(folder) / (f"{entry.name}-onnx" if wanted[0].form == "onnx" else entry.name)
+    raise ModelMissing(f"model '{entry.name}': not found; {_what_to_fetch(wanted[0])} into {place}, or set SU3D_MODELS")
 
 
 def _at(entry: ModelEntry, forms: Sequence[ModelForm], path: Path) -> ModelFiles:
@@ -182,11 +183,6 @@ def _what_to_fetch(form: ModelForm) -> str:
     return f"fetch {names} ({form.size_mb / 1000:.1f} GB) from {form.source}"
 
 
-def _advice(entry: ModelEntry, forms: Sequence[ModelForm], folder: Path | None) -> str:
-    place = models_folder(folder) / (f"{entry.name}-onnx" if forms[0].form == "onnx" else entry.name)
-    return f"model '{entry.name}': not found; {_what_to_fetch(forms[0])} into {place}, or set SU3D_MODELS"
-
-
 def file_sha256(path: Path) -> str:
     """SHA-256 of a file, kept in ``$SU3D_CACHE`` under its path, size and time of change: weights are gigabytes."""
     status = path.stat()
@@ -200,7 +196,7 @@ def file_sha256(path: Path) -> str:
         return known
     digest = digest_file(path)
     make_folder(note.parent)
-    write_json(note, {"of": key, "sha256": digest, "check": _check(key, digest)})
+    write_json(note, _note(key, digest))
     return digest
 
 
@@ -217,15 +213,13 @@ def _noted(note: Path, key: str) -> str | None:
         content: Any = read_json(note)
     except StoreError:  # a damaged note counts as absent
         return None
-    if not isinstance(content, dict) or content.get("of") != key:
-        return None
-    digest = content.get("sha256")
-    return digest if isinstance(digest, str) and content.get("check") == _check(key, digest) else None
+    digest = content.get("sha256") if isinstance(content, dict) else None
+    return digest if isinstance(digest, str) and content == _note(key, digest) else None
 
 
-def _check(key: str, digest: str) -> str:
-    """A digest of a note, so that a damaged one counts as absent."""
-    return digest_bytes(f"{key}\n{digest}".encode())
+def _note(key: str, digest: str) -> dict[str, str]:
+    """What is kept of a digest, with one of the note itself, so that a damaged one counts as absent."""
+    return {"of": key, "sha256": digest, "check": digest_bytes(f"{key}\n{digest}".encode())}
 
 
 def read_weights(path: Path, device: str = "cpu") -> dict[str, Any]:
@@ -252,15 +246,13 @@ def read_weights(path: Path, device: str = "cpu") -> dict[str, Any]:
 
 
 def _read_safetensors(path: Path, device: str) -> Any:
-    safetensors = require("safetensors.torch", f"{path.name}:")
-    error_class = require("safetensors", f"{path.name}:").SafetensorError
-    torch = require("torch", f"{path.name}:")
+    safetensors, torch = (require(package, f"{path.name}:") for package in ("safetensors", "torch"))
     try:
         if device != "meta":
-            return safetensors.load_file(str(path), device=device)
-        with require("safetensors", f"{path.name}:").safe_open(str(path), framework="pt") as file:
+            return require("safetensors.torch", f"{path.name}:").load_file(str(path), device=device)
+        with safetensors.safe_open(str(path), framework="pt") as file:
             return {name: torch.empty(file.get_slice(name).get_shape(), device="meta") for name in file.keys()}  # noqa: SIM118
-    except (error_class, OSError, ValueError, RuntimeError) as error:
+    except (safetensors.SafetensorError, OSError, ValueError, RuntimeError) as error:
         raise DataError(f"{path}: not readable as safetensors: {bounded(error)}; fetch it anew") from error
 
 

@@ -97,7 +97,7 @@ def _check_networks(config: PaperConfig, models: ModelsConfig) -> None:
 
 
 def _locate(models: ModelsConfig, name: str, forms: tuple[FormName, ...]) -> ModelFiles:
-    return locate(name, forms, path=models.path_of(name), folder=models.folder)
+    return locate(name, forms, path=models.paths.get(name), folder=models.folder)
 
 
 def _locate_sam(config: PaperConfig, models: ModelsConfig) -> ModelFiles:

@@ -58,7 +58,7 @@ def check_encoder(config: ModelsConfig, name: str) -> None:
 def encoder_files(config: ModelsConfig, name: str) -> ModelFiles:
     """Where the files of encoder ``name`` lie in the form that the configured runtime reads."""
     model_entry(name, "encoder")
-    return locate(name, (FORM_OF_RUNTIME[config.runtime],), path=config.path_of(name), folder=config.folder)
+    return locate(name, (FORM_OF_RUNTIME[config.runtime],), path=config.paths.get(name), folder=config.folder)
 
 
 def _refuse_idle_settings(config: ModelsConfig) -> None:

@@ -1,4 +1,4 @@
-"""The compiled loops of the segmenter's graph give what SciPy and NumPy give, to the bit."""
+"""Sums, components and borders of the segmenter's graph are what SciPy and NumPy give, to the bit."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ import pytest
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from su3d_bench.perception.embedded.segmenter.kernels import border_pairs, connected, sum_rows
+from su3d_bench.perception.embedded.segmenter.graph import border_pairs
+from su3d_bench.perception.embedded.segmenter.kernels import connected, sum_rows
 
 
 @pytest.mark.parametrize(("n", "n_links"), [(1, 0), (5, 0), (40, 12), (40, 60), (300, 900)])

@@ -177,25 +177,28 @@ def measure_borders(
 
     Depth differences are relative, in units of ``depth_unit``, from which on they are jumps; -1 where unknown.
     """
-    from su3d_bench.perception.embedded.segmenter.kernels import border_pairs
+    a, b, contrasts, depth = border_pairs(labels, contrast, depth_cost)
+    deep, gap = (depth >= 0).astype(np.float64), (depth >= 1).astype(np.float64)
+    jump = np.where(gap > 0, depth.astype(np.float64) * depth_unit, 0.0)
+    pairs = Borders(a, b, np.ones(len(depth)), contrasts.astype(np.float64), deep, gap, jump, np.zeros(len(depth)))
+    borders = pairs.joined(np.arange(len(pieces)))
+    return replace(borders, bend=(borders.n_deep - borders.gap) * signed_bend(pieces, borders.a, borders.b))
 
-    n = len(pieces)
-    low, high, contrasts, depth = border_pairs(labels, contrast, depth_cost)
-    key, inverse = np.unique(low * n + high, return_inverse=True)
-    low_of, high_of = (key // max(n, 1)).astype(np.intp), (key % max(n, 1)).astype(np.intp)
-    deep = (depth >= 0).astype(np.float64)
-    gap = (depth >= 1).astype(np.float64)
-    n_deep, n_gap = _sum_by(inverse, deep, len(key)), _sum_by(inverse, gap, len(key))
-    return Borders(
-        low_of,
-        high_of,
-        _sum_by(inverse, np.ones(len(depth)), len(key)),
-        _sum_by(inverse, contrasts.astype(np.float64), len(key)),
-        n_deep,
-        n_gap,
-        _sum_by(inverse, np.where(gap > 0, depth.astype(np.float64) * depth_unit, 0.0), len(key)),
-        (n_deep - n_gap) * signed_bend(pieces, low_of, high_of),
-    )
+
+def border_pairs(
+    labels: Int32Array, contrast: Float32Array, depth_cost: Float32Array
+) -> tuple[IndexArray, IndexArray, Float32Array, Float32Array]:
+    """The neighbouring pixels of different ``labels`` (H, W): the lower and the higher label, and both differences.
+
+    First the pairs along rows, then those along columns, as ``contrast`` and ``depth_cost`` (2, H, W) have them.
+    """
+    differs = np.zeros(contrast.shape, bool)
+    np.not_equal(labels[:, :-1], labels[:, 1:], out=differs[0, :, :-1])
+    np.not_equal(labels[:-1], labels[1:], out=differs[1, :-1])
+    at, flat = np.flatnonzero(differs), labels.ravel().astype(np.intp)
+    pixel = at % labels.size
+    here, there = flat[pixel], flat[pixel + np.where(at < labels.size, 1, labels.shape[1])]
+    return np.minimum(here, there), np.maximum(here, there), contrast.ravel()[at], depth_cost.ravel()[at]
 
 
 def signed_bend(pieces: Pieces, a: IndexArray, b: IndexArray) -> Float64Array:

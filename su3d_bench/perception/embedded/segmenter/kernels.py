@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, Int64Array
+from su3d_bench.numerics.clusters import root_of
 from su3d_bench.numerics.compiled import njit
 
 
@@ -234,14 +233,6 @@ def _chord(planes: Float32Array, v: int, u: int, v1: int, u1: int) -> float:
 
 
 @njit(cache=True)
-def _find(parent: NDArray[Any], node: int) -> int:
-    while parent[node] != node:
-        parent[node] = parent[parent[node]]
-        node = parent[node]
-    return node
-
-
-@njit(cache=True)
 def pair_costs(
     lab: Float32Array,
     disparity: Float32Array,
@@ -283,43 +274,24 @@ def pair_costs(
 
 
 @njit(cache=True)
-def grow_superpixels(cost: Float32Array, scale: float, min_size: int, n_levels: int) -> Int32Array:
+def grow_superpixels(cost: Float32Array, order: Int64Array, scale: float, min_size: int) -> Int32Array:
     """Labels (H, W) from 0 by the predicate of Felzenszwalb and Huttenlocher (2004) over ``cost`` (2, H, W).
 
-    Costs are counted in ``n_levels`` levels of 1 / 64; pairs of equal level are visited in row-major order, right
-    neighbours first. Segments below ``min_size`` pixels then join across their cheapest pair.
+    Pairs are visited in ``order``, their places in the flat ``cost``. Segments below ``min_size`` pixels then join
+    across their cheapest pair.
     """
     height, width = cost.shape[1], cost.shape[2]
-    n = height * width
-    counts = np.zeros(n_levels + 1, np.int64)
-    level = np.full((2, height, width), np.int32(-1))
-    for axis in range(2):
-        dv, du = (0, 1) if axis == 0 else (1, 0)
-        for v in range(height - dv):
-            for u in range(width - du):
-                bin_ = min(n_levels - 1, int(cost[axis, v, u] * 64))
-                level[axis, v, u] = bin_
-                counts[bin_ + 1] += 1
-    starts = np.cumsum(counts)
-    order = np.empty(starts[-1], np.int32)
-    for axis in range(2):
-        for v in range(height):
-            for u in range(width):
-                bin_ = level[axis, v, u]
-                if bin_ >= 0:
-                    order[starts[bin_]] = (v * width + u) * 2 + axis
-                    starts[bin_] += 1
+    n, weights = height * width, cost.ravel()
     parent = np.arange(n).astype(np.int32)
     size = np.ones(n, np.int32)
     limit = np.full(n, np.float32(scale))
     for step in range(2):
         for edge in order:
-            axis, pixel = edge & 1, edge >> 1
-            other = pixel + (1 if axis == 0 else width)
-            a, b = _find(parent, pixel), _find(parent, other)
+            pixel, step_to = (edge, 1) if edge < n else (edge - n, width)
+            a, b = root_of(parent, pixel), root_of(parent, pixel + step_to)
             if a == b:
                 continue
-            weight = cost[axis, pixel // width, pixel % width]
+            weight = weights[edge]
             joins = weight <= limit[a] and weight <= limit[b]
             if step == 1:
                 joins = size[a] < min_size or size[b] < min_size
@@ -333,7 +305,7 @@ def grow_superpixels(cost: Float32Array, scale: float, min_size: int, n_levels: 
     n_labels = 0
     for v in range(height):
         for u in range(width):
-            root = _find(parent, v * width + u)
+            root = root_of(parent, v * width + u)
             if number[root] < 0:
                 number[root] = n_labels
                 n_labels += 1
@@ -403,7 +375,7 @@ def connected(a: NDArray[np.intp], b: NDArray[np.intp], n: int) -> tuple[NDArray
     """
     parent = np.arange(n)
     for k in range(len(a)):
-        i, j = _find(parent, a[k]), _find(parent, b[k])
+        i, j = root_of(parent, a[k]), root_of(parent, b[k])
         parent[max(i, j)] = min(i, j)
     component = np.empty(n, np.intp)
     n_components = 0
@@ -424,31 +396,3 @@ def sum_rows(label: NDArray[np.intp], values: Float64Array, n: int) -> Float64Ar
         for c in range(values.shape[1]):
             sums[label[i], c] += values[i, c]
     return sums
-
-
-@njit(cache=True)
-def border_pairs(
-    labels: Int32Array, contrast: Float32Array, depth_cost: Float32Array
-) -> tuple[Int64Array, Int64Array, Float32Array, Float32Array]:
-    """The neighbouring pixels of different ``labels`` (H, W): the lower and the higher label, and both differences.
-
-    First the pairs along rows, then those along columns, as ``contrast`` and ``depth_cost`` (2, H, W) have them.
-    """
-    height, width = labels.shape
-    n = 0
-    for axis in range(2):
-        for v in range(height - axis):
-            for u in range(width - 1 + axis):
-                n += labels[v, u] != labels[v + axis, u + 1 - axis]
-    low, high = np.empty(n, np.int64), np.empty(n, np.int64)
-    contrasts, depths = np.empty(n, np.float32), np.empty(n, np.float32)
-    k = 0
-    for axis in range(2):
-        for v in range(height - axis):
-            for u in range(width - 1 + axis):
-                here, there = labels[v, u], labels[v + axis, u + 1 - axis]
-                if here != there:
-                    low[k], high[k] = min(here, there), max(here, there)
-                    contrasts[k], depths[k] = contrast[axis, v, u], depth_cost[axis, v, u]
-                    k += 1
-    return low, high, contrasts, depths

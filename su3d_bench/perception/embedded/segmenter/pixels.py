@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, UInt8Array
+from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, Int64Array, UInt8Array
 from su3d_bench.perception.embedded.segmenter.config import SegmenterConfig
 from su3d_bench.perception.embedded.segmenter.graph import Graph, Pieces, measure_borders
+
+MOST_LEVELS = 2048
 
 
 def superpixels(frame: Frame, config: SegmenterConfig) -> tuple[Int32Array, Graph]:
@@ -28,12 +30,22 @@ def superpixels(frame: Frame, config: SegmenterConfig) -> tuple[Int32Array, Grap
         lab, disparity, planes, x, y, config.colour_unit, config.depth_jump, config.noise_margin * noise, normal_unit
     )
     cost = np.sqrt(colour**2 + np.maximum(depth, 0) ** 2 + normal**2)
-    labels = kernels.grow_superpixels(cost, config.superpixel_scale, config.min_superpixel_px, 2048)
+    labels = kernels.grow_superpixels(cost, _cheap_first(cost), config.superpixel_scale, config.min_superpixel_px)
     contrast = colour * np.float32(config.colour_unit)
     pieces = Pieces.from_sums(kernels.sum_pixels(labels, int(labels.max()) + 1, lab, contrast, disparity, planes, x, y))
     borders = measure_borders(labels, contrast, depth, config.depth_jump, pieces)
     graph = Graph(pieces, borders, np.arange(len(pieces)))
     return labels, graph
+
+
+def _cheap_first(cost: Float32Array) -> Int64Array:
+    """Places of the pairs of neighbours in the flat ``cost`` (2, H, W), by its levels of 1 / 64.
+
+    Those of equal level are in row-major order, right neighbours first.
+    """
+    level = np.minimum(cost * 64, MOST_LEVELS - 1).astype(np.int16)
+    level[0, :, -1] = level[1, -1] = -1  # no neighbour
+    return np.argsort(level, axis=None, kind="stable")[sum(cost.shape[1:]) :]
 
 
 def _at_working_size(frame: Frame, max_width: int) -> tuple[UInt8Array, Float32Array, Float64Array]:

@@ -19,7 +19,13 @@ __all__ = ["RgbdSegmenter", "SegmenterConfig"]
 
 
 # What moves the regions: their key follows it.
-SOURCES = ("perception/embedded/segmenter", "numerics/compiled.py", *CACHE_SOURCES)
+SOURCES = (
+    "perception/embedded/segmenter",
+    "numerics/cells.py",
+    "numerics/clusters.py",
+    "numerics/compiled.py",
+    *CACHE_SOURCES,
+)
 
 
 class RgbdSegmenter:

@@ -7,11 +7,9 @@ A folder holds ``image.onnx``, ``text.onnx`` (and ``.data`` files beside large o
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
-from functools import cached_property
+from functools import cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -23,7 +21,7 @@ from su3d_bench.perception.models.encoders.encoder import EncoderSpec, check_spe
 from su3d_bench.perception.models.encoders.image_transform import Convention
 from su3d_bench.perception.models.encoders.text_tokens import read_tokeniser
 from su3d_bench.perception.models.files import ModelFiles, bounded
-from su3d_bench.perception.models.onnx.export import compare_outputs, export_onnx
+from su3d_bench.perception.models.onnx.export import as_module, compare_outputs, export_onnx
 from su3d_bench.perception.models.onnx.manifest import OnnxManifest, wrong_files
 from su3d_bench.perception.models.onnx.session import Provider, open_session
 from su3d_bench.store.atomic import make_folder
@@ -59,8 +57,8 @@ def export_encoder(files: ModelFiles, folder: Path) -> Manifest:
     written = []
     parity = []
     for name, tower, values in (
-        (IMAGE_FILE, _tower(towers.encode_image, model), torch.from_numpy(pixels)),
-        (TEXT_FILE, _tower(towers.encode_text, model), torch.from_numpy(tokens)),
+        (IMAGE_FILE, as_module(towers.encode_image, model), torch.from_numpy(pixels)),
+        (TEXT_FILE, as_module(towers.encode_text, model), torch.from_numpy(tokens)),
     ):
         kind = name.partition(".")[0]
         inputs = {"pixels" if kind == "image" else "tokens": values}
@@ -96,21 +94,6 @@ def _probes(files: ModelFiles, spec: EncoderSpec) -> tuple[Float32Array, Int64Ar
     return spec.transform.pixels(images), tokenise(PROBES)
 
 
-def _tower(encode: Callable[[Any], Any], model: Any) -> Any:
-    """``encode`` as a module, which is what the exporter takes."""
-    import torch
-
-    class Tower(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.model = model
-
-        def forward(self, values: Any) -> Any:
-            return encode(values)
-
-    return Tower().eval()
-
-
 def _copy_tokenizer(source: Path, folder: Path) -> list[Path]:
     try:
         return [
@@ -139,21 +122,11 @@ class OnnxTowers:
     def __init__(self, files: ModelFiles, provider: Provider, device_index: int, batch: int) -> None:
         if wrong := wrong_files(read_manifest(files.weights), files.folder):
             raise DataError(wrong[0])
-        self._folder = files.folder
-        self._provider = provider
-        self._device_index = device_index
+        self._session = cache(lambda name: open_session(files.folder / name, provider, device_index))
         self.batch = batch or (1 if provider == "cpu" else GPU_BATCH)
 
     def image_features(self, pixels: Float32Array) -> Float32Array:
-        return np.asarray(self._image.run(["features"], {"pixels": pixels})[0], np.float32)
+        return np.asarray(self._session(IMAGE_FILE).run(["features"], {"pixels": pixels})[0], np.float32)
 
     def text_features(self, tokens: Int64Array) -> Float32Array:
-        return np.asarray(self._text.run(["features"], {"tokens": tokens})[0], np.float32)
-
-    @cached_property
-    def _image(self) -> Any:
-        return open_session(self._folder / IMAGE_FILE, self._provider, self._device_index)
-
-    @cached_property
-    def _text(self) -> Any:
-        return open_session(self._folder / TEXT_FILE, self._provider, self._device_index)
+        return np.asarray(self._session(TEXT_FILE).run(["features"], {"tokens": tokens})[0], np.float32)

@@ -15,7 +15,7 @@ from su3d_bench.core.errors import CheckFailed, DataError
 from su3d_bench.core.types import Float32Array, Int64Array
 from su3d_bench.perception.models.files import ModelFiles
 from su3d_bench.perception.models.masks.sam import Prompts
-from su3d_bench.perception.models.onnx.export import Parity, export_onnx, measure_parity
+from su3d_bench.perception.models.onnx.export import Parity, as_module, export_onnx, measure_parity
 from su3d_bench.perception.models.onnx.manifest import OnnxManifest, wrong_files
 from su3d_bench.perception.models.onnx.session import Provider, open_session
 from su3d_bench.perception.models.pretrained import load_sam
@@ -144,37 +144,25 @@ def modules_to_export(model: Any) -> tuple[Any, Any]:
     """
     import torch
 
-    class Encoder(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.vision_encoder = model.vision_encoder
+    positions = model.get_image_wide_positional_embeddings().detach()
 
-        def forward(self, pixels: Any) -> Any:
-            return self.vision_encoder(pixels).last_hidden_state
+    def decode(embedding: Any, points: Any, labels: Any) -> tuple[Any, Any]:
+        sparse, dense = embedded_points(model.prompt_encoder, points, labels)
+        answers = [
+            model.mask_decoder(
+                image_embeddings=embedding,
+                image_positional_embeddings=positions,
+                sparse_prompt_embeddings=sparse,
+                dense_prompt_embeddings=dense,
+                multimask_output=is_multiple,
+            )
+            for is_multiple in (False, True)
+        ]
+        logits, scores = (torch.cat(parts, dim=2)[0] for parts in zip(*answers, strict=True))
+        return logits, scores
 
-    class Decoder(torch.nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.prompts = model.prompt_encoder
-            self.masks = model.mask_decoder
-            self.register_buffer("positions", model.get_image_wide_positional_embeddings().detach())
-
-        def forward(self, embedding: Any, points: Any, labels: Any) -> tuple[Any, Any]:
-            sparse, dense = embedded_points(self.prompts, points, labels)
-            answers = [
-                self.masks(
-                    image_embeddings=embedding,
-                    image_positional_embeddings=self.positions,
-                    sparse_prompt_embeddings=sparse,
-                    dense_prompt_embeddings=dense,
-                    multimask_output=is_multiple,
-                )
-                for is_multiple in (False, True)
-            ]
-            logits, scores = (torch.cat(parts, dim=2)[0] for parts in zip(*answers, strict=True))
-            return logits, scores
-
-    return Encoder().eval(), Decoder().eval()
+    encoder = as_module(lambda pixels: model.vision_encoder(pixels).last_hidden_state, model.vision_encoder)
+    return encoder, as_module(decode, torch.nn.ModuleList([model.prompt_encoder, model.mask_decoder]))
 
 
 def embedded_points(prompt_encoder: Any, points: Any, labels: Any) -> tuple[Any, Any]:

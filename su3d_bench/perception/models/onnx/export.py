@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import tempfile
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -35,6 +35,21 @@ class Parity:
     n_values: int
     max_abs_difference: float
     min_cosine: float
+
+
+def as_module(compute: Callable[..., Any], model: Any) -> Any:
+    """``compute``, which runs parts of ``model``, as a torch module in evaluation mode, which the exporter takes."""
+    import torch
+
+    class Computing(torch.nn.Module):
+        def __init__(self) -> None:
+            super().__init__()
+            self.model = model
+
+        def forward(self, *values: Any) -> Any:
+            return compute(*values)
+
+    return Computing().eval()
 
 
 def export_onnx(
