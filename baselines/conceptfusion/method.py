@@ -108,13 +108,12 @@ class ConceptFusion:
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
         """Fuses one image into the map; the association goes over the whole map, the rest over the image."""
-        if detections.frame_index != frame.index:
-            raise DataError(f"frame {frame.index}: the detections are those of frame {detections.frame_index}")
+        detections.check_of(frame)
         features = self._table_for(detections)
         with timer.stage("backproject"):
             view = self._view(frame)
         with timer.stage("paint"):
-            field = self._field(frame, detections)
+            field = self._field(detections)
         with timer.stage("match"):
             matched = self._map.associate(view)
         with timer.stage("fuse"):
@@ -142,10 +141,7 @@ class ConceptFusion:
             frame, picked(n_rows, self.config.height), picked(n_columns, self.config.width), self.config.sigma
         )
 
-    def _field(self, frame: Frame, detections: Detections) -> PixelFeatures:
-        if len(detections) and detections.masks.shape[1:] != frame.depth_m.shape:
-            (rows, columns), (height, width) = detections.masks.shape[1:], frame.depth_m.shape
-            raise DataError(f"frame {frame.index}: masks are {columns}x{rows} and the image is {width}x{height}")
+    def _field(self, detections: Detections) -> PixelFeatures:
         config, whole, regions = self.config, detections.global_feature, detections.crop_features[:, 0]
         mixed = np.zeros((0, len(whole)))
         if len(regions):

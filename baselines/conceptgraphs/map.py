@@ -22,7 +22,6 @@ from su3d_bench.baselines.conceptgraphs.objects import (
     unit,
 )
 from su3d_bench.baselines.conceptgraphs.regions import LiftedRegion, kept_regions, lift, subtract_contained
-from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import StageTimer
 from su3d_bench.core.types import Detections, Float32Array, Frame, Instances, Masks, starts_of
 
@@ -59,8 +58,7 @@ class ObjectMap:
 
     def update(self, frame: Frame, detections: Detections, text_features: Float32Array, timer: StageTimer) -> None:
         """Take in one frame; ``text_features`` (K, T) are those of the detections' names."""
-        if detections.frame_index != frame.index:
-            raise DataError(f"frame {frame.index}: the detections are those of frame {detections.frame_index}")
+        detections.check_of(frame)
         self._n_frames += 1
         self._feature_size = detections.crop_features.shape[2]
         with timer.stage("filter"):

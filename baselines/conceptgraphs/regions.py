@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from su3d_bench.baselines.conceptgraphs.clouds import bounding_box, largest_cluster, voxel_average
 from su3d_bench.baselines.conceptgraphs.config import MappingConfig
-from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Detections, Float32Array, Float64Array, Frame, OrientedBox
 from su3d_bench.numerics.geometry import back_project, valid_depth
 
@@ -74,9 +73,6 @@ def lift(
     """The regions ``rows`` of a frame, whose masks (K, H, W) are given in their order, those too small left out."""
     if not len(rows):
         return
-    if masks.shape[1:] != frame.depth_m.shape:
-        (height, width), (rows_px, columns_px) = frame.depth_m.shape, masks.shape[1:]
-        raise DataError(f"frame {frame.index}: masks are {columns_px}x{rows_px} and the image is {width}x{height}")
     has_depth = valid_depth(frame.depth_m, 0.0, np.inf)
     points = back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, has_depth)
     row_of_pixel = np.cumsum(has_depth.ravel()) - 1

@@ -40,7 +40,7 @@ def crop_boxes(mask: BoolArray, n_levels: int, growth: float) -> Int64Array:
     step_x, step_y = int((x1 - x0) * growth), int((y1 - y0) * growth)
     steps = np.arange(n_levels)[:, None] * np.array([-step_x, -step_y, step_x, step_y])
     height, width = mask.shape
-    return np.clip(np.array([x0, y0, x1, y1]) + steps, 0, [width, height, width, height])
+    return np.asarray(np.clip(np.array([x0, y0, x1, y1]) + steps, 0, [width, height, width, height]), np.int64)
 
 
 class FeatureMeans:

@@ -177,8 +177,7 @@ class SAM3D:
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
         """Takes one image in; with ``schedule`` incremental it is merged at once, which costs what the map costs."""
-        if detections.frame_index != frame.index:
-            raise DataError(f"frame {frame.index}: the detections are those of frame {detections.frame_index}")
+        detections.check_of(frame)
         n_dimensions = detections.crop_features.shape[2]
         if len(detections) and self._views and n_dimensions != len(self._views[0].feature):
             raise DataError(
@@ -284,9 +283,6 @@ class SAM3D:
 
 def paint(frame: Frame, masks: BoolArray) -> Int64Array:
     """The detection (H, W) of each pixel, NO_GROUP in no mask; of overlapping masks the first shows."""
-    if len(masks) and masks.shape[1:] != frame.depth_m.shape:
-        (rows, columns), (height, width) = masks.shape[1:], frame.depth_m.shape
-        raise DataError(f"frame {frame.index}: masks are {columns}x{rows} and the image is {width}x{height}")
     detection = np.full(frame.depth_m.shape, NO_GROUP, np.int64)
     for k in reversed(range(len(masks))):
         detection[masks[k]] = k

@@ -193,6 +193,14 @@ class Detections:
     def __len__(self) -> int:
         return len(self.names)
 
+    def check_of(self, frame: Frame) -> None:
+        """Raises ``DataError`` where these are the detections of another frame, or their masks of another size."""
+        if self.frame_index != frame.index:
+            raise DataError(f"frame {frame.index}: the detections are those of frame {self.frame_index}")
+        if len(self) and self.masks.shape[1:] != frame.depth_m.shape:
+            size = _size(self.masks[0])
+            raise DataError(f"frame {frame.index}: masks are {size} and the image is {_size(frame.depth_m)}")
+
 
 @dataclass(frozen=True)
 class PerceptionNeeds:

@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int32Array, Int64Array
 from su3d_bench.numerics.geometry import ray_parts, valid_depth
 from su3d_bench.opensu3d.config import OpenSU3DConfig
@@ -73,9 +72,6 @@ def frame_cloud(frame: Frame, masks: BoolArray, config: OpenSU3DConfig) -> Frame
 
     Where ``frame_voxel`` is above 0 it is reduced to the first point of each voxel and detection (in and out of rings).
     """
-    if len(masks) and masks.shape[1:] != frame.depth_m.shape:
-        (rows, columns), (height, width) = masks.shape[1:], frame.depth_m.shape
-        raise DataError(f"frame {frame.index}: masks are {columns}x{rows} and the image is {width}x{height}")
     painted = paint(masks, config.border_in(frame.depth_m.shape[1]), config.border_shape)
     pixels = valid_depth(frame.depth_m, config.depth_min, config.depth_max)
     points, owner, rank = _cloud(frame, pixels, painted, config)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any, ClassVar
 import numpy as np
 
 from su3d_bench.core.devices import CPU
-from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.types import Detections, Frame, Instances, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
 from su3d_bench.opensu3d.association import assign_ids, count_overlaps, overlap_ratios
@@ -86,8 +85,7 @@ class OpenSU3D:
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
         """Fuses one image into the map; costs what the view costs, however large the map is."""
-        if detections.frame_index != frame.index:
-            raise DataError(f"frame {frame.index}: the detections are those of frame {detections.frame_index}")
+        detections.check_of(frame)
         with timer.stage("backproject"):
             cloud = frame_cloud(frame, detections.masks, self.config)
         with timer.stage("match"):

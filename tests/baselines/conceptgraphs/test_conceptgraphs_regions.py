@@ -240,6 +240,6 @@ def test_a_region_whose_box_is_below_one_cubic_centimetre_is_left_out() -> None:
 def test_masks_of_another_size_than_the_image_are_refused() -> None:
     frame, detections = look([LEFT])
     with pytest.raises(DataError, match="frame 0: masks are 90x72 and the image is 96x72"):
-        list(lift(frame, np.array([0]), detections.masks[:, :, :90], QUIET, 0))
+        ConceptGraphs().update(frame, replace(detections, masks=detections.masks[:, :, :90]), Timer())
     with pytest.raises(DataError, match="frame 3: the detections are those of frame 0"):
         ConceptGraphs().update(replace(frame, index=3), detections, Timer())
