@@ -12,7 +12,7 @@ import numpy as np
 
 from su3d_bench.core.errors import printable
 from su3d_bench.core.types import BoolArray, Float64Array, Instances, UInt8Array
-from su3d_bench.reports.pictures.canvas import DARK, GREY, Canvas, drawable, hex_of
+from su3d_bench.reports.pictures.canvas import DARK, GREY, Canvas, drawable, hex_of, paper
 from su3d_bench.reports.pictures.maps import NO_INSTANCE, SQUARE_M, Cloud, Colour, instance_colours, map_cloud, thinned
 from su3d_bench.reports.pictures.render import Camera, View, colour, project, render, room_bounds, view_cameras
 
@@ -58,10 +58,7 @@ def draw_reasoning(
     palette = _palette(names, spoken_of)
     for column, (camera, view, title) in enumerate(_two_views(cloud, spoken_of)):
         left = MARGIN + column * (PANEL_WIDTH + MARGIN)
-        axes = page.axes(left, header, PANEL_WIDTH, PANEL_HEIGHT)
-        axes.imshow(colour(view, palette[cloud.owner]), interpolation="nearest", aspect="auto")
-        axes.set_xlim(-0.5, PANEL_WIDTH - 0.5)
-        axes.set_ylim(PANEL_HEIGHT - 0.5, -0.5)
+        axes = page.picture(left, header, PANEL_WIDTH, PANEL_HEIGHT, colour(view, palette[cloud.owner]))
         _draw_spoken_of(axes, camera, instances, spoken_of, names)
         axes.text(10, PANEL_HEIGHT - 10, title, fontsize=10, color=GREY, va="bottom")
     page.write(path)
@@ -116,7 +113,7 @@ def _draw_spoken_of(axes: Any, camera: Camera, instances: Instances, spoken_of: 
         middle = np.nanmean(pixels, axis=0)
         if not ((pixels[:, 1].min() - 2 * LABEL_HEIGHT <= y) & (y <= pixels[:, 1].max())):
             axes.plot([x, middle[0]], [y, middle[1]], color=shade, linewidth=0.6, alpha=0.6)
-        box = {"boxstyle": "round,pad=0.2", "facecolor": "white", "edgecolor": shade, "alpha": 0.92}
+        box = paper(shade, 0.2, 0.92)
         axes.text(x, y, names[row], fontsize=9.5, color=shade, ha="center", va="center", bbox=box, parse_math=False)
 
 

@@ -6,6 +6,7 @@ import io
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.core.types import UInt8Array
 from su3d_bench.store.atomic import make_folder, write_bytes
 
 DPI = 100
@@ -36,6 +37,14 @@ class Canvas:
         axes.set_axis_off()
         return axes
 
+    def picture(self, x: float, y: float, width: float, height: float, pixels: UInt8Array) -> Any:
+        """Axes at this place whose unit is a pixel of the picture that fills them."""
+        axes = self.axes(x, y, width, height)
+        axes.imshow(pixels, interpolation="nearest", aspect="auto")
+        axes.set_xlim(-0.5, pixels.shape[1] - 0.5)
+        axes.set_ylim(pixels.shape[0] - 0.5, -0.5)
+        return axes
+
     def write(self, path: Path) -> None:
         """Write the page as a PNG, with its folder."""
         write_figure(self.figure, path)
@@ -60,6 +69,11 @@ def drawable(text: str) -> str:
 
     known = get_font(findfont("DejaVu Sans")).get_charmap()
     return "".join(c if ord(c) in known else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
+def paper(edge: str = "none", pad: float = 0.15, alpha: float = 0.85, **more: Any) -> dict[str, Any]:
+    """The white box with round corners on which words stand in a picture."""
+    return {"boxstyle": f"round,pad={pad}", "facecolor": "white", "edgecolor": edge, "alpha": alpha} | more
 
 
 def hex_of(colour: tuple[int, ...]) -> str:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.types import UInt8Array
-from su3d_bench.reports.pictures.canvas import Canvas, drawable, figure_bytes, hex_of
+from su3d_bench.reports.pictures.canvas import Canvas, drawable, figure_bytes, hex_of, paper
 from su3d_bench.reports.pictures.items import Tag
 from su3d_bench.store.atomic import make_folder, write_bytes
 
@@ -69,14 +69,8 @@ def _figure_bytes(suffix: str, columns: Sequence[str], rows: Sequence[GridRow], 
     page = _Page(width, height, per_inch=1, dpi=DPI)
     for c, title in enumerate(columns):
         left = GAP_IN + c * (CELL_WIDTH_IN + GAP_IN)
-        page.text(
-            left + CELL_WIDTH_IN / 2,
-            0.06,
-            textwrap.shorten(printable(title, 60), 34, placeholder="..."),
-            9,
-            colour=INK,
-            ha="center",
-        )
+        heading = textwrap.shorten(printable(title, 60), 34, placeholder="...")
+        page.text(left + CELL_WIDTH_IN / 2, 0.06, heading, 9, colour=INK, ha="center")
     for r, row in enumerate(rows):
         top = tops[r]
         room = int(width * 13)
@@ -129,13 +123,7 @@ class _Page(Canvas):
             if is_beside:
                 places = [tag.x * width] * 2, [tag.y * height, row * height]
                 axes.plot(*places, color=shade, linewidth=0.7, marker="o", markersize=1.4, markevery=[0])
-            box = {
-                "boxstyle": "round,pad=0.12",
-                "facecolor": "white",
-                "edgecolor": shade,
-                "alpha": 0.88,
-                "linewidth": 0.5,
-            }
+            box = paper(shade, 0.12, 0.88, linewidth=0.5)
             axes.text(
                 tag.x * width, row * height, text, fontsize=4.6, color=INK, ha="center", va="center", bbox=box,
                 parse_math=False, clip_on=True,

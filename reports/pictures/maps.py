@@ -231,8 +231,7 @@ def _write_picture(path: Path, title: str, rows: Sequence[Row], legend: Mapping[
     page.text(14, 16, title, 14, fontweight="bold")
     for r, row in enumerate(rows):
         for c, picture in enumerate(row.pictures):
-            axes = page.axes(c * VIEW_WIDTH, header + r * VIEW_HEIGHT, VIEW_WIDTH, VIEW_HEIGHT)
-            axes.imshow(picture, interpolation="nearest", aspect="auto")
+            axes = page.picture(c * VIEW_WIDTH, header + r * VIEW_HEIGHT, VIEW_WIDTH, VIEW_HEIGHT, picture)
             label = f"{row.title} {VIEW_TITLES[c]}".strip()
             axes.text(14, VIEW_HEIGHT - 14, label, fontsize=10, color=PALE, va="bottom")
     left = 3 * VIEW_WIDTH

@@ -10,7 +10,7 @@ import numpy as np
 
 from su3d_bench.core.errors import printable
 from su3d_bench.core.types import Float32Array, Float64Array, GroundTruth, Int32Array, UInt8Array
-from su3d_bench.reports.pictures.canvas import DARK, GREY, Canvas, hex_of
+from su3d_bench.reports.pictures.canvas import DARK, GREY, Canvas, hex_of, paper
 from su3d_bench.reports.pictures.maps import (
     NO_INSTANCE,
     Colour,
@@ -57,14 +57,11 @@ def draw_scene_picture(look: SceneLook, path: Path) -> None:
     for column, panel in enumerate(_panels(look)):
         left = MARGIN + column * (PANEL_WIDTH + MARGIN)
         page.text(left, HEADER, panel.caption, size=11)
-        axes = page.axes(left, HEADER + CAPTION, PANEL_WIDTH, PANEL_HEIGHT)
-        axes.imshow(panel.pixels, interpolation="nearest", aspect="auto")
+        axes = page.picture(left, HEADER + CAPTION, PANEL_WIDTH, PANEL_HEIGHT, panel.pixels)
         if panel.camera is not None:
             _draw_scale(axes, panel.camera)
             if column == 0:
                 _draw_walk(axes, panel.camera, look.poses)
-        axes.set_xlim(-0.5, PANEL_WIDTH - 0.5)
-        axes.set_ylim(PANEL_HEIGHT - 0.5, -0.5)
     if look.truth is not None:
         _draw_legend(page, look.truth)
     else:
@@ -223,7 +220,7 @@ def _draw_walk(axes: Any, camera: Camera, poses: Float64Array) -> None:
             fontsize=10,
             color=shade,
             fontweight="bold",
-            bbox={"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.85},
+            bbox=paper(),
         )
 
 
@@ -234,8 +231,7 @@ def _draw_scale(axes: Any, camera: Camera) -> None:
     left, row = 14, PANEL_HEIGHT - 12
     axes.plot([left, left + length_m * pixels_a_metre], [row, row], color="white", linewidth=6, solid_capstyle="butt")
     axes.plot([left, left + length_m * pixels_a_metre], [row, row], color=DARK, linewidth=3, solid_capstyle="butt")
-    box = {"boxstyle": "round,pad=0.15", "facecolor": "white", "edgecolor": "none", "alpha": 0.85}
-    axes.text(left, row - 8, f"{length_m:g} m", fontsize=10, color=DARK, va="bottom", bbox=box)
+    axes.text(left, row - 8, f"{length_m:g} m", fontsize=10, color=DARK, va="bottom", bbox=paper())
 
 
 def _frame_height(look: SceneLook) -> int:

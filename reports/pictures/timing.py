@@ -82,15 +82,15 @@ def _save(figure: Figure, path: Path) -> Path:
     return path
 
 
-def _label(times: Sequence[UpdateTimes], several_runs: bool) -> str:
+def _label(method: str, run: str, several_runs: bool) -> str:
     # A dollar sign would start mathematics.
-    name = f"{times[0].method} ({times[0].run})" if several_runs else times[0].method
-    return printable(name, 60).replace("$", r"\$")
+    return printable(f"{method} ({run})" if several_runs else method, 60).replace("$", r"\$")
 
 
-def _several_runs(times: Sequence[Sequence[UpdateTimes]]) -> bool:
-    """Whether a method stands there more than once, so that its name alone does not tell it."""
-    return len({one[0].method for one in times}) < len(times)
+def _labels(times: Sequence[Sequence[UpdateTimes]]) -> list[str]:
+    """The name of each method, with its run where one stands there more than once."""
+    several_runs = len({of_method[0].method for of_method in times}) < len(times)
+    return [_label(of_method[0].method, of_method[0].run, several_runs) for of_method in times]
 
 
 def _sizes(one: UpdateTimes, against: str, warm_up: int) -> Float64Array | None:
@@ -106,7 +106,7 @@ def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: 
     Each update is a dot; a method's line runs through the medians of the updates of about one size.
     """
     figure, (axes,) = _figure(7.0, 4.0 + 0.16 * len(times))
-    for index, of_method in enumerate(times):
+    for index, (of_method, label) in enumerate(zip(times, _labels(times), strict=True)):
         sized = [(one, size) for one in of_method if (size := _sizes(one, against, warm_up)) is not None]
         sizes = np.concatenate([size for _, size in sized] or [np.zeros(0)])
         costs = pooled([one for one, _ in sized], MAP, warm_up)
@@ -114,7 +114,6 @@ def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: 
         if not usable.any():
             continue
         growth = growth_exponent(sizes, costs)
-        label = _label(of_method, _several_runs(times))
         if growth is not None:
             label += f": exponent {growth.exponent:.2f} [{growth.low:.2f}, {growth.high:.2f}], {growth.words}"
         _draw_cost(axes, sizes[usable], costs[usable], index, label)
@@ -165,7 +164,7 @@ def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int) -> Figure:
         style: dict[str, Any] = {"hatch": hatch, "color": COLOURS[index % len(COLOURS)]}
         axes.barh(rows, widths, left=left, edgecolor="white", label=stage, **style)
         left += widths
-    axes.set_yticks(rows, [_label(of_method, _several_runs(times)) for of_method in times])
+    axes.set_yticks(rows, _labels(times))
     axes.invert_yaxis()
     axes.set_xlabel("mean ms per update")
     figure.legend(loc="outside lower center", ncols=min(len(stages), 6), fontsize=8, frameon=False)
@@ -176,14 +175,13 @@ def _memory(times: Sequence[Sequence[UpdateTimes]]) -> Figure:
     """Mebibytes of the map against its points, and of the process against the updates, the scenes' medians."""
     figure, panels = _figure(4.8, 3.2 + 0.16 * len(times), 2)
     for axes, (column, against) in zip(panels, (("map_bytes", POINTS), ("rss_bytes", UPDATES)), strict=True):
-        for index, of_method in enumerate(times):
+        for index, (of_method, label) in enumerate(zip(times, _labels(times), strict=True)):
             sized = [(one, _sizes(one, against, 0)) for one in of_method if column in one.columns]
             sizes = np.concatenate([size for _, size in sized if size is not None] or [np.zeros(0)])
             values = np.concatenate([one.columns[column] for one, size in sized if size is not None] or [np.zeros(0)])
             if not (sizes > 0).any():
                 continue
             x, y = medians_by_size(sizes[sizes > 0], values[sizes > 0] / MIB)
-            label = _label(of_method, _several_runs(times))
             axes.plot(x, y, linewidth=1.2, markersize=4.5, markerfacecolor="white", label=label, **_style(index))
         what = "the map" if column == "map_bytes" else "the process"
         axes.set(xscale="log", xlabel=against, ylabel=f"MiB of {what}", ylim=(0, None))
@@ -214,7 +212,7 @@ def _anytime(points: Sequence[AnytimePoint]) -> Figure:
         for index, (run, method) in enumerate(curves):
             mine = [one for one in points if (one.run, one.method, one.protocol) == (run, method, protocol)]
             values = [100.0 * value if (value := one.metrics.get(name)) is not None else np.nan for one in mine]
-            label = printable(f"{method} ({run})" if several else method, 60).replace("$", r"\$")
+            label = _label(method, run, several)
             axes.plot([one.seconds for one in mine], values, markersize=4, label=label, **_style(index))
         axes.set(xlabel="seconds", ylabel=f"{name} (%)", title=protocol)
         axes.grid(True, color="0.85", linewidth=0.6)

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 from su3d_bench.datasets.rooms.objects.items import Assembly
 from su3d_bench.datasets.rooms.objects.materials import (
     Material,
+    Rgb,
     Texture,
     chrome,
     glass,
@@ -16,7 +19,12 @@ from su3d_bench.datasets.rooms.objects.materials import (
     shade,
     tone,
 )
-from su3d_bench.datasets.rooms.objects.shapes import block, cylinder, lathe, soft_block, tube
+from su3d_bench.datasets.rooms.objects.shapes import Shape, block, corners, cylinder, lathe, soft_block, tube
+
+
+def _handle(x: float, near: float, far: float, heights: Sequence[float], radius: float) -> Shape:
+    """An upright bar before a front: from ``near`` to ``far`` and back again, at four heights."""
+    return tube([(x, y, z) for y, z in zip((near, far, far, near), heights, strict=True)], radius)
 
 
 def refrigerator(build: Assembly) -> None:
@@ -31,10 +39,7 @@ def refrigerator(build: Assembly) -> None:
     steel = chrome(build.rng)
     x = width / 2 - 0.06
     for z0, z1 in ((split - 0.5, split - 0.06), (split + 0.06, min(split + 0.38, height - 0.08))):
-        build.add(
-            steel,
-            tube([(x, y - 0.02, z0), (x, y - 0.065, z0 + 0.02), (x, y - 0.065, z1 - 0.02), (x, y - 0.02, z1)], 0.012),
-        )
+        build.add(steel, _handle(x, y - 0.02, y - 0.065, (z0, z0 + 0.02, z1 - 0.02, z1), 0.012))
     build.spot((-width / 2 + 0.02, width / 2 - 0.02), (-depth / 2 + 0.08, depth / 2 - 0.02), height, 0.45)
 
 
@@ -74,22 +79,9 @@ def microwave(build: Assembly) -> None:
             build.add(
                 grey, block(0.02, 0.006, 0.016, width * 0.36 + (i - 1) * 0.028, y - 0.0115, height * 0.3 + j * 0.04)
             )
-    build.add(
-        chrome(build.rng),
-        tube(
-            [
-                (width * 0.18, y - 0.012, height * 0.25),
-                (width * 0.18, y - 0.035, height * 0.27),
-                (width * 0.18, y - 0.035, height * 0.83),
-                (width * 0.18, y - 0.012, height * 0.85),
-            ],
-            0.008,
-        ),
-    )
-    build.add(
-        paint(tone("black")),
-        *[block(0.04, 0.04, 0.014, sx * width * 0.4, sy * depth * 0.38) for sx in (-1, 1) for sy in (-1, 1)],
-    )
+    heights = [height * share for share in (0.25, 0.27, 0.83, 0.85)]
+    build.add(chrome(build.rng), _handle(width * 0.18, y - 0.012, y - 0.035, heights, 0.008))
+    build.add(paint(tone("black")), *[block(0.04, 0.04, 0.014, *foot) for foot in corners(width * 0.4, depth * 0.38)])
     build.spot((-width / 2 + 0.03, width / 2 - 0.03), (-depth / 2 + 0.03, depth / 2 - 0.03), height + 0.012, 0.4)
 
 
@@ -158,15 +150,7 @@ def laptop(build: Assembly) -> None:
     width, depth = build.size(0.33, 0.37), build.size(0.23, 0.25)
     case = build.main()
     build.add(case, soft_block(width, depth, 0.02, 0, 0, 0, 0.007))
-    keys = Material(
-        Texture.KEYS,
-        linear((30, 30, 33)),
-        linear((120, 122, 126)),
-        0.02,
-        0.1,
-        axis=2,
-        extent=(-width / 2, width / 2, -depth / 2, depth / 2),
-    )
+    keys = _keys(linear((30, 30, 33)), linear((120, 122, 126)), 0.02, width, depth)
     build.add(keys, block(width * 0.86, depth * 0.5, 0.003, 0, depth * 0.14, 0.0202))
     build.add(plastic(shade(build.rgb, 0.7)), block(width * 0.3, depth * 0.26, 0.002, 0, -depth * 0.3, 0.0202))
     lid = block(width, 0.009, depth * 0.98)
@@ -176,13 +160,16 @@ def laptop(build: Assembly) -> None:
         build.add(material, shape.turned("x", -16).moved(0, depth / 2 + 0.004, 0.012))
 
 
+def _keys(key: Rgb, gap: Rgb, size: float, width: float, depth: float) -> Material:
+    return Material(Texture.KEYS, key, gap, size, 0.1, axis=2, extent=(-width / 2, width / 2, -depth / 2, depth / 2))
+
+
 def keyboard(build: Assembly) -> None:
     width, depth = build.size(0.4, 0.47), build.size(0.13, 0.155)
     build.add(plastic(build.rgb), soft_block(width, depth, 0.022, 0, 0, 0, 0.008))
     light = build.colour == "black"
     a, b = (linear((58, 58, 62)), linear((150, 150, 155))) if light else (linear((250, 250, 250)), linear((80, 80, 84)))
-    keys = Material(Texture.KEYS, a, b, 0.021, 0.1, axis=2, extent=(-width / 2, width / 2, -depth / 2, depth / 2))
-    build.add(keys, block(width - 0.025, depth - 0.025, 0.009, 0, 0, 0.0222))
+    build.add(_keys(a, b, 0.021, width, depth), block(width - 0.025, depth - 0.025, 0.009, 0, 0, 0.0222))
 
 
 def mouse(build: Assembly) -> None:
@@ -201,10 +188,7 @@ def mouse(build: Assembly) -> None:
 def desktop_computer(build: Assembly) -> None:
     width, depth, height = build.size(0.18, 0.22), build.size(0.4, 0.46), build.size(0.4, 0.46)
     build.add(plastic(build.rgb), soft_block(width, depth, height, 0, 0, 0.015, 0.012))
-    build.add(
-        paint(tone("black")),
-        *[block(0.03, 0.06, 0.015, sx * width * 0.35, sy * depth * 0.35) for sx in (-1, 1) for sy in (-1, 1)],
-    )
+    build.add(paint(tone("black")), *[block(0.03, 0.06, 0.015, *foot) for foot in corners(width * 0.35, depth * 0.35)])
     y = -depth / 2
     contrast = plastic(tone("grey") if build.colour == "black" else shade(tone("black"), 1.2))
     for z in (0.85, 0.74):

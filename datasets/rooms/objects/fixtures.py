@@ -154,13 +154,11 @@ def _faucet(build: Assembly, x: float, y: float, z: float, reach: float = 0.16, 
 
 def _basin(material: Material, width: float, depth: float, tall: float, wall: float = 0.03) -> list[Shape]:
     """An open rectangular tub out of four walls and a bottom."""
-    w, d = width / 2, depth / 2
+    w, d, high = width / 2, depth / 2, tall - wall - 0.001
     return [
         box(-w, w, -d, d, 0, wall),
-        soft_block(wall, depth, tall - wall - 0.001, -w + wall / 2, 0, wall + 0.001, 0.012),
-        soft_block(wall, depth, tall - wall - 0.001, w - wall / 2, 0, wall + 0.001, 0.012),
-        soft_block(width - 2 * wall, wall, tall - wall - 0.001, 0, -d + wall / 2, wall + 0.001, 0.012),
-        soft_block(width - 2 * wall, wall, tall - wall - 0.001, 0, d - wall / 2, wall + 0.001, 0.012),
+        *[soft_block(wall, depth, high, x, 0, wall + 0.001, 0.012) for x in both(w - wall / 2)],
+        *[soft_block(width - 2 * wall, wall, high, 0, y, wall + 0.001, 0.012) for y in both(d - wall / 2)],
     ]
 
 

@@ -15,12 +15,12 @@ from su3d_bench.datasets.rooms.objects.materials import (
     tone,
     wood,
 )
-from su3d_bench.datasets.rooms.objects.shapes import Shape, block, both, box, cylinder, lathe, soft_block, tube
+from su3d_bench.datasets.rooms.objects.shapes import Shape, block, both, box, corners, cylinder, lathe, soft_block, tube
 
 
 def _legs(width: float, depth: float, height: float, thick: float, inset: float = 0.02) -> list[Shape]:
     x, y = width / 2 - inset - thick / 2, depth / 2 - inset - thick / 2
-    return [block(thick, thick, height, sx * x, sy * y) for sx in (-1, 1) for sy in (-1, 1)]
+    return [block(thick, thick, height, *foot) for foot in corners(x, y)]
 
 
 def _knob(x: float, y: float, z: float) -> Shape:
@@ -89,8 +89,7 @@ def stool(build: Assembly) -> None:
     )
     legs = chrome(build.rng) if build.material == "metal" else build.main(axis=2)
     reach = radius * 0.95
-    feet = [(sx * reach, sy * reach) for sx in (-1, 1) for sy in (-1, 1)]
-    for x, y in feet:
+    for x, y in corners(reach, reach):
         build.add(legs, tube([(x, y, 0), (x * 0.62, y * 0.62, height - 0.048)], 0.017))
     ring = 0.85 * reach
     for sign in (-1, 1):
@@ -125,8 +124,7 @@ def sofa(build: Assembly) -> None:
     cover = leather(build.rgb, build.rng) if build.material == "leather" else plain_cloth(build.rgb, build.rng)
     build.add(cover, soft_block(width - 0.02, depth - 0.02, 0.22, 0, 0, 0.08, 0.03))
     arm_top = build.rng.uniform(0.56, 0.64)
-    for sx in (-1, 1):
-        build.add(cover, soft_block(arm, depth, arm_top - 0.07, sx * (width - arm) / 2, 0, 0.07, 0.06))
+    build.add(cover, *[soft_block(arm, depth, arm_top - 0.07, x, 0, 0.07, 0.06) for x in both((width - arm) / 2)])
     build.add(cover, soft_block(width - 2 * arm, 0.2, back - 0.1, 0, depth / 2 - 0.1, 0.1, 0.06))
     n = 3 if width > 1.75 else 2
     inner = (width - 2 * arm) / n

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from su3d_bench.datasets.rooms.objects.items import Assembly
@@ -30,10 +32,12 @@ def books(build: Assembly) -> None:
         x += thick + 0.0015
 
 
+def _cover(rgb: Rgb, size: float, seed: int) -> Material:
+    return Material(Texture.LABEL, rgb, mix(rgb, (0.9, 0.85, 0.6), 0.75), size, 0.1, seed=seed)
+
+
 def _volume(build: Assembly, rgb: Rgb, thick: float, depth: float, tall: float, x: float) -> None:
-    label = Material(
-        Texture.LABEL, rgb, mix(rgb, (0.9, 0.85, 0.6), 0.75), tall, 0.1, seed=int(build.rng.integers(1, 999))
-    )
+    label = _cover(rgb, tall, seed=int(build.rng.integers(1, 999)))
     build.add(
         label, block(0.003, depth, tall, x - thick / 2 + 0.0015), block(0.003, depth, tall, x + thick / 2 - 0.0015)
     )
@@ -48,16 +52,7 @@ def book_stack(build: Assembly) -> None:
         width, depth, thick = build.size(0.2, 0.26), build.size(0.15, 0.19), build.rng.uniform(0.022, 0.042)
         rgb = build.rgb if i % 2 == 0 else build.other("red", "blue", "green", "brown", "black", "white")
         turn = float(build.rng.uniform(-14, 14))
-        cover = Material(
-            Texture.LABEL,
-            rgb,
-            mix(rgb, (0.9, 0.85, 0.6), 0.75),
-            0.2,
-            0.1,
-            axis=2,
-            extent=(-width / 2, width / 2, -depth / 2, depth / 2),
-            seed=7,
-        )
+        cover = replace(_cover(rgb, 0.2, seed=7), axis=2, extent=(-width / 2, width / 2, -depth / 2, depth / 2))
         boards = [block(width, depth, 0.003, 0, 0, z), block(width, depth, 0.003, 0, 0, z + thick - 0.003)]
         boards.append(block(width, 0.003, thick - 0.0064, 0, -depth / 2 + 0.0015, z + 0.0032))
         build.add(cover, *[shape.turned("z", turn) for shape in boards])

@@ -79,6 +79,11 @@ def both(x: float) -> tuple[float, float]:
     return -x, x
 
 
+def corners(x: float, y: float) -> list[tuple[float, float]]:
+    """Where a thing stands that there is in every corner."""
+    return [(sx * x, sy * y) for sx in (-1, 1) for sy in (-1, 1)]
+
+
 def soft_block(
     width: float, depth: float, height: float, x: float = 0.0, y: float = 0.0, z: float = 0.0, radius: float = 0.03
 ) -> Shape:

@@ -138,8 +138,7 @@ def backpack(build: Assembly) -> None:
     build.add(cover, soft_block(width, depth, height, 0, 0, 0, 0.07))
     build.add(trim, soft_block(width * 0.78, 0.07, height * 0.42, 0, -depth / 2 - 0.02, 0.03, 0.03))
     build.add(trim, soft_block(width * 0.9, depth * 0.9, 0.03, 0, -0.02, height * 0.72, 0.012))
-    build.add(trim, soft_block(0.06, depth * 0.6, height * 0.3, -width / 2 - 0.015, 0, 0.04, 0.025))
-    build.add(trim, soft_block(0.06, depth * 0.6, height * 0.3, width / 2 + 0.015, 0, 0.04, 0.025))
+    build.add(trim, *[soft_block(0.06, depth * 0.6, height * 0.3, x, 0, 0.04, 0.025) for x in both(width / 2 + 0.015)])
     angle = np.linspace(0, np.pi, 7)
     build.add(
         trim,
