@@ -20,8 +20,8 @@ import numpy as np
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, UInt8Array
 from su3d_bench.datasets.recordings.recorded_frames import numbers, read_text
-from su3d_bench.datasets.recordings.source import SensorPair, Size
-from su3d_bench.formats.images import UInt16Array, image_size, read_bytes, sized_colour, sized_depth
+from su3d_bench.datasets.recordings.source import SensorPair
+from su3d_bench.formats.images import Size, UInt16Array, decode_colour, decode_depth, image_size, read_bytes, sized
 
 FRAMES_PER_SECOND = 30.0  # of ScanNet's recordings; the exports have no times
 MOST_MISSING = 1000  # named; a stray file with a huge number makes all those before it missing
@@ -85,11 +85,11 @@ class ExportedFrames:
 
     def colour(self, i: int) -> UInt8Array:
         where, content = self._read(self._frames[i].colour)
-        return sized_colour(content, self.camera.colour_size, where, self._size_reason)
+        return sized(decode_colour, content, self.camera.colour_size, where, self._size_reason)
 
     def depth(self, i: int) -> UInt16Array:
         where, content = self._read(self._frames[i].depth)
-        return sized_depth(content, self.camera.depth_size, where, self._size_reason)
+        return sized(decode_depth, content, self.camera.depth_size, where, self._size_reason)
 
     def frame_number(self, i: int) -> int:
         return self._frames[i].number

@@ -159,11 +159,7 @@ class _Points:
 def _motion(first: Float64Array, second: Float64Array, motion: Motion) -> Float64Array:
     """The map (4, 4) from the camera of the first pose into that of the second, under a reading of both."""
     if motion.startswith("inverse"):
-        first, second = _inverse(first), _inverse(second)
+        first, second = (np.asarray(np.linalg.inv(pose), np.float64) for pose in (first, second))
     if motion.endswith("other axes"):
         first, second = first @ FLIP, second @ FLIP
-    return np.asarray(_inverse(second) @ first)
-
-
-def _inverse(pose: Float64Array) -> Float64Array:
-    return np.asarray(np.linalg.inv(pose), np.float64)
+    return np.asarray(np.linalg.inv(second) @ first)

@@ -15,9 +15,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, UInt8Array
-from su3d_bench.formats.images import MAX_PIXELS, UInt16Array
-
-Size = tuple[int, int]  # width, height in pixels
+from su3d_bench.formats.images import MAX_PIXELS, Size, UInt16Array
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from su3d_bench.datasets.scannet.annotations import (
     segments_name,
 )
 from su3d_bench.datasets.scannet.labels import MAX_NYU40_ID, TABLE_NAME, LabelTable, nyu40_label_set, raw_label_set
-from su3d_bench.formats.ply import ListColumn, PlyFile, read_ply
+from su3d_bench.formats.ply import ListColumn, read_ply
 from su3d_bench.numerics.geometry import are_rigid
 
 ALIGNMENT = "axisAlignment"  # in the facts of a scan, ``<scan>.txt``
@@ -80,21 +80,15 @@ def read_annotated_scan(files: Mapping[str, Path], scan: str, where: str) -> Ann
     """The mesh of ``scan`` with its annotation; ``files`` has the path of each of ``truth_names``."""
     segments = read_segments(files[segments_name(scan)], scan, where)
     objects = read_objects(files[aggregation_name(scan)], scan, where)
-    mesh_where = f"{where}: {mesh_name(scan)}"
-    mesh = read_ply(files[mesh_name(scan)], mesh_where)
-    vertices = vertex_positions(mesh, mesh_where)
+    vertices, triangles = _mesh(files[mesh_name(scan)], f"{where}: {mesh_name(scan)}")
     _check_one_mesh(segments, vertices, scan, where)
     labels = _labels(files[labels_name(scan)], vertices, f"{where}: {labels_name(scan)}", mesh_name(scan))
-    triangles = _triangles(mesh, len(vertices), mesh_where)
     return AnnotatedScan(where, vertices, triangles, labels, objects, object_of_vertex(segments, objects))
 
 
 def read_surface(mesh: Path, segments: Path | None, scan: str, where: str) -> Surface:
     """The mesh of ``scan`` without labels, with the published segments where their file is there."""
-    mesh_where = f"{where}: {mesh.name}"
-    file = read_ply(mesh, mesh_where)
-    vertices = vertex_positions(file, mesh_where)
-    triangles = _triangles(file, len(vertices), mesh_where)
+    vertices, triangles = _mesh(mesh, f"{where}: {mesh.name}")
     if segments is None:
         return Surface(vertices, triangles)
     ids = read_segments(segments, scan, where)
@@ -144,15 +138,16 @@ def _labels(path: Path, vertices: Float32Array, where: str, mesh: str) -> Int64A
     return labels.astype(np.int64)
 
 
-def _triangles(file: PlyFile, n_vertices: int, where: str) -> Int32Array:
-    """Rows of three vertices; none where the file has no faces."""
-    element = file.element("face")
+def _mesh(path: Path, where: str) -> tuple[Float32Array, Int32Array]:
+    """Vertices (V, 3) and rows of three of them; none where the file has no faces."""
+    file = read_ply(path, where)
+    vertices, element = vertex_positions(file, where), file.element("face")
     if element is None or element.n_rows == 0:
-        return np.zeros((0, 3), np.int32)
-    corners = face_corners(element, n_vertices, where)
+        return vertices, np.zeros((0, 3), np.int32)
+    corners = face_corners(element, len(vertices), where)
     if (corners.lengths != 3).any():
         raise DataError(f"{where}: faces are no triangles of 'vertex_indices'; expected the mesh of the release")
-    return corners.values.reshape(-1, 3).astype(np.int32)
+    return vertices, corners.values.reshape(-1, 3).astype(np.int32)
 
 
 def nyu40_truth(scan: AnnotatedScan, table: LabelTable | None) -> GroundTruth:

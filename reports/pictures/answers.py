@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import printable
-from su3d_bench.core.types import BoolArray, Float64Array, Instances, UInt8Array
+from su3d_bench.core.types import Float64Array, Instances, UInt8Array
 from su3d_bench.reports.pictures.canvas import DARK, GREY, Canvas, drawable, hex_of, paper
 from su3d_bench.reports.pictures.maps import NO_INSTANCE, SQUARE_M, Cloud, Colour, instance_colours, map_cloud, thinned
 from su3d_bench.reports.pictures.render import Camera, View, colour, project, render, room_bounds, view_cameras
@@ -78,12 +78,8 @@ def _two_views(cloud: Cloud, spoken_of: SpokenOf) -> list[tuple[Camera, View, st
     cameras = view_cameras(room_bounds(cloud.points), PANEL_WIDTH, PANEL_HEIGHT)
     above, *corners = [(camera, render(cloud.points, SQUARE_M, camera)) for camera in cameras]
     wanted = np.isin(cloud.owner, spoken_of.rows)
-    camera, view = max(corners, key=lambda pair: _n_seen(pair[1], wanted))
+    camera, view = max(corners, key=lambda pair: wanted[pair[1].point[pair[1].point >= 0]].sum())
     return [(*above, "from above"), (camera, view, "from the corner that shows most of it")]
-
-
-def _n_seen(view: View, wanted: BoolArray) -> int:
-    return int(wanted[view.point[view.point >= 0]].sum())
 
 
 def _draw_spoken_of(axes: Any, camera: Camera, instances: Instances, spoken_of: SpokenOf, names: Sequence[str]) -> None:

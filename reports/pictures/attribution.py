@@ -6,11 +6,10 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.reports.pictures.canvas import write_figure
+from su3d_bench.reports.pictures.canvas import Canvas
 from su3d_bench.reports.tables.attribution import n_text
 from su3d_bench.reports.tables.model import signed
 
-DPI = 100
 PANEL_WIDTH, ROW_HEIGHT, PANEL_EXTRA = 4.6, 0.34, 1.25  # inches
 # Grey and hatches tell bars apart on a printer without colours.
 STYLES: dict[str, dict[str, Any]] = {
@@ -22,23 +21,20 @@ STYLES: dict[str, dict[str, Any]] = {
 
 def draw_attribution(attribution: Mapping[str, Any], path: Path) -> None:
     """Write the plot as a PNG: a row of panels a protocol, a panel a metric."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
     protocols = attribution["protocols"]
     n_columns = max(len(protocol["values"]) for protocol in protocols)
     heights = [
         ROW_HEIGHT * len(_bars(protocol, next(iter(protocol["values"])))) + PANEL_EXTRA for protocol in protocols
     ]
-    figure = Figure(figsize=(1.6 + PANEL_WIDTH * n_columns, sum(heights) + 0.5), dpi=DPI, facecolor="white")
-    FigureCanvasAgg(figure)
+    page = Canvas(1.6 + PANEL_WIDTH * n_columns, sum(heights) + 0.5, per_inch=1)
+    figure = page.figure
     figure.suptitle(f"{attribution['run']}: {attribution['method']}", fontsize=13, fontweight="bold")
     grid = figure.add_gridspec(len(protocols), n_columns, height_ratios=heights)
     for row, protocol in enumerate(protocols):
         for column, name in enumerate(protocol["values"]):
             _draw_panel(figure.add_subplot(grid[row, column]), protocol, name, has_names=column == 0)
     figure.tight_layout(rect=(0, 0, 1, 0.98))
-    write_figure(figure, path)
+    page.write(path)
 
 
 Bar = tuple[str, float, str, str]  # name, length, style, what stands beside it

@@ -47,13 +47,8 @@ class Canvas:
 
     def write(self, path: Path) -> None:
         """Write the page as a PNG, with its folder."""
-        write_figure(self.figure, path)
-
-
-def write_figure(figure: Any, path: Path) -> None:
-    """Write a figure as a PNG, with its folder."""
-    make_folder(path.parent)
-    write_bytes(path, figure_bytes(figure, "png"))
+        make_folder(path.parent)
+        write_bytes(path, figure_bytes(self.figure, "png"))
 
 
 def figure_bytes(figure: Any, kind: str, dpi: float | None = None) -> bytes:

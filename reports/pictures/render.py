@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int32Array, UInt8Array
+from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, UInt8Array
 
 BACKGROUND = (252, 252, 250)
 OVERSAMPLING = 2
@@ -95,7 +95,9 @@ def _corner_camera(open_top: Float64Array, azimuth: float, width: int, height: i
 
 def render(points: Float32Array, spacing_m: float, camera: Camera) -> View:
     """The visible point of each pixel, every point drawn as a square of ``spacing_m`` across."""
-    inside = np.flatnonzero(_inside(points, camera.box))
+    from scipy.ndimage import minimum_filter
+
+    inside = np.flatnonzero(((points >= camera.box[0]) & (points <= camera.box[1])).all(axis=1))
     relative = (points[inside].astype(np.float64) - camera.eye) @ camera.rotation.T
     depth = relative[:, 2]
     scale = camera.focal / depth if camera.is_perspective else np.full(len(depth), camera.focal)
@@ -111,7 +113,7 @@ def render(points: Float32Array, spacing_m: float, camera: Camera) -> View:
         layer = np.full((camera.height, camera.width), np.inf)
         layer[row[order[part]], column[order[part]]] = rank[part]
         size = int(np.clip(np.rint(spacing_m * scale[order[part]].mean()), 1, MAX_SQUARE))
-        np.minimum(nearest, _spread(layer, size), out=nearest)
+        np.minimum(nearest, minimum_filter(layer, size, mode="constant", cval=np.inf), out=nearest)
     is_drawn = np.isfinite(nearest)
     chosen = order[len(order) - nearest[is_drawn].astype(np.int64)]
     point = np.full(nearest.shape, -1, np.int32)
@@ -129,19 +131,6 @@ def project(camera: Camera, points: Float64Array) -> Float64Array:
     middle = np.array([camera.width, camera.height]) / 2
     pixels: Float64Array = (relative[:, :2] * scale[:, None] + middle) / OVERSAMPLING
     return pixels
-
-
-def _spread(image: Float64Array, size: int) -> Float64Array:
-    """The least value within a square of ``size`` pixels around each pixel."""
-    from scipy.ndimage import minimum_filter
-
-    spread: Float64Array = minimum_filter(image, size, mode="constant", cval=np.inf)
-    return spread
-
-
-def _inside(points: Float32Array, box: Float64Array) -> BoolArray:
-    inside: BoolArray = ((points >= box[0]) & (points <= box[1])).all(axis=1)
-    return inside
 
 
 def _shade(depth: Float64Array) -> Float32Array:

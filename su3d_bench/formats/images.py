@@ -9,8 +9,9 @@ from __future__ import annotations
 import re
 import stat
 import zlib
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +21,8 @@ from su3d_bench.core.types import Float32Array, Int32Array, UInt8Array
 from su3d_bench.formats.ply import ListColumn
 
 UInt16Array = NDArray[np.uint16]
+Image = TypeVar("Image", UInt8Array, UInt16Array)
+Size = tuple[int, int]  # width, height in pixels
 MAX_PIXELS = 100_000_000  # no RGB-D camera has more; a damaged header may promise 4 billion
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
 MAX_BYTES = 1 << 30  # of one file; 100 million pixels of 16-bit RGB take 600 MB
@@ -87,23 +90,15 @@ def decode_depth(content: bytes, where: str) -> UInt16Array:
     return np.asarray(values)
 
 
-def sized_colour(content: bytes, size: tuple[int, int], where: str, reason: str) -> UInt8Array:
-    """``decode_colour`` of an image whose width and height must be ``size``; ``reason`` says why in the message."""
+def sized(decode: Callable[[bytes, str], Image], content: bytes, size: Size, where: str, reason: str) -> Image:
+    """What ``decode`` gives, which must have the width and height ``size``; ``reason`` says why in the message."""
     _check_size(image_size(content), size, where, reason)
-    rgb = decode_colour(content, where)
-    _check_size((rgb.shape[1], rgb.shape[0]), size, where, reason)
-    return rgb
+    image = decode(content, where)
+    _check_size((image.shape[1], image.shape[0]), size, where, reason)
+    return image
 
 
-def sized_depth(content: bytes, size: tuple[int, int], where: str, reason: str) -> UInt16Array:
-    """``decode_depth`` of an image whose width and height must be ``size``; ``reason`` says why in the message."""
-    _check_size(image_size(content), size, where, reason)
-    values = decode_depth(content, where)
-    _check_size((values.shape[1], values.shape[0]), size, where, reason)
-    return values
-
-
-def _check_size(actual: tuple[int, int] | None, size: tuple[int, int], where: str, reason: str) -> None:
+def _check_size(actual: Size | None, size: Size, where: str, reason: str) -> None:
     """Nothing where no size was found: the decoder says what is wrong with such an image."""
     if actual is not None and actual != size:
         raise DataError(f"{where} is {actual[0]}x{actual[1]}; expected {size[0]}x{size[1]}, {reason}")

@@ -24,7 +24,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, Int64Array, UInt8Array
 from su3d_bench.datasets.recordings.source import SensorPair
 from su3d_bench.datasets.scannet.sens.header import COUNT, MAX_FRAMES, MAX_HEADER_BYTES, SensHeader, parse_header
-from su3d_bench.formats.images import JPEG_START, PNG_SIGNATURE, UInt16Array, image_size, sized_colour
+from su3d_bench.formats.images import JPEG_START, PNG_SIGNATURE, UInt16Array, decode_colour, image_size, sized
 
 FRAME_RECORD = np.dtype(
     [
@@ -114,7 +114,7 @@ class SensFile:
         signature = PNG_SIGNATURE if header.colour_compression == "png" else JPEG_START
         if not content.startswith(signature) or image_size(content) is None:
             raise DataError(f"{where}: not a {header.colour_compression.upper()} image; copy the file again")
-        return sized_colour(content, size, where, "as the header says")
+        return sized(decode_colour, content, size, where, "as the header says")
 
     def depth(self, i: int) -> UInt16Array:
         """The depth image (H, W) of frame ``i`` in raw units, 0 where invalid."""
