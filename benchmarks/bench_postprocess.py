@@ -60,7 +60,7 @@ def filled() -> OpenSU3D:
             )
         )
         for k in range(N_INSTANCES):
-            method._table.add(k + 1, View(position, k))
+            method._table[k + 1].append(View(position, k))
     return method
 
 

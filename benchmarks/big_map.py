@@ -102,7 +102,7 @@ def fill(method: OpenSU3D, n_points: int, n_instances: int) -> GroundTruth:
             record = record_of(found, method.config.fusion, segment[seen], np.concatenate(hits)[seen], method._scratch)
             method._images.append(record)
             for row, k in enumerate(objects):
-                method._table.add(k + 1, View(position, row))
+                method._table[k + 1].append(View(position, row))
     method._next_id = n_instances + 1
     labels = LabelSet("replica", tuple(entry.id for entry in RULES.classes), tuple(c.name for c in RULES.classes))
     points, ids, instances = (np.concatenate(column) for column in zip(*truths, strict=True))

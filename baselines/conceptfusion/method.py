@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -27,11 +28,6 @@ PAPER = "Jatavallabhula et al.: ConceptFusion: Open-set Multimodal 3D Mapping, R
 SOURCE = (
     "https://github.com/concept-fusion/concept-fusion, commit 4457c1f (its branch fastsam: 668c26c); "
     "https://github.com/gradslam/gradslam, branch conceptfusion, commit 59ca872"
-)
-LICENCE = "MIT (concept-fusion and gradslam)"
-STATUS = (
-    "each formula of the released code and of the paper is tested on hand-worked values; never run beside the "
-    "original, and no figure of a paper has been reproduced"
 )
 
 
@@ -68,9 +64,10 @@ class ConceptFusion:
     about = MethodAbout(
         paper=PAPER,
         source=f"{SOURCE}; masks of Mask2Former and the uniqueness term are the paper's alone",
-        licence=LICENCE,
+        licence="MIT (concept-fusion and gradslam)",
         needs=("masks of named objects",),
-        status=STATUS,
+        status="each formula of the released code and of the paper is tested on hand-worked values; never run beside "
+        "the original, and no figure of a paper has been reproduced",
     )
 
     def __init__(self, config: ConceptFusionConfig | None = None) -> None:
@@ -111,7 +108,8 @@ class ConceptFusion:
         detections.check_of(frame)
         features = self._table_for(detections)
         with timer.stage("backproject"):
-            view = self._view(frame)
+            rows, columns = map(picked, frame.depth_m.shape, (self.config.height, self.config.width))
+            view = view_of(frame, rows, columns, self.config.sigma)
         with timer.stage("paint"):
             field = self._field(detections)
         with timer.stage("match"):
@@ -134,12 +132,6 @@ class ConceptFusion:
                 f"{self._features.n_dimensions}; make all with one encoder"
             )
         return self._features
-
-    def _view(self, frame: Frame) -> View:
-        n_rows, n_columns = frame.depth_m.shape
-        return view_of(
-            frame, picked(n_rows, self.config.height), picked(n_columns, self.config.width), self.config.sigma
-        )
 
     def _field(self, detections: Detections) -> PixelFeatures:
         config, whole, regions = self.config, detections.global_feature, detections.crop_features[:, 0]
@@ -177,12 +169,11 @@ class ConceptFusionSam(ConceptFusion):
 
     name = "conceptfusion-sam"
     Config = ConceptFusionSamConfig
-    about = MethodAbout(
+    about = replace(
+        ConceptFusion.about,
         paper=f"{PAPER}; with SAM's masks: Gu et al.: ConceptGraphs, ICRA 2024, Table II",
         source=SOURCE,
-        licence=LICENCE,
         needs=("class-agnostic masks",),
-        status=STATUS,
     )
 
     @property

@@ -55,7 +55,7 @@ class OpenSU3D:
         self._scratch.close()
         self._scratch = Scratch()
         self._map = _empty_map(self.config.eps, self._device)
-        self._table = TrackingTable()
+        self._table = TrackingTable(list)
         self._images: list[ImageRecord] = []
         self._next_id = NO_INSTANCE + 1
         self.postprocess_ms: float | None = None  # of the last ``finish``
@@ -111,7 +111,7 @@ class OpenSU3D:
         ids, self._next_id = assign_ids(overlaps, ratios, self.config.overlap_threshold, self._next_id)
         scene_id_of[overlaps.segments] = ids
         for detection, scene_id in zip(overlaps.segments, ids, strict=True):
-            self._table.add(int(scene_id), View(len(self._images), int(detection)))
+            self._table[int(scene_id)].append(View(len(self._images), int(detection)))
         return scene_id_of
 
     def _insert(self, cloud: FrameCloud, matched: Int64Array, scene_id_of: Int32Array, detections: Detections) -> None:

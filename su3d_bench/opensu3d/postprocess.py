@@ -72,13 +72,13 @@ def segments_of(
     order = np.argsort(ids, kind="stable")
     kept: list[Segment] = []
     split_off: list[Segment] = []
-    scene_ids = table.scene_ids()
+    scene_ids = sorted(table)
     ends = [np.searchsorted(ids[order], np.array(scene_ids, np.int32), side) for side in ("left", "right")]
     for scene_id, first, last in zip(scene_ids, *ends, strict=True):
         own = order[first:last]
         labels = cluster(points[own], config)
         clusters = kept_clusters(labels, config.split_fraction)
-        views = table.views(scene_id)
+        views = tuple(table[scene_id])
         for rank, label in enumerate(clusters):
             members = own[labels == label]
             hitting = views if len(clusters) == 1 else _views_that_hit(members, views, images)

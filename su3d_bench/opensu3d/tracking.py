@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import sys
+from collections import defaultdict
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,10 @@ class View:
 
     position: int
     detection: int
+
+
+# Q: scene id -> the views merged into it, in the order they came.
+TrackingTable = defaultdict[int, list[View]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -97,21 +102,3 @@ def _column(detections: Detections, ratio: float) -> int:
             f"{detections.crop_ratios}"
         )
     return detections.crop_ratios.index(ratio)
-
-
-class TrackingTable:
-    """Q: scene id -> the views merged into it, in the order they came."""
-
-    def __init__(self) -> None:
-        self._views: dict[int, list[View]] = {}
-
-    def add(self, scene_id: int, view: View) -> None:
-        self._views.setdefault(scene_id, []).append(view)
-
-    def views(self, scene_id: int) -> tuple[View, ...]:
-        """The views of one scene id; empty where it is not known."""
-        return tuple(self._views.get(scene_id, ()))
-
-    def scene_ids(self) -> tuple[int, ...]:
-        """Every id, ascending."""
-        return tuple(sorted(self._views))

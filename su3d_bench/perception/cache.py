@@ -8,7 +8,7 @@ and is made anew.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -16,8 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DAMAGE, StoreError
-from su3d_bench.core.interfaces import StageTimer
-from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, UInt8Array
+from su3d_bench.core.types import BoolArray, Float64Array, Frame, UInt8Array
 from su3d_bench.perception.crops import mask_boxes
 from su3d_bench.store.atomic import filling, read_arrays
 
@@ -138,34 +137,3 @@ def unpack_masks(arrays: Mapping[str, NDArray[Any]]) -> BoolArray:
         mask[y0:y1, x0:x1] = bits.reshape(y1 - y0, x1 - x0)
         start += n_bytes
     return masks
-
-
-class CachedRows:
-    """Rows of a table (n, dim) float32 that are computed once each and kept under a key."""
-
-    def __init__(self, cache: FrameCache, dim: int) -> None:
-        self._cache = cache
-        self._dim = dim
-
-    def rows(
-        self,
-        key: str,
-        n: int,
-        wanted: NDArray[np.intp],
-        compute: Callable[[NDArray[np.intp]], Float32Array],
-        timer: StageTimer,
-    ) -> Float32Array:
-        """Rows ``wanted`` of the table of ``n`` rows under ``key``; ``compute`` is asked for the missing ones only."""
-        with timer.stage("cache"):
-            entry = self._cache.load(key)
-        if entry is None or entry["rows"].shape != (n, self._dim):
-            table, known = np.zeros((n, self._dim), np.float32), np.zeros(n, bool)
-        else:
-            table, known = entry["rows"], entry["known"]
-        missing = wanted[~known[wanted]]
-        if len(missing):
-            table[missing] = compute(missing)
-            known[missing] = True
-            with timer.stage("cache"):
-                self._cache.save(key, {"rows": table, "known": known})
-        return table[wanted]

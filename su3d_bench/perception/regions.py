@@ -13,7 +13,6 @@ from su3d_bench.core.interfaces import Encoder, Segmenter, StageTimer
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, Int64Array, Regions
 from su3d_bench.perception.cache import (
     CACHE_SOURCES,
-    CachedRows,
     FrameCache,
     array_digest,
     content_key,
@@ -123,7 +122,6 @@ class CropEncoder:
         self._encoder = encoder
         self._cache = cache
         self._source = package_digest(*SOURCES)
-        self._rows = CachedRows(cache, encoder.dim)
 
     def crops(
         self,
@@ -153,7 +151,7 @@ class CropEncoder:
                     return self._encoder.encode_images(crop_images(frame.rgb, boxes[missing], ratio))
 
             key = content_key("crops", image, self._source, self._encoder.digest, repr(float(ratio)))
-            features[:, column] = self._rows.rows(key, len(boxes), wanted, compute, timer)
+            features[:, column] = self._rows(key, len(boxes), wanted, compute, timer)
         return features
 
     def whole(self, frame: Frame, timer: StageTimer) -> Float32Array:
@@ -166,5 +164,28 @@ class CropEncoder:
         with timer.stage("cache"):
             image = self._cache.image_digest(frame.rgb) if self._cache.is_on else ""
             key = content_key("image", image, self._encoder.digest)
-        row: Float32Array = self._rows.rows(key, 1, np.zeros(1, np.intp), compute, timer)[0]
+        row: Float32Array = self._rows(key, 1, np.zeros(1, np.intp), compute, timer)[0]
         return row
+
+    def _rows(
+        self,
+        key: str,
+        n: int,
+        wanted: NDArray[np.intp],
+        compute: Callable[[NDArray[np.intp]], Float32Array],
+        timer: StageTimer,
+    ) -> Float32Array:
+        """Rows ``wanted`` of the table of ``n`` features under ``key``; ``compute`` makes the missing ones."""
+        with timer.stage("cache"):
+            entry = self._cache.load(key)
+        if entry is None or entry["rows"].shape != (n, self._encoder.dim):
+            table, known = np.zeros((n, self._encoder.dim), np.float32), np.zeros(n, bool)
+        else:
+            table, known = entry["rows"], entry["known"]
+        missing = wanted[~known[wanted]]
+        if len(missing):
+            table[missing] = compute(missing)
+            known[missing] = True
+            with timer.stage("cache"):
+                self._cache.save(key, {"rows": table, "known": known})
+        return table[wanted]

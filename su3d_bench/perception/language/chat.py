@@ -37,10 +37,6 @@ class Image:
         assert done, "a picture in memory is packed"
         return packed.tobytes()
 
-    @property
-    def data_url(self) -> str:
-        return "data:image/png;base64," + base64.b64encode(self.png).decode("ascii")
-
     def n_tokens(self, detail: str) -> int:
         """Tokens by OpenAI's rule for GPT-4 with vision: 85, and 170 a tile of 512 pixels unless detail is low."""
         if detail == "low":
@@ -96,10 +92,8 @@ class ChatRequest:
     def body(self) -> dict[str, Any]:
         """The arguments of a chat completion."""
         content: list[dict[str, Any]] = [{"type": "text", "text": self.text}]
-        content += [
-            {"type": "image_url", "image_url": {"url": image.data_url, "detail": self.image_detail}}
-            for image in self.images
-        ]
+        urls = ("data:image/png;base64," + base64.b64encode(image.png).decode("ascii") for image in self.images)
+        content += [{"type": "image_url", "image_url": {"url": url, "detail": self.image_detail}} for url in urls]
         messages: list[dict[str, Any]] = [{"role": "system", "content": self.system}] if self.system else []
         messages.append({"role": "user", "content": content if self.images else self.text})
         body: dict[str, Any] = {

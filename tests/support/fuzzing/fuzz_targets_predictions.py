@@ -164,7 +164,7 @@ def _command_output(folder: Path) -> Read:
 
     write_openyolo3d(folder, TOY)
     n = TOY["masks"].shape[1]
-    return lambda: as_prediction(read_output(folder, TOY["name"], None).content, flat(n), None)
+    return lambda: as_prediction(read_output(folder, TOY["name"], None).content, flat(n), {})
 
 
 def _evaluated(folder: Path) -> Read:
