@@ -74,7 +74,7 @@ class ScanNet:
         self.options = options or ScannetOptions()
         self._scan: tuple[str, AnnotatedScan] | None = None
         self._recording: tuple[str, RgbdSource, Walk] | None = None
-        self._said: set[str] = set()
+        self._warned_of: set[str] = set()
 
     @cached_property
     def tree(self) -> ScanFolders:
@@ -116,8 +116,8 @@ class ScanNet:
         """The usable ones among the first of every ``stride`` frames; a line of the log counts the others once."""
         source, walk = self._open(scene)
         registration = make_registration(source.camera, self.options.grid, self._where(scene))
-        if (line := walk.say_what_is_lost(self._where(scene))) and scene not in self._said:
-            self._said.add(scene)
+        if (line := walk.say_what_is_lost(self._where(scene))) and scene not in self._warned_of:
+            self._warned_of.add(scene)
             logger.warning("%s", line)
         return ScannetFrames(source, registration, walk, walk.every(stride), self._motion(scene))
 

@@ -89,7 +89,7 @@ def _draw_spoken_of(axes: Any, camera: Camera, instances: Instances, spoken_of: 
     halo = [withStroke(linewidth=3, foreground="white")]
     centres = instances.centroids.astype(np.float64)
     for row in spoken_of.answer[:MOST_LABELS]:
-        others = np.array([one for one in spoken_of.reference if one != row and not _touch(instances, one, row)], int)
+        others = np.array([k for k in spoken_of.reference if k != row and not _touch(instances, k, row)], int)
         if len(others):
             nearest = int(others[np.argmin(np.linalg.norm(centres[others] - centres[row], axis=1))])
             ends = project(camera, centres[[row, nearest]])
@@ -128,7 +128,7 @@ def _free_place(corners: Float64Array, name: str, placed: list[Float64Array]) ->
         down = LABEL_HEIGHT / 2 * (step // 2) * (-1 if step % 2 else 1)
         place = start + np.array([0.0, down])
         is_inside = half[1] <= place[1] <= PANEL_HEIGHT - half[1]
-        if is_inside and not any((np.abs(one[:2] - place) < one[2:] + half).all() for one in placed):
+        if is_inside and not any((np.abs(label[:2] - place) < label[2:] + half).all() for label in placed):
             break
     else:
         place = start

@@ -158,7 +158,7 @@ def _draw_ring(shown: UInt8Array, ring: tuple[float, float, float], eye: tuple[f
         away = middle - start
         length = float(np.linalg.norm(away))
         end = middle - away / max(length, 1.0) * min(radius + 3, length)
-        first, last = (tuple(int(v) for v in np.rint(one)) for one in (start, end))
+        first, last = (tuple(int(v) for v in np.rint(point)) for point in (start, end))
         for shade, width in ((HALO, 5), (INK, 2)):
             tip = min(0.3, 12 / max(length, 1))
             cv2.arrowedLine(shown, first, last, shade, width, cv2.LINE_AA, tipLength=tip)
@@ -233,7 +233,7 @@ def _title_lines(title: tuple[str, ...]) -> list[tuple[str, int]]:
         size = TITLE_SIZE if k == 0 else TITLE_SIZE - 6
         wide = 60 if k == 0 else 88
         wrapped = textwrap.wrap(printable(text, 3 * wide), wide) or [""]
-        lines += [(one, size) for one in wrapped]
+        lines += [(line, size) for line in wrapped]
     if len(lines) > MOST_TITLE_LINES:
         lines = [*lines[: MOST_TITLE_LINES - 1], (lines[MOST_TITLE_LINES - 1][0][:56] + "...", TITLE_SIZE)]
     return lines

@@ -227,7 +227,7 @@ def _draw_walk(axes: Any, camera: Camera, poses: Float64Array) -> None:
 def _draw_scale(axes: Any, camera: Camera) -> None:
     """A bar of a round length in the lower left corner."""
     pixels_a_metre = camera.focal / OVERSAMPLING
-    length_m = max((one for one in SCALE_LENGTHS_M if one * pixels_a_metre < 0.3 * PANEL_WIDTH), default=0.1)
+    length_m = max((length for length in SCALE_LENGTHS_M if length * pixels_a_metre < 0.3 * PANEL_WIDTH), default=0.1)
     left, row = 14, PANEL_HEIGHT - 12
     axes.plot([left, left + length_m * pixels_a_metre], [row, row], color="white", linewidth=6, solid_capstyle="butt")
     axes.plot([left, left + length_m * pixels_a_metre], [row, row], color=DARK, linewidth=3, solid_capstyle="butt")

@@ -93,11 +93,11 @@ def _labels(times: Sequence[Sequence[UpdateTimes]]) -> list[str]:
     return [_label(of_method[0].method, of_method[0].run, several_runs) for of_method in times]
 
 
-def _sizes(one: UpdateTimes, against: str, warm_up: int) -> Float64Array | None:
+def _sizes(scene: UpdateTimes, against: str, warm_up: int) -> Float64Array | None:
     """The size at each update after the first ``warm_up``; None where it was not counted."""
     if against == UPDATES:
-        return np.arange(warm_up + 1, len(one) + 1, dtype=np.float64)
-    return one.columns["n_points"][warm_up:] if "n_points" in one.columns else None
+        return np.arange(warm_up + 1, len(scene) + 1, dtype=np.float64)
+    return scene.columns["n_points"][warm_up:] if "n_points" in scene.columns else None
 
 
 def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: str) -> Figure:
@@ -107,9 +107,9 @@ def _update_cost(times: Sequence[Sequence[UpdateTimes]], warm_up: int, against: 
     """
     figure, (axes,) = _figure(7.0, 4.0 + 0.16 * len(times))
     for index, (of_method, label) in enumerate(zip(times, _labels(times), strict=True)):
-        sized = [(one, size) for one in of_method if (size := _sizes(one, against, warm_up)) is not None]
+        sized = [(scene, size) for scene in of_method if (size := _sizes(scene, against, warm_up)) is not None]
         sizes = np.concatenate([size for _, size in sized] or [np.zeros(0)])
-        costs = pooled([one for one, _ in sized], MAP, warm_up)
+        costs = pooled([scene for scene, _ in sized], MAP, warm_up)
         usable = (sizes > 0) & (costs > 0)
         if not usable.any():
             continue
@@ -154,7 +154,7 @@ def medians_by_size(sizes: Float64Array, costs: Float64Array) -> tuple[Float64Ar
 def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int) -> Figure:
     """The mean update of each method, stacked by stage."""
     figure, (axes,) = _figure(7.0, 1.6 + 0.45 * len(times))
-    stages = list(dict.fromkeys(stage for of_method in times for one in of_method for stage in one.stages))
+    stages = list(dict.fromkeys(stage for of_method in times for scene in of_method for stage in scene.stages))
     left = np.zeros(len(times))
     rows = np.arange(len(times))
     for index, stage in enumerate(stages):
@@ -176,9 +176,10 @@ def _memory(times: Sequence[Sequence[UpdateTimes]]) -> Figure:
     figure, panels = _figure(4.8, 3.2 + 0.16 * len(times), 2)
     for axes, (column, against) in zip(panels, (("map_bytes", POINTS), ("rss_bytes", UPDATES)), strict=True):
         for index, (of_method, label) in enumerate(zip(times, _labels(times), strict=True)):
-            sized = [(one, _sizes(one, against, 0)) for one in of_method if column in one.columns]
-            sizes = np.concatenate([size for _, size in sized if size is not None] or [np.zeros(0)])
-            values = np.concatenate([one.columns[column] for one, size in sized if size is not None] or [np.zeros(0)])
+            counted = [scene for scene in of_method if column in scene.columns]
+            sized = [(scene, size) for scene in counted if (size := _sizes(scene, against, 0)) is not None]
+            sizes = np.concatenate([size for _, size in sized] or [np.zeros(0)])
+            values = np.concatenate([scene.columns[column] for scene, _ in sized] or [np.zeros(0)])
             if not (sizes > 0).any():
                 continue
             x, y = medians_by_size(sizes[sizes > 0], values[sizes > 0] / MIB)
@@ -204,16 +205,16 @@ def _one_legend(figure: Figure, panels: Sequence[Axes]) -> None:
 
 def _anytime(points: Sequence[AnytimePoint]) -> Figure:
     """Each headline metric of each protocol against the seconds until the map was there."""
-    panels = list(dict.fromkeys((one.protocol, name) for one in points for name in one.metrics))
+    panels = list(dict.fromkeys((point.protocol, name) for point in points for name in point.metrics))
     figure, all_axes = _figure(3.5, 3.4, len(panels))
-    several = len({one.run for one in points}) > 1
+    several = len({point.run for point in points}) > 1
     for axes, (protocol, name) in zip(all_axes, panels, strict=True):
-        curves = dict.fromkeys((one.run, one.method) for one in points)
+        curves = dict.fromkeys((point.run, point.method) for point in points)
         for index, (run, method) in enumerate(curves):
-            mine = [one for one in points if (one.run, one.method, one.protocol) == (run, method, protocol)]
-            values = [100.0 * value if (value := one.metrics.get(name)) is not None else np.nan for one in mine]
+            mine = [point for point in points if (point.run, point.method, point.protocol) == (run, method, protocol)]
+            values = [100.0 * value if (value := point.metrics.get(name)) is not None else np.nan for point in mine]
             label = _label(method, run, several)
-            axes.plot([one.seconds for one in mine], values, markersize=4, label=label, **_style(index))
+            axes.plot([point.seconds for point in mine], values, markersize=4, label=label, **_style(index))
         axes.set(xlabel="seconds", ylabel=f"{name} (%)", title=protocol)
         axes.grid(True, color="0.85", linewidth=0.6)
     _one_legend(figure, all_axes)

@@ -137,7 +137,7 @@ class _Storages:
 
     def __init__(self, archive: zipfile.ZipFile, prefix: str, path: Path) -> None:
         self._archive, self._prefix, self._path = archive, prefix, path
-        self._found: dict[str, bytes] = {}
+        self._contents: dict[str, bytes] = {}
         self._n_file = path.stat().st_size
         self._order = "<"
         if f"{prefix}byteorder" in archive.namelist():
@@ -158,13 +158,13 @@ class _Storages:
         name, n = key[2], key[4]
         if not isinstance(name, str) or re.fullmatch(r"\d{1,9}", name) is None or type(n) is not int:
             raise RefusedError("a reference without a valid name or size")
-        if name not in self._found:
+        if name not in self._contents:
             content = read_member(self._archive, f"{self._prefix}data/{name}", str(self._path))
-            self._found[name] = content
-            if sum(len(content) for content in self._found.values()) > self._n_file:
+            self._contents[name] = content
+            if sum(len(content) for content in self._contents.values()) > self._n_file:
                 raise RefusedError("its storages are larger than the file; torch.save does not compress them")
         code = CODES.get(key[1].name.removesuffix("Storage"))
-        content = self._found[name]
+        content = self._contents[name]
         if code is not None and n * int(code[-1]) != len(content):
             raise RefusedError(f"storage {name} of {n} values has {len(content)} bytes")
         return Storage(content, code, self._order)
