@@ -19,7 +19,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, UInt8Array
-from su3d_bench.datasets.recordings.recorded_frames import numbers, read_text
+from su3d_bench.datasets.recordings.recorded_frames import read_text, square
 from su3d_bench.datasets.recordings.source import SensorPair
 from su3d_bench.formats.images import Size, UInt16Array, decode_colour, decode_depth, image_size, read_bytes, sized
 
@@ -107,15 +107,6 @@ def read_matrix(folder: Path, name: str, where: str, sides: Sequence[int] = (4,)
     """The square matrix, of as many rows as one of ``sides``, in a text file; its numbers may be not finite."""
     where = f"{where}: {name}"
     return square(read_text(folder / name, where, EXPORT_AGAIN).split(), where, sides)
-
-
-def square(words: Sequence[str], where: str, sides: Sequence[int] = (4,)) -> Float64Array:
-    """The words as the numbers of a square matrix, row by row."""
-    for side in sides:
-        if len(words) == side * side:
-            return np.array(numbers(words, where)).reshape(side, side)
-    expected = " or ".join(f"{side * side}, a {side}x{side} matrix" for side in sides)
-    raise DataError(f"{where} has {len(words)} values; expected {expected}")
 
 
 def read_size(folder: Path, name: str, where: str) -> Size:

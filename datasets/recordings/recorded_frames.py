@@ -65,6 +65,15 @@ def numbers(words: Sequence[str], where: str) -> list[float]:
     return values
 
 
+def square(words: Sequence[str], where: str, sides: Sequence[int] = (4,)) -> Float64Array:
+    """The words as the numbers of a square matrix, row by row."""
+    for side in sides:
+        if len(words) == side * side:
+            return np.array(numbers(words, where)).reshape(side, side)
+    expected = " or ".join(f"{side * side}, a {side}x{side} matrix" for side in sides)
+    raise DataError(f"{where} has {len(words)} values; expected {expected}")
+
+
 class Folder:
     """A folder whose files are named by other files: a name that leads out of it is a ``DataError``."""
 

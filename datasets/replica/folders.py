@@ -106,20 +106,21 @@ def original_name(scene: str) -> str:
 
 def find_original_scene(root: Path, scene: str) -> Path | None:
     """The folder of the original release with ``habitat/`` in it; None where no tree below ``root`` has it."""
-    for name in ORIGINAL_FOLDERS:
-        for scene_name in dict.fromkeys((original_name(scene), scene)):
-            if (root / name / scene_name / "habitat").is_dir():
-                return root / name / scene_name
-    return None
+    return _scene_with("habitat", root, ORIGINAL_FOLDERS, scene)
 
 
 def find_semantic_sequence(root: Path, scene: str) -> Path | None:
     """The folder ``Sequence_1`` with ConceptGraphs' fused clouds of the scene; None where there is none."""
-    for name in SEMANTIC_FOLDERS:
+    folder = _scene_with(f"Sequence_1/{FUSED_CLOUD}", root, SEMANTIC_FOLDERS, scene)
+    return None if folder is None else folder / "Sequence_1"
+
+
+def _scene_with(part: str, root: Path, folders: tuple[str, ...], scene: str) -> Path | None:
+    """The first folder of the scene, in one of ``folders``, in which there is a folder ``part``."""
+    for name in folders:
         for scene_name in dict.fromkeys((original_name(scene), scene)):
-            sequence = root / name / scene_name / "Sequence_1"
-            if (sequence / FUSED_CLOUD).is_dir():
-                return sequence
+            if (root / name / scene_name / part).is_dir():
+                return root / name / scene_name
     return None
 
 

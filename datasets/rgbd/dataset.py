@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, field_validator
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, GroundTruth, InstanceMesh, SceneInfo, Surface
+from su3d_bench.datasets.recordings.exported_frames import read_matrix
 from su3d_bench.datasets.recordings.meshes import read_surface
 from su3d_bench.datasets.recordings.pose_convention import ROTATED, judge_convention
 from su3d_bench.datasets.recordings.recorded_frames import (
@@ -35,7 +36,6 @@ from su3d_bench.datasets.rgbd.files import (
     camera_to_world,
     files_of,
     read_intrinsics,
-    read_pose_file,
     read_trajectory_file,
 )
 
@@ -208,8 +208,8 @@ def _poses(folder: Folder, description: RgbdDescription, images: list[int], wher
         pose_of = {}
         names = files_of(folder, description.pose, place)
         for number, name in names.items():
-            values = read_pose_file(folder.path / name, f"{where}: {name}")
-            pose_of[number] = camera_to_world(values, description, f"{where}: {name}")
+            matrix = read_matrix(folder.path, name, where)
+            pose_of[number] = camera_to_world(matrix, description, f"{where}: {name}")
         return _Poses(pose_of, {}, tuple(folder.path / name for name in names.values()))
     assert description.trajectory is not None
     path, where = folder.file(description.trajectory, place), f"{where}: {description.trajectory}"
@@ -225,7 +225,7 @@ def _poses(folder: Folder, description: RgbdDescription, images: list[int], wher
             )
         )
     rows = zip(numbers, matrices, strict=True)
-    pose_of = {n: camera_to_world(values, description, f"{where}, pose {k}") for k, (n, values) in enumerate(rows)}
+    pose_of = {n: camera_to_world(matrix, description, f"{where}, pose {k}") for k, (n, matrix) in enumerate(rows)}
     return _Poses(pose_of, dict(zip(numbers, times_s or (), strict=False)), (path,))
 
 

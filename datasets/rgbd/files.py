@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Sequence
 from fnmatch import fnmatchcase
@@ -13,7 +12,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array
-from su3d_bench.datasets.recordings.recorded_frames import Folder, numbers, pinhole, read_text
+from su3d_bench.datasets.recordings.recorded_frames import Folder, numbers, parsed_json, pinhole, read_text, square
 from su3d_bench.datasets.rgbd.description import INDEX, RgbdDescription
 from su3d_bench.datasets.tum.timed_poses import quaternion_poses, rows_of, seconds, unit_quaternion
 from su3d_bench.numerics.geometry import are_rigid
@@ -73,28 +72,21 @@ def _numeric_order(name: str) -> tuple[list[int], str]:
     return [int(digits) for digits in re.findall(r"[0-9]{1,18}", name)], name
 
 
-def read_pose_file(path: Path, where: str) -> list[float]:
-    """The 16 numbers of a 4x4 matrix, row by row."""
-    words = read_text(path, where).split()
-    if len(words) != 16:
-        raise DataError(f"{where} has {len(words)} values; expected 16, a 4x4 matrix")
-    return numbers(words, where)
-
-
-def read_trajectory_file(path: Path, form: str, where: str) -> tuple[list[list[float]], list[float] | None]:
-    """The 16 numbers of each pose, row by row, and the times in seconds where the file has them."""
+def read_trajectory_file(path: Path, form: str, where: str) -> tuple[Float64Array, list[float] | None]:
+    """The matrix of each pose (n, 4, 4), and the times in seconds where the file has them."""
     if form == "open3d":
-        return _open3d_log(read_text(path, where).split("\n"), where), None
+        return np.array(_open3d_log(read_text(path, where).split("\n"), where)).reshape(-1, 4, 4), None
     if form == "kitti":
         rows = rows_of(path, where, 12, "12 numbers, the upper rows of a 4x4 matrix")
-        return [[*numbers(words, f"{where} line {n}"), 0.0, 0.0, 0.0, 1.0] for n, words in rows], None
-    matrices, times_s = [], []
+        upper = np.array([numbers(words, f"{where} line {n}") for n, words in rows]).reshape(-1, 3, 4)
+        return np.concatenate([upper, np.tile([0.0, 0.0, 0.0, 1.0], (len(rows), 1, 1))], axis=1), None
+    values, times_s = [], []
     for n, words in rows_of(path, where, 8, "'time tx ty tz qx qy qz qw'"):
-        values = numbers(words[1:], f"{where} line {n}")
+        row = numbers(words[1:], f"{where} line {n}")
         times_s.append(seconds(words[0], f"{where} line {n}"))
-        quaternion = unit_quaternion(values[3:], f"{where} line {n}")
-        matrices.append(quaternion_poses(np.array([values[:3]]), np.array([quaternion]))[0].reshape(-1).tolist())
-    return matrices, times_s
+        values.append([*row[:3], *unit_quaternion(row[3:], f"{where} line {n}")])
+    table = np.array(values)
+    return quaternion_poses(table[:, :3], table[:, 3:]), times_s
 
 
 def _open3d_log(lines: list[str], where: str) -> list[list[float]]:
@@ -117,9 +109,8 @@ def _open3d_log(lines: list[str], where: str) -> list[list[float]]:
     return matrices
 
 
-def camera_to_world(values: Sequence[float], description: RgbdDescription, where: str) -> Pose:
-    """The pose with OpenCV axes out of 16 numbers as the description says they are meant."""
-    matrix = np.array(values).reshape(4, 4)
+def camera_to_world(matrix: Float64Array, description: RgbdDescription, where: str) -> Pose:
+    """The pose with OpenCV axes out of a matrix (4, 4) that is meant as the description says."""
     if not np.isfinite(matrix).all():
         return None
     if np.abs(matrix[:3, 3]).max() > MAX_DISTANCE_M or not are_rigid(matrix[None])[0]:
@@ -134,18 +125,11 @@ def read_intrinsics(path: Path, where: str) -> tuple[Float64Array, tuple[int, in
     text = read_text(path, where)
     if path.suffix == ".json":
         return _open3d_camera(text, where)
-    values = numbers(text.split(), where)
-    if len(values) not in (9, 16):
-        raise DataError(f"{where} has {len(values)} values; expected a 3x3 matrix, or a 4x4 one")
-    side = 3 if len(values) == 9 else 4
-    return _pinhole_matrix(np.array(values).reshape(side, side)[:3, :3], where), None
+    return _pinhole_matrix(square(text.split(), where, (3, 4))[:3, :3], where), None
 
 
 def _open3d_camera(text: str, where: str) -> tuple[Float64Array, tuple[int, int]]:
-    try:
-        content = json.loads(text)
-    except (ValueError, RecursionError) as error:
-        raise DataError(f"{where}: not JSON; copy the file again") from error
+    content = parsed_json(text, where)
     if isinstance(content, dict) and isinstance(content.get("intrinsic"), dict):
         content = content["intrinsic"]  # of Open3D's PinholeCameraParameters
     values = content.get("intrinsic_matrix") if isinstance(content, dict) else None

@@ -31,9 +31,8 @@ from su3d_bench.datasets.recordings.exported_frames import (
     list_folder,
     read_matrix,
     read_size,
-    square,
 )
-from su3d_bench.datasets.recordings.recorded_frames import numbers, read_text, reading
+from su3d_bench.datasets.recordings.recorded_frames import numbers, read_text, reading, square
 from su3d_bench.datasets.recordings.source import RgbdSource, SensorPair
 from su3d_bench.datasets.scannet.sens.header import MAX_HEADER_BYTES, header_bytes, parse_header
 from su3d_bench.datasets.scannet.sens.read import SensSource

@@ -19,9 +19,10 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.config import write_toml
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.datasets.recordings.pose_convention import FLIP
+from su3d_bench.datasets.recordings.recorded_frames import read_text, square
 from su3d_bench.datasets.rgbd.dataset import Rgbd, RgbdOptions
 from su3d_bench.datasets.rgbd.description import RgbdDescription
-from su3d_bench.datasets.rgbd.files import camera_to_world, read_intrinsics, read_pose_file, read_trajectory_file
+from su3d_bench.datasets.rgbd.files import camera_to_world, read_intrinsics, read_trajectory_file
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 
 WIDTH, HEIGHT = 12, 8
@@ -402,7 +403,7 @@ def write_room(root: Path, direction: str, axes: str) -> Path:
 
 
 def read_pose(path: Path, where: str) -> None:
-    camera_to_world(read_pose_file(path, where), DESCRIPTION, where)
+    camera_to_world(square(read_text(path, where).split(), where), DESCRIPTION, where)
 
 
 def read_log(path: Path, where: str) -> None:
