@@ -19,7 +19,7 @@ from su3d_bench.reports.tables.model import (
     text_table,
 )
 from su3d_bench.reports.tables.paper import Shown, protocol_table, reported_rows
-from su3d_bench.reports.tables.published import Figure, PaperTable, published
+from su3d_bench.reports.tables.published import Figure, PaperTable, figures_of
 
 OWN_NAMES = {"merge-accuracy": "well-merged"}  # the paper's name: ours
 
@@ -64,7 +64,7 @@ def judged_table(number: PaperTable, found: Sequence[Measured], shown: Shown, *,
         )
     tables = []
     for dataset in dict.fromkeys(one.datasets for one in rows if one.per_scene):
-        figures = [one for one in published() if one.table == number] if with_published else []
+        figures = figures_of(is_wanted=with_published, table=number)
         of_dataset = [one for one in rows if one.datasets == dataset or not one.per_scene]
         tables.append(_dataset_table(number, layout, dataset, of_dataset, figures, shown))
     return tables

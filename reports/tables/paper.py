@@ -22,7 +22,7 @@ from su3d_bench.reports.tables.model import (
     percent,
     some,
 )
-from su3d_bench.reports.tables.published import Figure, PaperTable, published
+from su3d_bench.reports.tables.published import Figure, PaperTable, figures_of
 
 LEVEL = 0.05
 PAPER_DATA = "replica"  # of Tables II and III
@@ -70,7 +70,7 @@ def paper_table(number: PaperTable, found: Sequence[Measured], shown: Shown, *, 
         )
     names = list(dict.fromkeys(one.protocol for one in fitting))
     names = [layout.protocol] if layout.protocol in names else names
-    figures = [figure for figure in published() if figure.table == number] if with_published else []
+    figures = figures_of(is_wanted=with_published, table=number)
     tables = []
     for name in names:
         rows = [one for one in fitting if one.protocol == name]
@@ -93,12 +93,9 @@ def selection_tables(found: Sequence[Measured], shown: Shown, *, with_published:
         if known.issuperset(metrics):  # else the table says which is known nowhere
             metrics = tuple(metric for metric in metrics if metric in rows[0].metrics)
         if metrics or not shown.metrics:
-            tables.append(protocol_table(rows, replace(shown, metrics=metrics), _figures(name, with_published)))
+            figures = figures_of(is_wanted=with_published, protocol=name)
+            tables.append(protocol_table(rows, replace(shown, metrics=metrics), figures))
     return tables
-
-
-def _figures(protocol: str, with_published: bool) -> list[Figure]:
-    return [figure for figure in published() if figure.protocol == protocol] if with_published else []
 
 
 def protocol_table(measured: Sequence[Measured], shown: Shown, figures: Sequence[Figure]) -> Table:
@@ -325,7 +322,7 @@ def ablation_table(
         labels = [one.method if one.is_whole else f"{one.method} ({one.scenes_text} scenes)" for one in own]
         notes |= dict.fromkeys(run_notes(own, labels))
     is_papers = with_published and sweep[0].method.partition("@")[0] == "opensu3d"
-    figures = [figure for figure in published() if figure.table == "I"] if is_papers else []
+    figures = figures_of(is_wanted=is_papers, table="I")
     reported, sources = reported_rows(figures, METRICS, len(METRICS))
     body = (*rows, *map(_named, reported))
     return Table("I", "Ablation of single parameters.", "parameter", METRICS, body, (*notes, *marks, *sources))

@@ -10,7 +10,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from su3d_bench.core.errors import ConfigError, printable
+from su3d_bench.core.errors import ConfigError, printable, reading
 
 FILE = Path(__file__).resolve().parent / "published.toml"
 MOST_BYTES = 1 << 20
@@ -60,10 +60,8 @@ class _File(BaseModel):
 def read_published(path: Path = FILE) -> tuple[Figure, ...]:
     """Every figure of a file such as ``published.toml``; ``ConfigError`` with one line where it is not of that form."""
     shown = printable(path.name, 100)
-    try:
+    with reading(shown, ConfigError):
         content = path.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{shown}: cannot be read: {error.strerror}") from error
     if len(content) > MOST_BYTES:
         raise ConfigError(f"{shown}: has {len(content)} bytes; expected at most {MOST_BYTES}")
     try:
@@ -99,6 +97,7 @@ def published() -> tuple[Figure, ...]:
     return read_published()
 
 
-def figures_of(method: str) -> tuple[Figure, ...]:
-    """What is reported of one method."""
-    return tuple(one for one in published() if one.method == method)
+def figures_of(*, is_wanted: bool = True, **fields: str) -> list[Figure]:
+    """What is reported where each of ``fields`` is as given, such as ``method="sam3d"``; none where not wanted."""
+    figures = published() if is_wanted else ()
+    return [figure for figure in figures if all(getattr(figure, name) == value for name, value in fields.items())]

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from su3d_bench.analysis.sides import Side, refuse_unlike, rules_of
-from su3d_bench.core.errors import ConfigError, Su3dError, printable, suggest
+from su3d_bench.core.errors import ConfigError, Su3dError, printable, reading, suggest
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.scoring import ProtocolResult, combine
 from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
@@ -261,10 +261,8 @@ def _read_from(folder: Path, name: str) -> Path | None:
 
 def _source_text(file: Path) -> str:
     shown = printable(str(file), 200)
-    try:
+    with reading(shown, ConfigError):
         content = file.read_bytes()
-    except OSError as error:
-        raise ConfigError(f"{shown}: cannot be read: {error.strerror}") from error
     if len(content) > MOST_SOURCE_BYTES:
         raise ConfigError(f"{shown}: has {len(content)} bytes; a paper's source has at most {MOST_SOURCE_BYTES}")
     return content.decode("utf-8", "replace")

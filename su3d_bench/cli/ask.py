@@ -15,7 +15,6 @@ from su3d_bench.cli.common import (
     answer_json,
     chat_client,
     file_name_of,
-    language_config,
     remark,
 )
 from su3d_bench.cli.query import asked_map
@@ -117,10 +116,8 @@ def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) ->
     if arguments.solver != "llm":
         answer("the built-in solver asks no model: nothing to pay")
         return EXIT_DONE
-    config = language_config(arguments)
-    client = chat_client(arguments, run, config)
-    request = LanguageSolver(scene, client, config).request(arguments.question)
-    return answer_estimate(arguments, client, [request])
+    client, config = chat_client(arguments, run)
+    return answer_estimate(arguments, client, [LanguageSolver(scene, client, config).request(arguments.question)])
 
 
 def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> Answer:
@@ -130,8 +127,7 @@ def _solve(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> An
     from su3d_bench.questions.reasoning.solver import Solver
 
     if arguments.solver == "llm":
-        config = language_config(arguments)
-        return LanguageSolver(scene, chat_client(arguments, run, config), config).answer(arguments.question)
+        return LanguageSolver(scene, *chat_client(arguments, run)).answer(arguments.question)
     eye = None if arguments.eye is None else np.array(arguments.eye, np.float64)
     if eye is not None and not np.isfinite(eye).all():
         raise ConfigError(f"--eye {arguments.eye}: expected three finite numbers of metres")

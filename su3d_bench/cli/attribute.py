@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer_either, formatted, remark
+from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer_either, formatted, remark
 from su3d_bench.core.errors import EXIT_DONE
 
 
@@ -23,14 +23,7 @@ def add_parser(verbs: Any) -> None:
     )
     parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a run")
     parser.add_argument("--method", help="whose predictions (default: the run's only method)")
-    parser.add_argument(
-        "--protocol",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="P",
-        help="under these protocols alone (default: all of kind instance or semantic)",
-    )
+    add_protocols(parser, "under these protocols alone (default: all of kind instance or semantic)")
     parser.add_argument(
         "--oracle", type=Path, metavar="RUN", help="the same run with --profile oracle: what perfect 2D masks give"
     )

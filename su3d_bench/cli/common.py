@@ -84,6 +84,11 @@ def add_settings(parser: argparse.ArgumentParser, description: str) -> None:
     parser.add_argument("--set", nargs="+", action="extend", default=[], metavar="KEY=VALUE", help=description)
 
 
+def add_protocols(parser: argparse.ArgumentParser, description: str, metavar: str = "P") -> None:
+    """``--protocol NAME...``, which may be given several times; ``description`` says what is done under them."""
+    parser.add_argument("--protocol", nargs="+", action="extend", default=[], metavar=metavar, help=description)
+
+
 def add_whose_map(parser: argparse.ArgumentParser) -> None:
     """``--run`` and ``--method``: the map that is asked."""
     parser.add_argument(
@@ -178,11 +183,16 @@ def add_language_flags(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--dry-run", action="store_true", help="say what asking would cost, and ask nothing")
 
 
-def language_config(arguments: argparse.Namespace) -> LanguageConfig:
-    """The settings of the file, then ``--set``, then the flags; keys of other sections are left to other verbs."""
+def chat_client(arguments: argparse.Namespace, run: RunFolder) -> tuple[ChatClient, LanguageConfig]:
+    """The client whose replies are kept in the folder ``language`` of the run, and its settings.
+
+    Those of the file, then ``--set``, then the flags; keys of other sections are left to other verbs.
+    """
     from su3d_bench.core.config import Setting, Settings, read_assignments, read_file, resolve
     from su3d_bench.core.errors import ConfigError
+    from su3d_bench.perception.language.client import ChatClient
     from su3d_bench.perception.language.config import LanguageConfig
+    from su3d_bench.perception.language.reply_store import ReplyStore
 
     settings = Settings() if arguments.config is None else read_file(arguments.config)
     assigned = read_assignments(arguments.set, (), ())
@@ -191,16 +201,9 @@ def language_config(arguments: argparse.Namespace) -> LanguageConfig:
             raise ConfigError(f"{entry.source}: only perception.language.KEY=VALUE is of use here")
     flags = [("text_model", "--model", arguments.model), ("base_url", "--base-url", arguments.base_url)]
     given = tuple(Setting((*PREFIX, key), value, flag) for key, flag, value in flags if value is not None)
-    return resolve(settings + assigned + Settings(given), PREFIX, LanguageConfig)
-
-
-def chat_client(arguments: argparse.Namespace, run: RunFolder, config: LanguageConfig) -> ChatClient:
-    """The client whose replies are kept in the folder ``language`` of the run."""
-    from su3d_bench.perception.language.client import ChatClient
-    from su3d_bench.perception.language.reply_store import ReplyStore
-
+    config = resolve(settings + assigned + Settings(given), PREFIX, LanguageConfig)
     store = ReplyStore(run.path / "language")
-    return ChatClient(config, store, offline=arguments.offline, ask_failed_again=arguments.ask_failed_again)
+    return ChatClient(config, store, offline=arguments.offline, ask_failed_again=arguments.ask_failed_again), config
 
 
 @contextmanager

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer_either, formatted
+from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer_either, formatted
 from su3d_bench.core.errors import EXIT_DONE
 
 
@@ -23,14 +23,7 @@ def add_parser(verbs: Any) -> None:
     parser.add_argument("left", metavar="A", help="the folder of a run, or FOLDER:METHOD")
     parser.add_argument("right", metavar="B", help="the run that is held against it; differences are B - A")
     parser.add_argument("--method", help="compare this method alone (default: all of the same name)")
-    parser.add_argument(
-        "--protocol",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="P",
-        help="under these protocols alone (default: all that scored both)",
-    )
+    add_protocols(parser, "under these protocols alone (default: all that scored both)")
     parser.add_argument("--per-class", action="store_true", help="each class too")
     add_table_format(parser)
 

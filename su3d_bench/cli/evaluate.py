@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer, formatted, remark, written
+from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer, formatted, remark, written
 from su3d_bench.core.errors import EXIT_DONE
 
 
@@ -39,14 +39,7 @@ def add_parser(verbs: Any) -> None:
         help="ground truth as text instead, <scene>.txt with label * 1000 + instance a vertex, or label ids; or "
         "OpenLex3D's release",
     )
-    parser.add_argument(
-        "--protocol",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="PROTOCOL",
-        help="evaluations (default: all that fit)",
-    )
+    add_protocols(parser, "evaluations (default: all that fit)", "PROTOCOL")
     parser.add_argument("--scenes", nargs="+", default=[], metavar="SCENE", help="names or patterns (default: all)")
     parser.add_argument("--format", metavar="FORMAT", help="of the predictions, where it cannot be recognised")
     parser.add_argument(

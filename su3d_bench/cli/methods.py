@@ -64,7 +64,7 @@ def _show(arguments: argparse.Namespace) -> int:
     method = registry.load("method", arguments.name)
     defaults = method.Config().model_dump(mode="json")
     row = _about(method.name, method)
-    figures = [figure.model_dump(mode="json", exclude_none=True) for figure in figures_of(method.name)]
+    figures = [figure.model_dump(mode="json", exclude_none=True) for figure in figures_of(method=method.name)]
     if arguments.json:
         answer_json({**row, "settings": defaults, "published": figures})
         return EXIT_DONE

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,7 +14,6 @@ from su3d_bench.cli.common import (
     answer_estimate,
     answer_json,
     chat_client,
-    language_config,
     remark,
 )
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError, suggest
@@ -96,13 +94,9 @@ def _jobs(arguments: argparse.Namespace) -> dict[str, JobFolder]:
 def _scenes(run: RunFolder) -> list[str]:
     """The scenes that the run was asked for."""
     from su3d_bench.core.errors import printable
-    from su3d_bench.store.atomic import read_json
-    from su3d_bench.store.records import RequestRecord, checked
+    from su3d_bench.store.records import RequestRecord, read_record
 
-    scenes: tuple[str, ...] = ()
-    record = read_json(run.path / "run.json")
-    with suppress(ValueError, RecursionError):  # pydantic's errors are of value
-        scenes = checked(RequestRecord, record).scenes
+    scenes = read_record(RequestRecord, run.path / "run.json", str(run.path)).scenes
     if not scenes or any(".." in scene for scene in scenes):
         raise StoreError(f"{run.path}: run.json is not as a run writes it; name the folder of a run")
     return [printable(scene, 200) for scene in scenes]
@@ -127,8 +121,7 @@ def _estimate(tops: dict[str, list[TopNames]], arguments: argparse.Namespace) ->
     if arguments.refiner != "model":
         answer("the vote asks no model: nothing to pay")
         return EXIT_DONE
-    config = language_config(arguments)
-    client = chat_client(arguments, RunFolder(arguments.run), config)
+    client, config = chat_client(arguments, RunFolder(arguments.run))
     refiner = ModelRefiner(client, config)
     requests = [request for of_scene in tops.values() for request in refiner.requests(of_scene)]
     return answer_estimate(arguments, client, requests)
@@ -143,8 +136,8 @@ def _refine(
 
     if arguments.refiner == "vote":
         return {scene: [vote(top) for top in of_scene] for scene, of_scene in tops.items()}, ""
-    config = language_config(arguments)
-    refiner = ModelRefiner(chat_client(arguments, RunFolder(arguments.run), config), config)
+    client, config = chat_client(arguments, RunFolder(arguments.run))
+    refiner = ModelRefiner(client, config)
     return {scene: refiner.refine(of_scene) for scene, of_scene in tops.items()}, config.text_model
 
 

@@ -15,25 +15,6 @@ if TYPE_CHECKING:
     from su3d_bench.runs.plan import Plan
     from su3d_bench.runs.runner import RunResult
 
-FLAGS_OF_KEYS = (
-    "scenes",
-    "methods",
-    "profile",
-    "protocols",
-    "stride",
-    "seed",
-    "limit",
-    "jobs",
-    "pictures",
-    "offline",
-    "anytime",
-    "executor",
-    "ray_address",
-    "gpus_per_job",
-    "retries",
-    "slurm",
-)
-
 
 def add_parser(verbs: Any) -> None:
     parser = add_verb(
@@ -127,10 +108,10 @@ def plan_of(arguments: argparse.Namespace) -> Plan:
 
 def settings_of(arguments: argparse.Namespace) -> Settings:
     """The file's settings, then those of the flags, which win."""
-    from su3d_bench.core.config import Setting, Settings, read_file
+    from su3d_bench.core.config import RunConfig, Setting, Settings, read_file
 
     settings = Settings() if arguments.config is None else read_file(arguments.config)
-    flags: list[tuple[KeyPath, Any]] = [((name,), getattr(arguments, name)) for name in FLAGS_OF_KEYS]
+    flags: list[tuple[KeyPath, Any]] = [((name,), getattr(arguments, name)) for name in RunConfig.model_fields]
     flags.append((("perception", "models", "device"), arguments.device))
     return settings + Settings(
         tuple(Setting(key, value, f"--{key[-1].replace('_', '-')}") for key, value in flags if value is not None)

@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from su3d_bench.core import registry
 from su3d_bench.core.config import parse_value, toml_value
@@ -32,6 +32,9 @@ class AblationRow:
     value: str
     method: str
     is_default: bool
+
+
+_ROWS = TypeAdapter(tuple[AblationRow, ...])
 
 
 @dataclass(frozen=True)
@@ -127,9 +130,6 @@ def read_rows(folder: Path) -> tuple[AblationRow, ...]:
         raise StoreError(f"{folder}: holds no {FILE}; make a sweep with su3d-bench ablate --vary KEY=V1,V2")
     value = read_json(folder / FILE)
     try:
-        return tuple(
-            AblationRow(str(one["parameter"]), str(one["value"]), str(one["method"]), bool(one["is_default"]))
-            for one in value["rows"]
-        )
-    except (TypeError, KeyError, RecursionError) as error:
+        return _ROWS.validate_python(value["rows"])
+    except (TypeError, KeyError, ValidationError, RecursionError) as error:
         raise StoreError(f"{folder}: {FILE} is not as ablate writes it; run the sweep again") from error

@@ -10,13 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
-from su3d_bench.core import registry
 from su3d_bench.core.config import KeyPath, Settings, read_file, resolve
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, StoreError, printable, suggest
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.scoring import SceneScore, unpack_scores
-from su3d_bench.runs.job import Part, build_dataset
+from su3d_bench.runs.job import build_dataset, part_of
 from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets
 from su3d_bench.store.atomic import is_file
 from su3d_bench.store.records import (
@@ -54,9 +53,8 @@ class RunData:
         addresses = {entry.path: entry.value for entry in self.settings.entries}.get(("scenes",), ())
         found = {}
         for target in dataset_targets([str(address) for address in addresses]):
-            name = str(registry.load("dataset", target).name)
-            options = resolve(self.settings, ("dataset", name), registry.load("dataset", target).Options)
-            found[name] = build_dataset(Part(target, name, options.model_dump_json()), data_root())
+            part = part_of("dataset", target, self.settings)
+            found[part.name] = build_dataset(part, data_root())
         return found
 
     def dataset(self, scene: str) -> Any:
@@ -231,18 +229,7 @@ def read_update_times(run: FinishedRun, method: str) -> list[UpdateTimes]:
         columns = read_updates(job.updates, where)
         if columns and len(columns["total_ms"]):
             costs = _costs(job.remarks("predict").get("costs"), where)
-            times.append(
-                UpdateTimes(
-                    run.name,
-                    scene,
-                    method,
-                    columns,
-                    costs.maps,
-                    costs.peak_rss_bytes,
-                    costs.device_bytes,
-                    costs.calibration_ms,
-                )
-            )
+            times.append(UpdateTimes(run.name, scene, method, columns, **vars(costs)))
     return times
 
 

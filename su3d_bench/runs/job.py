@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core import registry
-from su3d_bench.core.config import flatten
+from su3d_bench.core.config import Settings, flatten, resolve
 from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_json, package_versions
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.interfaces import HasCaveat, HasInputs, HasOwnPerception, Method, ReadsMadeRooms
@@ -114,6 +114,17 @@ def refuse_other_run(folder: JobFolder, key: Mapping[str, str], known_later: Seq
         raise StoreError(
             f"{folder.path}: holds another run ({changed}); choose another folder with --out or delete this one"
         )
+
+
+def options_model(kind: str, target: str) -> Any:
+    """The model of the options of a dataset, or of the settings of a method."""
+    return getattr(registry.load(kind, target), "Config" if kind == "method" else "Options")
+
+
+def part_of(kind: str, target: str, settings: Settings) -> Part:
+    """The dataset or method at ``target`` with what ``settings`` say of it."""
+    name = str(registry.load(kind, target).name)
+    return Part(target, name, resolve(settings, (kind, name), options_model(kind, target)).model_dump_json())
 
 
 def build_dataset(part: Part, data_root: Path) -> Any:

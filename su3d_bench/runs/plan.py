@@ -38,6 +38,8 @@ from su3d_bench.runs.job import (
     SceneJob,
     build_method,
     config_key,
+    options_model,
+    part_of,
     refuse_other_run,
 )
 from su3d_bench.runs.remote.data import DataPlace, RemoteData, data_place
@@ -149,8 +151,8 @@ def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | s
         device_for(perception.models.device, 0)  # raises where there is no such GPU
     parts = _Parts(
         tuple(_method_part(one, settings) for one in methods.values()),
-        {target: _part("dataset", target, settings) for target in datasets.values()},
-        None if CEILING_METHOD in methods else _part("method", CEILING_METHOD, settings),
+        {target: part_of("dataset", target, settings) for target in datasets.values()},
+        None if CEILING_METHOD in methods else part_of("method", CEILING_METHOD, settings),
         perception.model_dump_json(),
         protocols_of_run(config.protocols, list(datasets.values())),
     )
@@ -187,26 +189,15 @@ class _Parts:
     protocols: dict[str, tuple[str, ...]]
 
 
-def _options_model(kind: str, target: str) -> Any:
-    return getattr(registry.load(kind, target), "Config" if kind == "method" else "Options")
-
-
-def _part(kind: str, target: str, settings: Settings) -> Part:
-    name = str(registry.load(kind, target).name)
-    options = resolve(settings, (kind, name), _options_model(kind, target))
-    return Part(target, name, options.model_dump_json())
-
-
 def _method_part(method: NamedMethod, settings: Settings) -> Part:
     """A method with the settings of its base, then those of its variant, then those under its own full name."""
-    base = [
-        replace(entry, path=("method", method.name, *entry.path)) for entry in settings.under(("method", method.base))
-    ]
-    own = [
-        replace(entry, path=("method", method.name, *entry.path)) for entry in settings.under(("method", method.name))
-    ]
+    path = "method", method.name
+    base, own = (
+        [replace(entry, path=(*path, *entry.path)) for entry in settings.under(("method", name))]
+        for name in (method.base, method.name)
+    )
     layered = Settings((*base, *method.settings, *(own if method.name != method.base else ())))
-    options = resolve(layered, ("method", method.name), _options_model("method", method.target))
+    options = resolve(layered, path, options_model("method", method.target))
     return Part(method.target, method.name, options.model_dump_json())
 
 
@@ -219,7 +210,7 @@ def _check_sections(kind: str, settings: Settings, used: Mapping[str, str], vari
     check_names(kind, settings, [*known, *variants])
     for name in known:
         if settings.under((kind, name)):
-            resolve(settings, (kind, name), _options_model(kind, used.get(name, name)))
+            resolve(settings, (kind, name), options_model(kind, used.get(name, name)))
 
 
 def _all_systems() -> list[str]:

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -169,7 +170,7 @@ def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> MetricsRecord:
     by_method: dict[str, list[MethodOutcome]] = {}
     for one in outcomes:
         by_method.setdefault(one.method, []).append(one)
-    perfect = _read_scores(plan, by_method.get(CEILING_METHOD, ()), _final_counts)
+    perfect = _read_scores(plan, by_method.get(CEILING_METHOD, ()), attrgetter("counts"))
     rules = _rules(plan)
 
     @cache
@@ -179,7 +180,7 @@ def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> MetricsRecord:
     results = {}
     for method in plan.methods:
         mine = by_method.get(method, ())
-        scores = perfect if method == CEILING_METHOD else _read_scores(plan, mine, _final_counts)
+        scores = perfect if method == CEILING_METHOD else _read_scores(plan, mine, attrgetter("counts"))
         early = {
             share: _read_scores(plan, mine, partial(JobFolder.anytime_counts, share=share))
             for share in sorted(set(plan.config.anytime))
@@ -199,10 +200,6 @@ def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> MetricsRecord:
 
 def _rules(plan: Plan) -> list[ProtocolRules]:
     return [load_protocol(name) for name in dict.fromkeys(name for job in plan.jobs for name in job.protocols)]
-
-
-def _final_counts(job: JobFolder) -> Path:
-    return job.counts
 
 
 def _read_scores(plan: Plan, outcomes: Sequence[MethodOutcome], file_of: Callable[[JobFolder], Path]) -> Scores:

@@ -218,7 +218,8 @@ class _Scene:
         start_memory_watch()
         feeding = Feeding(self.job.scene, method, perception, self.report)
         shares = self.job.anytime if method.needs.frames else ()
-        with ReadAhead(frames, n, n_ahead=0 if self._renders_frames else N_AHEAD) as ahead:
+        is_rendered = isinstance(self.dataset, RendersFrames) and self.dataset.renders_frames
+        with ReadAhead(frames, n, n_ahead=0 if is_rendered else N_AHEAD) as ahead:
             method.start(info)
             for share in shares:
                 feeding.up_to(math.ceil(share * n), ahead, n)
@@ -236,10 +237,6 @@ class _Scene:
             "device_bytes": device_memory_bytes(),
         }
         folder.seal("predict", key, files, {"costs": costs} | log.remarks())
-
-    @property
-    def _renders_frames(self) -> bool:
-        return isinstance(self.dataset, RendersFrames) and self.dataset.renders_frames
 
     def _tools(self, method: Method, perception: Perception, frames: Sequence[Frame], n: int) -> SceneTools:
         return SceneTools(

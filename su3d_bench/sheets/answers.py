@@ -15,7 +15,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from su3d_bench.core.errors import DataError, ModelMissing, printable, suggest
+from su3d_bench.core.errors import DataError, ModelMissing, printable, reading, suggest
 from su3d_bench.formats.numpy_files import DAMAGE
 from su3d_bench.questions.model import KINDS
 from su3d_bench.reports.tables.formats import FORMULA_STARTS
@@ -49,13 +49,11 @@ def read_answers(path: Path) -> list[AnswerRow]:
     suffix = path.suffix.lower()
     if suffix not in (".csv", ".xlsx"):
         raise DataError(f"{where}: is neither .csv nor .xlsx; export a CSV from the page or save an .xlsx workbook")
-    try:
+    with reading(where, DataError):
         size = path.stat().st_size
         if size > (MOST_TEXT_BYTES if suffix == ".csv" else MOST_BYTES):
             raise DataError(f"{where}: has {size >> 20} MiB; a file of answers is smaller")
         content = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{where}: cannot be read: {error.strerror}") from error
     return parse_csv(content, where) if suffix == ".csv" else parse_workbook(content, where)
 
 

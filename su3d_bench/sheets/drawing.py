@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import numpy as np
 
@@ -224,22 +224,12 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class SceneDrafts:
-    """What one process draws: ``places`` of the drafts of one scene among all."""
+    """What one process draws: the drafts of one scene by their places among all."""
 
     run: Path
     methods: tuple[str, ...]
     scale: Scale
-    places: tuple[int, ...]
-    drafts: tuple[Draft, ...]
-
-
-@dataclass(frozen=True)
-class DrawnScene:
-    """The PNG of each draft; ``lost`` says why there are none."""
-
-    places: tuple[int, ...]
-    pictures: tuple[bytes, ...]
-    lost: str = ""
+    drafts: Mapping[int, Draft]
 
 
 def draw_all(
@@ -252,9 +242,8 @@ def draw_all(
     """The pictures of ``drafts`` in their order, ``jobs`` scenes at once; the same bytes whatever their number."""
     units = []
     for scene in dict.fromkeys(one.scene for one in drafts):
-        places = tuple(k for k, one in enumerate(drafts) if one.scene == scene)
-        mine = tuple(drafts[k] for k in places)
-        units.append(SceneDrafts(source.run.folder.path, source.methods, scale, places, mine))
+        mine = {k: draft for k, draft in enumerate(drafts) if draft.scene == scene}
+        units.append(SceneDrafts(source.run.folder.path, source.methods, scale, mine))
     n_done = 0
 
     def report(event: Event) -> None:
@@ -268,22 +257,20 @@ def draw_all(
         found = run_processes(draw_scene, units, report, jobs=jobs, lost=_lost)
     pictures: dict[int, bytes] = {}
     for drawn in found:
-        if drawn.lost:
-            raise DataError(drawn.lost)
-        pictures.update(zip(drawn.places, drawn.pictures, strict=True))
+        pictures |= drawn
     return [pictures[k] for k in range(len(drafts))]
 
 
-def draw_scene(unit: SceneDrafts, report: Report) -> DrawnScene:
-    """The pictures of one scene."""
+def draw_scene(unit: SceneDrafts, report: Report) -> dict[int, bytes]:
+    """The PNG of each draft of one scene by its place."""
     artist = Artist(RunSource(read_run(unit.run), unit.methods), unit.scale)
-    pictures = []
-    for k, draft in enumerate(unit.drafts):
-        pictures.append(artist.draw(draft))
-        report(Event(draft.scene, "pictures", k + 1, len(unit.drafts)))
-    return DrawnScene(unit.places, tuple(pictures))
+    pictures = {}
+    for place, draft in unit.drafts.items():
+        pictures[place] = artist.draw(draft)
+        report(Event(draft.scene, "pictures", len(pictures), len(unit.drafts)))
+    return pictures
 
 
-def _lost(unit: SceneDrafts, how: str) -> DrawnScene:
-    scene = unit.drafts[0].scene
-    return DrawnScene(unit.places, (), f"{scene}: the process that drew its pictures {how}; try --jobs 1")
+def _lost(unit: SceneDrafts, how: str) -> NoReturn:
+    scene = next(iter(unit.drafts.values())).scene
+    raise DataError(f"{scene}: the process that drew its pictures {how}; try --jobs 1")

@@ -14,7 +14,7 @@ from typing import Any, Literal, Protocol, TypeVar
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from su3d_bench.core.digests import digest_json
-from su3d_bench.core.errors import DataError, printable
+from su3d_bench.core.errors import DataError, printable, reading
 from su3d_bench.store.atomic import write_json
 
 SCHEMA = 1
@@ -29,23 +29,28 @@ JUDGEMENTS = (RIGHT, WRONG, CANNOT_TELL)
 # The names that metrics/score_questions.py has for the merging of a mask.
 MERGES = ("well-merged", "under-merged", "over-merged", CANNOT_TELL)
 _DIGITS = 12
-_STRICT = ConfigDict(extra="forbid", strict=True)
+
+
+class _Strict:
+    """What is read as it was written: no other fields, and no value that would have to be converted."""
+
+    __pydantic_config__ = ConfigDict(extra="forbid", strict=True)
 
 
 @dataclass(frozen=True)
-class Ask:
+class Ask(_Strict):
     """A question that is put of an item: ``name`` stands in the answers, ``text`` is read, one of ``choices`` is right.
 
     ``meanings``: what each choice means, in their order.
     """
 
-    __pydantic_config__ = _STRICT
     name: str
     text: str
     choices: tuple[str, ...]
     meanings: tuple[str, ...] = ()
 
 
+LABEL_MEANINGS = ("a fitting name, general or special", "a name of something else", "the picture does not show it")
 ASKS: Mapping[SheetKind, tuple[Ask, ...]] = {
     "retrieval": (
         Ask(
@@ -56,18 +61,8 @@ ASKS: Mapping[SheetKind, tuple[Ask, ...]] = {
         ),
     ),
     "annotation": (
-        Ask(
-            "label 1",
-            "Is label 1 right?",
-            JUDGEMENTS,
-            ("a fitting name, general or special", "a name of something else", "the picture does not show it"),
-        ),
-        Ask(
-            "label 2",
-            "Is label 2 right?",
-            JUDGEMENTS,
-            ("a fitting name, general or special", "a name of something else", "the picture does not show it"),
-        ),
+        Ask("label 1", "Is label 1 right?", JUDGEMENTS, LABEL_MEANINGS),
+        Ask("label 2", "Is label 2 right?", JUDGEMENTS, LABEL_MEANINGS),
         Ask(
             "merging",
             "How is the mask merged?",
@@ -98,13 +93,12 @@ ASKS: Mapping[SheetKind, tuple[Ask, ...]] = {
 
 
 @dataclass(frozen=True)
-class SheetItem:
+class SheetItem(_Strict):
     """One thing to judge: ``text`` is the query, the labels, or question and answer; ``asks`` names what is asked.
 
     ``pictures`` are file names below ``PICTURES``, ``picture_digests`` their SHA-256; ``check`` changes with all of it.
     """
 
-    __pydantic_config__ = _STRICT
     id: str
     text: str
     asks: tuple[str, ...]
@@ -114,19 +108,17 @@ class SheetItem:
 
 
 @dataclass(frozen=True)
-class AnnotatorShare:
+class AnnotatorShare(_Strict):
     """Ids of the items that one annotator gets, in that annotator's order."""
 
-    __pydantic_config__ = _STRICT
     name: str
     item_ids: tuple[str, ...]
 
 
 @dataclass(frozen=True)
-class Sheet:
+class Sheet(_Strict):
     """What all annotators of a set together see; ``id`` is a digest of it and begins with the kind."""
 
-    __pydantic_config__ = _STRICT
     id: str
     kind: SheetKind
     seed: int
@@ -138,9 +130,14 @@ class Sheet:
     def ask(self, name: str) -> Ask:
         return next(one for one in self.asks if one.name == name)
 
+    def items_of(self, share: AnnotatorShare) -> list[SheetItem]:
+        """The items of one annotator in that annotator's order."""
+        by_id = {item.id: item for item in self.items}
+        return [by_id[item_id] for item_id in share.item_ids]
+
 
 @dataclass(frozen=True)
-class KeyItem:
+class KeyItem(_Strict):
     """What an item is: the instance ``instance_id`` of a map of ``scene`` (``<dataset>/<scene>``).
 
     ``methods``: all whose answer this is, a variant such as ``opensu3d@scheme4`` a name; ``instance_ids`` its id in the
@@ -149,7 +146,6 @@ class KeyItem:
     ``{"label 1": ("n", "n'")}``. ``automatic``: ask -> the choice that the ground truth makes, where it is known.
     """
 
-    __pydantic_config__ = _STRICT
     id: str
     scene: str
     methods: tuple[str, ...]
@@ -161,11 +157,10 @@ class KeyItem:
 
 
 @dataclass(frozen=True)
-class Key:
+class Key(_Strict):
     """What the maintainer keeps: ``sheet_id`` ties it to its sheet, ``run`` names the run folder, ``run_digest`` its
     code; ``answered_by``: who gave the answers of reasoning sheets."""
 
-    __pydantic_config__ = _STRICT
     sheet_id: str
     kind: SheetKind
     run: str
@@ -256,12 +251,10 @@ class _Versioned(Protocol):
 def read_record(path: Path, kind: type[Read], schema: int, maker: str, again: str) -> Read:
     """The value of a JSON file as the verb ``maker`` writes it; ``DataError`` where it is another."""
     where = printable(str(path), 200)
-    try:
+    with reading(where, DataError):
         if path.stat().st_size > MOST_BYTES:
             raise DataError(f"{where}: has more than {MOST_BYTES >> 20} MiB; it is no file of su3d-bench {maker}")
         content = path.read_bytes()
-    except OSError as error:
-        raise DataError(f"{where}: cannot be read: {error.strerror}") from error
     try:
         found = TypeAdapter(kind).validate_json(content, strict=True)
     except ValidationError as error:

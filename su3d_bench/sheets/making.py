@@ -23,7 +23,6 @@ from su3d_bench.sheets.items import (
     Key,
     KeyItem,
     Sheet,
-    SheetItem,
     SheetKind,
     new_item,
     sheet_id_of,
@@ -178,21 +177,15 @@ def page_data(made: MadeSheets, share: AnnotatorShare) -> dict[str, Any]:
                 "check": one.check,
                 "picture": base64.b64encode(made.pictures[one.pictures[0]]).decode("ascii"),
             }
-            for one in items_of(made.sheet, share)
+            for one in made.sheet.items_of(share)
         ],
     }
-
-
-def items_of(sheet: Sheet, share: AnnotatorShare) -> list[SheetItem]:
-    """The items of one annotator in that annotator's order."""
-    by_id = {one.id: one for one in sheet.items}
-    return [by_id[one] for one in share.item_ids]
 
 
 def table_csv(sheet: Sheet, share: AnnotatorShare) -> str:
     """The table of one annotator, answers to be filled in; text that a spreadsheet would compute begins with ``'``."""
     rows: list[tuple[str, ...]] = [(*ANSWER_COLUMNS, "picture", "text", "asked", "choices")]
-    for item in items_of(sheet, share):
+    for item in sheet.items_of(share):
         for name in item.asks:
             ask = sheet.ask(name)
             told = (f"../{PICTURES}/{item.pictures[0]}", as_text(" / ".join(item.text.split("\n"))), ask.text)

@@ -49,11 +49,9 @@ def _write_rows(page: Any, sheet: Sheet, share: AnnotatorShare, pictures: Mappin
     from openpyxl.worksheet.datavalidation import DataValidation
 
     lists: dict[tuple[str, ...], DataValidation] = {}
-    by_id = {one.id: one for one in sheet.items}
     line = Side(style="thin", color=EDGE)
     row = HEADER_ROW
-    for item_id in share.item_ids:
-        item = by_id[item_id]
+    for item in sheet.items_of(share):
         first = row + 1
         for name in item.asks:
             row += 1

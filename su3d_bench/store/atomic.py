@@ -26,7 +26,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import DAMAGE, StoreError
+from su3d_bench.core.errors import DAMAGE, StoreError, reading
 
 MAGIC_1_0 = b"\x93NUMPY\x01\x00"
 SMALL_BYTES = 1 << 16  # of an array that is read whole before its header is looked at
@@ -139,9 +139,8 @@ def is_file(path: Path) -> bool:
 def read_json(path: Path) -> Any:
     """The value of a JSON file; a missing or damaged file is a ``StoreError``."""
     try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except OSError as error:
-        raise StoreError(f"{path}: cannot be read: {error.strerror}") from error
+        with reading(str(path), StoreError):
+            return json.loads(path.read_text(encoding="utf-8"))
     except (ValueError, RecursionError) as error:
         raise StoreError(f"{path}: not readable as JSON; run the same command again to mend it") from error
 

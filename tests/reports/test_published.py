@@ -43,8 +43,8 @@ def test_the_papers_own_contradictions_are_kept_and_said() -> None:
     ablation = rows("I")
     assert ablation["opensu3d", "replica", "m=5"] == ablation["opensu3d", "replica", "k=3"]
     assert ablation["opensu3d", "replica", "m=5"][:2] == ("40.8", "44.7")
-    quoted = next(one for one in figures_of("conceptgraphs-detector") if one.table == "II")
-    own = next(one for one in figures_of("conceptgraphs-detector") if one.source.startswith("ConceptGraphs"))
+    quoted = next(one for one in figures_of(method="conceptgraphs-detector") if one.table == "II")
+    own = next(one for one in figures_of(method="conceptgraphs-detector") if one.source.startswith("ConceptGraphs"))
     assert (quoted.values["F-mIoU"], own.values["F-mIoU"]) == ("35.4", "35.82")
     assert quoted.read_from == "quoted"
     assert quoted.note is not None and "35.82" in quoted.note

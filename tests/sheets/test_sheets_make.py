@@ -378,7 +378,8 @@ def test_scenes_drawn_in_processes_give_the_pictures_in_order(source: RunSource,
     drawn = draw_all(source, "paper", drafts, 1, lambda *counts: told.append(counts))
     assert told == [(1, 3), (2, 3), (3, 3)]
     assert drawn == [Artist(source).draw(one) for one in drafts]
-    unit = SceneDrafts(folder / "run", METHODS, "paper", (0,), tuple(drafts[:1]))
+    unit = SceneDrafts(folder / "run", METHODS, "paper", {0: drafts[0]})
     (in_process,) = run_processes(draw_scene, [unit], lambda event: None, jobs=2, lost=_lost)
-    assert in_process.pictures == (drawn[0],)
-    assert "try --jobs 1" in _lost(unit, "died").lost
+    assert in_process == {0: drawn[0]}
+    with pytest.raises(DataError, match="try --jobs 1"):
+        _lost(unit, "died")

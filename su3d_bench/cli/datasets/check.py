@@ -11,12 +11,12 @@ from typing import Any
 
 from su3d_bench.cli.common import answer, answer_json, progress, remark
 from su3d_bench.core import registry
-from su3d_bench.core.config import read_assignments, resolve
+from su3d_bench.core.config import read_assignments
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable, printable_json
 from su3d_bench.datasets.checks import Inspection, TruthVariant, inspect
 from su3d_bench.datasets.checks_of_frames import Finding
 from su3d_bench.runs.executors.local import Event
-from su3d_bench.runs.job import Part, build_dataset
+from su3d_bench.runs.job import build_dataset, part_of
 from su3d_bench.runs.scenes import data_root, dataset_targets, expand_scenes
 
 MOST_OF_A_KIND = 10  # findings of one kind that are printed; --json has all
@@ -64,10 +64,7 @@ def chosen_scenes(addresses: Sequence[str], assignments: Sequence[str], *, is_qu
     """(dataset, scene) of every address or pattern, with the options of ``--set``; a dataset is built once."""
     targets = {str(registry.load("dataset", target).name): target for target in dataset_targets(addresses)}
     settings = read_assignments(assignments, (), tuple(targets))
-    parts = {}
-    for name, target in targets.items():
-        options = resolve(settings, ("dataset", name), registry.load("dataset", target).Options)
-        parts[target] = Part(target, name, options.model_dump_json())
+    parts = {target: part_of("dataset", target, settings) for target in targets.values()}
     chosen, notes = expand_scenes(addresses, parts)
     for note in notes:
         remark(printable(note), quiet=is_quiet)

@@ -14,12 +14,12 @@ from typing import Any, NoReturn
 
 from su3d_bench.cli.common import answer_either, drawn_bars, remark
 from su3d_bench.core import registry
-from su3d_bench.core.config import read_assignments, resolve
+from su3d_bench.core.config import read_assignments
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, suggest
 from su3d_bench.datasets.layouts import LAYOUTS
 from su3d_bench.datasets.writing import SceneTarget, finish_scene, plan_scenes, write_frames
 from su3d_bench.runs.executors.local import Event, Report, run_inline, run_processes
-from su3d_bench.runs.job import Part, build_dataset
+from su3d_bench.runs.job import Part, build_dataset, part_of
 from su3d_bench.runs.scenes import data_root, expand_scenes
 from su3d_bench.store.atomic import make_folder
 from su3d_bench.store.run_folder import RunFolder
@@ -82,8 +82,7 @@ def _dataset_part(name: str, assignments: Sequence[str]) -> Part:
     own_name = str(dataset_class.name)
     # An option may be written as in `run --set`, with the dataset's name before it, or alone.
     texts = [text if text.partition("=")[0].count(".") else f"{own_name}.{text}" for text in assignments]
-    options = resolve(read_assignments(texts, (), (own_name,)), ("dataset", own_name), dataset_class.Options)
-    return Part(name, own_name, options.model_dump_json())
+    return part_of("dataset", name, read_assignments(texts, (), (own_name,)))
 
 
 def _scenes(part: Part, asked: Sequence[str] | None) -> list[str]:

@@ -14,7 +14,6 @@ from su3d_bench.cli.common import (
     answer_estimate,
     answer_json,
     chat_client,
-    language_config,
     remark,
 )
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted
@@ -183,16 +182,15 @@ def _ask_map(source: RunSource, encoder: Encoder | None, arguments: argparse.Nam
 
     if arguments.solver != "llm":
         return built_in(encoder), "the built-in solver"
-    config = language_config(arguments)
-    return by_language_model(chat_client(arguments, source.run.folder, config), config), config.text_model
+    client, config = chat_client(arguments, source.run.folder)
+    return by_language_model(client, config), config.text_model
 
 
 def _estimate(source: RunSource, arguments: argparse.Namespace) -> int:
     """Tell what asking the language model would cost at the most."""
     from su3d_bench.sheets.drafts import reasoning_drafts, requests_into
 
-    config = language_config(arguments)
-    client = chat_client(arguments, source.run.folder, config)
+    client, config = chat_client(arguments, source.run.folder)
     given = _given(source, arguments)
     requests: list[ChatRequest] = []
     for scene in source.scenes:

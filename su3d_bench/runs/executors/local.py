@@ -159,7 +159,7 @@ def answer_of(work: Work[Unit, Outcome], unit: Unit, report: Report) -> tuple[st
             return "outcome", work(unit, report)
     except Su3dError as error:
         return "user-error", error
-    except Exception:  # noqa: BLE001 - ``unwrap`` raises it again, with its traceback
+    except BaseException:  # noqa: BLE001 - ``unwrap`` raises it again, with its traceback
         return "internal-error", traceback.format_exc()
 
 
@@ -184,16 +184,7 @@ def _cause(exit_code: int | None) -> str:
 def _worker(work: Work[Unit, Outcome], unit: Unit, connection: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interrupt means
     threading.Thread(target=_die_with_parent, daemon=True).start()
-    message: tuple[str, Any]
-    try:
-        with one_thread():
-            message = ("outcome", work(unit, lambda event: connection.send(("event", event))))
-    except Su3dError as error:
-        message = ("user-error", error)
-    except BaseException:
-        connection.send(("internal-error", traceback.format_exc()))
-        raise
-    connection.send(message)
+    connection.send(answer_of(work, unit, lambda event: connection.send(("event", event))))
     connection.close()
 
 
