@@ -7,8 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 from urllib.parse import quote
 
-from su3d_bench.core.errors import printable
-from su3d_bench.reports.tables.formats import csv_lines, harmless
+from su3d_bench.reports.tables.formats import csv_lines, harmless, inert
 
 COLUMNS = ("item_id", "question", "reason", "answers", "truth", "scene", "methods", "text", "pictures")
 STYLE = (
@@ -37,21 +36,21 @@ def second_looks_page(looks: Sequence[Mapping[str, Any]], pictures: str, sheet_i
         '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>Second looks</title>\n'
-        f"<style>{STYLE}</style>\n<h1>Second looks at {_text(sheet_id)}: {len(looks)}</h1>\n{body}\n</html>\n"
+        f"<style>{STYLE}</style>\n<h1>Second looks at {inert(sheet_id)}: {len(looks)}</h1>\n{body}\n</html>\n"
     )
 
 
 def _article(one: Mapping[str, Any], pictures: str) -> str:
     images = "".join(
-        f'<p><img loading="lazy" alt="{_text(one["item_id"])}" src="{html.escape(quote(f"{pictures}/{name}"))}"></p>'
+        f'<p><img loading="lazy" alt="{inert(one["item_id"])}" src="{html.escape(quote(f"{pictures}/{name}"))}"></p>'
         for name in one["pictures"]
         if is_file_name(name)
     )
-    truth = f"; ground truth: {_text(one['automatic'])}" if one["automatic"] else ""
+    truth = f"; ground truth: {inert(one['automatic'])}" if one["automatic"] else ""
     return (
-        f'<article><h2 dir="auto">{_text(one["text"])}</h2>'
-        f'<p><span class="reason">{_text(one["reason"])}</span>, {_text(one["ask"])}: {_text(_answers(one))}{truth}</p>'
-        f"<p>{_text(one['item_id'])}, {_text(one['scene'])}, {_text(', '.join(one['methods']))}</p>{images}</article>"
+        f'<article><h2 dir="auto">{inert(one["text"])}</h2>'
+        f'<p><span class="reason">{inert(one["reason"])}</span>, {inert(one["ask"])}: {inert(_answers(one))}{truth}</p>'
+        f"<p>{inert(one['item_id'])}, {inert(one['scene'])}, {inert(', '.join(one['methods']))}</p>{images}</article>"
     )
 
 
@@ -66,7 +65,3 @@ def is_file_name(name: str) -> bool:
 
 def _answers(one: Mapping[str, Any]) -> str:
     return "; ".join(f"{name}: {answer}" for name, answer in one["answers"].items())
-
-
-def _text(text: str) -> str:
-    return html.escape(printable(text, 2000))

@@ -7,10 +7,11 @@ import re
 import unicodedata
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 from urllib.parse import quote, unquote
 
 from su3d_bench.core.errors import printable
-from su3d_bench.reports.tables.model import Cell, Interval, Origin, Prose, Table, TableRow, What, blocks_of
+from su3d_bench.reports.tables.model import Cell, Origin, Prose, Table, TableRow, blocks_of
 
 HEADER = "% made by su3d-bench report tables; needs \\usepackage{booktabs}; su3d-bench report verify checks it"
 _ESCAPES = {
@@ -277,22 +278,11 @@ def _origin(comment: str) -> Origin | None:
     match = _ORIGIN.fullmatch(comment)
     if match is None:
         return None
+    fields: dict[str, Any] = match.groupdict()
+    low, high = fields.pop("low"), fields.pop("high")
+    fields |= {name: unquote(fields[name]) for name in ("run", "method", "protocol", "metric")}
     try:
-        value = float(match["value"])
-        interval: Interval | None = None
-        if match["low"] is not None:
-            interval = (float(match["low"]), float(match["high"]))
+        fields |= {"version": int(fields["version"]), "value": float(fields["value"])}
+        return Origin(**fields, interval=None if low is None else (float(low), float(high)))
     except ValueError:
         return None
-    texts = {name: unquote(match[name]) for name in ("run", "method", "protocol", "metric")}
-    what: dict[str, What] = {"value": "value", "ceiling": "ceiling", "scenes": "scenes"}
-    return Origin(
-        texts["run"],
-        texts["method"],
-        texts["protocol"],
-        int(match["version"]),
-        texts["metric"],
-        what[match["what"]],
-        value,
-        interval,
-    )

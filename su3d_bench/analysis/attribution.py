@@ -6,6 +6,7 @@ the kinds of errors are is said in ``metrics.attribution`` and ``metrics.attribu
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from functools import cached_property
@@ -15,13 +16,11 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.analysis.sides import Side, refuse_unlike
-from su3d_bench.core.errors import ConfigError, PredictionError, printable, suggest
+from su3d_bench.core.errors import ConfigError, PredictionError, printable
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import DenseFeatures, GroundTruth, Prediction
-from su3d_bench.metrics.attribution import masks as instances
-from su3d_bench.metrics.attribution import points as semantic
-from su3d_bench.metrics.attribution.arrays import scored_masks, scored_points
-from su3d_bench.metrics.attribution.overlaps import measure_overlaps
+from su3d_bench.core.types import GroundTruth, Prediction
+from su3d_bench.metrics.attribution.arrays import EXPLAINED
+from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.metric import Counts
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import SceneScore, metric_of, plain_json
@@ -29,7 +28,6 @@ from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.store.predictions import read_prediction
 
 SCHEMA = 1
-KINDS = {"instance": instances.KINDS, "semantic": semantic.CAUSES}
 Values = Mapping[str, float]
 
 
@@ -66,18 +64,12 @@ class ProtocolAttribution:
 class RunAttribution:
     run: str
     method: str
-    protocols: tuple[ProtocolAttribution, ...]
     remarks: tuple[str, ...]
+    protocols: tuple[ProtocolAttribution, ...]
 
     def to_json(self) -> dict[str, Any]:
         """Plain values, fractions in full precision, null where undefined."""
-        return {
-            "schema": SCHEMA,
-            "run": self.run,
-            "method": self.method,
-            "remarks": list(self.remarks),
-            "protocols": [plain_json(asdict(protocol)) for protocol in self.protocols],
-        }
+        return {"schema": SCHEMA, **plain_json(asdict(self))}
 
 
 def attribute(
@@ -112,7 +104,7 @@ def attribute(
     formed = tuple(one.form(_oracle_values(one.rules, side, other, one.scenes)) for one in explained)
     if not formed:
         raise ConfigError(f"{side.name}: no scene is scored under {', '.join(names)}; nothing to explain")
-    return RunAttribution(run.name, side.method, formed, (*remarks, *_remarks(run)))
+    return RunAttribution(run.name, side.method, (*remarks, *_remarks(run)), formed)
 
 
 def _method_of(run: FinishedRun, method: str | None) -> str:
@@ -126,9 +118,7 @@ def _method_of(run: FinishedRun, method: str | None) -> str:
 def _protocols_of(run: FinishedRun, wanted: Sequence[str]) -> tuple[list[str], list[str]]:
     """The protocols that can be explained, and remarks on the others; one that is named and cannot is an error."""
     for name in wanted:
-        if name not in run.protocols:
-            known = suggest(name, run.protocols) or f"; it has {', '.join(run.protocols)}"
-            raise ConfigError(f"{run.name}: was not scored under '{printable(name, 80)}'{known}")
+        run.check_protocol(name)
     chosen, remarks = [], []
     for name in wanted or run.protocols:
         rules = load_protocol(name)
@@ -137,7 +127,7 @@ def _protocols_of(run: FinishedRun, wanted: Sequence[str]) -> tuple[list[str], l
                 f"{run.name}: was scored under {name} version {run.protocols[name].version}, here is version "
                 f"{rules.version}; score it again"
             )
-        if rules.kind in KINDS:
+        if rules.kind in EXPLAINED:
             chosen.append(name)
         elif wanted:
             raise ConfigError(f"protocol '{name}' is of kind '{rules.kind}'; only instance and semantic are explained")
@@ -206,39 +196,30 @@ class _Gathered:
     all: list[Counts] = field(default_factory=list)
     alone: dict[str, list[Counts]] = field(default_factory=dict)
     labelled: list[Counts | None] = field(default_factory=list)
-    n: dict[str, int] = field(default_factory=dict)
-    n_scored: int = 0
+    n: Counter[str] = field(default_factory=Counter)
+    n_scored: int | None = None
 
     def add(
         self, scene: str, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None, score: SceneScore
     ) -> None:
-        if self.rules.kind == "instance":
-            if isinstance(prediction, DenseFeatures):
-                raise PredictionError(f"{scene}: {self.rules.name}: needs instances, the map has one feature a point")
-            values, masks, scoring = scored_masks(self.rules, truth, prediction, encoder)
-            mended: instances.Mended | semantic.MendedPoints = instances.mend_scene(values, masks, scoring)
-            relabelled: Counts | None = None
-            if self.rules.class_agnostic is None:
-                overlaps = measure_overlaps(values, masks, scoring)
-                relabelled = instances.count_masks(values, instances.with_true_labels(overlaps), scoring)
-        else:
-            found = scored_points(self.rules, truth, prediction, encoder)
-            mended = semantic.mend_points(found.points, found.is_counted, has_masks=found.has_masks)
-            relabelled = mended.with_true_labels
-            self.n_scored += mended.n_scored
+        if (reason := why_not_scorable(self.rules, prediction)) is not None:
+            raise PredictionError(f"{scene}: {reason}")
+        mended = EXPLAINED[self.rules.kind][1](self.rules, truth, prediction, encoder)
+        if mended.n_scored is not None:
+            self.n_scored = (self.n_scored or 0) + mended.n_scored
         _refuse_other_counts(scene, self.rules, score.counts, mended.as_is)
         self.scenes.append(scene)
         self.as_is.append(mended.as_is)
         self.all.append(mended.all)
-        self.labelled.append(relabelled)
+        self.labelled.append(mended.with_true_labels)
+        self.n.update(mended.n)
         for kind, counts in mended.alone.items():
             self.alone.setdefault(kind, []).append(counts)
-            self.n[kind] = self.n.get(kind, 0) + mended.n[kind]
 
     def form(self, with_true_masks: Values | None) -> ProtocolAttribution:
         values, mended = _values(self.rules, self.as_is), _values(self.rules, self.all)
         causes = {}
-        for kind in KINDS[self.rules.kind]:
+        for kind in EXPLAINED[self.rules.kind][0]:
             after = _values(self.rules, self.alone[kind])
             causes[kind] = Cause(self.n[kind], {name: after[name] - values[name] for name in values})
         labelled = [counts for counts in self.labelled if counts is not None]
@@ -256,7 +237,7 @@ class _Gathered:
             overlap={name: mended[name] - values[name] - total[name] for name in values},
             rest={name: 1.0 - mended[name] for name in values},
             stages=stages,
-            n_scored=self.n_scored if self.rules.kind == "semantic" else None,
+            n_scored=self.n_scored,
         )
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -21,7 +21,7 @@ from su3d_bench.metrics.matching.labelling import (
     cosines,
     scored_classes,
 )
-from su3d_bench.metrics.metric import present
+from su3d_bench.metrics.metric import n_predictions, present
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.reports.page.maps import (
@@ -58,6 +58,7 @@ THUMBNAIL_WIDTH, JPEG_QUALITY = 240, 62
 MOST_VIEWS = 12  # frames of an instance that are named
 MOST_CAPTION = 240  # characters
 MapOfRun = tuple[int, FinishedRun, str, str]
+Made = TypeVar("Made")
 
 
 @dataclass(frozen=True)
@@ -157,6 +158,14 @@ class _Scene:
         except Su3dError as error:
             return printable(str(error))
 
+    def _had(self, what: str, make: Callable[[], Made]) -> Made | None:
+        """What ``make`` gives; None and a remark where it cannot be had."""
+        try:
+            return make()
+        except Su3dError as error:
+            self._remarks.append(f"{what}: {error}")
+            return None
+
     @cached_property
     def _dataset(self) -> Any:
         """The dataset where its data are those of the runs, else None."""
@@ -172,43 +181,35 @@ class _Scene:
     def _look(self) -> SceneLook | None:
         if self._dataset is None:
             return None
-        try:
-            return look_at(self._dataset, self._scene.partition("/")[2])
-        except Su3dError as error:
-            self._remarks.append(f"no colours: {error}")
-            return None
+        return self._had("no colours", lambda: look_at(self._dataset, self._scene.partition("/")[2]))
 
     def _thumbnail_frames(self, maps: Sequence[Instances]) -> dict[int, Frame]:
         if self._dataset is None:
             return {}
         chosen = frame_cover([_frames_of(one, k) for one in maps for k in range(len(one))], THUMBNAILS)
         found = {}
-        try:
+
+        def look() -> None:
             frames = self._dataset.frames(self._scene.partition("/")[2], 1)
             for index in sorted(chosen):
                 if 0 <= index < len(frames) and (frame := frames[index]).index == index:
                     found[index] = frame
-        except Su3dError as error:
-            self._remarks.append(f"no views: {error}")
+
+        self._had("no views", look)
         return found
 
     def _rules(self, run: FinishedRun) -> ProtocolRules | None:
         """The rules whose classes the map is shown in: of points before those of instances."""
-        rules = [load_protocol(name) for name in run.protocols]
-        fitting = [one for one in rules if one.kind in ("semantic", "instance") and one.classes]
-        fitting = [one for one in fitting if one.class_agnostic is None]
-        fitting = [one for one in fitting if one.version == run.protocols[one.name].version]
-        return min(fitting, key=lambda one: one.kind != "semantic", default=None)
+        fitting = [rules for rules in map(load_protocol, run.protocols) if rules.vocabulary is not None]
+        fitting = [rules for rules in fitting if rules.version == run.protocols[rules.name].version]
+        return min(fitting, key=lambda rules: not rules.takes_dense, default=None)
 
     def _truth(self, rules: ProtocolRules) -> GroundTruth | None:
         if self._dataset is None:
             return None
-        try:
-            truth: GroundTruth = self._dataset.ground_truth(self._scene.partition("/")[2], rules.ground_truth)
-        except Su3dError as error:
-            self._remarks.append(f"no truth: {error}")
-            return None
-        return truth
+        return self._had(
+            "no truth", lambda: self._dataset.ground_truth(self._scene.partition("/")[2], rules.ground_truth)
+        )
 
     def _pack(self, run: FinishedRun, prediction: Prediction, frames: Mapping[int, Frame], most_points: int) -> str:
         cloud = thinned(prediction.points, most_points)
@@ -235,7 +236,7 @@ class _Scene:
             similarity = self._similarity(run, prediction)
             about["queries"] = [] if similarity is None else list(self._known.queries)
             about["instances"] = [
-                _instance_data(prediction, k, classes, similarity, frames) for k in range(_n_instances(prediction))
+                _instance_data(prediction, k, classes, similarity, frames) for k in range(n_predictions(prediction))
             ]
         return pack_map(cloud, planes, printable_json(about))
 
@@ -246,15 +247,13 @@ class _Scene:
         if isinstance(prediction, DenseFeatures):
             prediction = DenseFeatures(cloud.points, np.asarray(prediction.features[cloud.rows]))
         is_present = scored_classes(rules) if truth is None else present(truth, len(rules.classes))
-        try:
+
+        def classes() -> Int64Array:
             candidates = candidate_classes(rules, is_present & scored_classes(rules))
-            classes = classes_of_prediction(rules, prediction, self._encoder(run, prediction), candidates)
-        except Su3dError as error:
-            self._remarks.append(f"no classes: {error}")
-            return None
-        if isinstance(prediction, DenseFeatures):
-            return np.where(has_feature(prediction), classes, -1)
-        return classes
+            called = classes_of_prediction(rules, prediction, self._encoder(run, prediction), candidates)
+            return np.where(has_feature(prediction), called, -1) if isinstance(prediction, DenseFeatures) else called
+
+        return self._had("no classes", classes)
 
     def _encoder(self, run: FinishedRun, prediction: Prediction) -> Encoder | None:
         labels = getattr(prediction, "labels", None)
@@ -265,16 +264,8 @@ class _Scene:
         features = prediction.features
         if features is None or not len(features) or not self._known.queries:
             return None
-        try:
-            texts = self._known.encoder(run)[1]
-        except Su3dError as error:
-            self._remarks.append(f"no similarities: {error}")
-            return None
-        return cosines(features, texts) if texts.shape[1] == features.shape[1] else None
-
-
-def _n_instances(prediction: Prediction) -> int:
-    return len(prediction) if isinstance(prediction, Instances) else len(prediction.features)
+        texts = self._had("no similarities", lambda: self._known.encoder(run)[1])
+        return cosines(features, texts) if texts is not None and texts.shape[1] == features.shape[1] else None
 
 
 def _frames_of(instances: Instances, k: int) -> list[int]:

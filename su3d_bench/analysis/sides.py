@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from su3d_bench.core.errors import ConfigError, printable, suggest
+from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import SceneScore, metric_of
 from su3d_bench.runs.finished import FinishedRun, read_run
@@ -76,9 +76,7 @@ def protocols_in_both(left: Side, right: Side, wanted: Sequence[str]) -> list[st
     common = [name for name in left.run.protocols if name in right.run.protocols]
     for name in wanted:
         for side in (left, right):
-            if name not in side.run.protocols:
-                known = suggest(name, side.run.protocols) or f"; it has {', '.join(side.run.protocols)}"
-                raise ConfigError(f"{side.run.name}: was not scored under '{printable(name, 80)}'{known}")
+            side.run.check_protocol(name)
     if not common:
         raise ConfigError(
             f"{left.run.name} was scored under {', '.join(left.run.protocols) or 'nothing'}, {right.run.name} under "

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,11 +15,10 @@ from su3d_bench.metrics.scoring import ProtocolResult, combine
 from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.model import BY_PEOPLE, Measured, Origin, is_count
 from su3d_bench.runs.finished import FinishedRun, read_run
-from su3d_bench.sheets.score_file import FILE as SCORES_FILE
-from su3d_bench.sheets.score_file import read_scores
-from su3d_bench.sheets.scores import ScoreCell, Scores
+from su3d_bench.sheets.scores import FILE as SCORES_FILE
+from su3d_bench.sheets.scores import ScoreCell, Scores, read_scores
 from su3d_bench.store.atomic import is_file
-from su3d_bench.store.records import ResultRecord
+from su3d_bench.store.records import NumbersRecord, ResultRecord
 
 MOST_SOURCE_BYTES, MOST_SOURCES = 1 << 24, 500  # of a paper's LaTeX
 _READ_SOURCE = re.compile(r"\\(?:input|include)\s*\{([^{}\0]{1,200})\}")
@@ -102,14 +101,14 @@ def _results_of(name: str, run: FinishedRun) -> list[Measured]:
         if result.result is not None:
             names.setdefault(result.protocol, list(result.result.metrics))
     return [
-        _measured(name, run.limit, result, names.get(result.protocol, result.headline))
+        _measured(name, run.limit, result, dict.fromkeys(names.get(result.protocol, result.headline)))
         for result in run.results.values()
     ]
 
 
-def _measured(run: str, limit: int, record: ResultRecord, names: Sequence[str]) -> Measured:
-    """``names`` of the protocol's metrics, for a method without any value."""
-    numbers = record.result
+def _measured(run: str, limit: int, record: ResultRecord, nothing: Mapping[str, None]) -> Measured:
+    """``nothing``: the protocol's metrics without a value, for a method that has none."""
+    numbers = record.result or NumbersRecord(scenes=(), metrics=nothing, intervals={}, per_scene={}, per_class={})
     return Measured(
         run=run,
         method=record.method,
@@ -117,9 +116,9 @@ def _measured(run: str, limit: int, record: ResultRecord, names: Sequence[str]) 
         version=record.version,
         kind=record.kind,
         headline=record.headline,
-        metrics=dict.fromkeys(names) if numbers is None else numbers.metrics,
-        intervals={} if numbers is None else numbers.intervals,
-        per_scene={} if numbers is None else numbers.per_scene,
+        metrics=numbers.metrics,
+        intervals=numbers.intervals,
+        per_scene=numbers.per_scene,
         ceilings=record.ceiling or {},
         n_planned=record.n_planned,
         failed=record.failed,
@@ -181,10 +180,13 @@ class _Recomputed:
 
     def _run(self, name: str) -> FinishedRun:
         if name not in self._runs:
-            places = [root / name for root in self._roots]
-            path = next((place for place in places if is_file(place / "run.json")), places[0])
-            self._runs[name] = read_run(path)
+            self._runs[name] = read_run(self._place(name, lambda place: is_file(place / "run.json")))
         return self._runs[name]
+
+    def _place(self, name: str, is_it: Callable[[Path], bool]) -> Path:
+        """Where the run or the scores ``name`` are."""
+        places = [root / name for root in self._roots]
+        return next(filter(is_it, places), places[0])
 
     def numbers(self, origin: Origin) -> ProtocolResult | Measured:
         """Raises ``Su3dError`` where they cannot be had, or are of another version than the cell."""
@@ -194,8 +196,7 @@ class _Recomputed:
         return result
 
     def _of_people(self, origin: Origin) -> Measured:
-        places = [root / origin.run for root in self._roots]
-        path = next((place for place in places if is_file(place) or is_file(place / SCORES_FILE)), places[0])
+        path = self._place(origin.run, lambda place: is_file(place) or is_file(place / SCORES_FILE))
         for one in _judged_by_people(path):
             if (one.protocol, one.method) == (origin.protocol, origin.method):
                 return one

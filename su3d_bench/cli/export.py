@@ -95,8 +95,8 @@ def call(arguments: argparse.Namespace) -> int:
         answer_json({"to": arguments.to, "folder": str(arguments.out), "scenes": rows})
         return EXIT_DONE
     for row in rows:
-        for one in row["remarks"]:
-            remark(printable(f"{row['scene']}: {one}"), quiet=arguments.quiet)
+        for line in row["remarks"]:
+            remark(printable(f"{row['scene']}: {line}"), quiet=arguments.quiet)
     answer(f"{len(rows)} scene{'s' if len(rows) > 1 else ''} for {arguments.to}: {arguments.out}")
     return EXIT_DONE
 
@@ -254,7 +254,7 @@ def _rules(name: str | None, dataset: Any) -> ProtocolRules:
 
 
 def _has_masks(rules: ProtocolRules) -> bool:
-    return rules.kind == "instance" and bool(rules.classes) and rules.class_agnostic is None
+    return rules.vocabulary is not None and rules.confidence is not None
 
 
 def _encoder(content: Content, source: Source, rules: ProtocolRules, texts: Path | None) -> Encoder | None:

@@ -16,6 +16,7 @@ from su3d_bench.core import registry
 from su3d_bench.core.config import parse_value, toml_value
 from su3d_bench.core.errors import ConfigError, StoreError, suggest
 from su3d_bench.core.interfaces import HasShortNames
+from su3d_bench.reports.tables.paper import SweepRow
 from su3d_bench.store.atomic import read_json, write_json
 
 FILE = "ablation.json"
@@ -25,12 +26,9 @@ Short = tuple[str, Callable[[Any], Any]]
 
 
 @dataclass(frozen=True)
-class AblationRow:
-    """One value of one parameter, as it was asked for, and the variant of the method that has it."""
+class AblationRow(SweepRow):
+    """A row, its value as it was asked for; ``is_default`` where the method has it anyway."""
 
-    parameter: str
-    value: str
-    method: str
     is_default: bool
 
 

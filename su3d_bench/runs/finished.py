@@ -114,6 +114,12 @@ class FinishedRun:
             hint = suggest(method, known) or f"; it has {', '.join(known)}"
             raise ConfigError(f"{self.name}: holds no scores of the method '{printable(method, 80)}'{hint}")
 
+    def check_protocol(self, protocol: str) -> None:
+        """A ``ConfigError`` where the run was not scored under ``protocol``."""
+        if protocol not in self.protocols:
+            hint = suggest(protocol, self.protocols) or f"; it has {', '.join(self.protocols)}"
+            raise ConfigError(f"{self.name}: was not scored under '{printable(protocol, 80)}'{hint}")
+
     def has_scores(self, method: str) -> bool:
         """Whether any scene was scored for ``method``; those of the ceiling stand in no table."""
         is_name = "/" not in method

@@ -83,7 +83,7 @@ def questions_of(
                 f"{printable(scene, 100)}: has no ground truth that questions could be made from; name a file with "
                 "--questions FILE, or --questions paper"
             )
-        dataset, name = source.dataset(scene), scene.partition("/")[2]
+        dataset, name = source.run.dataset(scene), scene.partition("/")[2]
         if rules.questions == "dataset":
             given = own_questions(dataset, name)
         else:
@@ -147,26 +147,20 @@ def annotation_drafts(source: RunSource, scene: str, n_most: int, random: np.ran
             if key in found:
                 found[key] = also(found[key], method, id_of(instances, row))
             else:
-                found[key] = _annotation_draft(scene, method, instances, row, names, judge(row, names))
+                found[key] = Draft(
+                    kind="annotation",
+                    scene=scene,
+                    methods=(method,),
+                    instance_ids=(id_of(instances, row),),
+                    rows=(row,),
+                    title=tuple(names),
+                    text="",
+                    asks=(),
+                    automatic=judge(row, names),
+                )
     drafts = list(found.values())
     kept = sorted(random.permutation(len(drafts))[:n_most].tolist())
     return [_with_labels_shuffled(drafts[k], random) for k in kept]
-
-
-def _annotation_draft(
-    scene: str, method: str, instances: Instances, row: int, names: list[str], automatic: Mapping[str, str]
-) -> Draft:
-    return Draft(
-        kind="annotation",
-        scene=scene,
-        methods=(method,),
-        instance_ids=(id_of(instances, row),),
-        rows=(row,),
-        title=tuple(names),
-        text="",
-        asks=(),
-        automatic=automatic,
-    )
 
 
 def _with_labels_shuffled(draft: Draft, random: np.random.Generator) -> Draft:
@@ -196,7 +190,7 @@ def _annotation_judge(
     covered = source.covered(scene, rules, instances)
     if covered is None or rules is None or truth is None or rules.merging is None:
         return lambda row, names: {}
-    known: Any = question_truth(rules, source.dataset(scene), scene.partition("/")[2], truth)
+    known: Any = question_truth(rules, source.run.dataset(scene), scene.partition("/")[2], truth)
     merges, main = judge_merging(rules.merging, covered), covered.main_object
 
     def judge(row: int, names: Sequence[str]) -> Mapping[str, str]:
@@ -292,7 +286,7 @@ def _known(source: RunSource, scene: str, rules: ProtocolRules | None, per_kind:
             "questions of kind reasoning with --questions FILE"
         )
     with_fewer = rules.model_copy(update={"per_kind": per_kind})
-    made: Any = question_truth(with_fewer, source.dataset(scene), scene.partition("/")[2], truth)
+    made: Any = question_truth(with_fewer, source.run.dataset(scene), scene.partition("/")[2], truth)
     assert isinstance(made, ReasoningTruth)
     return made.asked
 

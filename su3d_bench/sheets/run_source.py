@@ -6,7 +6,6 @@ import hashlib
 from collections.abc import Sequence
 from copy import copy
 from functools import lru_cache
-from typing import Any
 
 import numpy as np
 
@@ -74,10 +73,6 @@ class RunSource:
             )
         return found
 
-    def dataset(self, scene: str) -> Any:
-        """The dataset of a scene, whose data are those of the run."""
-        return self.run.dataset(scene)
-
     def refined(self, scene: str, method: str) -> tuple[str, ...] | None:
         """Labels n' of the map's instances; None where nobody made them."""
         found = refined_names(self.run.folder.job(scene, method), self.instances(scene, method))
@@ -89,14 +84,14 @@ class RunSource:
 
     def frames(self, scene: str, method: str) -> tuple[Frame, ...]:
         """Some of the frames that the map was made from, spread over the scene."""
-        n = len(self.dataset(scene).frames(scene.partition("/")[2], 1))
+        n = len(self.run.dataset(scene).frames(scene.partition("/")[2], 1))
         of_views = np.unique(self.instances(scene, method).views[:, 0])
         indices = of_views[(of_views >= 0) & (of_views < n)] if len(of_views) else np.arange(n)
         chosen = np.unique(np.linspace(0, len(indices) - 1, min(MOST_FRAMES, len(indices))).astype(np.int64))
         return self._frames_at(scene, tuple(int(indices[k]) for k in chosen))
 
     def _read_frames(self, scene: str, indices: tuple[int, ...]) -> tuple[Frame, ...]:
-        frames = self.dataset(scene).frames(scene.partition("/")[2], 1)
+        frames = self.run.dataset(scene).frames(scene.partition("/")[2], 1)
         return tuple(frames[index] for index in indices)
 
     def rules(self, scene: str, kind: str) -> ProtocolRules | None:
@@ -104,7 +99,7 @@ class RunSource:
         name = scene.partition("/")[0]
         for rules in map(load_protocol, protocol_names()):
             is_meant = rules.kind == kind and name in rules.datasets
-            if is_meant and why_not_truth(rules, TruthFacts.of_dataset(self.dataset(scene))) is None:
+            if is_meant and why_not_truth(rules, TruthFacts.of_dataset(self.run.dataset(scene))) is None:
                 return rules
         return None
 
@@ -114,7 +109,7 @@ class RunSource:
 
     def _read_truth(self, scene: str, variant: str) -> GroundTruth | None:
         try:
-            truth: GroundTruth = self.dataset(scene).ground_truth(scene.partition("/")[2], variant)
+            truth: GroundTruth = self.run.dataset(scene).ground_truth(scene.partition("/")[2], variant)
         except GroundTruthMissing:
             return None
         return truth

@@ -1,22 +1,32 @@
-"""What the answers to a set of sheets add up to: accuracies, tests between methods, agreement, people beside truth."""
+"""What the answers to a set of sheets add up to: accuracies, tests between methods, agreement, people beside truth.
+
+``scores.json`` holds it, from which tables are made again.
+"""
 
 from __future__ import annotations
 
+import math
 from collections import Counter, defaultdict
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import lru_cache
 from itertools import combinations
-from typing import Literal
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
+from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.numerics.statistics import percentile_interval, resample_weights, sign_flip_test
 from su3d_bench.questions.model import ALL_KINDS
 from su3d_bench.sheets.agreement import Agreement, Interval, agreement, cohen_kappa
 from su3d_bench.sheets.answers import LABELS, Judgement
-from su3d_bench.sheets.items import CANNOT_TELL, MERGES, RIGHT, Key, KeyItem, Sheet
+from su3d_bench.sheets.items import CANNOT_TELL, MERGES, RIGHT, Key, KeyItem, Sheet, read_record
+from su3d_bench.store.atomic import write_json
+
+if TYPE_CHECKING:
+    import pandas
 
 Judge = Literal["people", "automatic"]
 SCHEMA = 1
@@ -27,6 +37,7 @@ OF_ALL_KINDS = "all"
 LABEL_METRICS = (f"label {LABELS[0]}", f"label {LABELS[1]}")
 # As the protocols that let the ground truth judge call the same numbers.
 METRICS = (*ALL_KINDS, OF_ALL_KINDS, *LABEL_METRICS, WELL_MERGED, UNDER_MERGED, OVER_MERGED, "answer", "objects")
+_PLACE = ["method", "dataset", "metric"]  # of a cell
 
 
 @dataclass(frozen=True)
@@ -131,34 +142,20 @@ class Scores:
     schema_version: int = SCHEMA
 
 
-@dataclass(frozen=True)
-class _Value:
-    """What one item gives to one metric of each of its methods; ``unit`` is what methods are compared over."""
-
-    metric: str
-    unit: str
-    key: KeyItem
-    values: tuple[float, ...]
-    n_cannot_tell: int
-
-    @property
-    def mean(self) -> float:
-        return float(np.mean(self.values))
-
-
 def score(sheet: Sheet, key: Key, judgements: Sequence[Judgement], silent: Sequence[str] = ()) -> Scores:
     """The scores of judgements that ``check_answers`` found without fault; without any, what the truth says of all."""
-    keys = {one.id: one for one in key.items}
-    told = [(keys[one.item_id], one.ask, one.answer) for one in judgements]
-    by_people = _values(told)
-    judged = {(one.item_id, one.ask) for one in judgements}
+    keys = {item.id: item for item in key.items}
+    given = [(keys[judgement.item_id], judgement.ask, judgement.answer) for judgement in judgements]
+    by_people = _shares(given)
+    clear = by_people[by_people["n_clear"] > 0]
+    judged = {(judgement.item_id, judgement.ask) for judgement in judgements}
     truth = [
-        (one, ask, choice)
-        for one in key.items
-        for ask, choice in one.automatic.items()
-        if (one.id, ask) in judged or not judgements
+        (item, ask, choice)
+        for item in key.items
+        for ask, choice in item.automatic.items()
+        if (item.id, ask) in judged or not judgements
     ]
-    ratings = _ratings(told, judgements)
+    ratings = _ratings(given, judgements)
     return Scores(
         sheet_id=sheet.id,
         kind=sheet.kind,
@@ -169,22 +166,22 @@ def score(sheet: Sheet, key: Key, judgements: Sequence[Judgement], silent: Seque
         silent=tuple(silent),
         n_items=len(sheet.items),
         n_judged=len({one.item_id for one in judgements}),
-        cells=(*_cells("people", key.methods, by_people), *_cells("automatic", key.methods, _values(truth))),
-        tests=tuple(_label_tests(key, by_people) if sheet.kind == "annotation" else _method_tests(key, by_people)),
+        cells=(*_cells("people", key.methods, by_people), *_cells("automatic", key.methods, _shares(truth))),
+        tests=tuple(test for test in _tests(sheet, key, clear) if test.n_items),
         agreements=tuple(AskAgreement(what, agreement(items)) for what, items in ratings.items()),
-        confusions=tuple(one for what in ratings if (one := _confusion(sheet, what, told)) is not None),
+        confusions=tuple(one for what in ratings if (one := _confusion(sheet, what, given)) is not None),
         second_looks=tuple(_second_looks(sheet, keys, judgements)),
         answered_by=key.answered_by,
     )
 
 
-_Told = tuple[KeyItem, str, str]  # an item, one of its asks, the answer
+_Given = tuple[KeyItem, str, str]  # an item, one of its asks, the answer
 
 
-def _ratings(told: Sequence[_Told], judgements: Sequence[Judgement]) -> dict[str, dict[str, dict[str, str]]]:
+def _ratings(given: Sequence[_Given], judgements: Sequence[Judgement]) -> dict[str, dict[str, dict[str, str]]]:
     """What is asked -> item and ask -> annotator -> answer."""
     found: dict[str, dict[str, dict[str, str]]] = {}
-    for (key, ask, answer), one in zip(told, judgements, strict=True):
+    for (key, ask, answer), one in zip(given, judgements, strict=True):
         found.setdefault(_asked(key, ask), {}).setdefault(f"{key.id}\0{ask}", {})[one.annotator] = answer
     return found
 
@@ -194,23 +191,26 @@ def _asked(key: KeyItem, ask: str) -> str:
     return "label" if ask in key.stands_for else ask
 
 
-def _values(told: Iterable[_Told]) -> list[_Value]:
-    """What items give to metrics, each metric of an item once, in the order of the sheet."""
-    answers: dict[tuple[str, str], list[str]] = defaultdict(list)
-    keys: dict[str, KeyItem] = {}
-    for key, ask, answer in told:
-        answers[key.id, ask].append(answer)
-        keys[key.id] = key
-    found = []
-    for (item, ask), given in answers.items():
-        key = keys[item]
-        clear = [answer for answer in given if answer != CANNOT_TELL]
-        unit = f"{key.scene}\0{key.question_id or item}"
-        for metric, choice in _metrics(key, ask):
-            found.append(
-                _Value(metric, unit, key, tuple(float(one == choice) for one in clear), len(given) - len(clear))
-            )
-    return found
+def _shares(given: Iterable[_Given]) -> pandas.DataFrame:
+    """A row a method, metric and ask of an item, in the order of the sheet: how many answers, and how many are clear.
+
+    ``share`` of the clear ones speaks for the metric, NaN where none is; ``unit`` is what methods are compared over.
+    """
+    import pandas
+
+    names = [*_PLACE, "scene", "unit", "item", "ask"]
+    rows = [
+        (
+            *(method, key.scene.partition("/")[0], metric, key.scene),
+            *(f"{key.scene}\0{key.question_id or key.id}", key.id, ask),
+            np.nan if answer == CANNOT_TELL else float(answer == choice),
+        )
+        for key, ask, answer in given
+        for metric, choice in _metrics(key, ask)
+        for method in key.methods
+    ]
+    table = pandas.DataFrame(rows, columns=[*names, "share"]).astype({"share": np.float64})
+    return table.groupby(names, sort=False)["share"].agg(share="mean", n="size", n_clear="count").reset_index()
 
 
 def _metrics(key: KeyItem, ask: str) -> list[tuple[str, str]]:
@@ -224,24 +224,19 @@ def _metrics(key: KeyItem, ask: str) -> list[tuple[str, str]]:
     return [(ask, RIGHT)]
 
 
-def _cells(judge: Judge, methods: Sequence[str], values: Sequence[_Value]) -> list[ScoreCell]:
-    groups: dict[tuple[str, str, str], list[_Value]] = defaultdict(list)
-    for one in values:
-        for method in one.key.methods:
-            groups[method, one.key.scene.partition("/")[0], one.metric].append(one)
+def _cells(judge: Judge, methods: Sequence[str], shares: pandas.DataFrame) -> list[ScoreCell]:
+    groups = dict(iter(shares.groupby(_PLACE)))
 
     def order(place: tuple[str, str, str]) -> tuple[str, int, int]:
         return place[1], methods.index(place[0]), METRICS.index(place[2])
 
-    return [_cell(judge, *place, groups[place]) for place in sorted(groups, key=order)]
+    return [_cell(judge, place, groups[place]) for place in sorted(groups, key=order)]
 
 
-def _cell(judge: Judge, method: str, dataset: str, metric: str, group: Sequence[_Value]) -> ScoreCell:
-    clear = [one for one in group if one.values]
-    scenes: dict[str, list[float]] = defaultdict(list)
-    for one in clear:
-        scenes[one.key.scene].append(one.mean)
-    means = np.array([one.mean for one in clear], np.float64)
+def _cell(judge: Judge, place: tuple[str, str, str], group: pandas.DataFrame) -> ScoreCell:
+    method, dataset, metric = place
+    clear = group[group["n_clear"] > 0]
+    means = clear["share"].to_numpy()
     return ScoreCell(
         judge=judge,
         method=method,
@@ -250,9 +245,9 @@ def _cell(judge: Judge, method: str, dataset: str, metric: str, group: Sequence[
         value=float(means.mean()) if len(means) else None,
         interval=_interval(means),
         n_items=len(clear),
-        n_judgements=sum(len(one.values) for one in group),
-        n_cannot_tell=sum(one.n_cannot_tell for one in group),
-        per_scene={scene: float(np.mean(found)) for scene, found in sorted(scenes.items())},
+        n_judgements=int(group["n_clear"].sum()),
+        n_cannot_tell=int((group["n"] - group["n_clear"]).sum()),
+        per_scene={scene: float(shares.to_numpy().mean()) for scene, shares in clear.groupby("scene")["share"]},
     )
 
 
@@ -269,33 +264,27 @@ def _draws(n_items: int) -> Float64Array:
     return resample_weights(n_items).astype(np.float64)
 
 
-def _method_tests(key: Key, values: Sequence[_Value]) -> list[PairTest]:
-    """Each pair of methods under each metric, over the questions that were asked of both."""
-    found: dict[tuple[str, str], dict[str, dict[str, float]]] = {}
-    for one in values:
-        place = one.key.scene.partition("/")[0], one.metric
-        for method in one.key.methods if one.values else ():
-            found.setdefault(place, {}).setdefault(method, {})[one.unit] = one.mean
-    tests = []
-    for (dataset, metric), of_method in sorted(found.items(), key=lambda one: (one[0][0], METRICS.index(one[0][1]))):
-        for left, right in combinations([method for method in key.methods if method in of_method], 2):
-            tests.append(_test(left, right, dataset, metric, of_method[left], of_method[right]))
-    return [one for one in tests if one.n_items]
+def _tests(sheet: Sheet, key: Key, clear: pandas.DataFrame) -> Iterator[PairTest]:
+    """Each pair of methods under each metric over the questions that were asked of both; of labels, n' against n of
+    each method over its instances, for other methods have other instances."""
+    if sheet.kind == "annotation":
+        left, right = LABEL_METRICS
+        for method in key.methods:
+            for dataset, group in clear[clear["method"] == method].groupby("dataset", sort=False):
+                shares = _by_unit(group, "metric")
+                before, after = shares.get(left, {}), shares.get(right, {})
+                yield _test(f"{method} {left}", f"{method} {right}", dataset, "label", before, after)
+        return
+    groups = dict(iter(clear.groupby(["dataset", "metric"])))
+    for dataset, metric in sorted(groups, key=lambda place: (place[0], METRICS.index(place[1]))):
+        shares = _by_unit(groups[dataset, metric], "method")
+        for left, right in combinations([method for method in key.methods if method in shares], 2):
+            yield _test(left, right, dataset, metric, shares[left], shares[right])
 
 
-def _label_tests(key: Key, values: Sequence[_Value]) -> list[PairTest]:
-    """Label n' against n of each method over its instances; other methods have other instances."""
-    found: dict[tuple[str, str], dict[str, dict[str, float]]] = {}
-    for one in values:
-        for method in one.key.methods if one.values else ():
-            place = one.key.scene.partition("/")[0], method
-            found.setdefault(place, {}).setdefault(one.metric, {})[one.unit] = one.mean
-    left, right = LABEL_METRICS
-    tests = [
-        _test(f"{method} {left}", f"{method} {right}", dataset, "label", labels.get(left, {}), labels.get(right, {}))
-        for (dataset, method), labels in sorted(found.items(), key=lambda one: key.methods.index(one[0][1]))
-    ]
-    return [one for one in tests if one.n_items]
+def _by_unit(group: pandas.DataFrame, column: str) -> dict[str, dict[str, float]]:
+    """Value of ``column`` -> unit -> share."""
+    return {name: dict(zip(own["unit"], own["share"], strict=True)) for name, own in group.groupby(column)}
 
 
 def _test(
@@ -353,9 +342,9 @@ def _sign_flip_of_steps(steps: Int64Array) -> float:
     return min(1.0, float(shares[np.abs(np.arange(-far, far + 1)) >= at_least].sum()))
 
 
-def _confusion(sheet: Sheet, what: str, told: Sequence[_Told]) -> Confusion | None:
+def _confusion(sheet: Sheet, what: str, given: Sequence[_Given]) -> Confusion | None:
     """None where the truth is known of no judged item."""
-    known = [(key, ask, answer) for key, ask, answer in told if _asked(key, ask) == what and ask in key.automatic]
+    known = [(key, ask, answer) for key, ask, answer in given if _asked(key, ask) == what and ask in key.automatic]
     if not known:
         return None
     choices = sheet.ask(known[0][1]).choices
@@ -398,3 +387,28 @@ def _reason(answers: Sequence[str], automatic: str) -> Literal["annotators disag
         return "annotators disagree"
     is_against = bool(answers) and automatic not in ("", CANNOT_TELL) and answers[0] not in (automatic, CANNOT_TELL)
     return "against the truth" if is_against else None
+
+
+FILE = "scores.json"
+
+
+def write_scores(folder: Path, scores: Scores) -> Path:
+    """Write ``scores.json`` into ``folder``; its path."""
+    write_json(folder / FILE, asdict(scores))
+    return folder / FILE
+
+
+def read_scores(path: Path) -> Scores:
+    """The scores of a file or of the folder that holds it; ``DataError`` where it is not as ``sheets score`` writes."""
+    file = path / FILE if path.is_dir() else path
+    found = read_record(file, Scores, SCHEMA, "sheets score", "score again")
+    if not all(_is_sound(cell) for cell in found.cells):
+        raise DataError(
+            f"{printable(str(file), 200)}: holds a number that is no share or a metric that is none; score again"
+        )
+    return found
+
+
+def _is_sound(cell: ScoreCell) -> bool:
+    values = [*(() if cell.value is None else (cell.value,)), *(cell.interval or ()), *cell.per_scene.values()]
+    return cell.metric in METRICS and all(math.isfinite(one) and 0.0 <= one <= 1.0 for one in values)

@@ -16,11 +16,12 @@ from places import SCENES
 from scored_room import ENCODER, NAMES, instances, noisy, room, truth_as_prediction
 
 import su3d_bench.reports.tables.attribution
-from su3d_bench.analysis.attribution import KINDS, attribute
+from su3d_bench.analysis.attribution import attribute
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError
 from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
 from su3d_bench.metrics.attribution import points as attribution_semantic
+from su3d_bench.metrics.attribution.arrays import EXPLAINED as EXPLAINED_KINDS
 from su3d_bench.metrics.attribution.arrays import scored_masks, scored_points
 from su3d_bench.metrics.attribution.masks import count_masks
 from su3d_bench.metrics.attribution.points import CAUSES, causes_of, mend_points
@@ -299,7 +300,9 @@ def test_the_command_prints_a_table_and_draws_the_plot(capsys: pytest.CaptureFix
 
 
 def test_the_table_says_what_every_kind_of_error_is() -> None:
-    assert {kind: tuple(names) for kind, names in MEANINGS.items()} == KINDS
+    assert {kind: tuple(names) for kind, names in MEANINGS.items()} == {
+        kind: causes for kind, (causes, _) in EXPLAINED_KINDS.items()
+    }
 
 
 def test_the_examples_in_the_docstrings_run() -> None:

@@ -18,8 +18,7 @@ from su3d_bench.reports.tables.latex import latex
 from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.paper import Shown
 from su3d_bench.sheets.answers import check_answers
-from su3d_bench.sheets.score_file import write_scores
-from su3d_bench.sheets.scores import score
+from su3d_bench.sheets.scores import score, write_scores
 
 LABELS = [("right", "right", "well-merged"), ("wrong", "right", "well-merged"), ("wrong", "wrong", "over-merged")]
 

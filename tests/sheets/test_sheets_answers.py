@@ -15,8 +15,7 @@ from simulated_annotators import annotation_set, answered, as_csv, retrieval_set
 from su3d_bench.core.errors import DataError
 from su3d_bench.sheets.answers import check_answers, check_key, parse_csv, parse_workbook, read_answers
 from su3d_bench.sheets.items import ANSWER_COLUMNS, Key, Sheet, read_key, write_key
-from su3d_bench.sheets.score_file import read_scores, write_scores
-from su3d_bench.sheets.scores import Scores, score
+from su3d_bench.sheets.scores import Scores, read_scores, score, write_scores
 
 
 @pytest.fixture(scope="module")

@@ -74,7 +74,7 @@ def call(arguments: argparse.Namespace) -> int:
 def _tables(arguments: argparse.Namespace) -> list[Table]:
     from su3d_bench.analysis.tables import choose, is_scores, measured_results
     from su3d_bench.reports.tables.judged import JUDGED, judged_table
-    from su3d_bench.reports.tables.paper import Shown, SweepRow, ablation_table, paper_table, selection_tables
+    from su3d_bench.reports.tables.paper import Shown, ablation_table, paper_table, selection_tables
     from su3d_bench.runs.ablation import read_rows
 
     shown = Shown(
@@ -91,8 +91,7 @@ def _tables(arguments: argparse.Namespace) -> list[Table]:
     tables = []
     for number in dict.fromkeys(arguments.table):
         if number == "I":
-            rows = [row for run in arguments.runs if not is_scores(run) for row in read_rows(run)]
-            sweep = [SweepRow(row.parameter, row.value, row.method) for row in rows]
+            sweep = [row for run in arguments.runs if not is_scores(run) for row in read_rows(run)]
             tables.append(ablation_table(found, sweep, shown, with_published=with_published))
         elif number in JUDGED:
             tables += judged_table(number, found, shown, with_published=with_published)

@@ -129,7 +129,7 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
     from su3d_bench.reports.tables.formats import FORMATS
     from su3d_bench.reports.tables.judged import sheet_tables
     from su3d_bench.sheets.items import PICTURES
-    from su3d_bench.sheets.score_file import write_scores
+    from su3d_bench.sheets.scores import write_scores
     from su3d_bench.store.atomic import make_folder, write_text
 
     make_folder(folder)

@@ -1,11 +1,13 @@
 """What a protocol's evaluator sees of a scene, as plain arrays: the masks with their classes, or the scored points.
 
-They are those that scoring itself counts; whoever uses them compares the counts with those stored.
+They are those that scoring itself counts; whoever uses them compares the counts with those stored. ``EXPLAINED`` is
+the one table of the kinds of protocols whose errors can be told apart.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,7 +21,9 @@ from su3d_bench.core.types import (
     Partition,
     Prediction,
 )
-from su3d_bench.metrics.attribution.overlaps import LabelledMasks, ScoringRules
+from su3d_bench.metrics.attribution import masks as instances
+from su3d_bench.metrics.attribution import points as semantic
+from su3d_bench.metrics.attribution.overlaps import LabelledMasks, ScoringRules, measure_overlaps
 from su3d_bench.metrics.attribution.points import LabelledPoints
 from su3d_bench.metrics.instance.score import masks_on_truth
 from su3d_bench.metrics.matching import nearest as transfer
@@ -77,3 +81,33 @@ def _object_ids(rules: ProtocolRules, truth: GroundTruth) -> Int64Array:
     """One number an object: its instance, or where there is none one for all of its class."""
     instance = truth.instance.astype(np.int64)
     return np.where(instance > 0, instance, instance.max(initial=0) + 2 + class_index_of_ids(rules, truth.semantic))
+
+
+MendedScene = instances.Mended | semantic.MendedPoints
+Mend = Callable[[ProtocolRules, GroundTruth, Prediction, Encoder | None], MendedScene]
+
+
+def _mended_masks(
+    rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
+) -> MendedScene:
+    assert not isinstance(prediction, DenseFeatures)
+    values, masks, scoring = scored_masks(rules, truth, prediction, encoder)
+    mended = instances.mend_scene(values, masks, scoring)
+    if rules.class_agnostic is not None:
+        return mended
+    relabelled = instances.with_true_labels(measure_overlaps(values, masks, scoring))
+    return replace(mended, with_true_labels=instances.count_masks(values, relabelled, scoring))
+
+
+def _mended_points(
+    rules: ProtocolRules, truth: GroundTruth, prediction: Prediction, encoder: Encoder | None
+) -> MendedScene:
+    scored = scored_points(rules, truth, prediction, encoder)
+    return semantic.mend_points(scored.points, scored.is_counted, has_masks=scored.has_masks)
+
+
+# Of each kind the causes of its errors, and what mends a scene.
+EXPLAINED: dict[str, tuple[tuple[str, ...], Mend]] = {
+    "instance": (instances.KINDS, _mended_masks),
+    "semantic": (semantic.CAUSES, _mended_points),
+}

@@ -54,12 +54,17 @@ Mending = tuple[LabelledMasks, int]
 
 @dataclass(frozen=True)
 class Mended:
-    """A scene's counts as they are, after each mending alone and after ``all``; ``n`` errors of each kind."""
+    """A scene's counts as they are, after each mending alone and after ``all``; ``n`` errors of each kind.
+
+    ``with_true_labels``: each mask named by the truth, where labels count. Points are not counted here.
+    """
 
     as_is: InstanceCounts
     alone: Mapping[str, InstanceCounts]
     all: InstanceCounts
     n: Mapping[str, int]
+    with_true_labels: InstanceCounts | None = None
+    n_scored: int | None = None
 
 
 def mend_scene(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules) -> Mended:

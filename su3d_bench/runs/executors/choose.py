@@ -74,11 +74,10 @@ def run_units(
     if executor == "processes":
         return run_processes(work, units, report, jobs=n_workers, lost=lost)
     if executor == "ray":
-        from su3d_bench.runs.executors.ray import RayOptions, run_ray
+        from su3d_bench.runs.executors.ray import run_ray
 
-        options = RayOptions(config.ray_address, config.gpus_per_job, config.retries)
-        return run_ray(work, units, report, jobs=n_workers, options=options, lost=lost)
-    from su3d_bench.runs.executors.slurm import SlurmOptions, run_slurm
+        return run_ray(work, units, report, jobs=n_workers, config=config, lost=lost)
+    from su3d_bench.runs.executors.slurm import run_slurm
 
-    at = SlurmOptions(folder.absolute() / "slurm", slurm_parameters(config), int(config.gpus_per_job), config.retries)
-    return run_slurm(work, units, report, jobs=n_workers, options=at, lost=lost)
+    at, parameters = folder.absolute() / "slurm", slurm_parameters(config)
+    return run_slurm(work, units, report, jobs=n_workers, config=config, folder=at, parameters=parameters, lost=lost)

@@ -10,9 +10,9 @@ import socket
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from typing import Any
 
+from su3d_bench.core.config import RunConfig
 from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, package_versions
 from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError
 from su3d_bench.runs.executors.local import Outcome, Report, Unit, Work, answer_of, limit_threads, unwrap
@@ -21,31 +21,22 @@ CONNECT_S = 5.0  # a machine of a cluster in one network answers within millisec
 MOST_AT_ONCE = 1000  # each pending task costs the driver memory, and each wait a look at all of them
 
 
-@dataclass(frozen=True)
-class RayOptions:
-    """``address`` empty: the cluster that ``RAY_ADDRESS`` names or that runs on this machine."""
-
-    address: str = ""
-    gpus_per_job: float = 0.0
-    retries: int = 2
-
-
 def run_ray(
     work: Work[Unit, Outcome],
     units: Sequence[Unit],
     report: Report,
     *,
     jobs: int,
-    options: RayOptions,
+    config: RunConfig,
     lost: Callable[[Unit, str], Outcome],
 ) -> Iterator[Outcome]:
     """Outcomes of ``units`` as they come in, at most ``jobs`` of them handed to the cluster at once.
 
-    A unit whose worker or machine was lost ``options.retries`` + 1 times has the outcome that ``lost`` makes. A
+    A unit whose worker or machine was lost ``config.retries`` + 1 times has the outcome that ``lost`` makes. A
     ``Su3dError`` that leaves ``work``, or an interrupt, stops all. ``report`` hears nothing from inside a unit.
     """
-    with _connected(options) as ray:
-        remote = ray.remote(num_cpus=1, num_gpus=options.gpus_per_job, max_retries=0, max_calls=1)(_on_node)
+    with _connected(config) as ray:
+        remote = ray.remote(num_cpus=1, num_gpus=config.gpus_per_job, max_retries=0, max_calls=1)(_on_node)
         versions = _versions()
         waiting = deque((unit, 1) for unit in units)
         running: dict[Any, tuple[Unit, int]] = {}
@@ -58,7 +49,7 @@ def run_ray(
                 answer, reason = _answer(ray, reference)
                 if reason is None:
                     yield unwrap(answer)
-                elif attempt <= options.retries:
+                elif attempt <= config.retries:
                     waiting.appendleft((unit, attempt + 1))
                 else:
                     yield lost(unit, f"{reason}, {attempt} times; see the cluster's logs, or raise --retries")
@@ -98,18 +89,18 @@ def _versions() -> dict[str, str]:
 
 
 @contextmanager
-def _connected(options: RayOptions) -> Iterator[Any]:
-    """The module ``ray``, connected to the cluster that ``options`` speak of, which has a machine for each job."""
+def _connected(config: RunConfig) -> Iterator[Any]:
+    """The module ``ray``, connected to the cluster that ``config`` names, which has a machine for each job."""
     try:
         import ray
     except ImportError as error:
         raise ModelMissing("the executor 'ray' needs the ray extra: pip install 'su3d-bench[ray]'") from error
     was_connected = ray.is_initialized()
     if not was_connected:
-        _refuse_silent(options.address)
-        _connect(ray, options.address or "auto")
+        _refuse_silent(config.ray_address)
+        _connect(ray, config.ray_address or "auto")
     try:
-        _refuse_too_many_gpus(ray, options.gpus_per_job)
+        _refuse_too_many_gpus(ray, config.gpus_per_job)
         yield ray
     finally:
         if not was_connected:

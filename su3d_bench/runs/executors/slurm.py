@@ -10,10 +10,10 @@ import shutil
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.core.config import RunConfig
 from su3d_bench.core.errors import ConfigError, ModelMissing
 from su3d_bench.runs.executors.local import Outcome, Report, Unit, Work, answer_of, limit_threads, unwrap
 
@@ -23,32 +23,25 @@ MOST_AT_ONCE = 1000  # Slurm's MaxArraySize is 1001 where nobody set it
 POLL_S = 0.5
 
 
-@dataclass(frozen=True)
-class SlurmOptions:
-    """``parameters`` are those of submitit's ``AutoExecutor``, and ``cluster``; ``folder`` is on a shared disk."""
-
-    folder: Path
-    parameters: Mapping[str, Any] = field(default_factory=dict)
-    gpus_per_job: int = 0
-    retries: int = 2
-
-
 def run_slurm(
     work: Work[Unit, Outcome],
     units: Sequence[Unit],
     report: Report,
     *,
     jobs: int,
-    options: SlurmOptions,
+    config: RunConfig,
+    folder: Path,
+    parameters: Mapping[str, Any],
     lost: Callable[[Unit, str], Outcome],
 ) -> Iterator[Outcome]:
     """Outcomes of ``units`` as they come in, at most ``jobs`` of them submitted at once, as job arrays.
 
-    A unit whose job died ``options.retries`` + 1 times has the outcome that ``lost`` makes. A ``Su3dError`` that leaves
+    ``parameters`` are those of submitit's ``AutoExecutor``, and ``cluster``; ``folder`` is on a shared disk. A unit
+    whose job died ``config.retries`` + 1 times has the outcome that ``lost`` makes. A ``Su3dError`` that leaves
     ``work``, or an interrupt, stops all. ``report`` hears nothing from inside a unit.
     """
     n_at_once = min(jobs, MOST_AT_ONCE)
-    executor, failures = _executor(options, n_at_once)
+    executor, failures = _executor(folder, parameters, int(config.gpus_per_job), n_at_once)
     waiting = deque((unit, 1) for unit in units)
     running: list[tuple[Any, Unit, int]] = []
     is_clean = True
@@ -62,11 +55,11 @@ def run_slurm(
                 try:
                     answer = job.result()
                 except failures as error:
-                    if attempt <= options.retries:
+                    if attempt <= config.retries:
                         waiting.appendleft((unit, attempt + 1))
                         continue
                     is_clean = False
-                    yield lost(unit, f"its job failed {attempt} times: {_last_line(error)}; see {options.folder}")
+                    yield lost(unit, f"its job failed {attempt} times: {_last_line(error)}; see {folder}")
                     continue
                 yield unwrap(answer)
             if not ended:
@@ -75,7 +68,7 @@ def run_slurm(
         for job, _, _ in running:
             job.cancel(check=False)
     if is_clean:
-        shutil.rmtree(options.folder, ignore_errors=True)
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 def _submit(executor: Any, work: Work[Unit, Outcome], fresh: Sequence[tuple[Unit, int]]) -> list[tuple[Any, Unit, int]]:
@@ -89,20 +82,22 @@ def _in_job(work: Work[Unit, Outcome], unit: Unit) -> tuple[str, Any]:
     return answer_of(work, unit, lambda event: None)
 
 
-def _executor(options: SlurmOptions, n_at_once: int) -> tuple[Any, tuple[type[Exception], ...]]:
+def _executor(
+    folder: Path, given: Mapping[str, Any], n_gpus: int, n_at_once: int
+) -> tuple[Any, tuple[type[Exception], ...]]:
     """submitit's executor, and the errors by which it says that a job died."""
     try:
         import submitit
     except ImportError as error:
         raise ModelMissing("the executor 'slurm' needs the slurm extra: pip install 'su3d-bench[slurm]'") from error
-    parameters = {**DEFAULTS, "slurm_array_parallelism": n_at_once, **options.parameters}
+    parameters = {**DEFAULTS, "slurm_array_parallelism": n_at_once, **given}
     cluster = parameters.pop("cluster", CLUSTERS[0])
     if cluster not in CLUSTERS:
         raise ConfigError(f"--slurm cluster={cluster}: expected {' or '.join(CLUSTERS)}")
-    if options.gpus_per_job:
-        parameters["gpus_per_node"] = options.gpus_per_job
+    if n_gpus:
+        parameters["gpus_per_node"] = n_gpus
     try:
-        executor = submitit.AutoExecutor(folder=options.folder, cluster=cluster)
+        executor = submitit.AutoExecutor(folder=folder, cluster=cluster)
         executor.update_parameters(**parameters)
     except (NameError, AssertionError, TypeError, ValueError, RuntimeError) as error:
         line = " ".join(str(error).split())[:300]

@@ -181,7 +181,7 @@ def _sheet_files(folder: Path) -> Read:
 
     def asked() -> Iterator[Read]:
         from su3d_bench.sheets.items import KEY_FILE, SHEET_FILE, read_key, read_sheet
-        from su3d_bench.sheets.score_file import read_scores
+        from su3d_bench.sheets.scores import read_scores
 
         yield lambda: called(words)
         yield lambda: read_sheet(folder / "sheet" / SHEET_FILE)
