@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
-from functools import cached_property
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -91,15 +91,22 @@ def attribute(
         other.run.check_method(other.method)
     scores = run.scores(side.method)
     gathered = {name: _Gathered(load_protocol(name)) for name in names}
-    read = _Reader(run)
+    encoder = cache(run.encoder)
+
+    @cache
+    def truth_of(scene: str, variant: str) -> GroundTruth:
+        truth: GroundTruth = run.dataset(scene).ground_truth(scene.partition("/")[2], variant)
+        return truth
+
     for scene in run.scenes:
         mine = [name for name in names if scene in scores[name]]
         if mine:
             prediction = read_prediction(run.folder.job(scene, side.method).prediction)
+            naming = encoder() if getattr(prediction, "labels", None) is None else None
             for name in mine:
-                truth = read.truth(scene, gathered[name].rules.ground_truth)
-                gathered[name].add(scene, truth, prediction, read.encoder(prediction), scores[name][scene])
-            read.forget(scene)
+                truth = truth_of(scene, gathered[name].rules.ground_truth)
+                gathered[name].add(scene, truth, prediction, naming, scores[name][scene])
+            truth_of.cache_clear()
     explained = [one for one in gathered.values() if one.scenes]
     formed = tuple(one.form(_oracle_values(one.rules, side, other, one.scenes)) for one in explained)
     if not formed:
@@ -160,30 +167,6 @@ def _oracle_values(rules: ProtocolRules, side: Side, other: Side | None, scenes:
         raise ConfigError(f"{other.name}: lacks {printable(missing[0], 100)}; the run must have the same scenes")
     refuse_unlike(side, other, rules.name, scenes)
     return _values(rules, [scores[scene].counts for scene in scenes])
-
-
-class _Reader:
-    """Truths and the encoder of a run, read when they are asked for."""
-
-    def __init__(self, run: FinishedRun) -> None:
-        self._run = run
-        self._truths: dict[tuple[str, str], GroundTruth] = {}
-
-    @cached_property
-    def _encoder(self) -> Encoder:
-        return self._run.encoder()
-
-    def truth(self, scene: str, variant: str) -> GroundTruth:
-        if (scene, variant) not in self._truths:
-            self._truths[scene, variant] = self._run.dataset(scene).ground_truth(scene.partition("/")[2], variant)
-        return self._truths[scene, variant]
-
-    def forget(self, scene: str) -> None:
-        self._truths = {key: truth for key, truth in self._truths.items() if key[0] != scene}
-
-    def encoder(self, prediction: Prediction) -> Encoder | None:
-        """None for a prediction that has labels of its own."""
-        return self._encoder if getattr(prediction, "labels", None) is None else None
 
 
 @dataclass

@@ -17,7 +17,7 @@ from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.protocol_files import protocol_names
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import combine
-from su3d_bench.reports.tables.model import NOT_MEASURED, Cell, Origin, Table, TableRow, bracketed, percent
+from su3d_bench.reports.tables.model import NOT_MEASURED, Cell, Origin, Table, TableRow, bracketed, percent, some
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 MOST_RUNS = 10_000
@@ -187,8 +187,7 @@ def _left_out(refused: Sequence[Refused]) -> Iterator[str]:
         method, slash, protocol = one.what.rpartition(" / ")
         groups.setdefault((one.run, slash + protocol, one.reason), []).append(method)
     for (run, where, reason), methods in groups.items():
-        more = f" and {len(methods) - MOST_NAMED} more" if len(methods) > MOST_NAMED else ""
-        yield f"Left out: {run}, {', '.join(methods[:MOST_NAMED])}{more}{where}: {reason}"
+        yield f"Left out: {run}, {some(methods, MOST_NAMED)}{where}: {reason}"
 
 
 def _table(board: Sequence[Entry], index: int, intervals: bool) -> Table:

@@ -71,9 +71,14 @@ class PageMap:
     content: str
     reason: str | None
 
-    def listed(self, scene: str) -> dict[str, Any]:
+    def listed(self) -> dict[str, Any]:
         """What the page's list of maps says of it."""
-        return {"run": self.run, "scene": scene, "method": printable(self.method, 200), "reason": self.reason}
+        return {
+            "run": self.run,
+            "scene": printable(self.scene, 200),
+            "method": printable(self.method, 200),
+            "reason": self.reason,
+        }
 
 
 @dataclass(frozen=True)
@@ -143,10 +148,9 @@ class _Scene:
         made = []
         for index, run, scene, method in self._maps:
             prediction = read[index, method]
-            if isinstance(prediction, str):
-                made.append(PageMap(index, scene, method, "", prediction))
-                continue
-            made.append(PageMap(index, scene, method, self._pack(run, prediction, frames, most_points), None))
+            reason = prediction if isinstance(prediction, str) else None
+            content = "" if isinstance(prediction, str) else self._pack(run, prediction, frames, most_points)
+            made.append(PageMap(index, printable(scene, 200), printable(method, 200), content, reason))
         thumbnails = tuple((index, _jpeg(frame)) for index, frame in frames.items())
         remarks = tuple(printable(line) for line in dict.fromkeys(self._remarks))
         return PageScene(printable(self._scene, 200), thumbnails, tuple(made), remarks)

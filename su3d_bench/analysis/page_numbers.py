@@ -9,6 +9,7 @@ from typing import Any
 
 from su3d_bench.analysis.attribution import attribute
 from su3d_bench.analysis.comparison import SideNumbers, compare
+from su3d_bench.analysis.sides import Side
 from su3d_bench.core.config import KeyPath
 from su3d_bench.core.errors import Su3dError, printable, printable_json
 from su3d_bench.metrics.costs import summarise
@@ -138,22 +139,20 @@ def _times(run: FinishedRun, method: str) -> dict[str, Any] | None:
 
 def _comparisons(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
     """The first ``MOST_PAIRS`` pairs: methods of one name in two runs, then methods within a run."""
-    pairs: list[tuple[FinishedRun, str, FinishedRun, str]] = []
-    for one, other in itertools.combinations(runs, 2):
-        pairs += [(one, method, other, method) for method in one.methods if method in other.methods]
+    pairs: list[tuple[Side, Side]] = []
+    for left, right in itertools.combinations(runs, 2):
+        pairs += [(Side(left, method), Side(right, method)) for method in left.methods if method in right.methods]
     for run in runs:
-        pairs += [(run, first, run, second) for first, second in itertools.combinations(run.methods, 2)]
+        pairs += itertools.combinations((Side(run, method) for method in run.methods), 2)
     numbers = SideNumbers()
     return [_compared(runs, numbers, *pair) for pair in pairs[:MOST_PAIRS]]
 
 
-def _compared(
-    runs: Sequence[FinishedRun], numbers: SideNumbers, one: FinishedRun, first: str, other: FinishedRun, second: str
-) -> dict[str, Any]:
-    sides = {"left": [runs.index(one), first], "right": [runs.index(other), second]}
+def _compared(runs: Sequence[FinishedRun], numbers: SideNumbers, left: Side, right: Side) -> dict[str, Any]:
+    sides = {"left": [runs.index(left.run), left.method], "right": [runs.index(right.run), right.method]}
     try:
-        left, right = (f"{run.folder.path}:{method}" for run, method in ((one, first), (other, second)))
-        found = compare(left, right, numbers=numbers).to_json()
+        addresses = (f"{side.run.folder.path}:{side.method}" for side in (left, right))
+        found = compare(*addresses, numbers=numbers).to_json()
     except Su3dError as error:
         return {**sides, "protocols": [], "remarks": [], "reason": str(error)}
     return {**sides, "protocols": found["protocols"], "remarks": found["remarks"], "reason": None}

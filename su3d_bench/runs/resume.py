@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping
+from functools import cache, lru_cache
 from typing import Any
 
 from su3d_bench.core.types import SceneInfo
@@ -33,10 +34,10 @@ class FinishedScenes:
     """
 
     def __init__(self) -> None:
-        self._datasets: dict[Part, Any] = {}
+        self._dataset = cache(build_dataset)
+        self._data_digest = lru_cache(maxsize=1)(self._read_digest)
         self._methods: dict[tuple[Part, Part], tuple[Any, dict[str, str]]] = {}
         self._perceptions: dict[str, Perception | None] = {}  # by the domain of the images
-        self._last_digest = ("", "")  # a scene and that of its data
 
     def outcomes(self, job: SceneJob) -> tuple[MethodOutcome, ...] | None:
         """The outcomes of a scene, that of the ceiling last; None where a worker is needed, be it to say an error."""
@@ -70,23 +71,14 @@ class FinishedScenes:
     def inputs(self, job: SceneJob, part: Part) -> JobInputs | None:
         """What decides the numbers of a job; None where only a worker can tell."""
         method, config = self._method(job, part)
-        info = self._dataset(job).info(job.scene_name, stride_of(job.stride, part.options))
+        info = self._dataset(job.dataset, job.data_root).info(job.scene_name, stride_of(job.stride, part.options))
         perception = self._perception(job, info)
         if perception is None:
             return None
         return JobInputs(job, part.name, config, method, info, perception, self._data_digest(job))
 
-    def _data_digest(self, job: SceneJob) -> str:
-        scene, digest = self._last_digest
-        if scene != job.scene:
-            digest = str(self._dataset(job).digest(job.scene_name))
-            self._last_digest = job.scene, digest
-        return digest
-
-    def _dataset(self, job: SceneJob) -> Any:
-        if job.dataset not in self._datasets:
-            self._datasets[job.dataset] = build_dataset(job.dataset, job.data_root)
-        return self._datasets[job.dataset]
+    def _read_digest(self, job: SceneJob) -> str:
+        return str(self._dataset(job.dataset, job.data_root).digest(job.scene_name))
 
     def _method(self, job: SceneJob, part: Part) -> tuple[Any, dict[str, str]]:
         if (job.dataset, part) not in self._methods:

@@ -21,8 +21,6 @@ from su3d_bench.sheets.drafts import built_in
 from su3d_bench.sheets.drawing import ANSWER_COLOUR, OTHER_COLOUR, tags_of
 from su3d_bench.sheets.run_source import RunSource
 
-Subject = Literal["similarity", "labels", "reasoning"]
-SUBJECTS: tuple[Subject, ...] = ("similarity", "labels", "reasoning")
 CELL_WIDTH, CELL_HEIGHT = 720, 500  # pixels of one picture
 SMALLER = 4  # times, of the views in which the corner is chosen
 UNSEEN = 225

@@ -154,18 +154,11 @@ def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
     with zipfile.ZipFile(source) as archive:
         arrays = {info.filename.removesuffix(".npy"): _array(archive, info, held) for info in archive.infolist()}
     for name, array in arrays.items():
-        if (
-            array.dtype.kind == "U"
-            and array.size
-            and array.reshape(-1).view(_codes(array.dtype)).max() > sys.maxunicode
-        ):
-            raise ValueError(f"{name}: holds what is no text")
+        if array.dtype.kind == "U" and array.size:
+            codes = array.reshape(-1).view(np.dtype(np.uint32).newbyteorder(array.dtype.byteorder))
+            if codes.max() > sys.maxunicode:
+                raise ValueError(f"{name}: holds what is no text")
     return arrays
-
-
-def _codes(texts: np.dtype[Any]) -> np.dtype[Any]:
-    """The type of the characters in an array of ``texts``."""
-    return np.dtype(np.uint32).newbyteorder(texts.byteorder)
 
 
 def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, held: bytes | None) -> NDArray[Any]:

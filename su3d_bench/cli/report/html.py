@@ -59,7 +59,7 @@ def call(arguments: argparse.Namespace) -> int:
     shown = [one for scene in scenes for one in scene.maps]
     page = page_html(
         printable(title, 200),
-        {**numbers, "maps": [one.listed(scene.scene) for scene in scenes for one in scene.maps]},
+        {**numbers, "maps": [one.listed() for one in shown]},
         [scene.listed() for scene in scenes],
         [one.content for one in shown],
     )

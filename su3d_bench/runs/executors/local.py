@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
-from typing import Any, Generic, TypeVar
+from typing import Any, TypeVar
 
 from su3d_bench.core.errors import Su3dError
 
@@ -80,13 +80,6 @@ def run_inline(work: Work[Unit, Outcome], units: Sequence[Unit], report: Report)
         yield outcome
 
 
-@dataclass
-class _Running(Generic[Unit]):
-    unit: Unit
-    process: BaseProcess
-    connection: Connection
-
-
 def run_processes(
     work: Work[Unit, Outcome],
     units: Sequence[Unit],
@@ -101,31 +94,32 @@ def run_processes(
     ``work``, or an interrupt, stops all.
     """
     waiting = list(reversed(units))
-    running: dict[Connection, _Running[Unit]] = {}
+    running: dict[Connection, tuple[Unit, BaseProcess]] = {}
     try:
         while waiting or running:
             while waiting and len(running) < jobs:
-                started = _start(work, waiting.pop())
-                running[started.connection] = started
-            for connection in wait(list(running)):
-                assert isinstance(connection, Connection)
-                message = _receive(connection)
+                unit = waiting.pop()
+                connection, process = _start(work, unit)
+                running[connection] = unit, process
+            for ready in wait(list(running)):
+                assert isinstance(ready, Connection)
+                message = _receive(ready)
                 if message is not None and message[0] == "event":
                     report(message[1])
                     continue
-                one = running.pop(connection)
-                one.process.join()
-                connection.close()
-                yield lost(one.unit, _cause(one.process.exitcode)) if message is None else unwrap(message)
+                unit, process = running.pop(ready)
+                process.join()
+                ready.close()
+                yield lost(unit, _cause(process.exitcode)) if message is None else unwrap(message)
     finally:
-        for one in running.values():
-            one.process.terminate()
-        for one in running.values():
-            one.process.join()
-            one.connection.close()
+        for _, process in running.values():
+            process.terminate()
+        for connection, (_, process) in running.items():
+            process.join()
+            connection.close()
 
 
-def _start(work: Work[Unit, Outcome], unit: Unit) -> _Running[Unit]:
+def _start(work: Work[Unit, Outcome], unit: Unit) -> tuple[Connection, BaseProcess]:
     context = multiprocessing.get_context("spawn")
     ours, theirs = context.Pipe(duplex=False)
     before = {name: os.environ.get(name) for name in ONE_THREAD}
@@ -140,7 +134,7 @@ def _start(work: Work[Unit, Outcome], unit: Unit) -> _Running[Unit]:
             else:
                 os.environ[name] = value
     theirs.close()
-    return _Running(unit, process, ours)
+    return ours, process
 
 
 def _receive(connection: Connection) -> tuple[str, Any] | None:
