@@ -73,12 +73,7 @@ class PageMap:
 
     def listed(self) -> dict[str, Any]:
         """What the page's list of maps says of it."""
-        return {
-            "run": self.run,
-            "scene": printable(self.scene, 200),
-            "method": printable(self.method, 200),
-            "reason": self.reason,
-        }
+        return {"run": self.run, "scene": self.scene, "method": self.method, "reason": self.reason}
 
 
 @dataclass(frozen=True)

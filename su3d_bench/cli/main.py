@@ -6,28 +6,10 @@ import argparse
 import os
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from typing import Any
 
 from su3d_bench import __version__
-from su3d_bench.cli import (
-    ablate,
-    ask,
-    attribute,
-    check,
-    compare,
-    evaluate,
-    export,
-    methods,
-    models,
-    protocols,
-    query,
-    questions,
-    refine,
-    report,
-    run,
-    sheets,
-)
-from su3d_bench.cli.datasets import list as datasets
 from su3d_bench.core.errors import (
     EXIT_DONE,
     EXIT_INTERNAL,
@@ -39,6 +21,26 @@ from su3d_bench.core.errors import (
 )
 from su3d_bench.runs.executors.local import limit_threads
 
+# Modules of this folder with ``add_parser(verbs)``, in the order of the help.
+VERBS = (
+    "run",
+    "ablate",
+    "evaluate",
+    "check",
+    "compare",
+    "attribute",
+    "report",
+    "sheets",
+    "query",
+    "questions",
+    "ask",
+    "refine",
+    "datasets.list",
+    "methods",
+    "models",
+    "protocols",
+    "export",
+)
 EXIT_INTERRUPTED = 130  # 128 + SIGINT, as shells have it
 DESCRIPTION = "Evaluate and benchmark open-vocabulary, instance-level 3D scene understanding from RGB-D."
 EPILOG = """examples:
@@ -83,26 +85,8 @@ def build_parser() -> Parser:
     )
     parser.add_argument("--version", action="version", version=f"su3d-bench {__version__}")
     verbs = parser.add_subparsers(dest="verb", metavar="VERB", required=True)
-    for module in (
-        run,
-        ablate,
-        evaluate,
-        check,
-        compare,
-        attribute,
-        report,
-        sheets,
-        query,
-        questions,
-        ask,
-        refine,
-        datasets,
-        methods,
-        models,
-        protocols,
-        export,
-    ):
-        module.add_parser(verbs)
+    for name in VERBS:
+        import_module(f"su3d_bench.cli.{name}").add_parser(verbs)
     return parser
 
 
