@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -94,9 +95,13 @@ def _jobs(arguments: argparse.Namespace) -> dict[str, JobFolder]:
 def _scenes(run: RunFolder) -> list[str]:
     """The scenes that the run was asked for."""
     from su3d_bench.core.errors import printable
-    from su3d_bench.store.records import RequestRecord, read_record
+    from su3d_bench.store.atomic import read_json
+    from su3d_bench.store.records import RequestRecord, checked
 
-    scenes = read_record(RequestRecord, run.path / "run.json", str(run.path)).scenes
+    scenes: tuple[str, ...] = ()
+    record = read_json(run.path / "run.json")
+    with suppress(ValueError, RecursionError):  # pydantic's errors are of value
+        scenes = checked(RequestRecord, record).scenes
     if not scenes or any(".." in scene for scene in scenes):
         raise StoreError(f"{run.path}: run.json is not as a run writes it; name the folder of a run")
     return [printable(scene, 200) for scene in scenes]
