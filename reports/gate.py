@@ -38,7 +38,7 @@ class Verdict:
 
     @property
     def failures(self) -> tuple[Finding, ...]:
-        return tuple(one for one in self.findings if one.is_failure)
+        return tuple(finding for finding in self.findings if finding.is_failure)
 
     @property
     def is_passed(self) -> bool:
@@ -60,7 +60,7 @@ def headline(verdict: Verdict) -> str:
 
 def plain_lines(verdict: Verdict) -> list[str]:
     """The headline, then one line a finding, failures first."""
-    return [headline(verdict), *(f"{_mark(one)} {one.where}: {_sentence(one)}" for one in _ordered(verdict))]
+    return [headline(verdict), *(f"{_mark(row)} {row.where}: {_sentence(row)}" for row in _ordered(verdict))]
 
 
 def markdown(verdict: Verdict) -> str:
@@ -69,8 +69,8 @@ def markdown(verdict: Verdict) -> str:
     rows = _ordered(verdict)
     if rows:
         lines += ["| | where | reference | now | |", "|---|---|---|---|---|"]
-        for one in rows[:MAX_ROWS]:
-            cells = (_mark(one), one.where, _number(one, one.reference), _number(one, one.measured), one.text)
+        for row in rows[:MAX_ROWS]:
+            cells = (_mark(row), row.where, _number(row, row.reference), _number(row, row.measured), row.text)
             lines.append("| " + " | ".join(_cell(cell) for cell in cells) + " |")
         if len(rows) > MAX_ROWS:
             lines.append(f"| | and {len(rows) - MAX_ROWS} more | | | |")
@@ -86,14 +86,14 @@ def junit_xml(verdict: Verdict) -> str:
     ElementTree.SubElement(
         suite, "testcase", classname="su3d-bench", name=f"{verdict.n_compared} headline values compared"
     )
-    for one in _ordered(verdict):
+    for row in _ordered(verdict):
         case = ElementTree.SubElement(
-            suite, "testcase", classname=f"su3d-bench.{one.kind}", name=printable(one.where, 300)
+            suite, "testcase", classname=f"su3d-bench.{row.kind}", name=printable(row.where, 300)
         )
-        if one.is_failure:
-            ElementTree.SubElement(case, "failure", message=printable(_sentence(one), 600))
+        if row.is_failure:
+            ElementTree.SubElement(case, "failure", message=printable(_sentence(row), 600))
         else:
-            ElementTree.SubElement(case, "system-out").text = printable(_sentence(one), 600)
+            ElementTree.SubElement(case, "system-out").text = printable(_sentence(row), 600)
     ElementTree.indent(suite)
     return '<?xml version="1.0" encoding="utf-8"?>\n' + ElementTree.tostring(suite, encoding="unicode") + "\n"
 
@@ -101,13 +101,13 @@ def junit_xml(verdict: Verdict) -> str:
 def github_lines(verdict: Verdict) -> list[str]:
     """Workflow commands: an error a failure, a notice an improvement; GitHub shows ten of a kind."""
     return [
-        f"::{'error' if one.is_failure else 'notice'} title=su3d-bench::{_workflow(f'{one.where}: {_sentence(one)}')}"
-        for one in _ordered(verdict)
+        f"::{'error' if row.is_failure else 'notice'} title=su3d-bench::{_workflow(f'{row.where}: {_sentence(row)}')}"
+        for row in _ordered(verdict)
     ] + [f"::notice title=su3d-bench::{_workflow(headline(verdict))}"]
 
 
 def _ordered(verdict: Verdict) -> Sequence[Finding]:
-    return sorted(verdict.findings, key=lambda one: not one.is_failure)
+    return sorted(verdict.findings, key=lambda finding: not finding.is_failure)
 
 
 def _mark(finding: Finding) -> str:

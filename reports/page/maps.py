@@ -93,17 +93,17 @@ def nearest_colours(points: Float32Array, seen: Float32Array, seen_rgb: UInt8Arr
     """The colour (n, 3) of what frames saw nearest to each point, grey where nothing is near; None without frames."""
     if not len(seen) or not len(points):
         return None
-    _, found = nearest(seen, points, COLOUR_NEAR_M)
-    return np.where(found[:, None] >= 0, seen_rgb[found], np.uint8(128))
+    _, nearest_row = nearest(seen, points, COLOUR_NEAR_M)
+    return np.where(nearest_row[:, None] >= 0, seen_rgb[nearest_row], np.uint8(128))
 
 
 def nearest_classes(points: Float32Array, truth: Float32Array, classes: Int64Array) -> Int64Array:
     """The true class (n,) near each point; ``NOT_SCORED`` where the truth there has none, ``NO_TRUTH_NEAR``."""
-    _, found = nearest(truth, points, NEAR_M)
+    _, nearest_row = nearest(truth, points, NEAR_M)
     if not len(truth):
         return np.full(len(points), NO_TRUTH_NEAR)
     classes = np.where(classes >= 0, classes, NOT_SCORED)
-    return np.where(found >= 0, classes[found], NO_TRUTH_NEAR)
+    return np.where(nearest_row >= 0, classes[nearest_row], NO_TRUTH_NEAR)
 
 
 def pack_map(cloud: Cloud, planes: Mapping[str, NDArray[Any]], about: Mapping[str, Any]) -> str:

@@ -32,11 +32,11 @@ def confusion_cells(confusion: Int64Array) -> list[list[int]]:
 def series_of(times: UpdateTimes) -> dict[str, Any]:
     """The course of a scene's updates as means of ``per`` updates each, in ms, with the map's points where known."""
     per = max(1, -(-len(times) // MOST_BINS))
-    found: dict[str, Any] = {"per": per, "n": len(times)}
-    found |= {stage: _binned(times.ms(stage), per) for stage in (TOTAL, MAP)}
+    series: dict[str, Any] = {"per": per, "n": len(times)}
+    series |= {stage: _binned(times.ms(stage), per) for stage in (TOTAL, MAP)}
     if "n_points" in times.columns:
-        found["points"] = [int(value) for value in _binned(times.columns["n_points"], per)]
-    return found
+        series["points"] = [int(value) for value in _binned(times.columns["n_points"], per)]
+    return series
 
 
 def _binned(values: Float64Array, per: int) -> list[float]:
@@ -61,7 +61,7 @@ def summary_data(summary: MethodSummary) -> dict[str, Any]:
         "method": summary.method,
         "scenes": list(summary.scenes),
         "n_updates": summary.n_updates,
-        "stages": [_stage_data(one) for one in summary.stages],
+        "stages": [_stage_data(stage) for stage in summary.stages],
         "updates_per_s": _number(summary.updates_per_s),
         "finish_ms": _number(summary.finish_ms),
         "n_points": summary.n_points,
@@ -71,14 +71,14 @@ def summary_data(summary: MethodSummary) -> dict[str, Any]:
     }
 
 
-def _stage_data(one: StageSummary) -> dict[str, Any]:
-    numbers: Mapping[str, float] = {"first": one.first, "p50": one.p50, "p95": one.p95, "max": one.worst}
+def _stage_data(stage: StageSummary) -> dict[str, Any]:
+    numbers: Mapping[str, float] = {"first": stage.first, "p50": stage.p50, "p95": stage.p95, "max": stage.worst}
     return {
-        "name": one.name,
+        "name": stage.name,
         **{name: _number(value) for name, value in numbers.items()},
-        "share": _number(one.share),
-        "by_points": _growth_data(one.against_points),
-        "by_updates": _growth_data(one.against_frames),
+        "share": _number(stage.share),
+        "by_points": _growth_data(stage.against_points),
+        "by_updates": _growth_data(stage.against_frames),
     }
 
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 from urllib.parse import quote
 
-from su3d_bench.reports.tables.formats import csv_lines, harmless, inert
+from su3d_bench.reports.tables.formats import csv_lines, harmless, safe
 
 COLUMNS = ("item_id", "question", "reason", "answers", "truth", "scene", "methods", "text", "pictures")
 STYLE = (
@@ -22,35 +22,35 @@ POLICY = "default-src 'none'; style-src 'unsafe-inline'; img-src 'self' file:"
 def second_looks_csv(looks: Sequence[Mapping[str, Any]]) -> str:
     """One line an item and question."""
     rows: list[Sequence[Any]] = [COLUMNS]
-    for one in looks:
-        row = [one["item_id"], one["ask"], one["reason"], _answers(one), one["automatic"], one["scene"]]
-        row += [", ".join(one["methods"]), one["text"], ", ".join(one["pictures"])]
+    for look in looks:
+        row = [look["item_id"], look["ask"], look["reason"], _answers(look), look["automatic"], look["scene"]]
+        row += [", ".join(look["methods"]), look["text"], ", ".join(look["pictures"])]
         rows.append([harmless(cell) for cell in row])
     return csv_lines(rows)
 
 
 def second_looks_page(looks: Sequence[Mapping[str, Any]], pictures: str, sheet_id: str) -> str:
     """A page without scripts; ``pictures`` is where its picture files are, as the page sees it."""
-    body = "\n".join(_article(one, pictures) for one in looks) or "<p>Nothing: all agree.</p>"
+    body = "\n".join(_article(look, pictures) for look in looks) or "<p>Nothing: all agree.</p>"
     return (
         '<!doctype html>\n<html lang="en">\n<meta charset="utf-8">\n'
         f'<meta http-equiv="Content-Security-Policy" content="{POLICY}">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n<title>Second looks</title>\n'
-        f"<style>{STYLE}</style>\n<h1>Second looks at {inert(sheet_id)}: {len(looks)}</h1>\n{body}\n</html>\n"
+        f"<style>{STYLE}</style>\n<h1>Second looks at {safe(sheet_id)}: {len(looks)}</h1>\n{body}\n</html>\n"
     )
 
 
-def _article(one: Mapping[str, Any], pictures: str) -> str:
+def _article(look: Mapping[str, Any], pictures: str) -> str:
     images = "".join(
-        f'<p><img loading="lazy" alt="{inert(one["item_id"])}" src="{html.escape(quote(f"{pictures}/{name}"))}"></p>'
-        for name in one["pictures"]
+        f'<p><img loading="lazy" alt="{safe(look["item_id"])}" src="{html.escape(quote(f"{pictures}/{name}"))}"></p>'
+        for name in look["pictures"]
         if is_file_name(name)
     )
-    truth = f"; ground truth: {inert(one['automatic'])}" if one["automatic"] else ""
+    truth = f"; ground truth: {safe(look['automatic'])}" if look["automatic"] else ""
     return (
-        f'<article><h2 dir="auto">{inert(one["text"])}</h2>'
-        f'<p><span class="reason">{inert(one["reason"])}</span>, {inert(one["ask"])}: {inert(_answers(one))}{truth}</p>'
-        f"<p>{inert(one['item_id'])}, {inert(one['scene'])}, {inert(', '.join(one['methods']))}</p>{images}</article>"
+        f'<article><h2 dir="auto">{safe(look["text"])}</h2>'
+        f'<p><span class="reason">{safe(look["reason"])}</span>, {safe(look["ask"])}: {safe(_answers(look))}{truth}</p>'
+        f"<p>{safe(look['item_id'])}, {safe(look['scene'])}, {safe(', '.join(look['methods']))}</p>{images}</article>"
     )
 
 
@@ -60,8 +60,8 @@ def is_file_name(name: str) -> bool:
     >>> is_file_name("item-1.png"), is_file_name("../item-1.png"), is_file_name("..")
     (True, False, False)
     """
-    return bool(name.strip(".")) and not any(one in name for one in "/\\:\0")
+    return bool(name.strip(".")) and not any(character in name for character in "/\\:\0")
 
 
-def _answers(one: Mapping[str, Any]) -> str:
-    return "; ".join(f"{name}: {answer}" for name, answer in one["answers"].items())
+def _answers(look: Mapping[str, Any]) -> str:
+    return "; ".join(f"{name}: {answer}" for name, answer in look["answers"].items())

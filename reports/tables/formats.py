@@ -137,17 +137,17 @@ def html_page(parts: Sequence[Table | Prose]) -> str:
 
 def _html(table: Table | Prose) -> str:
     if isinstance(table, Prose):
-        return _list(table.lines) if table.is_list else "<p>" + "<br>\n".join(map(inert, table.lines)) + "</p>"
-    head = "".join(f'<th scope="col">{inert(name)}</th>' for name in (table.head, *table.columns))
+        return _list(table.lines) if table.is_list else "<p>" + "<br>\n".join(map(safe, table.lines)) + "</p>"
+    head = "".join(f'<th scope="col">{safe(name)}</th>' for name in (table.head, *table.columns))
     bodies = []
     for block in blocks_of(table.rows):
         lines = []
         for row in block:
             cells = "".join(f"<td>{_strong(cell)}</td>" for cell in row.cells)
             kind = ' class="reported"' if row.is_reported else ""
-            lines.append(f'<tr{kind}><th scope="row">{inert(row.title)}</th>{cells}</tr>')
+            lines.append(f'<tr{kind}><th scope="row">{safe(row.title)}</th>{cells}</tr>')
         bodies.append("<tbody>" + "\n".join(lines) + "</tbody>")
-    caption = inert(table.heading + table.caption)
+    caption = safe(table.heading + table.caption)
     return (
         f'<section><div class="wide"><table><caption>{caption}</caption>\n'
         f"<thead><tr>{head}</tr></thead>\n" + "\n".join(bodies) + f"</table></div>{_list(table.notes)}</section>"
@@ -155,15 +155,15 @@ def _html(table: Table | Prose) -> str:
 
 
 def _list(lines: Sequence[str]) -> str:
-    items = "".join(f"<li>{inert(line)}</li>" for line in lines)
+    items = "".join(f"<li>{safe(line)}</li>" for line in lines)
     return f"<ul>{items}</ul>" if items else ""
 
 
 def _strong(cell: Cell) -> str:
-    return f"<strong>{inert(cell.text)}</strong> {inert(cell.beside)}".rstrip() if cell.is_best else inert(cell.whole)
+    return f"<strong>{safe(cell.text)}</strong> {safe(cell.beside)}".rstrip() if cell.is_best else safe(cell.whole)
 
 
-def inert(text: str) -> str:
+def safe(text: str) -> str:
     """``text`` on one line, without what HTML would take for its own."""
     return html.escape(printable(text, 2000))
 

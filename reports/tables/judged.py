@@ -52,20 +52,20 @@ JUDGED: Mapping[PaperTable, JudgedLayout] = {
 }
 
 
-def judged_table(number: PaperTable, found: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
+def judged_table(number: PaperTable, results: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
     """Such a table for each dataset: what people judged, what the ground truth judged, what the paper reports."""
     layout = JUDGED[number]
-    rows = [one for one in found if one.kind == layout.kind]
-    if not any(one.per_scene for one in rows):
-        have = ", ".join(dict.fromkeys(one.protocol for one in found))
+    rows = [row for row in results if row.kind == layout.kind]
+    if not any(row.per_scene for row in rows):
+        have = ", ".join(dict.fromkeys(row.protocol for row in results))
         raise ConfigError(
             f"Table {number}: needs {_protocols(layout.kind)}, or scores of sheets of kind {layout.kind}; there are "
             f"{have}"
         )
     tables = []
-    for dataset in dict.fromkeys(one.datasets for one in rows if one.per_scene):
+    for dataset in dict.fromkeys(row.datasets for row in rows if row.per_scene):
         figures = figures_of(is_wanted=with_published, table=number)
-        of_dataset = [one for one in rows if one.datasets == dataset or not one.per_scene]
+        of_dataset = [row for row in rows if row.datasets == dataset or not row.per_scene]
         tables.append(_dataset_table(number, layout, dataset, of_dataset, figures, shown))
     return tables
 
@@ -82,16 +82,16 @@ def _dataset_table(
     body: list[TableRow] = []
     notes: list[str] = []
     columns: tuple[str, ...] = ()
-    for protocol in sorted({one.protocol for one in measured}, key=lambda name: not name.endswith("-people")):
-        rows = [one for one in measured if one.protocol == protocol]
-        if not any(one.per_scene for one in rows):
+    for protocol in sorted({row.protocol for row in measured}, key=lambda name: not name.endswith("-people")):
+        rows = [row for row in measured if row.protocol == protocol]
+        if not any(row.per_scene for row in rows):
             continue
-        table = protocol_table([_part(one, name, layout) for one in rows for name in layout.parts], shown, [])
+        table = protocol_table([_part(row, name, layout) for row in rows for name in layout.parts], shown, [])
         judge = "people" if rows[0].is_by_people else "ground truth"
         body += [_named(row, judge, layout) for row in table.rows]
         notes += [f"{judge}: {note}" for note in table.notes]
         columns = table.columns
-    same = [one for one in figures if one.dataset == dataset]
+    same = [figure for figure in figures if figure.dataset == dataset]
     reported, sources = reported_rows(same or figures, shown.metrics, len(columns))
     setup = "" if same or not figures else ", not the paper's data"
     return Table(
@@ -106,7 +106,7 @@ def _dataset_table(
 
 def _protocols(kind: str) -> str:
     datasets = ("rooms",) if kind == "reasoning" else ("rooms", "replica", "scannet")
-    names = [f"{one}-{kind}" for one in datasets]
+    names = [f"{dataset}-{kind}" for dataset in datasets]
     return f"protocol {' or '.join(names)}"
 
 
@@ -158,11 +158,11 @@ def sheet_tables(scores: Mapping[str, Any]) -> list[Table]:
     datasets = dict.fromkeys(cell["dataset"] for cell in scores["cells"])
     tables = [_accuracies(scores, dataset) for dataset in datasets]
     tables += [_tests(scores["tests"])] if scores["tests"] else []
-    shared = [one for one in scores["agreements"] if one["agreement"]["n_items"]]
+    shared = [question for question in scores["agreements"] if question["agreement"]["n_items"]]
     tables += [_agreements(shared)] if shared else []
-    pairs = [(one["ask"], pair) for one in shared for pair in one["agreement"]["pairs"]]
+    pairs = [(question["ask"], pair) for question in shared for pair in question["agreement"]["pairs"]]
     tables += [_pairs(pairs)] if pairs else []
-    return [*tables, *(_confusion(one, scores["automatic_rule"]) for one in scores["confusions"])]
+    return [*tables, *(_confusion(confusion, scores["automatic_rule"]) for confusion in scores["confusions"])]
 
 
 def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
@@ -207,17 +207,17 @@ def _accuracy(cell: Mapping[str, Any] | None) -> Cell:
 
 def _tests(tests: Sequence[Mapping[str, Any]]) -> Table:
     rows = []
-    differing = [one for one in tests if one["n_differ"]]
-    for one in differing[:SHOWN_TESTS]:
-        texts = (one["metric"], str(one["n_items"]), str(one["n_differ"]))
-        p = f"{one['p']:.3g}" if one["is_exact"] else f"about {one['p']:.2g}"
+    differing = [test for test in tests if test["n_differ"]]
+    for test in differing[:SHOWN_TESTS]:
+        texts = (test["metric"], str(test["n_items"]), str(test["n_differ"]))
+        p = f"{test['p']:.3g}" if test["is_exact"] else f"about {test['p']:.2g}"
         cells = (
             *map(Cell, texts),
-            Cell(signed(one["difference"]), bracketed(one["interval"], signed)),
+            Cell(signed(test["difference"]), bracketed(test["interval"], signed)),
             Cell(p),
-            Cell(f"{one['smallest_p']:.2g}"),
+            Cell(f"{test['smallest_p']:.2g}"),
         )
-        rows.append(TableRow(f"{one['right']} - {one['left']} ({one['dataset']})", cells))
+        rows.append(TableRow(f"{test['right']} - {test['left']} ({test['dataset']})", cells))
     n_same, n_more = len(tests) - len(differing), len(differing) - len(rows)
     return Table(
         name="differences",
@@ -234,15 +234,15 @@ def _tests(tests: Sequence[Mapping[str, Any]]) -> Table:
     )
 
 
-def _agreements(found: Sequence[Mapping[str, Any]]) -> Table:
+def _agreements(agreements: Sequence[Mapping[str, Any]]) -> Table:
     rows = []
-    for one in found:
-        of = one["agreement"]
+    for question in agreements:
+        of = question["agreement"]
         share = f"{of['n_equal']}/{of['n_items']}"
         beside = bracketed(of["interval"], "{:.2f}".format)
         fleiss = f"(n={of['n_fleiss']}, {of['n_raters']} each)" if of["fleiss"] is not None else ""
         cells = (Cell(str(of["n_annotators"])), Cell(share), Cell(_coefficient(of["alpha"]), beside))
-        rows.append(TableRow(one["ask"], (*cells, Cell(_coefficient(of["fleiss"]), fleiss))))
+        rows.append(TableRow(question["ask"], (*cells, Cell(_coefficient(of["fleiss"]), fleiss))))
     return Table(
         name="agreement",
         caption="Agreement of annotators.",
@@ -273,17 +273,18 @@ def _coefficient(value: float | None) -> str:
     return NOT_MEASURED if value is None else f"{value:.3f}"
 
 
-def _confusion(one: Mapping[str, Any], rule: str) -> Table:
-    columns = [k for k, _ in enumerate(one["choices"]) if any(row[k] for row in one["counts"])]
-    header = ["judgements", *(f"truth: {one['choices'][k]}" for k in columns)]
+def _confusion(confusion: Mapping[str, Any], rule: str) -> Table:
+    columns = [k for k, _ in enumerate(confusion["choices"]) if any(row[k] for row in confusion["counts"])]
+    header = ["judgements", *(f"truth: {confusion['choices'][k]}" for k in columns)]
     rows = [
         [f"people: {choice}", *(str(counts[k]) for k in columns)]
-        for choice, counts in zip(one["choices"], one["counts"], strict=True)
+        for choice, counts in zip(confusion["choices"], confusion["counts"], strict=True)
     ]
-    share = f"{one['n_equal']} of {one['n']} judgements are those of the ground truth" if one["n"] else "none is clear"
+    n = confusion["n"]
+    share = f"{confusion['n_equal']} of {n} judgements are those of the ground truth" if n else "none is clear"
     return text_table(
-        f"confusion-{one['ask']}",
+        f"confusion-{confusion['ask']}",
         [header, *rows],
-        caption=f"People against the ground truth: {one['ask']}.",
-        notes=(f"{share}; Cohen's kappa {_coefficient(one['kappa'])}; truth: {rule}",),
+        caption=f"People against the ground truth: {confusion['ask']}.",
+        notes=(f"{share}; Cohen's kappa {_coefficient(confusion['kappa'])}; truth: {rule}",),
     )

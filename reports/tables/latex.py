@@ -139,10 +139,10 @@ def _floats(table: Table) -> Iterator[str]:
     notes_pt = sum(LINES_PT[r"\scriptsize"] * math.ceil(len(note) * NOTE_LETTER_PT / width_pt) for note in table.notes)
     pages: list[list[_Piece]] = [[]]
     for piece in _pieces(table, place):
-        if pages[-1] and sum(one.height_pt for one in (*pages[-1], piece)) > PAGE_PT:
+        if pages[-1] and sum(placed.height_pt for placed in (*pages[-1], piece)) > PAGE_PT:
             pages.append([])
         pages[-1].append(piece)
-    if sum(one.height_pt for one in pages[-1]) + notes_pt > PAGE_PT:
+    if sum(placed.height_pt for placed in pages[-1]) + notes_pt > PAGE_PT:
         pages.append([])
     for k, pieces in enumerate(pages):
         yield _float(table, place, pieces, is_first=k == 0, is_last=k == len(pages) - 1)
@@ -237,12 +237,12 @@ def _cell(cell: Cell) -> str:
 def origin_comment(origin: Origin) -> str:
     """The comment that tells a cell's run, in one line without a blank inside a value."""
     parts = [("run", origin.run), ("method", origin.method), ("protocol", origin.protocol)]
-    told = " ".join(f"{name}={quote(value, safe=_SAFE)}" for name, value in parts)
-    told += f" version={origin.version} metric={quote(origin.metric, safe=_SAFE)} what={origin.what}"
-    told += f" value={origin.value!r}"
+    comment = " ".join(f"{name}={quote(value, safe=_SAFE)}" for name, value in parts)
+    comment += f" version={origin.version} metric={quote(origin.metric, safe=_SAFE)} what={origin.what}"
+    comment += f" value={origin.value!r}"
     if origin.interval is not None:
-        told += f" interval={origin.interval[0]!r},{origin.interval[1]!r}"
-    return f"% {told}"
+        comment += f" interval={origin.interval[0]!r},{origin.interval[1]!r}"
+    return f"% {comment}"
 
 
 @dataclass(frozen=True)
@@ -264,14 +264,14 @@ class PrintedCell:
 
 def printed_cells(text: str) -> list[PrintedCell]:
     """Every cell of a LaTeX source that carries the comment of ``origin_comment``."""
-    found = []
+    cells = []
     for number, line in enumerate(text.splitlines(), start=1):
         mark = _MARK.search(line)
         if mark is None:
             continue
         shown = re.split(r"(?<!\\)&", line[: mark.start()])[-1].strip()
-        found.append(PrintedCell(number, shown, _origin(line[mark.start() :])))
-    return found
+        cells.append(PrintedCell(number, shown, _origin(line[mark.start() :])))
+    return cells
 
 
 def _origin(comment: str) -> Origin | None:

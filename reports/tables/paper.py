@@ -54,41 +54,41 @@ class Shown:
     only_significant: bool = False
 
 
-def paper_table(number: PaperTable, found: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
+def paper_table(number: PaperTable, measured: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
     """Table II or III of the paper: under the protocol of its set-up, or one each for the others that have its metrics.
 
     ``found`` under several protocols of which one is the paper's gives that one alone.
     """
     layout = LAYOUTS[number]
     metrics = shown.metrics or layout.metrics
-    fitting = [one for one in found if all(name in one.metrics for name in metrics)]
+    fitting = [row for row in measured if all(name in row.metrics for name in metrics)]
     if not fitting:
-        have = ", ".join(dict.fromkeys(one.protocol for one in found))
+        have = ", ".join(dict.fromkeys(row.protocol for row in measured))
         raise ConfigError(
             f"Table {number}: needs {', '.join(metrics)}, which none of the runs' protocols has ({have}); score them "
             f"with --protocols {layout.protocol} too"
         )
-    names = list(dict.fromkeys(one.protocol for one in fitting))
+    names = list(dict.fromkeys(row.protocol for row in fitting))
     names = [layout.protocol] if layout.protocol in names else names
     figures = figures_of(is_wanted=with_published, table=number)
     tables = []
     for name in names:
-        rows = [one for one in fitting if one.protocol == name]
-        one = protocol_table(rows, replace(shown, metrics=metrics), figures)
+        rows = [row for row in fitting if row.protocol == name]
+        table = protocol_table(rows, replace(shown, metrics=metrics), figures)
         where = next((row.datasets for row in rows if row.per_scene), "no scene")
         setup = "" if name == layout.protocol else ", not the paper's set-up"
         setup += " and data" if setup and where != PAPER_DATA else ""
         caption = f"{layout.subject} on {where}, {name}{setup}."
-        tables.append(replace(one, name=f"{number}-{name}", caption=caption))
+        tables.append(replace(table, name=f"{number}-{name}", caption=caption))
     return tables
 
 
-def selection_tables(found: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
+def selection_tables(measured: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
     """One table a protocol, in the order of the runs; of chosen metrics those that it has, none where it has none."""
     tables = []
-    known = {name for one in found for name in one.metrics}
-    for name in dict.fromkeys(one.protocol for one in found):
-        rows = [one for one in found if one.protocol == name]
+    known = {name for row in measured for name in row.metrics}
+    for name in dict.fromkeys(row.protocol for row in measured):
+        rows = [row for row in measured if row.protocol == name]
         metrics = shown.metrics
         if known.issuperset(metrics):  # else the table says which is known nowhere
             metrics = tuple(metric for metric in metrics if metric in rows[0].metrics)
@@ -103,11 +103,11 @@ def protocol_table(measured: Sequence[Measured], shown: Shown, figures: Sequence
 
     A method that failed has a row without values; one that the protocol cannot score is named in a note.
     """
-    rows = [one for one in measured if one.per_scene or one.failed]
+    rows = [row for row in measured if row.per_scene or row.failed]
     if not rows:
-        raise ConfigError(f"{measured[0].protocol}: scored none of {', '.join(one.method for one in measured)}")
-    first = next((one for one in rows if one.per_scene), rows[0])
-    left_out = [one.method for one in measured if one not in rows]
+        raise ConfigError(f"{measured[0].protocol}: scored none of {', '.join(row.method for row in measured)}")
+    first = next((row for row in rows if row.per_scene), rows[0])
+    left_out = [row.method for row in measured if row not in rows]
     metrics = shown.metrics or rows[0].headline
     for name in metrics:
         if name not in rows[0].metrics:
@@ -203,7 +203,7 @@ def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int
         return {}, None
     if len({(rows[k].scenes, rows[k].limit) for k in competing}) > 1:
         return {}, "The rows are of different scenes or frames, so that none is marked as the best."
-    found: dict[str, set[int]] = {}
+    marked: dict[str, set[int]] = {}
     tests: list[SignFlipTest | None] = []
     for name in shown.metrics:
         values = np.array([np.nan if row.metrics[name] is None else row.metrics[name] for row in rows], np.float64)
@@ -216,11 +216,11 @@ def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int
             tests.append(test)
             best = best if len(best) == 1 and test is not None and test.p < LEVEL else set()
         if len(best) < len(competing):
-            found[name] = best
+            marked[name] = best
     if not shown.only_significant:
-        return found, "Bold: the highest measured value." if any(found.values()) else None
+        return marked, "Bold: the highest measured value." if any(marked.values()) else None
     smallest = min((test.smallest_p for test in tests if test is not None), default=1.0)
-    return found, (
+    return marked, (
         "Bold: the highest measured value where it differs from the second (two-sided sign-flip test over scenes, "
         f"p < {LEVEL}; with these scenes p cannot be below {smallest:.2g})."
     )
@@ -297,29 +297,29 @@ class SweepRow:
 
 
 def ablation_table(
-    found: Sequence[Measured], sweep: Sequence[SweepRow], shown: Shown, *, with_published: bool
+    measured: Sequence[Measured], sweep: Sequence[SweepRow], shown: Shown, *, with_published: bool
 ) -> Table:
     """A row for each of ``sweep``, the best of each parameter marked.
 
     Raises ``ConfigError`` where ``found`` lacks one of its methods, or a protocol of either kind.
     """
-    sides = [_of_protocol(found, side) for side in SIDES]
+    sides = [_of_protocol(measured, side) for side in SIDES]
     looks = [replace(shown, metrics=side.metrics, ceilings=False, scenes_count=False) for side in SIDES]
     rows: list[TableRow] = []
     notes: dict[str, None] = {}
     marks: dict[str, None] = {}
-    for parameter in dict.fromkeys(one.parameter for one in sweep):
-        members = [one for one in sweep if one.parameter == parameter]
+    for parameter in dict.fromkeys(row.parameter for row in sweep):
+        members = [row for row in sweep if row.parameter == parameter]
         halves = [_cells(members, side, look, marks) for side, look in zip(sides, looks, strict=True)]
         rows += [
-            TableRow(f"{parameter} = {one.value}", (*left, *right), group=parameter)
-            for one, left, right in zip(members, *halves, strict=True)
+            TableRow(f"{parameter} = {member.value}", (*left, *right), group=parameter)
+            for member, left, right in zip(members, *halves, strict=True)
         ]
-    used = {one.method for one in sweep}
+    used = {row.method for row in sweep}
     for side, look in zip(sides, looks, strict=True):
-        own = [one for method, one in side.items() if method in used]
+        own = [row for method, row in side.items() if method in used]
         notes[f"{', '.join(look.metrics)}: {units(own[0], look)}"] = None
-        labels = [one.method if one.is_whole else f"{one.method} ({one.scenes_text} scenes)" for one in own]
+        labels = [row.method if row.is_whole else f"{row.method} ({row.scenes_text} scenes)" for row in own]
         notes |= dict.fromkeys(run_notes(own, labels))
     is_papers = with_published and sweep[0].method.partition("@")[0] == "opensu3d"
     figures = figures_of(is_wanted=is_papers, table="I")
@@ -328,17 +328,17 @@ def ablation_table(
     return Table("I", "Ablation of single parameters.", "parameter", METRICS, body, (*notes, *marks, *sources))
 
 
-def _of_protocol(found: Sequence[Measured], side: Layout) -> dict[str, Measured]:
+def _of_protocol(measured: Sequence[Measured], side: Layout) -> dict[str, Measured]:
     """Method -> its numbers under the protocol of that side's set-up, or the first that has its metrics."""
-    fitting = [one for one in found if all(name in one.metrics for name in side.metrics)]
+    fitting = [row for row in measured if all(name in row.metrics for name in side.metrics)]
     if not fitting:
         raise ConfigError(f"Table I: needs {', '.join(side.metrics)}; score the sweep under {side.protocol} too")
-    names = [one.protocol for one in fitting]
+    names = [row.protocol for row in fitting]
     chosen = side.protocol if side.protocol in names else names[0]
     members: dict[str, Measured] = {}
-    for one in fitting:
-        if one.protocol == chosen and members.setdefault(one.method, one) is not one:
-            raise ConfigError(f"Table I: {one.method} is in {members[one.method].run} and {one.run}; name one of them")
+    for row in fitting:
+        if row.protocol == chosen and members.setdefault(row.method, row) is not row:
+            raise ConfigError(f"Table I: {row.method} is in {members[row.method].run} and {row.run}; name one of them")
     return members
 
 
@@ -346,13 +346,13 @@ def _cells(
     sweep: Sequence[SweepRow], side: Mapping[str, Measured], shown: Shown, marks: dict[str, None]
 ) -> list[list[Cell]]:
     """The cells of one parameter's rows; what must be said of the best of them is entered in ``marks``."""
-    for one in sweep:
-        if one.method not in side:
+    for entry in sweep:
+        if entry.method not in side:
             raise ConfigError(
-                f"Table I: no scores of {one.method} for {', '.join(shown.metrics)}; run the sweep again, it goes on "
+                f"Table I: no scores of {entry.method} for {', '.join(shown.metrics)}; run the sweep again, it goes on "
                 "where it stopped"
             )
-    rows = [side[one.method] for one in sweep]
+    rows = [side[row.method] for row in sweep]
     best, why = best_rows(rows, shown)
     marks |= {why: None} if why else {}
     return [

@@ -80,7 +80,7 @@ def _explain(error: ValidationError | TypeError, table: dict[str, object], shown
         return f"{shown}: 'figure' is no list; write each as [[figure]]"
     faults = error.errors()
     # a misspelt key is also a missing one; the misspelling says more
-    first = next((one for one in faults if one["type"] == "extra_forbidden"), faults[0])
+    first = next((fault for fault in faults if fault["type"] == "extra_forbidden"), faults[0])
     place = [str(part) for part in first["loc"]]
     where = shown
     if len(place) > 1:

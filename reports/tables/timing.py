@@ -56,12 +56,12 @@ def csv_text(summaries: Sequence[MethodSummary], hardware: Mapping[str, str]) ->
     growth = [f"{name}_{part}" for name in ("points", "frames") for part in ("exponent", "low", "high", "words")]
     head = ["run", "hardware", "method", "n_scenes", "stage", "n", "first_ms", "p50_ms", "p95_ms", "max_ms", "share"]
     rows: list[list[Any]] = [[*head, *growth]]
-    for one in summaries:
-        for stage in one.stages:
+    for cost in summaries:
+        for stage in cost.stages:
             numbers = [stage.n, stage.first, stage.p50, stage.p95, stage.worst, stage.share]
             grown = [cell for each in (stage.against_points, stage.against_frames) for cell in _growth_cells(each)]
-            scenes = len(one.scenes)
-            rows.append([one.run, hardware[one.run], one.method, scenes, stage.name, *numbers, *grown])
+            scenes = len(cost.scenes)
+            rows.append([cost.run, hardware[cost.run], cost.method, scenes, stage.name, *numbers, *grown])
     return csv_lines(rows)
 
 
@@ -70,10 +70,10 @@ def methods_csv(summaries: Sequence[MethodSummary], hardware: Mapping[str, str],
     speeds = ("updates_per_s", "frames_per_s", "camera_rate", "real_time_factor")
     sizes = ("finish_ms", "n_points", "map_bytes", "peak_rss_bytes", "device_bytes")
     rows: list[list[Any]] = [["run", "hardware", "method", "n_scenes", "n_updates", *speeds, *sizes]]
-    for one in summaries:
-        speed = [one.updates_per_s, one.frames_per_s, camera_rate, one.frames_per_s / camera_rate]
-        values = [getattr(one, name) for name in sizes]
-        rows.append([one.run, hardware[one.run], one.method, len(one.scenes), one.n_updates, *speed, *values])
+    for cost in summaries:
+        speed = [cost.updates_per_s, cost.frames_per_s, camera_rate, cost.frames_per_s / camera_rate]
+        values = [getattr(cost, name) for name in sizes]
+        rows.append([cost.run, hardware[cost.run], cost.method, len(cost.scenes), cost.n_updates, *speed, *values])
     return csv_lines(rows)
 
 
@@ -86,17 +86,17 @@ def _methods_table(summaries: Sequence[MethodSummary], camera_rate: float) -> It
         *("run", "method", "updates", "update p50", "p95", "max", "first", "map update p50", "updates/s", "frames/s"),
         *(f"real time at {camera_rate:g}/s", "finish", "points", "map MiB", "peak MiB", "GPU MiB"),
     ]
-    for one in summaries:
-        total, of_map = (next(stage for stage in one.stages if stage.name == name) for name in ("total", "map"))
+    for cost in summaries:
+        total, of_map = (next(stage for stage in cost.stages if stage.name == name) for name in ("total", "map"))
         yield [
-            *(one.run, one.method, str(one.n_updates)),
+            *(cost.run, cost.method, str(cost.n_updates)),
             *(_ms(total.p50), _ms(total.p95), _ms(total.worst), _ms(total.first), _ms(of_map.p50)),
-            f"{one.updates_per_s:.2f}",
-            f"{one.frames_per_s:.2f}",
-            f"{one.frames_per_s / camera_rate:.2f}x",
-            NOT_MEASURED if one.finish_ms is None else _ms(one.finish_ms),
-            NOT_MEASURED if one.n_points is None else f"{one.n_points:,}",
-            *(_mib(value) for value in (one.map_bytes, one.peak_rss_bytes, one.device_bytes)),
+            f"{cost.updates_per_s:.2f}",
+            f"{cost.frames_per_s:.2f}",
+            f"{cost.frames_per_s / camera_rate:.2f}x",
+            NOT_MEASURED if cost.finish_ms is None else _ms(cost.finish_ms),
+            NOT_MEASURED if cost.n_points is None else f"{cost.n_points:,}",
+            *(_mib(value) for value in (cost.map_bytes, cost.peak_rss_bytes, cost.device_bytes)),
         ]
 
 
@@ -123,11 +123,11 @@ def _growth(growth: Growth | None) -> str:
 
 
 def _anytime_table(points: Sequence[AnytimePoint]) -> Iterator[list[str]]:
-    names = list(dict.fromkeys(name for one in points for name in one.metrics))
+    names = list(dict.fromkeys(name for point in points for name in point.metrics))
     yield ["run", "method", "protocol", "frames", "seconds", *names]
-    for one in points:
-        values = [percent(one.metrics[name]) if name in one.metrics else "" for name in names]
-        yield [one.run, one.method, one.protocol, f"{100 * one.share:g} %", f"{one.seconds:.1f}", *values]
+    for point in points:
+        values = [percent(point.metrics[name]) if name in point.metrics else "" for name in names]
+        yield [point.run, point.method, point.protocol, f"{100 * point.share:g} %", f"{point.seconds:.1f}", *values]
 
 
 def _ms(value: float) -> str:

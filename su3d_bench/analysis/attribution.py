@@ -107,8 +107,8 @@ def attribute(
                 truth = truth_of(scene, gathered[name].rules.ground_truth)
                 gathered[name].add(scene, truth, prediction, naming, scores[name][scene])
             truth_of.cache_clear()
-    explained = [one for one in gathered.values() if one.scenes]
-    formed = tuple(one.form(_oracle_values(one.rules, side, other, one.scenes)) for one in explained)
+    explained = [counted for counted in gathered.values() if counted.scenes]
+    formed = tuple(counted.form(_oracle_values(counted.rules, side, other, counted.scenes)) for counted in explained)
     if not formed:
         raise ConfigError(f"{side.name}: no scene is scored under {', '.join(names)}; nothing to explain")
     return RunAttribution(run.name, side.method, (*remarks, *_remarks(run)), formed)

@@ -139,8 +139,8 @@ def compare(
     pairs = pair_methods(parse_side(left, method), parse_side(right, method))
     first, second = pairs[0]
     compared: list[ProtocolComparison] = []
-    for one, other in pairs:
-        compared += _compare_methods(one, other, protocols, per_class, numbers or SideNumbers())
+    for pair in pairs:
+        compared += _compare_methods(*pair, protocols, per_class, numbers or SideNumbers())
     sides = [side for pair in pairs for side in pair]
     remarks = _remarks(first.run, second.run, {side.method for side in sides})
     remarks += [line for side in sides for line in _caveats(side)]
@@ -175,12 +175,12 @@ def _compare_protocol(
     rules: ProtocolRules,
     left: Side,
     right: Side,
-    one: _Resampled,
+    own: _Resampled,
     other: _Resampled,
     remarks: Sequence[str],
     per_class: bool,
 ) -> ProtocolComparison:
-    results = one.result, other.result
+    results = own.result, other.result
     scenes = results[0].scenes
     metrics = {
         name: form_difference(
@@ -188,7 +188,7 @@ def _compare_protocol(
             scenes,
             np.array([results[0].per_scene[scene][name] for scene in scenes]),
             np.array([results[1].per_scene[scene][name] for scene in scenes]),
-            other.drawn[name] - one.drawn[name],
+            other.drawn[name] - own.drawn[name],
         )
         for name in rules.headline
     }
@@ -200,7 +200,7 @@ def _compare_protocol(
         right=right.method,
         scenes=scenes,
         metrics=metrics,
-        classes=_compare_classes(rules, results, (one.counts, other.counts)) if per_class else {},
+        classes=_compare_classes(rules, results, (own.counts, other.counts)) if per_class else {},
         remarks=tuple(remarks),
     )
 
@@ -286,10 +286,10 @@ def _remarks(left: FinishedRun, right: FinishedRun, methods: Set[str]) -> list[s
     """What must be said of two runs of which ``methods`` are compared."""
     lines = []
     for run in dict.fromkeys((left.name, right.name)):
-        one = left if run == left.name else right
-        if one.record.is_partial:
-            lines.append(f"PARTIAL: {run} has only the first {one.limit} frames of each scene")
-        if one.is_incomplete:
+        side = left if run == left.name else right
+        if side.record.is_partial:
+            lines.append(f"PARTIAL: {run} has only the first {side.limit} frames of each scene")
+        if side.is_incomplete:
             lines.append(f"INCOMPLETE: {run} lacks scenes that failed")
     changed = []
     for path in dict.fromkeys([*left.settings, *right.settings]):

@@ -126,10 +126,10 @@ def learn(
         limit=first.limit,
         settings=_settings(first),
         data_digests=dict(first.record.data_digests),
-        protocols={name: ProtocolKey(version=one.version, digest=one.digest) for name, one in first.protocols.items()},
+        protocols={name: ProtocolKey(version=key.version, digest=key.digest) for name, key in first.protocols.items()},
         results=tuple(_learn_result([table[key] for table in tables]) for key in tables[0]),
         costs={name: float(np.median([cost[name] for cost in costs if name in cost])) for name in costs[0]},
-        calibration_ms=_median([one for run in runs if (one := calibration_of(run)) is not None]),
+        calibration_ms=_median([milliseconds for run in runs if (milliseconds := calibration_of(run)) is not None]),
     )
 
 
@@ -139,19 +139,19 @@ def _median(values: Sequence[float]) -> float | None:
 
 def _learn_result(repeats: Sequence[ResultRecord]) -> MethodResult:
     first = repeats[0]
-    numbers = [one.result for one in repeats if one.result is not None]
+    numbers = [repeat.result for repeat in repeats if repeat.result is not None]
     if len(numbers) < len(repeats):
         raise ConfigError(f"{first.method} under {first.protocol}: was not scored; learn from runs with numbers")
-    scenes = [{scene: _only(row, first.headline) for scene, row in one.per_scene.items()} for one in numbers]
+    scenes = [{scene: _only(row, first.headline) for scene, row in result.per_scene.items()} for result in numbers]
     return MethodResult(
         method=first.method,
         protocol=first.protocol,
         profile=first.profile,
         encoder_digest=first.encoder_digest,
-        metrics=_learn_values([_only(one.metrics, first.headline) for one in numbers]),
-        scenes={scene: _learn_values([one.get(scene, {}) for one in scenes]) for scene in scenes[0]},
+        metrics=_learn_values([_only(result.metrics, first.headline) for result in numbers]),
+        scenes={scene: _learn_values([rows.get(scene, {}) for rows in scenes]) for scene in scenes[0]},
         classes={
-            name: _learn_values([one.per_class.get(name, {}) for one in numbers]) for name in numbers[0].per_class
+            name: _learn_values([result.per_class.get(name, {}) for result in numbers]) for name in numbers[0].per_class
         },
     )
 
@@ -161,7 +161,7 @@ def _only(row: Mapping[str, float | None], names: Sequence[str]) -> dict[str, fl
 
 
 def _learn_values(repeats: Sequence[Mapping[str, float | None]]) -> dict[str, Value]:
-    return {name: _learn_value([one.get(name) for one in repeats]) for name in repeats[0]}
+    return {name: _learn_value([repeat.get(name) for repeat in repeats]) for name in repeats[0]}
 
 
 def _learn_value(repeats: Sequence[float | None]) -> Value:
@@ -180,15 +180,15 @@ def check(run: FinishedRun, reference: Reference) -> Verdict:
     n_compared = 0
     for expected in reference.results:
         where = f"{expected.method} / {expected.protocol}"
-        found = table.get((expected.method, expected.protocol))
-        if found is None or found.result is None:
+        measured = table.get((expected.method, expected.protocol))
+        if measured is None or measured.result is None:
             findings.append(Finding("missing", where, "the run has no score of it"))
             continue
-        if found.profile != expected.profile:
-            findings.append(_changed(where, "profile", expected.profile, found.profile))
-        if found.encoder_digest != expected.encoder_digest:
-            findings.append(_changed(where, "encoder digest", expected.encoder_digest, found.encoder_digest))
-        findings += _numbers(where, expected, found.result, None if is_same_machine else reference.across_machines)
+        if measured.profile != expected.profile:
+            findings.append(_changed(where, "profile", expected.profile, measured.profile))
+        if measured.encoder_digest != expected.encoder_digest:
+            findings.append(_changed(where, "encoder digest", expected.encoder_digest, measured.encoder_digest))
+        findings += _numbers(where, expected, measured.result, None if is_same_machine else reference.across_machines)
         n_compared += len(expected.metrics)
     busy = _busy(run, reference) if is_same_machine else None
     findings += _costs(run, reference, is_judged=is_same_machine and busy is None)
@@ -247,12 +247,12 @@ def _short(value: object) -> str:
     return f"{text[:12]}..." if len(text) > 40 and " " not in text else text
 
 
-def _numbers(where: str, expected: MethodResult, found: NumbersRecord, across: float | None) -> Iterator[Finding]:
+def _numbers(where: str, expected: MethodResult, measured: NumbersRecord, across: float | None) -> Iterator[Finding]:
     """``across``: the tolerance of headline values of another machine; None on the same one."""
-    yield from _compare(where, expected.metrics, found.metrics, across)
+    yield from _compare(where, expected.metrics, measured.metrics, across)
     for kind, tables, rows in (
-        ("scene", expected.scenes, found.per_scene),
-        ("class", expected.classes, found.per_class),
+        ("scene", expected.scenes, measured.per_scene),
+        ("class", expected.classes, measured.per_class),
     ):
         for name, values in tables.items():
             row = rows.get(name)
@@ -264,23 +264,21 @@ def _numbers(where: str, expected: MethodResult, found: NumbersRecord, across: f
                 yield from _compare(f"{where} / {kind} {printable(name, 80)}", values, row, None)
 
 
-def _compare(
-    where: str, expected: Values, found: Mapping[str, float | None], across: float | None
-) -> Iterator[Finding]:
-    for name, one in expected.items():
-        tolerance = one.tolerance if across is None else max(across, one.tolerance)
-        measured = found.get(name)
-        if measured == one.value:
+def _compare(where: str, expected: Values, row: Mapping[str, float | None], across: float | None) -> Iterator[Finding]:
+    for name, value in expected.items():
+        tolerance = value.tolerance if across is None else max(across, value.tolerance)
+        measured = row.get(name)
+        if measured == value.value:
             continue
-        if measured is None or one.value is None:
-            yield Finding("regression", f"{where} / {name}", "is undefined in one of the two", one.value, measured)
-        elif abs(measured - one.value) > tolerance:
-            is_better = name in HIGHER_IS_BETTER and measured > one.value
+        if measured is None or value.value is None:
+            yield Finding("regression", f"{where} / {name}", "is undefined in one of the two", value.value, measured)
+        elif abs(measured - value.value) > tolerance:
+            is_better = name in HIGHER_IS_BETTER and measured > value.value
             text = "is better than the reference" if is_better else "is worse than the reference"
             if name not in HIGHER_IS_BETTER:
                 text = "differs from the reference"
             kind: Literal["better", "regression"] = "better" if is_better else "regression"
-            yield Finding(kind, f"{where} / {name}", text, one.value, measured, tolerance)
+            yield Finding(kind, f"{where} / {name}", text, value.value, measured, tolerance)
 
 
 def _costs(run: FinishedRun, reference: Reference, *, is_judged: bool) -> Iterator[Finding]:
@@ -300,10 +298,10 @@ def update_costs(run: FinishedRun) -> dict[str, float]:
     costs = {}
     for method in run.methods:
         ratios = []
-        for one in read_update_times(run, method):
-            steady = pooled([one], MAP, WARM_UP)
-            if one.calibration_ms and len(steady) and steady.any():
-                ratios.append(float(np.median(steady)) / one.calibration_ms)
+        for times in read_update_times(run, method):
+            steady = pooled([times], MAP, WARM_UP)
+            if times.calibration_ms and len(steady) and steady.any():
+                ratios.append(float(np.median(steady)) / times.calibration_ms)
         if ratios:
             costs[method] = float(np.median(ratios))
     return costs
@@ -311,8 +309,8 @@ def update_costs(run: FinishedRun) -> dict[str, float]:
 
 def calibration_of(run: FinishedRun) -> float | None:
     """Median milliseconds of the calibrating work over scenes and methods; None where nothing was updated."""
-    times = (one.calibration_ms for method in run.methods for one in read_update_times(run, method))
-    return _median([one for one in times if one])
+    times = (times.calibration_ms for method in run.methods for times in read_update_times(run, method))
+    return _median([time for time in times if time])
 
 
 def _settings(run: FinishedRun) -> dict[str, str]:

@@ -78,8 +78,8 @@ def leaderboard(folder: Path, protocols: Sequence[str] = ()) -> Leaderboard:
     if not entries and not refused:
         raise ConfigError(f"{printable(str(folder), 200)}: holds no run below it; a run has a run.json")
     boards: list[tuple[Entry, ...]] = []
-    for key in dict.fromkeys((one.protocol, one.scenes) for one in entries):
-        alike, others = _of_same_data([one for one in entries if (one.protocol, one.scenes) == key])
+    for key in dict.fromkeys((entry.protocol, entry.scenes) for entry in entries):
+        alike, others = _of_same_data([entry for entry in entries if (entry.protocol, entry.scenes) == key])
         boards.append(tuple(sorted(alike, key=_rank)))
         refused += others
     return Leaderboard(tuple(boards), tuple(refused))
@@ -155,14 +155,14 @@ def _why_not(run: FinishedRun, protocol: str, failed: Sequence[str]) -> str | No
 
 def _of_same_data(entries: Sequence[Entry]) -> tuple[list[Entry], list[Refused]]:
     """The entries whose scenes have the data that most have, the first seen of equals, and the others."""
-    common, _ = Counter(one.data for one in entries).most_common(1)[0]
-    alike = [one for one in entries if one.data == common]
+    common, _ = Counter(entry.data for entry in entries).most_common(1)[0]
+    alike = [entry for entry in entries if entry.data == common]
     others = []
-    for one in entries:
-        if one.data != common:
-            scene = next(scene for (scene, mine), (_, other) in zip(one.data, common, strict=True) if mine != other)
+    for entry in entries:
+        if entry.data != common:
+            scene = next(scene for (scene, mine), (_, other) in zip(entry.data, common, strict=True) if mine != other)
             reason = f"other data of {printable(scene, 80)} than {len(alike)} of {len(entries)} entries have"
-            others.append(Refused(one.run, f"{one.method} / {one.protocol}", reason))
+            others.append(Refused(entry.run, f"{entry.method} / {entry.protocol}", reason))
     return alike, others
 
 
@@ -171,10 +171,10 @@ def _rank(entry: Entry) -> tuple[bool, float, str, str]:
     return entry.is_ceiling, -(first if first is not None else -1.0), entry.method, entry.run
 
 
-def tables(found: Leaderboard, *, intervals: bool) -> list[Table]:
+def tables(board_of_runs: Leaderboard, *, intervals: bool) -> list[Table]:
     """One table a ranking; what was refused stands beneath the last one."""
-    made = [_table(board, index, intervals) for index, board in enumerate(found.boards)]
-    notes = tuple(_left_out(found.refused))
+    made = [_table(board, index, intervals) for index, board in enumerate(board_of_runs.boards)]
+    notes = tuple(_left_out(board_of_runs.refused))
     if not made:
         return [Table("leaderboard", "Leaderboard: no run may stand in a ranking.", "method", (), (), notes)]
     return [*made[:-1], replace(made[-1], notes=(*made[-1].notes, *notes))]
@@ -183,27 +183,27 @@ def tables(found: Leaderboard, *, intervals: bool) -> list[Table]:
 def _left_out(refused: Sequence[Refused]) -> Iterator[str]:
     """One line for what is refused of one run under one protocol for one reason."""
     groups: dict[tuple[str, str, str], list[str]] = {}
-    for one in refused:
-        method, slash, protocol = one.what.rpartition(" / ")
-        groups.setdefault((one.run, slash + protocol, one.reason), []).append(method)
+    for refusal in refused:
+        method, slash, protocol = refusal.what.rpartition(" / ")
+        groups.setdefault((refusal.run, slash + protocol, refusal.reason), []).append(method)
     for (run, where, reason), methods in groups.items():
         yield f"Left out: {run}, {some(methods, MOST_NAMED)}{where}: {reason}"
 
 
 def _table(board: Sequence[Entry], index: int, intervals: bool) -> Table:
     first = board[0]
-    rivals = [one for one in board if not one.is_ceiling]
+    rivals = [entry for entry in board if not entry.is_ceiling]
     best = [
-        max((percent(value) for one in rivals if (value := one.values[k]) is not None), key=float, default="")
+        max((percent(value) for entry in rivals if (value := entry.values[k]) is not None), key=float, default="")
         for k in range(len(first.headline))
     ]
     rows = []
-    for one in board:
-        cells = [_cell(one, k, best[k], intervals) for k in range(len(first.headline))]
-        rows.append(TableRow(one.method, (*cells, Cell(one.profile), Cell(one.run)), group=str(one.is_ceiling)))
+    for entry in board:
+        cells = [_cell(entry, k, best[k], intervals) for k in range(len(first.headline))]
+        rows.append(TableRow(entry.method, (*cells, Cell(entry.profile), Cell(entry.run)), group=str(entry.is_ceiling)))
     scenes = counted(len(first.scenes), "scene")
     notes = [f"Scenes: {', '.join(first.scenes)}."]
-    if any(one.is_ceiling for one in board):
+    if any(entry.is_ceiling for entry in board):
         notes.append("Rows that were told the truth stand last and compete with none.")
     return Table(
         name=f"leaderboard-{index + 1}",

@@ -108,9 +108,9 @@ def page_scenes(
 ) -> Iterator[PageScene]:
     """The scenes of ``maps`` in their order. What fails of a map is a reason on the page, never a page without it."""
     known = _Known(tuple(queries))
-    for scene in dict.fromkeys(one[2] for one in maps):
+    for scene in dict.fromkeys(map_of_run[2] for map_of_run in maps):
         progress(f"{printable(scene, 120)}: maps")
-        yield _Scene(scene, [one for one in maps if one[2] == scene], known).page(most_points)
+        yield _Scene(scene, [map_of_run for map_of_run in maps if map_of_run[2] == scene], known).page(most_points)
 
 
 class _Known:
@@ -139,7 +139,7 @@ class _Scene:
 
     def page(self, most_points: int) -> PageScene:
         read = {key[:1] + key[3:]: self._read(key) for key in self._maps}
-        frames = self._thumbnail_frames([one for one in read.values() if isinstance(one, Instances)])
+        frames = self._thumbnail_frames([a_map for a_map in read.values() if isinstance(a_map, Instances)])
         made = []
         for index, run, scene, method in self._maps:
             prediction = read[index, method]
@@ -185,17 +185,17 @@ class _Scene:
     def _thumbnail_frames(self, maps: Sequence[Instances]) -> dict[int, Frame]:
         if self._dataset is None:
             return {}
-        chosen = frame_cover([_frames_of(one, k) for one in maps for k in range(len(one))], THUMBNAILS)
-        found = {}
+        chosen = frame_cover([_frames_of(a_map, k) for a_map in maps for k in range(len(a_map))], THUMBNAILS)
+        frame_of = {}
 
         def look() -> None:
             frames = self._dataset.frames(self._scene.partition("/")[2], 1)
             for index in sorted(chosen):
                 if 0 <= index < len(frames) and (frame := frames[index]).index == index:
-                    found[index] = frame
+                    frame_of[index] = frame
 
         self._had("no views", look)
-        return found
+        return frame_of
 
     def _rules(self, run: FinishedRun) -> ProtocolRules | None:
         """The rules whose classes the map is shown in: of points before those of instances."""
@@ -279,17 +279,17 @@ def _instance_data(
     prediction: Prediction, k: int, classes: Int64Array | None, similarity: Any, frames: Mapping[int, Frame]
 ) -> dict[str, Any]:
     """An instance: n points, c class, s similarities in thousandths, and of ``Instances`` its name, score and views."""
-    found: dict[str, Any] = {}
+    data: dict[str, Any] = {}
     if classes is not None:
-        found["class"] = int(classes[k])
+        data["class"] = int(classes[k])
     if similarity is not None:
-        found["similarity"] = [round(1000 * float(value)) for value in similarity[k]]
+        data["similarity"] = [round(1000 * float(value)) for value in similarity[k]]
     if not isinstance(prediction, Instances):
         assert not isinstance(prediction, DenseFeatures)
-        return {"id": k, "points": int((prediction.instance == k).sum()), **found}
+        return {"id": k, "points": int((prediction.instance == k).sum()), **data}
     views = _frames_of(prediction, k)
     own = prediction.points[prediction.mask(k)]
-    found |= {
+    data |= {
         "id": int(prediction.ids[k]) if len(prediction.ids) else k,
         "name": printable((prediction.labels or prediction.names)[k] or prediction.names[k], 80),
         "caption": printable(prediction.captions[k], MOST_CAPTION),
@@ -300,16 +300,16 @@ def _instance_data(
     }
     if len(own):
         low, high = own.min(axis=0), own.max(axis=0)
-        found["centre"] = [round(float(value), 3) for value in (low + high) / 2]
-        found["size"] = [round(float(value), 3) for value in high - low]
+        data["centre"] = [round(float(value), 3) for value in (low + high) / 2]
+        data["size"] = [round(float(value), 3) for value in high - low]
     boxes = {index: _box(own, frames[index]) for index in views if index in frames}
     seen = {index: box for index, box in boxes.items() if box is not None}
     if seen:
         best = max(
             seen, key=lambda index: ((seen[index][2] - seen[index][0]) * (seen[index][3] - seen[index][1]), -index)
         )
-        found |= {"view": best, "box": seen[best]}
-    return found
+        data |= {"view": best, "box": seen[best]}
+    return data
 
 
 def _box(points: Any, frame: Frame) -> list[float] | None:

@@ -54,14 +54,14 @@ def page_numbers(
         results += [{"run": index, **_shown(result)} for result in run.results.values()]
         if n_jobs > MOST_JOBS:
             continue
-        timing += [{"run": index, **one} for method in run.methods if (one := _times(run, method)) is not None]
+        timing += [{"run": index, **times} for method in run.methods if (times := _times(run, method)) is not None]
         for method in run.methods:
-            confusions += [{"run": index, **one} for one in _confusions(run, method)]
+            confusions += [{"run": index, **confusion} for confusion in _confusions(run, method)]
             if with_errors:
                 progress(f"{run.name}: errors of {printable(method, 80)}")
                 errors.append({"run": index, **_errors(run, method)})
     progress("comparisons")
-    found = {
+    numbers = {
         "left_out": f"{n_jobs} jobs, more than {MOST_JOBS}: {LEFT_OUT}" if n_jobs > MOST_JOBS else None,
         "runs": [_about(run) for run in runs],
         "results": results,
@@ -70,7 +70,7 @@ def page_numbers(
         "timing": timing,
         "comparisons": _comparisons(runs) if n_jobs <= MOST_JOBS else [],
     }
-    plain: dict[str, Any] = printable_json(found)
+    plain: dict[str, Any] = printable_json(numbers)
     return plain
 
 
@@ -106,19 +106,19 @@ def _dotted(path: KeyPath) -> str:
 
 def _confusions(run: FinishedRun, method: str) -> list[dict[str, Any]]:
     """The confusion of every semantic protocol, its scenes added up; none where the rules here are not the run's."""
-    found = []
+    confusions = []
     for name, of_scene in run.scores(method).items():
         counts = [score.counts for score in of_scene.values() if isinstance(score.counts, SemanticCounts)]
         if not counts:
             continue
         rules = load_protocol(name)
-        one: dict[str, Any] = {"method": method, "protocol": name}
+        confusion: dict[str, Any] = {"method": method, "protocol": name}
         if rules.digest != run.protocols[name].digest or any(len(c.is_present) != len(rules.classes) for c in counts):
-            found.append(one | {"reason": f"the rules of {name} here are not those that scored the run"})
+            confusions.append(confusion | {"reason": f"the rules of {name} here are not those that scored the run"})
             continue
         names = [entry.name for entry in rules.classes]
-        found.append(one | {"names": names, "cells": confusion_cells(concatenate(counts).confusion)})
-    return found
+        confusions.append(confusion | {"names": names, "cells": confusion_cells(concatenate(counts).confusion)})
+    return confusions
 
 
 def _errors(run: FinishedRun, method: str) -> dict[str, Any]:
@@ -134,7 +134,7 @@ def _times(run: FinishedRun, method: str) -> dict[str, Any] | None:
     times = read_update_times(run, method)
     if not times:
         return None
-    return {**summary_data(summarise(times)), "series": {one.scene: series_of(one) for one in times}}
+    return {**summary_data(summarise(times)), "series": {of_scene.scene: series_of(of_scene) for of_scene in times}}
 
 
 def _comparisons(runs: Sequence[FinishedRun]) -> list[dict[str, Any]]:
@@ -152,10 +152,10 @@ def _compared(runs: Sequence[FinishedRun], numbers: SideNumbers, left: Side, rig
     sides = {"left": [runs.index(left.run), left.method], "right": [runs.index(right.run), right.method]}
     try:
         addresses = (f"{side.run.folder.path}:{side.method}" for side in (left, right))
-        found = compare(*addresses, numbers=numbers).to_json()
+        comparison = compare(*addresses, numbers=numbers).to_json()
     except Su3dError as error:
         return {**sides, "protocols": [], "remarks": [], "reason": str(error)}
-    return {**sides, "protocols": found["protocols"], "remarks": found["remarks"], "reason": None}
+    return {**sides, "protocols": comparison["protocols"], "remarks": comparison["remarks"], "reason": None}
 
 
 def _n_jobs(runs: Sequence[FinishedRun]) -> int:
@@ -168,11 +168,11 @@ def scored_maps(folders: Sequence[Path]) -> list[tuple[int, FinishedRun, str, st
     Of more than ``MOST_JOBS`` jobs only the maps of the first scenes, at most ``MOST_MAPS``.
     """
     runs = [read_run(folder) for folder in dict.fromkeys(folders)]
-    found = (
+    maps = (
         (index, run, scene, method)
         for index, run in enumerate(runs)
         for scene in run.scenes
         for method in run.methods
         if run.folder.job(scene, method).prediction.is_file()
     )
-    return list(itertools.islice(found, MOST_MAPS) if _n_jobs(runs) > MOST_JOBS else found)
+    return list(itertools.islice(maps, MOST_MAPS) if _n_jobs(runs) > MOST_JOBS else maps)

@@ -93,10 +93,10 @@ def refuse_unlike(left: Side, right: Side, protocol: str, scenes: Sequence[str])
     where = f"{left.name} and {right.name} cannot be compared"
     rules, others = left.run.protocols[protocol], right.run.protocols[protocol]
     for what in ("version", "digest"):
-        one, other = getattr(rules, what), getattr(others, what)
-        if one != other:
+        rule, other = getattr(rules, what), getattr(others, what)
+        if rule != other:
             raise ConfigError(
-                f"{where}: {what} of protocol {protocol} is {_short(one)} and {_short(other)}; score both again with "
+                f"{where}: {what} of protocol {protocol} is {_short(rule)} and {_short(other)}; score both again with "
                 "the same rules"
             )
     for scene in scenes:

@@ -34,19 +34,19 @@ def measured_results(folders: Sequence[Path]) -> list[Measured]:
     """
     paths = dict.fromkeys(folders)
     runs = {str(folder): read_run(folder) for folder in paths if not is_scores(folder)}
-    found = [one for path in paths if is_scores(path) for one in _judged_by_people(path)]
+    measured = [row for path in paths if is_scores(path) for row in _judged_by_people(path)]
     first: dict[str, tuple[FinishedRun, Measured]] = {}
     for name, run in runs.items():
-        for one in _results_of(name, run):
-            if one.protocol in first and first[one.protocol][0] is not run:
-                other, known = first[one.protocol]
-                common = sorted(known.scenes & one.scenes)
-                refuse_unlike(Side(other, known.method), Side(run, one.method), one.protocol, common)
-            first.setdefault(one.protocol, (run, one))
-            found.append(one)
-    if not any(one.per_scene for one in found):
+        for row in _results_of(name, run):
+            if row.protocol in first and first[row.protocol][0] is not run:
+                other, known = first[row.protocol]
+                common = sorted(known.scenes & row.scenes)
+                refuse_unlike(Side(other, known.method), Side(run, row.method), row.protocol, common)
+            first.setdefault(row.protocol, (run, row))
+            measured.append(row)
+    if not any(row.per_scene for row in measured):
         raise ConfigError(f"{', '.join(map(str, paths))}: no scene was scored, so there is nothing for a table")
-    return found
+    return measured
 
 
 def is_scores(path: Path) -> bool:
@@ -61,10 +61,10 @@ def _judged_by_people(path: Path) -> list[Measured]:
     for cell in scores.cells:
         if cell.judge == "people":
             groups.setdefault((cell.dataset, cell.method), []).append(cell)
-    found = []
+    measured = []
     for (dataset, method), cells in groups.items():
         scenes = sorted({scene for cell in cells for scene in cell.per_scene})
-        found.append(
+        measured.append(
             Measured(
                 run=str(path),
                 method=method,
@@ -74,7 +74,7 @@ def _judged_by_people(path: Path) -> list[Measured]:
                 headline=tuple(cell.metric for cell in cells),
                 metrics={cell.metric: cell.value for cell in cells},
                 intervals={cell.metric: cell.interval for cell in cells},
-                per_scene={one: {cell.metric: cell.per_scene.get(one) for cell in cells} for one in scenes},
+                per_scene={scene: {cell.metric: cell.per_scene.get(scene) for cell in cells} for scene in scenes},
                 ceilings={},
                 n_planned=len(scenes),
                 failed=(),
@@ -85,7 +85,7 @@ def _judged_by_people(path: Path) -> list[Measured]:
                 caveat=_who_judged(scores, cells),
             )
         )
-    return found
+    return measured
 
 
 def _who_judged(scores: Scores, cells: Sequence[ScoreCell]) -> str:
@@ -131,30 +131,30 @@ def _measured(run: str, limit: int, record: ResultRecord, nothing: Mapping[str, 
 
 
 def choose(
-    found: Sequence[Measured], methods: Sequence[str], protocols: Sequence[str], datasets: Sequence[str] = ()
+    measured: Sequence[Measured], methods: Sequence[str], protocols: Sequence[str], datasets: Sequence[str] = ()
 ) -> list[Measured]:
     """Those of ``methods``, ``protocols`` and ``datasets``, all where none is named, methods in the order asked for."""
     for wanted, known, what in (
-        (datasets, {scene.partition("/")[0] for one in found for scene in one.per_scene}, "dataset"),
-        (methods, {one.method for one in found}, "method"),
-        (protocols, {one.protocol for one in found}, "protocol"),
+        (datasets, {scene.partition("/")[0] for row in measured for scene in row.per_scene}, "dataset"),
+        (methods, {row.method for row in measured}, "method"),
+        (protocols, {row.protocol for row in measured}, "protocol"),
     ):
         for name in wanted:
             if name not in known:
                 hint = suggest(name, known) or f"; they have {', '.join(sorted(known))}"
                 raise ConfigError(f"these runs hold no scores of the {what} '{printable(name, 80)}'{hint}")
-    kept = [one for one in found if not datasets or _is_of(one, datasets)]
-    kept = [one for one in kept if not protocols or one.protocol in protocols]
-    kept = [one for name in methods for one in kept if one.method == name] if methods else kept
-    return [one for name in protocols for one in kept if one.protocol == name] if protocols else kept
+    kept = [row for row in measured if not datasets or _is_of(row, datasets)]
+    kept = [row for row in kept if not protocols or row.protocol in protocols]
+    kept = [row for name in methods for row in kept if row.method == name] if methods else kept
+    return [row for name in protocols for row in kept if row.protocol == name] if protocols else kept
 
 
-def _is_of(one: Measured, datasets: Sequence[str]) -> bool:
+def _is_of(row: Measured, datasets: Sequence[str]) -> bool:
     """Whether all its scenes are of ``datasets``; refused where only some are, for its numbers are of all together."""
-    own = {scene.partition("/")[0] for scene in (*one.per_scene, *one.failed, *one.unscored)}
+    own = {scene.partition("/")[0] for scene in (*row.per_scene, *row.failed, *row.unscored)}
     if own & set(datasets) and not own <= set(datasets):
         raise ConfigError(
-            f"{one.protocol}: its numbers are of {one.datasets} together; name all of these or none, or run them apart"
+            f"{row.protocol}: its numbers are of {row.datasets} together; name all of these or none, or run them apart"
         )
     return bool(own) and own <= set(datasets)
 
@@ -197,9 +197,9 @@ class _Recomputed:
 
     def _of_people(self, origin: Origin) -> Measured:
         path = self._place(origin.run, lambda place: is_file(place) or is_file(place / SCORES_FILE))
-        for one in _judged_by_people(path):
-            if (one.protocol, one.method) == (origin.protocol, origin.method):
-                return one
+        for row in _judged_by_people(path):
+            if (row.protocol, row.method) == (origin.protocol, origin.method):
+                return row
         raise ConfigError(f"{path}: holds no scores of '{printable(origin.method, 80)}' by people")
 
     def _result(self, origin: Origin) -> ProtocolResult:
@@ -280,15 +280,15 @@ def _check(cell: PrintedCell, file: str, recomputed: _Recomputed) -> CellCheck:
     numbers = _numbers(cell.origin, result)
     if numbers is None:
         return CellCheck(file, cell.line, text, None, f"the run has no '{printable(cell.origin.metric, 60)}'")
-    found = " ".join(f"{number:.4f}".rstrip("0").rstrip(".") for number in numbers)
+    given = " ".join(f"{number:.4f}".rstrip("0").rstrip(".") for number in numbers)
     printed = cell.numbers[: len(numbers)]
     if len(printed) < len(numbers):
-        return CellCheck(file, cell.line, text, found, "shows fewer numbers than its comment")
-    for one, number in zip(printed, numbers, strict=True):
-        n_decimals = len(one.partition(".")[2])
-        if one != f"{number:.{n_decimals}f}":
-            return CellCheck(file, cell.line, text, found, f"shows {one}, the run gives {number:.{n_decimals}f}")
-    return CellCheck(file, cell.line, text, found, None)
+        return CellCheck(file, cell.line, text, given, "shows fewer numbers than its comment")
+    for figure, number in zip(printed, numbers, strict=True):
+        n_decimals = len(figure.partition(".")[2])
+        if figure != f"{number:.{n_decimals}f}":
+            return CellCheck(file, cell.line, text, given, f"shows {figure}, the run gives {number:.{n_decimals}f}")
+    return CellCheck(file, cell.line, text, given, None)
 
 
 def _numbers(origin: Origin, result: ProtocolResult | Measured) -> list[float] | None:

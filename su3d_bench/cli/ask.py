@@ -81,17 +81,17 @@ def call(arguments: argparse.Namespace) -> int:
     scene = map_of(instances, refined)
     if arguments.dry_run:
         return _estimate(scene, run, arguments)
-    found = _solve(scene, run, arguments)
-    picture = _draw(instances, scene, found, job, arguments)
+    reply = _solve(scene, run, arguments)
+    picture = _draw(instances, scene, reply, job, arguments)
     if arguments.json:
         answer_json(
             {"scene": arguments.scene, "question": arguments.question}
-            | found.to_json()
+            | reply.to_json()
             | {"names": note, "picture": None if picture is None else str(picture)}
         )
         return EXIT_DONE
-    answer(found.text)
-    for line in (*found.notes, f"names: {note}"):
+    answer(reply.text)
+    for line in (*reply.notes, f"names: {note}"):
         remark(line, quiet=arguments.quiet)
     if picture is not None:
         remark(f"picture: {picture}", quiet=arguments.quiet)
@@ -143,20 +143,20 @@ def _nearest_name(noun: str, names: Sequence[str]) -> tuple[str, float]:
 
 
 def _draw(
-    instances: Instances, scene: SceneMap, found: Answer, job: JobFolder, arguments: argparse.Namespace
+    instances: Instances, scene: SceneMap, reply: Answer, job: JobFolder, arguments: argparse.Namespace
 ) -> Path | None:
     """Draw the answer; None where it names no object."""
     from su3d_bench.reports.pictures.answers import SpokenOf, draw_reasoning
 
-    if not found.object_ids:
+    if not reply.object_ids:
         if arguments.out is not None:
             remark(f"{arguments.out}: not drawn, for the answer names no object", quiet=arguments.quiet)
         return None
     picture: Path = arguments.out or job.pictures / f"ask-{file_name_of(arguments.question, 'question')}.png"
-    rows = [tuple(scene.by_id(one).row for one in ids) for ids in (found.object_ids, found.reference_ids)]
+    rows = [tuple(scene.by_id(object_id).row for object_id in ids) for ids in (reply.object_ids, reply.reference_ids)]
     names = [""] * len(instances)
-    for one in scene.objects:
-        names[one.row] = one.shown
+    for thing in scene.objects:
+        names[thing.row] = thing.shown
     title = f"{arguments.scene}: {arguments.question}"
-    draw_reasoning(instances, SpokenOf(*rows), names, picture, title, (found.text, *found.notes))
+    draw_reasoning(instances, SpokenOf(*rows), names, picture, title, (reply.text, *reply.notes))
     return picture

@@ -68,7 +68,7 @@ def _learn(arguments: argparse.Namespace) -> int:
         raise ConfigError("check: --cost-limit is a factor above 1, --across-machines from 0 to 100 points")
     reference = learn([read_run(path) for path in arguments.learn], across, cost_limit)
     written(arguments.out, json_text(reference.model_dump(mode="json", exclude_defaults=True)))
-    n_exact = sum(one.tolerance == 0 for each in reference.results for one in each.metrics.values())
+    n_exact = sum(metric.tolerance == 0 for each in reference.results for metric in each.metrics.values())
     n_values = sum(len(each.metrics) for each in reference.results)
     answer(f"{arguments.out}: {n_values} headline values from {reference.n_runs} runs, {n_exact} of them exact")
     if reference.n_runs == 1:

@@ -122,20 +122,20 @@ def sources_of(path: Path, format: str | None, method: str | None) -> list[Sourc
     """Every scene at ``path``: those of one method of a run folder, or what the reader of its format finds."""
     from su3d_bench.predictions.formats import READERS, recognise
 
-    found = _maps_of_run(path) if format in {None, "su3d-bench"} else {}
-    if not found and method is not None:
+    maps = _maps_of_run(path) if format in {None, "su3d-bench"} else {}
+    if not maps and method is not None:
         raise ConfigError(f"--method {method}: {path} is no run folder; leave it out")
-    if found:
-        method = method or _only_method(found)
+    if maps:
+        method = method or _only_method(maps)
         if method is None:
-            raise ConfigError(f"{path}: holds the maps of {', '.join(found)}; choose one with --method")
-        if method not in found:
+            raise ConfigError(f"{path}: holds the maps of {', '.join(maps)}; choose one with --method")
+        if method not in maps:
             raise ConfigError(
-                f"{path}: holds no map of the method '{method}'{suggest(method, found)}; it has {', '.join(found)}"
+                f"{path}: holds no map of the method '{method}'{suggest(method, maps)}; it has {', '.join(maps)}"
             )
         reader = READERS["su3d-bench"]
-        run = _run_of(found[method][0])
-        return [Source(reader, file, name, name, run) for file in found[method] for name in reader.scenes(file)]
+        run = _run_of(maps[method][0])
+        return [Source(reader, file, name, name, run) for file in maps[method] for name in reader.scenes(file)]
     reader = recognise(path, format)
     scenes = reader.scenes(path)
     if not scenes:
@@ -143,14 +143,14 @@ def sources_of(path: Path, format: str | None, method: str | None) -> list[Sourc
     return [Source(reader, path, name, name, _run_of(file)) for name, file in scenes.items()]
 
 
-def _only_method(found: Mapping[str, Sequence[Path]]) -> str | None:
+def _only_method(maps: Mapping[str, Sequence[Path]]) -> str | None:
     """The one method that a run was asked for; the ceiling that comes with it is not meant."""
     from su3d_bench.core.config import RunConfig, read_file, resolve
     from su3d_bench.core.registry import CEILING_METHOD
 
-    run = _run_of(next(iter(found.values()))[0])
+    run = _run_of(next(iter(maps.values()))[0])
     is_single = run is not None and len(resolve(read_file(run / "run.toml"), (), RunConfig).methods) == 1
-    names = [name for name in found if name != CEILING_METHOD] if is_single and len(found) > 1 else list(found)
+    names = [name for name in maps if name != CEILING_METHOD] if is_single and len(maps) > 1 else list(maps)
     return names[0] if len(names) == 1 else None
 
 
@@ -163,10 +163,10 @@ def _run_of(file: Path) -> Path | None:
 
 def _maps_of_run(path: Path) -> dict[str, list[Path]]:
     """The predictions of a run folder by method."""
-    found: dict[str, list[Path]] = {}
+    maps: dict[str, list[Path]] = {}
     for file in sorted(path.glob("scenes/*/*/prediction.npz")):
-        found.setdefault(file.parent.name, []).append(file)
-    return found
+        maps.setdefault(file.parent.name, []).append(file)
+    return maps
 
 
 def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> list[Source]:
@@ -175,20 +175,20 @@ def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> li
 
     if not patterns:
         return list(sources)
-    found: dict[str, Source] = {}
+    matches: dict[str, Source] = {}
     for pattern in patterns:
         dataset, tail = split_address(pattern)
         matching = []
-        for one in sources:
-            lacks_dataset = bool(tail) and "/" not in one.scene
-            if fnmatch.fnmatchcase(one.scene, tail if lacks_dataset else pattern):
-                matching.append(replace(one, address=f"{dataset}/{one.scene}") if lacks_dataset else one)
+        for source in sources:
+            lacks_dataset = bool(tail) and "/" not in source.scene
+            if fnmatch.fnmatchcase(source.scene, tail if lacks_dataset else pattern):
+                matching.append(replace(source, address=f"{dataset}/{source.scene}") if lacks_dataset else source)
         if not matching:
-            known = [one.scene for one in sources]
+            known = [source.scene for source in sources]
             hint = suggest(pattern, known) or f"; it has {', '.join(known[:5])}{', ...' if len(known) > 5 else ''}"
             raise ConfigError(printable(f"no scene of {path} matches '{pattern}'{hint}"))
-        found.update({one.address: one for one in matching})
-    return list(found.values())
+        matches.update({source.address: source for source in matching})
+    return list(matches.values())
 
 
 def _names(addresses: Sequence[str], *, is_flat: bool) -> list[str]:
@@ -271,7 +271,7 @@ def _encoder(content: Content, source: Source, rules: ProtocolRules, texts: Path
     if source.run is not None and texts is None:
         return encoder_of(RunFolder(source.run))
     is_own = source.reader.name == "su3d-bench"
-    found = encoder_for(rules, n_dimensions, read_text_features(texts), is_own=is_own)
-    if isinstance(found, str):
-        raise PredictionError(f"{rules.name}: {found}")
-    return found
+    encoder = encoder_for(rules, n_dimensions, read_text_features(texts), is_own=is_own)
+    if isinstance(encoder, str):
+        raise PredictionError(f"{rules.name}: {encoder}")
+    return encoder

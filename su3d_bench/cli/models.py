@@ -186,9 +186,9 @@ def call_export(arguments: argparse.Namespace) -> int:
     value = {"folder": str(arguments.out), "files": export.files, "parity": [asdict(p) for p in export.parity]}
     lines = [f"{digest}  {arguments.out / name}" for name, digest in export.files.items()]
     lines += [
-        f"{one.output}: torch and ONNX Runtime differ by at most {one.max_abs_difference:.1e} over {one.n_values} "
-        f"values, cosine at least {one.min_cosine:.9f}"
-        for one in export.parity
+        f"{gap.output}: torch and ONNX Runtime differ by at most {gap.max_abs_difference:.1e} over {gap.n_values} "
+        f"values, cosine at least {gap.min_cosine:.9f}"
+        for gap in export.parity
     ]
     answer_either(arguments, value, "\n".join(lines))
     return EXIT_DONE

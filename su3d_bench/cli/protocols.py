@@ -50,9 +50,9 @@ def call(arguments: argparse.Namespace) -> int:
         return EXIT_DONE
     rows = [load_protocol(name) for name in protocol_names()]
     fields = {"name", "version", "summary", "kind", "datasets", "headline", "ground_truth", "label_space"}
-    width = max(len(one.name) for one in rows)
-    text = "\n".join(f"{one.name:<{width}}  {one.summary}" for one in rows)
-    answer_either(arguments, [one.model_dump(mode="json", include=fields) for one in rows], text)
+    width = max(len(rules.name) for rules in rows)
+    text = "\n".join(f"{rules.name:<{width}}  {rules.summary}" for rules in rows)
+    answer_either(arguments, [rules.model_dump(mode="json", include=fields) for rules in rows], text)
     return EXIT_DONE
 
 
@@ -100,8 +100,8 @@ def read_remarks(file: Path) -> dict[str, list[str]]:
     remarks: dict[str, list[str]] = {}
     section, waiting, has_key = "", list[str](), False
     for line in file.read_text(encoding="utf-8").splitlines():
-        found = _COMMENT.match(line)
-        comment = [found[1]] if found is not None else []
+        match = _COMMENT.match(line)
+        comment = [match[1]] if match is not None else []
         key, header = _KEY.match(line), _SECTION.match(line)
         if key or header:
             name = section + key[1] if key else header[1] if header else ""

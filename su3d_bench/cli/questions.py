@@ -79,15 +79,15 @@ def _made(arguments: argparse.Namespace) -> list[Question]:
 
     made: list[Question] = []
     for dataset, scene in chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet):
-        found = questions_of(
+        questions = questions_of(
             dataset,
             scene,
             per_kind=arguments.per_kind,
             own=arguments.source == "auto",
             colours=arguments.colours,
         )
-        remark(f"{dataset.name}/{scene}: {len(found)} questions", quiet=arguments.quiet)
-        made += found
+        remark(f"{dataset.name}/{scene}: {len(questions)} questions", quiet=arguments.quiet)
+        made += questions
     return made
 
 
@@ -96,42 +96,42 @@ def _show(arguments: argparse.Namespace) -> int:
 
     if arguments.file is None:
         raise ConfigError("questions show: name a file, or 'paper' for the queries that the paper's page shows")
-    found: Sequence[Question]
-    found = paper_queries() if arguments.file == PAPER else read_questions(Path(arguments.file), "")
+    questions: Sequence[Question]
+    questions = paper_queries() if arguments.file == PAPER else read_questions(Path(arguments.file), "")
     if arguments.json:
-        answer_json([_row(one) for one in found])
+        answer_json([_row(question) for question in questions])
         return EXIT_DONE
-    _answer_counts(found, arguments)
-    for one in found[:N_SHOWN]:
-        answer("  ".join(str(value) for value in _printable_row(one)))
-    if len(found) > N_SHOWN:
-        answer(f"... and {len(found) - N_SHOWN} more; --json shows all")
+    _answer_counts(questions, arguments)
+    for question in questions[:N_SHOWN]:
+        answer("  ".join(str(value) for value in _printable_row(question)))
+    if len(questions) > N_SHOWN:
+        answer(f"... and {len(questions) - N_SHOWN} more; --json shows all")
     return EXIT_DONE
 
 
-def _row(one: Question) -> dict[str, Any]:
+def _row(question: Question) -> dict[str, Any]:
     return {
-        "id": one.id,
-        "scene": one.scene,
-        "kind": one.kind,
-        "text": one.text,
-        "answers": None if one.answers is None else list(one.answers),
-        "reply": one.reply,
-        "source": one.source,
+        "id": question.id,
+        "scene": question.scene,
+        "kind": question.kind,
+        "text": question.text,
+        "answers": None if question.answers is None else list(question.answers),
+        "reply": question.reply,
+        "source": question.source,
     }
 
 
-def _printable_row(one: Question) -> tuple[str, ...]:
+def _printable_row(question: Question) -> tuple[str, ...]:
     from su3d_bench.core.errors import printable
 
-    ids = "unknown" if one.answers is None else " ".join(map(str, one.answers))
-    return printable(one.scene, 60), one.kind, printable(one.text, MOST_CHARACTERS), f"-> {ids}"
+    ids = "unknown" if question.answers is None else " ".join(map(str, question.answers))
+    return printable(question.scene, 60), question.kind, printable(question.text, MOST_CHARACTERS), f"-> {ids}"
 
 
-def _answer_counts(found: Sequence[Question], arguments: argparse.Namespace) -> None:
-    counts = Counter(one.kind for one in found)
-    n_known = sum(one.is_known for one in found)
+def _answer_counts(questions: Sequence[Question], arguments: argparse.Namespace) -> None:
+    counts = Counter(question.kind for question in questions)
+    n_known = sum(question.is_known for question in questions)
     kinds = ", ".join(f"{n} {kind}" for kind, n in counts.items())
-    n_scenes = len({one.scene for one in found})
-    text = f"{len(found)} questions on {n_scenes} scenes ({kinds}); {n_known} with known answers"
-    answer_either(arguments, {"n": len(found), "n_known": n_known, "kinds": dict(counts)}, text)
+    n_scenes = len({question.scene for question in questions})
+    text = f"{len(questions)} questions on {n_scenes} scenes ({kinds}); {n_known} with known answers"
+    answer_either(arguments, {"n": len(questions), "n_known": n_known, "kinds": dict(counts)}, text)

@@ -86,10 +86,10 @@ def _jobs(arguments: argparse.Namespace) -> dict[str, JobFolder]:
             hint = suggest(scene, known) or f"; it has {', '.join(known[:8])}"
             raise ConfigError(f"{run.path}: holds no scene '{scene}'{hint}")
     jobs = {scene: run.job(scene, arguments.method) for scene in arguments.scenes or known}
-    found = {scene: job for scene, job in jobs.items() if job.prediction.is_file()}
-    if not found:
+    mapped = {scene: job for scene, job in jobs.items() if job.prediction.is_file()}
+    if not mapped:
         raise StoreError(f"{run.path}: holds no map by '{arguments.method}'; name another with --method")
-    return found
+    return mapped
 
 
 def _scenes(run: RunFolder) -> list[str]:
@@ -151,11 +151,11 @@ def _answer(made: dict[str, NameRecords], arguments: argparse.Namespace) -> None
         answer_json({scene: records.model_dump(mode="json") for scene, records in made.items()})
         return
     for scene, records in made.items():
-        changed = [one for one in records.names if one.refined != one.label]
-        kept = [one for one in records.names if one.source == "label"]
+        changed = [name for name in records.names if name.refined != name.label]
+        kept = [name for name in records.names if name.source == "label"]
         answer(f"{scene}: {len(records.names)} instances, {len(changed)} names changed")
-        for one in changed:
-            answer(f"  {one.id:>4}  {one.label} -> {one.refined}")
+        for name in changed:
+            answer(f"  {name.id:>4}  {name.label} -> {name.refined}")
         if kept:
-            reasons = ", ".join(dict.fromkeys(one.reason for one in kept))
+            reasons = ", ".join(dict.fromkeys(name.reason for name in kept))
             remark(f"{scene}: label n stays for {len(kept)} instances: {reasons}", quiet=arguments.quiet)

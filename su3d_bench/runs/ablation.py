@@ -54,7 +54,7 @@ def ablation_rows(method: str, vary: Sequence[str], *, is_grid: bool) -> tuple[A
     n_rows = _product(map(len, choices)) if is_grid else sum(map(len, choices))
     if n_rows > MOST_VARIANTS:
         raise ConfigError(f"ablate: {n_rows} variants; at most {MOST_VARIANTS} make one run")
-    combinations = itertools.product(*choices) if is_grid else ((one,) for each in choices for one in each)
+    combinations = itertools.product(*choices) if is_grid else ((choice,) for each in choices for choice in each)
     names = {_effective(method_class.Config()): str(method_class.name)}
     return tuple(_row(method_class, combination, names) for combination in combinations)
 
@@ -76,21 +76,21 @@ def _choices(method: str, method_class: Any, text: str) -> list[_Choice]:
     if parameter not in known:
         raise ConfigError(f"--vary {text}: {method} has no setting '{parameter}'{suggest(parameter, known)}")
     key, change = shorts.get(parameter, (parameter, lambda value: value))
-    found = []
+    choices = []
     for part in _COMMA_OUTSIDE_BRACKETS.split(values):
         try:
-            found.append(_Choice(parameter, part.strip(), key, change(parse_value(part))))
+            choices.append(_Choice(parameter, part.strip(), key, change(parse_value(part))))
         except (TypeError, ValueError) as error:
             raise ConfigError(f"--vary {text}: '{part.strip()}': {error}") from error
-    return found
+    return choices
 
 
 def _row(method_class: Any, combination: Sequence[_Choice], names: dict[str, str]) -> AblationRow:
     """``names``: what settings are called by their effect; a new one is entered."""
-    keys = [one.key for one in combination]
+    keys = [choice.key for choice in combination]
     if len(set(keys)) < len(keys):
         raise ConfigError(f"--vary: '{keys[0]}' is varied twice in one variant; name it once")
-    values = {one.key: one.value for one in combination}
+    values = {choice.key: choice.value for choice in combination}
     try:
         # Through JSON, because strict models take a list for a tuple only there.
         effective = _effective(method_class.Config.model_validate_json(json.dumps(values)))
@@ -100,8 +100,8 @@ def _row(method_class: Any, combination: Sequence[_Choice], names: dict[str, str
         raise ConfigError(f"--vary {text}: {reason[:1].lower()}{reason[1:]}") from error
     variant = ",".join(f"{key}={_bare(value)}" for key, value in values.items()).replace(" ", "")
     return AblationRow(
-        parameter=" x ".join(one.parameter for one in combination),
-        value=" x ".join(one.text for one in combination),
+        parameter=" x ".join(choice.parameter for choice in combination),
+        value=" x ".join(choice.text for choice in combination),
         method=names.setdefault(effective, f"{method_class.name}@{variant}"),
         is_default=effective == next(iter(names)),
     )

@@ -51,11 +51,11 @@ class RunData:
     @cached_property
     def _datasets(self) -> dict[str, Any]:
         addresses = {entry.path: entry.value for entry in self.settings.entries}.get(("scenes",), ())
-        found = {}
+        datasets = {}
         for target in dataset_targets([str(address) for address in addresses]):
             part = part_of("dataset", target, self.settings)
-            found[part.name] = build_dataset(part, data_root())
-        return found
+            datasets[part.name] = build_dataset(part, data_root())
+        return datasets
 
     def dataset(self, scene: str) -> Any:
         """The dataset of ``scene``; a ``DataError`` where it is not known, or its data are not those of the run."""
@@ -127,7 +127,7 @@ class FinishedRun:
 
     def scores(self, method: str) -> dict[str, dict[str, SceneScore]]:
         """Protocol -> scene -> counts, of every scene that was scored."""
-        found: dict[str, dict[str, SceneScore]] = {name: {} for name in self.protocols}
+        scores: dict[str, dict[str, SceneScore]] = {name: {} for name in self.protocols}
         for scene in self.scenes:
             file = self.folder.job(scene, method).counts
             if not is_file(file):
@@ -137,8 +137,8 @@ class FinishedRun:
             except DataError as error:
                 raise DataError(f"{printable(scene, 120)}: {method}: {error}") from error
             for protocol, score in of_scene.items():
-                found.setdefault(protocol, {})[scene] = score
-        return found
+                scores.setdefault(protocol, {})[scene] = score
+        return scores
 
     def to_frame(self) -> pandas.DataFrame:
         """A row a method, protocol and metric, as fractions: value, low and high of its interval, ceiling; scenes.

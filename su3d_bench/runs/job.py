@@ -170,8 +170,8 @@ class JobInputs:
         rules = {name: load_protocol(name) for name in self.job.protocols}
         key = {"predict": digest_json(predict_key), "encoder": self.perception.encoder.digest}
         key |= {"pictures": str(self.job.pictures)}
-        key |= {f"protocol.{name}": one.digest for name, one in rules.items()}
-        return key | refined_digest(folder) if any(one.goes_by_names for one in rules.values()) else key
+        key |= {f"protocol.{name}": protocol.digest for name, protocol in rules.items()}
+        return key | refined_digest(folder) if any(protocol.goes_by_names for protocol in rules.values()) else key
 
     def outcome(self, remarks: Mapping[str, Any], *, was_resumed: bool) -> MethodOutcome:
         """The outcome once both steps are sealed; ``remarks`` stand beside the seal of the scores."""

@@ -140,17 +140,17 @@ def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | s
     if config.profile not in PROFILES:
         hint = suggest(config.profile, PROFILES) or "; known: " + ", ".join(PROFILES)
         raise ConfigError(f"unknown profile '{config.profile}'{hint}")
-    methods = {one.name: one for one in map(named_method, _method_targets(config.methods))}
+    methods = {method.name: method for method in map(named_method, _method_targets(config.methods))}
     datasets = {str(registry.load("dataset", target).name): target for target in dataset_targets(config.scenes)}
-    settings += read_assignments(assignments, [*{one.base for one in methods.values()}, *methods], list(datasets))
-    _check_sections("method", settings, {one.base: one.target for one in methods.values()}, list(methods))
+    settings += read_assignments(assignments, [*{method.base for method in methods.values()}, *methods], list(datasets))
+    _check_sections("method", settings, {method.base: method.target for method in methods.values()}, list(methods))
     _check_sections("dataset", settings, datasets)
     perception = resolve(settings, ("perception",), PerceptionConfig)
     check_models(config.profile, perception)
     if config.executor not in ELSEWHERE:
         device_for(perception.models.device, 0)  # raises where there is no such GPU
     parts = _Parts(
-        tuple(_method_part(one, settings) for one in methods.values()),
+        tuple(_method_part(method, settings) for method in methods.values()),
         {target: part_of("dataset", target, settings) for target in datasets.values()},
         None if CEILING_METHOD in methods else part_of("method", CEILING_METHOD, settings),
         perception.model_dump_json(),
@@ -219,25 +219,25 @@ def _all_systems() -> list[str]:
 
 
 def _method_targets(methods: Sequence[str]) -> list[str]:
-    named = [name for one in methods for name in (_all_systems() if one == "all" else [one])]
+    named = [name for method in methods for name in (_all_systems() if method == "all" else [method])]
     targets = list(dict.fromkeys(named))
     if not targets:
         raise ConfigError("no method was named; known: " + ", ".join(registry.names("method")))
     return targets
 
 
-def protocols_of_run(asked: Sequence[str], targets: Sequence[str]) -> dict[str, tuple[str, ...]]:
+def protocols_of_run(wanted: Sequence[str], targets: Sequence[str]) -> dict[str, tuple[str, ...]]:
     """Dataset target -> protocols that score it: those asked for that fit it, or its own where none is asked for."""
-    if not asked:
+    if not wanted:
         return {target: tuple(protocols_for(registry.load("dataset", target).name)) for target in targets}
-    rules = [load_protocol(name) for name in dict.fromkeys(asked)]
+    rules = [load_protocol(name) for name in dict.fromkeys(wanted)]
     truths = {target: TruthFacts.of_dataset(registry.load("dataset", target)) for target in targets}
-    for one in rules:
-        reasons = [reason for truth in truths.values() if (reason := why_not_truth(one, truth)) is not None]
+    for rule in rules:
+        reasons = [reason for truth in truths.values() if (reason := why_not_truth(rule, truth)) is not None]
         if len(reasons) == len(truths):
-            raise ConfigError(f"protocol '{one.name}' fits no scene of this run: {reasons[0]}")
+            raise ConfigError(f"protocol '{rule.name}' fits no scene of this run: {reasons[0]}")
     return {
-        target: tuple(name for name, one in zip(asked, rules, strict=True) if why_not_truth(one, truth) is None)
+        target: tuple(name for name, rule in zip(wanted, rules, strict=True) if why_not_truth(rule, truth) is None)
         for target, truth in truths.items()
     }
 

@@ -44,17 +44,17 @@ class FinishedScenes:
         parts = job.methods if job.ceiling is None else (*job.methods, job.ceiling)
         folders = [RunFolder(job.folder).job(job.scene, part.name) for part in parts]
         seals = [folder.seals() for folder in folders]
-        if any("predict" not in one or "score" not in one for one in seals):
+        if any("predict" not in seal or "score" not in seal for seal in seals):
             return None
         package = logging.getLogger("su3d_bench")
         package.addHandler(unheard := logging.NullHandler())  # what is said of a scene's data was said in its first run
         try:
-            found = [self._outcome(job, *each) for each in zip(parts, folders, seals, strict=True)]
+            outcomes = [self._outcome(job, *each) for each in zip(parts, folders, seals, strict=True)]
         except Exception:  # noqa: BLE001 - a plug-in may raise anything; a worker tells it as ever
             return None
         finally:
             package.removeHandler(unheard)
-        return None if None in found else tuple(one for one in found if one is not None)
+        return None if None in outcomes else tuple(outcome for outcome in outcomes if outcome is not None)
 
     def _outcome(
         self, job: SceneJob, part: Part, folder: JobFolder, seals: Mapping[str, SealRecord]

@@ -82,7 +82,7 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
             raise
         if plan.store is not None:
             fetch_results(plan.store, plan.folder.path)
-        failed = [(one.scene, one.method, one.error) for one in outcomes if one.error is not None]
+        failed = [(outcome.scene, outcome.method, outcome.error) for outcome in outcomes if outcome.error is not None]
         failures = tuple(each for each in failed if each[1] in plan.methods)
         metrics = plain(summarise(plan, outcomes))
         write_json(metrics_file, metrics)
@@ -100,17 +100,23 @@ def publish(plan: Plan) -> None:
 
 def _remarks(plan: Plan, outcomes: Sequence[MethodOutcome]) -> tuple[str, ...]:
     """What is worth saying of scenes that did not fail: warnings, protocols left out, ceilings that are missing."""
-    failed = {one.scene for one in outcomes if one.error is not None and one.method in plan.methods}
-    lines = [line for one in outcomes for line in one.warnings]
-    reasons = [(one, protocol, why) for one in outcomes for protocol, why in one.unscored]
-    lines += [f"{one.scene}, {one.method}: not scored under {protocol}: {why}" for one, protocol, why in reasons]
+    failed = {outcome.scene for outcome in outcomes if outcome.error is not None and outcome.method in plan.methods}
+    lines = [line for outcome in outcomes for line in outcome.warnings]
+    reasons = [(outcome, protocol, why) for outcome in outcomes for protocol, why in outcome.unscored]
+    lines += [
+        f"{outcome.scene}, {outcome.method}: not scored under {protocol}: {why}" for outcome, protocol, why in reasons
+    ]
     # A table says the caveat beneath it; what no protocol scores has no table.
     without_table = {job.scene for job in plan.jobs if not job.protocols}
-    lines += [f"{one.method}: {one.caveat}" for one in outcomes if one.caveat and one.scene in without_table]
-    said = {(one.scene, why) for one, _, why in reasons}
-    for one in outcomes:
-        if one.error is not None and one.scene not in failed and (one.scene, one.error) not in said:
-            lines.append(f"{one.scene}: no ceiling: {one.error}")
+    lines += [
+        f"{outcome.method}: {outcome.caveat}"
+        for outcome in outcomes
+        if outcome.caveat and outcome.scene in without_table
+    ]
+    reported = {(outcome.scene, why) for outcome, _, why in reasons}
+    for outcome in outcomes:
+        if outcome.error is not None and outcome.scene not in failed and (outcome.scene, outcome.error) not in reported:
+            lines.append(f"{outcome.scene}: no ceiling: {outcome.error}")
     return tuple(dict.fromkeys(lines))
 
 
@@ -168,8 +174,8 @@ def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> MetricsRecord:
     The counts of one method and of the ceiling are in memory at a time.
     """
     by_method: dict[str, list[MethodOutcome]] = {}
-    for one in outcomes:
-        by_method.setdefault(one.method, []).append(one)
+    for outcome in outcomes:
+        by_method.setdefault(outcome.method, []).append(outcome)
     perfect = _read_scores(plan, by_method.get(CEILING_METHOD, ()), attrgetter("counts"))
     rules = _rules(plan)
 
@@ -205,17 +211,17 @@ def _rules(plan: Plan) -> list[ProtocolRules]:
 def _read_scores(plan: Plan, outcomes: Sequence[MethodOutcome], file_of: Callable[[JobFolder], Path]) -> Scores:
     """(protocol, scene) -> counts, from the files of the outcomes that did not fail and have one."""
     scores: dict[tuple[str, str], SceneScore] = {}
-    for one in outcomes:
-        file = file_of(plan.folder.job(one.scene, one.method))
-        if one.error is None and file.is_file():
-            scores |= {(name, one.scene): score for name, score in unpack_scores(file.read_bytes()).items()}
+    for outcome in outcomes:
+        file = file_of(plan.folder.job(outcome.scene, outcome.method))
+        if outcome.error is None and file.is_file():
+            scores |= {(name, outcome.scene): score for name, score in unpack_scores(file.read_bytes()).items()}
     return scores
 
 
 def _metrics_over(scenes: Sequence[str], rules: ProtocolRules, scores: Scores) -> Any:
     """The metrics over ``scenes``; None where there is none, or one has no score."""
-    found = {scene: scores[rules.name, scene] for scene in scenes if (rules.name, scene) in scores}
-    return plain_json(combined_metrics(rules, found)) if found and len(found) == len(scenes) else None
+    of_scenes = {scene: scores[rules.name, scene] for scene in scenes if (rules.name, scene) in scores}
+    return plain_json(combined_metrics(rules, of_scenes)) if of_scenes and len(of_scenes) == len(scenes) else None
 
 
 def _result(
@@ -266,7 +272,7 @@ def _model_files(plan: Plan, outcomes: Sequence[MethodOutcome]) -> dict[str, dic
     from su3d_bench.perception.models.catalogue import PROFILE_MODELS
     from su3d_bench.perception.models.inspection import models_record
 
-    used = [profile for one in outcomes for profile in (one.profile or "").split(", ")]
+    used = [profile for outcome in outcomes for profile in (outcome.profile or "").split(", ")]
     names = [name for profile in dict.fromkeys(used) for name in PROFILE_MODELS.get(profile, ())]
     return models_record(names, PerceptionConfig.model_validate_json(plan.jobs[0].perception).models) if names else {}
 
@@ -288,11 +294,17 @@ def record(plan: Plan, outcomes: Sequence[MethodOutcome], status: str) -> RunRec
         models=_model_files(plan, outcomes),
         encoder=_join(outcome.encoder for outcome in outcomes),
         encoder_digest=_join(outcome.encoder_digest for outcome in outcomes),
-        data_digests={one.scene: one.data_digest for one in outcomes if one.data_digest is not None},
+        data_digests={outcome.scene: outcome.data_digest for outcome in outcomes if outcome.data_digest is not None},
         protocols=tuple(ProtocolRecord(rules.name, rules.version, rules.digest) for rules in _rules(plan)),
         methods=plan.methods,
         scenes=tuple(job.scene for job in plan.jobs),
-        failed=tuple(FailureRecord(one.scene, one.method, one.error) for one in outcomes if one.error is not None),
-        unscored=tuple(UnscoredRecord(one.scene, one.method, *pair) for one in outcomes for pair in one.unscored),
+        failed=tuple(
+            FailureRecord(outcome.scene, outcome.method, outcome.error)
+            for outcome in outcomes
+            if outcome.error is not None
+        ),
+        unscored=tuple(
+            UnscoredRecord(outcome.scene, outcome.method, *pair) for outcome in outcomes for pair in outcome.unscored
+        ),
         warnings=tuple(dict.fromkeys(line for outcome in outcomes for line in outcome.warnings)),
     )

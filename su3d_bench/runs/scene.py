@@ -285,9 +285,9 @@ class _Scene:
             if (reason := why_not_scorable(rules, prediction)) is not None:
                 unscored[rules.name] = reason
                 continue
-            told = self._prediction_in_words_of(truth, part, prediction)
-            asked = self._truth_of(rules, truth, refined_in)
-            scores[rules.name] = score_scene(rules, asked, told, perception.encoder)
+            renamed = self._prediction_in_words_of(truth, part, prediction)
+            known = self._truth_of(rules, truth, refined_in)
+            scores[rules.name] = score_scene(rules, known, renamed, perception.encoder)
         return scores, unscored
 
     def _truth_of(self, rules: ProtocolRules, truth: GroundTruth, refined_in: JobFolder | None) -> Truth:
@@ -303,5 +303,5 @@ class _Scene:
         if not isinstance(method, TakesTruth) or truth.labels == self.truth(self.dataset.variants[0]).labels:
             return prediction
         method.receive_truth(truth)
-        told: Prediction = method.finish()
-        return told
+        renamed: Prediction = method.finish()
+        return renamed

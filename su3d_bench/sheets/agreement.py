@@ -50,7 +50,8 @@ def agreement(ratings: Ratings) -> Agreement:
     """All coefficients for one question; ``ratings`` may hold items with a single answer, which say nothing."""
     answers = sorted({answer for item in ratings.values() for answer in item.values()})
     annotators = sorted({annotator for item in ratings.values() for annotator in item})
-    counts = np.array([[list(item.values()).count(one) for one in answers] for item in ratings.values()], np.int64)
+    given = [list(item.values()) for item in ratings.values()]
+    counts = np.array([[item.count(answer) for answer in answers] for item in given], np.int64)
     counts = counts.reshape(-1, len(answers))
     counts = counts[counts.sum(axis=1) >= 2]
     sizes = counts.sum(axis=1)
@@ -75,8 +76,8 @@ def agreement(ratings: Ratings) -> Agreement:
 
 def _pair(ratings: Ratings, left: str, right: str) -> PairAgreement:
     both = [(item[left], item[right]) for item in ratings.values() if left in item and right in item]
-    kappa = cohen_kappa([one for one, _ in both], [other for _, other in both])
-    return PairAgreement(left, right, len(both), sum(one == other for one, other in both), kappa)
+    kappa = cohen_kappa([answer for answer, _ in both], [other for _, other in both])
+    return PairAgreement(left, right, len(both), sum(answer == other for answer, other in both), kappa)
 
 
 def cohen_kappa(left: Sequence[str], right: Sequence[str]) -> float | None:

@@ -74,8 +74,8 @@ def parse_csv(content: bytes, where: str) -> list[AnswerRow]:
     columns = _columns(rows[0]) if rows else None
     if columns is None:
         missing = [name for name in ANSWER_COLUMNS if not rows or name not in _names(rows[0])]
-        told = f"lacks {', '.join(missing)}" if missing else "names a column twice"
-        raise DataError(f"{where}: the first line {told}; export it again, or put the columns' names back")
+        fault = f"lacks {', '.join(missing)}" if missing else "names a column twice"
+        raise DataError(f"{where}: the first line {fault}; export it again, or put the columns' names back")
     return list(_rows(enumerate(rows[1:], 2), columns, where))
 
 
@@ -86,7 +86,7 @@ def parse_workbook(content: bytes, where: str) -> list[AnswerRow]:
     except ImportError as error:
         raise ModelMissing(f"{where}: a workbook needs the sheets extra: pip install 'su3d-bench[sheets]'") from error
     _check_archive(content, where)
-    found: list[AnswerRow] = []
+    answers: list[AnswerRow] = []
     has_columns = False
     try:
         book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=False, keep_links=False)
@@ -100,15 +100,15 @@ def parse_workbook(content: bytes, where: str) -> list[AnswerRow]:
                     break
             if columns is not None:
                 has_columns = True
-                found += _rows(rows, columns, place)
+                answers += _rows(rows, columns, place)
     except DataError:
         raise
     except Exception as error:  # openpyxl meets damage with errors of any kind
-        told = printable(f"{type(error).__name__}: {error}", 120)
-        raise DataError(f"{where}: is damaged ({told}); save the workbook as .xlsx again") from error
+        reason = printable(f"{type(error).__name__}: {error}", 120)
+        raise DataError(f"{where}: is damaged ({reason}); save the workbook as .xlsx again") from error
     if not has_columns:
         raise DataError(f"{where}: no worksheet has the columns {', '.join(ANSWER_COLUMNS)}; put their names back")
-    return found
+    return answers
 
 
 def _check_archive(content: bytes, where: str) -> None:
@@ -116,14 +116,14 @@ def _check_archive(content: bytes, where: str) -> None:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             members = archive.infolist()
-            n_bytes = sum(one.file_size for one in members if not one.filename.startswith("xl/media/"))
+            n_bytes = sum(member.file_size for member in members if not member.filename.startswith("xl/media/"))
             if len(members) > MOST_MEMBERS or n_bytes > MOST_TEXT_BYTES:
                 raise DataError(
                     f"{where}: unpacks to {len(members)} parts and {n_bytes >> 20} MiB of text; no workbook of "
                     f"su3d-bench sheets make does"
                 )
-            for one in members:
-                if one.filename.endswith((".xml", ".rels")) and b"<!DOCTYPE" in archive.read(one):
+            for member in members:
+                if member.filename.endswith((".xml", ".rels")) and b"<!DOCTYPE" in archive.read(member):
                     raise DataError(f"{where}: defines entities, which no workbook needs; save it as .xlsx again")
     except DataError:
         raise
@@ -132,7 +132,7 @@ def _check_archive(content: bytes, where: str) -> None:
 
 
 def _names(row: Iterable[object]) -> list[str]:
-    return [one.strip().lower() if isinstance(one, str) else "" for one in row]
+    return [cell.strip().lower() if isinstance(cell, str) else "" for cell in row]
 
 
 def _columns(row: Sequence[object]) -> dict[str, int] | None:
@@ -159,7 +159,7 @@ def _cell(value: object, name: str, at: str) -> str:
     # as files that a spreadsheet is to open have it before text that would be taken for a formula
     if text[:1] == "'" and text[1:2] in FORMULA_STARTS:
         text = text[1:]
-    if len(text) > MOST_CHARACTERS or any(unicodedata.category(one) in ("Cc", "Cs") for one in text):
+    if len(text) > MOST_CHARACTERS or any(unicodedata.category(character) in ("Cc", "Cs") for character in text):
         raise DataError(f"{at}: '{name}' is too long or holds control characters: '{printable(text, 40)}'")
     return text
 
@@ -197,16 +197,16 @@ def check_key(sheet: Sheet, key: Key) -> None:
             f"key: is of the set '{printable(key.sheet_id, 60)}', the sheet is '{printable(sheet.id, 60)}'; give the "
             f"key that was made with it"
         )
-    known = {one.id for one in sheet.items}
-    keyed = [one.id for one in key.items]
+    known = {item.id for item in sheet.items}
+    keyed = [item.id for item in key.items]
     if set(keyed) != known or len(keyed) != len(known):
         raise DataError(f"key: has {len(keyed)} items, the sheet {len(known)}; give the key that was made with it")
-    if {one.name: one.choices for one in sheet.asks} != {one.name: one.choices for one in ASKS[sheet.kind]}:
+    if {ask.name: ask.choices for ask in sheet.asks} != {ask.name: ask.choices for ask in ASKS[sheet.kind]}:
         raise DataError(f"sheet: asks something else than '{sheet.kind}' sheets of this version do; make it again")
-    asks = {one.id: one.asks for one in sheet.items}
-    for one in key.items:
-        if not _fits(sheet, asks[one.id], one, key.methods):
-            raise DataError(f"key: item '{printable(one.id, 40)}' does not fit the sheet; make the sheets again")
+    asks = {item.id: item.asks for item in sheet.items}
+    for item in key.items:
+        if not _fits(sheet, asks[item.id], item, key.methods):
+            raise DataError(f"key: item '{printable(item.id, 40)}' does not fit the sheet; make the sheets again")
 
 
 def _fits(sheet: Sheet, asks: Sequence[str], item: KeyItem, methods: Sequence[str]) -> bool:
@@ -215,7 +215,7 @@ def _fits(sheet: Sheet, asks: Sequence[str], item: KeyItem, methods: Sequence[st
     return (
         set(item.methods) <= set(methods)
         and (sheet.kind != "retrieval" or item.question_kind in KINDS)
-        and set(item.stands_for) == {one for one in asks if one.startswith("label ")}
+        and set(item.stands_for) == {ask for ask in asks if ask.startswith("label ")}
         and set(labels) <= set(LABELS)
         and len(set(labels)) == len(labels)
         and all(name in asks and choice in sheet.ask(name).choices for name, choice in item.automatic.items())
@@ -225,8 +225,8 @@ def _fits(sheet: Sheet, asks: Sequence[str], item: KeyItem, methods: Sequence[st
 def check_answers(sheet: Sheet, rows: Sequence[AnswerRow]) -> Checked:
     """Every row held against the sheet, then what each annotator who answered has left out."""
     faults, own = _of_other_sets(sheet, rows)
-    items = {one.id: one for one in sheet.items}
-    shares = {one.name: set(one.item_ids) for one in sheet.annotators}
+    items = {item.id: item for item in sheet.items}
+    shares = {share.name: set(share.item_ids) for share in sheet.annotators}
     first: dict[tuple[str, str, str], AnswerRow] = {}
     given: dict[tuple[str, str, str], str] = {}
     empty: dict[str, list[AnswerRow]] = defaultdict(list)
@@ -243,17 +243,17 @@ def check_answers(sheet: Sheet, rows: Sequence[AnswerRow]) -> Checked:
             given[place], fault = _choice(sheet, row)
         if fault is not None:
             faults.append(f"{row.at}: {fault}")
-    faults += [_unanswered(found) for found in empty.values()]
+    faults += [_unanswered(open_rows) for open_rows in empty.values()]
     there = {(row.annotator, row.item_id, row.question) for row in own}  # with a fault of its own or without
     answered = {name for name, _, _ in there}
     for share in sheet.annotators:
         if share.name in answered:
-            faults += _left_out(share.name, [items[one] for one in share.item_ids], there)
-    order = {one.id: k for k, one in enumerate(sheet.items)}
-    names = {one.name: k for k, one in enumerate(sheet.asks)}
+            faults += _left_out(share.name, [items[item_id] for item_id in share.item_ids], there)
+    order = {item.id: k for k, item in enumerate(sheet.items)}
+    names = {ask.name: k for k, ask in enumerate(sheet.asks)}
     places = sorted(given, key=lambda place: (order[place[1]], names[place[2]], place[0]))
     judgements = tuple(Judgement(item, who, ask, given[who, item, ask]) for who, item, ask in places)
-    silent = tuple(one.name for one in sheet.annotators if one.name not in answered)
+    silent = tuple(share.name for share in sheet.annotators if share.name not in answered)
     return Checked(judgements, tuple(faults), silent)
 
 
@@ -267,10 +267,10 @@ def _of_other_sets(sheet: Sheet, rows: Iterable[AnswerRow]) -> tuple[list[str], 
         else:
             others[_file_of(row), row.sheet_id].append(row)
     faults = []
-    for (_, other), found in others.items():
+    for (_, other), foreign in others.items():
         what = f"belongs to the set '{printable(other, 60)}'" if other else "has no sheet_id"
         faults.append(
-            f"{_places(found)}: {what}, not to '{sheet.id}' (another kind, seed or run, or a changed cell); "
+            f"{_places(foreign)}: {what}, not to '{sheet.id}' (another kind, seed or run, or a changed cell); "
             f"score each set with its own sheet and key"
         )
     return faults, own
@@ -298,9 +298,9 @@ def _identity_fault(row: AnswerRow, items: dict[str, SheetItem], shares: dict[st
 def _choice(sheet: Sheet, row: AnswerRow) -> tuple[str, str | None]:
     """The choice that was made, whatever its capitals, and what is wrong with it."""
     choices = sheet.ask(row.question).choices
-    for one in choices:
-        if " ".join(row.answer.split()).casefold() == one.casefold():
-            return one, None
+    for choice in choices:
+        if " ".join(row.answer.split()).casefold() == choice.casefold():
+            return choice, None
     near = suggest(row.answer, choices) or f"; choose {' | '.join(choices)}"
     return "", f"unknown answer '{printable(row.answer, 40)}' to '{row.question}'{near}"
 
@@ -323,7 +323,7 @@ def _places(rows: Sequence[AnswerRow]) -> str:
 
 def _left_out(who: str, share: Sequence[SheetItem], there: set[tuple[str, str, str]]) -> list[str]:
     """A line for the items of an annotator of which rows are missing."""
-    missing = Counter(one.id for one in share for ask in one.asks if (who, one.id, ask) not in there)
+    missing = Counter(item.id for item in share for ask in item.asks if (who, item.id, ask) not in there)
     if not missing:
         return []
     names = ", ".join(list(missing)[:SHOWN_ITEMS]) + (", ..." if len(missing) > SHOWN_ITEMS else "")

@@ -89,16 +89,16 @@ def questions_of(
         else:
             assert rules.min_region_size is not None
             given = generate(scene, known_objects(truth, rules.min_region_size))
-    mine = [one for one in given if one.scene == scene]
-    return [one for kind in KINDS for one in chosen([each for each in mine if each.kind == kind], per_kind)]
+    mine = [question for question in given if question.scene == scene]
+    return [question for kind in KINDS for question in chosen([each for each in mine if each.kind == kind], per_kind)]
 
 
 def retrieval_drafts(source: RunSource, scene: str, questions: Sequence[Question], encoder: Encoder) -> list[Draft]:
     """For each question one draft for every instance that some method ranks first, with all methods that do."""
     rules = source.rules(scene, "retrieval")
-    texts = [one.text for one in questions]
+    texts = [question.text for question in questions]
     maps = {method: source.instances(scene, method) for method in source.methods}
-    rankings = {method: rank_all(found, texts, encoder) for method, found in maps.items() if len(found)}
+    rankings = {method: rank_all(instances, texts, encoder) for method, instances in maps.items() if len(instances)}
     objects = {method: source.covered(scene, rules, maps[method]) for method in rankings}
     drafts = []
     for place, question in enumerate(questions):
@@ -110,15 +110,15 @@ def retrieval_drafts(source: RunSource, scene: str, questions: Sequence[Question
             row, covered = int(first.order[0]), objects[methods[0]]
             automatic = {}
             if covered is not None and question.is_known:
-                asked = AskedText(question.kind, question.text, question.answers or ())
-                is_right = judge_retrieval(covered.main_object, np.array([row]), [asked])
+                query = AskedText(question.kind, question.text, question.answers or ())
+                is_right = judge_retrieval(covered.main_object, np.array([row]), [query])
                 automatic = {"retrieval": judged(bool(is_right[0]))}
             drafts.append(
                 Draft(
                     kind="retrieval",
                     scene=scene,
                     methods=tuple(methods),
-                    instance_ids=tuple(id_of(maps[one], int(rankings[one][place].order[0])) for one in methods),
+                    instance_ids=tuple(id_of(maps[name], int(rankings[name][place].order[0])) for name in methods),
                     rows=(row,),
                     title=(f"Is this: {question.text}?",),
                     text=printable(question.text, MOST_TEXT),
@@ -136,18 +136,18 @@ def annotation_drafts(source: RunSource, scene: str, n_most: int, random: np.ran
     """At most ``n_most`` instances a scene, drawn with ``random``, each with its labels n and n' in drawn order."""
     rules = source.rules(scene, "annotation")
     truth = source.truth(scene, rules)
-    found: dict[bytes, Draft] = {}
+    draft_of: dict[bytes, Draft] = {}
     for method in source.methods:
         instances = source.instances(scene, method)
         judge = _annotation_judge(source, scene, rules, truth, instances)
         labels = [labels_n(instances), source.refined(scene, method)]
         for row in range(len(instances)):
-            names = [printable(one[row], MOST_TEXT) or NO_LABEL for one in labels if one is not None]
+            names = [printable(label[row], MOST_TEXT) or NO_LABEL for label in labels if label is not None]
             key = mask_digest(instances, [row]) + "\0".join(names).encode()
-            if key in found:
-                found[key] = also(found[key], method, id_of(instances, row))
+            if key in draft_of:
+                draft_of[key] = also(draft_of[key], method, id_of(instances, row))
             else:
-                found[key] = Draft(
+                draft_of[key] = Draft(
                     kind="annotation",
                     scene=scene,
                     methods=(method,),
@@ -158,7 +158,7 @@ def annotation_drafts(source: RunSource, scene: str, n_most: int, random: np.ran
                     asks=(),
                     automatic=judge(row, names),
                 )
-    drafts = list(found.values())
+    drafts = list(draft_of.values())
     kept = sorted(random.permutation(len(drafts))[:n_most].tolist())
     return [_with_labels_shuffled(drafts[k], random) for k in kept]
 
@@ -224,7 +224,7 @@ def built_in(encoder: Encoder | None) -> AskMap:
 
     def ask(scene: SceneMap, questions: Sequence[str]) -> Sequence[Answer]:
         solver = Solver(scene, None, None if encoder is None else nearest_by(encoder))
-        return [solver.answer(one) for one in questions]
+        return [solver.answer(question) for question in questions]
 
     return ask
 
@@ -234,12 +234,12 @@ def by_language_model(model: LanguageModel, config: LanguageConfig) -> AskMap:
     return lambda scene, questions: LanguageSolver(scene, model, config).answers(questions)
 
 
-def requests_into(found: list[ChatRequest], model: LanguageModel, config: LanguageConfig) -> AskMap:
+def requests_into(requests: list[ChatRequest], model: LanguageModel, config: LanguageConfig) -> AskMap:
     """Puts what a language model would be asked into ``found`` and asks nobody."""
 
     def ask(scene: SceneMap, questions: Sequence[str]) -> Sequence[Answer]:
         solver = LanguageSolver(scene, model, config)
-        found.extend(solver.request(one) for one in questions)
+        requests.extend(solver.request(question) for question in questions)
         return [unsettled("not asked")] * len(questions)
 
     return ask
@@ -255,9 +255,9 @@ def reasoning_drafts(
     """
     rules = source.rules(scene, "reasoning")
     known = () if given is not None else _known(source, scene, rules, per_kind)
-    texts = [one.text for one in known]
+    texts = [answer.text for answer in known]
     if given is not None:
-        texts = [one.text for one in given if one.scene == scene and one.kind == REASONING]
+        texts = [question.text for question in given if question.scene == scene and question.kind == REASONING]
     groups: dict[bytes, Draft] = {}
     for method in source.methods:
         instances = source.instances(scene, method)
@@ -302,14 +302,14 @@ class _Shown:
 
     def __init__(self, scene: str, method: str, instances: Instances, a_map: SceneMap) -> None:
         self._scene, self._method, self._instances = scene, method, instances
-        self._row_of = {one.id: one.row for one in a_map.objects}
+        self._row_of = {thing.id: thing.row for thing in a_map.objects}
         names = [""] * len(instances)
-        for one in a_map.objects:
-            names[one.row] = one.shown
+        for thing in a_map.objects:
+            names[thing.row] = thing.shown
         self._names = tuple(names)
 
     def rows(self, ids: Sequence[int]) -> tuple[int, ...]:
-        return tuple(self._row_of[one] for one in ids)
+        return tuple(self._row_of[object_id] for object_id in ids)
 
     def instance_id(self, rows: Sequence[int]) -> int:
         """That of the only instance; -1 of several or none."""
@@ -341,16 +341,16 @@ def _judged_answer(
     assert rules.answers is not None
     given = GivenAnswer(_value(true, answer), np.array(rows, np.int64), answer.is_settled)
     main = covered.main_object
-    found = {"answer": judged(is_answer_right(rules.answers, true, given, main))}
+    judgements = {"answer": judged(is_answer_right(rules.answers, true, given, main))}
     if true.object_ids:
-        found["objects"] = judged(are_objects_right(true, given, main))
-    return found
+        judgements["objects"] = judged(are_objects_right(true, given, main))
+    return judgements
 
 
 def _value(true: TrueAnswer, answer: Answer) -> float | int | bool | None:
     """What the answer says; the words of a language model are read for their yes or no, or their first number."""
     if true.value is None or answer.solver == "built-in":
         return answer.value
-    said = said_value(answer, true.value)
-    is_count = said is not None and not isinstance(true.value, float | bool) and said == int(said)
-    return int(said) if is_count and said is not None else said
+    value = said_value(answer, true.value)
+    is_count = value is not None and not isinstance(true.value, float | bool) and value == int(value)
+    return int(value) if is_count and value is not None else value

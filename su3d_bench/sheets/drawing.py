@@ -117,7 +117,7 @@ class Artist:
         instances = self._source.instances(scene, method)
         key = mask_digest(instances, range(len(instances)))
         if key not in self._maps:
-            if any(scene != one.scene for one in self._maps.values()):
+            if any(scene != known.scene for known in self._maps.values()):
                 self._maps.clear()
             self._maps[key] = _ShownMap(scene, instances)
         return self._maps[key]
@@ -241,7 +241,7 @@ def draw_all(
 ) -> list[bytes]:
     """The pictures of ``drafts`` in their order, ``jobs`` scenes at once; the same bytes whatever their number."""
     units = []
-    for scene in dict.fromkeys(one.scene for one in drafts):
+    for scene in dict.fromkeys(draft.scene for draft in drafts):
         mine = {k: draft for k, draft in enumerate(drafts) if draft.scene == scene}
         units.append(SceneDrafts(source.run.folder.path, source.methods, scale, mine))
     n_done = 0
@@ -252,11 +252,11 @@ def draw_all(
         progress(n_done, len(drafts))
 
     if jobs == 1 or len(units) == 1:
-        found = run_inline(draw_scene, units, report)
+        scenes = run_inline(draw_scene, units, report)
     else:
-        found = run_processes(draw_scene, units, report, jobs=jobs, lost=_lost)
+        scenes = run_processes(draw_scene, units, report, jobs=jobs, lost=_lost)
     pictures: dict[int, bytes] = {}
-    for drawn in found:
+    for drawn in scenes:
         pictures |= drawn
     return [pictures[k] for k in range(len(drafts))]
 

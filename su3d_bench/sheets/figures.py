@@ -45,7 +45,7 @@ class Figures:
         rows = []
         for scene in self._source.scenes:
             maps = self._maps(scene)
-            ranked = [rank_all(one.instances, texts, encoder) for one in maps]
+            ranked = [rank_all(shown.instances, texts, encoder) for shown in maps]
             for k, text in enumerate(texts):
                 best = [ranking[k].order[:1].tolist() for ranking in ranked]
                 views = self._views(maps, best[0])
@@ -87,11 +87,11 @@ class Figures:
                 for k, (method, shown) in enumerate(zip(self._source.methods, maps, strict=True)):
                     a_map = self._source.scene_map(scene, method)
                     answer = built_in(encoder)(a_map, [question])[0]
-                    row_of = {one.id: one.row for one in a_map.objects}
-                    rows_of = [[row_of[one] for one in ids] for ids in (answer.object_ids, answer.reference_ids)]
+                    row_of = {thing.id: thing.row for thing in a_map.objects}
+                    rows_of = [[row_of[number] for number in ids] for ids in (answer.object_ids, answer.reference_ids)]
                     view = self._views([shown], [*rows_of[0], *rows_of[1]])[0]
                     views[k] = view
-                    names = {one.row: one.shown for one in a_map.objects}
+                    names = {thing.row: thing.shown for thing in a_map.objects}
                     cells.append(replace(_answer_cell(shown, view, rows_of, names), caption=answer.text))
                 photo = self._photo(scene, maps[0], views[0])
                 rows.append(GridRow(printable(question, 160), scene, (*photo, *cells)))
@@ -106,11 +106,11 @@ class Figures:
         place = 0
         if self._view == "corner":
             members = first.members(wanted)
-            small = [first.view(one) for one in first.cameras(CELL_WIDTH // SMALLER, CELL_HEIGHT // SMALLER)[1:]]
+            small = [first.view(camera) for camera in first.cameras(CELL_WIDTH // SMALLER, CELL_HEIGHT // SMALLER)[1:]]
             place = 1 + int(np.argmax([view.shows(members).sum() for view in small]))
         camera = first.cameras(CELL_WIDTH, CELL_HEIGHT)[place]
         chosen = first.view(camera)
-        return [chosen, *(MapView(camera, one.view(camera).view, chosen.box) for one in maps[1:])]
+        return [chosen, *(MapView(camera, other.view(camera).view, chosen.box) for other in maps[1:])]
 
     def _photo(self, scene: str, shown: DrawnMap, view: MapView) -> tuple[Cell, ...]:
         """The map in the colours that the frames saw, where it is asked for."""

@@ -128,7 +128,7 @@ class Sheet(_Strict):
     schema_version: int = SCHEMA
 
     def ask(self, name: str) -> Ask:
-        return next(one for one in self.asks if one.name == name)
+        return next(ask for ask in self.asks if ask.name == name)
 
     def items_of(self, share: AnnotatorShare) -> list[SheetItem]:
         """The items of one annotator in that annotator's order."""
@@ -211,15 +211,15 @@ def read_sheet(path: Path) -> Sheet:
     """The set in a ``sheet.json``; a ``DataError`` where the file is not as ``sheets make`` writes it."""
     sheet = read_record(path, Sheet, SCHEMA, "sheets make", "make them again")
     where = printable(str(path), 200)
-    known = [one.id for one in sheet.items]
+    known = [item.id for item in sheet.items]
     if len(set(known)) != len(known):
         raise DataError(f"{where}: two items have one id; make the sheets again")
-    names = {one.name for one in sheet.asks}
-    for one in sheet.items:
-        if not set(one.asks) <= names:
-            raise DataError(f"{where}: item '{printable(one.id, 40)}' asks what the sheet does not; make it again")
-        if one.check != item_check(sheet.id, one.id, one.text, one.asks, one.picture_digests):
-            raise DataError(f"{where}: item '{printable(one.id, 40)}' was changed; make the sheets again")
+    names = {ask.name for ask in sheet.asks}
+    for item in sheet.items:
+        if not set(item.asks) <= names:
+            raise DataError(f"{where}: item '{printable(item.id, 40)}' asks what the sheet does not; make it again")
+        if item.check != item_check(sheet.id, item.id, item.text, item.asks, item.picture_digests):
+            raise DataError(f"{where}: item '{printable(item.id, 40)}' was changed; make the sheets again")
     for share in sheet.annotators:
         if not set(share.item_ids) <= set(known):
             raise DataError(f"{where}: annotator '{printable(share.name, 40)}' has an unknown item; make it again")
@@ -229,11 +229,11 @@ def read_sheet(path: Path) -> Sheet:
 def read_key(path: Path) -> Key:
     """The key in a ``key.json``; a ``DataError`` where the file is not as ``sheets make`` writes it."""
     key = read_record(path, Key, SCHEMA, "sheets make", "make them again")
-    for one in key.items:
-        if len(one.methods) != len(one.instance_ids):
+    for item in key.items:
+        if len(item.methods) != len(item.instance_ids):
             raise DataError(
-                f"{printable(str(path), 200)}: item '{printable(one.id, 40)}' names {len(one.methods)} methods and "
-                f"{len(one.instance_ids)} instances; make the sheets again"
+                f"{printable(str(path), 200)}: item '{printable(item.id, 40)}' names {len(item.methods)} methods and "
+                f"{len(item.instance_ids)} instances; make the sheets again"
             )
     return key
 
@@ -256,10 +256,10 @@ def read_record(path: Path, kind: type[Read], schema: int, maker: str, again: st
             raise DataError(f"{where}: has more than {MOST_BYTES >> 20} MiB; it is no file of su3d-bench {maker}")
         content = path.read_bytes()
     try:
-        found = TypeAdapter(kind).validate_json(content, strict=True)
+        record = TypeAdapter(kind).validate_json(content, strict=True)
     except ValidationError as error:
         place = printable(".".join(map(str, error.errors()[0]["loc"])), 120) or "it"
         raise DataError(f"{where}: {place} is not as su3d-bench {maker} writes it; {again}") from error
-    if found.schema_version != schema:
-        raise DataError(f"{where}: has schema {found.schema_version}, this version reads {schema}; {again}")
-    return found
+    if record.schema_version != schema:
+        raise DataError(f"{where}: has schema {record.schema_version}, this version reads {schema}; {again}")
+    return record

@@ -79,7 +79,7 @@ def make_sheets(
     random = np.random.default_rng(seed)
     number_of = random.permutation(len(drafts))
     ids = [f"item-{number + 1:04d}" for number in number_of]
-    pictures = {f"{one}.png": content for one, content in zip(ids, drawn, strict=True)}
+    pictures = {f"{item_id}.png": content for item_id, content in zip(ids, drawn, strict=True)}
     digests = {name: digest_bytes(content) for name, content in pictures.items()}
     order = np.argsort(number_of)
     contents = [[ids[k], drafts[k].text, list(drafts[k].asks), digests[f"{ids[k]}.png"]] for k in order]
@@ -88,7 +88,7 @@ def make_sheets(
         new_item(set_id, ids[k], drafts[k].text, drafts[k].asks, (f"{ids[k]}.png",), (digests[f"{ids[k]}.png"],))
         for k in order
     )
-    shares = dealt([one.id for one in items], annotators, overlap, random)
+    shares = dealt([item.id for item in items], annotators, overlap, random)
     sheet = Sheet(set_id, kind, seed, ASKS[kind], items, shares)
     key_items = tuple(_key_item(ids[k], drafts[k]) for k in order)
     key = Key(sheet_id=set_id, kind=kind, items=key_items, **asdict(origin))
@@ -171,13 +171,13 @@ def page_data(made: MadeSheets, share: AnnotatorShare) -> dict[str, Any]:
         "asks": [asdict(ask) for ask in made.sheet.asks],
         "items": [
             {
-                "id": one.id,
-                "text": one.text,
-                "asks": list(one.asks),
-                "check": one.check,
-                "picture": base64.b64encode(made.pictures[one.pictures[0]]).decode("ascii"),
+                "id": item.id,
+                "text": item.text,
+                "asks": list(item.asks),
+                "check": item.check,
+                "picture": base64.b64encode(made.pictures[item.pictures[0]]).decode("ascii"),
             }
-            for one in made.sheet.items_of(share)
+            for item in made.sheet.items_of(share)
         ],
     }
 
@@ -188,8 +188,8 @@ def table_csv(sheet: Sheet, share: AnnotatorShare) -> str:
     for item in sheet.items_of(share):
         for name in item.asks:
             ask = sheet.ask(name)
-            told = (f"../{PICTURES}/{item.pictures[0]}", as_text(" / ".join(item.text.split("\n"))), ask.text)
-            rows.append((sheet.id, item.id, share.name, name, "", item.check, *told, " | ".join(ask.choices)))
+            shown = (f"../{PICTURES}/{item.pictures[0]}", as_text(" / ".join(item.text.split("\n"))), ask.text)
+            rows.append((sheet.id, item.id, share.name, name, "", item.check, *shown, " | ".join(ask.choices)))
     return csv_lines(rows)
 
 

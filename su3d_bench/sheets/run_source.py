@@ -65,18 +65,18 @@ class RunSource:
                 f"{self.run.name}: holds no map of {printable(scene, 100)} by {printable(method, 80)}; run it, or "
                 "leave it out with --methods or --scenes"
             )
-        found = read_prediction(job.prediction)
-        if not isinstance(found, Instances):
+        prediction = read_prediction(job.prediction)
+        if not isinstance(prediction, Instances):
             raise PredictionError(
                 f"{printable(str(job.prediction), 200)}: holds no instances that people could judge; leave "
                 f"{printable(method, 80)} out with --methods"
             )
-        return found
+        return prediction
 
     def refined(self, scene: str, method: str) -> tuple[str, ...] | None:
         """Labels n' of the map's instances; None where nobody made them."""
-        found = refined_names(self.run.folder.job(scene, method), self.instances(scene, method))
-        return None if found is None else tuple(found.names)
+        names = refined_names(self.run.folder.job(scene, method), self.instances(scene, method))
+        return None if names is None else tuple(names.names)
 
     def scene_map(self, scene: str, method: str) -> SceneMap:
         """The map as questions are put to it, under labels n' where it has them."""
@@ -121,7 +121,7 @@ class RunSource:
             return None
         key = (scene, rules.name, mask_digest(instances, range(len(instances))))
         if key not in self._covered:
-            self._covered = {old: one for old, one in self._covered.items() if old[0] == scene}
+            self._covered = {old: covered for old, covered in self._covered.items() if old[0] == scene}
             self._covered[key] = covered_objects(rules.transfer, truth, instances)
         return self._covered[key]
 

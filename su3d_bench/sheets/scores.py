@@ -162,14 +162,14 @@ def score(sheet: Sheet, key: Key, judgements: Sequence[Judgement], silent: Seque
         run=key.run,
         automatic_rule=key.automatic_rule,
         methods=key.methods,
-        annotators=dict(sorted(Counter(one.annotator for one in judgements).items())),
+        annotators=dict(sorted(Counter(judgement.annotator for judgement in judgements).items())),
         silent=tuple(silent),
         n_items=len(sheet.items),
-        n_judged=len({one.item_id for one in judgements}),
+        n_judged=len({judgement.item_id for judgement in judgements}),
         cells=(*_cells("people", key.methods, by_people), *_cells("automatic", key.methods, _shares(truth))),
         tests=tuple(test for test in _tests(sheet, key, clear) if test.n_items),
         agreements=tuple(AskAgreement(what, agreement(items)) for what, items in ratings.items()),
-        confusions=tuple(one for what in ratings if (one := _confusion(sheet, what, given)) is not None),
+        confusions=tuple(confusion for what in ratings if (confusion := _confusion(sheet, what, given)) is not None),
         second_looks=tuple(_second_looks(sheet, keys, judgements)),
         answered_by=key.answered_by,
     )
@@ -180,10 +180,10 @@ _Given = tuple[KeyItem, str, str]  # an item, one of its asks, the answer
 
 def _ratings(given: Sequence[_Given], judgements: Sequence[Judgement]) -> dict[str, dict[str, dict[str, str]]]:
     """What is asked -> item and ask -> annotator -> answer."""
-    found: dict[str, dict[str, dict[str, str]]] = {}
-    for (key, ask, answer), one in zip(given, judgements, strict=True):
-        found.setdefault(_asked(key, ask), {}).setdefault(f"{key.id}\0{ask}", {})[one.annotator] = answer
-    return found
+    ratings: dict[str, dict[str, dict[str, str]]] = {}
+    for (key, ask, answer), judgement in zip(given, judgements, strict=True):
+        ratings.setdefault(_asked(key, ask), {}).setdefault(f"{key.id}\0{ask}", {})[judgement.annotator] = answer
+    return ratings
 
 
 def _asked(key: KeyItem, ask: str) -> str:
@@ -356,17 +356,17 @@ def _confusion(sheet: Sheet, what: str, given: Sequence[_Given]) -> Confusion | 
         choices=choices,
         counts=tuple(tuple(counts[row, column] for column in choices) for row in choices),
         n=len(clear),
-        n_equal=sum(one == other for one, other in clear),
-        kappa=cohen_kappa([one for one, _ in clear], [other for _, other in clear]),
+        n_equal=sum(answer == other for answer, other in clear),
+        kappa=cohen_kappa([answer for answer, _ in clear], [other for _, other in clear]),
     )
 
 
 def _second_looks(sheet: Sheet, keys: Mapping[str, KeyItem], judgements: Iterable[Judgement]) -> list[SecondLook]:
     """What somebody should look at again, in the order of the sheet."""
     given: dict[tuple[str, str], dict[str, str]] = defaultdict(dict)
-    for one in judgements:
-        given[one.item_id, one.ask][one.annotator] = one.answer
-    found = []
+    for judgement in judgements:
+        given[judgement.item_id, judgement.ask][judgement.annotator] = judgement.answer
+    looks = []
     for item in sheet.items:
         key = keys[item.id]
         for ask in item.asks:
@@ -374,12 +374,12 @@ def _second_looks(sheet: Sheet, keys: Mapping[str, KeyItem], judgements: Iterabl
             automatic = key.automatic.get(ask, "")
             reason = _reason(list(answers.values()), automatic)
             if reason is not None:
-                found.append(
+                looks.append(
                     SecondLook(
                         item.id, ask, item.text, key.scene, key.methods, item.pictures, answers, automatic, reason
                     )
                 )
-    return found
+    return looks
 
 
 def _reason(answers: Sequence[str], automatic: str) -> Literal["annotators disagree", "against the truth"] | None:
@@ -401,14 +401,14 @@ def write_scores(folder: Path, scores: Scores) -> Path:
 def read_scores(path: Path) -> Scores:
     """The scores of a file or of the folder that holds it; ``DataError`` where it is not as ``sheets score`` writes."""
     file = path / FILE if path.is_dir() else path
-    found = read_record(file, Scores, SCHEMA, "sheets score", "score again")
-    if not all(_is_sound(cell) for cell in found.cells):
+    scores = read_record(file, Scores, SCHEMA, "sheets score", "score again")
+    if not all(_is_sound(cell) for cell in scores.cells):
         raise DataError(
             f"{printable(str(file), 200)}: holds a number that is no share or a metric that is none; score again"
         )
-    return found
+    return scores
 
 
 def _is_sound(cell: ScoreCell) -> bool:
     values = [*(() if cell.value is None else (cell.value,)), *(cell.interval or ()), *cell.per_scene.values()]
-    return cell.metric in METRICS and all(math.isfinite(one) and 0.0 <= one <= 1.0 for one in values)
+    return cell.metric in METRICS and all(math.isfinite(value) and 0.0 <= value <= 1.0 for value in values)

@@ -67,8 +67,8 @@ def _write_rows(page: Any, sheet: Sheet, share: AnnotatorShare, pictures: Mappin
                 lists[ask.choices] = _choice_list(ask.choices)
             lists[ask.choices].add(answer)
         _put_picture(page, first, row, pictures[item.pictures[0]])
-    for one in lists.values():
-        page.add_data_validation(one)
+    for menu in lists.values():
+        page.add_data_validation(menu)
     return row
 
 
@@ -86,9 +86,9 @@ def text_cell(page: Any, row: int, column: int, text: str) -> Any:
 def _choice_list(choices: tuple[str, ...]) -> Any:
     from openpyxl.worksheet.datavalidation import DataValidation
 
-    found = DataValidation(type="list", formula1='"' + ",".join(choices) + '"', allow_blank=True, showErrorMessage=True)
-    found.errorTitle, found.error = "one of the list", f"choose {', '.join(choices)}"
-    return found
+    menu = DataValidation(type="list", formula1='"' + ",".join(choices) + '"', allow_blank=True, showErrorMessage=True)
+    menu.errorTitle, menu.error = "one of the list", f"choose {', '.join(choices)}"
+    return menu
 
 
 def _put_picture(page: Any, first: int, last: int, content: bytes) -> None:

@@ -217,8 +217,8 @@ def _small_array(content: bytes, name: str) -> NDArray[Any]:
 def _header_1_0(content: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
     stream = io.BytesIO(content)
     np.lib.format.read_magic(stream)
-    found: tuple[tuple[int, ...], bool, np.dtype[Any]] = np.lib.format.read_array_header_1_0(stream)
-    return found
+    header: tuple[tuple[int, ...], bool, np.dtype[Any]] = np.lib.format.read_array_header_1_0(stream)
+    return header
 
 
 @contextmanager

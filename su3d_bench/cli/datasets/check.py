@@ -28,23 +28,23 @@ def check(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"--jobs {arguments.jobs}: expected 1 or more")
     scenes = chosen_scenes(arguments.scenes, arguments.set, is_quiet=arguments.quiet)
     n_threads = arguments.jobs or os.cpu_count() or 1
-    found = []
+    inspections = []
     for dataset, scene in scenes:
-        found.append(_inspect(dataset, scene, n_threads, arguments))
+        inspections.append(_inspect(dataset, scene, n_threads, arguments))
         if not arguments.json:
-            answer("\n".join([*([""] if len(found) > 1 else []), *lines_of(found[-1])]))
-    n_with_errors = sum(one.count("error") > 0 for one in found)
+            answer("\n".join([*([""] if len(inspections) > 1 else []), *lines_of(inspections[-1])]))
+    n_with_errors = sum(inspection.count("error") > 0 for inspection in inspections)
     if arguments.json:
         answer_json(
             {
                 "data_root": printable(str(data_root())),
-                "n_scenes": len(found),
+                "n_scenes": len(inspections),
                 "n_with_errors": n_with_errors,
-                "scenes": [as_json(one) for one in found],
+                "scenes": [as_json(inspection) for inspection in inspections],
             }
         )
     else:
-        answer(f"\n{counted(len(found), 'scene')}, {n_with_errors} with errors")
+        answer(f"\n{counted(len(inspections), 'scene')}, {n_with_errors} with errors")
     return EXIT_CHECK_FAILED if n_with_errors else EXIT_DONE
 
 
@@ -72,52 +72,51 @@ def chosen_scenes(addresses: Sequence[str], assignments: Sequence[str], *, is_qu
     return [(datasets[target], scene) for target, scene in chosen]
 
 
-def as_json(one: Inspection) -> dict[str, Any]:
+def as_json(inspection: Inspection) -> dict[str, Any]:
     """All of an inspection as JSON has it, with its numbers of errors and warnings."""
-    counts = {"n_errors": one.count("error"), "n_warnings": one.count("warning")}
-    table: dict[str, Any] = printable_json(asdict(one))
+    counts = {"n_errors": inspection.count("error"), "n_warnings": inspection.count("warning")}
+    table: dict[str, Any] = printable_json(asdict(inspection))
     return {"scene": table.pop("scene"), **counts, **table}
 
 
-def lines_of(one: Inspection) -> list[str]:
+def lines_of(inspection: Inspection) -> list[str]:
     """The block of one scene: what is there, then what is wrong."""
-    rows = [("frames", _frames_text(one))]
-    if one.depth is not None:
-        d = one.depth
+    rows = [("frames", _frames_text(inspection))]
+    if inspection.depth is not None:
+        d = inspection.depth
         text = f"{d.near_m:.2f} to {d.far_m:.2f} m, median {d.median_m:.2f} m, {d.valid_share:.1%} of the pixels"
         rows.append(("depth", text))
-    rows += [("ground truth", _truth_text(variant)) for variant in one.truth]
-    if one.meeting is not None:
-        meeting = one.meeting
+    rows += [("ground truth", _truth_text(variant)) for variant in inspection.truth]
+    if inspection.meeting is not None:
+        meeting = inspection.meeting
         rows.append(
             ("seen points", f"{meeting.share:.1%} within {meeting.distance_m * 100:.3g} cm of the ground truth")
         )
-    rows.append(("digest", one.digest or "none"))
-    lines = [printable(one.scene), *(f"  {name:<13} {text}" for name, text in rows)]
-    for _, group in groupby(one.findings, key=lambda finding: (finding.severity, finding.check)):
+    rows.append(("digest", inspection.digest or "none"))
+    lines = [printable(inspection.scene), *(f"  {name:<13} {text}" for name, text in rows)]
+    for _, group in groupby(inspection.findings, key=lambda finding: (finding.severity, finding.check)):
         lines += _finding_lines(list(group))
-    n_errors, n_warnings = one.count("error"), one.count("warning")
-    verdict = (
-        f"{counted(n_errors, 'error')}, {counted(n_warnings, 'warning')}" if one.findings else "nothing found wrong"
-    )
-    return [*lines, f"  {'checked':<13} {one.elapsed_s:.1f} s: {verdict}"]
+    n_errors, n_warnings = inspection.count("error"), inspection.count("warning")
+    wrong = f"{counted(n_errors, 'error')}, {counted(n_warnings, 'warning')}"
+    verdict = wrong if inspection.findings else "nothing found wrong"
+    return [*lines, f"  {'checked':<13} {inspection.elapsed_s:.1f} s: {verdict}"]
 
 
 def _finding_lines(findings: Sequence[Finding]) -> list[str]:
-    shown = [f"  {one.severity:<13} {f'{one.where}: ' if one.where else ''}{one.text}" for one in findings]
+    shown = [f"  {fault.severity:<13} {f'{fault.where}: ' if fault.where else ''}{fault.text}" for fault in findings]
     n_more = len(shown) - MOST_OF_A_KIND
     if n_more <= 0:
         return shown
     return [*shown[:MOST_OF_A_KIND], f"  {'':<13} and {n_more} more of this kind; --json lists all"]
 
 
-def _frames_text(one: Inspection) -> str:
-    if one.n_frames is None:
+def _frames_text(inspection: Inspection) -> str:
+    if inspection.n_frames is None:
         return "cannot be counted"
-    read = "all read" if one.n_read == one.n_frames else f"{one.n_read} read"
-    size = "" if one.size is None else f", {one.size[0]}x{one.size[1]}"
-    files = f", {one.n_files} files" if one.n_files else ", made on demand"
-    return f"{one.n_frames} ({read}){size}{files}"
+    read = "all read" if inspection.n_read == inspection.n_frames else f"{inspection.n_read} read"
+    size = "" if inspection.size is None else f", {inspection.size[0]}x{inspection.size[1]}"
+    files = f", {inspection.n_files} files" if inspection.n_files else ", made on demand"
+    return f"{inspection.n_frames} ({read}){size}{files}"
 
 
 def _truth_text(variant: TruthVariant) -> str:

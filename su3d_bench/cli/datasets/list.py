@@ -172,7 +172,7 @@ def _lines(row: dict[str, Any]) -> list[str]:
     if row["error"]:
         return [*lines, f"  {row['error']}"]
     scenes = row["scenes"][:MAX_LISTED]
-    width = max((len(one["scene"]) for one in scenes), default=0)
-    lines += [f"  {one['scene']:<{width}}  {one['status']}" for one in scenes]
+    width = max((len(scene["scene"]) for scene in scenes), default=0)
+    lines += [f"  {scene['scene']:<{width}}  {scene['status']}" for scene in scenes]
     n_more = len(row["scenes"]) - len(scenes)
     return [*lines, f"  and {n_more} more; --json lists all"] if n_more else lines

@@ -85,9 +85,9 @@ def _dataset_part(name: str, assignments: Sequence[str]) -> Part:
     return part_of("dataset", name, read_assignments(texts, (), (own_name,)))
 
 
-def _scenes(part: Part, asked: Sequence[str] | None) -> list[str]:
+def _scenes(part: Part, wanted: Sequence[str] | None) -> list[str]:
     prefix = f"{part.target}/"
-    addresses = [scene if "/" in scene else prefix + scene for scene in asked or ("*",)]
+    addresses = [scene if "/" in scene else prefix + scene for scene in wanted or ("*",)]
     for address in addresses:
         if not address.startswith(prefix):
             hint = suggest(address, [prefix + "*"]) or f"; expected '{prefix}...'"

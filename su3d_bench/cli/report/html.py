@@ -56,12 +56,12 @@ def call(arguments: argparse.Namespace) -> int:
     most_points = points_of_each(len(maps), round(arguments.most_megabytes * MEGABYTE)) if maps else MOST_POINTS
     scenes = list(page_scenes(maps, queries, most_points, progress))
     title = arguments.title or ", ".join(dict.fromkeys(run.resolve().name for run in arguments.runs))
-    shown = [one for scene in scenes for one in scene.maps]
+    shown = [page_map for scene in scenes for page_map in scene.maps]
     page = page_html(
         printable(title, 200),
-        {**numbers, "maps": [one.listed() for one in shown]},
+        {**numbers, "maps": [page_map.listed() for page_map in shown]},
         [scene.listed() for scene in scenes],
-        [one.content for one in shown],
+        [page_map.content for page_map in shown],
     )
     written(arguments.out, page)
     n_bytes = len(page.encode())

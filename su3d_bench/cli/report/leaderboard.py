@@ -35,12 +35,12 @@ def call(arguments: argparse.Namespace) -> int:
 
     from su3d_bench.analysis.leaderboard import leaderboard, tables
 
-    found = leaderboard(arguments.folder, arguments.protocols)
+    board = leaderboard(arguments.folder, arguments.protocols)
     if arguments.json:
-        answer_json(asdict(found))
+        answer_json(asdict(board))
         return EXIT_DONE
-    text = formatted(tables(found, intervals=arguments.intervals), arguments)
+    text = formatted(tables(board, intervals=arguments.intervals), arguments)
     answer_or_write(arguments, text)
-    n_entries = sum(map(len, found.boards))
-    remark(f"{n_entries} entries in {len(found.boards)} rankings, {len(found.refused)} left out", quiet=arguments.quiet)
+    n_entries = sum(map(len, board.boards))
+    remark(f"{n_entries} entries in {len(board.boards)} rankings, {len(board.refused)} left out", quiet=arguments.quiet)
     return EXIT_DONE

@@ -66,7 +66,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.store.atomic import json_text
 
     tables = _tables(arguments)
-    text = json_text([asdict(one) for one in tables]) if arguments.json else formatted(tables, arguments)
+    text = json_text([asdict(table) for table in tables]) if arguments.json else formatted(tables, arguments)
     answer_or_write(arguments, text)
     return EXIT_DONE
 
@@ -85,16 +85,16 @@ def _tables(arguments: argparse.Namespace) -> list[Table]:
         only_significant=arguments.significant,
     )
     with_published = bool(arguments.table) if arguments.published is None else arguments.published
-    found = choose(measured_results(arguments.runs), arguments.methods, arguments.protocols, arguments.datasets)
+    measured = choose(measured_results(arguments.runs), arguments.methods, arguments.protocols, arguments.datasets)
     if not arguments.table:
-        return selection_tables(found, shown, with_published=with_published)
+        return selection_tables(measured, shown, with_published=with_published)
     tables = []
     for number in dict.fromkeys(arguments.table):
         if number == "I":
             sweep = [row for run in arguments.runs if not is_scores(run) for row in read_rows(run)]
-            tables.append(ablation_table(found, sweep, shown, with_published=with_published))
+            tables.append(ablation_table(measured, sweep, shown, with_published=with_published))
         elif number in JUDGED:
-            tables += judged_table(number, found, shown, with_published=with_published)
+            tables += judged_table(number, measured, shown, with_published=with_published)
         else:
-            tables += paper_table(number, found, shown, with_published=with_published)
+            tables += paper_table(number, measured, shown, with_published=with_published)
     return tables

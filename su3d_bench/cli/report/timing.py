@@ -57,7 +57,7 @@ def call(arguments: argparse.Namespace) -> int:
     anytime = [point for each in times for point in _anytime(next(r for r in runs if r.name == each[0].run), each)]
     hardware = {run.name: run.record.hardware for run in runs}
     tables = timing_tables(summaries, anytime, hardware, arguments.camera_rate)
-    value = {"hardware": hardware, "methods": [asdict(one) for one in summaries]}
+    value = {"hardware": hardware, "methods": [asdict(summary) for summary in summaries]}
     answer_either(arguments, value, formatted(tables, arguments))
     if arguments.out is not None:
         files = {
@@ -78,12 +78,12 @@ def _anytime(run: FinishedRun, times: list[UpdateTimes]) -> list[Any]:
     for (name, protocol), record in run.results.items():
         if name != method or not record.anytime or record.result is None:
             continue
-        midway = sorted(record.anytime, key=lambda one: one.share)
-        maps = [*((one.share, one.metrics) for one in midway), (1.0, record.result.metrics)]
-        if any(len(one.maps) != len(maps) for one in times):
+        midway = sorted(record.anytime, key=lambda point: point.share)
+        maps = [*((point.share, point.metrics) for point in midway), (1.0, record.result.metrics)]
+        if any(len(of_scene.maps) != len(maps) for of_scene in times):
             continue  # the record of a scene's maps is damaged
         for index, (share, metrics) in enumerate(maps):
-            seconds = sum(_seconds_until(one, index) for one in times)
+            seconds = sum(_seconds_until(of_scene, index) for of_scene in times)
             headline = {metric: metrics.get(metric) for metric in record.headline}
             points.append(AnytimePoint(run.name, method, protocol, share, seconds, headline))
     return points

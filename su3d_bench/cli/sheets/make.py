@@ -99,11 +99,11 @@ def call(arguments: argparse.Namespace) -> int:
     if arguments.json:
         answer_json({"sets": written_sets})
         return EXIT_DONE
-    for one in written_sets:
-        answer(f"{one['sheet_id']}: {counted(one['n_items'], 'item')}, {counted(one['n_questions'], 'question')}")
-        for path in one["files"]:
+    for sheet in written_sets:
+        answer(f"{sheet['sheet_id']}: {counted(sheet['n_items'], 'item')}, {counted(sheet['n_questions'], 'question')}")
+        for path in sheet["files"]:
             answer(path)
-        remark(f"key, which annotators must not see: {one['key']}", quiet=arguments.quiet)
+        remark(f"key, which annotators must not see: {sheet['key']}", quiet=arguments.quiet)
     return EXIT_DONE
 
 
@@ -129,7 +129,7 @@ def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
     if kind != "retrieval":
         return source
     scene = source.scenes[0]
-    kept = tuple(one for one in source.methods if source.instances(scene, one).features is not None)
+    kept = tuple(method for method in source.methods if source.instances(scene, method).features is not None)
     if not kept:
         raise ConfigError(
             f"{source.run.name}: {', '.join(source.methods)}: no map has features that a text could be compared with; "
@@ -137,7 +137,7 @@ def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
         )
     if kept == source.methods:
         return source
-    left_out = [one for one in source.methods if one not in kept]
+    left_out = [method for method in source.methods if method not in kept]
     remark(f"retrieval: left out {', '.join(left_out)}, which keeps no features to rank by", quiet=is_quiet)
     return source.of_methods(kept)
 
@@ -154,7 +154,7 @@ def _drafts(
     source = next(iter(sources.values()))
     random = np.random.default_rng(arguments.seed)
     given = _given(source, arguments)
-    found: dict[SheetKind, list[Draft]] = {kind: [] for kind in sources}
+    drafts_of: dict[SheetKind, list[Draft]] = {kind: [] for kind in sources}
     needs_encoder = "retrieval" in sources or ("reasoning" in sources and arguments.solver != "llm")
     encoder = source.run.encoder(arguments.device) if needs_encoder else None
     ask, answered_by = _ask_map(source, encoder, arguments) if "reasoning" in sources else (None, "")
@@ -162,18 +162,18 @@ def _drafts(
         for kind, mine in sources.items():
             n_most = arguments.per_kind or PER_KIND[kind]
             if kind == "annotation":
-                found[kind] += annotation_drafts(mine, scene, n_most, random)
+                drafts_of[kind] += annotation_drafts(mine, scene, n_most, random)
             elif kind == "reasoning":
                 assert ask is not None
-                found[kind] += reasoning_drafts(mine, scene, given, n_most, ask)
+                drafts_of[kind] += reasoning_drafts(mine, scene, given, n_most, ask)
             else:
                 assert encoder is not None
                 # A file is asked as it stands, unless --per-kind limits it.
-                asked = questions_of(mine, scene, given, n_most if given is None else arguments.per_kind)
-                found[kind] += retrieval_drafts(mine, scene, asked, encoder)
-    for drafts in found.values():
+                questions = questions_of(mine, scene, given, n_most if given is None else arguments.per_kind)
+                drafts_of[kind] += retrieval_drafts(mine, scene, questions, encoder)
+    for drafts in drafts_of.values():
         check_split(len(drafts), arguments.annotators, arguments.overlap)
-    return found, answered_by
+    return drafts_of, answered_by
 
 
 def _ask_map(source: RunSource, encoder: Encoder | None, arguments: argparse.Namespace) -> tuple[AskMap, str]:
@@ -210,7 +210,7 @@ def _given(source: RunSource, arguments: argparse.Namespace) -> Sequence[Questio
         given = paper_queries()
     else:
         given = read_questions(Path(arguments.questions), datasets.pop() if len(datasets) == 1 else None)
-    if not any(one.scene in source.scenes for one in given):
+    if not any(question.scene in source.scenes for question in given):
         raise ConfigError(f"--questions {arguments.questions}: asks nothing of a scene of this run")
     return given
 
@@ -223,7 +223,7 @@ def _drawn(
     from su3d_bench.runs.executors.local import Event
     from su3d_bench.sheets.drawing import draw_all
 
-    flat = [one for of_kind in drafts.values() for one in of_kind]
+    flat = [draft for of_kind in drafts.values() for draft in of_kind]
     name = source.run.name
     with progress(1, is_quiet=arguments.quiet, last_step="writing") as report:
         pictures = draw_all(
@@ -269,7 +269,7 @@ def _write(
                 "kind": kind,
                 "sheet_id": made.sheet.id,
                 "n_items": len(made.sheet.items),
-                "n_questions": sum(len(one.asks) for one in made.sheet.items),
+                "n_questions": sum(len(item.asks) for item in made.sheet.items),
                 "files": [str(path) for path in files],
                 "key": str(key),
             }

@@ -44,7 +44,7 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.sheets.figures import Figures
     from su3d_bench.sheets.run_source import RunSource
 
-    texts = [one.strip() for one in arguments.queries]
+    texts = [query.strip() for query in arguments.queries]
     if (arguments.what == "labels") == bool(texts) or not all(texts):
         what = "labels take none" if arguments.what == "labels" else f"{arguments.what} needs at least one, not empty"
         raise ConfigError(f"--queries: {what}")

@@ -144,6 +144,6 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
 
 
 def _looks_line(scores: Scores) -> str:
-    n_disagree = sum(one.reason == "annotators disagree" for one in scores.second_looks)
+    n_disagree = sum(look.reason == "annotators disagree" for look in scores.second_looks)
     n_against = len(scores.second_looks) - n_disagree
     return f"To look at again: {n_disagree} where annotators disagree, {n_against} against the ground truth."

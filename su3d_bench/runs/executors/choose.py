@@ -33,7 +33,7 @@ def check_execution(config: RunConfig) -> None:
         value = getattr(config, name)
         if value != RunConfig.model_fields[name].default and config.executor not in executors:
             shown = " ".join(value) if isinstance(value, tuple) else value
-            wanted = " or ".join(f"--executor {one}" for one in executors)
+            wanted = " or ".join(f"--executor {executor}" for executor in executors)
             raise ConfigError(
                 f"--{name.replace('_', '-')} {shown}: means nothing to the executor '{config.executor}'; add {wanted}"
             )
@@ -48,13 +48,13 @@ def check_execution(config: RunConfig) -> None:
 
 def slurm_parameters(config: RunConfig) -> dict[str, Any]:
     """What ``--slurm KEY=VALUE`` says, by key."""
-    found = {}
+    parameters = {}
     for text in config.slurm:
         key, equals, value = text.partition("=")
         if not equals or not key.strip().isidentifier():
             raise ConfigError(f"--slurm {text}: expected KEY=VALUE, such as slurm_partition=gpu timeout_min=60")
-        found[key.strip()] = parse_value(value)
-    return found
+        parameters[key.strip()] = parse_value(value)
+    return parameters
 
 
 def run_units(

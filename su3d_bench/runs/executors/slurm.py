@@ -49,8 +49,8 @@ def run_slurm(
         while waiting or running:
             fresh = [waiting.popleft() for _ in range(min(len(waiting), n_at_once - len(running)))]
             running += _submit(executor, work, fresh) if fresh else []
-            ended = [one for one in running if one[0].done()]
-            running = [one for one in running if one not in ended]
+            ended = [job for job in running if job[0].done()]
+            running = [job for job in running if job not in ended]
             for job, unit, attempt in ended:
                 try:
                     answer = job.result()

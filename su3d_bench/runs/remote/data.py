@@ -44,7 +44,7 @@ class DataPlace:
         files: dict[str, Mapping[str, int]] = {}
         for part in datasets:
             of_scenes = files_of_scenes(self.sizes, build_dataset(part, self.root).scenes())
-            files |= {f"{part.name}/{scene}": found for scene, found in of_scenes.items()}
+            files |= {f"{part.name}/{scene}": sizes for scene, sizes in of_scenes.items()}
         return RemoteData(self.url, files)
 
 
@@ -77,11 +77,11 @@ def files_of_scenes(sizes: Mapping[str, int], scenes: Sequence[str]) -> dict[str
         for name, owner in owners.items()
         if owner is None and _top(name) in tops and sizes[name] <= MOST_SHARED_BYTES
     }
-    found: dict[str, dict[str, int]] = {scene: dict(shared) for scene in scenes}
+    files: dict[str, dict[str, int]] = {scene: dict(shared) for scene in scenes}
     for name, owner in owners.items():
         if owner is not None:
-            found[owner][name] = sizes[name]
-    return found
+            files[owner][name] = sizes[name]
+    return files
 
 
 def _top(name: str) -> str:

@@ -50,11 +50,11 @@ class RemoteFolder:
         with self._telling("cannot be listed"):
             self._driver.invalidate_cache()
             try:
-                found = self._driver.find(start, detail=True)
+                entries = self._driver.find(start, detail=True)
             except FileNotFoundError:
                 return {}
         sizes = {}
-        for path, about in found.items():
+        for path, about in entries.items():
             name = str(path)[len(self._root) :].lstrip("/")
             self._check(name)
             sizes[name] = int(about.get("size") or 0)
@@ -87,8 +87,8 @@ class RemoteFolder:
         for start in range(0, len(wanted), AT_ONCE):
             paths = {f"{self._root}/{name}": name for name in wanted[start : start + AT_ONCE]}
             with self._telling("cannot be read"):
-                found = self._driver.cat(list(paths), on_error="omit")
-            yield from ((paths[path], content) for path, content in found.items())
+                contents = self._driver.cat(list(paths), on_error="omit")
+            yield from ((paths[path], content) for path, content in contents.items())
 
     def send(self, folder: Path, names: Sequence[str]) -> None:
         """Copy the files ``names`` of ``folder`` here, one after the other, in this order."""

@@ -81,8 +81,8 @@ def _stored(store: RemoteFolder, job: SceneJob) -> Iterator[None]:
 
 def _stamps(folder: Path) -> dict[str, tuple[int, int]]:
     """Inode and time of every file, which a file that is written again does not keep."""
-    found = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.endswith(".tmp")]
-    stats = {path.relative_to(folder).as_posix(): path.stat() for path in found}
+    paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.endswith(".tmp")]
+    stats = {path.relative_to(folder).as_posix(): path.stat() for path in paths}
     return {name: (about.st_ino, about.st_mtime_ns) for name, about in stats.items()}
 
 
@@ -94,7 +94,7 @@ def failed_distant(distant: DistantJob, reason: str) -> tuple[MethodOutcome, ...
     """The outcome of a scene whose worker was lost; its logs say so, in the store too."""
     outcomes = failed_outcomes(distant.job, reason)
     if distant.store is not None:
-        logs = [RunFolder(distant.job.folder).job(one.scene, one.method).log for one in outcomes]
+        logs = [RunFolder(distant.job.folder).job(outcome.scene, outcome.method).log for outcome in outcomes]
         names = [log.relative_to(distant.job.folder).as_posix() for log in logs if log.is_file()]
         RemoteFolder(distant.store).send(distant.job.folder, names)
     return outcomes
