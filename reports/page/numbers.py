@@ -57,18 +57,9 @@ def short(value: float) -> float:
 
 def summary_data(summary: MethodSummary) -> dict[str, Any]:
     """A method's costs; times in ms, null where nothing was measured."""
-    return {
-        "method": summary.method,
-        "scenes": list(summary.scenes),
-        "n_updates": summary.n_updates,
-        "stages": [_stage_data(stage) for stage in summary.stages],
-        "updates_per_s": _number(summary.updates_per_s),
-        "finish_ms": _number(summary.finish_ms),
-        "n_points": summary.n_points,
-        "map_bytes": summary.map_bytes,
-        "peak_rss_bytes": summary.peak_rss_bytes,
-        "device_bytes": summary.device_bytes,
-    }
+    shown = {name: value for name, value in vars(summary).items() if name not in ("run", "frames_per_s")}
+    numbers = {name: _number(value) if isinstance(value, float) else value for name, value in shown.items()}
+    return numbers | {"stages": [_stage_data(stage) for stage in summary.stages]}
 
 
 def _stage_data(stage: StageSummary) -> dict[str, Any]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import html
 import io
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict
+from typing import Any
 
 from su3d_bench.core.errors import printable
 from su3d_bench.reports.tables.latex import latex
@@ -77,33 +79,31 @@ def _pipes(text: str, most: int = 2000) -> str:
 
 def csv_text(parts: Sequence[Table | Prose]) -> str:
     """One line a cell, then one a note; measured values also in full precision, as fractions."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, CSV_COLUMNS, restval="", lineterminator="\n")
-    writer.writeheader()
-    for table in parts:
-        if isinstance(table, Prose):
-            writer.writerows({"kind": "note", "text": harmless(line)} for line in table.lines)
-            continue
-        for row in table.rows:
-            for column, cell in zip(table.columns, row.cells, strict=True):
-                values: dict[str, str | int | float] = {
-                    "table": table.name,
-                    "kind": "reported" if row.is_reported else "measured",
-                    "row": row.label,
-                    "column": column,
-                    "text": cell.whole,
-                    "is_best": int(cell.is_best),
-                    "mark": row.mark,
-                }
-                if (origin := cell.origin) is not None:
-                    low, high = origin.interval or ("", "")
-                    values |= {"value": origin.value, "low": low, "high": high, "what": origin.what, "run": origin.run}
-                    values |= {"method": origin.method, "protocol": origin.protocol, "version": origin.version}
-                    values |= {"metric": origin.metric}
-                writer.writerow({key: harmless(value) for key, value in values.items()})
-        for note in table.notes:
-            writer.writerow({"table": harmless(table.name), "kind": "note", "text": harmless(note)})
-    return text.getvalue()
+    rows = [row for part in parts for row in (_note_rows("", part.lines) if isinstance(part, Prose) else _rows(part))]
+    return csv_lines([CSV_COLUMNS, *([harmless(row.get(name, "")) for name in CSV_COLUMNS] for row in rows)])
+
+
+def _rows(table: Table) -> Iterator[Mapping[str, Any]]:
+    for row in table.rows:
+        for column, cell in zip(table.columns, row.cells, strict=True):
+            origin = cell.origin
+            low, high = ("", "") if origin is None else origin.interval or ("", "")
+            yield {
+                "table": table.name,
+                "kind": "reported" if row.is_reported else "measured",
+                "row": row.label,
+                "column": column,
+                "text": cell.whole,
+                "is_best": int(cell.is_best),
+                "mark": row.mark,
+                "low": low,
+                "high": high,
+            } | ({} if origin is None else asdict(origin))
+    yield from _note_rows(table.name, table.notes)
+
+
+def _note_rows(table: str, lines: Sequence[str]) -> Iterator[Mapping[str, Any]]:
+    return ({"table": table, "kind": "note", "text": line} for line in lines)
 
 
 def csv_lines(rows: Iterable[Iterable[object]]) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 NOT_MEASURED = "-"
@@ -146,7 +146,7 @@ def blocks_of(rows: Sequence[TableRow]) -> list[list[TableRow]]:
 BY_PEOPLE = "-people"  # ends the name of what stands in a protocol's place where people judged
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Measured:
     """The numbers of ``metrics.json`` for one method and protocol, as fractions, None where undefined.
 
@@ -164,13 +164,13 @@ class Measured:
     metrics: Mapping[str, float | None]
     intervals: Mapping[str, Interval | None]
     per_scene: Mapping[str, Mapping[str, float | None]]
-    ceilings: Mapping[str, float | None]
+    ceilings: Mapping[str, float | None] = field(default_factory=dict)
     n_planned: int
-    failed: tuple[str, ...]
-    unscored: tuple[str, ...]
-    limit: int
-    profile: str | None
-    encoder: str | None
+    failed: tuple[str, ...] = ()
+    unscored: tuple[str, ...] = ()
+    limit: int = 0
+    profile: str | None = None
+    encoder: str | None = None
     caveat: str | None
 
     @property

@@ -75,13 +75,7 @@ def _judged_by_people(path: Path) -> list[Measured]:
                 metrics={cell.metric: cell.value for cell in cells},
                 intervals={cell.metric: cell.interval for cell in cells},
                 per_scene={scene: {cell.metric: cell.per_scene.get(scene) for cell in cells} for scene in scenes},
-                ceilings={},
                 n_planned=len(scenes),
-                failed=(),
-                unscored=(),
-                limit=0,
-                profile=None,
-                encoder=None,
                 caveat=_who_judged(scores, cells),
             )
         )
