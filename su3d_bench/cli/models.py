@@ -101,11 +101,11 @@ def call_list(arguments: argparse.Namespace) -> int:
     width = max(len(state.entry.name) for state in states)
     for state in states:
         entry = state.entry
-        place = f"found: {state.found[0].folder}" if state.found else "missing"
+        place = f"found: {state.files[0].folder}" if state.files else "missing"
         size = f"{entry.forms[0].size_mb / 1000:.1f} GB"
         profiles = f" (profile {', '.join(state.profiles)})" if state.profiles else ""
         answer(f"{entry.name:<{width}}  {entry.kind:<9}  {size:>6}  {entry.licence:<10}  {place}{profiles}")
-    if missing := [state for state in states if not state.found]:
+    if missing := [state for state in states if not state.files]:
         remark(
             f"{len(missing)} missing; su3d-bench models check {missing[0].entry.name} says what to fetch",
             quiet=arguments.quiet,
@@ -135,7 +135,7 @@ def _state_row(state: ModelState) -> dict[str, Any]:
             {"form": form.form, "files": list(form.files), "size_mb": form.size_mb, "source": form.source}
             for form in entry.forms
         ],
-        "found": {files.form.form: str(files.folder) for files in state.found},
+        "found": {files.form.form: str(files.folder) for files in state.files},
         "missing": state.missing,
         "remark": entry.remark or None,
     }
@@ -144,8 +144,8 @@ def _state_row(state: ModelState) -> dict[str, Any]:
 def call_check(arguments: argparse.Namespace) -> int:
     names = tuple(dict.fromkeys(arguments.names))
     states = _states(arguments, names)
-    rows = [_checked(files) for state in states for files in state.found]
-    rows += [_absent(state) for state in states if names and not state.found]
+    rows = [_checked(files) for state in states for files in state.files]
+    rows += [_absent(state) for state in states if names and not state.files]
     if not rows:
         raise ConfigError("models check: none of the models is here; su3d-bench models list names them all")
     answer_either(arguments, rows, "\n".join(line for row in rows for line in _check_lines(row)))

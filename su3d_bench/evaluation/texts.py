@@ -130,7 +130,7 @@ def _real_encoder(name: str) -> Encoder | None:
     from su3d_bench.perception.models.inspection import model_state
 
     entry = encoder_known_as(name)
-    forms = () if entry is None else model_state(entry).found
+    forms = () if entry is None else model_state(entry).files
     folder = next((files.folder for files in forms if files.form.form == "transformers"), None)
     return None if entry is None or folder is None else _loaded(entry.name, folder)
 

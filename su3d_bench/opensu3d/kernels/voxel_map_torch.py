@@ -151,7 +151,7 @@ class DeviceVoxelMap:
         distinct, place = _distinct(self._packed(voxels >> 3))
         near = torch.arange(-1, 2, device=self._device)
         around = torch.stack(torch.meshgrid(near, near, near, indexing="ij"), dim=-1).view(1, 27, 3)
-        rows = self._found_rows(_packed_relative(_unpacked(distinct)[:, None] + around))
+        rows = self._rows_of(_packed_relative(_unpacked(distinct)[:, None] + around))
         rows[distinct < 0] = NO_BLOCK
         return _View(points, voxels, rows.view(-1), place * 27)
 
@@ -197,10 +197,10 @@ class DeviceVoxelMap:
                 f"point cloud: a point lies at {far} m; on a device, a map with eps {self.eps} m reaches "
                 f"{(REACH - 2) * 8 * self.eps:.0f} m from its first point; use device cpu"
             )
-        missing = distinct[self._found_rows(distinct) == NO_BLOCK]
+        missing = distinct[self._rows_of(distinct) == NO_BLOCK]
         if len(missing):
             self._add_blocks(missing)
-        return self._found_rows(distinct)[place] * VOXELS + _number(voxels & 7, 8)
+        return self._rows_of(distinct)[place] * VOXELS + _number(voxels & 7, 8)
 
     def _fill(self, new_points: Tensor, new_ids: Tensor, slots: Tensor) -> Tensor:
         """Adds the first point of each voxel that is free; gives the index that each point took, ABSENT for none."""
@@ -253,7 +253,7 @@ class DeviceVoxelMap:
     def _packed(self, blocks: Tensor) -> Tensor:
         return _packed_relative(blocks - self._origin)
 
-    def _found_rows(self, keys: Tensor) -> Tensor:
+    def _rows_of(self, keys: Tensor) -> Tensor:
         """The row of heads of each key, NO_BLOCK where there is no such block."""
         at = torch.searchsorted(self._keys, keys)
         return torch.where(self._keys[at] == keys, self._rows[at], NO_BLOCK)

@@ -42,7 +42,7 @@ class ChatClient:
         self._pace = _Pace(config.requests_per_minute)
         self._lock = threading.Lock()
         self._locks: dict[str, threading.Lock] = {}
-        self._asked: set[str] = set()
+        self._sent: set[str] = set()
         self._n_failures_in_a_row = 0
         self.spending = Spending(config)
 
@@ -76,12 +76,12 @@ class ChatClient:
                     f"'{request.model}' ({request.key[:12]}); give the command without --offline to ask for it"
                 )
             reply = self._send(request)
-            self._asked.add(request.key)
+            self._sent.add(request.key)
             return self._store.save(request, reply, self._transport.server, replace=self._ask_failed_again)
 
     def _known(self, request: ChatRequest) -> Reply | None:
         reply = self._store.load(request.key)
-        is_wanted_again = self._ask_failed_again and request.key not in self._asked and not self._offline
+        is_wanted_again = self._ask_failed_again and request.key not in self._sent and not self._offline
         return None if reply is not None and reply.failure and is_wanted_again else reply
 
     def estimate(self, requests: Sequence[ChatRequest]) -> Estimate:
@@ -101,13 +101,13 @@ class ChatClient:
                 self._count(failed=False)  # the server is there and has spoken
                 return Reply("", failure=str(refused))
             except TryAgain as failed:
-                asked_for = failed.wait_s
+                pause_s = failed.wait_s
                 is_last = attempt == self._config.max_retries
-                if asked_for is not None and asked_for > self._config.max_wait_s:
-                    return self._failed(f"{failed}; it asks to wait {asked_for:.0f} s", failed)
+                if pause_s is not None and pause_s > self._config.max_wait_s:
+                    return self._failed(f"{failed}; it asks to wait {pause_s:.0f} s", failed)
                 if is_last:
                     return self._failed(f"{failed}; tried {attempt + 1} times", failed)
-                sleep(wait_s if asked_for is None else asked_for)
+                sleep(wait_s if pause_s is None else pause_s)
                 wait_s = min(2 * wait_s, self._config.max_wait_s)
                 continue
             self._count(failed=False)

@@ -30,7 +30,7 @@ class ModelState:
     """A model of the catalogue and the forms of it that are here; where none is, ``missing`` says what to fetch."""
 
     entry: ModelEntry
-    found: tuple[ModelFiles, ...]
+    files: tuple[ModelFiles, ...]
     missing: str | None
 
     @property
@@ -85,7 +85,7 @@ def _problems_of_export(files: ModelFiles) -> list[str]:
 def models_record(names: Sequence[str], config: ModelsConfig) -> dict[str, dict[str, str]]:
     """For a run's record: the SHA-256 of every file of the models ``names`` that are here, by model and file name."""
     states = [model_state(model_entry(name), config.paths.get(name), config.folder) for name in dict.fromkeys(names)]
-    return {state.entry.name: state.found[0].digests() for state in states if state.found}
+    return {state.entry.name: state.files[0].digests() for state in states if state.files}
 
 
 @dataclass(frozen=True)

@@ -134,7 +134,7 @@ def without_small_parts(mask: BoolArray, min_area_px: int, part: Literal["holes"
 
 
 @dataclass(frozen=True)
-class _Found:
+class _Candidates:
     """Masks cut to their windows (K, 4) in the image, right and bottom exclusive, with predicted IoU (K,)."""
 
     cuts: list[BoolArray]
@@ -147,12 +147,12 @@ class _Found:
         """The original's boxes: first and last pixel, which makes them a pixel smaller than the windows."""
         return np.asarray(self.windows - np.array([0, 0, 1, 1]), np.float32)
 
-    def at(self, kept: Int64Array) -> _Found:
-        return _Found([self.cuts[k] for k in kept], self.windows[kept], self.scores[kept], self.crop_areas[kept])
+    def at(self, kept: Int64Array) -> _Candidates:
+        return _Candidates([self.cuts[k] for k in kept], self.windows[kept], self.scores[kept], self.crop_areas[kept])
 
     @staticmethod
-    def joined(parts: list[_Found]) -> _Found:
-        return _Found(
+    def joined(parts: list[_Candidates]) -> _Candidates:
+        return _Candidates(
             [cut for part in parts for cut in part.cuts],
             np.concatenate([part.windows for part in parts]),
             np.concatenate([part.scores for part in parts]),
@@ -176,7 +176,7 @@ class AutomaticMasks:
         config = self._config
         height, width = rgb.shape[:2]
         crops = crops_of(height, width, config.crop_n_layers, config.crop_overlap_ratio)
-        candidates = _Found.joined([self._in_crop(rgb, crop) for crop in crops])
+        candidates = _Candidates.joined([self._in_crop(rgb, crop) for crop in crops])
         if len(crops) > 1:
             candidates = candidates.at(suppress(candidates.boxes, 1 / candidates.crop_areas, config.crop_nms_thresh))
         masks = np.zeros((len(candidates.cuts), height, width), bool)
@@ -191,16 +191,16 @@ class AutomaticMasks:
         masks = masks[is_something]
         return Regions(masks, mask_boxes(masks), np.clip(scores[is_something], 0, 1).astype(np.float32))
 
-    def _in_crop(self, rgb: UInt8Array, crop: Crop) -> _Found:
+    def _in_crop(self, rgb: UInt8Array, crop: Crop) -> _Candidates:
         x0, y0, x1, y1 = crop.box
         image = self._sam.look(np.ascontiguousarray(rgb[y0:y1, x0:x1]))
         n_side = int(self._config.points_per_side / self._config.crop_n_points_downscale_factor**crop.layer)
         points = (point_grid(max(n_side, 1)) * np.array([x1 - x0, y1 - y0])).astype(np.float32)
         batches = self._batches.run(range(len(points)), lambda part: self._from_points(image, points[part], crop, rgb))
-        candidates = _Found.joined(batches)
+        candidates = _Candidates.joined(batches)
         return candidates.at(suppress(candidates.boxes, candidates.scores, self._config.box_nms_thresh))
 
-    def _from_points(self, image: SeenImage, points: Float32Array, crop: Crop, rgb: UInt8Array) -> _Found:
+    def _from_points(self, image: SeenImage, points: Float32Array, crop: Crop, rgb: UInt8Array) -> _Candidates:
         """The three masks at each point that pass the filters, which look at one mask alone, whatever the batch."""
         labels = np.full((len(points), 1), OBJECT_POINT, np.int64)
         logits, predicted = self._sam.decode(image, Prompts(points[:, None], labels), is_single=False)
@@ -213,9 +213,9 @@ class AutomaticMasks:
             self._large(image, logits[at : at + FULL_SIZE_AT_ONCE], predicted[at : at + FULL_SIZE_AT_ONCE], crop, rgb)
             for at in range(0, max(len(logits), 1), FULL_SIZE_AT_ONCE)
         ]
-        return _Found.joined(parts)
+        return _Candidates.joined(parts)
 
-    def _large(self, image: SeenImage, logits: Any, predicted: Any, crop: Crop, rgb: UInt8Array) -> _Found:
+    def _large(self, image: SeenImage, logits: Any, predicted: Any, crop: Crop, rgb: UInt8Array) -> _Candidates:
         """Those of some masks that are stable and not cut by the crop."""
         if len(logits):
             logits = self._sam.full_size(image, logits)
@@ -229,7 +229,7 @@ class AutomaticMasks:
         cuts = [mask[b:d, a:c].copy() for mask, (a, b, c, d) in zip(masks, inside.tolist(), strict=True)]
         windows = inside + np.array([x0, y0, x0, y0])
         area = np.full(len(masks), float((x1 - x0) * (y1 - y0)))
-        candidates = _Found(cuts, windows, predicted.cpu().numpy().astype(np.float32), area)
+        candidates = _Candidates(cuts, windows, predicted.cpu().numpy().astype(np.float32), area)
         return candidates.at(np.flatnonzero(~is_cut_by_crop(candidates.boxes, crop, *rgb.shape[:2])))
 
     def _cleaned(self, masks: BoolArray) -> tuple[BoolArray, Int64Array]:

@@ -105,7 +105,7 @@ class GroundingDino:
         Tags that the network's text is too short for are asked for in a text of their own; the original cuts them off.
         """
         tags = [tag for tag in dict.fromkeys(clean_tag(tag) for tag in tags) if tag]
-        parts = [self._found(rgb, part, config) for part in self._texts(tags)]
+        parts = [self._candidates(rgb, part, config) for part in self._texts(tags)]
         candidates = NamedBoxes(
             np.concatenate([part.boxes for part in parts] or [np.zeros((0, 4), np.float32)]),
             np.concatenate([part.scores for part in parts] or [np.zeros(0, np.float32)]),
@@ -141,7 +141,7 @@ class GroundingDino:
         height, width = rgb.shape[:2]
         return normalised(resized(rgb, *size_with_shortest_side(height, width, *self._sides_px)))
 
-    def _found(self, rgb: UInt8Array, tags: Sequence[str], config: BoxConfig) -> NamedBoxes:
+    def _candidates(self, rgb: UInt8Array, tags: Sequence[str], config: BoxConfig) -> NamedBoxes:
         """Everything above the thresholds, in the network's order."""
         probabilities, boxes, tokens = self.answer(self.pixels(rgb), text_prompt(tags))
         scores = probabilities.max(axis=1)
