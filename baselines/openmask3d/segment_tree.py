@@ -66,7 +66,8 @@ def contacts_of(vertices: Float32Array, triangles: Int32Array, segments: Int64Ar
     n_segments = int(segments.max()) + 1 if len(segments) else 0
     patch_m = _patch_size_m(vertices, triangles)
     cells, step = _cells(vertices, n_segments, patch_m)
-    patch, owner, inverse = _distinct(cells * max(n_segments, 1) + segments, max(n_segments, 1))
+    keys, inverse = np.unique(cells * max(n_segments, 1) + segments, return_inverse=True)
+    patch, owner = np.divmod(keys, max(n_segments, 1))
     n = np.bincount(inverse, minlength=len(patch))
     centres = _sums(inverse, vertices, len(patch)) / n[:, None]
     normals = _sums(inverse, _vertex_normals(vertices, triangles), len(patch))
@@ -77,9 +78,10 @@ def contacts_of(vertices: Float32Array, triangles: Int32Array, segments: Int64Ar
     bend = np.where(is_convex, CONVEX_SHARE * bend * bend, bend) + FLAT_BEND
     low, high = np.minimum(owner[a], owner[b]), np.maximum(owner[a], owner[b])
     pairs, of_pair = np.unique(low * max(n_segments, 1) + high, return_inverse=True)
+    first, second = np.divmod(pairs, max(n_segments, 1))
     return Contacts(
-        first=pairs // max(n_segments, 1),
-        second=pairs % max(n_segments, 1),
+        first=first,
+        second=second,
         n=np.bincount(of_pair, minlength=len(pairs)),
         bend=np.bincount(of_pair, bend, len(pairs)).astype(np.float64),
         n_patches=np.bincount(owner, minlength=n_segments),
@@ -105,12 +107,6 @@ def _cells(vertices: Float32Array, n_segments: int, patch_m: float) -> tuple[Int
     low = vertices.min(axis=0).astype(np.float64) if len(vertices) else np.zeros(3)
     grid = np.floor((vertices - low) / patch_m).astype(np.int64) + 1
     return grid @ np.array(step, np.int64), step
-
-
-def _distinct(keys: Int64Array, base: int) -> tuple[Int64Array, Int64Array, Int64Array]:
-    """Cube and segment of each distinct key, ascending, and which of them each key is."""
-    distinct, inverse = np.unique(keys, return_inverse=True)
-    return distinct // base, distinct % base, inverse.reshape(-1)
 
 
 def _sums(group: Int32Array | Int64Array, values: Float32Array | Float64Array, n: int) -> Float64Array:

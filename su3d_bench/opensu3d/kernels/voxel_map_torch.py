@@ -122,7 +122,8 @@ class DeviceVoxelMap:
         points = checked_points(points)
         if len(points) == 0:
             return np.zeros(0, np.int64)
-        self._reserve_points(len(self) + len(points))
+        of_points = self._points, self._ids, self._following
+        self._points, self._ids, self._following = (_with_room(part, len(self) + len(points)) for part in of_points)
         new_points, new_ids = self._up(points), self._up(np.ascontiguousarray(ids, np.int32))
         slots = self._slots(new_points)
         if not keep_density:
@@ -261,7 +262,7 @@ class DeviceVoxelMap:
     def _add_blocks(self, keys: Tensor) -> None:
         """Enters blocks of new ``keys`` (K,), which ascend."""
         first = self.n_blocks + 1
-        self._reserve_blocks(first + len(keys))
+        self._heads = _with_room(self._heads, (first + len(keys)) * VOXELS)
         rows = torch.arange(first, first + len(keys), device=self._device)
         at = torch.searchsorted(self._keys, keys) + torch.arange(len(keys), device=self._device)
         is_old = torch.ones(len(self._keys) + len(keys), dtype=torch.bool, device=self._device)
@@ -273,23 +274,6 @@ class DeviceVoxelMap:
             merged.append(both)
         self._keys, self._rows = merged
 
-    def _reserve_points(self, n: int) -> None:
-        capacity = doubled(len(self._ids), n)
-        if capacity == len(self._ids):
-            return
-        for name in ("_points", "_ids", "_following"):
-            old = getattr(self, name)
-            larger = self._empty((capacity, *old.shape[1:]), old.dtype)
-            larger[: len(self)] = old[: len(self)]
-            setattr(self, name, larger)
-
-    def _reserve_blocks(self, n: int) -> None:
-        capacity = doubled(len(self._heads), n * VOXELS)
-        if capacity > len(self._heads):
-            larger = self._full(capacity, ABSENT, torch.int32)
-            larger[: len(self._heads)] = self._heads
-            self._heads = larger
-
     def _up(self, array: np.ndarray) -> Tensor:
         return torch.from_numpy(np.require(array, requirements=["C", "W"])).to(self._device)
 
@@ -298,6 +282,12 @@ class DeviceVoxelMap:
 
     def _full(self, n: int, value: int, dtype: torch.dtype) -> Tensor:
         return torch.full((n,), value, dtype=dtype, device=self._device)
+
+
+def _with_room(tensor: Tensor, n: int) -> Tensor:
+    """``tensor``, doubled until it has ``n`` rows; the new ones are ABSENT."""
+    n_new = doubled(len(tensor), n) - len(tensor)
+    return torch.cat([tensor, tensor.new_full((n_new, *tensor.shape[1:]), ABSENT)]) if n_new else tensor
 
 
 def _present(at: Tensor) -> Tensor:

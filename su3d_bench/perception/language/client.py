@@ -101,17 +101,15 @@ class ChatClient:
                 self._count(failed=False)  # the server is there and has spoken
                 return Reply("", failure=str(refused))
             except TryAgain as failed:
-                pause_s = failed.wait_s
-                is_last = attempt == self._config.max_retries
-                if pause_s is not None and pause_s > self._config.max_wait_s:
-                    return self._failed(f"{failed}; it asks to wait {pause_s:.0f} s", failed)
-                if is_last:
+                if failed.wait_s is not None and failed.wait_s > self._config.max_wait_s:
+                    return self._failed(f"{failed}; it asks to wait {failed.wait_s:.0f} s", failed)
+                if attempt == self._config.max_retries:
                     return self._failed(f"{failed}; tried {attempt + 1} times", failed)
-                sleep(wait_s if pause_s is None else pause_s)
+                sleep(wait_s if failed.wait_s is None else failed.wait_s)
                 wait_s = min(2 * wait_s, self._config.max_wait_s)
-                continue
-            self._count(failed=False)
-            return replies[0]
+            else:
+                self._count(failed=False)
+                return replies[0]
         raise AssertionError("the last attempt returns")
 
     def _failed(self, reason: str, last: TryAgain) -> Reply:

@@ -38,7 +38,11 @@ def load_encoder(
     if name == EMBEDDED:
         from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 
-        _refuse_idle_settings(config)
+        if config.runtime != "torch":
+            raise ConfigError(
+                f"perception.models.runtime '{config.runtime}': the embedded encoder has its own; choose "
+                "perception.models.encoder or --profile paper"
+            )
         return EmbeddedEncoder(device=device_for(config.device, job_index))
     files = encoder_files(config, name)
     for package in PACKAGES_OF_RUNTIME[config.runtime]:
@@ -59,13 +63,6 @@ def encoder_files(config: ModelsConfig, name: str) -> ModelFiles:
     """Where the files of encoder ``name`` lie in the form that the configured runtime reads."""
     model_entry(name, "encoder")
     return locate(name, (FORM_OF_RUNTIME[config.runtime],), path=config.paths.get(name), folder=config.folder)
-
-
-def _refuse_idle_settings(config: ModelsConfig) -> None:
-    """The embedded encoder has a runtime of its own."""
-    advice = "choose perception.models.encoder or --profile paper"
-    if config.runtime != "torch":
-        raise ConfigError(f"perception.models.runtime '{config.runtime}': the embedded encoder has its own; {advice}")
 
 
 def _torch_encoder(
