@@ -21,11 +21,9 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import DataError, reading
 from su3d_bench.core.types import Int64Array
 from su3d_bench.formats.ply_parts import (
-    BYTE_ORDERS,
     NAMES_OF_TYPES,
     BinaryBody,
     Body,
-    ByteOrder,
     Promise,
     Property,
     TextBody,
@@ -213,19 +211,15 @@ def _walk(promise: Promise, body: Body, at: int, where: str) -> tuple[Int64Array
     return np.array(starts, np.int64), [np.array(known, np.int64) for known in lengths], at
 
 
-def write_ply(
-    path: Path, elements: Sequence[PlyElement], *, format: str = "binary_little_endian", comments: Sequence[str] = ()
-) -> None:
-    """Write ``elements``, whole or not at all; the types of the arrays become those of the properties."""
-    assert format in BYTE_ORDERS, format
-    lines = ["ply", f"format {format} 1.0", *(f"comment {comment}" for comment in comments)]
+def write_ply(path: Path, elements: Sequence[PlyElement]) -> None:
+    """Write ``elements`` in little-endian bytes, whole or not at all; the types of the arrays are those of the file."""
+    lines = ["ply", "format binary_little_endian 1.0"]
     for element in elements:
         lines.append(f"element {element.name} {element.n_rows}")
         lines += [_property_line(name, column) for name, column in element.columns.items()]
         assert all(len(column) == element.n_rows for column in element.columns.values()), element.name
     header = "\n".join([*lines, "end_header", ""]).encode()
-    write = _text_rows if format == "ascii" else _binary_rows
-    write_bytes(path, header + b"".join(write(element, BYTE_ORDERS[format]) for element in elements))
+    write_bytes(path, header + b"".join(map(_rows, elements)))
 
 
 def _property_line(name: str, column: Column) -> str:
@@ -238,7 +232,7 @@ def _type_name(kind: np.dtype[Any]) -> str:
     return NAMES_OF_TYPES[kind.newbyteorder("=").str[1:]][0]
 
 
-def _binary_rows(element: PlyElement, order: ByteOrder) -> bytes:
+def _rows(element: PlyElement) -> bytes:
     """The rows of an element, each value scattered to its place."""
     sizes = np.zeros(element.n_rows, np.int64)
     for column in element.columns.values():
@@ -252,32 +246,18 @@ def _binary_rows(element: PlyElement, order: ByteOrder) -> bytes:
         if isinstance(column, ListColumn):
             lengths, step = column.lengths, column.values.itemsize
             assert lengths.max(initial=0) <= np.iinfo(column.count_type).max, "the count type cannot hold the lengths"
-            _scatter(out, starts, lengths.astype(column.count_type), order)
+            _scatter(out, starts, lengths.astype(column.count_type))
             starts = starts + column.count_type.itemsize
             items = np.repeat(starts - column.indptr[:-1] * step, lengths) + np.arange(len(column.values)) * step
-            _scatter(out, items, column.values, order)
+            _scatter(out, items, column.values)
             starts = starts + lengths * step
         else:
-            _scatter(out, starts, column, order)
+            _scatter(out, starts, column)
             starts = starts + column.itemsize
     return out.tobytes()
 
 
-def _scatter(out: NDArray[np.uint8], starts: Int64Array, values: AnyArray, order: ByteOrder) -> None:
-    raw = np.ascontiguousarray(values, values.dtype.newbyteorder(order)).view(np.uint8).reshape(-1, values.itemsize)
+def _scatter(out: NDArray[np.uint8], starts: Int64Array, values: AnyArray) -> None:
+    raw = np.ascontiguousarray(values, values.dtype.newbyteorder("<")).view(np.uint8).reshape(-1, values.itemsize)
     for byte in range(values.itemsize):
         out[starts + byte] = raw[:, byte]
-
-
-def _text_rows(element: PlyElement, _: ByteOrder) -> bytes:
-    texts = [_texts(column) for column in element.columns.values()]
-    return "".join(" ".join(row) + "\n" for row in zip(*texts, strict=True)).encode()
-
-
-def _texts(column: Column) -> list[str]:
-    """The text of each row: the shortest digits that give the value back."""
-    if not isinstance(column, ListColumn):
-        return [str(value) for value in column]
-    items = [str(value) for value in column.values]
-    bounds = zip(column.indptr[:-1].tolist(), column.indptr[1:].tolist(), strict=True)
-    return [" ".join([str(end - begin), *items[begin:end]]) for begin, end in bounds]

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from ply_files import write_ply_as
 
 from su3d_bench.core.errors import DataError, StoreError
 from su3d_bench.formats.ply import Column, ListColumn, PlyElement, PlyFile, read_ply, write_ply
@@ -59,14 +60,14 @@ def assert_same(file: PlyFile, elements: list[PlyElement]) -> None:
 
 
 def mesh_bytes(tmp_path: Path, format: str, corners: ListColumn = MIXED) -> bytes:
-    write_ply(tmp_path / "whole.ply", [vertices(8), faces(corners)], format=format)
+    write_ply_as(tmp_path / "whole.ply", [vertices(8), faces(corners)], format)
     return (tmp_path / "whole.ply").read_bytes()
 
 
 @pytest.mark.parametrize("format", FORMATS)
 def test_every_scalar_type_keeps_its_values_to_the_ends_of_its_range(tmp_path: Path, format: str) -> None:
     elements = [PlyElement("sample", 5, {f"value_{kind}": extremes(kind) for kind in TYPES})]
-    write_ply(tmp_path / "a.ply", elements, format=format)
+    write_ply_as(tmp_path / "a.ply", elements, format)
     assert_same(read_ply(tmp_path / "a.ply"), elements)
 
 
@@ -78,7 +79,7 @@ def test_lists_of_every_count_and_item_type_round_trip(tmp_path: Path, format: s
     for indptr in (np.array([0, 5, 10]), np.array([0, 3, 3, 10])):  # equal lengths and different ones
         column = ListColumn(indptr, values, np.dtype(count))
         elements = [PlyElement("strip", len(column), {"before": np.arange(len(column), dtype="u1"), "items": column})]
-        write_ply(tmp_path / "a.ply", elements, format=format)
+        write_ply_as(tmp_path / "a.ply", elements, format)
         assert_same(read_ply(tmp_path / "a.ply"), elements)
 
 
@@ -87,7 +88,7 @@ def test_lists_of_every_count_and_item_type_round_trip(tmp_path: Path, format: s
 @pytest.mark.parametrize("corners", [QUADS, MIXED], ids=["quads", "mixed"])
 def test_object_id_survives_with_its_type(tmp_path: Path, format: str, id_type: str, corners: ListColumn) -> None:
     elements = [vertices(8), faces(corners, id_type)]
-    write_ply(tmp_path / "a.ply", elements, format=format, comments=["made by a test"])
+    write_ply_as(tmp_path / "a.ply", elements, format, ["made by a test"])
     file = read_ply(tmp_path / "a.ply")
     assert_same(file, elements)
     assert (file.format, file.comments) == (format, ("made by a test",))
@@ -97,14 +98,14 @@ def test_object_id_survives_with_its_type(tmp_path: Path, format: str, id_type: 
 def test_two_lists_in_one_row_round_trip(tmp_path: Path, format: str) -> None:
     other = ListColumn(np.array([0, 0, 2, 3, 3]), np.array([0.5, 1.5, 2.5], np.float64), np.dtype(np.int32))
     columns: dict[str, Column] = {"a": MIXED, "b": np.arange(4, dtype="i2"), "c": other, "d": np.ones(4, np.float32)}
-    write_ply(tmp_path / "a.ply", [PlyElement("row", 4, columns)], format=format)
+    write_ply_as(tmp_path / "a.ply", [PlyElement("row", 4, columns)], format)
     assert_same(read_ply(tmp_path / "a.ply"), [PlyElement("row", 4, columns)])
 
 
 @pytest.mark.parametrize("format", FORMATS)
 def test_elements_without_rows_keep_their_properties(tmp_path: Path, format: str) -> None:
     elements = [vertices(0), faces(ListColumn(np.zeros(1, np.int64), np.zeros(0, np.int32)))]
-    write_ply(tmp_path / "a.ply", elements, format=format)
+    write_ply_as(tmp_path / "a.ply", elements, format)
     assert_same(read_ply(tmp_path / "a.ply"), elements)
 
 
@@ -254,7 +255,7 @@ def test_open3d_reads_our_files_and_we_read_its(tmp_path: Path, is_text: bool) -
 
     triangles = ListColumn(np.arange(3) * 3, np.array([0, 1, 2, 2, 3, 7], np.int32))
     ours = [vertices(8), PlyElement("face", 2, {"vertex_indices": triangles})]
-    write_ply(tmp_path / "ours.ply", ours, format="ascii" if is_text else "binary_little_endian")
+    write_ply_as(tmp_path / "ours.ply", ours, "ascii" if is_text else "binary_little_endian")
     mesh = o3d.io.read_triangle_mesh(str(tmp_path / "ours.ply"))
     assert np.asarray(mesh.triangles).tolist() == [[0, 1, 2], [2, 3, 7]]
     columns = ours[0].columns

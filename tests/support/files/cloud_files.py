@@ -12,10 +12,11 @@ from typing import Any
 import h5py
 import numpy as np
 import pytest
+from ply_files import write_ply_as
 from prediction_files import TorchFile
 
 from su3d_bench.formats.pcd import write_pcd_points
-from su3d_bench.formats.ply import PlyElement, write_ply
+from su3d_bench.formats.ply import PlyElement
 
 RNG = np.random.default_rng(0)
 NAMES = ["couch", "lamp", "wall"]
@@ -100,7 +101,8 @@ def write_object(path: Path, points: Any) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
     columns = {axis: np.asarray(points)[:, k].astype(np.float64) for k, axis in enumerate("xyz")}
     colours = {name: np.full(len(points), 7, np.uint8) for name in ("red", "green", "blue")}
-    write_ply(path, [PlyElement("vertex", len(points), {**columns, **colours})], comments=["Created by Open3D"])
+    vertex = PlyElement("vertex", len(points), {**columns, **colours})
+    write_ply_as(path, [vertex], "binary_little_endian", ["Created by Open3D"])
 
 
 def write_hovsg(folder: Path, clouds: dict[int, Any], features: Any) -> None:
