@@ -116,7 +116,7 @@ def camera_to_world(matrix: Float64Array, description: RgbdDescription, where: s
     if np.abs(matrix[:3, 3]).max() > MAX_DISTANCE_M or not are_rigid(matrix[None])[0]:
         raise DataError(f"{where}: not a rigid motion in metres; expected a rotation, a translation and 0 0 0 1")
     if description.pose_direction == "world_to_camera":
-        matrix = np.linalg.inv(matrix)
+        matrix = np.asarray(np.linalg.inv(matrix), np.float64)
     return matrix @ OPENGL_TO_OPENCV if description.camera_axes == "opengl" else matrix
 
 

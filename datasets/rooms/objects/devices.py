@@ -19,7 +19,7 @@ from su3d_bench.datasets.rooms.objects.materials import (
     shade,
     tone,
 )
-from su3d_bench.datasets.rooms.objects.shapes import Shape, block, corners, cylinder, lathe, soft_block, tube
+from su3d_bench.datasets.rooms.objects.shapes import Shape, block, both, corners, cylinder, lathe, soft_block, tube
 
 
 def _handle(x: float, near: float, far: float, heights: Sequence[float], radius: float) -> Shape:
@@ -40,7 +40,7 @@ def refrigerator(build: Assembly) -> None:
     x = width / 2 - 0.06
     for z0, z1 in ((split - 0.5, split - 0.06), (split + 0.06, min(split + 0.38, height - 0.08))):
         build.add(steel, _handle(x, y - 0.02, y - 0.065, (z0, z0 + 0.02, z1 - 0.02, z1), 0.012))
-    build.spot((-width / 2 + 0.02, width / 2 - 0.02), (-depth / 2 + 0.08, depth / 2 - 0.02), height, 0.45)
+    build.spot(both(width / 2 - 0.02), (-depth / 2 + 0.08, depth / 2 - 0.02), height, 0.45)
 
 
 def cooktop(build: Assembly) -> None:
@@ -82,7 +82,7 @@ def microwave(build: Assembly) -> None:
     heights = [height * share for share in (0.25, 0.27, 0.83, 0.85)]
     build.add(chrome(build.rng), _handle(width * 0.18, y - 0.012, y - 0.035, heights, 0.008))
     build.add(paint(tone("black")), *[block(0.04, 0.04, 0.014, *foot) for foot in corners(width * 0.4, depth * 0.38)])
-    build.spot((-width / 2 + 0.03, width / 2 - 0.03), (-depth / 2 + 0.03, depth / 2 - 0.03), height + 0.012, 0.4)
+    build.spot(both(width / 2 - 0.03), both(depth / 2 - 0.03), height + 0.012, 0.4)
 
 
 def _screen(build: Assembly, width: float, z0: float, z1: float, lively: float, glow: float) -> Material:
@@ -196,4 +196,4 @@ def desktop_computer(build: Assembly) -> None:
     for i in range(5):
         build.add(contrast, block(width * 0.7, 0.006, 0.01, 0, y - 0.003, 0.05 + i * 0.026))
     build.add(light((60, 150, 250), 0.8), cylinder(0.014, 0.006).turned("x", 90).moved(0, y, height * 0.6))
-    build.spot((-width / 2 + 0.01, width / 2 - 0.01), (-depth / 2 + 0.02, depth / 2 - 0.02), height + 0.015, 0.2)
+    build.spot(both(width / 2 - 0.01), both(depth / 2 - 0.02), height + 0.015, 0.2)

@@ -106,7 +106,7 @@ def bench(build: Assembly) -> None:
         build.add(build.main(axis=2), block(0.06, depth * 0.9, 0.06, x, 0, height - 0.1))
         build.add(build.main(axis=2), *[block(0.06, 0.06, height - 0.1, x, y) for y in both(depth * 0.45 - 0.03)])
     build.add(build.main(axis=0), block(width - 0.25, 0.04, 0.05, 0, 0, 0.14))
-    build.spot((-width / 2, width / 2), (-depth / 2, depth / 2), height, role="seat")
+    build.spot(both(width / 2), both(depth / 2), height, role="seat")
 
 
 def beanbag(build: Assembly) -> None:
@@ -156,8 +156,8 @@ def bed(build: Assembly) -> None:
     build.add(duvet, cover)
     fold = soft_block(width + 0.02, 0.18, 0.07, 0, length * 0.12 + 0.05, top + 0.04, 0.03)
     build.add(plain_cloth(sheet_rgb, build.rng), fold)
-    build.spot((-width / 2 + 0.06, width / 2 - 0.06), (length / 2 - 0.56, length / 2 - 0.1), top + 0.003, role="head")
-    build.spot((-width / 2 + 0.08, width / 2 - 0.08), (-length / 2 + 0.12, length * 0.02), top + 0.082, role="seat")
+    build.spot(both(width / 2 - 0.06), (length / 2 - 0.56, length / 2 - 0.1), top + 0.003, role="head")
+    build.spot(both(width / 2 - 0.08), (-length / 2 + 0.12, length * 0.02), top + 0.082, role="seat")
 
 
 def table(build: Assembly) -> None:
@@ -169,7 +169,7 @@ def table(build: Assembly) -> None:
     build.add(build.main(axis=2), *_legs(width, depth, height - 0.04, 0.07, 0.03))
     for sy in (-1, 1):
         build.add(build.main(axis=0), block(width - 0.22, 0.025, 0.08, 0, sy * (depth / 2 - 0.065), height - 0.12))
-    build.spot((-width / 2 + 0.03, width / 2 - 0.03), (-depth / 2 + 0.03, depth / 2 - 0.03), height)
+    build.spot(both(width / 2 - 0.03), both(depth / 2 - 0.03), height)
 
 
 def _round_table(build: Assembly) -> None:
@@ -179,7 +179,7 @@ def _round_table(build: Assembly) -> None:
     build.add(build.main(axis=2), cylinder(0.05, height - 0.07, z=0.035))
     build.add(build.main(), lathe([(0, 0), (0.3, 0), (0.3, 0.015), (0.06, 0.06), (0, 0.06)]))
     side = radius * 0.68
-    build.spot((-side, side), (-side, side), height)
+    build.spot(both(side), both(side), height)
 
 
 def coffee_table(build: Assembly) -> None:
@@ -187,7 +187,7 @@ def coffee_table(build: Assembly) -> None:
     build.add(build.main(axis=0), soft_block(width, depth, 0.045, 0, 0, height - 0.045, 0.012))
     build.add(build.main(axis=2), *_legs(width, depth, height - 0.045, 0.055, 0.04))
     build.add(build.main(axis=0), block(width - 0.16, depth - 0.16, 0.02, 0, 0, 0.12))
-    build.spot((-width / 2 + 0.03, width / 2 - 0.03), (-depth / 2 + 0.03, depth / 2 - 0.03), height)
+    build.spot(both(width / 2 - 0.03), both(depth / 2 - 0.03), height)
 
 
 def side_table(build: Assembly) -> None:
@@ -197,7 +197,7 @@ def side_table(build: Assembly) -> None:
         foot = tube([(radius * 0.95, 0, 0), (radius * 0.45, 0, height - 0.027)], 0.018).turned("z", 120 * i + 90)
         build.add(build.main(axis=2), foot)
     side = radius * 0.66
-    build.spot((-side, side), (-side, side), height)
+    build.spot(both(side), both(side), height)
 
 
 def desk(build: Assembly) -> None:
@@ -221,7 +221,7 @@ def desk(build: Assembly) -> None:
         *[block(0.05, 0.05, height - 0.036, -side * (width / 2 - 0.045), y) for y in both(depth / 2 - 0.045)],
     )
     build.add(build.main(axis=0), block(width - 0.55, 0.018, 0.3, -side * 0.2, depth / 2 - 0.06, height - 0.36))
-    build.spot((-width / 2 + 0.02, width / 2 - 0.02), (-depth / 2 + 0.02, depth / 2 - 0.02), height)
+    build.spot(both(width / 2 - 0.02), both(depth / 2 - 0.02), height)
 
 
 def _fronts(
@@ -249,7 +249,7 @@ def nightstand(build: Assembly) -> None:
     build.add(build.main(axis=2), *_legs(width, depth, 0.12, 0.045, 0.0))
     build.add(build.main(axis=0), soft_block(width + 0.03, depth + 0.03, 0.025, 0, 0, height, 0.008))
     _fronts(build, width, depth, 0.13, height - 0.01, 1, 2, True)
-    build.spot((-width / 2, width / 2), (-depth / 2, depth / 2), height + 0.025)
+    build.spot(both(width / 2), both(depth / 2), height + 0.025)
 
 
 def cabinet(build: Assembly) -> None:
@@ -260,7 +260,7 @@ def cabinet(build: Assembly) -> None:
     split = height * 0.68
     _fronts(build, width, depth, 0.09, split, 2, 1, True)
     _fronts(build, width, depth, split, height - 0.025, 2, 1, True)
-    build.spot((-width / 2, width / 2), (-depth / 2, depth / 2), height + 0.01)
+    build.spot(both(width / 2), both(depth / 2), height + 0.01)
 
 
 def base_cabinet(build: Assembly) -> None:
@@ -269,7 +269,7 @@ def base_cabinet(build: Assembly) -> None:
     build.add(paint(tone("black")), block(width - 0.01, depth - 0.07, 0.1, 0, 0.03, 0))
     _fronts(build, width, depth, 0.11, 0.66, 2, 1, False)
     _fronts(build, width, depth, 0.66, height - 0.005, 1, 1, True)
-    build.spot((-width / 2, width / 2), (-depth / 2, depth / 2), height, role="base")
+    build.spot(both(width / 2), both(depth / 2), height, role="base")
 
 
 def wall_cabinet(build: Assembly) -> None:
@@ -302,9 +302,7 @@ def shelf(build: Assembly) -> None:
         build.add(build.main(axis=0), block(width - 2 * thick, depth - 0.012, thick, 0, -0.006, z))
         clearance = step - thick - 0.015 if i < n - 1 else 0.5
         role = "board" if i < n - 1 else "top"
-        build.spot(
-            (-width / 2 + 0.045, width / 2 - 0.045), (-depth / 2 + 0.01, depth / 2 - 0.02), z + thick, clearance, role
-        )
+        build.spot(both(width / 2 - 0.045), (-depth / 2 + 0.01, depth / 2 - 0.02), z + thick, clearance, role)
 
 
 def wall_shelf(build: Assembly) -> None:
@@ -314,7 +312,7 @@ def wall_shelf(build: Assembly) -> None:
         x = sx * (width / 2 - 0.12)
         build.add(build.main(axis=1), block(0.024, depth - 0.02, 0.022, x, 0.005, 0.098))
         build.add(build.main(axis=2), block(0.024, 0.022, 0.12, x, depth / 2 - 0.011, 0.0))
-    build.spot((-width / 2 + 0.01, width / 2 - 0.01), (-depth / 2 + 0.005, depth / 2 - 0.01), 0.152, 0.45)
+    build.spot(both(width / 2 - 0.01), (-depth / 2 + 0.005, depth / 2 - 0.01), 0.152, 0.45)
 
 
 def tv_stand(build: Assembly) -> None:
@@ -334,10 +332,8 @@ def tv_stand(build: Assembly) -> None:
         build.add(build.main(axis=0), block(width / 3 - 0.04, 0.02, height - 0.145, x, -depth / 2 + 0.012, 0.1))
         build.add(chrome(build.rng), _knob(x, -depth / 2, height / 2 + 0.03))
     build.add(build.main(axis=2), *_legs(width, depth, 0.06, 0.05, 0.05))
-    build.spot((-width / 2 + 0.02, width / 2 - 0.02), (-depth / 2 + 0.01, depth / 2 - 0.01), height)
-    build.spot(
-        (-width / 6 + 0.03, width / 6 - 0.03), (-depth / 2 + 0.02, depth / 2 - 0.04), 0.095, height - 0.15, "board"
-    )
+    build.spot(both(width / 2 - 0.02), both(depth / 2 - 0.01), height)
+    build.spot(both(width / 6 - 0.03), (-depth / 2 + 0.02, depth / 2 - 0.04), 0.095, height - 0.15, "board")
 
 
 def plant_stand(build: Assembly) -> None:
@@ -349,4 +345,4 @@ def plant_stand(build: Assembly) -> None:
         build.add(frame, leg.turned("z", 120 * i + 30))
     build.add(frame, lathe([(0, 0), (radius * 0.78, 0), (radius * 0.78, 0.014), (0, 0.014)]).moved(z=height * 0.45))
     side = radius * 0.7
-    build.spot((-side, side), (-side, side), height, 1.0)
+    build.spot(both(side), both(side), height, 1.0)

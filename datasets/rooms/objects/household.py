@@ -73,7 +73,7 @@ def cardboard_box(build: Assembly) -> None:
         build.add(tape, block(width * 1.002, 0.055, 0.002, 0, 0, height + 0.001))
         build.add(tape, *[block(0.002, 0.055, 0.07, x, 0, height - 0.07) for x in both(width / 2 + 0.0015)])
         build.add(paper(tone("white")), block(0.11, 0.002, 0.075, width * 0.2, -depth / 2 - 0.0015, height * 0.4))
-        build.spot((-width / 2 + 0.02, width / 2 - 0.02), (-depth / 2 + 0.02, depth / 2 - 0.02), height + 0.002, 0.4)
+        build.spot(both(width / 2 - 0.02), both(depth / 2 - 0.02), height + 0.002, 0.4)
         return
     build.add(side, block(width, depth, 0.006))
     build.add(side, *[block(0.006, depth, height - 0.007, x, 0, 0.007) for x in both(width / 2 - 0.003)])
@@ -81,7 +81,7 @@ def cardboard_box(build: Assembly) -> None:
     for sx in (-1, 1):
         flap = block(0.13, depth * 0.96, 0.004, sx * 0.065, 0, 0).turned("y", sx * 28)
         build.add(side, flap.moved(sx * (width / 2 + 0.002), 0, height + 0.002))
-    build.spot((-width / 2 + 0.02, width / 2 - 0.02), (-depth / 2 + 0.02, depth / 2 - 0.02), 0.007, role="inside")
+    build.spot(both(width / 2 - 0.02), both(depth / 2 - 0.02), 0.007, role="inside")
 
 
 def basket(build: Assembly) -> None:
@@ -107,7 +107,7 @@ def basket(build: Assembly) -> None:
         arc = [(sx * (r + 0.004), 0.07 * float(np.cos(a)), h + 0.005 + 0.06 * float(np.sin(a))) for a in angle]
         build.add(rim, tube(arc, 0.011, 7))
     side = (r * 0.8 - 0.03) * 0.7071
-    build.spot((-side, side), (-side, side), 0.017, role="inside")
+    build.spot(both(side), both(side), 0.017, role="inside")
 
 
 def bin_(build: Assembly) -> None:
