@@ -47,6 +47,7 @@ class FrameFiles:
     pose: str
 
 
+@dataclass(frozen=True, eq=False)
 class ExportedFrames:
     """An export as an ``RgbdSource``; each file is read when it is asked for.
 
@@ -54,24 +55,18 @@ class ExportedFrames:
     image of another size why it should have that of ``camera``.
     """
 
-    def __init__(
-        self,
-        folder: Path,
-        where: str,
-        camera: SensorPair,
-        frames: Sequence[FrameFiles],
-        camera_files: Sequence[str],
-        size_reason: str,
-    ) -> None:
-        self.where, self.camera = where, camera
-        self._folder, self._frames, self._camera_files = folder, frames, camera_files
-        self._size_reason = size_reason
+    folder: Path
+    where: str
+    camera: SensorPair
+    frames: Sequence[FrameFiles]
+    camera_files: Sequence[str]
+    size_reason: str
 
     def __len__(self) -> int:
-        return len(self._frames)
+        return len(self.frames)
 
     def pose(self, i: int) -> Float64Array:
-        return read_matrix(self._folder, self._frames[i].pose, self.where)
+        return read_matrix(self.folder, self.frames[i].pose, self.where)
 
     def poses(self) -> Float64Array:
         return self._poses.copy()
@@ -84,23 +79,23 @@ class ExportedFrames:
         return self.frame_number(i) / FRAMES_PER_SECOND
 
     def colour(self, i: int) -> UInt8Array:
-        where, content = self._read(self._frames[i].colour)
-        return sized(decode_colour, content, self.camera.colour_size, where, self._size_reason)
+        where, content = self._read(self.frames[i].colour)
+        return sized(decode_colour, content, self.camera.colour_size, where, self.size_reason)
 
     def depth(self, i: int) -> UInt16Array:
-        where, content = self._read(self._frames[i].depth)
-        return sized(decode_depth, content, self.camera.depth_size, where, self._size_reason)
+        where, content = self._read(self.frames[i].depth)
+        return sized(decode_depth, content, self.camera.depth_size, where, self.size_reason)
 
     def frame_number(self, i: int) -> int:
-        return self._frames[i].number
+        return self.frames[i].number
 
     def files(self) -> Sequence[Path]:
-        images = (name for frame in self._frames for name in (frame.colour, frame.depth, frame.pose))
-        return [self._folder / name for name in (*self._camera_files, *images)]
+        images = (name for frame in self.frames for name in (frame.colour, frame.depth, frame.pose))
+        return [self.folder / name for name in (*self.camera_files, *images)]
 
     def _read(self, name: str) -> tuple[str, bytes]:
         where = f"{self.where}: {name}"
-        return where, read_bytes(self._folder / name, where, EXPORT_AGAIN)
+        return where, read_bytes(self.folder / name, where, EXPORT_AGAIN)
 
 
 def read_matrix(folder: Path, name: str, where: str, sides: Sequence[int] = (4,)) -> Float64Array:
