@@ -11,9 +11,11 @@ from pathlib import Path
 from su3d_bench.analysis.sides import Side, refuse_unlike, rules_of
 from su3d_bench.core.errors import ConfigError, Su3dError, printable, reading, suggest
 from su3d_bench.core.registry import CEILING_METHOD
+from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.scoring import ProtocolResult, combine
 from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.model import BY_PEOPLE, Measured, Origin, is_count
+from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.sheets.scores import FILE as SCORES_FILE
 from su3d_bench.sheets.scores import ScoreCell, Scores, read_scores
@@ -122,6 +124,31 @@ def _measured(run: str, limit: int, record: ResultRecord, nothing: Mapping[str, 
         encoder=record.encoder,
         caveat=record.caveat,
     )
+
+
+def anytime_points(runs: Sequence[FinishedRun], times: Sequence[UpdateTimes]) -> list[AnytimePoint]:
+    """The maps midway and the last one of a method in one of ``runs``, where that scored some midway."""
+    run = next(run for run in runs if run.name == times[0].run)
+    method = times[0].method
+    points = []
+    for (name, protocol), record in run.results.items():
+        if name != method or not record.anytime or record.result is None:
+            continue
+        midway = sorted(record.anytime, key=lambda point: point.share)
+        maps = [*((point.share, point.metrics) for point in midway), (1.0, record.result.metrics)]
+        if any(len(of_scene.maps) != len(maps) for of_scene in times):
+            continue  # the record of a scene's maps is damaged
+        for index, (share, metrics) in enumerate(maps):
+            seconds = sum(_seconds_until(of_scene, index) for of_scene in times)
+            headline = {metric: metrics.get(metric) for metric in record.headline}
+            points.append(AnytimePoint(run.name, method, protocol, share, seconds, headline))
+    return points
+
+
+def _seconds_until(times: UpdateTimes, index: int) -> float:
+    """Seconds of the updates before map ``index`` and of its own making."""
+    made = times.maps[index]
+    return float(times.ms("total")[: made.n_updates].sum() + made.finish_ms) / 1e3
 
 
 def choose(

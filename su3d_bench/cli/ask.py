@@ -17,7 +17,6 @@ from su3d_bench.cli.common import (
     file_name_of,
     remark,
 )
-from su3d_bench.cli.query import asked_map
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError
 
 if TYPE_CHECKING:
@@ -69,12 +68,13 @@ def add_parser(verbs: Any) -> None:
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.core.types import Instances
     from su3d_bench.questions.reasoning.scene_map import map_of
+    from su3d_bench.runs.finished import map_of_scene
 
     if not arguments.question.strip():
         raise ConfigError(
             'the question is empty; ask such as: su3d-bench ask rooms/living0 "How many lamps are there?"'
         )
-    run, job, instances = asked_map(arguments)
+    run, job, instances = map_of_scene(arguments.scene, arguments.method, arguments.run)
     if not isinstance(instances, Instances):
         raise PredictionError(f"{job.prediction}: holds no instances, so there is nothing to ask about")
     refined, note = _refined(job, arguments.names)

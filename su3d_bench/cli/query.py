@@ -3,17 +3,15 @@
 from __future__ import annotations
 
 import argparse
-from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.common import add_verb, add_whose_map, answer, answer_json, file_name_of, remark
-from su3d_bench.core.errors import ConfigError, PredictionError, StoreError, suggest
+from su3d_bench.core.errors import ConfigError, PredictionError
 
 if TYPE_CHECKING:
-    from su3d_bench.core.types import Instances, Prediction
+    from su3d_bench.core.types import Instances
     from su3d_bench.questions.retrieval import Ranking
-    from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 
 def add_parser(verbs: Any) -> None:
@@ -39,11 +37,11 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.core.types import DenseFeatures, Instances
     from su3d_bench.questions.retrieval import rank
     from su3d_bench.reports.pictures.maps import draw_heat_map
-    from su3d_bench.runs.finished import encoder_of
+    from su3d_bench.runs.finished import encoder_of, map_of_scene
 
     if arguments.top < 1:
         raise ConfigError(f"--top {arguments.top}: at least 1 instance must be listed")
-    run, job, prediction = asked_map(arguments)
+    run, job, prediction = map_of_scene(arguments.scene, arguments.method, arguments.run)
     if not isinstance(prediction, Instances):
         what = "one feature a point and no instances" if isinstance(prediction, DenseFeatures) else "no instances"
         raise PredictionError(f"{job.prediction}: has {what}, so there is nothing to rank; choose another --method")
@@ -77,43 +75,3 @@ def _rows(instances: Instances, ranking: Ranking, top: int) -> list[dict[str, An
             }
         )
     return rows
-
-
-def asked_map(arguments: argparse.Namespace) -> tuple[RunFolder, JobFolder, Prediction]:
-    """The map that ``add_whose_map`` and the scene name, with its place and its run."""
-    from su3d_bench.store.predictions import read_prediction
-    from su3d_bench.store.run_folder import RunFolder
-
-    run = RunFolder(arguments.run) if arguments.run is not None else latest_run(arguments.scene, arguments.method)
-    job = run.job(arguments.scene, arguments.method)
-    if not job.prediction.is_file():
-        raise no_map(run, arguments.scene, arguments.method)
-    return run, job, read_prediction(job.prediction)
-
-
-def latest_run(scene: str, method: str) -> RunFolder:
-    """The run folder below ``runs/`` whose map of the scene is the youngest."""
-    from su3d_bench.store.run_folder import RunFolder
-
-    runs = [RunFolder(path) for path in Path("runs").glob("*") if path.is_dir()]
-    made = [(run.job(scene, method).prediction, run) for run in runs if run.job(scene, method).prediction.is_file()]
-    if not made:
-        raise StoreError(
-            f"no run in runs/ holds {scene} by {method}; run: su3d-bench run --scenes {scene} --methods {method}"
-        )
-    return max(made, key=lambda pair: pair[0].stat().st_mtime)[1]
-
-
-def no_map(run: RunFolder, scene: str, method: str) -> StoreError:
-    """The error of a run without such a map: the names that it has instead, else the command that would make it."""
-    from su3d_bench.store.records import RequestRecord, read_record
-
-    record = RequestRecord()
-    with suppress(StoreError):
-        record = read_record(RequestRecord, run.path / "run.json", str(run.path))
-    scenes, methods = record.scenes, record.methods
-    hint = suggest(scene, scenes) if scene not in scenes else ""
-    if scene in scenes and method not in methods:
-        hint = suggest(method, methods) or f"; it has {', '.join(methods)}"
-    hint = hint or f"; run: su3d-bench run --scenes {scene} --methods {method} --out {run.path}"
-    return StoreError(f"{run.path}: holds no map of {scene} by {method}{hint}")

@@ -1,4 +1,5 @@
-"""The TOML files of protocols: which there are, what one holds with what it extends, and where a key stands."""
+"""The TOML files of protocols: which there are, what one holds with what it extends, where a key stands, and what
+comments say of a rule: its source, or that it is ours."""
 
 from __future__ import annotations
 
@@ -13,6 +14,11 @@ from su3d_bench.core.errors import ConfigError, suggest
 
 RULES = Path(__file__).parent / "rules"
 _TABLE_PREFIX = "classes."  # rules/classes.<name>.toml holds a class table, not a protocol
+HEADING = ""  # stands for the comments above the first rule of a file
+_KEY = re.compile(r"(\w+)\s*=")
+_SECTION = re.compile(r"\[(\w+)\]")
+_COMMENT = re.compile(r"""(?:[^"'#]|"[^"]*"|'[^']*')*#\s*(.*)""")
+_ABSENT = re.compile(r"no (\w+)")
 
 
 def protocol_names() -> list[str]:
@@ -106,3 +112,42 @@ def line_of(files: Sequence[Path], key: str) -> str:
             if re.match(rf"\s*{re.escape(key)}\s*=", line):
                 return f"{path}:{number}"
     return str(files[0])
+
+
+def remarks_of(files: Sequence[Path]) -> dict[str, list[str]]:
+    """The comments of a protocol's file and of those that it extends; one that sets a rule alone speaks of it."""
+    each = [read_remarks(file) for file in files]
+    remarks = {key: lines for own in reversed(each) for key, lines in own.items()}
+    remarks[HEADING] = list(each[0].get(HEADING, []))
+    for file, own in zip(files[1:], each[1:], strict=True):
+        remarks[HEADING] += [f"extends {file.stem}:", *own.get(HEADING, [])]
+    return remarks
+
+
+def read_remarks(file: Path) -> dict[str, list[str]]:
+    """The comments of a protocol's file by the rule that they stand at or above, the first ones as its heading.
+
+    A comment ``no cap_m ...`` speaks of the rule that it names; comments with no rule after them belong to their
+    section.
+    """
+    from su3d_bench.metrics.protocols import ProtocolRules, TransferRules
+
+    remarks: dict[str, list[str]] = {}
+    section, waiting, has_key = "", list[str](), False
+    for line in file.read_text(encoding="utf-8").splitlines():
+        match = _COMMENT.match(line)
+        comment = [match[1]] if match is not None else []
+        key, header = _KEY.match(line), _SECTION.match(line)
+        if key or header:
+            name = section + key[1] if key else header[1] if header else ""
+            remarks.setdefault(name if has_key else HEADING, []).extend(waiting)
+            remarks.setdefault(name, []).extend(comment)
+            waiting, has_key = [], True
+            section = f"{header[1]}." if header else section
+        elif comment:
+            absent = _ABSENT.match(comment[0])
+            fields = TransferRules.model_fields if section else ProtocolRules.model_fields
+            names_one = absent is not None and absent[1] in fields
+            (remarks.setdefault(section + absent[1], []) if absent and names_one else waiting).extend(comment)
+    remarks.setdefault(section.rstrip(".") or HEADING, []).extend(waiting)
+    return remarks

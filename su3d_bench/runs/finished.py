@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,11 +14,13 @@ from pydantic import ValidationError
 from su3d_bench.core.config import KeyPath, Settings, read_file, resolve
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, StoreError, printable, suggest
 from su3d_bench.core.registry import CEILING_METHOD
+from su3d_bench.core.types import Prediction
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.scoring import SceneScore, unpack_scores
 from su3d_bench.runs.job import build_dataset, part_of
 from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets
 from su3d_bench.store.atomic import is_file
+from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import (
     CostsRecord,
     MetricsRecord,
@@ -187,6 +190,39 @@ def read_run(path: Path) -> FinishedRun:
         limit=metrics.limit,
         data=RunData(read_file(path / "run.toml"), record.data_digests),
     )
+
+
+def map_of_scene(scene: str, method: str, run: Path | None) -> tuple[RunFolder, JobFolder, Prediction]:
+    """The map of ``scene`` by ``method`` in ``run``, or in the latest of ``runs/`` that has it, with its place."""
+    folder = latest_run(scene, method) if run is None else RunFolder(run)
+    job = folder.job(scene, method)
+    if not job.prediction.is_file():
+        raise _no_map(folder, scene, method)
+    return folder, job, read_prediction(job.prediction)
+
+
+def latest_run(scene: str, method: str) -> RunFolder:
+    """The run folder below ``runs/`` whose map of the scene is the youngest."""
+    runs = [RunFolder(path) for path in Path("runs").glob("*") if path.is_dir()]
+    made = [(run.job(scene, method).prediction, run) for run in runs if run.job(scene, method).prediction.is_file()]
+    if not made:
+        raise StoreError(
+            f"no run in runs/ holds {scene} by {method}; run: su3d-bench run --scenes {scene} --methods {method}"
+        )
+    return max(made, key=lambda pair: pair[0].stat().st_mtime)[1]
+
+
+def _no_map(run: RunFolder, scene: str, method: str) -> StoreError:
+    """The error of a run without such a map: the names that it has instead, else the command that would make it."""
+    record = RequestRecord()
+    with suppress(StoreError):
+        record = read_record(RequestRecord, run.path / "run.json", str(run.path))
+    scenes, methods = record.scenes, record.methods
+    hint = suggest(scene, scenes) if scene not in scenes else ""
+    if scene in scenes and method not in methods:
+        hint = suggest(method, methods) or f"; it has {', '.join(methods)}"
+    hint = hint or f"; run: su3d-bench run --scenes {scene} --methods {method} --out {run.path}"
+    return StoreError(f"{run.path}: holds no map of {scene} by {method}{hint}")
 
 
 def data_of_map(run: Path, scene: str, map_file: Path) -> RunData:

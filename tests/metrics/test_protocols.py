@@ -9,11 +9,10 @@ import pytest
 from places import CASES
 
 from su3d_bench.cli.main import main
-from su3d_bench.cli.protocols import read_remarks
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.datasets.rooms.classes import CLASSES
 from su3d_bench.metrics.instance.average_precision import MIN_REGION_SIZE, THRESHOLDS
-from su3d_bench.metrics.protocol_files import RULES, protocol_names
+from su3d_bench.metrics.protocol_files import RULES, protocol_names, read_remarks
 from su3d_bench.metrics.protocols import load_protocol, not_comparable_with, protocols_for
 
 NAMES = {

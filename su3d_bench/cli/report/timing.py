@@ -10,7 +10,6 @@ from su3d_bench.cli.common import add_table_format, add_verb, answer_either, for
 
 if TYPE_CHECKING:
     from su3d_bench.metrics.costs import UpdateTimes
-    from su3d_bench.runs.finished import FinishedRun
 
 NAME = "timing"
 
@@ -40,6 +39,7 @@ def add_parser(actions: Any) -> None:
 def call(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
+    from su3d_bench.analysis.tables import anytime_points
     from su3d_bench.core.errors import ConfigError
     from su3d_bench.metrics.costs import summarise
     from su3d_bench.reports.tables.formats import markdown
@@ -54,7 +54,7 @@ def call(arguments: argparse.Namespace) -> int:
     if not times:
         raise ConfigError("no update was timed in these runs: their methods look at no frame")
     summaries = [summarise(each, arguments.warm_up) for each in times]
-    anytime = [point for each in times for point in _anytime(next(r for r in runs if r.name == each[0].run), each)]
+    anytime = [point for each in times for point in anytime_points(runs, each)]
     hardware = {run.name: run.record.hardware for run in runs}
     tables = timing_tables(summaries, anytime, hardware, arguments.camera_rate)
     value = {"hardware": hardware, "methods": [asdict(summary) for summary in summaries]}
@@ -67,32 +67,6 @@ def call(arguments: argparse.Namespace) -> int:
         }
         _write(arguments, files, times, anytime)
     return 0
-
-
-def _anytime(run: FinishedRun, times: list[UpdateTimes]) -> list[Any]:
-    """The maps midway and the last one, where the run scored some midway."""
-    from su3d_bench.reports.tables.timing import AnytimePoint
-
-    method = times[0].method
-    points = []
-    for (name, protocol), record in run.results.items():
-        if name != method or not record.anytime or record.result is None:
-            continue
-        midway = sorted(record.anytime, key=lambda point: point.share)
-        maps = [*((point.share, point.metrics) for point in midway), (1.0, record.result.metrics)]
-        if any(len(of_scene.maps) != len(maps) for of_scene in times):
-            continue  # the record of a scene's maps is damaged
-        for index, (share, metrics) in enumerate(maps):
-            seconds = sum(_seconds_until(of_scene, index) for of_scene in times)
-            headline = {metric: metrics.get(metric) for metric in record.headline}
-            points.append(AnytimePoint(run.name, method, protocol, share, seconds, headline))
-    return points
-
-
-def _seconds_until(times: UpdateTimes, index: int) -> float:
-    """Seconds of the updates before map ``index`` and of its own making."""
-    made = times.maps[index]
-    return float(times.ms("total")[: made.n_updates].sum() + made.finish_ms) / 1e3
 
 
 def _write(
