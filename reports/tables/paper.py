@@ -169,7 +169,7 @@ def cells_of(row: Measured, shown: Shown, best: set[str]) -> list[Cell]:
     cells = []
     for name in shown.metrics:
         interval = row.intervals.get(name) if shown.intervals else None
-        value = row.metrics[name]
+        value = row.metrics.get(name)
         beside = bracketed(interval, partial(shown_as, name))
         origin = None if value is None else _origin(row, name, value, interval=interval)
         cells.append(Cell(shown_as(name, value), beside, name in best, origin))
@@ -206,11 +206,11 @@ def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int
     marked: dict[str, set[int]] = {}
     tests: list[SignFlipTest | None] = []
     for name in shown.metrics:
-        values = np.array([np.nan if row.metrics[name] is None else row.metrics[name] for row in rows], np.float64)
+        values = np.array([np.nan if row.metrics.get(name) is None else row.metrics[name] for row in rows], np.float64)
         order = sorted(competing, key=lambda k: -np.nan_to_num(values[k], nan=-1.0))
         if np.isnan(values[order[0]]):
             continue
-        best = {k for k in competing if percent(rows[k].metrics[name]) == percent(float(values[order[0]]))}
+        best = {k for k in competing if percent(rows[k].metrics.get(name)) == percent(float(values[order[0]]))}
         if shown.only_significant:
             test = sign_flip_test(_of_scenes(rows[order[0]], name) - _of_scenes(rows[order[1]], name))
             tests.append(test)

@@ -144,6 +144,13 @@ def test_a_metric_may_be_chosen_and_an_undefined_one_is_a_dash() -> None:
         protocol_table([measured()], Shown(metrics=("mAc",)), [])
 
 
+def test_a_metric_that_one_row_alone_has_is_a_dash_in_the_others() -> None:
+    """People judge label n' of the methods that have one."""
+    without = measured("oracle", 0.3, metrics={"mAcc": 0.3})
+    (table,) = selection_tables([measured(), without], Shown(), with_published=False)
+    assert [cell.text for cell in table.rows[1].cells][:2] == ["30.0", "-"]
+
+
 def test_the_papers_protocol_is_taken_where_it_is_there_and_others_say_that_they_are_not_it() -> None:
     own = measured(protocol="rooms-semantic")
     (table,) = paper_table("II", [own, measured()], Shown(), with_published=False)
