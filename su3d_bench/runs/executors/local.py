@@ -124,10 +124,13 @@ def _start(work: Work[Unit, Outcome], unit: Unit) -> tuple[Connection, BaseProce
     ours, theirs = context.Pipe(duplex=False)
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     limit_threads()
+    # A worker that still imports would answer an interrupt with a traceback; it inherits that none reaches it yet.
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
     try:
         process = context.Process(target=_worker, args=(work, unit, theirs), daemon=True)
         process.start()
     finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         for name, value in before.items():
             if value is None:
                 del os.environ[name]
@@ -177,6 +180,7 @@ def _cause(exit_code: int | None) -> str:
 
 def _worker(work: Work[Unit, Outcome], unit: Unit, connection: Connection) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interrupt means
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     threading.Thread(target=_die_with_parent, daemon=True).start()
     connection.send(answer_of(work, unit, lambda event: connection.send(("event", event))))
     connection.close()
