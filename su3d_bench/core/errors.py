@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-# Of a damaged file, an .npz above all; a compression that there is none of is a NotImplementedError, a RuntimeError.
+# What readers raise on a damaged file, an .npz above all; RuntimeError is zipfile's, of a compression unknown to it.
 DAMAGE = (
     OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, RuntimeError,
     SyntaxError, tokenize.TokenError, zipfile.BadZipFile, zlib.error, struct.error,

@@ -25,8 +25,8 @@ MOST_MEMBER = 4 << 30  # bytes; masks of a scene are some hundred MiB
 MOST_RATIO = 1032  # deflate cannot do better
 NEEDED_BY_DEFLATE = 64
 ENCRYPTED = 0x1
-# What zipfile raises on damaged archives; an unusual compression is a NotImplementedError, which is a RuntimeError.
-DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError, struct.error)
+# What zipfile raises on a damaged archive; RuntimeError is its answer to a compression that it does not know.
+ZIP_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError, struct.error)
 
 
 @contextmanager
@@ -37,7 +37,7 @@ def opened_zip(path: Path) -> Iterator[zipfile.ZipFile]:
             yield archive
     except OSError as error:
         raise PredictionError(f"{shown(path)}: cannot be read: {error.strerror or 'wrong offsets'}") from error
-    except DAMAGE as error:
+    except ZIP_DAMAGE as error:
         raise PredictionError(f"{shown(path)}: not a whole zip archive; copy the file again") from error
 
 

@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from su3d_bench.core.errors import DataError, ModelMissing, printable, reading, suggest
-from su3d_bench.formats.numpy_files import DAMAGE
+from su3d_bench.formats.numpy_files import ZIP_DAMAGE
 from su3d_bench.questions.model import KINDS
 from su3d_bench.reports.tables.formats import FORMULA_STARTS
 from su3d_bench.sheets.items import ANSWER_COLUMNS, ASKS, Key, KeyItem, Sheet, SheetItem
@@ -127,7 +127,7 @@ def _check_archive(content: bytes, where: str) -> None:
                     raise DataError(f"{where}: defines entities, which no workbook needs; save it as .xlsx again")
     except DataError:
         raise
-    except (*DAMAGE, OSError, OverflowError, LookupError, lzma.LZMAError) as error:
+    except (*ZIP_DAMAGE, OSError, OverflowError, LookupError, lzma.LZMAError) as error:
         raise DataError(f"{where}: is no whole .xlsx file; copy it again") from error
 
 
