@@ -1,4 +1,4 @@
-"""The vocabulary of the rooms, from ``classes.toml``: classes with Replica's ids, colours, materials, uses."""
+"""The vocabulary of the rooms, from ``classes.toml``: classes with Replica's ids, colours, materials."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ from typing import Any
 
 @dataclass(frozen=True)
 class RoomClass:
-    """One class: ``id`` and ``name`` as in Replica's info_semantic.json; what it may be made of; what it is for.
+    """One class: ``id`` and ``name`` as in Replica's info_semantic.json; what it may be made of.
 
-    ``models``: the usual volume in litres of each sort of it that can be built.
+    ``models``: the usual volume in litres of each sort of it that can be built; ``called``: what people call a sort
+    that is not called as its class is.
     """
 
     id: int
     name: str
     materials: tuple[str, ...]
     colours: tuple[str, ...]
-    affordances: tuple[str, ...]
     models: Mapping[str, float]
+    called: Mapping[str, str]
 
 
 _TABLE: Mapping[str, Any] = tomllib.loads(Path(__file__).with_name("classes.toml").read_text(encoding="utf-8"))
@@ -33,11 +34,15 @@ MATERIALS: tuple[str, ...] = tuple(_TABLE["materials"])
 def _room_class(name: str, row: Mapping[str, Any]) -> RoomClass:
     colours = tuple(colour for word in row["colours"] for colour in _TABLE["palettes"].get(word, [word]))
     return RoomClass(
-        row["id"], name, tuple(row["made_of"]), colours, tuple(row.get("used_as", ())), row.get("models", {})
+        row["id"],
+        name,
+        tuple(row["made_of"]),
+        colours,
+        row.get("models", {}),
+        row.get("called", {}),
     )
 
 
 CLASSES = tuple(_room_class(name, row) for name, row in _TABLE["classes"].items())
 CLASS_BY_NAME: Mapping[str, RoomClass] = {known.name: known for known in CLASSES}
 CLASS_ID: Mapping[str, int] = {known.name: known.id for known in CLASSES}
-AFFORDANCES: Mapping[str, tuple[str, ...]] = {known.name: known.affordances for known in CLASSES}

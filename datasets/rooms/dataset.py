@@ -25,6 +25,7 @@ from su3d_bench.core.types import (
     LabelSet,
     SceneInfo,
     Surface,
+    WholeObject,
 )
 from su3d_bench.datasets.rooms.rendering.render import LEVELS, add_noise
 
@@ -33,7 +34,7 @@ if TYPE_CHECKING:  # what makes a room is imported where one is made: a list of 
     from su3d_bench.datasets.rooms.rendering.mesh import Patches, RoomMesh
     from su3d_bench.datasets.rooms.rendering.render import RenderedFrame, Renderer
     from su3d_bench.datasets.rooms.scan import RoomScan
-    from su3d_bench.datasets.rooms.truth import Query, RoomObject, RoomTruth
+    from su3d_bench.datasets.rooms.truth import RoomObject, RoomTruth
 
 SOURCES = ("datasets/rooms", "numerics")  # what moves a room: what is kept of one is keyed by it
 GENERATOR_VERSION = 3  # raise it whenever a scene of the same name comes out different
@@ -194,11 +195,9 @@ class Rooms:
     def objects(self, scene: str) -> tuple[RoomObject, ...]:
         return self._room(scene).truth.objects
 
-    def queries(self, scene: str) -> tuple[Query, ...]:
-        """Texts of four kinds with all right answers, on what the walk sees."""
-        from su3d_bench.datasets.rooms.truth import queries
-
-        return queries(self.truth(scene), self.visible_vertices(scene))
+    def whole_objects(self, scene: str) -> tuple[WholeObject, ...]:
+        """Every object whole, seen or not."""
+        return tuple(known.whole() for known in self.objects(scene))
 
     def trajectory(self, scene: str) -> Float64Array:
         """Camera-to-world poses (n_frames, 4, 4), OpenCV axes, z up, metres."""

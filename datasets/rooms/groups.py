@@ -100,7 +100,7 @@ def stood_up(item: Item) -> Item:
     low = min(float(part.shape.quads[..., 2].min()) for part in parts)
     lifted = tuple(Part(part.shape.moved(z=-low), part.material) for part in parts)
     size = np.array([item.size[2], item.size[1], item.size[0]])
-    return Item(item.class_name, item.colour, item.material, item.size_word, lifted, (), size)
+    return Item(item.class_name, item.colour, item.material, item.size_word, lifted, (), size, item.model)
 
 
 def plant_on_stand(plan: Plan) -> None:

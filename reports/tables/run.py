@@ -8,6 +8,9 @@ from typing import Any
 from su3d_bench.reports.tables.formats import markdown
 from su3d_bench.reports.tables.model import NOT_MEASURED, Prose, Table, percent, some, text_table, with_interval
 
+# What stands below the methods: the prefix of a metric's name, and what the row is called.
+CHEAP = {"chance": "by chance", "names-alone": "by names alone"}
+
 
 def markdown_table(metrics: Mapping[str, Any]) -> str:
     """The tables of a run as Markdown that reads well as plain text too."""
@@ -46,8 +49,20 @@ def _protocol_table(rows: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any
         title += f": PARTIAL, only the first {metrics['limit']} frames of each scene"
     header = ["method", *names, f"ceiling ({' / '.join(names)})", "scenes", "covered at 2.5 / 5 / 10 cm"]
     body = [[row["method"], *(_value_text(row, name) for name in names), *_context(row, names)] for row in rows]
+    body += _cheap_rows(rows, names, len(header))
     notes = [line for row in rows for line in _notes(row)]
     return text_table(str(first["protocol"]), [header, *body], heading=title, notes=notes)
+
+
+def _cheap_rows(rows: Sequence[Mapping[str, Any]], names: Sequence[str], n_columns: int) -> list[list[str]]:
+    """What a guess scores, and who knows names alone, and the number of questions; nothing where nobody guesses."""
+    results = [row["result"] for row in rows if row["result"] is not None]
+    metrics: Mapping[str, Any] = results[0]["metrics"] if results else {}
+    if not any(f"chance_{name}" in metrics for name in names):
+        return []
+    shares = [[label, *(percent(metrics.get(f"{prefix}_{name}")) for name in names)] for prefix, label in CHEAP.items()]
+    counts = ["questions", *(str(metrics.get(f"n_{name}", NOT_MEASURED)) for name in names)]
+    return [[*row, *[NOT_MEASURED] * (n_columns - len(row))] for row in (*shares, counts)]
 
 
 def _context(row: Mapping[str, Any], names: Sequence[str]) -> list[str]:

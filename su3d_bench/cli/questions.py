@@ -42,7 +42,6 @@ def add_parser(verbs: Any) -> None:
         metavar="auto|generated",
         help="auto: what the dataset itself knows, else generated from classes and boxes",
     )
-    parser.add_argument("--colours", action="store_true", help="look up colours of objects in the scene's frames")
     parser.add_argument("--out", type=Path, metavar="FILE", help="make: where to write, .toml or .csv")
 
 
@@ -84,7 +83,6 @@ def _made(arguments: argparse.Namespace) -> list[Question]:
             scene,
             per_kind=arguments.per_kind,
             own=arguments.source == "auto",
-            colours=arguments.colours,
         )
         remark(f"{dataset.name}/{scene}: {len(questions)} questions", quiet=arguments.quiet)
         made += questions

@@ -26,6 +26,7 @@ from su3d_bench.core.types import (
     SceneInfo,
     Surface,
     UInt8Array,
+    WholeObject,
 )
 
 
@@ -127,6 +128,13 @@ class HasSurface(Protocol):
     """The scan's mesh without labels."""
 
     def surface(self, scene: str) -> Surface: ...
+
+
+@runtime_checkable
+class KnowsObjects(Protocol):
+    """The objects of a scene as they are, of which the ground truth may hold what a recording saw alone."""
+
+    def whole_objects(self, scene: str) -> Sequence[WholeObject]: ...
 
 
 @runtime_checkable
@@ -327,6 +335,7 @@ ABILITIES = {
         HasProblems,
         HasSurface,
         HasQueries,
+        KnowsObjects,
         RendersFrames,
         ReadsMadeRooms,
         NamesScenes,

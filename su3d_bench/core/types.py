@@ -89,6 +89,21 @@ class LabelSet:
 
 
 @dataclass(frozen=True)
+class WholeObject:
+    """An object of a scene as it is, whether or not a recording saw all of it.
+
+    ``id``: its instance in the ground truth; ``name`` as people say it; ``box`` (2, 3), lowest and highest corner in
+    metres; ``adjectives``: what any picture of it shows; ``colour``: what it was made in, empty where nobody knows.
+    """
+
+    id: int
+    name: str
+    box: Float64Array
+    adjectives: tuple[str, ...] = ()
+    colour: str = ""
+
+
+@dataclass(frozen=True)
 class GroundTruth:
     """Labelled points of a scene in one ``variant`` (mesh-vertices, face-corners, ...).
 

@@ -341,7 +341,7 @@ class RetrievalRules(_JudgedRules):
     """The first mask of each text."""
 
     values_of_metric: ClassVar[ValuesOfMetric] = {
-        "retrieval": ("instance", "affordance", "property", "relative", "all", "reachable")
+        "retrieval": ("instance", "affordance", "property", "relative", "all", "by name", "reachable")
     }
     text_metrics = ("retrieval",)
     needs = ("questions", "min_region_size")

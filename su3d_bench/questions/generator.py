@@ -1,79 +1,111 @@
 """Questions with known answers, made from any ground truth that has classes: names, uses, sizes, colours, relations.
 
-All objects that answer are carried; what more than a third of a scene's objects answer is dropped, as the built-in
-rooms have it. What is true but not known here (a class without an entry in the table of uses) is not counted right.
+All objects that answer are carried. What more than a third of a scene's objects answer is dropped, and so is what an
+object answers that no frame shows plainly, or that a little other threshold would decide otherwise. Properties and
+relations are asked where another object of the same name is not an answer; where the name alone gives the answer they
+are of a kind of their own.
 """
 
 from __future__ import annotations
 
 import hashlib
+import tomllib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.perception.embedded.lexicon import AFFORDANCES, SYNONYMS
-from su3d_bench.perception.embedded.naming import with_article
-from su3d_bench.questions.known_objects import plain_name
-from su3d_bench.questions.model import KINDS, Question, new_question
+from su3d_bench.numerics.relations import RELATIONS
+from su3d_bench.questions.english import with_article, words
+from su3d_bench.questions.model import BY_NAME, KINDS, MADE_KINDS, Question, new_question
 from su3d_bench.questions.reasoning.named_objects import meant_by
-from su3d_bench.questions.reasoning.relations import (
-    PairRelation,
-    RelationFound,
-    holds,
-    is_between,
-    is_container,
-    is_next_to,
-    relations_of,
-)
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.questions.sight import COLOURS
 
 SOURCE = "generated"
-MAX_ANSWER_SHARE = 1 / 3  # as the built-in rooms have it
-MOST_SYNONYMS = 2  # of a class, so that common classes do not fill the set
-LARGE = 1.5  # ours: volume of the box, as a multiple of the median of its name, from which a thing is called large
+MAX_ANSWER_SHARE = 1 / 3  # ours: what more objects answer asks for nothing
+TWICE = 2.0  # ours: volume, as a multiple of the others', from which anybody calls a thing large
+FLAT_SHARE = 0.2  # ours: a thing is flat whose least side is so much of the next; nobody speaks of its volume
 BETWEEN_M = 2.0  # ours: nobody looks farther for what something is between
-FLAT_M = 0.1  # ours: a rug is under the table that stands on it, a cabinet is not under its vase
-_RESTING: tuple[PairRelation, ...] = ("on", "in")
+
+
+@dataclass(frozen=True)
+class _Asked:
+    """A text of a kind with some of its answers; ``name``: what its subject is called, empty where it asks for that."""
+
+    kind: str
+    text: str
+    answers: tuple[int, ...]
+    name: str = ""
 
 
 def generate(scene: str, objects: SceneMap, per_kind: int | None = None) -> tuple[Question, ...]:
-    """The questions of all four kinds, ``per_kind`` of each at most, drawn by a digest of the text: always the same."""
-    right: dict[tuple[str, str], set[int]] = {}
-    for kind, text, answers in _texts(objects):
-        right.setdefault((kind, text), set()).update(answers)
+    """The questions of all kinds, ``per_kind`` of each at most, drawn by a digest of the text: always the same."""
+    right: dict[tuple[str, str, str], set[int]] = {}
+    doubtful: set[str] = set()
+    for asked in _texts(objects):
+        if asked.answers:
+            right.setdefault((asked.kind, asked.text, asked.name), set()).update(asked.answers)
+        else:
+            doubtful.add(asked.text)
     limit = max(1, int(len(objects) * MAX_ANSWER_SHARE))
-    kept = [
-        new_question(scene, kind, text, tuple(ids), SOURCE) for (kind, text), ids in right.items() if len(ids) <= limit
-    ]
-    return chosen(kept, per_kind)
+    made = []
+    for (kind, text, name), ids in right.items():
+        named = {thing.id for thing in objects.objects if thing.name == name}
+        is_plain = all(objects.by_id(object_id).is_asked for object_id in ids | named)
+        if len(ids) <= limit and is_plain and text not in doubtful:
+            own_kind = BY_NAME.get(kind, kind) if named == ids else kind
+            made.append(new_question(scene, own_kind, text, tuple(ids), SOURCE))
+    return chosen(made, per_kind)
 
 
 def chosen(questions: Sequence[Question], per_kind: int | None) -> tuple[Question, ...]:
     """At most ``per_kind`` questions of each kind by a digest of their text, sorted by kind and text."""
     drawn: list[Question] = []
-    for kind in KINDS:
+    for kind in MADE_KINDS:
         of_kind = [question for question in questions if question.kind == kind]
         of_kind.sort(key=lambda question: hashlib.sha256(question.text.encode()).digest())
         drawn += sorted(of_kind[:per_kind], key=lambda question: question.text)
     return tuple(drawn)
 
 
-def _texts(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-    """Kind, text and answers; the same text may come several times with some of its answers each."""
+def right_by_name(question: Question, objects: SceneMap) -> float:
+    """How often a system is right that knows what each object is called and nothing else; 0 without known answers.
+
+    It takes one of those that the question names, and where it names none (a use) it knows which serve.
+    """
+    if not question.answers:
+        return 0.0
+    if question.kind in KINDS[:2]:
+        return 1.0
+    names = {objects.by_id(object_id).name for object_id in question.answers if object_id in objects.ids}
+    named = [thing for thing in objects.objects if thing.name in names]
+    return min(1.0, len(question.answers) / max(1, len(named)))
+
+
+@cache
+def _table(section: str) -> Mapping[str, tuple[str, ...]]:
+    """``names``: a class -> its other names; ``uses``: what things are for -> every class that serves."""
+    table = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
+    return {phrase: tuple(entries) for phrase, entries in table[section].items()}
+
+
+def _texts(objects: SceneMap) -> Iterator[_Asked]:
+    """Texts with some of their answers each; one without an answer must not be asked at all."""
     names = sorted({thing.name for thing in objects.objects})
     for name in names:
-        yield "instance", name, _ids(objects, name)
-    for name, others in SYNONYMS.items():
-        if plain_name(name) in names:
-            for other in others[:MOST_SYNONYMS]:
-                yield "instance", other, _ids(objects, other)
-    for phrase, classes in AFFORDANCES.items():
-        answers = tuple(object_id for name in classes for object_id in _ids(objects, name))
-        if answers:
-            yield "affordance", phrase, answers
+        yield _Asked("instance", name, _ids(objects, name))
+    for name, others in _table("names").items():
+        if name in names:
+            for other in others:
+                yield _Asked("instance", other, _ids(objects, other))
+    for phrase, classes in _table("uses").items():
+        yield _Asked("affordance", phrase, tuple(thing for name in classes for thing in _called(objects, name)))
     yield from _sizes(objects)
-    yield from _attributes(objects)
+    yield from _adjectives(objects)
     yield from _relations(objects)
     yield from _between(objects)
 
@@ -82,75 +114,80 @@ def _ids(objects: SceneMap, name: str) -> tuple[int, ...]:
     return tuple(thing.id for thing in meant_by(name, objects).objects)
 
 
-def _sizes(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-    """Large and small things among those of one name, by the volume of the box."""
+def _called(objects: SceneMap, name: str) -> tuple[int, ...]:
+    """The objects that are called so, or something that ends so: an office chair is a chair, a plant stand no plant."""
+    wanted = words(name)
+    return tuple(thing.id for thing in objects.objects if words(thing.name)[-len(wanted) :] == wanted)
+
+
+def _sizes(objects: SceneMap) -> Iterator[_Asked]:
+    """Large and small things among those of one name."""
     for name, n in Counter(thing.name for thing in objects.objects).items():
-        if n < 2:
-            continue
         named = [thing for thing in objects.objects if thing.name == name]
-        volume = np.array([float(np.prod(thing.size)) for thing in named])
-        middle = float(np.median(volume))
-        for word, is_so in (("large", volume >= LARGE * middle), ("small", volume * LARGE <= middle)):
-            if is_so.any():
-                yield "property", f"{word} {name}", tuple(named[k].id for k in np.flatnonzero(is_so))
+        if n < 2 or not all(thing.is_whole for thing in named) or any(map(is_flat, named)):
+            continue
+        for word, sign in (("large", 1), ("small", -1)):
+            if (thing := extreme_of(named, sign)) is not None:
+                yield _Asked("property", f"{word} {name}", (thing.id,), name)
 
 
-def _attributes(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
-    """The words that are known of an object before its name: "red chair"."""
+def is_flat(thing: MapObject) -> bool:
+    """Whether a thing is so flat that nobody speaks of its volume."""
+    least, middle, _ = sorted(thing.size.tolist())
+    return bool(least < FLAT_SHARE * middle)
+
+
+def extreme_of(things: Sequence[MapObject], sign: int) -> MapObject | None:
+    """The largest (``sign`` 1) or smallest (-1), by twice the volume of the next and by its longest side; else None."""
+    ranked = sorted(things, key=lambda thing: -sign * float(np.prod(thing.size)))
+    volumes, sides = ([measure(thing.size) for thing in ranked] for measure in (np.prod, np.max))
+    if len(ranked) < 2 or max(volumes[:2]) < TWICE * min(volumes[:2]):
+        return None
+    return ranked[0] if all(sign * (sides[0] - side) > 0 for side in sides[1:]) else None
+
+
+def _adjectives(objects: SceneMap) -> Iterator[_Asked]:
+    """The words that are known of an object before its name, "red chair"; no colours where one so called has none."""
+    words_of = {thing.id: thing.caption.split() for thing in objects.objects}
+    without_colour = {thing.name for thing in objects.objects if not COLOURS & {*words_of[thing.id]}}
     for thing in objects.objects:
-        for word in thing.caption.split():
-            yield "property", f"{word} {thing.name}", (thing.id,)
+        for word in words_of[thing.id]:
+            if word not in COLOURS or thing.name not in without_colour:
+                yield _Asked("property", f"{word} {thing.name}", (thing.id,), thing.name)
 
 
-def _relations(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
+def _relations(objects: SceneMap) -> Iterator[_Asked]:
+    """What holds for sure; where a pair of these names is doubtful the text is not asked."""
     things = objects.objects
-    boxes = np.array([thing.box for thing in things]).reshape(-1, 2, 3)
-    links = list(relations_of(boxes, [thing.name for thing in things]))
-    held = {(link.subject, link.relation, link.object) for link in links}
-    resting = {link.subject for link in links if link.relation in ("on", "in")}
-    for link in links:
-        subject, holder = things[link.subject], things[link.object]
-        if subject.name != holder.name and _is_said(link, held, resting, things):
-            yield "relative", f"{subject.name} {link.relation} {with_article(holder.name)}", (subject.id,)
+    for relation in RELATIONS:
+        if relation == "near":
+            continue
+        held, doubtful = objects.relations.of(relation), objects.relations.doubtful(relation)
+        if relation == "in":
+            held = held & ~objects.relations.on  # a cushion is within the box of a sofa, and on it
+        for a, b in np.argwhere(held | doubtful).tolist():
+            subject, other = things[a], things[b]
+            text = f"{subject.name} {relation} {with_article(other.name)}"
+            if subject.name != other.name and objects.is_said(relation, subject, other):
+                is_sure = not doubtful[a, b] and other.is_asked
+                yield _Asked("relative", text, (subject.id,) if is_sure else (), subject.name)
 
 
-def _is_said(
-    link: RelationFound, held: set[tuple[int, PairRelation, int]], resting: set[int], things: Sequence[MapObject]
-) -> bool:
-    """Whether people would say so: a cushion is on a sofa, not in it; a book stands on its board, not above another."""
-    a, b = link.subject, link.object
-    if link.relation == "in":
-        return (a, "on", b) not in held
-    if link.relation == "above":
-        return a not in resting
-    if link.relation == "under":
-        bears = (b, "on", a) in held
-        is_flat = float(things[a].size[2]) < FLAT_M
-        return not any((a, relation, b) in held for relation in _RESTING) and (is_flat if bears else b not in resting)
-    return True
-
-
-def _between(objects: SceneMap) -> Iterator[tuple[str, str, tuple[int, ...]]]:
+def _between(objects: SceneMap) -> Iterator[_Asked]:
     """What stands between two things of which the scene has one each, on one level with both."""
     n_of = Counter(thing.name for thing in objects.objects)
-    single = [thing for thing in objects.objects if n_of[thing.name] == 1]
+    single = [thing for thing in objects.objects if n_of[thing.name] == 1 and thing.is_asked]
     for k, first in enumerate(single):
         for second in single[k + 1 :]:
-            if float(np.linalg.norm(first.centroid - second.centroid)) > BETWEEN_M or _touch(first, second):
+            if float(np.linalg.norm(first.centroid - second.centroid)) > BETWEEN_M or _touch(objects, first, second):
                 continue
             for thing in objects.objects:
-                if thing is not first and thing is not second and _stands_between(thing, first, second):
-                    yield "relative", f"{thing.name} between the {first.name} and the {second.name}", (thing.id,)
+                if objects.is_between(thing, first, second) and objects.are_in_one_place(thing, first, second):
+                    text = f"{thing.name} between the {first.name} and the {second.name}"
+                    yield _Asked("relative", text, (thing.id,), thing.name)
 
 
-def _stands_between(thing: MapObject, first: MapObject, second: MapObject) -> bool:
-    if any(min(thing.box[1][2], other.box[1][2]) <= max(thing.box[0][2], other.box[0][2]) for other in (first, second)):
-        return False
-    return is_between(thing.centroid, first.centroid, second.centroid)
-
-
-def _touch(a: MapObject, b: MapObject) -> bool:
+def _touch(objects: SceneMap, a: MapObject, b: MapObject) -> bool:
     """Whether nothing can be between the two: they stand side by side, or one holds the other."""
-    return is_next_to(a.box, b.box) or any(
-        holds("on", x.box, y.box, b_is_container=is_container(y.name)) for x, y in ((a, b), (b, a))
-    )
+    held = any(objects.holds(name, *pair) for name in ("on", "in") for pair in ((a, b), (b, a)))
+    return held or objects.holds("next to", a, b)

@@ -2,46 +2,63 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from su3d_bench.core.types import GroundTruth, Int64Array
+from su3d_bench.core.types import GroundTruth, Int64Array, WholeObject
 from su3d_bench.perception.embedded.lexicon import GROUPS
-from su3d_bench.perception.embedded.text import words
+from su3d_bench.questions.english import last_word, words
 from su3d_bench.questions.reasoning.named_objects import meant_by
-from su3d_bench.questions.reasoning.relations import is_room_surface
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap, is_room_surface
+from su3d_bench.questions.sight import WITHOUT_COLOUR, Sight, instance_rows
 
 STRAY_PERCENT = 1.0  # ours: of an object's vertices at either end of an axis, which in a scan are often a neighbour's
 
 
-def known_objects(truth: GroundTruth, min_vertices: int, captions: Mapping[int, str] | None = None) -> SceneMap:
-    """The objects of at least ``min_vertices`` vertices, without the room's own surfaces, by ascending id.
+def known_objects(
+    truth: GroundTruth,
+    min_vertices: int,
+    whole: Sequence[WholeObject] | None = None,
+    seen: Mapping[int, Sight] | None = None,
+) -> SceneMap:
+    """The objects of a scene without the room's own surfaces, by ascending id.
 
-    An object's class is that of most of its vertices. ``captions``: words on an object, such as its colour.
+    Those of the truth with at least ``min_vertices`` vertices; an object's class is that of most of them. ``whole``
+    gives all objects of the scene as they are. Where ``seen`` says what frames show, colours are in the captions and
+    what is not plain to see is not to be asked about.
     """
-    objects = []
-    for instance, rows in instance_rows(truth, min_vertices):
-        classes = np.bincount(truth.semantic[rows].clip(min=0))
-        class_id = int(classes.argmax())
-        if class_id == 0:
+    rows_of = dict(instance_rows(truth, min_vertices))
+    objects = [_of_vertices(truth, instance, rows) for instance, rows in rows_of.items()] if whole is None else whole
+    things = []
+    for known in objects:
+        if known is None or is_room_surface(known.name):
             continue
-        name = plain_name(truth.labels.name_of(class_id))
-        if not is_room_surface(name):
-            points = truth.points[rows].astype(np.float64)
-            box = np.percentile(points, [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
-            objects.append(MapObject(instance, name, (captions or {}).get(instance, ""), points.mean(axis=0), box))
-    return SceneMap(tuple(objects))
+        sight = None if seen is None else seen.get(known.id)
+        is_asked = known.id in rows_of and (seen is None or (sight is not None and sight.is_plain))
+        colour = "" if sight is None or last_word(known.name) in WITHOUT_COLOUR else sight.colour
+        colour = colour if known.colour in ("", colour) else ""  # in the light of the room it looks like another
+        words = [*([colour] if colour else []), *known.adjectives]
+        things.append(
+            MapObject(
+                known.id,
+                known.name,
+                " ".join(words),
+                known.box.mean(axis=0),
+                known.box,
+                is_asked=is_asked,
+                is_whole=whole is not None,
+            )
+        )
+    return SceneMap(tuple(things))
 
 
-def instance_rows(truth: GroundTruth, min_vertices: int) -> Iterator[tuple[int, Int64Array]]:
-    """Id and rows, both ascending, of each instance of the truth with at least ``min_vertices`` vertices."""
-    order = np.argsort(truth.instance, kind="stable")
-    ids, starts = np.unique(truth.instance[order], return_index=True)
-    for instance, rows in zip(ids.tolist(), np.split(order, starts[1:]), strict=True):
-        if instance > 0 and len(rows) >= min_vertices:
-            yield instance, rows
+def _of_vertices(truth: GroundTruth, instance: int, rows: Int64Array) -> WholeObject | None:
+    class_id = int(np.bincount(truth.semantic[rows].clip(min=0)).argmax())
+    if class_id == 0:
+        return None
+    box = np.percentile(truth.points[rows].astype(np.float64), [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
+    return WholeObject(instance, plain_name(truth.labels.name_of(class_id)), box)
 
 
 def plain_name(name: str) -> str:

@@ -8,8 +8,11 @@ from dataclasses import dataclass
 from su3d_bench.core.errors import DataError, printable
 
 KINDS = ("instance", "affordance", "property", "relative")
+# Properties and relations that nothing else of the name lacks: the name alone gives the answer.
+BY_NAME = {"property": "property by name", "relative": "relative by name"}
+MADE_KINDS = (*KINDS, *BY_NAME.values())
 REASONING = "reasoning"
-ALL_KINDS = (*KINDS, REASONING)
+ALL_KINDS = (*MADE_KINDS, REASONING)
 _DIGEST_LENGTH = 12
 
 

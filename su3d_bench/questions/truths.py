@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 
 from su3d_bench.core.errors import GroundTruthMissing
-from su3d_bench.core.interfaces import Encoder, HasQueries
+from su3d_bench.core.interfaces import Encoder, HasQueries, KnowsObjects
 from su3d_bench.core.types import GroundTruth, Instances
 from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.metrics.questions.truths import (
@@ -21,19 +22,22 @@ from su3d_bench.metrics.questions.truths import (
     TrueAnswer,
 )
 from su3d_bench.metrics.scoring import QuestionTruth
-from su3d_bench.questions.colours import colour_words
-from su3d_bench.questions.generator import chosen, generate
+from su3d_bench.questions.generator import chosen, generate, right_by_name
 from su3d_bench.questions.known_objects import is_called, known_objects
 from su3d_bench.questions.model import Question, new_question
 from su3d_bench.questions.reasoning.generated import generate_questions
 from su3d_bench.questions.reasoning.named_objects import nearest_by
-from su3d_bench.questions.reasoning.scene_map import map_of
+from su3d_bench.questions.reasoning.scene_map import SceneMap, map_of
 from su3d_bench.questions.reasoning.solver import Solver
+from su3d_bench.questions.sight import sights
 
 Refine = Callable[[Instances], RefinedNames | None]
 MIN_VERTICES = 100  # ScanNet's smallest instance that counts
 # The truth with the most classes, where it is not the first that a dataset gives.
 FULLEST = ("scannet200-vertices",)
+MOST_KEPT = 4  # scenes whose objects are kept: every method and protocol asks for the same
+_Kept = OrderedDict[tuple[int, str, str, int], tuple[Any, SceneMap]]  # with the dataset, whose id is in the key
+_KEPT: _Kept = OrderedDict()
 MOST_NAMES = 5  # the paper's m: n' comes from the names of so many best views
 
 
@@ -56,17 +60,34 @@ def question_truth(
 ) -> QuestionTruth:
     """The truth of a scene under a protocol that asks questions; ``refine`` gives labels n', by vote where absent."""
     assert rules.min_region_size is not None
-    if rules.kind == "retrieval":
-        if rules.questions == "dataset":
-            questions = own_questions(dataset, scene)
-        else:
-            questions = generate(f"{dataset.name}/{scene}", known_objects(truth, rules.min_region_size), rules.per_kind)
-        return RetrievalTruth(
-            truth, tuple(AskedText(question.kind, question.text, question.answers or ()) for question in questions)
-        )
     if rules.kind == "annotation":
         return _annotation_truth(rules.min_region_size, truth, refine or voted_names)
-    return _reasoning_truth(rules, truth, refine or voted_names)
+    objects = scene_objects(dataset, scene, truth, rules.min_region_size)
+    if rules.kind == "reasoning":
+        return _reasoning_truth(rules, truth, objects, refine or voted_names)
+    if rules.questions == "dataset":
+        questions = own_questions(dataset, scene)
+    else:
+        questions = generate(f"{dataset.name}/{scene}", objects, rules.per_kind)
+    return RetrievalTruth(truth, tuple(_asked(question, objects) for question in questions))
+
+
+def _asked(question: Question, objects: SceneMap) -> AskedText:
+    answers = question.answers or ()
+    by_chance = len(answers) / max(1, len(objects))
+    return AskedText(question.kind, question.text, answers, by_chance, right_by_name(question, objects))
+
+
+def scene_objects(dataset: Any, scene: str, truth: GroundTruth, min_vertices: int) -> SceneMap:
+    """What questions on a scene are made from: its objects, whole where the dataset knows them, as frames show them."""
+    key = (id(dataset), scene, truth.variant, min_vertices)
+    if key not in _KEPT:
+        while len(_KEPT) >= MOST_KEPT:
+            _KEPT.popitem(last=False)
+        whole = dataset.whole_objects(scene) if isinstance(dataset, KnowsObjects) else None
+        seen = sights(dataset, scene, truth, min_vertices)
+        _KEPT[key] = dataset, known_objects(truth, min_vertices, whole, seen)
+    return _KEPT[key][1]
 
 
 def _annotation_truth(min_vertices: int, truth: GroundTruth, refine: Refine) -> AnnotationTruth:
@@ -74,9 +95,7 @@ def _annotation_truth(min_vertices: int, truth: GroundTruth, refine: Refine) -> 
     return AnnotationTruth(truth, tuple(name_of), lambda label, object_id: is_called(label, name_of[object_id]), refine)
 
 
-def _reasoning_truth(rules: ProtocolRules, truth: GroundTruth, refine: Refine) -> ReasoningTruth:
-    assert rules.min_region_size is not None
-    objects = known_objects(truth, rules.min_region_size)
+def _reasoning_truth(rules: ProtocolRules, truth: GroundTruth, objects: SceneMap, refine: Refine) -> ReasoningTruth:
     questions = generate_questions(objects, n_each=rules.per_kind or len(objects) ** 2)
     texts = [question.text for question in questions]
 
@@ -90,7 +109,7 @@ def _reasoning_truth(rules: ProtocolRules, truth: GroundTruth, refine: Refine) -
     true = [
         TrueAnswer(
             question.text, question.kind, question.answer.value,
-            tuple(sorted(set(question.answer.object_ids) & known)),
+            tuple(sorted(set(question.answer.object_ids) & known)), question.by_chance, question.by_name,
         )
         for question in questions
     ]  # fmt: skip
@@ -115,10 +134,8 @@ def voted_names(instances: Instances) -> RefinedNames | None:
     return RefinedNames(names, f"the vote of the names of {MOST_NAMES} views, no language model")
 
 
-def questions_of(
-    dataset: Any, scene: str, *, per_kind: int | None = None, own: bool = True, colours: bool = False
-) -> tuple[Question, ...]:
-    """The questions of a scene, ``per_kind`` at most of each kind; ``colours``: look up those of objects in its frames.
+def questions_of(dataset: Any, scene: str, *, per_kind: int | None = None, own: bool = True) -> tuple[Question, ...]:
+    """The questions of a scene, ``per_kind`` at most of each kind.
 
     Raises ``GroundTruthMissing`` where the scene has no truth to make them from.
     """
@@ -128,5 +145,4 @@ def questions_of(
         raise GroundTruthMissing(f"{dataset.name}/{scene}: the dataset has no ground truth to make questions from")
     variant = next((name for name in FULLEST if name in dataset.variants), dataset.variants[0])
     truth = dataset.ground_truth(scene, variant)
-    words = colour_words(dataset, scene, truth, MIN_VERTICES) if colours else None
-    return generate(f"{dataset.name}/{scene}", known_objects(truth, MIN_VERTICES, words), per_kind)
+    return generate(f"{dataset.name}/{scene}", scene_objects(dataset, scene, truth, MIN_VERTICES), per_kind)

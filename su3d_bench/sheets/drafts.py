@@ -25,16 +25,14 @@ from su3d_bench.perception.language.chat import ChatRequest
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.questions.generator import chosen, generate
-from su3d_bench.questions.known_objects import known_objects
 from su3d_bench.questions.model import KINDS, REASONING, Question, question_id
 from su3d_bench.questions.reasoning.answers import Answer, unsettled
-from su3d_bench.questions.reasoning.judging import said_value
 from su3d_bench.questions.reasoning.language_solver import LanguageSolver
 from su3d_bench.questions.reasoning.named_objects import nearest_by
 from su3d_bench.questions.reasoning.scene_map import SceneMap
 from su3d_bench.questions.reasoning.solver import Solver
 from su3d_bench.questions.retrieval import rank_all
-from su3d_bench.questions.truths import own_questions, question_truth
+from su3d_bench.questions.truths import own_questions, question_truth, scene_objects
 from su3d_bench.sheets.items import RIGHT, WRONG, SheetKind
 from su3d_bench.sheets.run_source import RunSource, mask_digest
 
@@ -88,7 +86,7 @@ def questions_of(
             given = own_questions(dataset, name)
         else:
             assert rules.min_region_size is not None
-            given = generate(scene, known_objects(truth, rules.min_region_size))
+            given = generate(scene, scene_objects(dataset, name, truth, rules.min_region_size))
     mine = [question for question in given if question.scene == scene]
     return [question for kind in KINDS for question in chosen([each for each in mine if each.kind == kind], per_kind)]
 
@@ -351,6 +349,6 @@ def _value(true: TrueAnswer, answer: Answer) -> float | int | bool | None:
     """What the answer says; the words of a language model are read for their yes or no, or their first number."""
     if true.value is None or answer.solver == "built-in":
         return answer.value
-    value = said_value(answer, true.value)
+    value = answer.said(true.value)
     is_count = value is not None and not isinstance(true.value, float | bool) and value == int(value)
     return int(value) if is_count and value is not None else value

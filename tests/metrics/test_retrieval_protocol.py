@@ -22,14 +22,20 @@ from su3d_bench.metrics.protocols import load_protocol, protocols_for, read_prot
 from su3d_bench.metrics.questions.score import are_objects_right, is_answer_right
 from su3d_bench.metrics.questions.shares import ShareCounts
 from su3d_bench.metrics.questions.truths import AskedText, GivenAnswer, ReasoningTruth, RetrievalTruth, TrueAnswer
-from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores
+from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 from su3d_bench.predictions.base import vertex_masks
+from su3d_bench.questions import truths
+from su3d_bench.questions.sight import Sight
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.runs.plan import protocols_of_run
 
 RULES = load_protocol("rooms-retrieval")
 REASONING = load_protocol("rooms-reasoning")
+DRAWN = (
+    'questions = "generated"  # ours: questions/generator.py, over the whole objects and what the frames show of them\n'
+    'synonyms = "lexicon"'
+)
 TRUTH = room()
 # Objects 1..8 are NAMES in order: 2 and 3 are chairs, 4 the table, 5 the lamp.
 ASKED = (
@@ -44,9 +50,17 @@ QUESTIONS = RetrievalTruth(TRUTH, ASKED)
 PERFECT = truth_as_prediction(TRUTH, with_labels=False)
 
 
-def values(prediction: object, truth: RetrievalTruth = QUESTIONS) -> dict[str, float]:
+def values(prediction: object, truth: RetrievalTruth = QUESTIONS) -> dict[str, float | None]:
     score = score_scene(RULES, truth, prediction, ENCODER)  # type: ignore[arg-type]
-    return metric_of(RULES).combine([score.counts])
+    known: dict[str, float | None] = plain_json(metric_of(RULES).combine([score.counts]))
+    return known
+
+
+@pytest.fixture
+def all_is_seen(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Every object of the truth is plain to see, in no colour."""
+    seen = {int(instance): Sight(1.0, "") for instance in np.unique(TRUTH.instance)}
+    monkeypatch.setattr(truths, "sights", lambda dataset, scene, truth, min_vertices: seen)
 
 
 def test_the_instance_ranked_first_is_right_where_it_stands_for_an_answer() -> None:
@@ -76,7 +90,7 @@ def test_an_empty_map_answers_nothing() -> None:
 def test_a_kind_that_is_not_asked_has_no_value() -> None:
     found = values(PERFECT, RetrievalTruth(TRUTH, ASKED[:1]))
     assert found["instance"] == found["all"] == 1.0
-    assert np.isnan(found["relative"])
+    assert found["relative"] is None  # not a number
 
 
 def test_a_partition_is_scored_as_its_instances_are() -> None:
@@ -123,19 +137,42 @@ def test_a_map_without_features_is_told_why() -> None:
         score_scene(RULES, QUESTIONS, labelled, ENCODER)
 
 
-def test_protocols_of_questions_run_only_where_they_are_named() -> None:
+def test_protocols_of_questions_run_only_where_they_are_named(tmp_path: Path) -> None:
     assert not {"rooms-retrieval", "rooms-annotation", "rooms-reasoning"} & set(protocols_for("rooms"))
     assert protocols_of_run(["rooms-retrieval"], ["rooms"]) == {"rooms": ("rooms-retrieval",)}
+    own = own_questions_of_a_dataset(tmp_path)
     with pytest.raises(ConfigError, match="needs a dataset that knows questions and answers itself, which replica"):
-        protocols_of_run(["rooms-retrieval"], ["replica"])
+        protocols_of_run([own], ["replica"])
+
+
+def own_questions_of_a_dataset(folder: Path) -> str:
+    """The path of the rooms' rules, but with the questions that the dataset itself knows."""
+    text = rules_file("rooms-retrieval").read_text().replace('questions = "generated"', 'questions = "dataset"')
+    text = text.replace('synonyms = "lexicon"', "").replace('name = "rooms-retrieval"', 'name = "own-retrieval"')
+    (folder / "questions.toml").write_text(text)
+    return str(folder / "questions.toml")
+
+
+def test_questions_that_a_dataset_knows_itself_are_asked(tmp_path: Path, all_is_seen: None) -> None:
+    class Knowing:
+        name = "knowing"
+
+        def queries(self, scene: str) -> list[SimpleNamespace]:
+            return [SimpleNamespace(kind="instance", text="a chair", answers=(2, 3))]
+
+    rules = load_protocol(own_questions_of_a_dataset(tmp_path))
+    truth = question_truth(rules, Knowing(), "made", TRUTH)
+    assert isinstance(truth, RetrievalTruth)
+    assert [(asked.text, asked.answers) for asked in truth.asked] == [("a chair", (2, 3))]
+    assert (truth.asked[0].by_chance, truth.asked[0].by_name) == (2 / 7, 1.0)
 
 
 @pytest.mark.parametrize(
     ("name", "old", "new", "line"),
     [
-        ("rooms-retrieval", 'questions = "dataset"', "", "questions: kinds 'retrieval' and 'reasoning' need them"),
+        ("rooms-retrieval", 'questions = "generated"', "", "questions: kinds 'retrieval' and 'reasoning' need them"),
         ("replica-retrieval", 'synonyms = "lexicon"', "", "synonyms: kind 'annotation' and generated questions need"),
-        ("rooms-retrieval", "aggregate", "per_kind = 3\naggregate", "per_kind: belongs to generated questions"),
+        ("rooms-retrieval", DRAWN, 'questions = "dataset"\nper_kind = 3', "per_kind: belongs to generated questions"),
         ("rooms-annotation", "[merging]", "[answers]", "answers"),
         ("rooms-reasoning", "distance_m = 0.25", "distance_n = 0.25", "unknown key 'answers.distance_n'; did you mean"),
         ("rooms-reasoning", "cap_m = 0.05", "", "transfer.cap_m: kind 'reasoning' needs one"),
@@ -171,7 +208,7 @@ def test_objects_are_right_where_the_instances_stand_for_exactly_them() -> None:
         assert are_objects_right(true, GivenAnswer(None, np.array(rows, np.int64), True), main_object) is is_right
 
 
-def test_the_truth_answers_its_own_questions() -> None:
+def test_the_truth_answers_its_own_questions(all_is_seen: None) -> None:
     truth = question_truth(REASONING, SimpleNamespace(name="rooms"), "made", TRUTH)
     assert isinstance(truth, ReasoningTruth)
     assert len(truth.asked) > 10
@@ -186,7 +223,7 @@ def test_the_truth_answers_its_own_questions() -> None:
     assert metric_of(REASONING).combine([score_scene(REASONING, truth, wrong, None).counts])["answer"] < 1
 
 
-def test_generated_questions_find_their_objects_by_name() -> None:
+def test_generated_questions_find_their_objects_by_name(all_is_seen: None) -> None:
     rules = load_protocol("replica-retrieval")
     truth = question_truth(rules, SimpleNamespace(name="replica"), "made", TRUTH)
     assert isinstance(truth, RetrievalTruth)
@@ -223,7 +260,7 @@ def test_a_run_scores_variants_under_the_protocols_of_questions(
     assert "relative" in capsys.readouterr().out
 
 
-def test_predictions_from_elsewhere_are_scored_as_a_run_is() -> None:
+def test_predictions_from_elsewhere_are_scored_as_a_run_is(all_is_seen: None) -> None:
     rules = load_protocol("replica-retrieval")
     dataset = SimpleNamespace(name="replica")
     truth = question_truth(rules, dataset, "made", TRUTH)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,9 +14,9 @@ from scored_room import instances
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.datasets.rooms.dataset import Rooms
+from su3d_bench.questions.reasoning.answers import Answer
 from su3d_bench.questions.reasoning.generated import generate_questions
 from su3d_bench.questions.reasoning.question_words import Phrase, read_phrase
-from su3d_bench.questions.reasoning.relations import relations_of
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap, map_of
 from su3d_bench.questions.reasoning.solver import Solver
 
@@ -54,11 +53,12 @@ def solver() -> Solver:
         ("What is in the basket?", (14,), None),
         ("What is under the table?", (5,), None),
         ("What is above the bed?", (15,), None),
-        ("What is next to the bed?", (2, 3), None),
+        ("What is next to the bed?", (2,), None),
+        ("How many piles of cups are there?", (7, 8), 2),
         ("Is the nightstand beside the bed?", (2,), True),
         ("Is there a paper towel near, sink?", (17,), True),
         ("which lamp is on the nightstand next to the bed?", (3,), None),
-        ("What is between the bed and the basket?", (5, 6, 7, 8), None),
+        ("What is between the bed and the basket?", (5, 6), None),
         ("Which lamp is the tallest?", (4,), None),
         ("What is the largest object?", (1,), None),
         ("What is the smallest thing on the table?", (7,), None),
@@ -190,6 +190,15 @@ def test_no_words_break_the_solver(words: list[str]) -> None:
     assert set(found.object_ids) <= set(bedroom().ids)
 
 
+def test_answers_in_words_are_read_for_their_yes_or_number() -> None:
+    assert Answer("There are 2 cups (ID #7 and #8)").said(2) == 2
+    assert Answer("There are 3").said(2) == 3
+    assert Answer("No, there is none").said(True) is False
+    assert Answer("perhaps").said(True) is None
+    assert Answer("about 3.7 m").said(3.68) == 3.7
+    assert Answer("3", value=4).said(2) == 4
+
+
 @pytest.fixture(scope="module")
 def room(tmp_path_factory: pytest.TempPathFactory) -> SceneMap:
     truth = Rooms(tmp_path_factory.mktemp("data")).truth("kitchen0")
@@ -199,17 +208,6 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> SceneMap:
             for o in truth.objects
         )
     )
-
-
-def test_the_relations_that_a_room_was_built_with_are_found(room: SceneMap, tmp_path: Path) -> None:
-    truth = Rooms(tmp_path).truth("kitchen0")
-    found = {
-        (link.subject + 1, link.relation, link.object + 1)
-        for link in relations_of(np.array([one.box for one in room.objects]), [one.name for one in room.objects])
-    }
-    for relation, least in (("on", 1.0), ("above", 1.0), ("next to", 0.8)):
-        wanted = {(r.subject, r.relation, r.object) for r in truth.relations if r.relation == relation}
-        assert len(wanted & found) / len(wanted) >= least, relation
 
 
 def test_generated_questions_are_answered_as_they_were_made(room: SceneMap) -> None:

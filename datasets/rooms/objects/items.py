@@ -59,6 +59,7 @@ class Item:
     parts: tuple[Part, ...]
     spots: tuple[Spot, ...]
     size: Float64Array
+    model: str = ""  # which of the class's models was built; empty for parts of the room itself
 
     @cached_property
     def foot(self) -> Float64Array:
@@ -110,7 +111,7 @@ class Assembly:
         parts = tuple(Part(part.shape.moved(*shift), part.material) for part in self.parts)
         spots = tuple(spot.moved(*shift) for spot in self.spots)
         word = size_word(model, high - low)
-        return Item(self.class_name, self.colour, self.material, word, parts, spots, high - low)
+        return Item(self.class_name, self.colour, self.material, word, parts, spots, high - low, model)
 
 
 Builder = Callable[[Assembly], None]

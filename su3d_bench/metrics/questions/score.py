@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import ClassVar
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_wa
 from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, n_predictions
 from su3d_bench.metrics.protocols import AnswerRules, MergeRules, ProtocolRules
 from su3d_bench.metrics.questions import shares
-from su3d_bench.metrics.questions.shares import ShareCounts
+from su3d_bench.metrics.questions.shares import ShareCounts, share_counts
 from su3d_bench.metrics.questions.truths import (
     AnnotationTruth,
     AskedText,
@@ -24,6 +25,7 @@ from su3d_bench.metrics.questions.truths import (
     TrueAnswer,
 )
 
+BY_NAME = ("property by name", "relative by name")  # kinds of text to which the name alone is the answer
 WELL_MERGED, UNDER_MERGED, OVER_MERGED = "well-merged", "under-merged", "over-merged"
 
 
@@ -31,16 +33,24 @@ class ShareMetric(Metric[ShareCounts]):
     """What the kinds share whose numbers are shares of what was judged."""
 
     counts = ShareCounts
+    guessed: ClassVar[tuple[str, ...]] = ()  # values that a guess gets right now and then
 
     @property
     def sizes(self) -> dict[str, int]:
         return {"values": len(self.rules.value_names)}
 
     def pooled(self, counts: Sequence[ShareCounts]) -> Pooled:
-        """The share of right judgements under each value's name, and how many there were under ``n_<name>``."""
-        whole = shares.combine(counts)
-        n_judged = {f"n_{name}": n for name, n in zip(self.rules.value_names, whole.n_judged.tolist(), strict=True)}
-        return Pooled(dict(zip(self.rules.value_names, shares.shares(whole).tolist(), strict=True)) | n_judged)
+        """The share of right judgements under each value's name, and beside it how many there were and what is cheap.
+
+        ``n_<name>``: their number; ``chance_<name>``: what a guess gets right; ``names-alone_<name>``: what who knows
+        each object's name and no more does, both of the values that one can guess.
+        """
+        whole, names = shares.combine(counts), self.rules.value_names
+        values = dict(zip(names, shares.shares(whole).tolist(), strict=True))
+        values |= {f"n_{name}": n for name, n in zip(names, whole.n_judged.tolist(), strict=True)}
+        for prefix, cheap in zip(("chance", "names-alone"), shares.baselines(whole), strict=True):
+            values |= {f"{prefix}_{name}": float(cheap[names.index(name)]) for name in self.guessed}
+        return Pooled(values)
 
     def resampled(self, counts: Sequence[ShareCounts], weights: Int64Array) -> Mapping[str, Float64Array]:
         return dict(zip(self.rules.value_names, shares.resampled(counts, weights).T, strict=True))
@@ -52,11 +62,18 @@ class ShareMetric(Metric[ShareCounts]):
         prediction: Instances | Partition,
         rows: Mapping[str, BoolArray],
         warnings: Sequence[str | None],
+        cheap: Mapping[str, Float64Array] | None = None,
     ) -> SceneScore:
-        """The score, ``rows`` telling what is right, with the coverage of the objects on which that rests."""
-        judged = [rows[name] for name in self.rules.value_names]
-        counts = ShareCounts(
-            np.array([len(row) for row in judged], np.int64), np.array([int(row.sum()) for row in judged], np.int64)
+        """The score, ``rows`` telling what is right, with the coverage of the objects on which that rests.
+
+        ``cheap``: for some values the share (2, n) of each judgement that a guess and names alone get right.
+        """
+        names = self.rules.value_names
+        judged = [rows[name] for name in names]
+        known = {} if cheap is None else {name: shares_of.sum(axis=1) for name, shares_of in cheap.items()}
+        of_guess = [known.get(name, np.full(2, np.nan)) for name in names]
+        counts = share_counts(
+            [len(row) for row in judged], [int(row.sum()) for row in judged], *np.array(of_guess).T.tolist()
         )
         wanted = np.isin(truth.instance, np.array([*object_ids], np.int64))
         return score_of_masks(self, counts, prediction, truth.points, wanted, warnings)
@@ -66,6 +83,7 @@ class RetrievalMetric(ShareMetric):
     """Is the instance ranked first one that answers?"""
 
     truth = RetrievalTruth
+    guessed = ("instance", "affordance", "property", "relative", "all", "by name")
 
     def per_scene(
         self, truth: RetrievalTruth, prediction: Instances | Partition, encoder: Encoder | None
@@ -76,11 +94,15 @@ class RetrievalMetric(ShareMetric):
         in_map = set(covered.main_object.tolist()) - {NO_OBJECT}
         kinds = np.array([question.kind for question in truth.asked])
         rows = {kind: is_right[kinds == kind] for kind in self.rules.value_names[:4]}
-        rows["all"] = is_right
+        is_plain = ~np.isin(kinds, BY_NAME)
+        rows["all"], rows["by name"] = is_right[is_plain], is_right[~is_plain]
         rows["reachable"] = np.array([not in_map.isdisjoint(question.answers) for question in truth.asked], bool)
         warnings = [encoder_warning(self.rules, prediction, encoder)]
         asked_for = [answer for question in truth.asked for answer in question.answers]
-        return self._score(truth.scene, asked_for, prediction, rows, warnings)
+        each = np.array([(question.by_chance, question.by_name) for question in truth.asked]).reshape(-1, 2).T
+        cheap = {kind: each[:, kinds == kind] for kind in self.rules.value_names[:4]}
+        cheap |= {"all": each[:, is_plain], "by name": each[:, ~is_plain]}
+        return self._score(truth.scene, asked_for, prediction, rows, warnings, cheap)
 
 
 def first_instances(
@@ -172,6 +194,7 @@ class ReasoningMetric(ShareMetric):
     """Is the answer right, and are the objects that it names right?"""
 
     truth = ReasoningTruth
+    guessed = ("answer",)
 
     def per_scene(self, truth: ReasoningTruth, prediction: Instances, encoder: Encoder | None) -> SceneScore:
         rules = self.rules.answers
@@ -186,7 +209,8 @@ class ReasoningMetric(ShareMetric):
         is_open = any(not given.is_settled for given in answers)
         warnings = ["questions that the solver could not settle count as wrong"] if is_open else []
         named = [object_id for question in truth.asked for object_id in question.object_ids]
-        return self._score(truth.scene, named, prediction, rows, warnings)
+        cheap = {"answer": np.array([(q.by_chance, q.by_name) for q in truth.asked]).reshape(-1, 2).T}
+        return self._score(truth.scene, named, prediction, rows, warnings, cheap)
 
 
 def is_answer_right(rules: AnswerRules, true: TrueAnswer, given: GivenAnswer, main_object: Int64Array) -> bool:

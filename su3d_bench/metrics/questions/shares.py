@@ -1,4 +1,4 @@
-"""How many were judged and how many of them are right, as additive counts a value."""
+"""How many were judged, how many of them are right, and how many would be by a guess, as additive counts a value."""
 
 from __future__ import annotations
 
@@ -14,41 +14,73 @@ from su3d_bench.metrics.metric import Arrays, Counts
 
 @dataclass(frozen=True)
 class ShareCounts(Counts):
-    """What one scene adds: ``n_judged`` and ``n_right`` (V,) int64 for each of the protocol's V values."""
+    """What one scene adds: ``n_judged`` and ``n_right`` (V,) int64 for each of the protocol's V values.
+
+    ``by_chance`` (V,) float64: how many a guess gets right; ``by_name``: how many who knows each object's name and no
+    more; NaN where nobody can say.
+    """
 
     stored_as = "shares"
-    arrays: ClassVar[Arrays] = {"n_judged": ("i", ("values",)), "n_right": ("i", ("values",))}
+    arrays: ClassVar[Arrays] = {
+        "n_judged": ("i", ("values",)),
+        "n_right": ("i", ("values",)),
+        "by_chance": ("f", ("values",)),
+        "by_name": ("f", ("values",)),
+    }
 
     n_judged: Int64Array
     n_right: Int64Array
+    by_chance: Float64Array
+    by_name: Float64Array
 
 
 def combine(counts: Sequence[ShareCounts]) -> ShareCounts:
     """The counts of several scenes as one.
 
-    >>> a, b = ShareCounts(np.array([2]), np.array([1])), ShareCounts(np.array([2]), np.array([2]))
-    >>> combine([a, b])
-    ShareCounts(n_judged=array([4]), n_right=array([3]))
+    >>> a, b = share_counts([2], [1]), share_counts([2], [2])
+    >>> combine([a, b]).n_right.tolist()
+    [3]
     """
     return ShareCounts(
-        np.sum([of_scene.n_judged for of_scene in counts], axis=0),
-        np.sum([of_scene.n_right for of_scene in counts], axis=0),
+        *(np.sum([getattr(of_scene, name) for of_scene in counts], axis=0) for name in ShareCounts.arrays)
+    )
+
+
+def share_counts(
+    n_judged: Sequence[int],
+    n_right: Sequence[int],
+    by_chance: Sequence[float] | None = None,
+    by_name: Sequence[float] | None = None,
+) -> ShareCounts:
+    """The counts of a scene; what a guess gets right is not known where it is not given."""
+    unknown = np.full(len(n_judged), np.nan)
+    return ShareCounts(
+        np.array(n_judged, np.int64),
+        np.array(n_right, np.int64),
+        unknown if by_chance is None else np.array(by_chance, np.float64),
+        unknown if by_name is None else np.array(by_name, np.float64),
     )
 
 
 def shares(counts: ShareCounts) -> Float64Array:
     """The share (V,) that is right, NaN where nothing was judged.
 
-    >>> shares(ShareCounts(np.array([4, 0]), np.array([3, 0]))).tolist()
+    >>> shares(share_counts([4, 0], [3, 0])).tolist()
     [0.75, nan]
     """
     return _ratio(counts.n_right.astype(np.float64), counts.n_judged.astype(np.float64))
 
 
+def baselines(counts: ShareCounts) -> tuple[Float64Array, Float64Array]:
+    """The shares (V,) that a guess gets right, and who knows names alone; NaN where nobody can say."""
+    n_judged = counts.n_judged.astype(np.float64)
+    return _ratio(counts.by_chance, n_judged), _ratio(counts.by_name, n_judged)
+
+
 def resampled(counts: Sequence[ShareCounts], weights: Int64Array) -> Float64Array:
     """The shares (R, V) over the scenes drawn ``weights`` (R, S) times, NaN where none of these was judged.
 
-    >>> a, b = ShareCounts(np.array([2]), np.array([1])), ShareCounts(np.array([1]), np.array([1]))
+    >>> a, b = share_counts([2], [1]), share_counts([1], [1])
     >>> resampled([a, b], np.array([[2, 0], [0, 2]])).tolist()
     [[0.5], [1.0]]
     """

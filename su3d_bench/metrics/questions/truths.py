@@ -11,11 +11,16 @@ from su3d_bench.core.types import GroundTruth, Instances, Int64Array
 
 @dataclass(frozen=True)
 class AskedText:
-    """A text of a kind such as ``property``, and the ids of every object that answers it."""
+    """A text of a kind such as ``property``, and the ids of every object that answers it.
+
+    ``by_chance``: how often an object drawn at random answers; ``by_name``: one drawn from those of the right name.
+    """
 
     kind: str
     text: str
     answers: tuple[int, ...]
+    by_chance: float = float("nan")
+    by_name: float = float("nan")
 
 
 @dataclass(frozen=True)
@@ -50,12 +55,17 @@ class AnnotationTruth:
 
 @dataclass(frozen=True)
 class TrueAnswer:
-    """``value``: a count, metres or yes and no; None where the objects are the answer. ``object_ids`` are named."""
+    """``value``: a count, metres or yes and no; None where the objects are the answer. ``object_ids`` are named.
+
+    ``by_chance``: how often a guess is right; ``by_name``: that of who knows what each object is called and no more.
+    """
 
     text: str
     kind: str
     value: float | int | bool | None
     object_ids: tuple[int, ...]
+    by_chance: float = float("nan")
+    by_name: float = float("nan")
 
 
 @dataclass(frozen=True)

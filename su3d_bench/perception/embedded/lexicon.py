@@ -1,202 +1,23 @@
-"""English for the rooms' classes: other names of a class, what a class is for, words that cover several classes.
-
-A class that stands in no table is called by its own name only.
-"""
+"""English for the rooms' classes, from ``lexicon.toml``: other names, uses, words for several classes, for rooms."""
 
 from __future__ import annotations
 
+import tomllib
 from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
 
-# Other names that mean this class and no other. The first name of a class is its own, hyphens read as spaces.
-SYNONYMS: Mapping[str, tuple[str, ...]] = {
-    "floor": ("ground", "flooring"),
-    "ceiling": ("roof",),
-    "door": ("doorway",),
-    "sofa": ("couch", "settee"),
-    "beanbag": ("bean bag", "bean bag chair"),
-    "bench": ("wooden bench",),
-    "table": ("coffee table", "dining table", "side table"),
-    "desk": ("writing desk", "office desk", "work desk"),
-    "nightstand": ("night stand", "bedside table"),
-    "cabinet": ("cupboard", "sideboard", "side board", "storage cabinet"),
-    "base-cabinet": ("kitchen cabinet", "lower cabinet"),
-    "wall-cabinet": ("upper cabinet", "hanging cabinet", "overhead cabinet"),
-    "countertop": ("counter", "kitchen counter", "worktop"),
-    "wardrobe": ("closet", "clothes cupboard"),
-    "shelf": ("bookshelf", "bookcase", "shelving"),
-    "tv-stand": ("television stand", "tv console", "media console"),
-    "lamp": ("light", "floor lamp", "table lamp"),
-    "tv-screen": ("tv", "television", "tv set"),
-    "monitor": ("computer monitor", "computer screen", "digital display"),
-    "computer-keyboard": ("keyboard",),
-    "mouse": ("computer mouse",),
-    "laptop": ("notebook computer", "laptop computer"),
-    "desktop-computer": ("computer", "pc", "computer tower"),
-    "refrigerator": ("fridge",),
-    "cooktop": ("stove", "hob", "stovetop", "cooker"),
-    "microwave": ("microwave oven",),
-    "sink": ("washbasin", "basin", "wash basin"),
-    "toilet": ("toilet bowl", "wc"),
-    "bathtub": ("bath tub", "tub"),
-    "towel": ("hand towel", "bath towel"),
-    "mat": ("bath mat", "doormat"),
-    "paper-towel": ("kitchen roll", "roll of paper towel"),
-    "tissue-paper": ("tissue", "tissue box", "box of tissues"),
-    "pan": ("frying pan", "skillet"),
-    "pot": ("cooking pot", "saucepan"),
-    "plate": ("dinner plate", "side plate"),
-    "bowl": ("soup bowl",),
-    "cup": ("mug", "coffee cup"),
-    "bottle": ("glass bottle", "drinks bottle"),
-    "chopping-board": ("cutting board",),
-    "knife-block": ("knife holder", "block of knives"),
-    "vase": ("flower vase",),
-    "indoor-plant": ("plant", "potted plant", "house plant", "pot plant", "flower"),
-    "plant-stand": ("flower stand",),
-    "picture": ("painting", "framed picture", "wall art", "poster"),
-    "sculpture": ("statue", "figurine"),
-    "clock": ("wall clock",),
-    "candle": ("tealight candle",),
-    "cushion": ("throw pillow", "decorative pillow", "sofa cushion"),
-    "pillow": ("bed pillow", "sleeping pillow"),
-    "blanket": ("throw blanket", "throw", "bedspread"),
-    "rug": ("carpet", "area rug"),
-    "curtain": ("drape", "window curtain"),
-    "blinds": ("window blind", "venetian blinds"),
-    "book": ("novel", "paperback"),
-    "box": ("carton", "cardboard box", "storage box"),
-    "basket": ("wicker basket", "laundry basket"),
-    "bin": ("trash can", "recycle bin", "trashcan", "recyclebin", "dustbin", "waste bin", "rubbish bin"),
-    "backpack": ("rucksack", "schoolbag", "school bag"),
-    "exercise-ball": ("gym ball", "fitness ball"),
-    "umbrella": ("parasol",),
-    "switch": ("light switch",),
-    "wall-plug": ("socket", "power outlet", "wall socket", "outlet"),
-    "vent": ("air vent", "ventilation grille"),
-}
+Words = Mapping[str, tuple[str, ...]]
+_TABLE: Mapping[str, Any] = tomllib.loads(Path(__file__).with_name("lexicon.toml").read_text(encoding="utf-8"))
 
-# Words that cover several classes.
-GROUPS: Mapping[str, tuple[str, ...]] = {
-    "seat": ("chair", "sofa", "stool", "bench", "beanbag"),
-    "furniture": (
-        "chair", "sofa", "stool", "bench", "beanbag", "table", "desk", "bed", "nightstand", "cabinet", "base-cabinet",
-        "wall-cabinet", "wardrobe", "shelf", "tv-stand",
-    ),
-    "screen": ("tv-screen", "monitor"),
-    "display": ("tv-screen", "monitor"),
-    "electronics": (
-        "tv-screen", "monitor", "laptop", "desktop-computer", "computer-keyboard", "mouse", "microwave",
-    ),
-    "kitchenware": ("pan", "pot", "plate", "bowl", "cup", "chopping-board", "knife-block"),
-    "cookware": ("pan", "pot"),
-    "dishes": ("plate", "bowl", "cup"),
-    "window covering": ("curtain", "blinds"),
-    "appliance": ("refrigerator", "microwave", "cooktop"),
-    "storage": ("cabinet", "base-cabinet", "wall-cabinet", "wardrobe", "shelf", "nightstand", "box", "basket"),
-    "decoration": ("vase", "sculpture", "picture", "candle", "indoor-plant"),
-    "bag": ("backpack",),
-    "bedding": ("blanket", "pillow"),
-}  # fmt: skip
 
-_SEATS = ("chair", "sofa", "stool", "bench", "beanbag")
-_STORES = ("cabinet", "base-cabinet", "wall-cabinet", "wardrobe", "shelf", "nightstand", "tv-stand", "box", "basket")
+def _words(section: str) -> Words:
+    return {name: tuple(words) for name, words in _TABLE[section].items()}
 
-# What things are for: a phrase and every class of which it is true.
-AFFORDANCES: Mapping[str, tuple[str, ...]] = {
-    "place to sit": _SEATS,
-    "comfortable place to sit": ("sofa", "beanbag", "chair"),
-    "somewhere to sit down": _SEATS,
-    "place to relax": ("sofa", "beanbag"),
-    "place to sit and relax": ("sofa", "beanbag"),
-    "place to sit and read": ("sofa", "beanbag", "chair"),
-    "place to sleep": ("bed",),
-    "place to lie down": ("bed",),
-    "place to sleep at night": ("bed",),
-    "place to eat": ("table",),
-    "place for meeting": ("table",),
-    "place to work": ("desk",),
-    "place to study and work": ("desk",),
-    "place to sit and work": ("desk",),
-    "place to store things": _STORES,
-    "somewhere to put things away": _STORES,
-    "place to prepare food": ("countertop",),
-    "place to hang clothes": ("wardrobe",),
-    "place to put clothes": ("wardrobe",),
-    "source of light": ("lamp",),
-    "something that gives light": ("lamp",),
-    "something to watch films": ("tv-screen",),
-    "something to watch television": ("tv-screen",),
-    "something to see the computer's picture": ("monitor",),
-    "something to type with": ("computer-keyboard", "laptop"),
-    "something to move the pointer": ("mouse",),
-    "computer to carry": ("laptop",),
-    "machine to compute": ("desktop-computer",),
-    "place to keep food cold": ("refrigerator",),
-    "place to keep milk": ("refrigerator",),
-    "place to cook": ("cooktop",),
-    "place to cook food": ("cooktop",),
-    "something to heat food": ("microwave",),
-    "something to warm up food": ("microwave",),
-    "place to wash hands": ("sink",),
-    "place to relieve oneself": ("toilet",),
-    "place to bathe": ("bathtub",),
-    "place to take a bath": ("bathtub",),
-    "something to dry hands": ("towel",),
-    "something to wipe feet": ("mat",),
-    "something to wipe up spills": ("paper-towel",),
-    "something to blow the nose": ("tissue-paper",),
-    "something to fry with": ("pan",),
-    "something to boil with": ("pot",),
-    "something to eat from": ("plate", "bowl"),
-    "something to drink from": ("cup",),
-    "something that holds a drink": ("bottle",),
-    "something to cut food on": ("chopping-board",),
-    "something that holds knives": ("knife-block",),
-    "something to decorate the room": ("vase", "indoor-plant", "picture", "sculpture", "candle"),
-    "something to water": ("indoor-plant",),
-    "something that holds a plant": ("plant-stand",),
-    "something to read the time": ("clock",),
-    "something that tells the time": ("clock",),
-    "something soft to lean on": ("cushion",),
-    "something to rest the head on": ("pillow",),
-    "something to keep warm": ("blanket",),
-    "something soft to stand on": ("rug",),
-    "something to darken the room": ("curtain", "blinds"),
-    "something to read": ("book",),
-    "place to throw trash": ("bin",),
-    "place to throw rubbish away": ("bin",),
-    "something to carry things in": ("backpack",),
-    "something to exercise with": ("exercise-ball",),
-    "something to stay dry in the rain": ("umbrella",),
-    "something to turn the light on": ("switch",),
-    "something to charge a phone": ("wall-plug",),
-    "place to charge": ("wall-plug",),
-    "something that lets air in": ("vent",),
-    "way to leave the room": ("door",),
-    "exit the room": ("door",),
-    "something to look outside": ("window",),
-}
 
-# Other words for a room of a kind.
-ROOM_NAMES: Mapping[str, tuple[str, ...]] = {
-    "living": ("living room", "lounge"),
-    "bedroom": ("bedroom",),
-    "kitchen": ("kitchen",),
-    "office": ("office", "study"),
-    "bathroom": ("bathroom",),
-    "studio": ("studio", "studio flat"),
-}
-
-COLOUR_WORDS: Mapping[str, tuple[str, ...]] = {"grey": ("grey", "gray"), "orange": ("orange",)}
-SIZE_WORDS: Mapping[str, tuple[str, ...]] = {"small": ("small", "little"), "large": ("large", "big"), "medium": ()}
-RELATION_WORDS: Mapping[str, tuple[str, ...]] = {
-    "on": ("on", "on", "on top of"),
-    "under": ("under", "below"),
-    "next to": ("next to", "beside", "near"),
-    "in": ("in", "inside"),
-    "above": ("above", "over"),
-    "with": ("with",),
-}
-
-# What nearly everything stands on or hangs on; captions prefer another neighbour.
-SURFACES = frozenset({"floor", "wall", "ceiling"})
+SYNONYMS = _words("synonyms")  # other names that mean this class and no other
+GROUPS = _words("groups")  # words that cover several classes
+AFFORDANCES = _words("uses")  # a phrase and every class of which it is true
+ROOM_NAMES = _words("rooms")
+COLOUR_WORDS, SIZE_WORDS, RELATION_WORDS = map(_words, ("colours", "sizes", "relations"))
+SURFACES = frozenset(_TABLE["surfaces"])  # what nearly everything stands on; captions prefer another neighbour

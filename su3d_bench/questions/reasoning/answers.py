@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -22,6 +23,16 @@ class Answer:
     notes: tuple[str, ...] = ()
     is_settled: bool = True
     solver: Literal["built-in", "llm"] = "built-in"
+
+    def said(self, like: float | int | bool) -> float | int | bool | None:
+        """What it says of the kind of ``like``, read from its words where it gives no value; None for nothing."""
+        if self.value is not None:
+            return self.value
+        if isinstance(like, bool):
+            word = re.search(r"\b(yes|no)\b", self.text.lower())
+            return None if word is None else word[1] == "yes"
+        number = re.search(r"(?<![\w#.])\d+(?:\.\d+)?", self.text)
+        return None if number is None else float(number[0])
 
     def to_json(self) -> dict[str, Any]:
         return {

@@ -14,15 +14,15 @@ import numpy as np
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.embedded.lexicon import GROUPS, SYNONYMS
 from su3d_bench.perception.embedded.naming import vocabulary
-from su3d_bench.perception.embedded.text import words
-from su3d_bench.questions.reasoning.relations import is_room_surface
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.questions.english import words
+from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap, is_room_surface
 
 Words = tuple[str, ...]
 # A name, and how near it is by the encoder (cosine).
 NearestName = Callable[[str, Sequence[str]], tuple[str, float]]
 
 ANYTHING = frozenset({"object", "thing", "item", "anything", "something", "everything", "one"})
+GATHERED = frozenset({"row", "pile", "stack", "heap"})  # of things of one name
 MOST_ADJECTIVES = 3
 # Ours: by the embedded encoder other words of a thing reach 0.84 ("carpeting") to 0.93 ("armchair"), words of another
 # thing up to 0.72 ("wastebasket" for a basket).
@@ -61,13 +61,23 @@ def meant_by(noun: str, scene: SceneMap, nearest: NearestName | None = None) -> 
         held = tuple(thing for thing in named if _has(thing, adjectives))
         if held:
             return Meant(held)
+    if noun_words[0] in GATHERED and noun_words[1:2] == ("of",):
+        return meant_by(
+            " ".join(noun_words[2:]), scene, nearest
+        )  # of which a map may know the single ones, or one of all
     if noun_words in _class_of_words():
         return Meant(())  # a word that is known, for a thing that is not there
     return _by_encoder(noun, scene, nearest)
 
 
+@cache
+def groups() -> dict[Words, tuple[str, ...]]:
+    """Words for several classes -> the classes."""
+    return {words(name): classes for name, classes in GROUPS.items()}
+
+
 def _named(noun_words: Words, objects: Iterable[MapObject]) -> list[MapObject]:
-    group = GROUPS.get(" ".join(noun_words))
+    group = groups().get(noun_words)
     class_of = _class_of_words()
     if group is not None:
         return [

@@ -47,6 +47,10 @@ _HERE = re.compile(
 _POLITE = re.compile(
     r"^(?:please|can you|could you|would you|tell me|do you know|i want to know|find out|show me|let me know)\b[ ,]*"
 )
+# Distances are between centres anyway.
+_CENTRES = re.compile(
+    r"(?:,? measured (?:between|from) (?:their |the )?cent(?:re|er)s?(?: to cent(?:re|er)s?)?|the cent(?:re|er)s? of )"
+)
 _EVERYTHING = r"(?:object|objects|thing|things|item|items|furniture item)"
 
 
@@ -104,6 +108,7 @@ def _plain(text: str) -> str:
         plain = shorter
     plain = re.sub(r"\b(what|which|where|how|who)'s\b", r"\1 is", plain)
     plain = re.sub(r"\b(near|on|under|in|above|to|from|beside),\s", r"\1 ", plain)
+    plain = _CENTRES.sub("", plain)
     return " ".join(_HERE.sub("", plain).split()).strip(" ,?.!")
 
 

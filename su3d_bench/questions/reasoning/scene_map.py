@@ -10,13 +10,19 @@ import numpy as np
 
 from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.types import Float64Array, Instances
+from su3d_bench.numerics.relations import FIXTURES, SURFACES, Relation, Relations, is_between
+from su3d_bench.questions.english import last_word
 
 MOST_NAME, MOST_CAPTION = 80, 400  # characters; a hostile map may hold texts of any length
 
 
 @dataclass(frozen=True, eq=False)
 class MapObject:
-    """One instance; ``centroid`` (3,) and ``box`` (2, 3), lowest and highest corner, in metres, z up."""
+    """One instance; ``centroid`` (3,) and ``box`` (2, 3), lowest and highest corner, in metres, z up.
+
+    Of a truth: ``is_asked``, whether people can see it well enough to be asked about it; ``is_whole``, whether its box
+    is that of the thing itself and not of what a recording saw.
+    """
 
     id: int
     name: str
@@ -24,6 +30,8 @@ class MapObject:
     centroid: Float64Array
     box: Float64Array
     row: int = -1
+    is_asked: bool = True
+    is_whole: bool = True
 
     @property
     def shown(self) -> str:
@@ -34,6 +42,11 @@ class MapObject:
     def size(self) -> Float64Array:
         sides: Float64Array = self.box[1] - self.box[0]
         return sides
+
+
+def is_room_surface(name: str) -> bool:
+    """Whether what is called so is a part of the room itself."""
+    return last_word(name) in SURFACES
 
 
 @dataclass(frozen=True)
@@ -51,6 +64,42 @@ class SceneMap:
 
     def by_id(self, object_id: int) -> MapObject:
         return self._by_id[object_id]
+
+    @cached_property
+    def relations(self) -> Relations:
+        """How the objects lie to one another, by their rows here."""
+        boxes = np.array([thing.box for thing in self.objects], np.float64).reshape(-1, 2, 3)
+        return Relations(boxes, [last_word(thing.name) for thing in self.objects])
+
+    @cached_property
+    def _row_of(self) -> dict[int, int]:
+        return {thing.id: row for row, thing in enumerate(self.objects)}
+
+    def holds(self, relation: Relation, subject: MapObject, other: MapObject) -> bool:
+        """Whether one object of the map stands in ``relation`` to another."""
+        return bool(self.relations.of(relation)[self._row_of[subject.id], self._row_of[other.id]])
+
+    def is_doubtful(self, relation: Relation, subject: MapObject, other: MapObject) -> bool:
+        """Whether a little lower or higher threshold decides otherwise."""
+        return bool(self.relations.doubtful(relation)[self._row_of[subject.id], self._row_of[other.id]])
+
+    def is_between(self, thing: MapObject, first: MapObject, second: MapObject) -> bool:
+        """Whether an object stands between two others; what one of them holds, or stands on, does not."""
+        if thing.id in (first.id, second.id) or not is_between(thing.box, first.box, second.box):
+            return False
+        pairs = [pair for end in (first, second) for pair in ((thing, end), (end, thing))]
+        return not any(self.holds("on", *pair) or self.holds("in", *pair) for pair in pairs)
+
+    @staticmethod
+    def is_said(relation: Relation, subject: MapObject, other: MapObject) -> bool:
+        """Whether people speak so of such things: windows, blinds and vents are above whatever is in the room."""
+        are_things = {last_word(subject.name), last_word(other.name)}.isdisjoint(FIXTURES)
+        return are_things or relation not in ("above", "under")
+
+    def are_in_one_place(self, *things: MapObject) -> bool:
+        """Whether objects are on one support, all on the floor, or all hang."""
+        rows = [self._row_of[thing.id] for thing in things]
+        return all(self.relations.one_place[a, b] for a in rows for b in rows if a != b)
 
     @property
     def ids(self) -> tuple[int, ...]:

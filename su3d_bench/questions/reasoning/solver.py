@@ -11,18 +11,11 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from su3d_bench.core.types import Float64Array
-from su3d_bench.numerics.boxes import is_left_of
+from su3d_bench.numerics.relations import NEAR_M, is_left_of
 from su3d_bench.questions.reasoning.answers import Answer, unsettled
 from su3d_bench.questions.reasoning.named_objects import Meant, NearestName, meant_by
 from su3d_bench.questions.reasoning.question_words import ANYTHING, Phrase, Question, Relation, Size, read_question
-from su3d_bench.questions.reasoning.relations import (
-    NEAR_M,
-    holds,
-    is_between,
-    is_container,
-    is_room_surface,
-)
-from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap, is_room_surface
 
 CLOSE_CALL_M = 0.05  # a lead smaller than this is said
 MOST_LISTED = 12
@@ -103,14 +96,14 @@ class Solver:
         return objects
 
     def _witnesses(self, thing: MapObject, relation: Relation, others: Sequence[Objects]) -> Objects:
-        """Objects to which ``one`` stands in ``relation``."""
+        """Objects to which ``thing`` stands in ``relation``."""
         if relation == "between":
             if len(others) == 1 and len(others[0]) == 2:
                 others = [others[0][:1], others[0][1:]]
             if len(others) != 2:
                 raise _Unsettled("'between' needs two things, such as: between the bed and the door")
-            pairs = ((a, b) for a in others[0] for b in others[1] if len({a.id, b.id, thing.id}) == 3)
-            return next(((a, b) for a, b in pairs if is_between(thing.centroid, a.centroid, b.centroid)), ())
+            pairs = ((a, b) for a in others[0] for b in others[1] if a.id != b.id)
+            return next(((a, b) for a, b in pairs if self._scene.is_between(thing, a, b)), ())
         return tuple(other for other in others[0] if other.id != thing.id and self._stands(thing, relation, other))
 
     def _stands(self, thing: MapObject, relation: Relation, other: MapObject) -> bool:
@@ -118,15 +111,11 @@ class Solver:
             self._note_eye()
             a, b = (thing, other) if relation == "left of" else (other, thing)
             return is_left_of(a.centroid, b.centroid, self._eye)
-        holder = is_container(other.name)
         if relation == "with":
-            return (
-                holds("on", other.box, thing.box, b_is_container=is_container(thing.name))
-                or holds("in", other.box, thing.box, b_is_container=is_container(thing.name))
-                or holds("next to", thing.box, other.box)
-            )
+            held = any(self._scene.holds(name, other, thing) for name in ("on", "in"))
+            return held or self._scene.holds("next to", thing, other)
         assert relation != "between", "between has two others"
-        return holds(relation, thing.box, other.box, b_is_container=holder)
+        return self._scene.holds(relation, thing, other)
 
     def _note_eye(self) -> None:
         x, y = self._eye[:2]
@@ -222,7 +211,7 @@ class Solver:
     def _list(self, question: Question) -> _Solved:
         things, held = self._objects(question.subject)
         if question.subject.relation in ("left of", "right of"):
-            things = tuple(thing for thing in things if any(holds("near", thing.box, other.box) for other in held))
+            things = tuple(thing for thing in things if any(self._scene.holds("near", thing, other) for other in held))
             self._notes.append(f"no farther than {NEAR_M:g} m from it")
         if not things:
             return f"nothing: the map has no '{_shown(question.subject)}'", (), (), None

@@ -1,4 +1,4 @@
-"""What the rooms say of themselves: classes, sizes, relations that hold in space, questions with all answers."""
+"""What the rooms say of themselves: classes, sizes, relations that hold in space, what people call things."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from su3d_bench.datasets.rooms.objects.catalog import BUILDERS, make
 from su3d_bench.datasets.rooms.objects.items import USUAL_VOLUME_L, size_word
 from su3d_bench.datasets.rooms.plan import FLAT
 from su3d_bench.datasets.rooms.recipes import KINDS
-from su3d_bench.datasets.rooms.truth import Relation, RoomObject, RoomTruth, queries
+from su3d_bench.datasets.rooms.truth import RoomObject, RoomTruth
 
 SCENES = ("living3", "bedroom3", "kitchen3", "office3", "bathroom3", "studio3")
 
@@ -92,15 +92,15 @@ def test_relations_hold_in_space(truths: list[RoomTruth]) -> None:
             apart = np.clip(np.maximum(_low(a) - _high(b), _low(b) - _high(a))[:2], 0, None)
             if link.relation in ("on", "in"):
                 assert (apart == 0).all()
-                assert b.box_min[2] <= a.box_min[2] <= b.box_max[2] + 0.01
+                assert b.box_min[2] <= a.box_min[2] <= b.box_max[2] + 0.04
             if link.relation == "in":
                 assert a.box_min[2] < b.box_max[2] - 0.1
             if link.relation == "under":
-                assert (apart == 0).all() and a.box_max[2] <= b.box_min[2] + 1e-6
+                assert (apart <= 0.1 + 1e-9).all() and a.box_min[2] <= b.box_min[2] + 0.05
             if link.relation == "above":
-                assert a.box_min[2] >= b.box_max[2]
+                assert 0 < a.box_min[2] - b.box_max[2] <= 1.0
             if link.relation == "next to":
-                assert np.hypot(*apart) <= 0.3 + 1e-9
+                assert np.hypot(*apart) <= 0.5 + 1e-9
     assert min(counted[name] for name in ("on", "in", "under", "above", "next to")) > 0
 
 
@@ -122,52 +122,20 @@ def test_everything_stays_inside_the_room(truths: list[RoomTruth]) -> None:
             assert one.box_min[2] >= -1e-9 and one.box_max[2] <= ceiling.box_max[2] + 1e-9
 
 
-def _object(number: int, name: str, colour: str = "red") -> RoomObject:
-    at = (float(number), 0.0, 0.0)
-    return RoomObject(number, CLASS_ID[name], name, colour, "fabric", (1, 1, 1), "medium", at, at, at, "floor")
+def test_rows_and_piles_are_called_so(truths: list[RoomTruth]) -> None:
+    books = [known for truth in truths for known in truth.objects if known.class_name == "book"]
+    assert {known.whole().name for known in books} == {"row of books", "pile of books"}
+    names = {known.whole().name for truth in truths for known in truth.objects}
+    assert not any("-" in name for name in names)
 
 
-def test_questions_carry_all_right_answers() -> None:
-    objects = [_object(1, "floor"), _object(2, "sofa"), _object(3, "cushion", "blue"), _object(4, "cushion")]
-    objects += [_object(k, "bin", "green") for k in range(5, 11)]
-    truth = RoomTruth("test", "living", tuple(objects), (Relation(3, "on", 2), Relation(4, "on", 2)))
-    found = {(one.kind, one.text): one.answers for one in queries(truth)}
-    assert found["instance", "cushion"] == (3, 4)
-    assert found["relative", "cushion on a sofa"] == (3, 4)
-    assert found["property", "blue cushion"] == (3,)
-    assert found["affordance", "place to sit"] == (2,)
-    assert ("instance", "floor") not in found
-    assert ("instance", "bin") not in found  # six of nine objects: more than a third
-
-
-def test_objects_that_are_hardly_visible_are_neither_asked_nor_answers() -> None:
-    objects = tuple(_object(k, name) for k, name in enumerate(("sofa", "cushion", "cushion", "bin", "lamp", "vase"), 1))
-    truth = RoomTruth("test", "living", objects, (Relation(2, "on", 1),))
-    visible = {1: 5000, 2: 99, 3: 100, 4: 500, 5: 500, 6: 500}
-    found = {(one.kind, one.text): one.answers for one in queries(truth, visible)}
-    assert found["instance", "cushion"] == (3,)
-    assert not any(kind == "relative" for kind, _ in found)
+def test_a_material_is_told_where_a_picture_shows_it(truths: list[RoomTruth]) -> None:
+    shown = {(known.class_name, known.material) for t in truths for known in t.objects if known.shows_material}
+    assert {("table", "wooden"), ("basket", "wicker")} <= shown
+    assert {material for _, material in shown} == {"wooden", "wicker"}
+    assert not any(known.whole().adjectives for t in truths for known in t.objects if not known.shows_material)
 
 
 def test_a_room_without_its_scan_is_quick_and_writes_nothing(tmp_path: Path) -> None:
     Rooms(tmp_path).truth("office10001")
     assert not list(tmp_path.iterdir())
-
-
-def test_left_of_is_judged_from_where_one_stands(truths: list[RoomTruth]) -> None:
-    for truth in truths:
-        pairs = {(link.subject, link.object) for link in truth.left_of()}
-        assert pairs
-        assert not any((b, a) in pairs for a, b in pairs)
-        a, b = sorted(pairs)[0]
-        (ax, ay, z), (bx, by, _) = truth.by_id(a).centre, truth.by_id(b).centre
-        middle, across = ((ax + bx) / 2, (ay + by) / 2), (by - ay, ax - bx)
-        length = float(np.hypot(*across))
-        seen = [
-            (middle[0] + sign * 3 * across[0] / length, middle[1] + sign * 3 * across[1] / length, z)
-            for sign in (1, -1)
-        ]
-        from_one_side = {(link.subject, link.object) for link in truth.left_of(seen[0])}
-        from_the_other = {(link.subject, link.object) for link in truth.left_of(seen[1])}
-        assert ((a, b) in from_one_side) != ((a, b) in from_the_other)
-        assert ((a, b) in from_one_side) == ((b, a) in from_the_other)

@@ -1,0 +1,134 @@
+"""What pictures show of an object: how much of an image it fills at best, and its colour where they settle it.
+
+People are asked only about what they can see: an object that no frame shows large enough is not asked about.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.core.types import Float64Array, Frame, GroundTruth, Int64Array
+
+N_FRAMES = 40  # ours: spread evenly, enough to see nearly everything of a room
+MOST_VERTICES = 3000  # of one object: at 0.5 m a scan of 0.02 m still hits most cells of its image
+SAME_SURFACE_M = 0.05  # a vertex is seen where the depth image agrees with it
+CELLS_A_SIDE = 80  # of the grid over an image in which seen vertices are counted
+LEAST_SHARE = 0.002  # ours: of an image; 25 pixels a side of 640 x 480, of which one can tell what they are
+MIN_PIXELS = 60  # ours: fewer say too little of a colour
+# Things whose colour is that of what they show, or of their frame, and nobody's name for them.
+WITHOUT_COLOUR = frozenset(("picture", "painting", "poster", "photo", "mirror", "window", "screen", "tv", "monitor"))
+MIN_SHARE = 0.6  # ours: of the pixels of an object that have the same word
+# CIELAB, all ours: below this chroma a colour is black, grey or white, by its lightness.
+GREY_CHROMA, BLACK_L, WHITE_L = 12.0, 25.0, 75.0
+HUES_DEGREES = (
+    (40.0, "red"), (75.0, "orange"), (105.0, "yellow"), (200.0, "green"), (310.0, "blue"), (345.0, "purple"),
+)  # fmt: skip
+COLOURS = frozenset(("black", "grey", "white", "brown", "beige", "pink", *(name for _, name in HUES_DEGREES)))
+BROWN_L, BROWN_CHROMA, BEIGE_CHROMA = 60.0, 45.0, 30.0  # a dull dark orange is brown, a pale orange or yellow beige
+PINK_L = 60.0  # a light red is pink
+
+
+@dataclass(frozen=True)
+class Sight:
+    """``share``: the largest part of an image that an object fills; ``colour``: a word, empty where none fits."""
+
+    share: float
+    colour: str
+
+    @property
+    def is_plain(self) -> bool:
+        """Whether it can be seen well enough to be asked about."""
+        return self.share >= LEAST_SHARE
+
+
+def sights(dataset: Any, scene: str, truth: GroundTruth, min_vertices: int) -> Mapping[int, Sight]:
+    """Instance id -> what the frames show of it, for the instances of the truth that some frame sees."""
+    rows = _sampled_vertices(truth, min_vertices)
+    points, owner = truth.points[rows].astype(np.float64), truth.instance[rows].astype(np.int64)
+    n_frames = int(dataset.info(scene, 1).n_frames)
+    frames = dataset.frames(scene, max(1, n_frames // N_FRAMES))
+    pixels: dict[int, list[Float64Array]] = {}
+    shares: dict[int, float] = {}
+    for k in range(min(len(frames), N_FRAMES)):
+        frame = frames[k]
+        seen, line, column = _seen(frame, points)
+        side = max(frame.depth_m.shape) / CELLS_A_SIDE
+        n_lines, n_columns = np.ceil(np.array(frame.depth_m.shape) / side).astype(np.int64)
+        cell = (line / side).astype(np.int64) * n_columns + (column / side).astype(np.int64)
+        taken = np.unique(owner[seen] * (n_lines * n_columns) + cell) // (n_lines * n_columns)
+        for instance, n in zip(*np.unique(taken, return_counts=True), strict=True):
+            share = float(n / (n_lines * n_columns))
+            shares[int(instance)] = max(shares.get(int(instance), 0.0), share)
+        rgb = frame.rgb[line, column].astype(np.float64)
+        for instance in np.unique(owner[seen]).tolist():
+            pixels.setdefault(instance, []).append(rgb[owner[seen] == instance][:: max(1, MOST_VERTICES // 300)])
+    return {
+        instance: Sight(shares[instance], colour_word(np.concatenate(pixels[instance]))) for instance in sorted(shares)
+    }
+
+
+def instance_rows(truth: GroundTruth, min_vertices: int) -> Iterator[tuple[int, Int64Array]]:
+    """Id and rows, both ascending, of each instance of the truth with at least ``min_vertices`` vertices."""
+    order = np.argsort(truth.instance, kind="stable")
+    ids, starts = np.unique(truth.instance[order], return_index=True)
+    for instance, rows in zip(ids.tolist(), np.split(order, starts[1:]), strict=True):
+        if instance > 0 and len(rows) >= min_vertices:
+            yield instance, rows
+
+
+def _sampled_vertices(truth: GroundTruth, min_vertices: int) -> Int64Array:
+    """Rows of the truth: up to 3000 of each instance that is large enough, spread evenly in its order."""
+    parts = [
+        rows[np.linspace(0, len(rows) - 1, min(len(rows), MOST_VERTICES)).astype(np.int64)]
+        for _, rows in instance_rows(truth, min_vertices)
+    ]
+    return np.concatenate([np.zeros(0, np.int64), *parts])
+
+
+def _seen(frame: Frame, points: Float64Array) -> tuple[Int64Array, Int64Array, Int64Array]:
+    """The rows of the points that the frame sees, with the line and the column of the pixel of each."""
+    rotation, centre = frame.camera_to_world[:3, :3], frame.camera_to_world[:3, 3]
+    camera = (points - centre) @ rotation
+    rows = np.flatnonzero(camera[:, 2] > 0)
+    projected = camera[rows] @ frame.intrinsics.T
+    column, line = np.rint(projected[:, :2] / projected[:, 2:]).T
+    height, width = frame.depth_m.shape
+    inside = (column >= 0) & (column < width) & (line >= 0) & (line < height)
+    rows, column, line = rows[inside], column[inside].astype(np.int64), line[inside].astype(np.int64)
+    agrees = np.abs(frame.depth_m[line, column] - camera[rows, 2]) < SAME_SURFACE_M
+    return rows[agrees], line[agrees], column[agrees]
+
+
+def colour_word(rgb: Float64Array) -> str:
+    """The word for pixels (N, 3), 0..255, empty where they are too few or of too many colours.
+
+    >>> colour_word(np.tile([200.0, 40.0, 40.0], (100, 1))), colour_word(np.tile([200.0, 40.0, 40.0], (3, 1)))
+    ('red', '')
+    """
+    if len(rgb) < MIN_PIXELS:
+        return ""
+    words, counts = np.unique(_words_of(rgb), return_counts=True)
+    best = int(counts.argmax())
+    return str(words[best]) if counts[best] >= MIN_SHARE * len(rgb) else ""
+
+
+def _words_of(rgb: Float64Array) -> np.ndarray:
+    """The word for each pixel, by lightness, chroma and hue in CIELAB."""
+    import cv2
+
+    lab = cv2.cvtColor((rgb / 255.0).astype(np.float32)[None], cv2.COLOR_RGB2LAB)[0].astype(np.float64)
+    lightness, chroma = lab[:, 0], np.hypot(lab[:, 1], lab[:, 2])
+    hue = np.degrees(np.arctan2(lab[:, 2], lab[:, 1])) % 360
+    ends = np.array([end for end, _ in HUES_DEGREES])
+    names = np.array([*(name for _, name in HUES_DEGREES), "red"])
+    words = names[np.searchsorted(ends, hue, side="right")]
+    is_warm = (words == "orange") | (words == "yellow")
+    words = np.where(is_warm & (lightness >= BROWN_L) & (chroma < BEIGE_CHROMA), "beige", words)
+    words = np.where((words == "orange") & (lightness < BROWN_L) & (chroma < BROWN_CHROMA), "brown", words)
+    words = np.where((words == "red") & (lightness >= PINK_L), "pink", words)
+    greys = np.where(lightness < BLACK_L, "black", np.where(lightness >= WHITE_L, "white", "grey"))
+    return np.where(chroma < GREY_CHROMA, greys, words)

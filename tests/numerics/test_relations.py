@@ -1,0 +1,238 @@
+"""Every rule of relations on both sides of each of its thresholds, by hand; and that there is one code of them."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import numpy as np
+import pytest
+from bedroom_map import box
+from places import ROOT
+
+from su3d_bench.core.types import Float64Array
+from su3d_bench.datasets.rooms.dataset import DEFAULT_SCENES, Rooms
+from su3d_bench.numerics.relations import (
+    BAND,
+    RELATIONS,
+    Relation,
+    Relations,
+    bearing_rad,
+    gap_m,
+    is_between,
+    is_left_of,
+)
+from su3d_bench.questions.english import last_word
+from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.questions.reasoning.solver import Solver
+
+FLOOR = box(-5, -5, -0.1, 10, 10, 0.1)
+
+
+def holds(relation: Relation, a: Float64Array, b: Float64Array, *others: Float64Array, name: str = "thing") -> bool:
+    """Whether ``a`` stands in the relation to ``b``, which is called ``name``, on a floor at 0 among ``others``."""
+    boxes = np.array([a, b, FLOOR, *others])
+    names = ["thing", name, "floor", *["thing"] * len(others)]
+    return bool(Relations(boxes, names).of(relation)[0, 1])
+
+
+def moved(bounds: Float64Array, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Float64Array:
+    placed: Float64Array = bounds + np.array([x, y, z])
+    return placed
+
+
+TABLE, CUP = box(0, 0, 0, 1, 1, 0.7), box(0.4, 0.4, 0.7, 0.1, 0.1, 0.1)
+SHELF = box(0, 0, 0, 1, 0.3, 1.8)
+BOOK = box(0.2, 0.05, 0.9, 0.2, 0.2, 0.3)  # on an inner board
+PICTURE = box(0.2, 0.97, 1.2, 0.6, 0.03, 0.5)
+
+
+@pytest.mark.parametrize(
+    ("relation", "a", "b", "is_so"),
+    [
+        # on: contact of 0.04 m, 0.3 of the smaller footprint
+        ("on", CUP, TABLE, True),
+        ("on", TABLE, CUP, False),
+        ("on", moved(CUP, z=0.039), TABLE, True),
+        ("on", moved(CUP, z=0.041), TABLE, False),
+        ("on", moved(CUP, x=0.56), TABLE, True),  # 0.4 of the cup is over the table
+        ("on", moved(CUP, x=0.58), TABLE, False),  # 0.2
+        ("on", BOOK, SHELF, True),
+        ("on", moved(BOOK, z=-0.84), SHELF, True),  # 0.06 m above the foot: an inner board
+        ("on", moved(BOOK, z=-0.86), SHELF, False),  # 0.04 m: it stands on the floor
+        ("on", moved(BOOK, y=-0.12), SHELF, False),  # 0.65 of it inside
+        # under: what bears it, what has it above, what stands where it covers the ground
+        ("under", TABLE, CUP, True),
+        ("under", CUP, TABLE, False),
+        ("under", box(0.3, 0.3, 0, 0.3, 0.3, 0.4), TABLE, True),
+        ("under", box(0.78, 0.3, 0, 0.3, 0.3, 0.4), TABLE, True),  # 0.73 of its ground is covered
+        ("under", box(0.82, 0.3, 0, 0.3, 0.3, 0.4), TABLE, False),  # 0.6
+        ("under", box(0.3, 0.3, 0, 0.3, 0.3, 0.8), TABLE, False),  # it reaches higher
+        # above: half of it or its centre, no more than a metre, not resting
+        ("above", PICTURE, TABLE, True),
+        ("above", moved(PICTURE, z=0.49), TABLE, True),  # 0.99 m of air
+        ("above", moved(PICTURE, z=0.51), TABLE, False),
+        ("above", moved(PICTURE, x=0.58), TABLE, True),  # 0.53 of it is over the table grown by 0.1 m
+        ("above", moved(PICTURE, x=0.85), TABLE, False),
+        ("above", CUP, TABLE, False),
+        ("under", TABLE, PICTURE, True),
+        # next to: half the longer side of the smaller one, from 0.1 to 0.5 m
+        ("next to", box(1.24, 0, 0, 0.5, 0.5, 0.9), TABLE, True),  # 0.24 m apart
+        ("next to", box(1.26, 0, 0, 0.5, 0.5, 0.9), TABLE, False),
+        ("next to", box(1.49, 0, 0, 1.5, 1, 0.9), TABLE, True),
+        ("next to", box(1.51, 0, 0, 1.5, 1, 0.9), TABLE, False),
+        ("next to", box(1.09, 0, 0, 0.1, 0.1, 0.2), TABLE, True),
+        ("next to", box(1.11, 0, 0, 0.1, 0.1, 0.2), TABLE, False),
+        ("next to", box(1.1, 0, 0, 1.0, 0.5, 0.02), TABLE, False),  # a rug is part of the floor
+        ("next to", CUP, TABLE, False),
+        ("next to", box(0.9, 0, 0, 0.5, 0.5, 0.9), TABLE, True),  # pushed under it by a fifth
+        ("next to", box(0.8, 0, 0, 0.5, 0.5, 0.9), TABLE, False),  # by two fifths: under it
+        ("next to", PICTURE, TABLE, False),  # one hangs, one stands
+        ("next to", PICTURE, moved(PICTURE, x=0.85), True),
+        ("next to", PICTURE, moved(PICTURE, x=0.95), False),
+        ("next to", PICTURE, moved(PICTURE, y=-0.05), False),  # one hangs before the other
+        # near: a metre from box to box
+        ("near", box(1.99, 0, 0, 0.5, 0.5, 0.9), TABLE, True),
+        ("near", box(2.01, 0, 0, 0.5, 0.5, 0.9), TABLE, False),
+    ],
+)
+def test_a_rule_on_both_sides_of_its_threshold(
+    relation: Relation, a: Float64Array, b: Float64Array, is_so: bool
+) -> None:
+    assert holds(relation, a, b) is is_so
+
+
+def test_a_container_holds_what_a_shelf_carries() -> None:
+    holder, held = box(0, 0, 0, 0.5, 0.5, 0.4), box(0.1, 0.1, 0.1, 0.2, 0.2, 0.6)
+    assert holds("in", held, holder, name="basket") and not holds("on", held, holder, name="basket")
+    assert holds("on", held, holder, name="shelf") and not holds("in", held, holder, name="shelf")
+    assert not holds("in", moved(held, x=0.31), holder, name="basket")  # 0.45 of it inside
+
+
+def test_what_is_deeper_is_under_the_first_that_bears() -> None:
+    slab, cabinet = box(0, 0, 0.7, 2, 1, 0.03), box(0, 0, 0, 1, 1, 0.7)
+    cup = moved(CUP, z=0.03)
+    assert holds("on", cup, slab, cabinet) and holds("on", slab, cabinet, cup)
+    assert not holds("on", cup, cabinet, slab)
+    assert not holds("under", cabinet, cup, slab)
+
+
+def test_only_the_next_thing_below_is_under() -> None:
+    vase = box(0.7, 0.7, 0.7, 0.1, 0.28, 0.3)
+    assert holds("above", PICTURE, TABLE)
+    centred = box(0.2, 0.72, 0.7, 0.6, 0.26, 0.3)  # as wide as the picture, and right below it
+    assert holds("above", PICTURE, centred, TABLE)
+    assert not holds("above", PICTURE, TABLE, centred)
+    assert holds("above", PICTURE, TABLE, vase)  # a third of the picture is over the vase, not its middle
+
+
+def test_nothing_stands_between_neighbours() -> None:
+    chair, bin_between = box(1.24, 0, 0, 0.5, 1, 0.9), box(1.05, 0.3, 0, 0.15, 0.15, 0.3)
+    assert holds("next to", chair, TABLE)
+    assert not holds("next to", chair, TABLE, bin_between)
+    assert holds("next to", chair, TABLE, moved(bin_between, z=2.0))  # above their heads
+    assert holds("next to", bin_between, TABLE, chair)
+
+
+def test_neighbours_share_a_support() -> None:
+    plate = box(0.6, 0.4, 0.7, 0.2, 0.2, 0.03)
+    assert holds("next to", CUP, plate, TABLE)
+    assert not holds("next to", CUP, moved(plate, z=-0.7, x=0.1), box(0, 0, 0, 0.55, 1, 0.7))  # one on the floor
+
+
+def test_fixtures_rest_on_nothing_and_surfaces_stand_in_no_relation() -> None:
+    assert holds("on", box(0.2, 0.9, 0.71, 0.5, 0.1, 1), TABLE)
+    boxes = np.array([box(0.2, 0.9, 0.71, 0.5, 0.1, 1), TABLE, FLOOR])
+    relations = Relations(boxes, ["window", "table", "floor"])
+    assert not relations.on[0, 1]
+    assert not any(relations.of(name)[2].any() or relations.of(name)[:, 2].any() for name in RELATIONS)
+
+
+def test_what_a_little_more_or_less_decides_is_doubtful() -> None:
+    chair = box(1, 0, 0, 0.5, 0.5, 0.9)
+    for gap, is_doubtful in ((0.19, False), (0.21, True), (0.3, True), (0.32, False)):  # around 0.25 m, by a quarter
+        relations = Relations(np.array([TABLE, moved(chair, x=gap), FLOOR]), ["table", "chair", "floor"])
+        assert relations.doubtful("next to")[0, 1] == is_doubtful, gap
+    assert BAND == 1.25
+    certain = Relations(np.array([TABLE, CUP, FLOOR]), ["table", "cup", "floor"])
+    assert not certain.doubtful("on").any()
+    assert [(link.subject, link.relation, link.object) for link in certain.links(with_doubtful=False)] == [
+        (0, "under", 1),
+        (1, "on", 0),
+    ]
+
+
+def test_between_lies_on_the_way_on_one_level() -> None:
+    a, b = box(-0.5, -0.5, 0, 1, 1, 1), box(3.5, -0.5, 0, 1, 1, 1)
+    middle = box(1.9, -0.1, 0, 0.2, 0.2, 0.5)
+    assert is_between(middle, a, b)
+    assert is_between(moved(middle, y=0.14), a, b)  # the line leads over its footprint, grown by 0.05 m
+    assert not is_between(moved(middle, y=0.16), a, b)
+    assert is_between(moved(middle, x=-1.7), a, b)  # a tenth of 4 m on the way
+    assert not is_between(moved(middle, x=-1.85), a, b)
+    assert is_between(box(1.5, 1.5, 0, 1, 1, 1), box(0, 0, 0, 1, 1, 1), box(3, 3, 0, 1, 1, 1))  # aslant
+    assert not is_between(box(2.6, 0.4, 0, 1, 1, 1), box(0, 0, 0, 1, 1, 1), box(3, 3, 0, 1, 1, 1))
+    assert not is_between(moved(middle, z=1.0), a, b)  # over their heads
+    assert not is_between(moved(middle, x=1.9), a, b)
+    assert not is_between(a, b, b)
+
+
+def test_left_is_seen_from_an_eye() -> None:
+    eye = np.zeros(3)
+    assert bearing_rad(eye, np.array([1.0, 1.0, 0.0]), np.array([1.0, 0.0, 0.0])) == pytest.approx(np.pi / 4)
+    # The angle goes over the line where bearings jump from -180 to 180 degrees.
+    assert is_left_of(np.array([-1.0, -0.1, 0.0]), np.array([-1.0, 0.1, 0.0]), eye)
+    assert gap_m(box(1.25, 0, 0, 0.5, 0.5, 0.9), TABLE) == pytest.approx(0.25)
+
+
+@pytest.mark.parametrize("scene", DEFAULT_SCENES)
+def test_no_two_answers_differ_for_a_pair(scene: str, rooms_data: Path) -> None:
+    """The rooms' own truth, the relations of a map and the solver, over all pairs of a room."""
+    truth = Rooms(rooms_data).truth(scene)
+    things = [known.whole() for known in truth.objects]
+    objects = SceneMap(tuple(MapObject(t.id, t.name, "", t.box.mean(axis=0), t.box) for t in things))
+    of_truth = {(link.subject, link.relation, link.object) for link in truth.relations}
+    solver = Solver(objects)
+    for a in objects.objects:
+        for b in objects.objects:
+            for relation in RELATIONS:
+                if a is b or relation == "near":
+                    continue
+                is_so = (a.id, relation, b.id) in of_truth
+                assert objects.holds(relation, a, b) is is_so
+                assert solver._stands(a, relation, b) is is_so
+
+
+@pytest.mark.parametrize("scene", DEFAULT_SCENES)
+def test_what_a_room_was_built_with_is_found(scene: str, rooms_data: Path) -> None:
+    """On and in, as the room was put together; besides them only what stands on a rug."""
+    rooms = Rooms(rooms_data)
+    plan = rooms._room(scene).plan
+    built = {(subject, relation, holder) for subject, (holder, relation) in plan.parent.items()}
+    built |= {(subject, "on", holder) for subject, holder in plan.rests_also_on}
+    truth = rooms.truth(scene)
+    found = {(r.subject, r.relation, r.object) for r in truth.relations if r.relation in ("on", "in")}
+    assert built <= found
+    assert {truth.by_id(holder).class_name for _, _, holder in found - built} <= {"rug", "mat"}
+
+
+def test_thresholds_stand_in_one_module() -> None:
+    names = {"CONTACT_M", "WITHIN_SHARE", "ABOVE_M", "CONTAINERS", "OVER_SHARE", "REACH_SHARE", "BETWEEN_PAD_M"}
+    defined = [
+        file.relative_to(ROOT).as_posix()
+        for folder in ("su3d_bench", "datasets", "baselines", "reports")
+        for file in (ROOT / folder).rglob("*.py")
+        for node in ast.parse(file.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.Assign)
+        and names & {target.id for target in ast.walk(node) if isinstance(target, ast.Name)}
+    ]
+    assert {path.rpartition("/")[2] for path in defined} == {"relations.py"}
+
+
+def test_the_last_word_says_what_a_thing_is() -> None:
+    assert [last_word(name) for name in ("waste-baskets", "paper towel", "Floor", "")] == [
+        "basket",
+        "towel",
+        "floor",
+        "",
+    ]

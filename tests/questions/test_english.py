@@ -1,0 +1,69 @@
+"""One and several of every class: what is asked is English, and what is understood is what was asked."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from typing import Any
+
+import pytest
+from places import ROOT
+
+from su3d_bench.perception.embedded.lexicon import SYNONYMS
+from su3d_bench.perception.embedded.naming import vocabulary
+from su3d_bench.questions.english import is_countable, is_plural, plural, singular, with_article, words
+from su3d_bench.questions.known_objects import plain_name
+
+
+def texts_in(value: Any) -> set[str]:
+    if isinstance(value, str):
+        return {value}
+    parts = [*value, *value.values()] if isinstance(value, dict) else value if isinstance(value, list) else []
+    return {text for part in parts for text in texts_in(part)}
+
+
+def every_name() -> list[str]:
+    """The classes of every label set, the words that regions are called by, and other names of classes."""
+    names = {*vocabulary(), *(other for others in SYNONYMS.values() for other in others)}
+    for path in (ROOT / "su3d_bench/metrics/rules").glob("classes.*.toml"):
+        names |= {row[1] for row in tomllib.loads(path.read_text(encoding="utf-8"))["classes"]}
+    for dataset in ("replica", "scannet"):
+        names |= texts_in(json.loads((ROOT / "datasets" / dataset / "labels.json").read_text(encoding="utf-8")))
+    return sorted({plain_name(name).lower() for name in names if len(name) < 40})
+
+
+def test_several_of_a_thing_give_its_name_back_for_every_class() -> None:
+    names = every_name()
+    assert len(names) > 300
+    assert [name for name in names if words(plural(name)) != words(name)] == []
+
+
+@pytest.mark.parametrize(
+    ("one", "several"),
+    [
+        ("sofa", "sofas"), ("camera", "cameras"), ("shelf", "shelves"), ("bookshelf", "bookshelves"), ("box", "boxes"),
+        ("couch", "couches"), ("dish", "dishes"), ("glass", "glasses"), ("bus", "buses"), ("vase", "vases"),
+        ("knife", "knives"), ("stove", "stoves"), ("candy", "candies"), ("tray", "trays"), ("cookie", "cookies"),
+        ("mouse", "mice"), ("tv", "tvs"), ("house", "houses"), ("case", "cases"), ("loaf", "loaves"),
+    ],
+)  # fmt: skip
+def test_one_and_several(one: str, several: str) -> None:
+    assert plural(one) == several
+    if one != "glass":  # glasses are worn, too: what is called so already is one pair
+        assert singular(several) == one
+    assert singular(one) == one
+
+
+@pytest.mark.parametrize("word", ["canvas", "gas", "lens", "glass", "mattress", "cactus", "iris", "his", "is", "as"])
+def test_a_word_that_means_one_stays(word: str) -> None:
+    assert singular(word) == word
+
+
+def test_what_is_always_several_or_stuff_is_spoken_of_so() -> None:
+    assert (is_plural("blinds"), is_plural("pile of books"), is_plural("stairs"), is_plural("bus")) == (
+        True, False, True, False,
+    )  # fmt: skip
+    assert (with_article("blinds"), with_article("furniture"), with_article("hourglass")) == (
+        "blinds", "furniture", "an hourglass",
+    )  # fmt: skip
+    assert not is_countable("toilet paper") and is_countable("paper towel")
