@@ -34,7 +34,7 @@ REACH_SHARE, LEAST_REACH_M, MOST_REACH_M = 0.5, 0.1, 0.5  # neighbours: half the
 NEAR_M = 1.0  # an arm's length
 FLAT_M, SPREAD_M = 0.03, 0.5  # so low and so wide is a rug: part of the floor for what stands beside it
 BETWEEN_ENDS = 0.05  # share of the way, at either end, that is not between
-BETWEEN_PAD_M = 0.05  # by which the footprint of what is between is grown
+BETWEEN_CORE = 0.5  # of either side of a footprint, about its middle: what the line grazes is not between
 LEAST_BEARING_RAD = 0.05  # two things nearer to one line of sight are neither left nor right of each other
 # What things are called whose last word decides how others lie to them.
 CONTAINERS = frozenset(
@@ -304,11 +304,13 @@ class Relations:
 
 
 def is_between(a: Float64Array, b: Float64Array, c: Float64Array) -> bool:
-    """Whether the line from the middle of box ``b`` to that of box ``c`` leads over the footprint of box ``a``.
+    """Whether the line from the middle of box ``b`` to that of box ``c`` leads over the inner half of box ``a``.
 
-    Boxes (2, 3), ``a`` at the height of both; its middle is beside the way, not at either end.
+    Boxes (2, 3), ``a`` at the height of both; nothing is between what lies flat on the floor and something else.
     """
     if any(min(a[1, 2], end[1, 2]) <= max(a[0, 2], end[0, 2]) for end in (b, c)):
+        return False
+    if any(end[1, 2] - end[0, 2] < FLAT_M for end in (a, b, c)):
         return False
     start, way = b.mean(axis=0)[:2], (c - b).mean(axis=0)[:2]
     length = float(np.linalg.norm(way))
@@ -317,7 +319,8 @@ def is_between(a: Float64Array, b: Float64Array, c: Float64Array) -> bool:
     along = float((a.mean(axis=0)[:2] - start) @ way) / length**2
     # where the line enters and leaves the footprint, as shares of the way, along each axis
     with np.errstate(divide="ignore", invalid="ignore"):
-        ends = np.sort((a[:, :2] + [[-BETWEEN_PAD_M], [BETWEEN_PAD_M]] - start) / way, axis=0)
+        middle = a.mean(axis=0)
+        ends = np.sort(((middle + BETWEEN_CORE * (a - middle))[:, :2] - start) / way, axis=0)
     enters, leaves = float(np.nanmax(ends[0])), float(np.nanmin(ends[1]))
     return BETWEEN_ENDS < along < 1 - BETWEEN_ENDS and max(enters, 0.0) < min(leaves, 1.0)
 

@@ -26,16 +26,18 @@ def known_objects(
 
     Those of the truth with at least ``min_vertices`` vertices; an object's class is that of most of them. ``whole``
     gives all objects of the scene as they are. Where ``seen`` says what frames show, colours are in the captions and
-    what is not plain to see is not to be asked about.
+    what is not plain to see is not to be asked about; nor is a cabinet where there are base cabinets too.
     """
     rows_of = dict(instance_rows(truth, min_vertices))
     objects = [_of_vertices(truth, instance, rows) for instance, rows in rows_of.items()] if whole is None else whole
+    names = {known.name for known in objects if known is not None}
     things = []
     for known in objects:
         if known is None or is_room_surface(known.name):
             continue
         sight = None if seen is None else seen.get(known.id)
         is_asked = known.id in rows_of and (seen is None or (sight is not None and sight.is_plain))
+        is_asked &= not any(name.endswith(f" {known.name}") for name in names)
         colour = "" if sight is None or last_word(known.name) in WITHOUT_COLOUR else sight.colour
         colour = colour if known.colour in ("", colour) else ""  # in the light of the room it looks like another
         words = [*([colour] if colour else []), *known.adjectives]

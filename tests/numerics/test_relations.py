@@ -166,8 +166,8 @@ def test_between_lies_on_the_way_on_one_level() -> None:
     a, b = box(-0.5, -0.5, 0, 1, 1, 1), box(3.5, -0.5, 0, 1, 1, 1)
     middle = box(1.9, -0.1, 0, 0.2, 0.2, 0.5)
     assert is_between(middle, a, b)
-    assert is_between(moved(middle, y=0.14), a, b)  # the line leads over its footprint, grown by 0.05 m
-    assert not is_between(moved(middle, y=0.16), a, b)
+    assert is_between(moved(middle, y=0.04), a, b)  # the line leads over the inner half of its 0.2 m
+    assert not is_between(moved(middle, y=0.06), a, b)
     assert is_between(moved(middle, x=-1.7), a, b)  # a tenth of 4 m on the way
     assert not is_between(moved(middle, x=-1.85), a, b)
     assert is_between(box(1.5, 1.5, 0, 1, 1, 1), box(0, 0, 0, 1, 1, 1), box(3, 3, 0, 1, 1, 1))  # aslant
@@ -175,6 +175,7 @@ def test_between_lies_on_the_way_on_one_level() -> None:
     assert not is_between(moved(middle, z=1.0), a, b)  # over their heads
     assert not is_between(moved(middle, x=1.9), a, b)
     assert not is_between(a, b, b)
+    assert not is_between(box(1.9, -0.1, 0, 0.2, 0.2, 0.02), a, b)  # flat
 
 
 def test_left_is_seen_from_an_eye() -> None:
@@ -217,7 +218,7 @@ def test_what_a_room_was_built_with_is_found(scene: str, rooms_data: Path) -> No
 
 
 def test_thresholds_stand_in_one_module() -> None:
-    names = {"CONTACT_M", "WITHIN_SHARE", "ABOVE_M", "CONTAINERS", "OVER_SHARE", "REACH_SHARE", "BETWEEN_PAD_M"}
+    names = {"CONTACT_M", "WITHIN_SHARE", "ABOVE_M", "CONTAINERS", "OVER_SHARE", "REACH_SHARE", "BETWEEN_CORE"}
     defined = [
         file.relative_to(ROOT).as_posix()
         for folder in ("su3d_bench", "datasets", "baselines", "reports")

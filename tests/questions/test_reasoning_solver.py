@@ -58,7 +58,7 @@ def solver() -> Solver:
         ("Is the nightstand beside the bed?", (2,), True),
         ("Is there a paper towel near, sink?", (17,), True),
         ("which lamp is on the nightstand next to the bed?", (3,), None),
-        ("What is between the bed and the basket?", (5, 6), None),
+        ("What is between the bed and the basket?", (6,), None),
         ("Which lamp is the tallest?", (4,), None),
         ("What is the largest object?", (1,), None),
         ("What is the smallest thing on the table?", (7,), None),

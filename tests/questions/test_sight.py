@@ -67,6 +67,13 @@ def test_a_colour_is_told_where_frames_show_the_one_that_a_thing_was_made_in() -
     assert known_objects(truth, 1, [WholeObject(1, "picture", box)], seen).objects[0].caption == ""
 
 
+def test_a_name_that_another_ends_with_is_not_asked_for() -> None:
+    _, truth = seen_by_one_camera()
+    box = np.array([[0, 0, 0], [1, 1, 1]], float)
+    whole = [WholeObject(1, "cabinet", box), WholeObject(2, "base cabinet", box)]
+    assert [thing.is_asked for thing in known_objects(truth, 1, whole).objects] == [False, True]
+
+
 @pytest.mark.parametrize(
     ("rgb", "word"),
     [
