@@ -148,8 +148,11 @@ SUBJECTS = {
     "retrieval": ("Retrieval by text", "is the instance ranked first right?"),
     "annotation": ("Labels and merging of instances", "is the label right, how was the mask merged?"),
     "reasoning": ("Spatial reasoning", "is the answer right, and are the objects that it names?"),
+    "questions": ("Generated questions", "do they make sense, and are their wording and their answer right?"),
 }
 JUDGES = {"people": "people", "automatic": "ground truth"}
+ABOUT_TRUTH = "The ground truth judges the same items, as far as it knows them"
+ABOUT_QUESTIONS = "A question is as right as the worst of what is said of it; arguable: those that are no worse"
 SHOWN_TESTS = 60  # pairs of methods under one metric; scores.json has all
 
 
@@ -181,17 +184,18 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
     people = ", ".join(f"{name} {n}" for name, n in scores["annotators"].items())
     judged = f"{scores['n_judged']} of {scores['n_items']} items judged; judgements by {people}"
     judged = judged if people else f"no person judged; {scores['n_items']} items"
+    origin = f" of run {scores['run']}" if scores["run"] else ""
     return Table(
         name=f"{scores['kind']}-{dataset}",
         caption=f"{subject} on {dataset}, {counted(n_scenes, 'scene')}: {question}",
-        head="method",
+        head="kind" if scores["kind"] == "questions" else "method",
         columns=tuple(metrics),
         rows=tuple(rows),
         notes=(
             "Per cent; in brackets the 95 % interval over resampled items, then the number of items. An item that "
-            "several people judged counts once, with the share of them that said so. The ground truth judges the same "
-            "items, as far as it knows them",
-            f"set {scores['sheet_id']} of run {scores['run']}; {judged}",
+            "several people judged counts once, with the share of them that said so. "
+            + (ABOUT_QUESTIONS if scores["kind"] == "questions" else ABOUT_TRUTH),
+            f"set {scores['sheet_id']}{origin}; {judged}",
             *([f"answers by {printable(scores['answered_by'], 100)}"] if scores["answered_by"] else []),
             *([f"'cannot tell' is left out: at most {unclear} judgements of a number"] if unclear else []),
             *([f"no answers from {', '.join(scores['silent'])}"] if scores["silent"] else []),

@@ -27,7 +27,7 @@ def add_parser(verbs: Any) -> None:
         "questions",
         "Make sets of queries with known answers from ground truth, or show a set.",
         (
-            "su3d-bench questions make --scenes 'rooms/*' --per-kind 40 --out queries.toml",
+            "su3d-bench questions make --scenes 'rooms/*' --per-kind 40 --leave-out disputed.csv --out queries.toml",
             "su3d-bench questions show paper",
         ),
         call,
@@ -41,6 +41,9 @@ def add_parser(verbs: Any) -> None:
         default="auto",
         metavar="auto|generated",
         help="auto: what the dataset itself knows, else generated from classes and boxes",
+    )
+    parser.add_argument(
+        "--leave-out", type=Path, metavar="FILE", help="make: without the questions that a CSV file lists by their id"
     )
     parser.add_argument("--out", type=Path, metavar="FILE", help="make: where to write, .toml or .csv")
 
@@ -74,17 +77,18 @@ def _make(arguments: argparse.Namespace) -> int:
 
 def _made(arguments: argparse.Namespace) -> list[Question]:
     from su3d_bench.cli.datasets.check import chosen_scenes
+    from su3d_bench.questions.files.left_out import read_left_out
+    from su3d_bench.questions.generator import chosen
     from su3d_bench.questions.truths import questions_of
 
+    left_out = frozenset[str]() if arguments.leave_out is None else read_left_out(arguments.leave_out)
     made: list[Question] = []
     for dataset, scene in chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet):
-        questions = questions_of(
-            dataset,
-            scene,
-            per_kind=arguments.per_kind,
-            own=arguments.source == "auto",
-        )
-        remark(f"{dataset.name}/{scene}: {len(questions)} questions", quiet=arguments.quiet)
+        found = questions_of(dataset, scene, own=arguments.source == "auto")
+        kept = [question for question in found if question.id not in left_out]
+        questions = chosen(kept, arguments.per_kind)
+        without = f", {len(found) - len(kept)} left out" if left_out else ""
+        remark(f"{dataset.name}/{scene}: {len(questions)} questions{without}", quiet=arguments.quiet)
         made += questions
     return made
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -70,9 +70,16 @@ def judged(is_right: bool) -> str:
 
 
 def questions_of(
-    source: RunSource, scene: str, given: Sequence[Question] | None, per_kind: int | None
+    source: RunSource,
+    scene: str,
+    given: Sequence[Question] | None,
+    per_kind: int | None,
+    left_out: Collection[str] = (),
 ) -> list[Question]:
-    """The questions of four kinds to a scene: those ``given``, else the ones that its ground truth answers."""
+    """The questions of four kinds to a scene: those ``given``, else the ones that its ground truth answers.
+
+    Those whose ids are ``left_out`` make room for others.
+    """
     if given is None:
         rules = source.rules(scene, "retrieval")
         truth = source.truth(scene, rules)
@@ -87,7 +94,7 @@ def questions_of(
         else:
             assert rules.min_region_size is not None
             given = generate(scene, scene_objects(dataset, name, truth, rules.min_region_size))
-    mine = [question for question in given if question.scene == scene]
+    mine = [question for question in given if question.scene == scene and question.id not in left_out]
     return [question for kind in KINDS for question in chosen([each for each in mine if each.kind == kind], per_kind)]
 
 
@@ -244,18 +251,30 @@ def requests_into(requests: list[ChatRequest], model: LanguageModel, config: Lan
 
 
 def reasoning_drafts(
-    source: RunSource, scene: str, given: Sequence[Question] | None, per_kind: int, ask: AskMap
+    source: RunSource,
+    scene: str,
+    given: Sequence[Question] | None,
+    per_kind: int,
+    ask: AskMap,
+    left_out: Collection[str] = (),
 ) -> list[Draft]:
     """The answers about each map, one draft for all maps of which the same is said.
 
     Asked are the questions of kind ``reasoning`` that are ``given``, else ``per_kind`` of each template, made from the
-    ground truth.
+    ground truth; without those whose ids are ``left_out``.
     """
+
+    def is_asked(text: str) -> bool:
+        return question_id(scene, REASONING, text) not in left_out
+
     rules = source.rules(scene, "reasoning")
-    known = () if given is not None else _known(source, scene, rules, per_kind)
+    known = (
+        [] if given is not None else [true for true in _known(source, scene, rules, per_kind) if is_asked(true.text)]
+    )
     texts = [answer.text for answer in known]
     if given is not None:
-        texts = [question.text for question in given if question.scene == scene and question.kind == REASONING]
+        mine = [question.text for question in given if question.scene == scene and question.kind == REASONING]
+        texts = [text for text in mine if is_asked(text)]
     groups: dict[bytes, Draft] = {}
     for method in source.methods:
         instances = source.instances(scene, method)

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Protocol
 
 import numpy as np
 
@@ -26,10 +25,9 @@ from su3d_bench.reports.pictures.items import (
 from su3d_bench.reports.pictures.map_views import DrawnMap, MapView, drawn_map, pale
 from su3d_bench.reports.pictures.maps import Scale, instance_colours, scale_stops, similarity_colours
 from su3d_bench.runs.executors.local import Event, Report, run_inline, run_processes
-from su3d_bench.runs.finished import read_run
 from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import SheetKind
-from su3d_bench.sheets.run_source import RunSource, mask_digest
+from su3d_bench.sheets.run_source import mask_digest
 
 ANSWER_COLOUR, OTHER_COLOUR = (222, 74, 22), (32, 98, 196)  # those of reasoning_picture
 PALE_SHARE = 0.3
@@ -38,18 +36,32 @@ MAP_TITLES: Mapping[SheetKind, str] = {
     "retrieval": "similarity of everything in the map to the text",
     "annotation": "the map around it, the outlined mask in red",
     "reasoning": "the map: red what the answer names, blue what it was held against",
+    "questions": "the room: red what the answer names, blue what it was held against",
 }
 OUTLINED: Mapping[SheetKind, str] = {
     "retrieval": "what was found",
     "annotation": "the mask",
     "reasoning": "what the answer names",
+    "questions": "what the answer names",
 }
+
+
+class PictureSource(Protocol):
+    """Maps and frames of scenes; ``opener`` opens the same in another process."""
+
+    @property
+    def opener(self) -> Callable[[], PictureSource]: ...
+
+    @property
+    def instances(self) -> Callable[[str, str], Instances]: ...
+
+    def frames(self, scene: str, method: str) -> Sequence[Frame]: ...
 
 
 class Artist:
     """Draws the items of a run, one scene after another; what a scene's items share is made once."""
 
-    def __init__(self, source: RunSource, scale: Scale = "paper") -> None:
+    def __init__(self, source: PictureSource, scale: Scale = "paper") -> None:
         self._source, self._scale = source, scale
         self._maps: dict[bytes, _ShownMap] = {}
 
@@ -226,14 +238,13 @@ Progress = Callable[[int, int], None]
 class SceneDrafts:
     """What one process draws: the drafts of one scene by their places among all."""
 
-    run: Path
-    methods: tuple[str, ...]
+    opener: Callable[[], PictureSource]
     scale: Scale
     drafts: Mapping[int, Draft]
 
 
 def draw_all(
-    source: RunSource,
+    source: PictureSource,
     scale: Scale,
     drafts: Sequence[Draft],
     jobs: int,
@@ -243,7 +254,7 @@ def draw_all(
     units = []
     for scene in dict.fromkeys(draft.scene for draft in drafts):
         mine = {k: draft for k, draft in enumerate(drafts) if draft.scene == scene}
-        units.append(SceneDrafts(source.run.folder.path, source.methods, scale, mine))
+        units.append(SceneDrafts(source.opener, scale, mine))
     n_done = 0
 
     def report(event: Event) -> None:
@@ -263,7 +274,7 @@ def draw_all(
 
 def draw_scene(unit: SceneDrafts, report: Report) -> dict[int, bytes]:
     """The PNG of each draft of one scene by its place."""
-    artist = Artist(RunSource(read_run(unit.run), unit.methods), unit.scale)
+    artist = Artist(unit.opener(), unit.scale)
     pictures = {}
     for place, draft in unit.drafts.items():
         pictures[place] = artist.draw(draft)

@@ -21,11 +21,13 @@ SCHEMA = 1
 SHEET_FILE, KEY_FILE = "sheet.json", "key.json"
 PICTURES = "pictures"  # folder of the pictures, beside sheet.json
 MOST_BYTES = 64 << 20  # of sheet.json or key.json: a hundred thousand items
-SheetKind = Literal["retrieval", "annotation", "reasoning"]
+SheetKind = Literal["retrieval", "annotation", "reasoning", "questions"]
 # Columns of a file of answers; others may follow and are for the reader alone.
 ANSWER_COLUMNS = ("sheet_id", "item_id", "annotator", "question", "answer", "check")
 RIGHT, WRONG, CANNOT_TELL = "right", "wrong", "cannot tell"
 JUDGEMENTS = (RIGHT, WRONG, CANNOT_TELL)
+ARGUABLE = "arguable"
+VERDICTS = (RIGHT, ARGUABLE, WRONG)  # of a question: what nobody can tell from pictures is at best arguable
 # The names that metrics/score_questions.py has for the merging of a mask.
 MERGES = ("well-merged", "under-merged", "over-merged", CANNOT_TELL)
 _DIGITS = 12
@@ -89,6 +91,30 @@ ASKS: Mapping[SheetKind, tuple[Ask, ...]] = {
             ("all of them, and none is missing", "one is wrong or missing", "the picture does not show it"),
         ),
     ),
+    "questions": (
+        Ask(
+            "sense",
+            "Does the question make sense, and do pictures of the room answer it?",
+            VERDICTS,
+            (
+                "it asks for something plain to see",
+                "it can be taken in two ways",
+                "it cannot be answered, or is absurd",
+            ),
+        ),
+        Ask(
+            "wording",
+            "Is its wording right English?",
+            VERDICTS,
+            ("as people say it", "understood, but said differently", "a word is wrong or missing"),
+        ),
+        Ask(
+            "answer",
+            "Is its answer right?",
+            VERDICTS,
+            ("all of it, and nothing is missing", "people would differ", "something is wrong or missing"),
+        ),
+    ),
 }
 
 
@@ -141,7 +167,8 @@ class KeyItem(_Strict):
     """What an item is: the instance ``instance_id`` of a map of ``scene`` (``<dataset>/<scene>``).
 
     ``methods``: all whose answer this is, a variant such as ``opensu3d@scheme4`` a name; ``instance_ids`` its id in the
-    map of each of them (-1 where an answer names several or none). ``question_id`` and ``question_kind`` are those of
+    map of each of them (-1 where an answer names several or none). No method answers in sheets of questions: the kind
+    of question and ``all`` stand there instead. ``question_id`` and ``question_kind`` are those of
     the question that was asked ('' in annotation sheets). ``stands_for``: what an ask judges where that is hidden:
     ``{"label 1": ("n", "n'")}``. ``automatic``: ask -> the choice that the ground truth makes, where it is known.
     """

@@ -38,6 +38,7 @@ TITLES = {
     "retrieval": "Is the outlined object what is asked for?",
     "annotation": "Are the labels right, and is the mask one object?",
     "reasoning": "Is the answer right?",
+    "questions": "Are the question, its wording and its answer right?",
 }
 
 

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from copy import copy
-from functools import lru_cache
+from functools import lru_cache, partial
+from pathlib import Path
 
 import numpy as np
 
@@ -24,13 +25,13 @@ from su3d_bench.metrics.protocol_files import protocol_names
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.questions.reasoning.scene_map import SceneMap, map_of
 from su3d_bench.questions.refined_names import refined_names
-from su3d_bench.runs.finished import FinishedRun
+from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.store.predictions import read_prediction
 
 MOST_FRAMES = 32  # of a scene, among which the best view of an object is looked for
 
 
-def _chosen(run: FinishedRun, what: str, wanted: Sequence[str], known: tuple[str, ...]) -> tuple[str, ...]:
+def chosen_of(run: FinishedRun, what: str, wanted: Sequence[str], known: tuple[str, ...]) -> tuple[str, ...]:
     """Those that are ``wanted``, which the run must have; all without any."""
     for name in wanted:
         if name not in known:
@@ -44,12 +45,17 @@ class RunSource:
 
     def __init__(self, run: FinishedRun, methods: Sequence[str] = (), scenes: Sequence[str] = ()) -> None:
         self.run = run
-        self.methods = _chosen(run, "method", methods, run.methods)
-        self.scenes = _chosen(run, "scene", scenes, run.scenes)
+        self.methods = chosen_of(run, "method", methods, run.methods)
+        self.scenes = chosen_of(run, "scene", scenes, run.scenes)
         self.instances = lru_cache(maxsize=len(self.methods))(self._instances)
         self._covered: dict[tuple[str, str, bytes], Covered] = {}
         self._truths = lru_cache(maxsize=2)(self._read_truth)
         self._frames_at = lru_cache(maxsize=len(self.methods))(self._read_frames)
+
+    @property
+    def opener(self) -> Callable[[], RunSource]:
+        """Opens the same run in another process."""
+        return partial(_opened, self.run.folder.path, self.methods)
 
     def of_methods(self, methods: Sequence[str]) -> RunSource:
         """The same run with these of its methods alone; what was read is shared."""
@@ -124,6 +130,10 @@ class RunSource:
             self._covered = {old: covered for old, covered in self._covered.items() if old[0] == scene}
             self._covered[key] = covered_objects(rules.transfer, truth, instances)
         return self._covered[key]
+
+
+def _opened(run: Path, methods: Sequence[str]) -> RunSource:
+    return RunSource(read_run(run), methods)
 
 
 def mask_digest(instances: Instances, rows: Sequence[int]) -> bytes:

@@ -22,13 +22,15 @@ from su3d_bench.numerics.statistics import percentile_interval, resample_weights
 from su3d_bench.questions.model import ALL_KINDS
 from su3d_bench.sheets.agreement import Agreement, Interval, agreement, cohen_kappa
 from su3d_bench.sheets.answers import LABELS, Judgement
-from su3d_bench.sheets.items import CANNOT_TELL, MERGES, RIGHT, Key, KeyItem, Sheet, read_record
+from su3d_bench.sheets.items import ARGUABLE, CANNOT_TELL, MERGES, RIGHT, Key, KeyItem, Sheet, SheetKind, read_record
+from su3d_bench.sheets.verdicts import WHOLE, whole_verdicts
 from su3d_bench.store.atomic import write_json
 
 if TYPE_CHECKING:
     import pandas
 
 Judge = Literal["people", "automatic"]
+Reason = Literal["annotators disagree", "against the truth", "not right"]
 SCHEMA = 1
 STEPS = (1, 2, 6, 12, 60)  # of which shares of up to 1, 2, 3, 4, 6 judges, and their differences, are whole numbers
 MOST_STEPS = 50_000  # a distribution of 100,001 sums, some seconds for as many items
@@ -36,7 +38,10 @@ WELL_MERGED, UNDER_MERGED, OVER_MERGED = MERGES[:3]
 OF_ALL_KINDS = "all"
 LABEL_METRICS = (f"label {LABELS[0]}", f"label {LABELS[1]}")
 # As the protocols that let the ground truth judge call the same numbers.
-METRICS = (*ALL_KINDS, OF_ALL_KINDS, *LABEL_METRICS, WELL_MERGED, UNDER_MERGED, OVER_MERGED, "answer", "objects")
+METRICS = (
+    *(*ALL_KINDS, OF_ALL_KINDS, *LABEL_METRICS, WELL_MERGED, UNDER_MERGED, OVER_MERGED),
+    *("sense", "wording", "answer", "objects", WHOLE, ARGUABLE),
+)
 _PLACE = ["method", "dataset", "metric"]  # of a cell
 
 
@@ -107,7 +112,10 @@ class Confusion:
 
 @dataclass(frozen=True)
 class SecondLook:
-    """An item on which annotators differ, or most of them from the truth. ``automatic`` is '' where nobody knows."""
+    """An item on which annotators differ, or most of them from the truth, or a question that none of them calls right.
+
+    ``automatic`` is '' where nobody knows.
+    """
 
     item_id: str
     ask: str
@@ -117,7 +125,7 @@ class SecondLook:
     pictures: tuple[str, ...]
     answers: Mapping[str, str]
     automatic: str
-    reason: Literal["annotators disagree", "against the truth"]
+    reason: Reason
 
 
 @dataclass(frozen=True)
@@ -145,7 +153,8 @@ class Scores:
 def score(sheet: Sheet, key: Key, judgements: Sequence[Judgement], silent: Sequence[str] = ()) -> Scores:
     """The scores of judgements that ``check_answers`` found without fault; without any, what the truth says of all."""
     keys = {item.id: item for item in key.items}
-    given = [(keys[judgement.item_id], judgement.ask, judgement.answer) for judgement in judgements]
+    counted = [*judgements, *(whole_verdicts(judgements) if sheet.kind == "questions" else ())]
+    given = [(keys[judgement.item_id], judgement.ask, judgement.answer) for judgement in counted]
     by_people = _shares(given)
     clear = by_people[by_people["n_clear"] > 0]
     judged = {(judgement.item_id, judgement.ask) for judgement in judgements}
@@ -155,7 +164,7 @@ def score(sheet: Sheet, key: Key, judgements: Sequence[Judgement], silent: Seque
         for ask, choice in item.automatic.items()
         if (item.id, ask) in judged or not judgements
     ]
-    ratings = _ratings(given, judgements)
+    ratings = _ratings(given, counted)
     return Scores(
         sheet_id=sheet.id,
         kind=sheet.kind,
@@ -221,6 +230,8 @@ def _metrics(key: KeyItem, ask: str) -> list[tuple[str, str]]:
         return [(name, name) for name in (WELL_MERGED, UNDER_MERGED, OVER_MERGED)]
     if ask in key.stands_for:
         return [(f"label {name}", RIGHT) for name in key.stands_for[ask]]
+    if ask == WHOLE:
+        return [(WHOLE, RIGHT), (ARGUABLE, ARGUABLE)]
     return [(ask, RIGHT)]
 
 
@@ -266,7 +277,9 @@ def _draws(n_items: int) -> Float64Array:
 
 def _tests(sheet: Sheet, key: Key, clear: pandas.DataFrame) -> Iterator[PairTest]:
     """Each pair of methods under each metric over the questions that were asked of both; of labels, n' against n of
-    each method over its instances, for other methods have other instances."""
+    each method over its instances, for other methods have other instances; of questions none."""
+    if sheet.kind == "questions":
+        return
     if sheet.kind == "annotation":
         left, right = LABEL_METRICS
         for method in key.methods:
@@ -372,7 +385,7 @@ def _second_looks(sheet: Sheet, keys: Mapping[str, KeyItem], judgements: Iterabl
         for ask in item.asks:
             answers = given[item.id, ask]
             automatic = key.automatic.get(ask, "")
-            reason = _reason(list(answers.values()), automatic)
+            reason = _reason(sheet.kind, list(answers.values()), automatic)
             if reason is not None:
                 looks.append(
                     SecondLook(
@@ -382,9 +395,11 @@ def _second_looks(sheet: Sheet, keys: Mapping[str, KeyItem], judgements: Iterabl
     return looks
 
 
-def _reason(answers: Sequence[str], automatic: str) -> Literal["annotators disagree", "against the truth"] | None:
+def _reason(kind: SheetKind, answers: Sequence[str], automatic: str) -> Reason | None:
     if len(set(answers)) > 1:
         return "annotators disagree"
+    if kind == "questions" and answers:
+        return None if answers[0] == RIGHT else "not right"
     is_against = bool(answers) and automatic not in ("", CANNOT_TELL) and answers[0] not in (automatic, CANNOT_TELL)
     return "against the truth" if is_against else None
 

@@ -17,6 +17,7 @@ from painted import colour_perception
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import Instances
 from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.questions.model import question_id
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.sheets.items import read_key, read_sheet
@@ -167,6 +168,9 @@ def test_a_dry_run_tells_the_cost_and_makes_nothing(
     assert main(["sheets", "make", "run", *asked(made, server, "--dry-run")]) == 0
     assert "request" in capsys.readouterr().out
     assert server.n_asked == 0 and not (folder / "out").exists()
+    Path("gone.csv").write_text(f"question_id\n{question_id('painted/a', 'reasoning', QUESTION)}\n")
+    assert main(["sheets", "make", "run", *asked(made, server, "--dry-run", "--leave-out", "gone.csv")]) == 0
+    assert "0 requests" in capsys.readouterr().out
 
 
 def test_flags_of_the_language_model_are_refused_where_nobody_is_asked(

@@ -235,12 +235,12 @@ def test_answers_that_maps_share_are_judged_once(source: RunSource) -> None:
     assert all(one.automatic == {} for one in drafts)
 
 
-@pytest.mark.parametrize("kind", ["retrieval", "annotation", "reasoning"])
+@pytest.mark.parametrize("kind", ["retrieval", "annotation", "reasoning", "questions"])
 def test_the_picture_of_an_item_is_small_and_shows_the_object(source: RunSource, kind: Any) -> None:
     draft = replace(drafts_of(kind, ["sofa"])[0], scene="painted/a", methods=("collector",), rows=(1,), names=())
     if kind == "retrieval":
         draft = replace(draft, similarity=np.array([0.1, 0.9, 0.2, 0.3]))
-    if kind == "reasoning":
+    if kind in ("reasoning", "questions"):
         draft = replace(draft, names=("chair #1", "sofa #2", "table #3", "wall #4"), others=(0,))
     content = Artist(source).draw(draft)
     picture = np.asarray(Image.open(io.BytesIO(content)).convert("RGB")).astype(int)
@@ -378,7 +378,7 @@ def test_scenes_drawn_in_processes_give_the_pictures_in_order(source: RunSource,
     drawn = draw_all(source, "paper", drafts, 1, lambda *counts: told.append(counts))
     assert told == [(1, 3), (2, 3), (3, 3)]
     assert drawn == [Artist(source).draw(one) for one in drafts]
-    unit = SceneDrafts(folder / "run", METHODS, "paper", {0: drafts[0]})
+    unit = SceneDrafts(source.opener, "paper", {0: drafts[0]})
     (in_process,) = run_processes(draw_scene, [unit], lambda event: None, jobs=2, lost=_lost)
     assert in_process == {0: drawn[0]}
     with pytest.raises(DataError, match="try --jobs 1"):

@@ -1,11 +1,11 @@
-"""``su3d-bench sheets make``: a finished run -> sheets for people, as a page, a workbook and a table; the key apart."""
+"""``su3d-bench sheets make``: a run or scenes -> sheets for people, as page, workbook and table; the key apart."""
 
 from __future__ import annotations
 
 import argparse
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Final
 
 from su3d_bench.cli.common import (
     add_language_flags,
@@ -19,35 +19,45 @@ from su3d_bench.cli.common import (
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Collection, Mapping, Sequence
 
     from su3d_bench.core.interfaces import Encoder
     from su3d_bench.perception.language.chat import ChatRequest
     from su3d_bench.questions.model import Question
     from su3d_bench.sheets.drafts import AskMap, Draft
+    from su3d_bench.sheets.drawing import PictureSource
     from su3d_bench.sheets.items import SheetKind
+    from su3d_bench.sheets.making import Origin
     from su3d_bench.sheets.run_source import RunSource
+    from su3d_bench.sheets.truth_source import TruthSource
 
 NAME = "make"
-KINDS = ("retrieval", "annotation", "reasoning")
+QUESTIONS: Final = "questions"  # the kind that needs no method, and so no run
+KINDS = ("retrieval", "annotation", "reasoning", QUESTIONS)
 # A person judges some hundred items without a break: so many of each kind of question and scene, instances a scene,
 # or questions of each template and scene.
 LANGUAGE_FLAGS = ("model", "base_url", "config", "set", "offline", "ask_failed_again", "dry_run")
-PER_KIND = {"retrieval": 5, "annotation": 30, "reasoning": 1}
+PER_KIND = {"retrieval": 5, "annotation": 30, "reasoning": 1, QUESTIONS: 2}
 
 
 def add_parser(actions: Any) -> None:
     parser = add_verb(
         actions,
         NAME,
-        "Make sheets on which people judge a run: an offline page, a workbook and a table with pictures.",
+        "Make sheets on which people judge a run, or questions: an offline page, a workbook and a table with pictures.",
         (
-            "su3d-bench sheets make runs/my-run --kind retrieval --out sheets/my-run",
             "su3d-bench sheets make runs/my-run --kind retrieval annotation reasoning --annotators 3 --out sheets",
+            "su3d-bench sheets make --kind questions --scenes 'rooms/*' --annotators 2 --overlap 1 --out sheets",
         ),
         call,
     )
-    parser.add_argument("run", type=Path, metavar="RUN", help="the folder of a run; variants stand side by side in it")
+    parser.add_argument(
+        "run",
+        nargs="?",
+        type=Path,
+        metavar="RUN",
+        help="the folder of a run; variants stand side by side in it (--kind questions can do with --scenes)",
+    )
     parser.add_argument(
         "--kind", nargs="+", choices=KINDS, required=True, help="what is judged; several give a folder each in DIR"
     )
@@ -60,12 +70,22 @@ def add_parser(actions: Any) -> None:
         help="a file of questions, 'paper' for those of its page, or 'generated' from the ground truth (default)",
     )
     parser.add_argument("--methods", nargs="+", default=[], metavar="M", help="these alone (default: all of the run)")
-    parser.add_argument("--scenes", nargs="+", default=[], metavar="S", help="these alone (default: all of the run)")
+    parser.add_argument(
+        "--scenes",
+        nargs="+",
+        default=[],
+        metavar="S",
+        help="these alone (default: all of the run); without RUN addresses or patterns such as 'rooms/*'",
+    )
+    parser.add_argument(
+        "--leave-out", type=Path, metavar="FILE", help="without the questions that a CSV file lists by their id"
+    )
     parser.add_argument(
         "--per-kind",
         type=int,
         metavar="N",
-        help="most items of a scene: questions of a kind (default: 5), instances (30), questions of a template (1)",
+        help="most items of a scene: questions of a kind (default: 5), instances (30), questions of a template (1); "
+        "in sheets of questions 2 of each kind and template",
     )
     parser.add_argument("--annotators", type=int, default=1, metavar="N", help="people who share the work")
     parser.add_argument(
@@ -85,17 +105,31 @@ def add_parser(actions: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
+    from su3d_bench.questions.files.left_out import read_left_out
     from su3d_bench.runs.finished import read_run
     from su3d_bench.sheets.run_source import RunSource
 
     _check(arguments)
-    kinds = tuple(dict.fromkeys(arguments.kind))
-    source = RunSource(read_run(arguments.run), arguments.methods, arguments.scenes)
-    sources: dict[SheetKind, RunSource] = {kind: _judgeable(source, kind, arguments.quiet) for kind in kinds}
-    if arguments.dry_run:
-        return _estimate(sources["reasoning"], arguments)
-    drafts, answered_by = _drafts(sources, arguments)
-    written_sets = _write(sources, drafts, _drawn(source, drafts, arguments), answered_by, arguments)
+    left_out = frozenset[str]() if arguments.leave_out is None else read_left_out(arguments.leave_out)
+    kinds: tuple[SheetKind, ...] = tuple(dict.fromkeys(arguments.kind))
+    origins: dict[SheetKind, Origin] = {}
+    drafts: dict[SheetKind, list[Draft]] = {}
+    drawn: dict[SheetKind, list[bytes]] = {}
+    of_run = [kind for kind in kinds if kind != QUESTIONS]
+    if of_run:
+        source = RunSource(read_run(arguments.run), arguments.methods, arguments.scenes)
+        sources: dict[SheetKind, RunSource] = {kind: _judgeable(source, kind, arguments.quiet) for kind in of_run}
+        if arguments.dry_run:
+            return _estimate(sources["reasoning"], left_out, arguments)
+        drafts, answered_by = _drafts(sources, left_out, arguments)
+        origins = {kind: _origin(kind, mine, answered_by) for kind, mine in sources.items()}
+        drawn = _drawn(source, source.run.name, drafts, arguments)
+    if QUESTIONS in kinds:
+        truth = _truth(arguments)
+        of_truth, origins[QUESTIONS] = _questions(truth, left_out, arguments)
+        drafts |= of_truth
+        drawn |= _drawn(truth, truth.run or QUESTIONS, of_truth, arguments)
+    written_sets = _write({kind: origins[kind] for kind in kinds}, drafts, drawn, arguments)
     if arguments.json:
         answer_json({"sets": written_sets})
         return EXIT_DONE
@@ -115,8 +149,19 @@ def _check(arguments: argparse.Namespace) -> None:
         raise ConfigError(f"--jobs {arguments.jobs}: at least 1 is needed")
     if arguments.seed < 0:
         raise ConfigError(f"--seed {arguments.seed}: expected 0 or more")
-    if arguments.kind == ["annotation"] and arguments.questions != "generated":
+    kinds = set(arguments.kind)
+    if arguments.run is None and (kinds != {QUESTIONS} or not arguments.scenes):
+        raise ConfigError(
+            "RUN: name the folder of a run; only --kind questions can do without, and needs --scenes then"
+        )
+    if kinds == {"annotation"} and arguments.questions != "generated":
         raise ConfigError("--questions: annotation sheets ask about labels and masks; leave it out")
+    if kinds == {"annotation"} and arguments.leave_out is not None:
+        raise ConfigError("--leave-out: annotation sheets ask about labels and masks; leave it out")
+    if kinds == {QUESTIONS} and arguments.questions != "generated":
+        raise ConfigError("--questions: sheets of kind questions judge those made from the ground truth; leave it out")
+    if kinds == {QUESTIONS} and arguments.methods:
+        raise ConfigError("--methods: no method has a part in sheets of kind questions; leave it out")
     if arguments.solver == "llm" and "reasoning" not in arguments.kind:
         raise ConfigError("--solver llm: answers questions of reasoning sheets; add --kind reasoning")
     given = [f"--{name.replace('_', '-')}" for name in LANGUAGE_FLAGS if getattr(arguments, name)]
@@ -142,8 +187,31 @@ def _judgeable(source: RunSource, kind: SheetKind, is_quiet: bool) -> RunSource:
     return source.of_methods(kept)
 
 
+def _truth(arguments: argparse.Namespace) -> TruthSource:
+    from su3d_bench.sheets.truth_source import truth_of_addresses, truth_of_run
+
+    if arguments.run is None:
+        return truth_of_addresses(arguments.scenes)
+    return truth_of_run(arguments.run, arguments.scenes)
+
+
+def _questions(
+    truth: TruthSource, left_out: Collection[str], arguments: argparse.Namespace
+) -> tuple[dict[SheetKind, list[Draft]], Origin]:
+    """The questions that people judge, and where they come from; what is counted together stands for methods."""
+    from su3d_bench.sheets.making import Origin, check_split
+    from su3d_bench.sheets.question_drafts import question_drafts
+    from su3d_bench.sheets.scores import OF_ALL_KINDS
+
+    n_most = arguments.per_kind or PER_KIND[QUESTIONS]
+    drafts = [draft for scene in truth.scenes for draft in question_drafts(truth, scene, n_most, left_out)]
+    check_split(len(drafts), arguments.annotators, arguments.overlap)
+    counted_kinds = (*dict.fromkeys(draft.question_kind for draft in drafts), OF_ALL_KINDS)
+    return {QUESTIONS: drafts}, Origin(truth.run, truth.run_digest, counted_kinds, "")
+
+
 def _drafts(
-    sources: Mapping[SheetKind, RunSource], arguments: argparse.Namespace
+    sources: Mapping[SheetKind, RunSource], left_out: Collection[str], arguments: argparse.Namespace
 ) -> tuple[dict[SheetKind, list[Draft]], str]:
     """What is judged, and who answered the questions of reasoning sheets."""
     import numpy as np
@@ -165,11 +233,11 @@ def _drafts(
                 drafts_of[kind] += annotation_drafts(mine, scene, n_most, random)
             elif kind == "reasoning":
                 assert ask is not None
-                drafts_of[kind] += reasoning_drafts(mine, scene, given, n_most, ask)
+                drafts_of[kind] += reasoning_drafts(mine, scene, given, n_most, ask, left_out)
             else:
                 assert encoder is not None
                 # A file is asked as it stands, unless --per-kind limits it.
-                questions = questions_of(mine, scene, given, n_most if given is None else arguments.per_kind)
+                questions = questions_of(mine, scene, given, n_most if given is None else arguments.per_kind, left_out)
                 drafts_of[kind] += retrieval_drafts(mine, scene, questions, encoder)
     for drafts in drafts_of.values():
         check_split(len(drafts), arguments.annotators, arguments.overlap)
@@ -186,7 +254,7 @@ def _ask_map(source: RunSource, encoder: Encoder | None, arguments: argparse.Nam
     return by_language_model(client, config), config.text_model
 
 
-def _estimate(source: RunSource, arguments: argparse.Namespace) -> int:
+def _estimate(source: RunSource, left_out: Collection[str], arguments: argparse.Namespace) -> int:
     """Tell what asking the language model would cost at the most."""
     from su3d_bench.sheets.drafts import reasoning_drafts, requests_into
 
@@ -195,7 +263,7 @@ def _estimate(source: RunSource, arguments: argparse.Namespace) -> int:
     requests: list[ChatRequest] = []
     for scene in source.scenes:
         n_most = arguments.per_kind or PER_KIND["reasoning"]
-        reasoning_drafts(source, scene, given, n_most, requests_into(requests, client, config))
+        reasoning_drafts(source, scene, given, n_most, requests_into(requests, client, config), left_out)
     return answer_estimate(arguments, client, requests)
 
 
@@ -216,7 +284,7 @@ def _given(source: RunSource, arguments: argparse.Namespace) -> Sequence[Questio
 
 
 def _drawn(
-    source: RunSource, drafts: Mapping[SheetKind, Sequence[Draft]], arguments: argparse.Namespace
+    source: PictureSource, name: str, drafts: Mapping[SheetKind, Sequence[Draft]], arguments: argparse.Namespace
 ) -> dict[SheetKind, list[bytes]]:
     """The pictures of all drafts."""
     from su3d_bench.cli.common import progress
@@ -224,7 +292,6 @@ def _drawn(
     from su3d_bench.sheets.drawing import draw_all
 
     flat = [draft for of_kind in drafts.values() for draft in of_kind]
-    name = source.run.name
     with progress(1, is_quiet=arguments.quiet, last_step="writing") as report:
         pictures = draw_all(
             source,
@@ -237,22 +304,26 @@ def _drawn(
     return {kind: list(islice(remaining, len(of_kind))) for kind, of_kind in drafts.items()}
 
 
+def _origin(kind: SheetKind, source: RunSource, answered_by: str) -> Origin:
+    from su3d_bench.sheets.making import Origin
+
+    rules = {rules.name for scene in source.scenes if (rules := source.rules(scene, kind)) is not None}
+    by = answered_by if kind == "reasoning" else ""
+    return Origin(source.run.name, source.run.record.code, source.methods, ", ".join(sorted(rules)), by)
+
+
 def _write(
-    sources: Mapping[SheetKind, RunSource],
+    origins: Mapping[SheetKind, Origin],
     drafts: Mapping[SheetKind, Sequence[Draft]],
     drawn: Mapping[SheetKind, Sequence[bytes]],
-    answered_by: str,
     arguments: argparse.Namespace,
 ) -> list[dict[str, Any]]:
     """Write a set of each kind, several of them each into a folder of its name; what was written."""
-    from su3d_bench.sheets.making import Origin, make_sheets, write_sheets
+    from su3d_bench.sheets.making import make_sheets, write_sheets
 
     apart = arguments.key or arguments.out.with_name(f"{arguments.out.name}-key")
     written_sets = []
-    for kind, source in sources.items():
-        rules = {rules.name for scene in source.scenes if (rules := source.rules(scene, kind)) is not None}
-        by = answered_by if kind == "reasoning" else ""
-        origin = Origin(source.run.name, source.run.record.code, source.methods, ", ".join(sorted(rules)), by)
+    for kind, origin in origins.items():
         made = make_sheets(
             kind,
             drafts[kind],
@@ -262,7 +333,7 @@ def _write(
             annotators=arguments.annotators,
             overlap=arguments.overlap,
         )
-        folder, key = (arguments.out, apart) if len(sources) == 1 else (arguments.out / kind, apart / kind)
+        folder, key = (arguments.out, apart) if len(origins) == 1 else (arguments.out / kind, apart / kind)
         files = write_sheets(made, folder, key)
         written_sets.append(
             {

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.common import add_table_format, add_verb, answer, answer_json, formatted, remark
-from su3d_bench.core.errors import EXIT_DONE, DataError
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError
 
 if TYPE_CHECKING:
     from su3d_bench.sheets.scores import Scores
@@ -24,7 +24,7 @@ def add_parser(actions: Any) -> None:
         "Check the answers of all annotators and add them up: accuracies, tests, agreement, people beside the truth.",
         (
             "su3d-bench sheets score ann.csv bob.xlsx --key key/key.json --out scores",
-            "su3d-bench sheets score --key key",
+            "su3d-bench sheets score ann.csv bob.csv --key key --disputed disputed.csv",
         ),
         call,
     )
@@ -45,6 +45,12 @@ def add_parser(actions: Any) -> None:
     parser.add_argument(
         "--out", type=Path, metavar="DIR", help="write scores.json, tables and a list of what to look at again there"
     )
+    parser.add_argument(
+        "--disputed",
+        type=Path,
+        metavar="FILE",
+        help="sheets of questions: write those that not everybody calls right there, for --leave-out",
+    )
     add_table_format(parser)
 
 
@@ -56,12 +62,16 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.sheets.answers import check_answers, check_key, read_answers
     from su3d_bench.sheets.items import KEY_FILE, read_key, read_sheet
     from su3d_bench.sheets.scores import score
+    from su3d_bench.sheets.verdicts import disputed_csv
+    from su3d_bench.store.atomic import write_text
 
     key_file = arguments.key / KEY_FILE if arguments.key.is_dir() else arguments.key
     key = read_key(key_file)
     sheet_file = _sheet_file(arguments, key_file, key.sheet_id)
     sheet = read_sheet(sheet_file)
     check_key(sheet, key)
+    if arguments.disputed is not None and (sheet.kind != "questions" or not arguments.files):
+        raise ConfigError("--disputed: lists what people say of sheets of kind questions; give their key and answers")
     rows, faults = [], []
     for file in dict.fromkeys(arguments.files):
         try:
@@ -83,6 +93,9 @@ def call(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         _write(arguments.out, scores, sheet_file.parent)
         remark(f"written: {arguments.out}", quiet=arguments.quiet)
+    if arguments.disputed is not None:
+        write_text(arguments.disputed, disputed_csv(key, scores.second_looks))
+        remark(f"written: {arguments.disputed}", quiet=arguments.quiet)
     if arguments.json:
         answer_json(content)
     else:
@@ -145,5 +158,6 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
 
 def _looks_line(scores: Scores) -> str:
     n_disagree = sum(look.reason == "annotators disagree" for look in scores.second_looks)
-    n_against = len(scores.second_looks) - n_disagree
-    return f"To look at again: {n_disagree} where annotators disagree, {n_against} against the ground truth."
+    n_others = len(scores.second_looks) - n_disagree
+    others = "that nobody calls right" if scores.kind == "questions" else "against the ground truth"
+    return f"To look at again: {n_disagree} where annotators disagree, {n_others} {others}."
