@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import printable
-from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, UInt8Array
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, Int64Array, UInt8Array
 from su3d_bench.numerics.geometry import back_project, valid_depth
 from su3d_bench.reports.pictures.canvas import drawable
 
@@ -84,7 +84,7 @@ def compose(parts: ItemParts) -> UInt8Array:
     page = Image.new("RGB", (WIDTH, low + CAPTION + LOW_HEIGHT + MARGIN), PAPER)
     draw = ImageDraw.Draw(page)
     for k, (text, size) in enumerate(lines):
-        _write(draw, (MARGIN, MARGIN + TITLE_LINE * k), text, size, INK if k == 0 else GREY, is_bold=k == 0)
+        write_line(draw, (MARGIN, MARGIN + TITLE_LINE * k), text, size, INK if k == 0 else GREY, is_bold=k == 0)
     right = MARGIN + PHOTO_WIDTH + MARGIN
     if parts.photo is not None:
         _place(page, draw, parts.photo, (MARGIN, top), (PHOTO_WIDTH, TOP_HEIGHT))
@@ -103,7 +103,7 @@ def _place_room(page: Any, draw: Any, photos: tuple[UInt8Array, ...], top: int) 
     if not photos:
         box = (MARGIN, top + CAPTION, WIDTH - MARGIN, top + CAPTION + TOP_HEIGHT)
         draw.rectangle(box, fill=PANEL)
-        _write(draw, (MARGIN + 20, top + CAPTION + 20), "no frame shows this object", 18, GREY)
+        write_line(draw, (MARGIN + 20, top + CAPTION + 20), "no frame shows this object", 18, GREY)
         return
     wide = (WIDTH - 2 * MARGIN - (ROOM_COLUMNS - 1) * ROOM_GAP) // ROOM_COLUMNS
     n_rows = -(-len(photos) // ROOM_COLUMNS)
@@ -117,34 +117,54 @@ def _place_room(page: Any, draw: Any, photos: tuple[UInt8Array, ...], top: int) 
 def zoomed(photo: Panel) -> Panel:
     """The part of a photograph around the object, as wide for its height as its panel."""
     assert photo.mask is not None
-    height, width = photo.picture.shape[:2]
-    rows, columns = np.nonzero(photo.mask)
+    part = window_around(photo.mask, ZOOM_WIDTH / TOP_HEIGHT)
+    return Panel("closer", photo.picture[part], photo.mask[part])
+
+
+def window_around(mask: BoolArray, aspect: float, least_rows: float = 72.0) -> tuple[slice, slice]:
+    """Rows and columns of the part of an image around ``mask``, ``aspect`` times as wide as high; all without one."""
+    height, width = mask.shape
+    rows, columns = np.nonzero(mask)
     if not len(rows):
-        return Panel("closer", photo.picture, photo.mask)
+        return slice(0, height), slice(0, width)
     x0, x1, y0, y1 = columns.min(), columns.max() + 1, rows.min(), rows.max() + 1
-    aspect = ZOOM_WIDTH / TOP_HEIGHT
-    tall = max((y1 - y0) * ZOOM_GROWTH, (x1 - x0) * ZOOM_GROWTH / aspect, 72.0)
+    tall = max((y1 - y0) * ZOOM_GROWTH, (x1 - x0) * ZOOM_GROWTH / aspect, least_rows)
     tall = min(tall, float(height), width / aspect)
     wide = tall * aspect
     left = int(np.clip((x0 + x1 - wide) / 2, 0, width - wide))
     upper = int(np.clip((y0 + y1 - tall) / 2, 0, height - tall))
-    part = (slice(upper, upper + max(1, round(tall))), slice(left, left + max(1, round(wide))))
-    return Panel("closer", photo.picture[part], photo.mask[part])
+    return slice(upper, upper + max(1, round(tall))), slice(left, left + max(1, round(wide)))
 
 
 def outlined(picture: UInt8Array, mask: BoolArray | None, size: tuple[int, int], line: int = 3) -> UInt8Array:
     """``picture`` at ``size`` (width, height) with a line around ``mask``, light on both sides so that it shows."""
+    shown = fitted(picture, size)
+    if mask is not None and mask.any():
+        draw_outline(shown, mask, line)
+    return shown
+
+
+def fitted(picture: UInt8Array, size: tuple[int, int]) -> UInt8Array:
+    """``picture`` at ``size`` (width, height)."""
     import cv2
 
     is_smaller = size[0] < picture.shape[1]
     resized: Any = cv2.resize(picture, size, interpolation=cv2.INTER_AREA if is_smaller else cv2.INTER_CUBIC)
-    if mask is not None and mask.any():
-        smooth = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
-        contours, _ = cv2.findContours((smooth > 0.5).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
-        cv2.drawContours(resized, contours, -1, HALO, line + 3, cv2.LINE_AA)
-        cv2.drawContours(resized, contours, -1, OUTLINE, line, cv2.LINE_AA)
     result: UInt8Array = resized
     return result
+
+
+def draw_outline(
+    shown: UInt8Array, mask: BoolArray, line: int, colour: tuple[int, int, int] = OUTLINE, halo: int = 3
+) -> None:
+    """Draw a line around ``mask``, of whatever size, into a picture; ``halo`` is how much wider the white below is."""
+    import cv2
+
+    size = shown.shape[1], shown.shape[0]
+    smooth = cv2.resize(mask.astype(np.float32), size, interpolation=cv2.INTER_LINEAR)
+    contours, _ = cv2.findContours((smooth > 0.5).astype(np.uint8), cv2.RETR_EXTERNAL, cv2.CHAIN_APPROX_NONE)
+    cv2.drawContours(shown, contours, -1, HALO, line + halo, cv2.LINE_AA)
+    cv2.drawContours(shown, contours, -1, colour, line, cv2.LINE_AA)
 
 
 def _draw_ring(shown: UInt8Array, ring: tuple[float, float, float], eye: tuple[float, float] | None) -> None:
@@ -181,22 +201,22 @@ def png_bytes(picture: UInt8Array) -> bytes:
 def _place(page: Any, draw: Any, panel: Panel, at: tuple[int, int], size: tuple[int, int]) -> None:
     from PIL import Image
 
-    _write(draw, (at[0], at[1] + 3), panel.title, 14, GREY)
+    write_line(draw, (at[0], at[1] + 3), panel.title, 14, GREY)
     height, width = panel.picture.shape[:2]
     scale = min(size[0] / width, size[1] / height)
-    fitted = (max(1, round(width * scale)), max(1, round(height * scale)))
-    shown = outlined(panel.picture, panel.mask, fitted, panel.line)
+    inner = (max(1, round(width * scale)), max(1, round(height * scale)))
+    shown = outlined(panel.picture, panel.mask, inner, panel.line)
     if panel.ring is not None:
         _draw_ring(shown, panel.ring, panel.eye)
-    corner = (at[0] + (size[0] - fitted[0]) // 2, at[1] + CAPTION + (size[1] - fitted[1]) // 2)
+    corner = (at[0] + (size[0] - inner[0]) // 2, at[1] + CAPTION + (size[1] - inner[1]) // 2)
     page.paste(Image.fromarray(shown), corner)
-    _draw_tags(draw, panel.tags, corner, fitted)
+    draw_tags(draw, panel.tags[:MOST_TAGS], corner, inner)
 
 
-def _draw_tags(draw: Any, tags: tuple[Tag, ...], at: tuple[int, int], size: tuple[int, int]) -> None:
+def draw_tags(draw: Any, tags: tuple[Tag, ...], at: tuple[int, int], size: tuple[int, int]) -> None:
     """Names at their places, moved down where they would cover each other."""
     taken: list[tuple[float, float, float]] = []
-    for tag in tags[:MOST_TAGS]:
+    for tag in tags:
         text = printable(tag.text, MOST_TAG_TEXT)
         wide = 8.0 * len(text) + 8
         x = float(np.clip(tag.x * size[0] - wide / 2, 2, max(2.0, size[0] - wide - 2)))
@@ -207,9 +227,9 @@ def _draw_tags(draw: Any, tags: tuple[Tag, ...], at: tuple[int, int], size: tupl
         if y > size[1] - TAG_LINE:
             continue
         place = (at[0] + round(x), at[1] + round(y))
-        box = draw.textbbox(place, text, font=_font(13, False))
+        box = draw.textbbox(place, text, font=font(13, False))
         draw.rectangle((box[0] - 3, box[1] - 2, box[2] + 3, box[3] + 2), fill=PAPER, outline=tag.colour)
-        _write(draw, place, text, 13, tag.colour)
+        write_line(draw, place, text, 13, tag.colour)
 
 
 def _draw_scale(page: Any, draw: Any, scale: UInt8Array, at: tuple[int, int]) -> None:
@@ -219,9 +239,9 @@ def _draw_scale(page: Any, draw: Any, scale: UInt8Array, at: tuple[int, int]) ->
     bar = np.repeat(scale[None, ::2], 10, axis=0)
     words, wide = "less similar", 88
     draw.rectangle((at[0] - 4, at[1] - 4, at[0] + 2 * wide + bar.shape[1] + 20, at[1] + 20), fill=PAPER)
-    _write(draw, (at[0], at[1]), words, 13, INK)
+    write_line(draw, (at[0], at[1]), words, 13, INK)
     page.paste(Image.fromarray(bar), (at[0] + wide, at[1] + 4))
-    _write(draw, (at[0] + wide + bar.shape[1] + 8, at[1]), "more similar", 13, INK)
+    write_line(draw, (at[0] + wide + bar.shape[1] + 8, at[1]), "more similar", 13, INK)
 
 
 def _title_lines(title: tuple[str, ...]) -> list[tuple[str, int]]:
@@ -239,12 +259,14 @@ def _title_lines(title: tuple[str, ...]) -> list[tuple[str, int]]:
     return lines
 
 
-def _write(draw: Any, at: tuple[int, int], text: str, size: int, shade: tuple[int, ...], is_bold: bool = False) -> None:
-    draw.text(at, drawable(text), font=_font(size, is_bold), fill=shade)
+def write_line(
+    draw: Any, at: tuple[int, int], text: str, size: int, shade: tuple[int, ...], is_bold: bool = False
+) -> None:
+    draw.text(at, drawable(text), font=font(size, is_bold), fill=shade)
 
 
 @cache
-def _font(size: int, is_bold: bool) -> Any:
+def font(size: int, is_bold: bool) -> Any:
     from matplotlib import get_data_path
     from PIL import ImageFont
 
@@ -326,3 +348,19 @@ def mask_in_frame(frame: Frame, tree: object, is_member: BoolArray, bounds: Floa
         rows, columns = np.nonzero(pixels)
         mask[rows[is_near][owned], columns[is_near][owned]] = True
     return mask[::PIXEL_STEP, ::PIXEL_STEP]
+
+
+def owners_in_frame(frame: Frame, tree: object, owner: Int64Array) -> Int64Array:
+    """Whose map point is nearest to what the frame shows, of every ``PIXEL_STEP``-th pixel (h, w); 0 for nobody's.
+
+    ``tree`` is the ``KDTree`` of the map's points, ``owner`` (N,) says whose each is.
+    """
+    depth_m = frame.depth_m[::PIXEL_STEP, ::PIXEL_STEP]
+    pixels = np.zeros(frame.depth_m.shape, np.bool_)
+    pixels[::PIXEL_STEP, ::PIXEL_STEP] = True
+    pixels &= valid_depth(frame.depth_m, 0.0, np.inf)
+    places = back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, pixels)
+    owners = np.zeros(depth_m.shape, np.int64)
+    _, nearest = tree.query(places, distance_upper_bound=CAP_M)  # type: ignore[attr-defined]
+    owners[pixels[::PIXEL_STEP, ::PIXEL_STEP]] = np.append(owner, 0)[nearest]
+    return owners

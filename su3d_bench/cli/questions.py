@@ -1,4 +1,4 @@
-"""``su3d-bench questions``: make sets of queries with known answers, and look at sets from anywhere."""
+"""``su3d-bench questions``: make sets of queries with known answers, look at sets, and at whether they are right."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_either, answer_json, remark
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, suggest
+from su3d_bench.cli.common import add_table_format, add_verb, answer, answer_either, answer_json, formatted, remark
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.questions.model import Question
 
-ACTIONS = ("make", "show")
+ACTIONS = ("make", "show", "audit")
 PAPER = "paper"
 SOURCES = ("auto", "generated")
 N_SHOWN = 20
@@ -25,14 +25,14 @@ def add_parser(verbs: Any) -> None:
     parser = add_verb(
         verbs,
         "questions",
-        "Make sets of queries with known answers from ground truth, or show a set.",
+        "Make sets of queries with known answers from ground truth, show a set, or see whether questions are right.",
         (
             "su3d-bench questions make --scenes 'rooms/*' --per-kind 40 --leave-out disputed.csv --out queries.toml",
-            "su3d-bench questions show paper",
+            "su3d-bench questions audit --scenes 'rooms/*' --n 200 --out audit",
         ),
         call,
     )
-    parser.add_argument("action", metavar="make|show")
+    parser.add_argument("action", metavar="make|show|audit")
     parser.add_argument("file", nargs="?", help="show: a set (.toml, .csv, ScanRefer, Nr3D, SQA3D), or 'paper'")
     parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="addresses or patterns such as 'rooms/*'")
     parser.add_argument("--per-kind", type=int, metavar="N", help="at most N of each kind and scene (default: all)")
@@ -45,14 +45,24 @@ def add_parser(verbs: Any) -> None:
     parser.add_argument(
         "--leave-out", type=Path, metavar="FILE", help="make: without the questions that a CSV file lists by their id"
     )
-    parser.add_argument("--out", type=Path, metavar="FILE", help="make: where to write, .toml or .csv")
+    parser.add_argument(
+        "--out", type=Path, metavar="PATH", help="where to write: make: a .toml or .csv file; audit: a folder"
+    )
+    parser.add_argument("--n", type=int, default=200, metavar="N", help="audit: so many questions (default: 200)")
+    parser.add_argument("--seed", type=int, default=0, metavar="N", help="audit: of the draw (default: 0)")
+    parser.add_argument(
+        "--kinds", nargs="+", metavar="KIND", help="audit: of these kinds only, such as retrieval, property, 'what on'"
+    )
+    parser.add_argument("--per-page", type=int, default=12, metavar="N", help="audit: questions a sheet (default: 12)")
+    parser.add_argument("--score", type=Path, metavar="FILE", help="audit: add up the verdicts in this audit.csv")
+    add_table_format(parser)
 
 
 def call(arguments: argparse.Namespace) -> int:
     if arguments.action not in ACTIONS:
         hint = suggest(arguments.action, ACTIONS) or f"; known: {', '.join(ACTIONS)}"
         raise ConfigError(f"questions: unknown action '{arguments.action}'{hint}")
-    return _make(arguments) if arguments.action == "make" else _show(arguments)
+    return {"make": _make, "show": _show, "audit": _audit}[arguments.action](arguments)
 
 
 def _make(arguments: argparse.Namespace) -> int:
@@ -137,3 +147,60 @@ def _answer_counts(questions: Sequence[Question], arguments: argparse.Namespace)
     n_scenes = len({question.scene for question in questions})
     text = f"{len(questions)} questions on {n_scenes} scenes ({kinds}); {n_known} with known answers"
     answer_either(arguments, {"n": len(questions), "n_known": n_known, "kinds": dict(counts)}, text)
+
+
+def _audit(arguments: argparse.Namespace) -> int:
+    from su3d_bench.cli.datasets.check import chosen_scenes
+    from su3d_bench.questions.audit import audited_questions, n_of_each, of_kinds, sample
+    from su3d_bench.sheets.audit import make_audit
+
+    if arguments.score is not None:
+        return _score(arguments)
+    if arguments.file is not None or not arguments.scenes or arguments.out is None:
+        raise ConfigError("questions audit: needs --scenes and --out FOLDER, or --score FOLDER/audit.csv")
+    for flag, value, least in (
+        ("--n", arguments.n, 1),
+        ("--per-page", arguments.per_page, 1),
+        ("--seed", arguments.seed, 0),
+    ):
+        if value < least:
+            raise ConfigError(f"questions audit: {flag} is {value}; expected {least} or more")
+    scenes = chosen_scenes(arguments.scenes, [], is_quiet=arguments.quiet)
+    n_each = n_of_each(arguments.n, len(scenes))
+    every = []
+    for dataset, scene in scenes:
+        of_scene = list(audited_questions(dataset, scene, n_each=n_each, seed=arguments.seed))
+        remark(f"{dataset.name}/{scene}: {counted(len(of_scene), 'question')}", quiet=arguments.quiet)
+        every += of_scene
+    drawn = sample(of_kinds(every, arguments.kinds or ()), arguments.n, arguments.seed)
+    if not drawn:
+        raise DataError("questions audit: nothing can be asked of these scenes")
+    places = {f"{dataset.name}/{scene}": (dataset, scene) for dataset, scene in scenes}
+    sheets = make_audit(
+        drawn,
+        places.__getitem__,
+        arguments.out,
+        per_sheet=arguments.per_page,
+        progress=lambda scene: remark(f"{scene}: drawn", quiet=arguments.quiet),
+    )
+    counts = dict(sorted(Counter(question.kind for question in drawn).items()))
+    kinds = ", ".join(f"{n} {kind}" for kind, n in counts.items())
+    text = (
+        f"{counted(len(drawn), 'question')} on {counted(len(sheets), 'sheet')} ({kinds})\n"
+        f"look at {arguments.out}/sheet-*.png or index.html, write right, arguable or wrong into audit.csv, then: "
+        f"su3d-bench questions audit --score {arguments.out}/audit.csv"
+    )
+    answer_either(arguments, {"n": len(drawn), "kinds": counts, "sheets": [str(sheet) for sheet in sheets]}, text)
+    return EXIT_DONE
+
+
+def _score(arguments: argparse.Namespace) -> int:
+    from su3d_bench.sheets.audit_scores import audit_json, audit_table, read_verdicts
+
+    verdicts = read_verdicts(arguments.score)
+    table = audit_table(verdicts)
+    if arguments.json:
+        answer_json(audit_json(verdicts))
+    else:
+        answer(formatted([table], arguments))
+    return EXIT_DONE

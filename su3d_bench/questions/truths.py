@@ -141,12 +141,12 @@ def questions_of(dataset: Any, scene: str, *, per_kind: int | None = None, own: 
     """
     if own and has_own_queries(dataset):
         return chosen(own_questions(dataset, scene), per_kind)
-    truth = fullest_truth(dataset, scene)
-    return generate(f"{dataset.name}/{scene}", scene_objects(dataset, scene, truth, MIN_VERTICES), per_kind)
+    objects = scene_objects(dataset, scene, fullest_truth(dataset, scene), MIN_VERTICES)
+    return generate(f"{dataset.name}/{scene}", objects, per_kind)
 
 
 def fullest_truth(dataset: Any, scene: str) -> GroundTruth:
-    """The truth of a scene that questions are made from; ``GroundTruthMissing`` where there is none."""
+    """The truth of a scene with the most classes; ``GroundTruthMissing`` where the dataset has none."""
     if not dataset.variants:
         raise GroundTruthMissing(f"{dataset.name}/{scene}: the dataset has no ground truth to make questions from")
     variant = next((name for name in FULLEST if name in dataset.variants), dataset.variants[0])

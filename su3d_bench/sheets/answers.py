@@ -57,8 +57,8 @@ def read_answers(path: Path) -> list[AnswerRow]:
     return parse_csv(content, where) if suffix == ".csv" else parse_workbook(content, where)
 
 
-def parse_csv(content: bytes, where: str) -> list[AnswerRow]:
-    """The answers of a CSV file: UTF-8, with or without the mark that Excel writes, separated by ``,`` ``;`` or tab."""
+def csv_rows(content: bytes, where: str) -> list[list[str]]:
+    """The rows of a CSV file: UTF-8, with or without the mark that Excel writes, separated by ``,`` ``;`` or tab."""
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
@@ -71,6 +71,12 @@ def parse_csv(content: bytes, where: str) -> list[AnswerRow]:
         raise DataError(f"{where}: is no CSV ({printable(str(error), 120)}); export it again") from error
     if len(rows) > MOST_ROWS:
         raise DataError(f"{where}: has {len(rows)} rows; at most {MOST_ROWS} are read")
+    return rows
+
+
+def parse_csv(content: bytes, where: str) -> list[AnswerRow]:
+    """The answers of a CSV file."""
+    rows = csv_rows(content, where)
     columns = _columns(rows[0]) if rows else None
     if columns is None:
         missing = [name for name in ANSWER_COLUMNS if not rows or name not in _names(rows[0])]
@@ -148,12 +154,12 @@ def _rows(rows: Iterable[tuple[int, Sequence[object]]], columns: dict[str, int],
         if all(cell is None or cell == "" for cell in row):
             continue
         at = f"{where}: row {number}"
-        cells = {name: _cell(row[k] if k < len(row) else None, name, at) for name, k in columns.items()}
+        cells = {name: cell_text(row[k] if k < len(row) else None, name, at) for name, k in columns.items()}
         if any(cells[name] for name in ANSWER_COLUMNS if name != "annotator"):
             yield AnswerRow(at, **cells)
 
 
-def _cell(value: object, name: str, at: str) -> str:
+def cell_text(value: object, name: str, at: str) -> str:
     """The text of a cell; what is no text, a number or a date, as the text of it."""
     text = "" if value is None else str(value).strip()
     # as files that a spreadsheet is to open have it before text that would be taken for a formula

@@ -175,7 +175,7 @@ class _ShownMap:
             return None
         frame = frames[view.frame]
         bounds = np.stack([points.min(axis=0), points.max(axis=0)]).astype(np.float64)
-        return _Photo(frame, _at_full_size(mask_in_frame(frame, self._tree, is_member, bounds), frame))
+        return _Photo(frame, at_full_size(mask_in_frame(frame, self._tree, is_member, bounds), frame.rgb))
 
 
 def _tags(draft: Draft, instances: Instances, view: MapView) -> tuple[Tag, ...]:
@@ -215,12 +215,12 @@ def _ring(draft: Draft, shown: _ShownMap) -> tuple[float, float, float] | None:
     return float(x), float(y), float(0.6 * np.abs(high - low).max())
 
 
-def _at_full_size(mask: BoolArray, frame: Frame) -> BoolArray:
-    """The mask at the size of the colour image, small gaps of the map closed."""
+def at_full_size(mask: BoolArray, rgb: UInt8Array) -> BoolArray:
+    """The mask at the size of the colour image ``rgb``, small gaps of the map closed."""
     import cv2
 
     closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
-    height, width = frame.rgb.shape[:2]
+    height, width = rgb.shape[:2]
     full: BoolArray = cv2.resize(closed, (width, height), interpolation=cv2.INTER_NEAREST) > 0
     return full
 
