@@ -128,7 +128,7 @@ def test_outlines_have_the_colours_of_what_they_mean() -> None:
         BLUE: (slice(20, 30), slice(35, 45)),
         ORANGE: (slice(20, 30), slice(60, 70)),
     }
-    marks = []
+    marks: list[Mark] = []
     for shade, (rows, columns) in boxes.items():
         mask = np.zeros((60, 80), bool)
         mask[rows, columns] = True
