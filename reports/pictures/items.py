@@ -188,12 +188,19 @@ def _draw_ring(shown: UInt8Array, ring: tuple[float, float, float], eye: tuple[f
     cv2.circle(shown, centre, radius, OUTLINE, 3, cv2.LINE_AA)
 
 
-def png_bytes(picture: UInt8Array) -> bytes:
-    """A PNG of at most ``PNG_COLOURS`` colours: the same bytes for the same picture."""
+def png_bytes(picture: UInt8Array, *, is_true: bool = False) -> bytes:
+    """A PNG of at most ``PNG_COLOURS`` colours: the same bytes for the same picture.
+
+    ``is_true``: larger, with colours that can be judged: 256, and dots of two where none is near enough.
+    """
     from PIL import Image
 
     buffer = io.BytesIO()
-    image = Image.fromarray(picture).quantize(PNG_COLOURS, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    whole = Image.fromarray(picture)
+    n_colours = 256 if is_true else PNG_COLOURS
+    image = whole.quantize(n_colours, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    if is_true:
+        image = whole.quantize(palette=image, dither=Image.Dither.FLOYDSTEINBERG)
     image.save(buffer, format="PNG", compress_level=6)  # 9: a twentieth smaller in four times the time
     return buffer.getvalue()
 

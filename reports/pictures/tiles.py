@@ -153,9 +153,8 @@ def _draw_plan(draw: Any, plan: Plan, at: tuple[int, int], size: tuple[int, int]
         # below the box: a tag is put 30 above its place
         tags.append(Tag(label, ((left + right) / 2 - at[0]) / size[0], (bottom - at[1] + 34) / size[1], shade))
     draw_tags(draw, tuple(tags), at, size)
-    foot = at[1] + size[1] - 5
-    draw.line((at[0] + 6, foot, at[0] + 6 + scale, foot), fill=INK, width=2)
-    write_line(draw, (at[0] + 6, foot - 16), "1 m", 11, INK)
+    draw.line((at[0] + 6, at[1] + 20, at[0] + 6 + scale, at[1] + 20), fill=INK, width=2)
+    write_line(draw, (at[0] + 6, at[1] + 4), "1 m", 11, INK)
 
 
 def _drawn(photo: Photo, most: tuple[int, int]) -> tuple[UInt8Array, tuple[Tag, ...]]:

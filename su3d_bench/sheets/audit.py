@@ -31,6 +31,7 @@ GREEN, BLUE, ORANGE = (0, 140, 60), (20, 90, 225), (214, 104, 0)
 GOOD_SHARE = 0.1  # of an image from which a larger view of a thing tells no more
 PLAIN_SHARE = 0.01  # of an image from which a closer look at it does for a better frame
 OTHERS_WEIGHT = 0.5  # of all that is called like an answer, beside 1 for each thing that is in question
+GAP = 9  # every second pixel: a thing behind the slats of blinds has one outline and not forty
 LEAST_GAIN = 0.25  # of the view of one thing, for which a second frame is shown and not the first one closer
 WIDE_SHARE, CLOSE_SHARE = 0.5, 0.15  # of an image's height that a second frame, and a closer look, shows at least
 FILLED_SHARE = 0.5  # of an image's height or width that things fill, so that a closer look would show the same again
@@ -64,10 +65,10 @@ def make_audit(
             progress(question.scene)
         tiles.append(_tile(k + 1, question, photographer))
         names.append(f"{k + 1:03d}.png")
-        write_bytes(out / PICTURES / names[-1], png_bytes(picture_strip(tiles[-1], STRIP)))
+        write_bytes(out / PICTURES / names[-1], png_bytes(picture_strip(tiles[-1], STRIP), is_true=True))
         if len(tiles) == per_sheet or k == len(questions) - 1:
             sheets.append(out / f"sheet-{len(sheets) + 1:02d}.png")
-            write_bytes(sheets[-1], png_bytes(contact_sheet(tiles)))
+            write_bytes(sheets[-1], png_bytes(contact_sheet(tiles), is_true=True))
             tiles = []
     rows: list[list[str | int]]
     rows = [[k, one.scene, one.kind, one.text, one.answer, "", ""] for k, one in enumerate(questions, 1)]
@@ -210,7 +211,7 @@ class _Photographer:
     def _marks(self, place: int, question: AuditedQuestion) -> tuple[Mark, ...]:
         seen = self._seen[place]
         return tuple(
-            Mark(f"#{thing.id}", at_full_size(seen.owners == place, seen.rgb), shade, 3 if shade == GREEN else 2)
+            Mark(f"#{thing.id}", at_full_size(seen.owners == place, seen.rgb, GAP), shade, 3 if shade == GREEN else 2)
             for thing, shade in _shaded(question)
             if (place := self._place_of.get(thing.id, 0))
         )

@@ -215,11 +215,11 @@ def _ring(draft: Draft, shown: _ShownMap) -> tuple[float, float, float] | None:
     return float(x), float(y), float(0.6 * np.abs(high - low).max())
 
 
-def at_full_size(mask: BoolArray, rgb: UInt8Array) -> BoolArray:
-    """The mask at the size of the colour image ``rgb``, small gaps of the map closed."""
+def at_full_size(mask: BoolArray, rgb: UInt8Array, gap: int = 3) -> BoolArray:
+    """The mask at the size of the colour image ``rgb``, gaps of less than ``gap`` of its pixels closed."""
     import cv2
 
-    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((3, 3), np.uint8))
+    closed = cv2.morphologyEx(mask.astype(np.uint8), cv2.MORPH_CLOSE, np.ones((gap, gap), np.uint8))
     height, width = rgb.shape[:2]
     full: BoolArray = cv2.resize(closed, (width, height), interpolation=cv2.INTER_NEAREST) > 0
     return full

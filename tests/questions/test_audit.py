@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import json
 import re
 from collections import Counter
@@ -22,6 +23,7 @@ from su3d_bench.core.errors import ConfigError, DataError, StoreError
 from su3d_bench.questions.audit import AuditedQuestion, audited_questions, of_kinds, sample
 from su3d_bench.questions.model import MADE_KINDS, Question, new_question
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.reports.pictures.items import png_bytes
 from su3d_bench.reports.pictures.tiles import Line, Mark, Photo, Tile, contact_sheet, picture_strip
 from su3d_bench.sheets.audit import BLUE, GREEN, ORANGE, make_audit
 from su3d_bench.sheets.audit_scores import COLUMNS, audit_table, read_verdicts
@@ -136,6 +138,17 @@ def test_outlines_have_the_colours_of_what_they_mean() -> None:
     strip = picture_strip(Tile("", "", (), (Photo(grey, tuple(marks)),)), (400, 240))
     at = {shade: np.argwhere((strip == shade).all(axis=-1)).mean(axis=0) for shade in boxes}
     assert at[GREEN][1] < at[BLUE][1] < at[ORANGE][1] < 320
+
+
+def test_colours_can_be_judged_though_there_are_many() -> None:
+    shades = np.random.default_rng(0).integers(0, 256, (40, 40, 3), dtype=np.uint8)
+    picture = np.kron(shades, np.ones((12, 12, 1), np.uint8))
+    off = []
+    for is_true in (True, False):
+        with Image.open(io.BytesIO(png_bytes(picture, is_true=is_true))) as image:
+            blocks = np.asarray(image.convert("RGB"), float).reshape(40, 12, 40, 12, 3).mean(axis=(1, 3))
+        off.append(float(np.abs(blocks - shades).mean()))
+    assert off[0] < 5 < 10 < off[1]
 
 
 def test_a_sheet_takes_any_text_and_no_photograph() -> None:
