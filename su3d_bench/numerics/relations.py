@@ -40,7 +40,11 @@ LEAST_BEARING_RAD = 0.05  # two things nearer to one line of sight are neither l
 CONTAINERS = frozenset(
     {"basket", "bin", "box", "bag", "backpack", "bathtub", "sink", "bucket", "drawer", "pot", "bowl", "vase", "crate"}
 )
+# What carries things below its top; whether people call what stands in any other thing "on" it, nobody knows.
+SHELVES = frozenset({"shelf", "bookshelf", "bookcase", "rack"})
+SEATS = frozenset({"sofa", "couch", "loveseat", "chair", "armchair", "recliner", "bench", "stool", "bed", "futon"})
 FIXTURES = frozenset({"window", "door", "vent", "switch", "plug", "outlet", "socket", "blinds", "blind", "radiator"})
+BUILT_IN = frozenset({"sink", "basin", "washbasin", "cooktop", "hob", "stove"})  # "under the sink" is in its cabinet
 FLOORS = frozenset({"floor", "ground"})
 SURFACES = FLOORS | {"wall", "ceiling", "roof"}  # of the room itself
 BAND = 1.25  # what a threshold so much lower or higher would decide otherwise is doubtful
@@ -66,6 +70,7 @@ class Relations:
         self._boxes = np.asarray(boxes, np.float64).reshape(-1, 2, 3)
         self._names = tuple(names)
         self._is_container = np.array([name in CONTAINERS for name in names], bool)
+        self._carries_inside = np.array([name in SHELVES | SEATS for name in names], bool)
         self._is_fixture = np.array([name in FIXTURES for name in names], bool)
         self._is_thing = np.array([name not in SURFACES for name in names], bool)
         self._is_floor = np.array([name in FLOORS for name in names], bool)
@@ -88,9 +93,14 @@ class Relations:
         return matrix
 
     def doubtful(self, relation: Relation) -> BoolArray:
-        """The pairs (K, K) that a little lower or higher threshold decides otherwise."""
+        """The pairs (K, K) of which a slightly other threshold, or another reading of the word, says otherwise."""
         tight, loose = self._around
         answer: BoolArray = tight.of(relation) != loose.of(relation)
+        if relation in ("on", "under"):
+            is_within = self._stands_inside & ~self._rests_on_top & ~self._carries_inside[None]
+            answer |= is_within if relation == "on" else is_within.T
+        if relation == "next to":
+            answer |= loose.may_be_next_to & ~self.next_to
         return answer
 
     @cached_property
@@ -268,9 +278,24 @@ class Relations:
     @cached_property
     def next_to(self) -> BoolArray:
         """Side by side at one height on one support, on the floor or on the wall, with nothing in between."""
+        return self._without_between(self._is_beside(np.minimum) & self.one_place)
+
+    @cached_property
+    def may_be_next_to(self) -> BoolArray:
+        """What some people call so: by the reach of the larger thing, and for a switch beside the door that stands.
+
+        What lies on a table is not next to the chair before it, whatever one means by the words.
+        """
+        stands = self.is_on_floor & ~self.holders.any(axis=1)
+        lies = self.holders.any(axis=1) & ~self.is_on_floor
+        is_apart = (stands[:, None] & lies[None]) | (lies[:, None] & stands[None])
+        return self._without_between(self._is_beside(np.maximum) & ~is_apart)
+
+    def _is_beside(self, longer_or_shorter: np.ufunc) -> BoolArray:
+        """Pairs (K, K) at one height, aside of one another, within the reach of the larger or smaller of the two."""
         sides = (self._boxes[:, 1] - self._boxes[:, 0])[:, :2].max(axis=1, initial=0.0)
-        smaller = np.minimum(sides[:, None], sides[None])
-        reach_m = np.clip(REACH_SHARE * smaller, LEAST_REACH_M, MOST_REACH_M) * self._slack
+        side_m = longer_or_shorter(sides[:, None], sides[None])
+        reach_m = np.clip(REACH_SHARE * side_m, LEAST_REACH_M, MOST_REACH_M) * self._slack
         gap_m = np.linalg.norm(self._apart[..., :2], axis=2)
         low, high = self._boxes[:, 0, 2], self._boxes[:, 1, 2]
         shared_height = np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None])
@@ -279,12 +304,15 @@ class Relations:
         is_rug = self._is_spread_out[:, None] | self._is_spread_out[None]
         is_aside = self._shared() <= ON_SHARE * self._slack * np.minimum(self._area[:, None], self._area[None])
         is_aside &= ~(self.hangs[:, None] & self.hangs[None]) | ~self._hangs_before
-        pairs: BoolArray = (
-            (gap_m <= reach_m) & is_aside & is_level & self.one_place & ~stacked & ~stacked.T & ~is_rug & self._is_pair
-        )
+        beside: BoolArray = (gap_m <= reach_m) & is_aside & is_level & ~stacked & ~stacked.T & ~is_rug & self._is_pair
+        return beside
+
+    def _without_between(self, pairs: BoolArray) -> BoolArray:
+        """The symmetrical ``pairs`` (K, K) between which nothing stands."""
+        free = pairs.copy()
         for a, b in np.argwhere(np.triu(pairs)).tolist():
-            pairs[a, b] = pairs[b, a] = not self._has_between(a, b)
-        return pairs
+            free[a, b] = free[b, a] = not self._has_between(a, b)
+        return free
 
     def _has_between(self, a: int, b: int) -> bool:
         """Whether something at their height stands in the gap between two things."""
@@ -308,21 +336,58 @@ def is_between(a: Float64Array, b: Float64Array, c: Float64Array) -> bool:
 
     Boxes (2, 3), ``a`` at the height of both; nothing is between what lies flat on the floor and something else.
     """
-    if any(min(a[1, 2], end[1, 2]) <= max(a[0, 2], end[0, 2]) for end in (b, c)):
-        return False
-    if any(end[1, 2] - end[0, 2] < FLAT_M for end in (a, b, c)):
-        return False
-    start, way = b.mean(axis=0)[:2], (c - b).mean(axis=0)[:2]
-    length = float(np.linalg.norm(way))
-    if length < 1e-6:
-        return False
-    along = float((a.mean(axis=0)[:2] - start) @ way) / length**2
-    # where the line enters and leaves the footprint, as shares of the way, along each axis
-    with np.errstate(divide="ignore", invalid="ignore"):
-        middle = a.mean(axis=0)
-        ends = np.sort(((middle + BETWEEN_CORE * (a - middle))[:, :2] - start) / way, axis=0)
-    enters, leaves = float(np.nanmax(ends[0])), float(np.nanmin(ends[1]))
-    return BETWEEN_ENDS < along < 1 - BETWEEN_ENDS and max(enters, 0.0) < min(leaves, 1.0)
+    way = _Way.of(a, b, c)
+    return way is not None and BETWEEN_ENDS < way.along(a) < 1 - BETWEEN_ENDS and way.meets(a, BETWEEN_CORE, 0.0)
+
+
+def may_be_between(a: Float64Array, b: Float64Array, c: Float64Array) -> bool:
+    """Whether some people would call box ``a`` so: it stands anywhere in the lane that is as wide as its two ends."""
+    way = _Way.of(a, b, c)
+    return way is not None and 0.0 < way.along(a) < 1.0 and way.meets(a, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class _Way:
+    """Seen from above: from the middle of one box to that of another, with half their sides, each (2,)."""
+
+    start: Float64Array
+    way: Float64Array
+    half_start: Float64Array
+    half_end: Float64Array
+
+    @classmethod
+    def of(cls, a: Float64Array, b: Float64Array, c: Float64Array) -> _Way | None:
+        """From ``b`` to ``c``, where something may be between them and ``a`` is at their height."""
+        if any(min(a[1, 2], end[1, 2]) <= max(a[0, 2], end[0, 2]) for end in (b, c)):
+            return None
+        if any(end[1, 2] - end[0, 2] < FLAT_M for end in (a, b, c)):
+            return None
+        way = cls(b.mean(axis=0)[:2], (c - b).mean(axis=0)[:2], (b[1] - b[0])[:2] / 2, (c[1] - c[0])[:2] / 2)
+        return way if float(np.linalg.norm(way.way)) >= 1e-6 else None
+
+    def along(self, a: Float64Array) -> float:
+        """How far along the way the middle of a box stands, as a share of it."""
+        return float((a.mean(axis=0)[:2] - self.start) @ self.way) / float(self.way @ self.way)
+
+    def meets(self, a: Float64Array, share: float, width: float) -> bool:
+        """Whether what moves along the way comes to ``share`` of a box's sides.
+
+        It is as wide as ``width`` of the ends, shrinking or growing evenly from one to the other.
+        """
+        aside, half = self.start - a.mean(axis=0)[:2], share * (a[1] - a[0])[:2] / 2
+        enters, leaves = 0.0, 1.0
+        for sign in (1.0, -1.0):
+            # sign * (aside + t * way) <= half + width * (half_start + t * (half_end - half_start))
+            slope = sign * self.way - width * (self.half_end - self.half_start)
+            room = half + width * self.half_start - sign * aside
+            for rise, most in zip(slope.tolist(), room.tolist(), strict=True):
+                if rise > 0:
+                    leaves = min(leaves, most / rise)
+                elif rise < 0:
+                    enters = max(enters, most / rise)
+                elif most < 0:
+                    return False
+        return enters < leaves
 
 
 def bearing_rad(eye: Point, a: Point, b: Point) -> float:

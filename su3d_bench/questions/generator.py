@@ -147,12 +147,16 @@ def extreme_of(things: Sequence[MapObject], sign: int) -> MapObject | None:
 
 
 def _adjectives(objects: SceneMap) -> Iterator[_Asked]:
-    """The words that are known of an object before its name, "red chair"; no colours where one so called has none."""
-    words_of = {thing.id: thing.caption.split() for thing in objects.objects}
-    without_colour = {thing.name for thing in objects.objects if not COLOURS & {*words_of[thing.id]}}
+    """The words that are known of an object before its name, "red chair".
+
+    No colours where one so called has none that is known, and no materials: a painted chair may be of wood.
+    """
+    words_of = {thing.id: frozenset(thing.caption.split()) for thing in objects.objects}
+    without_colour = {thing.name for thing in objects.objects if not words_of[thing.id] & COLOURS}
+    without_material = {thing.name for thing in objects.objects if not words_of[thing.id] - COLOURS}
     for thing in objects.objects:
-        for word in words_of[thing.id]:
-            if word not in COLOURS or thing.name not in without_colour:
+        for word in sorted(words_of[thing.id]):
+            if thing.name not in (without_colour if word in COLOURS else without_material):
                 yield _Asked("property", f"{word} {thing.name}", (thing.id,), thing.name)
 
 
@@ -182,9 +186,11 @@ def _between(objects: SceneMap) -> Iterator[_Asked]:
             if float(np.linalg.norm(first.centroid - second.centroid)) > BETWEEN_M or _touch(objects, first, second):
                 continue
             for thing in objects.objects:
-                if objects.is_between(thing, first, second) and objects.are_in_one_place(thing, first, second):
+                if objects.may_be_between(thing, first, second):
+                    is_sure = objects.is_between(thing, first, second)
+                    is_sure &= objects.are_in_one_place(thing, first, second)
                     text = f"{thing.name} between the {first.name} and the {second.name}"
-                    yield _Asked("relative", text, (thing.id,), thing.name)
+                    yield _Asked("relative", text, (thing.id,) if is_sure else (), thing.name)
 
 
 def _touch(objects: SceneMap, a: MapObject, b: MapObject) -> bool:

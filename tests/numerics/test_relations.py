@@ -21,6 +21,7 @@ from su3d_bench.numerics.relations import (
     gap_m,
     is_between,
     is_left_of,
+    may_be_between,
 )
 from su3d_bench.questions.english import last_word
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
@@ -150,7 +151,8 @@ def test_fixtures_rest_on_nothing_and_surfaces_stand_in_no_relation() -> None:
 
 def test_what_a_little_more_or_less_decides_is_doubtful() -> None:
     chair = box(1, 0, 0, 0.5, 0.5, 0.9)
-    for gap, is_doubtful in ((0.19, False), (0.21, True), (0.3, True), (0.32, False)):  # around 0.25 m, by a quarter
+    # from 0.25 m less a quarter, half the chair's side, to 0.5 m and a quarter, half the table's
+    for gap, is_doubtful in ((0.19, False), (0.21, True), (0.62, True), (0.63, False)):
         relations = Relations(np.array([TABLE, moved(chair, x=gap), FLOOR]), ["table", "chair", "floor"])
         assert relations.doubtful("next to")[0, 1] == is_doubtful, gap
     assert BAND == 1.25
@@ -160,6 +162,19 @@ def test_what_a_little_more_or_less_decides_is_doubtful() -> None:
         (0, "under", 1),
         (1, "on", 0),
     ]
+
+
+def test_what_people_read_differently_is_doubtful() -> None:
+    door, switch = box(0, 0, 0, 0.9, 0.05, 2.0), box(1.1, 0, 1.2, 0.1, 0.03, 0.1)
+    beside = Relations(np.array([door, switch, FLOOR]), ["door", "switch", "floor"])
+    assert not beside.next_to.any() and beside.doubtful("next to")[0, 1] and beside.doubtful("next to")[1, 0]
+    chair = box(1.05, 0, 0, 0.5, 0.5, 0.9)
+    by_table = Relations(np.array([moved(CUP, x=0.45), TABLE, chair, FLOOR]), ["cup", "table", "chair", "floor"])
+    assert by_table.next_to[1, 2] and not by_table.doubtful("next to")[0, 2]  # nobody calls the cup so
+    held = np.array([BOOK, SHELF, FLOOR])
+    for name, is_doubtful in (("shelf", False), ("sofa", False), ("stand", True), ("desk", True)):
+        inner = Relations(held, ["book", name, "floor"])
+        assert inner.on[0, 1] and inner.doubtful("on")[0, 1] == is_doubtful == inner.doubtful("under")[1, 0], name
 
 
 def test_between_lies_on_the_way_on_one_level() -> None:
@@ -176,6 +191,18 @@ def test_between_lies_on_the_way_on_one_level() -> None:
     assert not is_between(moved(middle, x=1.9), a, b)
     assert not is_between(a, b, b)
     assert not is_between(box(1.9, -0.1, 0, 0.2, 0.2, 0.02), a, b)  # flat
+
+
+def test_what_stands_in_the_lane_may_be_between() -> None:
+    a, b = box(-0.5, -0.5, 0, 1, 1, 1), box(3.75, -0.25, 0, 0.5, 0.5, 1)  # the lane narrows from 1 m to 0.5 m
+    middle = box(1.9, -0.1, 0, 0.2, 0.2, 0.5)
+    for aside in (0.0, 0.1, 0.5):  # half of the lane is 0.407 m where the thing begins, and half of the thing 0.1 m
+        assert may_be_between(moved(middle, y=aside), a, b) and may_be_between(moved(middle, y=-aside), b, a), aside
+    assert not may_be_between(moved(middle, y=0.52), a, b) and not may_be_between(moved(middle, z=1.0), a, b)
+    assert not may_be_between(moved(middle, x=2.1), a, b) and not may_be_between(moved(middle, x=-2.1), a, b)
+    aslant = box(0, 0, 0, 1, 1, 1), box(3, 3, 0, 1, 1, 1)
+    assert may_be_between(box(2.4, 0.6, 0, 1, 1, 1), *aslant) and not is_between(box(2.4, 0.6, 0, 1, 1, 1), *aslant)
+    assert not may_be_between(box(3.0, 0.0, 0, 0.9, 0.9, 1), *aslant)
 
 
 def test_left_is_seen_from_an_eye() -> None:

@@ -146,6 +146,21 @@ def test_of_a_window_nobody_says_that_it_is_above_something() -> None:
     assert row_of(bench, picture)["relative by name", "picture above a bench"] == (2,)
 
 
+def test_of_a_sink_nobody_says_that_the_countertop_is_under_it() -> None:
+    slab, cup = thing(1, "countertop", (0, 0, 0), (2, 0.6, 0.9)), thing(2, "cup", (0.3, 0.2, 0.9), (0.1, 0.1, 0.1))
+    assert row_of(slab, cup)["relative by name", "countertop under a cup"] == (1,)
+    assert not any("under" in text for _, text in row_of(slab, replace(cup, name="sink")))
+
+
+def test_what_stands_in_the_lane_as_well_makes_between_doubtful() -> None:
+    bin_, sofa = thing(1, "bin", (0, 0, 0), (0.3, 0.3, 0.5)), thing(2, "sofa", (1.5, 0, 0), (0.3, 0.3, 0.5))
+    stool, other = thing(3, "stool", (0.6, 0, 0), (0.3, 0.3, 0.5)), thing(4, "stool", (1.1, 0.25, 0), (0.2, 0.2, 0.5))
+    text = "stool between the bin and the sofa"
+    far = thing(4, "stool", (1.1, 2.25, 0), (0.2, 0.2, 0.5))
+    assert row_of(bin_, sofa, stool, far)["relative", text] == (3,)
+    assert not any(asked == text for _, asked in row_of(bin_, sofa, stool, other))  # it reaches into the lane
+
+
 def test_what_no_frame_shows_is_neither_asked_for_nor_an_answer() -> None:
     table, cup = thing(1, "table", (0, 0, 0), (1, 1, 0.7)), thing(2, "cup", (0.4, 0.4, 0.7), (0.1, 0.1, 0.1))
     assert ("instance", "cup") in row_of(table, cup)
@@ -163,15 +178,17 @@ def test_sizes_are_said_of_whole_things_that_are_not_flat() -> None:
     assert not any("large" in text for _, text in row_of(*flat))
 
 
-def test_a_colour_is_asked_where_all_of_the_name_have_one() -> None:
-    red, blue, plain = (
+def test_a_colour_or_material_is_asked_where_all_of_the_name_have_one() -> None:
+    red, blue, plain, woven = (
         replace(thing(k, "chair", (4.0 * k, 0, 0), (0.5, 0.5, 0.9)), caption=caption)
-        for k, caption in ((1, "red"), (2, "blue wooden"), (3, ""))
+        for k, caption in ((1, "red"), (2, "blue wooden"), (3, ""), (4, "wicker"))
     )
     assert row_of(red, blue)["property", "red chair"] == (1,)
-    assert row_of(red, blue)["property", "wooden chair"] == (2,)
     assert not any(text == "red chair" for _, text in row_of(red, plain))
     assert row_of(red)["property by name", "red chair"] == (1,)
+    assert not any(text == "wooden chair" for _, text in row_of(red, blue))  # the red one may be of painted wood
+    assert row_of(blue, woven)["property", "wooden chair"] == (2,)
+    assert row_of(blue)["property by name", "wooden chair"] == (2,)
 
 
 def test_who_knows_names_alone_is_right_by_the_share_of_the_name() -> None:

@@ -185,6 +185,7 @@ class _Drafts:
                 continue
             between = [thing for thing in self._all if self._scene.is_between(thing, a, b)]
             is_plain = all(self._scene.are_in_one_place(thing, a, b) for thing in between)
+            is_plain &= not any(self._scene.may_be_between(thing, a, b) for thing in self._all if thing not in between)
             if 0 < len(between) <= FEW_BETWEEN and is_plain:
                 share = 1 / math.comb(len(self._all), len(between))
                 yield _Draft(f"What is between the {a.name} and the {b.name}?", share, share)

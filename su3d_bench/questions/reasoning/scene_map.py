@@ -10,7 +10,7 @@ import numpy as np
 
 from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.types import Float64Array, Instances
-from su3d_bench.numerics.relations import FIXTURES, SURFACES, Relation, Relations, is_between
+from su3d_bench.numerics.relations import BUILT_IN, FIXTURES, SURFACES, Relation, Relations, is_between, may_be_between
 from su3d_bench.questions.english import last_word
 
 MOST_NAME, MOST_CAPTION = 80, 400  # characters; a hostile map may hold texts of any length
@@ -85,16 +85,25 @@ class SceneMap:
 
     def is_between(self, thing: MapObject, first: MapObject, second: MapObject) -> bool:
         """Whether an object stands between two others; what one of them holds, or stands on, does not."""
-        if thing.id in (first.id, second.id) or not is_between(thing.box, first.box, second.box):
-            return False
-        pairs = [pair for end in (first, second) for pair in ((thing, end), (end, thing))]
-        return not any(self.holds("on", *pair) or self.holds("in", *pair) for pair in pairs)
+        return is_between(thing.box, first.box, second.box) and not self._is_of(thing, first, second)
+
+    def may_be_between(self, thing: MapObject, first: MapObject, second: MapObject) -> bool:
+        """Whether some people would say that an object stands between two others."""
+        return may_be_between(thing.box, first.box, second.box) and not self._is_of(thing, first, second)
+
+    def _is_of(self, thing: MapObject, *ends: MapObject) -> bool:
+        """Whether an object is one of ``ends``, or holds or is held by one."""
+        pairs = [pair for end in ends for pair in ((thing, end), (end, thing))]
+        return thing in ends or any(self.holds("on", *pair) or self.holds("in", *pair) for pair in pairs)
 
     @staticmethod
     def is_said(relation: Relation, subject: MapObject, other: MapObject) -> bool:
         """Whether people speak so of such things: windows, blinds and vents are above whatever is in the room."""
-        are_things = {last_word(subject.name), last_word(other.name)}.isdisjoint(FIXTURES)
-        return are_things or relation not in ("above", "under")
+        if relation not in ("above", "under"):
+            return True
+        if relation == "under" and last_word(other.name) in BUILT_IN:
+            return False
+        return {last_word(subject.name), last_word(other.name)}.isdisjoint(FIXTURES)
 
     def are_in_one_place(self, *things: MapObject) -> bool:
         """Whether objects are on one support, all on the floor, or all hang."""

@@ -29,7 +29,7 @@ MIN_VIEW_PIXELS = 80
 SHOWN_OF_WINDOW, SHOWN_OF_NEIGHBOUR = 0.02, 0.5
 # Ratio from which a window tells the kind of room, if it covers this part of the image.
 ROOM_PART_OF_IMAGE = 0.25
-INVERSE = {"on": "with", "in": "with", "next to": "next to", "under": "above", "above": "under"}
+HELD = ("on", "in")  # the holder is shown "with" what it holds; of other pairs the truth has both directions
 TIGHT_RATIOS = (0.8, 1.0, 1.2)
 WIDE_RATIOS = (2.0, 2.0, 4.0)
 # A region of the segmenter teaches the object that owns at least this part of its pixels.
@@ -200,12 +200,10 @@ class _View:
         n_ids = 1 + max(self._objects)
         self.counts = np.bincount(instance.ravel(), minlength=n_ids)
         self._related: dict[int, list[tuple[str, int]]] = {}
-        for relation in truth.relations:
-            # Sides are left out: training mirrors its crops.
-            if relation.relation in INVERSE:
-                self._related.setdefault(relation.subject, []).append((relation.relation, relation.object))
-                inverse = (INVERSE[relation.relation], relation.subject)
-                self._related.setdefault(relation.object, []).append(inverse)
+        for link in truth.relations:
+            self._related.setdefault(link.subject, []).append((link.relation, link.object))
+            if link.relation in HELD:
+                self._related.setdefault(link.object, []).append(("with", link.subject))
 
     def truth_of(self, object_id: int, window: Int64Array) -> CropTruth:
         """The truth of a window around ``object_id``, with those neighbours alone that the window shows."""
