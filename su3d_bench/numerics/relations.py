@@ -268,7 +268,7 @@ class Relations:
     def under(self) -> BoolArray:
         """The first bears the second or has it above, or stands on the ground that the second covers."""
         foot, top = self._boxes[:, 0, 2], self._boxes[:, 1, 2]
-        is_low = (np.abs(foot[:, None] - foot[None]) <= INNER_FLOOR_M) & (top[:, None] <= top[None])
+        is_low = (np.abs(foot[:, None] - foot[None]) <= INNER_FLOOR_M * self._slack) & (top[:, None] <= top[None])
         is_covered = self._shared() / self._area[:, None] >= min(1.0, WITHIN_SHARE / self._slack)
         stands_under = is_low & is_covered & (self._area[:, None] < self._area[None]) & ~self._is_container[None]
         is_covered_floor = stands_under & ~self._is_spread_out[:, None] & self._is_pair

@@ -39,7 +39,8 @@ def known_objects(
         is_asked = known.id in rows_of and (seen is None or (sight is not None and sight.is_plain))
         is_asked &= not any(name.endswith(f" {known.name}") for name in names)
         colour = "" if sight is None or last_word(known.name) in WITHOUT_COLOUR else sight.colour
-        colour = colour if known.colour in ("", colour) else ""  # in the light of the room it looks like another
+        is_sure = sight is not None and (known.colour == sight.colour or (not known.colour and sight.is_sure_colour))
+        colour = colour if is_sure else ""  # in the light of the room it may look like another
         words = [*([colour] if colour else []), *known.adjectives]
         things.append(
             MapObject(
@@ -50,6 +51,7 @@ def known_objects(
                 known.box,
                 is_asked=is_asked,
                 is_whole=whole is not None,
+                is_cut=whole is None and sight is not None and sight.is_cut,
             )
         )
     return SceneMap(tuple(things))

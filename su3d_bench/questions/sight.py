@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.types import Float64Array, Frame, GroundTruth, Int64Array
+from su3d_bench.core.types import BoolArray, Float64Array, Frame, GroundTruth, Int64Array
 
 N_FRAMES = 40  # ours: spread evenly, enough to see nearly everything of a room
 MOST_VERTICES = 3000  # of one object: at 0.5 m a scan of 0.02 m still hits most cells of its image
@@ -19,6 +19,9 @@ SAME_SURFACE_M = 0.05  # a vertex is seen where the depth image agrees with it
 CELLS_A_SIDE = 80  # of the grid over an image in which seen vertices are counted
 LEAST_SHARE = 0.002  # ours: of an image; 25 pixels a side of 640 x 480, of which one can tell what they are
 MIN_PIXELS = 60  # ours: fewer say too little of a colour
+OTHER_LIGHT = 1.25  # ours: a colour that nobody vouches for is named where so much more and less light leaves its word
+END_M = 0.05  # of an object within this of a side of its box some vertex must be seen away from the image's border
+BORDER_SHARE = 0.05  # of the image's longer side
 # Things whose colour is that of what they show, or of their frame, and nobody's name for them.
 WITHOUT_COLOUR = frozenset(("picture", "painting", "poster", "photo", "mirror", "window", "screen", "tv", "monitor"))
 MIN_SHARE = 0.6  # ours: of the pixels of an object that have the same word
@@ -34,10 +37,16 @@ PINK_L = 60.0  # a light red is pink
 
 @dataclass(frozen=True)
 class Sight:
-    """``share``: the largest part of an image that an object fills; ``colour``: a word, empty where none fits."""
+    """``share``: the largest part of an image that an object fills; ``colour``: a word, empty where none fits.
+
+    ``is_sure_colour``: whether it is the same in a little other light. ``is_cut``: whether a side of the object's box
+    was seen only where the images end.
+    """
 
     share: float
     colour: str
+    is_sure_colour: bool = False
+    is_cut: bool = False
 
     @property
     def is_plain(self) -> bool:
@@ -53,9 +62,11 @@ def sights(dataset: Any, scene: str, truth: GroundTruth, min_vertices: int) -> M
     frames = dataset.frames(scene, max(1, n_frames // N_FRAMES))
     pixels: dict[int, list[Float64Array]] = {}
     shares: dict[int, float] = {}
+    is_inside = np.zeros(len(points), bool)
     for k in range(min(len(frames), N_FRAMES)):
         frame = frames[k]
         seen, line, column = _seen(frame, points)
+        is_inside[seen] |= _is_off_the_border(frame, line, column)
         side = max(frame.depth_m.shape) / CELLS_A_SIDE
         n_lines, n_columns = np.ceil(np.array(frame.depth_m.shape) / side).astype(np.int64)
         cell = (line / side).astype(np.int64) * n_columns + (column / side).astype(np.int64)
@@ -66,9 +77,29 @@ def sights(dataset: Any, scene: str, truth: GroundTruth, min_vertices: int) -> M
         rgb = frame.rgb[line, column].astype(np.float64)
         for instance in np.unique(owner[seen]).tolist():
             pixels.setdefault(instance, []).append(rgb[owner[seen] == instance][:: max(1, MOST_VERTICES // 300)])
-    return {
-        instance: Sight(shares[instance], colour_word(np.concatenate(pixels[instance]))) for instance in sorted(shares)
-    }
+    found = {}
+    for instance in sorted(shares):
+        rgb, own = np.concatenate(pixels[instance]), owner == instance
+        word = colour_word(rgb)
+        is_sure = all(colour_word((rgb * light).clip(max=255.0)) == word for light in (1 / OTHER_LIGHT, OTHER_LIGHT))
+        found[instance] = Sight(shares[instance], word, is_sure, _is_cut(points[own], is_inside[own]))
+    return found
+
+
+def _is_off_the_border(frame: Frame, line: Int64Array, column: Int64Array) -> BoolArray:
+    height, width = frame.depth_m.shape
+    border = BORDER_SHARE * max(height, width)
+    is_off: BoolArray = (np.minimum(line, height - 1 - line) >= border) & (
+        np.minimum(column, width - 1 - column) >= border
+    )
+    return is_off
+
+
+def _is_cut(points: Float64Array, is_inside: BoolArray) -> bool:
+    """Whether along one of the six sides of their box no point (N, 3) was seen inside an image."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    ends = np.concatenate([points - low <= END_M, high - points <= END_M], axis=1)
+    return not (ends & is_inside[:, None]).any(axis=0).all()
 
 
 def instance_rows(truth: GroundTruth, min_vertices: int) -> Iterator[tuple[int, Int64Array]]:

@@ -156,6 +156,9 @@ def test_what_a_little_more_or_less_decides_is_doubtful() -> None:
         relations = Relations(np.array([TABLE, moved(chair, x=gap), FLOOR]), ["table", "chair", "floor"])
         assert relations.doubtful("next to")[0, 1] == is_doubtful, gap
     assert BAND == 1.25
+    box_on_floor = moved(BOOK, z=-0.85)  # 0.05 m above the shelf's foot: on its lowest board, or under it
+    bottom = Relations(np.array([box_on_floor, SHELF, FLOOR]), ["box", "shelf", "floor"])
+    assert bottom.doubtful("on")[0, 1] and bottom.doubtful("under")[0, 1]
     certain = Relations(np.array([TABLE, CUP, FLOOR]), ["table", "cup", "floor"])
     assert not certain.doubtful("on").any()
     assert [(link.subject, link.relation, link.object) for link in certain.links(with_doubtful=False)] == [

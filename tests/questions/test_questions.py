@@ -17,6 +17,7 @@ from su3d_bench.perception.embedded.lexicon import AFFORDANCES
 from su3d_bench.questions.generator import chosen, generate, right_by_name
 from su3d_bench.questions.known_objects import is_called, known_objects, plain_name
 from su3d_bench.questions.model import KINDS, Question, new_question, question_id
+from su3d_bench.questions.reasoning.generated import generate_questions
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
 
 HOSTILE = ("<script>alert(1)</script>", '=HYPERLINK("x","y")', "\u202eright to left", "😀 chair", "x" * 10_000)
@@ -159,6 +160,31 @@ def test_what_stands_in_the_lane_as_well_makes_between_doubtful() -> None:
     far = thing(4, "stool", (1.1, 2.25, 0), (0.2, 0.2, 0.5))
     assert row_of(bin_, sofa, stool, far)["relative", text] == (3,)
     assert not any(asked == text for _, asked in row_of(bin_, sofa, stool, other))  # it reaches into the lane
+
+
+def test_of_what_is_cut_by_the_images_no_place_is_asked() -> None:
+    table, cup = thing(1, "table", (0, 0, 0), (1, 1, 0.7)), thing(2, "cup", (0.4, 0.4, 0.7), (0.1, 0.1, 0.1))
+    lamp, sofa = thing(3, "lamp", (3, 0, 0), (0.3, 0.3, 1.5)), thing(4, "sofa", (6, 0, 0), (1, 1, 0.7))
+    assert row_of(table, cup)["relative by name", "cup on a table"] == (2,)
+    cut = row_of(replace(table, is_cut=True), cup)
+    assert not any("on a table" in text for _, text in cut) and ("instance", "table") in cut
+    objects = SceneMap((table, cup, lamp, sofa))
+    whole = [made.text for made in generate_questions(objects, n_each=99)]
+    seen = [
+        made.text for made in generate_questions(SceneMap((table, cup, lamp, replace(sofa, is_cut=True))), n_each=99)
+    ]
+    assert any("distance" in text and "sofa" in text for text in whole)
+    assert not any("sofa" in text for text in seen if "How many" not in text)
+
+
+def test_rows_and_piles_are_not_counted_as_one() -> None:
+    things = [
+        thing(k, name, (2.0 * k, 0, 0), (0.2, 0.2, 0.2)) for k, name in enumerate(("book", "lamp", "row of books"))
+    ]
+    made = [one for seed in range(9) for one in generate_questions(SceneMap(tuple(things)), n_each=99, seed=seed)]
+    texts = {one.text for one in made if one.kind == "count"}
+    assert "How many lamps are there?" in texts and "How many rows of books are there?" in texts
+    assert "How many books are there?" not in texts
 
 
 def test_what_no_frame_shows_is_neither_asked_for_nor_an_answer() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -65,6 +66,30 @@ def test_a_colour_is_told_where_frames_show_the_one_that_a_thing_was_made_in() -
     captions = [thing.caption for thing in known_objects(truth, 1, whole, seen).objects]
     assert captions == ["red wicker", ""]
     assert known_objects(truth, 1, [WholeObject(1, "picture", box)], seen).objects[0].caption == ""
+
+
+def test_a_colour_that_nobody_vouches_for_is_the_same_in_other_light() -> None:
+    dataset, truth = seen_by_one_camera()
+    box = np.array([[0, 0, 0], [1, 1, 1]], float)
+    seen = sights(dataset, "s", truth, 1)
+    assert seen[1].is_sure_colour and known_objects(truth, 1, None, seen).objects[0].caption == "red"
+    dataset.frames("s", 1)[0].rgb[:] = 190  # grey; white in more light
+    greyish = sights(dataset, "s", truth, 1)
+    assert (greyish[1].colour, greyish[1].is_sure_colour) == ("white", False)
+    assert known_objects(truth, 1, None, greyish).objects[0].caption == ""
+    assert known_objects(truth, 1, [WholeObject(1, "chair", box, (), "white")], greyish).objects[0].caption == "white"
+
+
+@pytest.mark.parametrize(("aside", "is_cut"), [(0.0, False), (-0.15, True)])
+def test_what_ends_where_the_image_ends_is_cut(aside: float, is_cut: bool) -> None:
+    dataset, truth = seen_by_one_camera()
+    moved = truth.points + np.array([aside, 0, 0], np.float32) * (truth.instance == 1)[:, None]
+    truth = replace(truth, points=moved)
+    seen = sights(dataset, "s", truth, 1)
+    assert (seen[1].is_cut, seen[2].is_cut) == (is_cut, False)
+    assert [thing.is_cut for thing in known_objects(truth, 1, None, seen).objects] == [is_cut, False]
+    box = np.array([[0, 0, 0], [1, 1, 1]], float)
+    assert not known_objects(truth, 1, [WholeObject(1, "chair", box)], seen).objects[0].is_cut  # its box is known
 
 
 def test_a_name_that_another_ends_with_is_not_asked_for() -> None:

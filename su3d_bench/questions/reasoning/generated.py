@@ -20,7 +20,7 @@ import numpy as np
 from su3d_bench.core.types import Float64Array
 from su3d_bench.numerics.relations import Relation, gap_m
 from su3d_bench.perception.embedded.naming import vocabulary
-from su3d_bench.questions.english import is_countable, is_plural, plural, with_article
+from su3d_bench.questions.english import is_countable, is_plural, plural, with_article, words
 from su3d_bench.questions.generator import extreme_of, is_flat
 from su3d_bench.questions.known_objects import plain_name
 from su3d_bench.questions.reasoning.answers import Answer
@@ -35,6 +35,7 @@ FEW_BETWEEN = 2  # more things between two are no answer that one would give
 BETWEEN_M = 2.5  # nobody looks farther for what is between
 MOST_SINGLE = 30  # of the objects whose name no other has, so many are asked about: there are cubically many triples
 DISTANCE_M, DISTANCE_SHARE = 0.25, 0.1  # a guess is right within this
+HEAPED = frozenset({("book",), ("magazine",), ("newspaper",), ("shoe",), ("dish",)})  # annotated by the row or the pile
 ASKED_RELATIONS: tuple[Relation, ...] = ("on", "under", "above", "next to", "in")
 CENTRES = ", measured between centres"
 Random = np.random.Generator
@@ -107,7 +108,11 @@ class _Drafts:
         hidden = {thing.name for thing in self._all if not thing.is_asked}
         self._things = [thing for thing in self._all if thing.name not in hidden]
         self._n_of = Counter(thing.name for thing in self._things)
-        single = [thing for thing in self._things if self._n_of[thing.name] == 1 and not is_plural(thing.name)]
+        single = [
+            thing
+            for thing in self._things
+            if self._n_of[thing.name] == 1 and not is_plural(thing.name) and not thing.is_cut
+        ]
         self._single = [single[k] for k in sorted(random.permutation(len(single))[:MOST_SINGLE])]
 
     def of_kinds(self) -> Mapping[str, list[_Draft]]:
@@ -156,9 +161,9 @@ class _Drafts:
 
     def _counts(self) -> Iterator[_Draft]:
         """How many there are of every name, and of as many names of which there is none."""
-        counted = {name: len(meant_by(name, self._scene).objects) for name in self._n_of if is_countable(name)}
+        counted = {name: len(meant_by(name, self._scene).objects) for name in self._n_of if _is_counted(name)}
         absent = [plain_name(name) for name in vocabulary() if not is_room_surface(name)]
-        absent = [name for name in absent if is_countable(name) and not meant_by(name, self._scene).objects]
+        absent = [name for name in absent if _is_counted(name) and not meant_by(name, self._scene).objects]
         counted |= {absent[k]: 0 for k in self._random.permutation(len(absent))[: max(1, len(counted) // 4)]}
         of_value = Counter(counted.values())
         for name, n in counted.items():
@@ -184,7 +189,7 @@ class _Drafts:
             if _away_m(a, b) > BETWEEN_M or gap_m(a.box, b.box) == 0 or not self._scene.are_in_one_place(a, b):
                 continue
             between = [thing for thing in self._all if self._scene.is_between(thing, a, b)]
-            is_plain = all(self._scene.are_in_one_place(thing, a, b) for thing in between)
+            is_plain = all(self._scene.are_in_one_place(thing, a, b) and not thing.is_cut for thing in between)
             is_plain &= not any(self._scene.may_be_between(thing, a, b) for thing in self._all if thing not in between)
             if 0 < len(between) <= FEW_BETWEEN and is_plain:
                 share = 1 / math.comb(len(self._all), len(between))
@@ -232,6 +237,10 @@ class _Drafts:
                 yield _Draft(f"Is the {a.name} left of the {b.name}?", 0.5, 0.5)
 
 
+def _is_counted(name: str) -> bool:
+    return is_countable(name) and words(name) not in HEAPED
+
+
 def _pairs(objects: Sequence[MapObject]) -> Iterator[tuple[MapObject, MapObject]]:
     return ((a, b) for k, a in enumerate(objects) for b in objects[k + 1 :])
 
@@ -243,6 +252,8 @@ def _away_m(a: MapObject, b: MapObject) -> float:
 def _leads(things: Sequence[MapObject], reference: MapObject, sign: int) -> bool:
     """Whether the first by distance (the last, ``sign`` -1) leads by what anybody sees, all on one level."""
     heights = [thing.centroid[2] for thing in (*things, reference)]
+    if any(thing.is_cut for thing in things):
+        return False
     if len(things) < 2 or max(heights) - min(heights) > LEVEL_M:
         return False
     ranked = sorted(things, key=lambda thing: sign * _away_m(thing, reference))[:2]

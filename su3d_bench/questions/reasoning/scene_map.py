@@ -9,7 +9,7 @@ from functools import cached_property
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError, printable
-from su3d_bench.core.types import Float64Array, Instances
+from su3d_bench.core.types import BoolArray, Float64Array, Instances
 from su3d_bench.numerics.relations import BUILT_IN, FIXTURES, SURFACES, Relation, Relations, is_between, may_be_between
 from su3d_bench.questions.english import last_word
 
@@ -21,7 +21,7 @@ class MapObject:
     """One instance; ``centroid`` (3,) and ``box`` (2, 3), lowest and highest corner, in metres, z up.
 
     Of a truth: ``is_asked``, whether people can see it well enough to be asked about it; ``is_whole``, whether its box
-    is that of the thing itself and not of what a recording saw.
+    is that of the thing itself and not of what a recording saw; ``is_cut``, whether it ends where the images ended.
     """
 
     id: int
@@ -32,6 +32,7 @@ class MapObject:
     row: int = -1
     is_asked: bool = True
     is_whole: bool = True
+    is_cut: bool = False
 
     @property
     def shown(self) -> str:
@@ -80,8 +81,14 @@ class SceneMap:
         return bool(self.relations.of(relation)[self._row_of[subject.id], self._row_of[other.id]])
 
     def is_doubtful(self, relation: Relation, subject: MapObject, other: MapObject) -> bool:
-        """Whether a little lower or higher threshold decides otherwise."""
-        return bool(self.relations.doubtful(relation)[self._row_of[subject.id], self._row_of[other.id]])
+        """Whether a slightly other threshold, another reading or an object that is seen whole may decide otherwise."""
+        return bool(self.doubtful(relation)[self._row_of[subject.id], self._row_of[other.id]])
+
+    def doubtful(self, relation: Relation) -> BoolArray:
+        """The doubtful pairs (K, K) by their rows here."""
+        is_cut = np.array([thing.is_cut for thing in self.objects], bool)
+        answer: BoolArray = self.relations.doubtful(relation) | ((is_cut[:, None] | is_cut[None]) & self.relations.near)
+        return answer
 
     def is_between(self, thing: MapObject, first: MapObject, second: MapObject) -> bool:
         """Whether an object stands between two others; what one of them holds, or stands on, does not."""
