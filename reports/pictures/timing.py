@@ -172,9 +172,14 @@ def _stages(times: Sequence[Sequence[UpdateTimes]], warm_up: int) -> Figure:
 
 
 def _memory(times: Sequence[Sequence[UpdateTimes]]) -> Figure:
-    """Mebibytes of the map against its points, and of the process against the updates, the scenes' medians."""
-    figure, panels = _figure(4.8, 3.2 + 0.16 * len(times), 2)
-    for axes, (column, against) in zip(panels, (("map_bytes", POINTS), ("rss_bytes", UPDATES)), strict=True):
+    """Mebibytes of the map against its points, where a method tells them, and of the process against the updates.
+
+    Medians over the scenes.
+    """
+    told = {column for of_method in times for scene in of_method for column in scene.columns}
+    drawn = [("map_bytes", POINTS)] * ("map_bytes" in told) + [("rss_bytes", UPDATES)]
+    figure, panels = _figure(4.8, 3.2 + 0.16 * len(times), len(drawn))
+    for axes, (column, against) in zip(panels, drawn, strict=True):
         for index, (of_method, label) in enumerate(zip(times, _labels(times), strict=True)):
             counted = [scene for scene in of_method if column in scene.columns]
             sized = [(scene, size) for scene in counted if (size := _sizes(scene, against, 0)) is not None]

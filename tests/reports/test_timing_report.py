@@ -18,6 +18,7 @@ from su3d_bench.core.timing import peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.costs import UpdateTimes, summarise
 from su3d_bench.numerics.statistics import growth_exponent
+from su3d_bench.reports.pictures.timing import _memory
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run, read_update_times
 from su3d_bench.store.records import MapCost
@@ -128,6 +129,15 @@ def test_the_report_prints_tables_and_writes_them_with_plots(
     for name in ("update-cost", "update-course", "memory", "stages", "anytime"):
         assert (tmp_path / f"{name}.png").read_bytes().startswith(b"\x89PNG")
         assert (tmp_path / f"{name}.pdf").read_bytes().startswith(b"%PDF")
+
+
+@pytest.mark.parametrize("tells", [False, True])
+def test_the_size_of_maps_is_drawn_where_a_method_tells_it(tells: bool) -> None:
+    columns = {"rss_bytes": np.linspace(1e7, 2e7, 8), "n_points": np.linspace(10, 80, 8)}
+    columns |= {"map_bytes": np.linspace(1e5, 8e5, 8)} if tells else {}
+    panels = _memory([[times(np.ones(8), **columns)]]).axes
+    assert [axes.get_ylabel() for axes in panels] == [*["MiB of the map"] * tells, "MiB of the process"]
+    assert all(axes.lines for axes in panels)
 
 
 def test_the_report_answers_in_json(run: Path, capsys: pytest.CaptureFixture[str]) -> None:
