@@ -31,6 +31,7 @@ INNER_FLOOR_M = 0.05  # an inner board lies above the holder's foot by this
 OVER_SHARE, OVER_PAD_M = 0.5, 0.1  # half of a footprint, or its centre; a picture hangs behind the sofa, not in it
 ABOVE_M = 1.0  # a lamp over a table, not one under the ceiling of a hall
 REACH_SHARE, LEAST_REACH_M, MOST_REACH_M = 0.5, 0.1, 0.5  # neighbours: half the longer side of the smaller one
+HAND_M = 0.25  # within an open hand of one another some people call the smallest things neighbours
 NEAR_M = 1.0  # an arm's length
 FLAT_M, SPREAD_M = 0.03, 0.5  # so low and so wide is a rug: part of the floor for what stands beside it
 BETWEEN_ENDS = 0.05  # share of the way, at either end, that is not between
@@ -278,7 +279,7 @@ class Relations:
     @cached_property
     def next_to(self) -> BoolArray:
         """Side by side at one height on one support, on the floor or on the wall, with nothing in between."""
-        return self._without_between(self._is_beside(np.minimum) & self.one_place)
+        return self._without_between(self._is_beside(np.minimum, LEAST_REACH_M) & self.one_place)
 
     @cached_property
     def may_be_next_to(self) -> BoolArray:
@@ -289,13 +290,13 @@ class Relations:
         stands = self.is_on_floor & ~self.holders.any(axis=1)
         lies = self.holders.any(axis=1) & ~self.is_on_floor
         is_apart = (stands[:, None] & lies[None]) | (lies[:, None] & stands[None])
-        return self._without_between(self._is_beside(np.maximum) & ~is_apart)
+        return self._without_between(self._is_beside(np.maximum, HAND_M) & ~is_apart)
 
-    def _is_beside(self, longer_or_shorter: np.ufunc) -> BoolArray:
+    def _is_beside(self, longer_or_shorter: np.ufunc, least_m: float) -> BoolArray:
         """Pairs (K, K) at one height, aside of one another, within the reach of the larger or smaller of the two."""
         sides = (self._boxes[:, 1] - self._boxes[:, 0])[:, :2].max(axis=1, initial=0.0)
         side_m = longer_or_shorter(sides[:, None], sides[None])
-        reach_m = np.clip(REACH_SHARE * side_m, LEAST_REACH_M, MOST_REACH_M) * self._slack
+        reach_m = np.clip(REACH_SHARE * side_m, least_m, MOST_REACH_M) * self._slack
         gap_m = np.linalg.norm(self._apart[..., :2], axis=2)
         low, high = self._boxes[:, 0, 2], self._boxes[:, 1, 2]
         shared_height = np.minimum(high[:, None], high[None]) - np.maximum(low[:, None], low[None])

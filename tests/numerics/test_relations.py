@@ -171,6 +171,12 @@ def test_what_people_read_differently_is_doubtful() -> None:
     door, switch = box(0, 0, 0, 0.9, 0.05, 2.0), box(1.1, 0, 1.2, 0.1, 0.03, 0.1)
     beside = Relations(np.array([door, switch, FLOOR]), ["door", "switch", "floor"])
     assert not beside.next_to.any() and beside.doubtful("next to")[0, 1] and beside.doubtful("next to")[1, 0]
+    mouse, bottle = box(0.1, 0.1, 0.7, 0.1, 0.1, 0.04), box(0.35, 0.1, 0.7, 0.08, 0.08, 0.3)
+    for aside, is_doubtful in ((0.0, True), (0.16, True), (0.17, False)):  # 0.15, 0.31 and 0.32 m apart
+        small = Relations(
+            np.array([mouse, moved(bottle, x=aside), TABLE, FLOOR]), ["mouse", "bottle", "table", "floor"]
+        )
+        assert not small.next_to[0, 1] and small.doubtful("next to")[0, 1] == is_doubtful, aside
     chair = box(1.05, 0, 0, 0.5, 0.5, 0.9)
     by_table = Relations(np.array([moved(CUP, x=0.45), TABLE, chair, FLOOR]), ["cup", "table", "chair", "floor"])
     assert by_table.next_to[1, 2] and not by_table.doubtful("next to")[0, 2]  # nobody calls the cup so
