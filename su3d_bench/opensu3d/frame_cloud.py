@@ -70,7 +70,7 @@ class FrameCloud:
 def frame_cloud(frame: Frame, masks: BoolArray, config: OpenSU3DConfig) -> FrameCloud:
     """P_frame of one image.
 
-    Where ``frame_voxel`` is above 0 it is reduced to the first point of each voxel and detection (in and out of rings).
+    Unless ``frame_voxel`` is 0 it is reduced to the first point of each voxel and detection (in and out of rings).
     """
     painted = paint(masks, config.border_in(frame.depth_m.shape[1]), config.border_shape)
     pixels = valid_depth(frame.depth_m, config.depth_min, config.depth_max)
@@ -95,6 +95,6 @@ def _cloud(
         painted.owner,
         rings[config.border_pixels],
         config.background_pixels == "drop",
-        config.frame_voxel,
+        config.voxel_of_frame,
     )
     return cloud

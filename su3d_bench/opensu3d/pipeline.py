@@ -37,7 +37,11 @@ class OpenSU3D:
         status="each step is tested on hand-worked cases; never run beside the original, and no figure of its paper "
         "has been reproduced",
     )
-    presets: ClassVar[Mapping[str, Mapping[str, str]]] = {scheme: {"scheme": scheme} for scheme in SCHEMES}
+    presets: ClassVar[Mapping[str, Mapping[str, str]]] = {
+        **{scheme: {"scheme": scheme} for scheme in SCHEMES},
+        "owner": {"border_pixels": "owner"},
+        **{f"score-{rule}": {"instance_score": rule} for rule in ("mean", "max", "top-m-sum")},
+    }
     # The paper's letters, as its ablation (Table I) varies them.
     short_names: ClassVar[Mapping[str, tuple[str, Callable[[Any], Any]]]] = {
         "m": ("top_m", lambda value: value),
@@ -54,7 +58,7 @@ class OpenSU3D:
     def _clear(self) -> None:
         self._scratch.close()
         self._scratch = Scratch()
-        self._map = _empty_map(self.config.eps, self._device)
+        self._map = _empty_map(self.config, self._device)
         self._table = TrackingTable(list)
         self._images: list[ImageRecord] = []
         self._next_id = NO_INSTANCE + 1
@@ -116,9 +120,7 @@ class OpenSU3D:
 
     def _insert(self, cloud: FrameCloud, matched: Int64Array, scene_id_of: Int32Array, detections: Detections) -> None:
         ids = np.append(scene_id_of, NO_INSTANCE).astype(np.int32)[cloud.owner]  # NO_DETECTION is the last
-        placed = self._map.insert(
-            cloud.points, ids, keep_density=self.config.keep_density, refill=self.config.refill_background
-        )
+        placed = self._map.insert(cloud.points, ids)
         hit = placed.copy()
         hit[: cloud.n_inside] = np.where(placed[: cloud.n_inside] >= 0, placed[: cloud.n_inside], matched)
         hit[cloud.owner == NO_DETECTION] = -1
@@ -127,8 +129,9 @@ class OpenSU3D:
     def finish(self) -> Instances:
         """The instances of the map so far, and its points of no instance."""
         start = time.perf_counter()
-        points, ids = self._map.points, self._map.ids
-        segments = segments_of(points, ids, self._table, self._images, self._next_id, self.config)
+        by_age = self._map.by_age
+        points, ids = self._map.points[by_age], self._map.ids[by_age]
+        segments = segments_of(points, ids, by_age, self._table, self._images, self._next_id, self.config)
         instances = to_instances(points, ids, segments, self._images, self.config)
         self.postprocess_ms = (time.perf_counter() - start) * 1e3
         return instances
@@ -139,9 +142,9 @@ class OpenSU3D:
         self._scratch.close()
 
 
-def _empty_map(eps: float, device: str) -> VoxelMap | DeviceVoxelMap:
+def _empty_map(config: OpenSU3DConfig, device: str) -> VoxelMap | DeviceVoxelMap:
     if device == CPU:
-        return VoxelMap(eps)
+        return VoxelMap(config.eps, config.density)
     from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap
 
-    return DeviceVoxelMap(eps, device)
+    return DeviceVoxelMap(config.eps, device, config.density)

@@ -63,12 +63,16 @@ def kept_clusters(labels: Int64Array, split_fraction: float) -> list[int]:
 def segments_of(
     points: Float64Array,
     ids: Int32Array,
+    index: Int64Array,
     table: TrackingTable,
     images: Sequence[ImageRecord],
     next_id: int,
     config: OpenSU3DConfig,
 ) -> list[Segment]:
-    """Instances after clustering, split-off ones last with new ids from ``next_id`` on; what is noise is left out."""
+    """Instances after clustering, split-off ones last with new ids from ``next_id`` on; what is noise is left out.
+
+    ``index`` (N,) is each point's index in the map, by which views know what they hit.
+    """
     order = np.argsort(ids, kind="stable")
     kept: list[Segment] = []
     split_off: list[Segment] = []
@@ -81,7 +85,7 @@ def segments_of(
         views = tuple(table[scene_id])
         for rank, label in enumerate(clusters):
             members = own[labels == label]
-            hitting = views if len(clusters) == 1 else _views_that_hit(members, views, images)
+            hitting = views if len(clusters) == 1 else _views_that_hit(np.sort(index[members]), views, images)
             if rank == 0:
                 kept.append(Segment(scene_id, members, hitting))
             else:
@@ -106,7 +110,9 @@ def best_views(views: tuple[View, ...], images: Sequence[ImageRecord], m: int) -
 
 
 def instance_score(scores: Float64Array, rule: InstanceScore, m: int) -> float:
-    """Prediction score of an instance from the detector's scores of its views."""
+    """Confidence of an instance: 1, or what the ``rule`` makes of the detector's scores of its views."""
+    if rule == "ones":
+        return 1.0
     if rule == "max":
         return float(scores.max())
     if rule == "mean":

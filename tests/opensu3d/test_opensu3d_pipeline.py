@@ -112,8 +112,9 @@ def test_name_and_score_come_from_the_views() -> None:
     ]
     found = run(views).finish()
     assert found.names == ("chair",)  # the highest score, of equal ones the earliest image
-    assert found.scores.tolist() == [pytest.approx(1.75 / 5)]  # three views of the five that the top m could hold
-    for rule, expected in (("mean", 1.75 / 3), ("max", 0.75)):
+    assert found.scores.tolist() == [1.0]  # the paper gives instances no score
+    # of the last, three views of the five that the top m could hold
+    for rule, expected in (("mean", 1.75 / 3), ("max", 0.75), ("top-m-sum", 1.75 / 5)):
         scored = run(views, CONFIG.model_copy(update={"instance_score": rule})).finish()
         assert scored.scores.tolist() == [pytest.approx(expected)]
 
