@@ -222,18 +222,20 @@ class PerceptionNeeds:
     """What a method asks of perception.
 
     ``masks``: ``grounded`` (named objects), ``class-agnostic`` (every region) or ``none``; regions whose name is in
-    ``background_names`` or whose box covers more than ``max_box_fraction`` of the image are left out before any
-    feature is computed. A crop is the region's box grown by ``crop_padding_px`` on every side, then scaled by a ratio
-    about its centre, then clipped. ``name_features``: the names' text features too. ``true_proposals``: masks in 3D
-    made from the ground truth, which makes every number of the method a ceiling. ``automatic`` and ``grounding`` name
-    the settings with which the method's own program makes class-agnostic and grounded masks, for profiles that have
-    its models; others pay them no heed.
+    ``background_names`` (or, with ``background_by_head``, whose head noun is: "brick walls" are a wall) or whose box
+    covers more than ``max_box_fraction`` of the image are left out before any feature is computed. A crop is the
+    region's box grown by ``crop_padding_px`` on every side, then scaled by a ratio about its centre, then clipped.
+    ``name_features``: the names' text features too. ``true_proposals``: masks in 3D made from the ground truth, which
+    makes every number of the method a ceiling. ``automatic`` and ``grounding`` name the settings with which the
+    method's own program makes class-agnostic and grounded masks, for profiles that have its models; others pay them no
+    heed.
     """
 
     masks: Literal["grounded", "class-agnostic", "none"] = "grounded"
     crop_ratios: tuple[float, ...] = (1.0,)
     crop_padding_px: int = 0
     background_names: tuple[str, ...] = ()
+    background_by_head: bool = False
     max_box_fraction: float = 1.0
     name_features: bool = False
     true_proposals: bool = False

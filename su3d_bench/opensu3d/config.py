@@ -80,6 +80,7 @@ class OpenSU3DConfig(BaseModel):
     border_pixels: Literal["background", "owner", "drop"] = "background"
     # Points of pixels in no mask: Eq. 1 back-projects every pixel.
     background_pixels: Literal["keep", "drop"] = "keep"
+    # The head nouns of what is left out: the paper's "walls" are "brick wall" to a tagger, and "wall lamp" is a lamp.
     background_names: Annotated[tuple[str, ...], Field(strict=False)] = ("wall", "floor", "ceiling", "ground", "roof")
     max_box_fraction: Fraction = 0.95
     scheme: Scheme = "scheme1"
@@ -141,6 +142,7 @@ class OpenSU3DConfig(BaseModel):
             masks="grounded",
             crop_ratios=self.fusion.crop_ratios,
             background_names=self.background_names,
+            background_by_head=True,
             max_box_fraction=self.max_box_fraction,
         )
 

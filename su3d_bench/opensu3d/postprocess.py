@@ -7,16 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from su3d_bench.core.english import with_article
 from su3d_bench.core.types import Float64Array, Instances, Int32Array, Int64Array, Masks, starts_of
 from su3d_bench.opensu3d.config import InstanceScore, OpenSU3DConfig
 from su3d_bench.opensu3d.feature_fusion import fuse_views
 from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View
 
 NOISE = -1
-# Spelt with a vowel but spoken with a consonant, and the other way round.
-_SPOKEN_WITH_CONSONANT = ("uni", "use", "usu", "usb", "uten", "util", "ukul", "eu", "ewe", "one", "once")
-_SPOKEN_WITH_VOWEL = ("hour", "heir", "honest", "honor", "honour")
-_LETTERS_WITH_VOWEL = "aefhilmnorsx"
 
 
 @dataclass(frozen=True)
@@ -28,22 +25,9 @@ class Segment:
     views: tuple[View, ...]
 
 
-def article(name: str) -> str:
-    """The English indefinite article of ``name``: "a" bed, "an" indoor-plant, "a" utensil-holder, "an" LCD screen."""
-    first = name.strip().replace("-", " ").split(" ")[0]
-    spelt_out = len(first) == 1 or (first.isupper() and len(first) <= 3)
-    word = first.lower()
-    if spelt_out:
-        return "an" if word[0] in _LETTERS_WITH_VOWEL else "a"
-    if word.startswith(_SPOKEN_WITH_VOWEL):
-        return "an"
-    return "an" if word[:1] in set("aeiou") and not word.startswith(_SPOKEN_WITH_CONSONANT) else "a"
-
-
 def caption_of(name: str) -> str:
     """The caption of an object that nothing more is known of: "an {object} in a scene", with the right article."""
-    name = name.strip() or "object"
-    return f"{article(name)} {name} in a scene"
+    return f"{with_article(name.strip() or 'object')} in a scene"
 
 
 def cluster(points: Float64Array, config: OpenSU3DConfig) -> Int64Array:
