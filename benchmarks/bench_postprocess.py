@@ -51,6 +51,7 @@ def filled() -> OpenSU3D:
         method._images.append(
             ImageRecord(
                 frame_index=position,
+                rows=np.arange(N_INSTANCES),
                 scores=generator.random(N_INSTANCES),
                 names=("thing",) * N_INSTANCES,
                 captions=("",) * N_INSTANCES,

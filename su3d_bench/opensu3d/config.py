@@ -112,6 +112,11 @@ class OpenSU3DConfig(BaseModel):
             raise ValueError(
                 f"crop_ratios {fusion.crop_ratios} hold no 1.0; weighted multi-scale fusion compares with that crop"
             )
+        if self.border_pixels == "background" and self.background_pixels == "drop":
+            raise ValueError(
+                "border_pixels 'background' makes points of rings that background_pixels 'drop' leaves out; set "
+                "border_pixels to 'drop' or 'owner'"
+            )
         if self.depth_min >= self.depth_max:
             raise ValueError(f"depth_min {self.depth_min} m is not below depth_max {self.depth_max} m")
         return self

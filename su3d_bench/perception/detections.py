@@ -78,6 +78,7 @@ class Assembler:
             global_feature=self._crops.whole(frame, timer) if global_feature is None else global_feature,
             name_features=self.text_features(chosen.names) if needs.name_features else None,
             score_scale=self._score_scale,
+            rows=chosen.rows,
         )
 
     def named(
@@ -130,4 +131,5 @@ def _at(regions: Regions, rows: NDArray[np.intp]) -> Regions:
     names, captions = (
         None if texts is None else tuple(texts[row] for row in rows) for texts in (regions.names, regions.captions)
     )
-    return Regions(regions.masks[rows], regions.boxes[rows], regions.scores[rows], names, captions)
+    sources = rows.astype(np.int64) if regions.rows is None else regions.rows[rows]
+    return Regions(regions.masks[rows], regions.boxes[rows], regions.scores[rows], names, captions, sources)
