@@ -17,7 +17,7 @@ from su3d_bench.core.types import Detections, Frame, Instances, Int32Array, Int6
 from su3d_bench.opensu3d.association import assign_ids, count_overlaps, overlap_ratios
 from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig, crop_levels
 from su3d_bench.opensu3d.frame_cloud import NO_DETECTION, FrameCloud, frame_cloud
-from su3d_bench.opensu3d.postprocess import IDS, segments_of, to_instances
+from su3d_bench.opensu3d.postprocess import CONFIDENCES, IDS, segments_of, to_instances
 from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View, record_of
 from su3d_bench.opensu3d.voxel_map import NO_INSTANCE, VoxelMap
 from su3d_bench.store.scratch import Scratch
@@ -77,6 +77,12 @@ class OpenSU3D:
     @property
     def needs(self) -> PerceptionNeeds:
         return self.config.needs
+
+    @property
+    def caveat(self) -> str | None:
+        """Where its confidences come from, unless they are 1."""
+        rule = self.config.instance_score
+        return None if rule == "ones" else f"confidence of an instance: {CONFIDENCES[rule]}; the paper defines none"
 
     @property
     def n_points(self) -> int:

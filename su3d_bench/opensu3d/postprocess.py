@@ -16,6 +16,11 @@ from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View
 NOISE = -1
 # Ids of clusters are above those of scene segments, which they show: 7000012 is a part of 12.
 IDS = 1_000_000
+CONFIDENCES: Mapping[InstanceScore, str] = {
+    "mean": "the mean score of its views",
+    "max": "the highest score of its views",
+    "top-m-sum": "the sum of its top m views' scores over m",
+}
 
 
 @dataclass(frozen=True)
