@@ -118,7 +118,7 @@ def test_name_and_score_come_from_the_views() -> None:
     for rule, expected in (("mean", 1.75 / 3), ("max", 0.75), ("top-m-sum", 1.75 / 5)):
         scored = run(views, CONFIG.model_copy(update={"instance_score": rule})).finish()
         assert scored.scores.tolist() == [pytest.approx(expected)]
-        assert "the paper defines none" in (OpenSU3D(OpenSU3DConfig(instance_score=rule)).caveat or "")
+        assert "the paper defines none" in (OpenSU3D(CONFIG.model_copy(update={"instance_score": rule})).caveat or "")
     assert OpenSU3D().caveat is None
 
 

@@ -209,7 +209,7 @@ def test_the_profile_says_what_it_computes_otherwise_than_the_paper_and_nothing_
     ram = SimpleNamespace(caveat=None)
     encoder, captioner = SimpleNamespace(name="clip-vit-h-14"), SimpleNamespace(vision_model="gpt-4-vision-preview")
     assert profile_paper.stand_ins(PaperConfig(), ram, encoder, captioner) == []  # type: ignore[arg-type]
-    assert profile_paper.stand_ins(PaperConfig(), ram, encoder, None) == [  # type: ignore[arg-type]
+    assert profile_paper.stand_ins(PaperConfig(), ram, encoder, None) == [
         "names and captions: the tagger's names and a template stand in for the paper's vision model"
     ]
     other = PaperConfig.model_validate({"segmenter": "sam-vit-b", "grounded": {"boxes": {"box_threshold": 0.3}}})
