@@ -18,6 +18,7 @@ from su3d_bench.reports.tables.model import (
     Table,
     TableRow,
     bracketed,
+    confidence_notes,
     is_count,
     percent,
     some,
@@ -248,7 +249,11 @@ def run_notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
             notes.setdefault(f"perception {row.profile}{encoder}", []).append(label)
     everyone = len(rows)
     return [
-        f"{'all measured rows' if len(who) == everyone > 1 else ', '.join(who)}: {what}" for what, who in notes.items()
+        *(
+            f"{'all measured rows' if len(who) == everyone > 1 else ', '.join(who)}: {what}"
+            for what, who in notes.items()
+        ),
+        *confidence_notes({label: row.confidences for row, label in zip(rows, labels, strict=True)}),
     ]
 
 
