@@ -130,12 +130,18 @@ def back_projected(depth: Array, intrinsics: Array, pose: Array, image: Array, s
     return Cloud(world.T, image[v, u])
 
 
+def cells_of(*columns: Array) -> Array:
+    """A number (N,) for each row of whole ``columns`` (N, any): equal rows have equal numbers, others have not."""
+    rows = np.column_stack(columns).astype(np.int64)
+    rows -= rows.min(axis=0)
+    return np.asarray(np.ravel_multi_index(tuple(rows.T), tuple(rows.max(axis=0) + 1)))
+
+
 def reduced(cloud: Cloud, voxel: float) -> Cloud:
     """One point a voxel an ID: the first."""
-    if voxel == 0:
+    if voxel == 0 or not len(cloud.ids):
         return cloud
-    keys = np.column_stack([np.floor(cloud.points / voxel), cloud.ids])
-    _, first = np.unique(keys, axis=0, return_index=True)
+    _, first = np.unique(cells_of(np.floor(cloud.points / voxel), cloud.ids), return_index=True)
     return cloud.where(np.sort(first))
 
 
@@ -185,9 +191,8 @@ def concatenated(scene: Cloud, near: Array, frame: Cloud, settings: PaperSetting
     """
     if settings.density == "all":
         return scene.followed_by(frame)
-    keys = np.floor(np.concatenate([scene.points[near], frame.points]) / settings.eps)
-    _, voxel = np.unique(keys, axis=0, return_inverse=True)
-    held, new = np.split(voxel.ravel(), [np.count_nonzero(near)])
+    voxels = cells_of(np.floor(np.concatenate([scene.points[near], frame.points]) / settings.eps))
+    held, new = np.split(voxels, [np.count_nonzero(near)])
     holds_instance, is_instance = scene.ids[near] != NONE, frame.ids != NONE
     comes = is_instance | ~np.isin(new, np.append(held[holds_instance], new[is_instance]))
     if settings.density == "frame":
