@@ -63,7 +63,7 @@ def random_settings(rng: np.random.Generator) -> PaperSettings:
         depth_min=float(rng.choice([0, 0, 0.9])),
         depth_max=float(rng.choice([1.1, 10])),
         eps=eps,
-        frame_voxel=rng.choice([None, None, None, 0.0, eps / 2, eps * 1.5]),
+        frame_voxel=(None, None, None, 0.0, eps / 2, eps * 1.5)[int(rng.integers(6))],
         overlap_threshold=float(rng.choice([0.0, 0.1, 0.3, 0.3, 0.5, 1.0])),
         overlap_rule=rng.choice(["smaller-segment", "smaller-segment", "frame-segment", "as-printed"]).item(),
         density=density,
@@ -112,7 +112,8 @@ def random_detections(rng: np.random.Generator, index: int, masks: Array, settin
     """Some of ``masks``, shifted by a pixel or not, in another order, and now and then one that only this image has."""
     seen = [np.roll(mask, rng.integers(-1, 2, 2), axis=(0, 1)) for mask in rng.permutation(masks) if rng.random() < 0.8]
     if rng.random() < 0.2:
-        seen.append(random_masks(rng, *masks.shape[1:], 1)[0] & (rng.random(masks.shape[1:]) < 0.9))
+        _, height, width = masks.shape
+        seen.append(random_masks(rng, height, width, 1)[0] & (rng.random((height, width)) < 0.9))
     if rng.random() < 0.1:
         seen.append(np.zeros_like(masks[0]))
     n, ratios = len(seen), (*settings.crop_ratios, 7.0)
