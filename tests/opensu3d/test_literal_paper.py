@@ -1,0 +1,121 @@
+"""The reference pipeline beside the paper's text written as a program: one map, on random problems and on rooms."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from literal_comparison import differences
+from literal_paper import PaperProgram, PaperSettings
+from literal_problems import Problem, random_problem
+from literal_settings import OURS, config_of, settings_of
+from places import SUPPORT
+
+from su3d_bench.cli.main import main
+from su3d_bench.core.timing import Timer
+from su3d_bench.core.types import Instances, SceneInfo
+from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig
+from su3d_bench.opensu3d.pipeline import OpenSU3D
+
+SIDE_BY_SIDE = SUPPORT / "literal_paper" / "side_by_side.py"
+ROOMS = ("living0", "bedroom0", "kitchen0", "office0")
+N_PROBLEMS, OF_ONE_TEST = 300, 50
+SCENE = SceneInfo("made", "random", 5, 7, "rendered-rooms")
+
+
+def both(problem: Problem) -> tuple[OpenSU3D, PaperProgram]:
+    method, program = OpenSU3D(config_of(problem.settings)), PaperProgram(problem.settings)
+    method.start(SCENE)
+    return method, program
+
+
+@pytest.mark.parametrize("first", range(0, N_PROBLEMS, OF_ONE_TEST))
+def test_the_pipeline_gives_the_map_of_the_papers_text_on_random_problems(first: int) -> None:
+    for seed in range(first, first + OF_ONE_TEST):
+        problem = random_problem(seed)
+        method, program = both(problem)
+        for frame, detections in problem.images:
+            method.update(frame, detections, Timer())
+            program.add_image(frame, detections)
+            where = f"problem {seed}, image {frame.index}"
+            assert (where, method.n_points, method.n_instances) == (where, len(program.scene.ids), len(program.tracks))
+        assert (seed, differences(method.finish(), program)) == (seed, [])
+        method.close()
+
+
+def test_random_problems_hold_what_could_come_out_otherwise() -> None:
+    """Instances seen again, split, of equal scores, without a caption, and images that show nothing."""
+    problems = [random_problem(seed) for seed in range(40)]
+    things = []
+    for problem in problems:
+        program = PaperProgram(problem.settings)
+        for frame, detections in problem.images:
+            program.add_image(frame, detections)
+        things += program.things()
+    assert sum(len(thing.views) > 1 for thing in things) > 40
+    assert sum(thing.part > 0 for thing in things) > 20
+    assert any(thing.caption.endswith(" in a scene") for thing in things)
+    assert any(len({view[0] for view in thing.views}) < len(thing.views) for thing in things)  # healed over-splits
+    assert any(not len(detections) for problem in problems for _, detections in problem.images)
+
+
+FAULTS: dict[str, Callable[[Instances], Instances]] = {
+    "map": lambda found: replace(found, points=found.points + np.float32(1e-3)),
+    "instances": lambda found: replace(found, indices=found.indices[::-1].copy()),
+    "views": lambda found: replace(found, views=found.views + np.int32(1)),
+    "name": lambda found: replace(found, names=("another",) * len(found)),
+    "caption": lambda found: replace(found, captions=("another",) * len(found)),
+    "feature": lambda found: replace(found, features=np.asarray(found.features) + np.float32(1e-3)),
+    "box": lambda found: replace(found, boxes=found.boxes + np.float32(1e-3)),
+    "centroid": lambda found: replace(found, centroids=found.centroids + np.float32(1e-3)),
+    "score": lambda found: replace(found, scores=found.scores / 2),
+    "ids": lambda found: replace(found, ids=found.ids * 0),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_map_that_is_not_the_papers_is_noticed(fault: str) -> None:
+    problem = random_problem(16)
+    method, program = both(problem)
+    for frame, detections in problem.images:
+        method.update(frame, detections, Timer())
+        program.add_image(frame, detections)
+    found = method.finish()
+    assert len(found) > 1
+    assert differences(found, program) == []
+    assert differences(FAULTS[fault](found), program) != []
+
+
+def test_the_defaults_are_the_papers() -> None:
+    assert settings_of(OpenSU3DConfig()) == replace(OURS, frame_voxel=PaperSettings.eps)
+    assert (OpenSU3DConfig().border_pixels, OpenSU3DConfig().instance_score) == ("background", "ones")
+
+
+def run_side_by_side(out: Path, profile: str, *words: str) -> None:
+    """A run with each fusion scheme, which fails where its map is not the paper's."""
+    methods = [f"{SIDE_BY_SIDE}:SideBySide@{scheme}" for scheme in SCHEMES]
+    options = ["--protocols", "rooms-instance", "--profile", profile, "--jobs", "1", "--no-pictures", "--quiet"]
+    assert main(["run", "--methods", *methods, *options, "--out", str(out), *words]) == 0
+    assert len(list(out.glob("scenes/*/side-by-side@*/prediction.npz"))) == len(methods)
+
+
+@pytest.mark.parametrize("profile", ["oracle", "embedded"])
+def test_a_room_is_what_the_papers_text_makes_of_it(
+    profile: str, tmp_path: Path, rooms_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SU3D_DATA", str(rooms_data))
+    size = ["rooms.width=160", "rooms.height=120", "rooms.mesh_spacing_m=0.1"]
+    run_side_by_side(tmp_path / "run", profile, "--scenes", "rooms/living0", "--limit", "6", "--set", *size)
+
+
+@pytest.mark.proof
+@pytest.mark.parametrize("profile", ["oracle", "embedded"])
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_whole_room_is_what_the_papers_text_makes_of_it(
+    room: str, profile: str, tmp_path: Path, rooms_data: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SU3D_DATA", str(rooms_data))
+    run_side_by_side(tmp_path / "run", profile, "--scenes", f"rooms/{room}")
