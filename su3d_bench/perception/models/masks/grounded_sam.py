@@ -46,19 +46,23 @@ class GroundedConfig(BaseModel):
     ram_resample: Resample = "bilinear"
 
 
+# generate_gsa_results.py --class_set ram --add_bg_classes (5c4da70); its --accumu_classes carries tags on from frame to
+# frame in an order that changes from run to run, and is left out. Its picture for RAM is Pillow's resize, whose default
+# is bicubic. The tagger is the run's: its README names RAM (ram_swin_large_14m.pth), not RAM++.
+_CONCEPTGRAPHS = GroundedConfig(
+    boxes=CONCEPTGRAPHS_BOXES,
+    stop_words=STOP_WORDS,
+    added_tags=(*ADDED_TAGS, *BACKGROUND_TAGS),
+    region_boxes="detector",
+    ram_resample="bicubic",
+)
 # What methods ask for by PerceptionNeeds.grounding; "paper" is configured.
 GROUNDED_MASKS: Mapping[str, GroundedConfig] = MappingProxyType(
     {
-        # generate_gsa_results.py --class_set ram --add_bg_classes; its --accumu_classes carries tags on from frame to
-        # frame in an order that changes from run to run, and is left out. Its picture for RAM is Pillow's resize, whose
-        # default is bicubic. The tagger is the run's: its README names RAM (ram_swin_large_14m.pth), not RAM++.
-        "conceptgraphs": GroundedConfig(
-            boxes=CONCEPTGRAPHS_BOXES,
-            stop_words=STOP_WORDS,
-            added_tags=(*ADDED_TAGS, *BACKGROUND_TAGS),
-            region_boxes="detector",
-            ram_resample="bicubic",
-        )
+        "conceptgraphs": _CONCEPTGRAPHS,
+        "conceptgraphs-whole-tags": _CONCEPTGRAPHS.model_copy(
+            update={"boxes": CONCEPTGRAPHS_BOXES.model_copy(update={"names": "tag"})}
+        ),
     }
 )
 

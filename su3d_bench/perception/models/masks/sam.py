@@ -142,7 +142,8 @@ def _at_seen_size(prompts: Prompts, image: SeenImage) -> Prompts:
     if prompts.boxes is not None:
         return Prompts(boxes=(prompts.boxes.astype(np.float64) * np.tile(scale, 2)).astype(np.float32))
     assert prompts.points is not None
-    return Prompts((prompts.points.astype(np.float64) * scale).astype(prompts.points.dtype), prompts.labels)
+    points = prompts.points.astype(np.float64) * scale
+    return Prompts(points if prompts.points.dtype == np.float64 else points.astype(np.float32), prompts.labels)
 
 
 def as_shares_of_float32(points: Float32Array | Float64Array, image_px: int) -> Float32Array | Float64Array:
