@@ -183,8 +183,8 @@ def open_recording(path: Path, description: RgbdDescription, where: str) -> Reco
     mesh = () if description.mesh is None else (folder.file(description.mesh, place),)
     files = (path, *camera_files, *poses.files, *mesh)
     lines = tuple(f"{where}: {line}" for line in missing)
-    depth = StoredDepth(where, depth_table(description))
-    return Recording(where, folder, tuple(frames), intrinsics, depth, files, size, lines)
+    stored = StoredDepth(where, depth_table(description))
+    return Recording(where, folder, tuple(frames), intrinsics, stored, files, size, lines)
 
 
 def _folder(path: Path, description: RgbdDescription, place: str) -> Folder:
