@@ -21,6 +21,7 @@ Severity = Literal["error", "warning", "note"]
 DEPTH_STEP = 4  # statistics look at every 4th row and column
 SEEN_POINTS = 300  # points kept of a frame, to be held against the truth
 PLAUSIBLE_MEDIAN_DEPTH_M = (0.2, 20.0)  # indoors; depth sensors begin at about 0.2 m
+PLAUSIBLE_FAR_DEPTH_M = 20.0  # of 99 of 100 pixels; halls aside, rooms end before
 LITTLE_DEPTH, LITTLE_DEPTH_OF_SCENE = 0.05, 0.3  # shares of pixels with a depth
 BLACK_BELOW = 8  # of 255; a covered lens and the noise of its sensor stay below
 PLAUSIBLE_WALK_M = 100.0
@@ -191,6 +192,14 @@ def _depth(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
     if not low <= median <= high:
         text = f"the median depth is {median:.3g} m, indoors it is {low:g} to {high:g} m; is the depth scale right?"
         yield Finding("error", "depth-scale", "", text)
+        return
+    far = [frame for frame in with_depth if frame.far_m > PLAUSIBLE_FAR_DEPTH_M]
+    if far:
+        text = (
+            f"in {len(far)} of {len(frames)} frames depth reaches {max(frame.far_m for frame in far):.3g} m, first "
+            f"frame {far[0].index}; indoors such a value stands for no depth (rgbd.toml names it in depth_invalid)"
+        )
+        yield Finding("warning", "depth", "", text)
 
 
 def _motion(frames: Sequence[FrameFacts]) -> Iterator[Finding]:

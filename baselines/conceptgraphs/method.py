@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import replace
-from typing import Annotated
+from typing import Annotated, ClassVar, Literal
 
 import numpy as np
 from pydantic import Field
@@ -85,7 +86,11 @@ class ConceptGraphs:
 
 
 class DetectorConfig(MappingConfig):
-    """The values of the README's command for Detect where they differ; no overlap merge but the last."""
+    """The values of the README's command for Detect where they differ; no overlap merge but the last.
+
+    ``grounding``: how the profile ``paper`` names boxes. The original guesses by the first word of what a box was found
+    by; ``conceptgraphs-whole-tags`` leaves out a box that no whole tag names.
+    """
 
     mask_conf_threshold: Fraction = 0.25  # of GroundingDINO's score
     merge_interval: Interval = -1
@@ -93,6 +98,7 @@ class DetectorConfig(MappingConfig):
     merge_text_sim: Cosine = 0.7
     skip_bg: bool = False  # True: background regions are dropped
     background_names: Annotated[tuple[str, ...], Field(strict=False)] = ("wall", "floor", "ceiling")
+    grounding: Literal["conceptgraphs", "conceptgraphs-whole-tags"] = "conceptgraphs"
 
 
 class ConceptGraphsDetector(ConceptGraphs):
@@ -105,6 +111,7 @@ class ConceptGraphsDetector(ConceptGraphs):
     name = "conceptgraphs-detector"
     Config = DetectorConfig
     config: DetectorConfig
+    presets: ClassVar[Mapping[str, Mapping[str, str]]] = {"whole-tags": {"grounding": "conceptgraphs-whole-tags"}}
     about = replace(
         ConceptGraphs.about,
         needs=("named masks of a tagger and a detector", "an encoder of images and texts"),
@@ -122,7 +129,7 @@ class ConceptGraphsDetector(ConceptGraphs):
             crop_padding_px=CROP_PADDING_PX,
             background_names=self.config.background_names if self.config.skip_bg else (),
             name_features=True,
-            grounding="conceptgraphs",
+            grounding=self.config.grounding,
         )
 
     def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import logging
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -22,6 +23,10 @@ from su3d_bench.formats.images import UInt16Array, decode_colour, decode_depth, 
 MAX_TEXT_BYTES = 64 << 20  # a trajectory of 100 poses a second for an hour has 30 MB
 MAX_NAME_LENGTH = 255  # of one part of a path, in every file system of today
 N_DEPTH_VALUES = 1 << 16
+LARGEST_DEPTH_VALUE = N_DEPTH_VALUES - 1
+# How much of the range below the largest value must be empty: in millimetres 6.6 m, in Replica's unit 1 m.
+STANDS_APART = 0.1
+logger = logging.getLogger(__name__)
 
 
 def read_text(path: Path, where: str, advice: str = "copy the file again") -> str:
@@ -52,6 +57,39 @@ def reading(where: str) -> Iterator[None]:
 def depth_m_of_values(units_per_metre: float) -> Float32Array:
     """Metres (65536,) of every value that a depth image can hold."""
     return (np.arange(N_DEPTH_VALUES) / units_per_metre).astype(np.float32)
+
+
+class StoredDepth:
+    """Metres of depth images as files hold them; 65535 is no depth where it stands apart from all others of the image.
+
+    So 7-Scenes and many other recorders write "nothing"; in an image whose depths come near it, it is one of them.
+    ``metres`` (65536,) float32 are those of every value, 0 where it means none. What is taken out is said once.
+    """
+
+    def __init__(self, where: str, metres: Float32Array) -> None:
+        self._where = where
+        self._metres = metres
+        self._is_said = False
+
+    def depth_m(self, values: UInt16Array, name: str) -> Float32Array:
+        """Depth (H, W) m of the image ``name`` with these ``values``, 0 where it has none."""
+        depth_m = self._metres.take(values)  # half the time of an index
+        far_m = float(self._metres[LARGEST_DEPTH_VALUE])
+        if far_m > 0 and values.max() == LARGEST_DEPTH_VALUE:
+            is_largest = values == LARGEST_DEPTH_VALUE
+            others_m = float(depth_m.max(initial=0.0, where=~is_largest))
+            if others_m < (1 - STANDS_APART) * far_m:
+                depth_m[is_largest] = 0
+                self._say(name, float(is_largest.mean()), others_m, far_m)
+        return depth_m
+
+    def _say(self, name: str, share: float, others_m: float, far_m: float) -> None:
+        if self._is_said:
+            return
+        self._is_said = True
+        apart = f"depth {LARGEST_DEPTH_VALUE} ({far_m:.4g} m) stands apart from all others (to {others_m:.4g} m)"
+        counts = f"counts as no depth; first in {name}, {share:.1%} of its pixels"
+        logger.warning("%s: %s and %s", self._where, apart, counts)
 
 
 def numbers(words: Sequence[str], where: str) -> list[float]:
@@ -115,7 +153,7 @@ class RecordedFrame:
 
 @dataclass(frozen=True)
 class Recording:
-    """The usable frames of a scene; ``depth_m_of_value`` (65536,) float32 turns stored depth into metres, 0: invalid.
+    """The usable frames of a scene; ``depth`` turns stored depth into metres.
 
     ``files`` are all that it is read from besides the images; ``image_size`` is what its camera file says, if it does;
     ``missing`` says, a line each, what was left out because something of it is not there.
@@ -125,7 +163,7 @@ class Recording:
     folder: Folder
     frames: tuple[RecordedFrame, ...]
     intrinsics: Float64Array
-    depth_m_of_value: Float32Array
+    depth: StoredDepth
     files: tuple[Path, ...]
     image_size: tuple[int, int] | None = None
     missing: tuple[str, ...] = ()
@@ -163,7 +201,7 @@ class RecordedFrames(Sequence[Frame]):
         where, content = self._read(frame.colour)
         rgb = decode_colour(content, where)
         self.check_size(rgb.shape[1], rgb.shape[0], where)
-        depth_m = recording.depth_m_of_value.take(self._depth_values(frame, rgb))  # half the time of an index
+        depth_m = recording.depth.depth_m(self._depth_values(frame, rgb), frame.depth)
         return Frame(frame.index, frame.timestamp_s, rgb, depth_m, frame.pose, recording.intrinsics)
 
     def check_size(self, width: int, height: int, where: str) -> None:

@@ -27,6 +27,7 @@ from su3d_bench.datasets.recordings.recorded_frames import (
     RecordedFrame,
     RecordedFrames,
     Recording,
+    StoredDepth,
     left_out,
     pinhole,
 )
@@ -42,7 +43,7 @@ from su3d_bench.datasets.rgbd.files import (
 logger = logging.getLogger(__name__)
 OTHER = {"camera_to_world": "world_to_camera", "world_to_camera": "camera_to_world"}
 OTHER |= {"opencv": "opengl", "opengl": "opencv"}
-READER_VERSION = 1  # raise it whenever the same files come out as other frames
+READER_VERSION = 2  # raise it whenever the same files come out as other frames
 
 
 class RgbdOptions(BaseModel):
@@ -182,7 +183,8 @@ def open_recording(path: Path, description: RgbdDescription, where: str) -> Reco
     mesh = () if description.mesh is None else (folder.file(description.mesh, place),)
     files = (path, *camera_files, *poses.files, *mesh)
     lines = tuple(f"{where}: {line}" for line in missing)
-    return Recording(where, folder, tuple(frames), intrinsics, depth_table(description), files, size, lines)
+    stored = StoredDepth(where, depth_table(description))
+    return Recording(where, folder, tuple(frames), intrinsics, stored, files, size, lines)
 
 
 def _folder(path: Path, description: RgbdDescription, place: str) -> Folder:

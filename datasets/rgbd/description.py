@@ -35,7 +35,7 @@ class RgbdDescription(BaseModel):
       (``opencv``) or y up and z back (``opengl``)
     - ``depth_unit_m``: metres of one unit. ``depth_rotated_bits``: by how many bits stored values are rotated to the
       left; with 3, a value p means ((p >> 3) | (p << 13)) & 0xffff units. ``depth_invalid``: how many units, besides 0,
-      mean no depth
+      mean no depth; 65535 need not be named, it means none wherever it stands apart from all other depths of its image
     - ``intrinsics``: fx, fy, cx, cy in pixels; or ``intrinsics_file``: 3x3 (or 4x4) numbers, or Open3D's camera (JSON)
     - ``mesh``: a mesh of the scene in the world of the poses (.ply), for methods that work on one
     - ``frames_per_second``: gives frames their times where the trajectory has none

@@ -9,7 +9,7 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float64Array, Frame, Int64Array
-from su3d_bench.datasets.recordings.recorded_frames import depth_m_of_values
+from su3d_bench.datasets.recordings.recorded_frames import StoredDepth, depth_m_of_values
 from su3d_bench.datasets.recordings.registration import Registration
 from su3d_bench.datasets.recordings.source import RgbdSource
 from su3d_bench.numerics.geometry import are_rigid
@@ -82,7 +82,7 @@ class ScannetFrames(Sequence[Frame]):
     ) -> None:
         self._source, self._registration, self._walk = source, registration, walk
         self._records, self._motion = records, motion
-        self._depth_m_of_value = depth_m_of_values(source.camera.depth_shift)
+        self._depth = StoredDepth(source.where, depth_m_of_values(source.camera.depth_shift))
 
     def __len__(self) -> int:
         return len(self._records)
@@ -90,7 +90,7 @@ class ScannetFrames(Sequence[Frame]):
     def __getitem__(self, position: int) -> Frame:  # type: ignore[override]
         i = int(self._records[position])
         pose = self._registration.camera_to_world(self._walk.poses[i])
-        depth_m = self._depth_m_of_value.take(self._source.depth(i))  # half the time of an index
+        depth_m = self._depth.depth_m(self._source.depth(i), f"frame {int(self._walk.numbers[i])}")
         rgb, depth_m = self._registration.images(self._source.colour(i), depth_m)
         return Frame(
             index=int(self._walk.numbers[i]),

@@ -31,6 +31,7 @@ from su3d_bench.datasets.recordings.recorded_frames import (
     RecordedFrame,
     RecordedFrames,
     Recording,
+    StoredDepth,
     depth_m_of_values,
     left_out,
     numbers,
@@ -40,7 +41,7 @@ from su3d_bench.datasets.recordings.recorded_frames import (
 from su3d_bench.datasets.tum.timed_poses import pose_at, read_trajectory, rows_of, seconds
 
 logger = logging.getLogger(__name__)
-READER_VERSION = 1  # raise it whenever the same files come out as other frames
+READER_VERSION = 2  # raise it whenever the same files come out as other frames
 FOLDERS = (".", "tum", "TUM")
 UNITS_PER_METRE = 5000.0  # the benchmark's page "file formats"
 DEPTH_M_OF_VALUE = depth_m_of_values(UNITS_PER_METRE)
@@ -171,7 +172,8 @@ class Tum:
             *(f"{where}: {name} has no pose within {limit_s:g} s in groundtruth.txt" for name in unposed),
         )
         intrinsics = self._intrinsics(path, where)
-        return Recording(where, folder, tuple(frames), intrinsics, DEPTH_M_OF_VALUE, files, missing=lines)
+        stored = StoredDepth(where, DEPTH_M_OF_VALUE)
+        return Recording(where, folder, tuple(frames), intrinsics, stored, files, missing=lines)
 
     def _intrinsics(self, path: Path, where: str) -> Float64Array:
         if self.options.intrinsics is not None:

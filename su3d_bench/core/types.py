@@ -170,7 +170,8 @@ class OrientedBox:
 class Detections:
     """What perception found in one frame: K regions, strongest evidence first is not implied.
 
-    ``masks`` (K, H, W) bool, may overlap; ``boxes`` (K, 4) float32 x0 y0 x1 y1 in pixels, right and bottom exclusive;
+    ``masks`` (K, H, W) bool, may overlap; ``boxes`` (K, 4) float32 x0 y0 x1 y1 in pixels, right and bottom exclusive,
+    but a detector's may reach beyond the image, and those of SAM's automatic masks end at the last pixel;
     ``scores`` (K,) float32 in 0..1; ``names`` and ``captions`` one text each;
     ``crop_features`` (K, R, D) float32, L2-normalised, crop r at ``crop_ratios[r]``;
     ``global_feature`` (D,) float32, of the whole image; ``name_features`` (K, D) float32, of the names as texts, where

@@ -96,6 +96,56 @@ def test_frames_hold_what_the_files_hold(tmp_path: Path) -> None:
     assert (last.rgb == (200, 120, 30)).all()
 
 
+def write_depth(folder: Path, index: int, values: np.ndarray) -> None:
+    cv2.imwrite(str(folder / f"data/depth/frame-{index}.png"), values.astype(np.uint16))
+
+
+def test_the_largest_value_is_no_depth_where_it_stands_apart_and_that_is_said_once(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    folder = write_scene(tmp_path)
+    near = np.linspace(810, 4000, WIDTH * HEIGHT).astype(np.uint16).reshape(HEIGHT, WIDTH)
+    far = np.linspace(60_000, 65_535, WIDTH * HEIGHT).astype(np.uint16).reshape(HEIGHT, WIDTH)
+    lone = near.copy()
+    lone[0] = 65535
+    for index, values in enumerate((lone, far, np.where(near > 2000, 65535, near))):
+        write_depth(folder, index, values)
+    with caplog.at_level(logging.WARNING, "su3d_bench"):
+        apart, among, again = (frame.depth_m for frame in open_scene(tmp_path))
+    assert (apart[0] == 0).all()
+    np.testing.assert_array_equal(apart[1:], (near[1:] * 0.001).astype(np.float32))
+    np.testing.assert_array_equal(among, (far * 0.001).astype(np.float32))
+    assert (again[near > 2000] == 0).all() and again.max() < 2.01
+    (said,) = (record.getMessage() for record in caplog.records)
+    assert said.startswith("rgbd/desk: depth 65535 (65.54 m) stands apart from all others (to 4 m)")
+    assert said.endswith("first in depth/frame-0.png, 12.5% of its pixels")
+
+
+def test_what_check_and_show_say_of_depth_survives_a_lone_largest_value_and_any_other_is_a_warning(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = write_scene(tmp_path)
+    for index in range(3):
+        values = np.full((HEIGHT, WIDTH), 900 + index)
+        values[:2] = 65535
+        write_depth(folder, index, values)
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path))
+    main(["datasets", "check", "rgbd/desk", "--quiet"])
+    said = capsys.readouterr().out
+    assert "0.90 to 0.90 m" in said and "counts as no depth; first in depth/frame-" in said
+    assert main(["datasets", "show", "rgbd/desk", "--quiet", "--json", "--out", str(tmp_path / "desk.png")]) == 0
+    shown = json.loads(capsys.readouterr().out)
+    assert shown["depth_m"] == pytest.approx([0.9, 0.902])
+    values[:2] = 60000
+    write_depth(folder, 1, values)
+    main(["datasets", "check", "rgbd/desk", "--quiet"])
+    assert "in 1 of 3 frames depth reaches 60 m, first frame 1; indoors" in capsys.readouterr().out
+    keys = {**NUMBERED, "check_convention": False, "depth_invalid": [60000]}
+    describe(folder, keys)
+    main(["datasets", "check", "rgbd/desk", "--quiet"])
+    assert "depth reaches" not in capsys.readouterr().out
+
+
 def test_an_unscored_run_says_what_its_labels_are_worth_and_needs_no_truth(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -16,6 +16,7 @@ from PIL import Image
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError
 from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Float32Array, Frame, PerceptionNeeds, SceneInfo
+from su3d_bench.perception.crops import crop_window
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception
 from su3d_bench.perception.stored.gsa_files import GsaFiles
 
@@ -60,10 +61,29 @@ def test_regions_are_those_of_the_file_and_pictures_are_passed_over(tmp_path: Pa
     found = GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
     assert found.regions.names == ("item", "coffee table")
     np.testing.assert_array_equal(found.regions.masks, masks()[:2])
-    np.testing.assert_array_equal(found.regions.boxes, np.array([[20.5, 40, 60, 80], [90, 50, 160, 90]], np.float32))
+    np.testing.assert_array_equal(found.regions.boxes, np.array([[20.5, 40, 60, 80], [90, 50, 200, 90]], np.float32))
     np.testing.assert_array_equal(found.regions.scores, np.array([0.97, 1], np.float32))
     assert found.features[1.0].argmax(axis=1).tolist() == [1, 3]
     assert found.regions.rows is not None and found.regions.rows.tolist() == [0, 1]
+
+
+def test_a_mask_of_one_pixels_width_stays_and_a_box_turned_round_goes(tmp_path: Path) -> None:
+    # SAM's box of a column of pixels, first to last, has no width; the original's filter_gobs looks at the mask's area.
+    thin = np.zeros((2, *FRAME.depth_m.shape), bool)
+    thin[0, 10:70, 33] = thin[1, 5:9, 5:9] = True
+    features = np.eye(8, dtype=np.float32)[:2]
+    rows = {"confidence": np.array([0.9, 0.9]), "class_id": np.array([0, 0]), "image_feats": features}
+    write(tmp_path, detections(mask=thin, xyxy=np.array([[33, 10, 33, 69], [9, 5, 5, 8]]), **rows))
+    found = GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
+    np.testing.assert_array_equal(found.regions.boxes, [[33, 10, 33, 69]])
+    np.testing.assert_array_equal(found.regions.masks, thin[:1])
+    assert (crop_window(found.regions.boxes[0], 1.0, 160, 120) == [33, 10, 34, 69]).all(), "and can be cut out"
+
+
+def test_a_box_beyond_the_image_is_bounded(tmp_path: Path) -> None:
+    write(tmp_path, detections(xyxy=np.array([[-1e300, -50, 60, 80], [90, 50, 1e300, 90], [1, 1, 5, 5]])))
+    found = GsaFiles(tmp_path, PATTERN, SCENE).frame(FRAME)
+    np.testing.assert_array_equal(found.regions.boxes, [[-160, -50, 60, 80], [90, 50, 320, 90]])
 
 
 def test_a_frame_without_detections_has_no_regions(tmp_path: Path) -> None:

@@ -110,6 +110,8 @@ def test_a_method_gets_the_settings_of_its_own_program(models: Path, tmp_path: P
     tags = perception.detect(FRAME, PerceptionNeeds(grounding="conceptgraphs"), Timer())
     known = {"other item", "wall", "floor", "ceiling", *config_words()}
     assert set(tags.names) <= known
+    whole = perception.detect(FRAME, PerceptionNeeds(grounding="conceptgraphs-whole-tags"), Timer())
+    assert len(whole) <= len(tags) and set(whole.names) <= known
     with pytest.raises(ConfigError, match=r"class-agnostic masks 'conceptgraph', there are none; did you mean"):
         perception.detect(FRAME, PerceptionNeeds(masks="class-agnostic", automatic="conceptgraph"), Timer())
 
@@ -121,8 +123,9 @@ def test_a_method_gets_the_settings_of_its_own_program(models: Path, tmp_path: P
                                "crop_n_points_downscale_factor": 2}),
         ("conceptgraphs", {"points_per_side": 12, "points_per_batch": 144, "min_mask_region_area": 100}),
         ("sam3d", {"points_per_side": 32, "pred_iou_thresh": 0.88, "stability_score_thresh": 0.95}),
-        ("conceptgraphs-detector", {"region_boxes": "detector",
-                                    "boxes": {"box_threshold": 0.2, "text_threshold": 0.2, "nms_iou": 0.5}}),
+        ("conceptgraphs-detector", {"region_boxes": "detector", "ram_resample": "bicubic",
+                                    "boxes": {"box_threshold": 0.2, "text_threshold": 0.2, "nms_iou": 0.5,
+                                              "names": "first-word"}}),
         ("conceptfusion", {"region_boxes": "mask", "boxes": {"box_threshold": 0.25, "text_threshold": 0.25}}),
         ("opensu3d", {"region_boxes": "mask",
                       "boxes": {"box_threshold": 0.25, "text_threshold": 0.25, "nms_iou": 0.4}}),

@@ -63,11 +63,14 @@ def _frame(content: Mapping[object, object], frame: Frame, where: str) -> Stored
     corners = _numbers(content, "xyxy", where).astype(np.float64).reshape(-1, 4) if n else np.zeros((0, 4))
     if corners.shape != (n, 4) or not np.isfinite(corners).all():
         raise DataError(f"{where}: xyxy is {corners.shape}; expected {n} boxes of finite numbers")
-    boxes: Float32Array = np.clip(corners, 0, np.array([width, height, width, height])).astype(np.float32)
+    # As the detector has them: a box may reach beyond the image, by half its size at most. That bounds hostile ones.
+    size = np.array([width, height, width, height])
+    boxes: Float32Array = np.clip(corners, -size, 2 * size).astype(np.float32)
     names = _names(content, n, where)
     features = _features(content, n, where)
-    # SAM's predicted IoU may be a little above 1. A mask without pixels or a box without area is no region.
-    kept = np.flatnonzero(masks.any(axis=(1, 2)) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1))
+    # SAM's predicted IoU may be a little above 1. A mask without pixels is no region; one that is a pixel wide is one,
+    # though SAM's box of it, from the first to the last pixel, has no width.
+    kept = np.flatnonzero(masks.any(axis=(1, 2)) & (boxes[:, 2:] >= boxes[:, :2]).all(axis=1))
     scores = np.clip(scores[kept], 0, 1).astype(np.float32)
     regions = Regions(masks[kept], boxes[kept], scores, tuple(names[k] for k in kept), rows=kept.astype(np.int64))
     of_ratio = {} if features is None else {1.0: features[kept]}

@@ -4,7 +4,8 @@
 
 - ``image_size`` (2,) integers: height, width of the masks, which must be the frame's
 - ``masks`` (K, ceil(height * width / 8)) uint8: ``numpy.packbits`` of each mask, row by row
-- ``boxes`` (K, 4) numbers: x0 y0 x1 y1 in pixels inside the image, right and bottom exclusive
+- ``boxes`` (K, 4) numbers: x0 y0 x1 y1 in pixels, right and bottom exclusive. As detectors have them they may reach
+  beyond the image, by its own size at most, and as SAM has them those of a mask one pixel wide have no width
 - ``scores`` (K,) numbers in 0..1;  ``names`` (K,) texts, none empty;  ``captions`` (K,) texts, optional
 - optional, all four together: ``crop_ratios`` (R,), ``crop_features`` (K, R, D), ``global_feature`` (D,) and
   ``encoder`` (), the digest of the encoder that made them, which must be the encoder of the run
@@ -145,10 +146,14 @@ def _boxes(arrays: Mapping[str, NDArray[Any]], frame: Frame, where: str) -> Floa
         raise DataError(f"{where}: 'boxes' has shape {boxes.shape}; expected four columns x0 y0 x1 y1")
     height, width = frame.depth_m.shape
     x0, y0, x1, y1 = boxes.T
-    bad = ~((x0 >= 0) & (y0 >= 0) & (x1 <= width) & (y1 <= height) & (x0 < x1) & (y0 < y1))
+    is_near = (x0 >= -width) & (y0 >= -height) & (x1 <= 2 * width) & (y1 <= 2 * height)
+    is_seen = (x0 < width) & (y0 < height) & (x1 >= 0) & (y1 >= 0)
+    bad = ~(is_near & is_seen & (x0 <= x1) & (y0 <= y1))
     if bad.any():
         k = int(np.flatnonzero(bad)[0])
-        raise DataError(f"{where}, region {k}: box {boxes[k].tolist()} is empty or outside the {width}x{height} image")
+        raise DataError(
+            f"{where}, region {k}: box {boxes[k].tolist()} is turned round or outside the {width}x{height} image"
+        )
     return boxes
 
 

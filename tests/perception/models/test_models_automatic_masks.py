@@ -136,7 +136,7 @@ class Drawn:
 def test_each_drawn_square_is_found_once_and_the_vague_and_the_larger_go() -> None:
     config = AutomaticMaskConfig(points_per_side=8, points_per_batch=5)
     found = AutomaticMasks(Sam(Drawn()), config).regions(blocks(64, 64))
-    np.testing.assert_array_equal(found.boxes, Drawn.squares)
+    np.testing.assert_array_equal(found.boxes, np.array(Drawn.squares) - [0, 0, 1, 1], "to the last pixel")
     for mask, (x0, y0, x1, y1) in zip(found.masks, Drawn.squares, strict=True):
         assert mask[y0:y1, x0:x1].all() and mask.sum() == (x1 - x0) * (y1 - y0)
     assert found.scores.tolist() == [1, 1], "a predicted IoU above 1 is cut there"
@@ -211,8 +211,7 @@ def test_what_passes_the_filters_is_what_transformers_lets_pass() -> None:
     assert len(found.masks) == len(rle), "with an overlap of 1 allowed nothing but the filters acts"
     order = np.argsort(-scores.numpy(), kind="stable")
     np.testing.assert_allclose(found.scores, np.clip(scores.numpy()[order], 0, 1), atol=1e-4)
-    # Theirs end at the last pixel, ours behind it.
-    np.testing.assert_allclose(found.boxes - np.array([0, 0, 1, 1]), boxes.numpy()[order], atol=1)
+    np.testing.assert_allclose(found.boxes, boxes.numpy()[order], atol=1)
 
 
 def test_crops_find_regions_of_their_own_on_random_weights_and_the_smaller_crop_wins() -> None:

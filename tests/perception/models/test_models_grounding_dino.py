@@ -51,7 +51,7 @@ def test_tokens_above_the_threshold_name_a_box_but_not_the_ends_of_the_text() ->
     assert chosen.tolist() == [[False, True, False, True, False, False], [False] * 6]
 
 
-@pytest.mark.parametrize("size", [(40, 60), (60, 40), (30, 90), (48, 48)])
+@pytest.mark.parametrize("size", [(40, 60), (60, 40), (40, 100), (48, 48)])
 def test_the_image_goes_in_as_transformers_prepares_it(detector: GroundingDino, size: tuple[int, int]) -> None:
     from transformers.models.grounding_dino.image_processing_pil_grounding_dino import GroundingDinoImageProcessorPil
 
@@ -86,8 +86,7 @@ def test_boxes_scores_and_phrases_are_those_of_transformers(detector: GroundingD
     assert len(order) > 1
     assert found.names == tuple(phrases[k] for k in order)
     np.testing.assert_allclose(found.scores, theirs["scores"].numpy()[order], atol=1e-5)
-    boxes = np.clip(theirs["boxes"].numpy()[order], 0, [60, 40, 60, 40])
-    np.testing.assert_allclose(found.boxes, boxes, atol=1e-3)
+    np.testing.assert_allclose(found.boxes, theirs["boxes"].numpy()[order], atol=1e-3)
 
 
 class Told(GroundingDino):
@@ -134,11 +133,37 @@ def test_boxes_are_thresholded_suppressed_and_called_by_their_phrases(tokenizer:
     np.testing.assert_allclose(found.boxes, [[0, 0, 30, 40], [30, 0, 60, 40]])
 
 
-def test_boxes_may_be_called_by_tags_and_go_where_they_stand_for_none(tokenizer: Any) -> None:
+def test_conceptgraphs_calls_every_box_by_the_first_word_of_its_phrase(tokenizer: Any) -> None:
     found = Told(tokenizer, PROBABILITIES, CENTRES).detect(RGB, ["cat", "coffee table"], CONCEPTGRAPHS_BOXES)
-    # "table" stands for no tag; "coffee table" overlaps it by one half, which 0.5 allows.
+    # "table" is in "coffee table", which overlaps it by one half, which 0.5 allows; a full stop alone is the first tag.
+    assert found.names == ("cat", "coffee table", "cat", "coffee table", "cat")
+    np.testing.assert_allclose(found.scores, [0.9, 0.8, 0.7, 0.3, 0.25])
+
+
+def test_a_box_found_by_the_mark_of_the_texts_beginning_is_the_first_tag_there_and_has_no_name_else(
+    tokenizer: Any,
+) -> None:
+    probabilities = np.zeros((1, 8), np.float32)
+    probabilities[0, [0, 3]] = 0.9  # [CLS] coffee
+    told = Told(tokenizer, probabilities, CENTRES[:1])
+    assert told.detect(RGB, ["cat", "coffee table"], CONCEPTGRAPHS_BOXES).names == ("cat",)
+    assert told.detect(RGB, ["cat", "coffee table"], BoxConfig()).names == ("coffee",)
+
+
+def test_a_box_may_be_called_by_a_whole_tag_and_go_where_it_stands_for_none(tokenizer: Any) -> None:
+    config = CONCEPTGRAPHS_BOXES.model_copy(update={"names": "tag"})
+    found = Told(tokenizer, PROBABILITIES, CENTRES).detect(RGB, ["cat", "coffee table"], config)
     assert found.names == ("cat", "coffee table", "cat")
     np.testing.assert_allclose(found.scores, [0.9, 0.3, 0.25])
+
+
+def test_boxes_are_suppressed_as_they_are_and_not_as_the_image_cuts_them(tokenizer: Any) -> None:
+    # Both reach beyond the left edge; inside they cover the same, outside one is twice as wide: IoU 1/2 and not 1.
+    probabilities = np.zeros((2, 8), np.float32)
+    probabilities[:, 1] = 0.9, 0.8
+    centres = np.array([[0.0, 0.5, 0.5, 1.0], [-0.25, 0.5, 1.0, 1.0]], np.float32)
+    found = Told(tokenizer, probabilities, centres).detect(RGB, ["cat"], BoxConfig(nms_iou=0.6))
+    np.testing.assert_array_equal(found.boxes, [[-15, 0, 15, 40], [-45, 0, 15, 40]])
 
 
 def test_tags_that_one_text_cannot_hold_are_asked_for_in_a_second(tokenizer: Any) -> None:
@@ -157,7 +182,7 @@ def test_presets_hold_the_published_values() -> None:
     paper = BoxConfig()
     assert (paper.box_threshold, paper.text_threshold, paper.nms_iou, paper.names) == (0.25, 0.25, 0.4, "phrase")
     other = CONCEPTGRAPHS_BOXES
-    assert (other.box_threshold, other.text_threshold, other.nms_iou, other.names) == (0.2, 0.2, 0.5, "tag")
+    assert (other.box_threshold, other.text_threshold, other.nms_iou, other.names) == (0.2, 0.2, 0.5, "first-word")
 
 
 def test_a_tokenizer_is_read_from_its_words(tokenizer: Any, tmp_path: Path) -> None:

@@ -12,20 +12,20 @@ import numpy as np
 from su3d_bench.core.devices import require, require_transformers
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Int64Array
+from su3d_bench.perception.models.encoders.plain_text import plain_text, without_marks
 from su3d_bench.perception.models.files import bounded, check_settings_size, read_settings
 
 TokensKind = Literal["clip", "siglip"]
 Tokeniser = Callable[[Sequence[str]], Int64Array]
 _CLIP_FILES = ("tokenizer.json", "vocab.json", "merges.txt", "tokenizer_config.json", "special_tokens_map.json")
-TOKENS_VERSION = "1"
+TOKENS_VERSION = "2"
 
 
 def read_tokeniser(folder: Path, kind: TokensKind, n_tokens: int, pad_id: int | None, n_words: int) -> Tokeniser:
     """What turns texts into rows (N, n_tokens) of ids below ``n_words``; longer texts are cut, the end token stays.
 
-    ``clip``: transformers' ``CLIPTokenizer``. It cleans texts as OpenAI's does but for broken encodings and HTML
-    entities, which that mends first. ``siglip``: the folder's ``tokenizer.json`` on texts without punctuation and
-    capitals, padded with ``pad_id`` as the towers were trained.
+    ``clip``: transformers' ``CLIPTokenizer`` on texts cleaned as open_clip cleans them. ``siglip``: the folder's
+    ``tokenizer.json`` on texts without punctuation and capitals, padded with ``pad_id`` as the towers were trained.
     """
     encode = _clip(folder, n_tokens) if kind == "clip" else _siglip(folder, n_tokens, pad_id or 0)
 
@@ -48,7 +48,12 @@ def _clip(folder: Path, n_tokens: int) -> Callable[[list[str]], Any]:
     for name in _CLIP_FILES:
         check_settings_size(folder / name)
     tokenizer = _load(folder, lambda: transformers.CLIPTokenizer.from_pretrained(str(folder), local_files_only=True))
-    return lambda texts: tokenizer(texts, padding="max_length", truncation=True, max_length=n_tokens)["input_ids"]
+
+    def encode(texts: list[str]) -> Any:
+        texts = [without_marks(plain_text(text)) for text in texts]
+        return tokenizer(texts, padding="max_length", truncation=True, max_length=n_tokens)["input_ids"]
+
+    return encode
 
 
 def _siglip(folder: Path, n_tokens: int, pad_id: int) -> Callable[[list[str]], Any]:

@@ -133,6 +133,15 @@ def without_small_parts(mask: BoolArray, min_area_px: int, part: Literal["holes"
     return (mask | changed if part == "holes" else mask & ~changed), True
 
 
+def to_last_pixel(boxes: Float32Array | Int64Array) -> Float32Array:
+    """Tight ``boxes`` (K, 4), right and bottom exclusive, as the original's, which end at the last pixel.
+
+    ``batched_mask_to_box`` of segment-anything; a mask without pixels has zeros there and here.
+    """
+    ends = np.maximum(boxes[:, 2:] - 1, boxes[:, :2])
+    return np.concatenate([boxes[:, :2], ends], axis=1).astype(np.float32)
+
+
 @dataclass(frozen=True)
 class _Candidates:
     """Masks cut to their windows (K, 4) in the image, right and bottom exclusive, with predicted IoU (K,)."""
@@ -144,8 +153,7 @@ class _Candidates:
 
     @property
     def boxes(self) -> Float32Array:
-        """The original's boxes: first and last pixel, which makes them a pixel smaller than the windows."""
-        return np.asarray(self.windows - np.array([0, 0, 1, 1]), np.float32)
+        return to_last_pixel(self.windows)
 
     def at(self, kept: Int64Array) -> _Candidates:
         return _Candidates([self.cuts[k] for k in kept], self.windows[kept], self.scores[kept], self.crop_areas[kept])
@@ -171,6 +179,7 @@ class AutomaticMasks:
     def regions(self, rgb: UInt8Array) -> Regions:
         """The masks of ``rgb`` in the original's order: best predicted IoU first, those of small crops before.
 
+        Boxes are the original's, from the first to the last pixel: a mask one pixel wide has a box without a width.
         Scores are the predicted IoU, which the network may put a little above 1 and which is cut there.
         """
         config = self._config
@@ -189,18 +198,18 @@ class AutomaticMasks:
         # A mask without pixels passes where the filters are off; a region has some.
         is_something = masks.any(axis=(1, 2))
         masks = masks[is_something]
-        return Regions(masks, mask_boxes(masks), np.clip(scores[is_something], 0, 1).astype(np.float32))
+        return Regions(masks, to_last_pixel(mask_boxes(masks)), np.clip(scores[is_something], 0, 1).astype(np.float32))
 
     def _in_crop(self, rgb: UInt8Array, crop: Crop) -> _Candidates:
         x0, y0, x1, y1 = crop.box
         image = self._sam.look(np.ascontiguousarray(rgb[y0:y1, x0:x1]))
         n_side = int(self._config.points_per_side / self._config.crop_n_points_downscale_factor**crop.layer)
-        points = (point_grid(max(n_side, 1)) * np.array([x1 - x0, y1 - y0])).astype(np.float32)
+        points = point_grid(max(n_side, 1)) * np.array([x1 - x0, y1 - y0])
         batches = self._batches.run(range(len(points)), lambda part: self._from_points(image, points[part], crop, rgb))
         candidates = _Candidates.joined(batches)
         return candidates.at(suppress(candidates.boxes, candidates.scores, self._config.box_nms_thresh))
 
-    def _from_points(self, image: SeenImage, points: Float32Array, crop: Crop, rgb: UInt8Array) -> _Candidates:
+    def _from_points(self, image: SeenImage, points: Float64Array, crop: Crop, rgb: UInt8Array) -> _Candidates:
         """The three masks at each point that pass the filters, which look at one mask alone, whatever the batch."""
         labels = np.full((len(points), 1), OBJECT_POINT, np.int64)
         logits, predicted = self._sam.decode(image, Prompts(points[:, None], labels), is_single=False)
@@ -243,7 +252,7 @@ class AutomaticMasks:
             filled, had_holes = without_small_parts(mask, smallest, "holes")
             cleaned[k], had_islands = without_small_parts(filled, smallest, "islands")
             is_unchanged[k] = not (had_holes or had_islands)
-        boxes = mask_boxes(cleaned) - np.array([0, 0, 1, 1], np.float32)
+        boxes = to_last_pixel(mask_boxes(cleaned))
         most = max(self._config.box_nms_thresh, self._config.crop_nms_thresh)
         kept = suppress(boxes, is_unchanged, most)
         return cleaned[kept], kept

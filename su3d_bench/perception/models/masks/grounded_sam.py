@@ -14,6 +14,7 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import BoolArray, Frame, Int64Array, Regions
 from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.crops import mask_boxes
+from su3d_bench.perception.models.encoders.model_images import Resample
 from su3d_bench.perception.models.masks.automatic_masks import AutomaticMaskConfig, AutomaticMasks
 from su3d_bench.perception.models.masks.grounding_dino import CONCEPTGRAPHS_BOXES, BoxConfig, GroundingDino
 from su3d_bench.perception.models.masks.sam import Sam
@@ -21,7 +22,7 @@ from su3d_bench.perception.models.masks.tagging import ADDED_TAGS, BACKGROUND_TA
 from su3d_bench.perception.regions import CropsOnDemand, OfLastFrame
 
 # Moves the digest when what lies between the networks changes.
-FRONT_END_VERSION = "1"
+FRONT_END_VERSION = "2"
 # ConceptGraphs calls every region so that no text named; a method that needs better names asks for grounded masks.
 UNNAMED = "item"
 
@@ -30,8 +31,9 @@ class GroundedConfig(BaseModel):
     """How named regions come about; the defaults are OpenSU3D's.
 
     ``masks``: SAM's best of three in each box by predicted IoU, or the one that it gives when asked for one, as in the
-    Grounded-SAM demonstrations. ``region_boxes``: the mask's, or the detector's. Tags that contain one of
-    ``stop_words`` are left out, ``added_tags`` are asked for in every image.
+    Grounded-SAM demonstrations. ``region_boxes``: the mask's, or the detector's, which may reach beyond the image. Tags
+    that contain one of ``stop_words`` are left out, ``added_tags`` are asked for in every image. ``ram_resample``: how
+    RAM++'s picture is made small; its own package does it bilinear.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -41,19 +43,26 @@ class GroundedConfig(BaseModel):
     added_tags: tuple[str, ...] = ()
     masks: Literal["best-of-three", "single"] = "best-of-three"
     region_boxes: Literal["mask", "detector"] = "mask"
+    ram_resample: Resample = "bilinear"
 
 
+# generate_gsa_results.py --class_set ram --add_bg_classes (5c4da70); its --accumu_classes carries tags on from frame to
+# frame in an order that changes from run to run, and is left out. Its picture for RAM is Pillow's resize, whose default
+# is bicubic. The tagger is the run's: its README names RAM (ram_swin_large_14m.pth), not RAM++.
+_CONCEPTGRAPHS = GroundedConfig(
+    boxes=CONCEPTGRAPHS_BOXES,
+    stop_words=STOP_WORDS,
+    added_tags=(*ADDED_TAGS, *BACKGROUND_TAGS),
+    region_boxes="detector",
+    ram_resample="bicubic",
+)
 # What methods ask for by PerceptionNeeds.grounding; "paper" is configured.
 GROUNDED_MASKS: Mapping[str, GroundedConfig] = MappingProxyType(
     {
-        # generate_gsa_results.py --class_set ram --add_bg_classes; its --accumu_classes carries tags on from frame to
-        # frame in an order that changes from run to run, and is left out.
-        "conceptgraphs": GroundedConfig(
-            boxes=CONCEPTGRAPHS_BOXES,
-            stop_words=STOP_WORDS,
-            added_tags=(*ADDED_TAGS, *BACKGROUND_TAGS),
-            region_boxes="detector",
-        )
+        "conceptgraphs": _CONCEPTGRAPHS,
+        "conceptgraphs-whole-tags": _CONCEPTGRAPHS.model_copy(
+            update={"boxes": CONCEPTGRAPHS_BOXES.model_copy(update={"names": "tag"})}
+        ),
     }
 )
 
@@ -82,10 +91,9 @@ class GroundedSam:
     def segment(self, frame: Frame) -> Regions:
         """Named regions, the detector's best first; empty where no tag is found."""
         config = self._config
-        tags = chosen_tags(self._networks.tagger.tags(frame.rgb), config.stop_words, config.added_tags)
+        found = self._networks.tagger.tags(frame.rgb, config.ram_resample)
+        tags = chosen_tags(found, config.stop_words, config.added_tags)
         named = self._networks.load_detector().detect(frame.rgb, tags, config.boxes)
-        # A box beyond the image's edge has been cut to a line there.
-        named = named.at(np.flatnonzero((named.boxes[:, 2:] > named.boxes[:, :2]).all(axis=1)))
         height, width = frame.rgb.shape[:2]
         if not len(named.names):
             return Regions(np.zeros((0, height, width), bool), named.boxes, named.scores, ())

@@ -23,8 +23,9 @@ SHORTEST_PX, LONGEST_PX = 800, 1333
 class BoxConfig(BaseModel):
     """Which boxes count; the defaults are the paper's (section IV-A: box and text 0.25, IoU 0.4).
 
-    ``names``: a box is called by the ``phrase`` that it was found by, as in the Grounded-SAM demonstrations, or by the
-    ``tag`` that the phrase stands for and left out where it stands for none, as in ConceptGraphs.
+    ``names``: a box is called by the ``phrase`` that it was found by, as in the Grounded-SAM demonstrations; by the
+    first tag that holds the phrase's ``first-word``, else by the first of all tags, as in ConceptGraphs; or by the
+    whole ``tag`` that the phrase is or holds, and left out where it holds none.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -32,16 +33,19 @@ class BoxConfig(BaseModel):
     box_threshold: float = Field(default=0.25, ge=0, le=1)
     text_threshold: float = Field(default=0.25, ge=0, le=1)
     nms_iou: float = Field(default=0.4, ge=0, le=1)
-    names: Literal["phrase", "tag"] = "phrase"
+    names: Literal["phrase", "first-word", "tag"] = "phrase"
 
 
-# ConceptGraphs-Detect, generate_gsa_results.py
-CONCEPTGRAPHS_BOXES = BoxConfig(box_threshold=0.2, text_threshold=0.2, nms_iou=0.5, names="tag")
+# ConceptGraphs-Detect, generate_gsa_results.py (5c4da70)
+CONCEPTGRAPHS_BOXES = BoxConfig(box_threshold=0.2, text_threshold=0.2, nms_iou=0.5, names="first-word")
 
 
 @dataclass(frozen=True)
 class NamedBoxes:
-    """Boxes (K, 4) x0 y0 x1 y1 in pixels inside the image, their scores (K,) and one name each, the best first."""
+    """Boxes (K, 4) x0 y0 x1 y1 in pixels, their scores (K,) and one name each, the best first.
+
+    A box may reach beyond the image, as the network has it; the originals cut none.
+    """
 
     boxes: Float32Array
     scores: Float32Array
@@ -77,10 +81,24 @@ def tag_of(phrase: str, tags: Sequence[str]) -> str | None:
     return next((tag for tag in tags if tag in phrase), None)
 
 
+def tag_of_first_word(phrase: str, tags: Sequence[str]) -> str:
+    """The first of ``tags`` that holds the first word of ``phrase``, be it inside a word; else the first tag.
+
+    ConceptGraphs' rule: ``Model.find_index`` of Grounded-Segment-Anything at a4d76a2, GroundingDINO's inference.py. A
+    phrase without words, at which that program ends, gets the first tag too.
+
+    >>> tag_of_first_word("table lamp", ["cat", "coffee table", "lamp"])
+    'coffee table'
+    """
+    word = (phrase.lower().split() or [""])[0]
+    return next((tag for tag in tags if word in tag.lower()), tags[0])
+
+
 def is_in_phrase(probabilities: Float32Array, text_threshold: float, n_tokens: int) -> BoolArray:
     """Which tokens (K, T) each of K boxes is found by: those above the threshold but for the text's first and last.
 
-    These two mark its ends; the original leaves out its first, and the last place of the longest text.
+    These two mark its ends; GroundingDINO (856dde2) leaves out its first, and the last place of the longest text. At
+    the commit that ConceptGraphs names it leaves out none, see ``GroundingDino.detect``.
     """
     chosen: BoolArray = probabilities > text_threshold
     chosen[:, 0] = False
@@ -112,6 +130,9 @@ class GroundingDino:
             tuple(name for part in parts for name in part.names),
         )
         candidates = candidates.at(suppress(candidates.boxes, candidates.scores, config.nms_iou))
+        if config.names == "first-word":
+            names = tuple(tag_of_first_word(phrase, tags) for phrase in candidates.names)
+            return NamedBoxes(candidates.boxes, candidates.scores, names)
         # A box found by marks alone has no name; it goes.
         named = [tag_of(name, tags) if config.names == "tag" else name or None for name in candidates.names]
         kept = np.flatnonzero([name is not None for name in named])
@@ -146,12 +167,14 @@ class GroundingDino:
         probabilities, boxes, tokens = self.answer(self.pixels(rgb), text_prompt(tags))
         scores = probabilities.max(axis=1)
         kept = np.flatnonzero(scores > config.box_threshold)
-        chosen = is_in_phrase(probabilities[kept], config.text_threshold, len(tokens))
+        if config.names == "first-word":
+            # There the marks of the text's ends name boxes too: no tag holds "[cls]", so these get the first.
+            chosen = probabilities[kept] > config.text_threshold
+        else:
+            chosen = is_in_phrase(probabilities[kept], config.text_threshold, len(tokens))
         names = tuple(self._phrase([tokens[i] for i in np.flatnonzero(row[: len(tokens)])]) for row in chosen)
         height, width = rgb.shape[:2]
-        limits = np.array([width, height, width, height], np.float32)
-        corners = np.clip(corners_of(boxes[kept], height, width), 0, limits)
-        return NamedBoxes(corners, scores[kept], names)
+        return NamedBoxes(corners_of(boxes[kept], height, width), scores[kept], names)
 
     def _phrase(self, tokens: list[int]) -> str:
         """Tokens as words; full stops between them go, as in the original."""

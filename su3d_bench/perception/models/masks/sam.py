@@ -13,8 +13,8 @@ from typing import Any, Protocol
 import numpy as np
 
 from su3d_bench.core.devices import Batches
-from su3d_bench.core.types import BoolArray, Float32Array, Int64Array, UInt8Array
-from su3d_bench.perception.models.encoders.model_images import normalised, resized, size_with_longest_side
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, UInt8Array
+from su3d_bench.perception.models.encoders.model_images import normalised_bytes, resized, size_with_longest_side
 
 MASK_THRESHOLD = 0.0  # on the network's logits
 BACKGROUND_POINT, OBJECT_POINT = 0, 1
@@ -24,9 +24,13 @@ FULL_SIZE_AT_ONCE = 64
 
 @dataclass(frozen=True)
 class Prompts:
-    """One prompt a mask: ``points`` (B, P, 2) x y with ``labels`` (B, P), 1 on the object, or ``boxes`` (B, 4)."""
+    """One prompt a mask: ``points`` (B, P, 2) x y with ``labels`` (B, P), 1 on the object, or ``boxes`` (B, 4).
 
-    points: Float32Array | None = None
+    ``points`` are float32 where somebody chose them, as in the original's predictor, and float64 where they are a grid,
+    as in its generator of automatic masks.
+    """
+
+    points: Float32Array | Float64Array | None = None
     labels: Int64Array | None = None
     boxes: Float32Array | None = None
 
@@ -82,7 +86,7 @@ class Sam:
         seen = size_with_longest_side(height, width, self.network.image_px)
         pixels = np.zeros((3, self.network.image_px, self.network.image_px), np.float32)
         # The border is 0 after the mean is taken off, which is the original's order.
-        pixels[:, : seen[0], : seen[1]] = normalised(resized(rgb, *seen))
+        pixels[:, : seen[0], : seen[1]] = normalised_bytes(resized(rgb, *seen))
         return SeenImage(self.network.embed(pixels), (height, width), seen)
 
     def decode(self, image: SeenImage, prompts: Prompts, is_single: bool) -> tuple[Any, Any]:
@@ -138,7 +142,20 @@ def _at_seen_size(prompts: Prompts, image: SeenImage) -> Prompts:
     if prompts.boxes is not None:
         return Prompts(boxes=(prompts.boxes.astype(np.float64) * np.tile(scale, 2)).astype(np.float32))
     assert prompts.points is not None
-    return Prompts((prompts.points.astype(np.float64) * scale).astype(np.float32), prompts.labels)
+    points = prompts.points.astype(np.float64) * scale
+    return Prompts(points if prompts.points.dtype == np.float64 else points.astype(np.float32), prompts.labels)
+
+
+def as_shares_of_float32(points: Float32Array | Float64Array, image_px: int) -> Float32Array | Float64Array:
+    """``points`` moved so little that their shares of the image are float32 numbers, where they are float64.
+
+    The original rounds the share and then takes 2 x - 1 (``PositionEmbeddingRandom.forward_with_coords``); transformers
+    takes it first, in float64. After this both give the same bits.
+    """
+    if points.dtype == np.float32:
+        return points
+    shares = ((points + 0.5) / image_px).astype(np.float32)
+    return shares.astype(np.float64) * image_px - 0.5
 
 
 class TorchSam:
@@ -162,7 +179,7 @@ class TorchSam:
             given["input_boxes"] = self._tensor(prompts.boxes[None])
         else:
             assert prompts.points is not None and prompts.labels is not None
-            given["input_points"] = self._tensor(prompts.points[None])
+            given["input_points"] = self._tensor(as_shares_of_float32(prompts.points, self.image_px)[None])
             given["input_labels"] = self._tensor(prompts.labels[None])
         with torch.inference_mode():
             answer = self.model(image_embeddings=embedding, multimask_output=not is_single, **given)

@@ -68,7 +68,7 @@ def exported_points(prompts: Prompts) -> tuple[Float32Array, Int64Array]:
         labels = np.tile(np.array([TOP_LEFT, BOTTOM_RIGHT], np.int64), (len(prompts), 1))
         return prompts.boxes.reshape(-1, 2, 2).astype(np.float32), labels
     assert prompts.points is not None and prompts.labels is not None
-    points = np.pad(prompts.points, ((0, 0), (0, 1), (0, 0)))
+    points = np.pad(prompts.points.astype(np.float32), ((0, 0), (0, 1), (0, 0)))
     return points, np.pad(prompts.labels, ((0, 0), (0, 1)), constant_values=NO_POINT)
 
 

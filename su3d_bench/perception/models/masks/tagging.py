@@ -15,7 +15,7 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.perception.cache import content_key
 from su3d_bench.perception.embedded.naming import PromptedWords, listed_words, vocabulary
-from su3d_bench.perception.models.encoders.model_images import normalised, resized
+from su3d_bench.perception.models.encoders.model_images import Resample, normalised, resized
 from su3d_bench.perception.models.files import ModelFiles, bounded, read_weights
 
 RAM_PX = 384
@@ -37,13 +37,16 @@ BACKGROUND_TAGS = ("wall", "floor", "ceiling")
 
 
 class Tagger(Protocol):
-    """Words for what an image shows; ``caveat`` says what must be said of them."""
+    """Words for what an image shows; ``caveat`` says what must be said of them.
+
+    ``resample``: how a tagger that takes a small picture of the whole image makes it.
+    """
 
     name: str
     digest: str
     caveat: str | None
 
-    def tags(self, rgb: UInt8Array) -> tuple[str, ...]: ...
+    def tags(self, rgb: UInt8Array, resample: Resample = "bilinear") -> tuple[str, ...]: ...
 
 
 class RamTagger:
@@ -57,11 +60,11 @@ class RamTagger:
         self._device = device
         self.digest = content_key("ram", digest)
 
-    def tags(self, rgb: UInt8Array) -> tuple[str, ...]:
+    def tags(self, rgb: UInt8Array, resample: Resample = "bilinear") -> tuple[str, ...]:
         """The tags of ``rgb`` (H, W, 3) in the order of RAM++'s list."""
         import torch
 
-        pixels = torch.from_numpy(ram_pixels(rgb)[None]).to(self._device)
+        pixels = torch.from_numpy(ram_pixels(rgb, resample)[None]).to(self._device)
         with torch.inference_mode():
             english, _ = self._model().generate_tag(pixels)
         return tuple(tag for tag in str(english[0]).split(" | ") if tag)
@@ -78,10 +81,10 @@ class OnnxRamTagger:
         self._tag_list = tuple(tag_list)
         self.digest = content_key("ram-onnx", digest, *self._tag_list)
 
-    def tags(self, rgb: UInt8Array) -> tuple[str, ...]:
+    def tags(self, rgb: UInt8Array, resample: Resample = "bilinear") -> tuple[str, ...]:
         """The tags of ``rgb`` (H, W, 3) in the order of the list."""
         session = self._session()
-        is_there = session.run(None, {session.get_inputs()[0].name: ram_pixels(rgb)[None]})[0]
+        is_there = session.run(None, {session.get_inputs()[0].name: ram_pixels(rgb, resample)[None]})[0]
         if is_there.shape != (1, len(self._tag_list)):
             raise DataError(
                 f"tagger 'ram-onnx': the model answers {is_there.shape}, {RAM_TAG_LIST} has {len(self._tag_list)} "
@@ -105,8 +108,8 @@ class WordTagger:
         self._n_tags = n_tags
         self.digest = content_key("words", encoder.digest, str(n_tags), prompt, *self._words.words)
 
-    def tags(self, rgb: UInt8Array) -> tuple[str, ...]:
-        """At most ``n_tags`` words for ``rgb`` (H, W, 3)."""
+    def tags(self, rgb: UInt8Array, resample: Resample = "bilinear") -> tuple[str, ...]:
+        """At most ``n_tags`` words for ``rgb`` (H, W, 3), each of whose views the encoder prepares in its own way."""
         similarity = self._words.similarity(self._encoder.encode_images(_views(rgb)))
         order = np.argsort(-similarity.max(axis=0), kind="stable")
         return tuple(self._words.words[index] for index in order[: self._n_tags])
@@ -121,9 +124,12 @@ def _views(rgb: UInt8Array) -> list[UInt8Array]:
     return [rgb, *parts]
 
 
-def ram_pixels(rgb: UInt8Array) -> Float32Array:
-    """``rgb`` (H, W, 3) as RAM++ takes it, (3, 384, 384): squeezed to a square, whatever its shape."""
-    return normalised(resized(rgb, RAM_PX, RAM_PX))
+def ram_pixels(rgb: UInt8Array, resample: Resample = "bilinear") -> Float32Array:
+    """``rgb`` (H, W, 3) as RAM++ takes it, (3, 384, 384): squeezed to a square, whatever its shape.
+
+    Its own transform is bilinear (recognize-anything 7cb804a, ram/transform.py).
+    """
+    return normalised(resized(rgb, RAM_PX, RAM_PX, resample))
 
 
 def chosen_tags(tags: Iterable[str], stop_words: Sequence[str], added: Sequence[str]) -> tuple[str, ...]:
