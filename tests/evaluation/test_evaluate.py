@@ -151,6 +151,20 @@ def test_masks_without_classes_are_scored_where_classes_do_not_count(tmp_path: P
         numbers(tmp_path)
 
 
+def test_instance_numbers_that_begin_anew_with_each_class_stay_objects_where_the_original_keeps_them(
+    tmp_path: Path,
+) -> None:
+    write_truth(tmp_path / "gt", values=np.repeat([4001, 5001, 6001], 200))
+    write_scannet_text(tmp_path / "pred", scene([CHAIR, TABLE, np.arange(400, 600)], [5, 5, 5]))
+    for name in ("class-agnostic-open3dis", "class-agnostic-segment3d"):
+        found = numbers(tmp_path, name)
+        assert found["metrics"] == {"ap": 1.0, "ap50": 1.0, "ap25": 1.0}
+        assert not [line for line in found["warnings"] if "begin anew" in line]
+    melted = numbers(tmp_path, "class-agnostic-maskclustering")
+    assert melted["metrics"]["ap50"] == 0.0
+    assert "and 2 of 3 objects melt with another" in said(melted, "scene0001_00: the instance numbers begin anew")
+
+
 def test_masks_of_class_0_alone_are_class_agnostic(tmp_path: Path) -> None:
     write_truth(tmp_path / "gt")
     write_maskclustering(tmp_path / "pred", scene([CHAIR], [0]))
