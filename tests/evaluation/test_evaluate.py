@@ -187,6 +187,13 @@ def test_instance_numbers_that_begin_anew_with_each_class_stay_objects_where_the
     assert "and 2 of 3 objects melt with another" in said(melted, "scene0001_00: the instance numbers begin anew")
 
 
+def test_a_method_may_exceed_the_score_of_the_truth_where_a_rule_counts_what_the_truth_leaves_out(tmp_path: Path) -> None:
+    write_truth(tmp_path / "gt", values=np.repeat([5001, 7002, 0], 200))
+    write_scannet_text(tmp_path / "pred", scene([CHAIR, TABLE, np.arange(400, 600)], [5, 7, 5]))
+    found = numbers(tmp_path, "class-agnostic-maskclustering")
+    assert found["metrics"]["ap"] == 1.0 > found["ceiling"]["ap"] == pytest.approx(2 / 3)
+
+
 def test_masks_of_class_0_alone_are_class_agnostic(tmp_path: Path) -> None:
     write_truth(tmp_path / "gt")
     write_maskclustering(tmp_path / "pred", scene([CHAIR], [0]))
