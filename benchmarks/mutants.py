@@ -82,6 +82,7 @@ _PAIRS = (
 )  # fmt: skip
 # Keywords that say how a thing is done, not what comes out.
 _NO_NUMBER = frozenset({"strict", "copy", "workers", "maxsize", "balanced_tree", "compact_nodes", "cache", "nogil"})
+_LEFT_ALONE = (ast.Raise, ast.Assert, ast.JoinedStr, ast.Import, ast.ImportFrom, ast.Lambda)
 _SWAPPED_NAMES = {a: b for pair in _PAIRS for a, b in (pair, pair[::-1])}
 
 
@@ -156,14 +157,13 @@ class _Faults(ast.NodeVisitor):
 
     # what is left alone
 
-    def _pass_over(self, node: ast.AST) -> None:
-        """Nothing of it is mutated."""
+    def visit(self, node: ast.AST) -> None:
+        if not isinstance(node, _LEFT_ALONE):
+            super().visit(node)
 
     def visit_keyword(self, node: ast.keyword) -> None:
         if node.arg not in _NO_NUMBER:
             self.visit(node.value)
-
-    visit_Raise = visit_Assert = visit_JoinedStr = visit_Import = visit_ImportFrom = visit_Lambda = _pass_over
 
     def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
         if node.value is not None:
