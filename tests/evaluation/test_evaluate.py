@@ -107,7 +107,9 @@ def test_labels_of_another_list_are_doubted(tmp_path: Path) -> None:
 def test_instance_protocols_refuse_a_truth_of_labels_alone(tmp_path: Path) -> None:
     write_truth(tmp_path / "gt", values=TRUTH // 1000)
     write_scannet_text(tmp_path / "pred", scene([CHAIR], [5]))
-    with pytest.raises(ConfigError, match=r"scannet-instance.*needs instances, .* 1 to 7, are taken for class ids alone"):
+    with pytest.raises(
+        ConfigError, match=r"scannet-instance.*needs instances, .* 1 to 7, are taken for class ids alone"
+    ):
         numbers(tmp_path)
     write_truth(tmp_path / "gt", values=np.repeat([7, 1001, 0], 200))
     with pytest.raises(ConfigError, match=r"7 to 1001, are taken for class ids alone: class id \* 1000 \+ instance is"):
@@ -187,7 +189,9 @@ def test_instance_numbers_that_begin_anew_with_each_class_stay_objects_where_the
     assert "and 2 of 3 objects melt with another" in said(melted, "scene0001_00: the instance numbers begin anew")
 
 
-def test_a_method_may_exceed_the_score_of_the_truth_where_a_rule_counts_what_the_truth_leaves_out(tmp_path: Path) -> None:
+def test_a_method_may_exceed_the_score_of_the_truth_where_a_rule_counts_what_the_truth_leaves_out(
+    tmp_path: Path,
+) -> None:
     write_truth(tmp_path / "gt", values=np.repeat([5001, 7002, 0], 200))
     write_scannet_text(tmp_path / "pred", scene([CHAIR, TABLE, np.arange(400, 600)], [5, 7, 5]))
     found = numbers(tmp_path, "class-agnostic-maskclustering")

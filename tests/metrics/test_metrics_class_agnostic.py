@@ -13,8 +13,8 @@ from scored_room import instances
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, LabelSet, Masks, Partition
-from su3d_bench.metrics.instance.average_precision import per_scene
 from su3d_bench.metrics.instance.average_precision import combine as combine_counts
+from su3d_bench.metrics.instance.average_precision import per_scene
 from su3d_bench.metrics.instance.score import encode_without_classes
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
@@ -161,7 +161,9 @@ def test_objects_are_matched_class_after_class_to_the_bits_of_the_original(index
     rules = load_protocol(f"class-agnostic-{name}")
     scores = {}
     for s, (values, masks) in enumerate(problem(index)):
-        labels = LabelSet("scannet", tuple(np.unique(values // 1000).tolist()), tuple(map(str, np.unique(values // 1000))))
+        labels = LabelSet(
+            "scannet", tuple(np.unique(values // 1000).tolist()), tuple(map(str, np.unique(values // 1000)))
+        )
         points = np.random.default_rng(s).random((len(values), 3)).astype(np.float32)
         truth = GroundTruth(points, values // 1000, values % 1000, labels, "scannet200-vertices", "made for a test")
         scores[f"scene{s}"] = score_scene(rules, truth, instances(points, masks, None), None)

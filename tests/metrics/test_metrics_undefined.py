@@ -49,9 +49,7 @@ def masks(*classes: tuple[int, bool]) -> InstanceCounts:
     indices = np.concatenate([np.arange(0), *(np.arange(100 * k, 100 * k + 100) for k in found)])
     labels = np.array([ids[k] for k in found], np.int64)
     every_id = [entry.id for entry in INSTANCE.scored]
-    return instance_ap.per_scene(
-        truth, np.arange(len(found) + 1) * 100, indices, labels, np.ones(len(found)), every_id
-    )
+    return instance_ap.per_scene(truth, np.arange(len(found) + 1) * 100, indices, labels, np.ones(len(found)), every_id)
 
 
 # ---- means
@@ -78,7 +76,9 @@ def test_no_file_holds_a_value_that_is_no_finite_number() -> None:
 WEIGHTS = np.array([[1, 1, 1], [0, 1, 1], [1, 0, 1], [1, 1, 0], [0, 0, 2], [0, 3, 0], [2, 0, 1]])
 
 
-def of_drawn(rules: ProtocolRules, counts: Sequence[SemanticCounts | InstanceCounts], weights: Int64Array) -> list[dict]:
+def of_drawn(
+    rules: ProtocolRules, counts: Sequence[SemanticCounts | InstanceCounts], weights: Int64Array
+) -> list[dict]:
     """The metrics over the scenes drawn, each as a scene of its own, by the function that knows no weights."""
     metric = metric_of(rules)
     return [metric.combine([counts[s] for s in range(len(counts)) for _ in range(n[s])]) for n in weights]

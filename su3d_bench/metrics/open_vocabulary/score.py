@@ -38,7 +38,9 @@ NO_CEILING = (
     "what the truth itself would score is not known: masks grow by the threshold, over their neighbours too, and each query's best mask has "
     "confidence 1, so that perfect masks with perfect features need not reach 1"
 )
-NO_QUERY_CEILING = "what the truth itself would score is not known: how well perfect masks are ranked is up to the encoder"
+NO_QUERY_CEILING = (
+    "what the truth itself would score is not known: how well perfect masks are ranked is up to the encoder"
+)
 NEEDS_FEATURES = "needs features to compare with texts, and the prediction has none"
 _BLOCK_UNITS = 2048  # 2048 units x 3407 prompts of float64 are 56 MB
 
