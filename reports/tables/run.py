@@ -31,7 +31,7 @@ def run_tables(metrics: Mapping[str, Any]) -> list[Table | Prose]:
 
 
 def headline(result: Mapping[str, Any]) -> str:
-    """One line a method and protocol: ``F-mIoU 31.2 [28.9, 33.4] (8 scenes, truth's score 97.1)``, metrics by commas."""
+    """One line a method and protocol: ``F-mIoU 31.2 [28.9, 33.4] (8 scenes, truth's score 97.1)``, by commas."""
     parts = []
     for name in result["headline"]:
         remarks = [_scenes_text(result) + " scenes"]

@@ -238,8 +238,8 @@ def _melted(scene: str, rules: ProtocolRules, values: Int64Array) -> list[str]:
     if rules.class_agnostic != "everything" or not n:
         return []
     return [
-        f"{scene}: the instance numbers begin anew with each class, and {n} of {len(objects)} objects melt with another "
-        "of their number, as in the original, which takes values modulo 1000; number the objects of a scene through"
+        f"{scene}: the instance numbers begin anew with each class, and {n} of {len(objects)} objects melt with another"
+        " of their number, as in the original, which takes values modulo 1000; number the objects of a scene through"
     ]
 
 

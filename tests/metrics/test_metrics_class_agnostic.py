@@ -140,7 +140,7 @@ def test_an_instance_id_or_more_objects_than_the_encoding_can_hold_are_refused()
         encode_without_classes(rules, 1 + number // 500, 1 + number % 500)
 
 
-# ---- what the originals answer: problems in which the order of objects, or numbers that begin anew with each class, count
+# ---- what the originals answer where the order of objects counts, or numbers begin anew with each class
 
 CASE = "agnostic01_class_after_class"
 PROBLEMS = json.loads((CASES / f"{CASE}.json").read_text())["problems"]

@@ -13,7 +13,7 @@ from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.resampling import resampled_ap
-from su3d_bench.metrics.metric import SceneScore, scene_mean
+from su3d_bench.metrics.metric import SceneScore, Values, scene_mean
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import combine, metric_of, plain_json
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate, conceptgraphs_metrics
@@ -78,13 +78,13 @@ WEIGHTS = np.array([[1, 1, 1], [0, 1, 1], [1, 0, 1], [1, 1, 0], [0, 0, 2], [0, 3
 
 def of_drawn(
     rules: ProtocolRules, counts: Sequence[SemanticCounts | InstanceCounts], weights: Int64Array
-) -> list[dict]:
+) -> list[Values]:
     """The metrics over the scenes drawn, each as a scene of its own, by the function that knows no weights."""
     metric = metric_of(rules)
     return [metric.combine([counts[s] for s in range(len(counts)) for _ in range(n[s])]) for n in weights]
 
 
-def assert_as_drawn(found: dict[str, Float64Array], expected: list[dict], names: Sequence[str]) -> None:
+def assert_as_drawn(found: dict[str, Float64Array], expected: list[Values], names: Sequence[str]) -> None:
     for name in names:
         np.testing.assert_allclose(found[name], [row[name] for row in expected], rtol=0, atol=1e-12, err_msg=name)
 
