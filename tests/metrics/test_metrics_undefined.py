@@ -36,7 +36,7 @@ def confusion(rows: dict[int, dict[int, int]], *, present: Sequence[int] = ()) -
     for true, of_row in rows.items():
         for predicted, n in of_row.items():
             table[true, predicted] = n
-    is_present = table.any(axis=1)
+    is_present = table.sum(axis=1) > 0
     is_present[list(present)] = True
     return SemanticCounts(table, is_present)
 

@@ -105,12 +105,13 @@ def conceptgraphs_metrics(
     (0.85, 0.7386)
     """
     kept: Int64Array = np.asarray(keep, np.int64)
-    square = np.ascontiguousarray(confusion[np.ix_(kept, kept)]).astype(dtype)
+    square: NDArray[Any] = np.ascontiguousarray(confusion[np.ix_(kept, kept)]).astype(dtype)
     has_none = confusion.shape[1] > confusion.shape[0]
-    n_none = confusion[kept, -1].astype(dtype) if has_none else np.zeros(len(kept), dtype)
+    n_none: NDArray[Any] = confusion[kept, -1].astype(dtype) if has_none else np.zeros(len(kept), dtype)
     hit = np.diag(square)
     # a sum beyond 2^24 rounds in float32 by its order: each row and each column by itself, as the original adds them
-    n_true = np.array([row.sum() for row in square], dtype) + n_none
+    n_true: NDArray[Any] = np.array([row.sum() for row in square], dtype)
+    n_true += n_none
     n_predicted = np.array([column.sum() for column in square.T], dtype)
     union = np.maximum(dtype(1), n_true + n_predicted - hit)
     recall = (hit / np.maximum(dtype(1), n_true)).astype(np.float64)
