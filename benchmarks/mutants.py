@@ -82,6 +82,11 @@ _PAIRS = (
 )  # fmt: skip
 # Keywords that say how a thing is done, not what comes out.
 _NO_NUMBER = frozenset({"strict", "copy", "workers", "maxsize", "balanced_tree", "compact_nodes", "cache", "nogil"})
+# Sizes that say in what portions, or in which of two equal ways, a thing is computed: assignments with them stay.
+_PORTIONS = frozenset({
+    "AT_ONCE", "MANY_ROWS", "MOST_REMEMBERED_ROWS", "MOST_SHARED", "_BLOCK_ROWS", "_BLOCK_UNITS", "_MAX_CELLS",
+    "_MAX_NEIGHBOURS",
+})  # fmt: skip
 _LEFT_ALONE = (ast.Raise, ast.Assert, ast.JoinedStr, ast.Import, ast.ImportFrom, ast.Lambda)
 _SWAPPED_NAMES = {a: b for pair in _PAIRS for a, b in (pair, pair[::-1])}
 
@@ -158,7 +163,10 @@ class _Faults(ast.NodeVisitor):
     # what is left alone
 
     def visit(self, node: ast.AST) -> None:
-        if not isinstance(node, _LEFT_ALONE):
+        is_portion = isinstance(node, ast.Assign | ast.AnnAssign) and any(
+            isinstance(part, ast.Name) and part.id in _PORTIONS for part in ast.walk(node)
+        )
+        if not isinstance(node, _LEFT_ALONE) and not is_portion:
             super().visit(node)
 
     def visit_keyword(self, node: ast.keyword) -> None:
