@@ -114,6 +114,15 @@ def test_a_mean_over_drawn_scenes_leaves_out_those_without_a_value() -> None:
     np.testing.assert_allclose(found["F-mIoU"], [0.5, NAN, 0.5, 0.5, NAN, NAN, 0.5], atol=1e-12)
 
 
+def test_a_class_of_a_single_point_has_values_in_the_scenes_that_have_it() -> None:
+    counts = [confusion({A: {A: 1}, B: {B: 3, N: 1}}), confusion({B: {B: 1}})]
+    found = metric_of(ROOM).resampled_classes(counts, np.array([[1, 1], [1, 0], [0, 1]]))
+    np.testing.assert_array_equal(found[ROOM.classes[A].name]["recall"], [1.0, 1.0, NAN])
+    np.testing.assert_array_equal(found[ROOM.classes[A].name]["IoU"], [1.0, 1.0, NAN])
+    np.testing.assert_array_equal(found[ROOM.classes[B].name]["recall"], [0.8, 0.75, 1.0])
+    assert set(found) == {ROOM.classes[A].name, ROOM.classes[B].name}
+
+
 # ---- results
 
 
