@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --quiet --disable-pip-version-check install -c constraints.txt
 DEMO_SCENES := rooms/living0 rooms/bedroom0 rooms/kitchen0 rooms/office0
 
-.PHONY: demo test test-quick proofs bench bench-methods reference architecture lint clean
+.PHONY: demo test test-quick proofs mutants bench bench-methods reference architecture lint clean
 
 demo: $(VENV)/core
 	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods opensu3d oracle --protocols rooms-semantic rooms-instance --out runs/demo
@@ -26,6 +26,11 @@ proofs: $(VENV)/test
 	$(BIN)/python benchmarks/fuzz.py --inputs 100000 --seed 1 --json build/measured/fuzz.json
 	$(BIN)/python benchmarks/kill_at_random.py --kills 200 --json build/measured/kills.json
 	if [ "$$(id -u)" = 0 ]; then $(BIN)/python benchmarks/full_disk.py --disks 20; fi
+
+# Faults planted in metrics, statistics, comparison and gate, one at a time: which do the tests not notice? Hours.
+mutants: $(VENV)/test
+	@mkdir -p build/measured
+	$(BIN)/python benchmarks/mutants.py --mutants 600 --json build/measured/mutants.json
 
 bench: $(VENV)/test
 	@mkdir -p build

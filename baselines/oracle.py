@@ -1,4 +1,4 @@
-"""The ground truth itself through the same evaluation steps: the ceiling of every protocol."""
+"""The ground truth itself through the same evaluation steps: the truth's score of every protocol."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Oracle:
         source="",
         licence="that of this project",
         needs=("ground truth",),
-        status="scores 1 where a protocol allows it; where it does not, its score is the ceiling",
+        status="scores 1 where a protocol allows it; where it does not, less, which a method may exceed",
     )
 
     class Config(BaseModel):

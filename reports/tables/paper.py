@@ -143,7 +143,7 @@ def units(row: Measured, shown: Shown) -> str:
     interval = ""
     if shown.intervals:
         interval = f"; in brackets the 95 % interval over {'items' if row.is_by_people else 'scenes'}"
-    ceiling = "; ceil.: what the truth itself scores" if shown.ceilings else ""
+    ceiling = "; (truth): what the truth itself scores" if shown.ceilings else ""
     return f"Protocol {row.protocol}, version {row.version}, on {row.datasets}; per cent{interval}{ceiling}."
 
 
@@ -162,7 +162,7 @@ def labels_of(rows: Sequence[Measured]) -> list[str]:
 
 
 def _columns(shown: Shown) -> list[str]:
-    ceilings = [f"{name} ceil." for name in shown.metrics] if shown.ceilings else []
+    ceilings = [f"{name} (truth)" for name in shown.metrics] if shown.ceilings else []
     return [*shown.metrics, *ceilings, *(["scenes"] if shown.scenes_count else [])]
 
 

@@ -40,12 +40,12 @@ def run_tables(metrics: Mapping[str, Any]) -> list[Table | Prose]:
 
 
 def headline(result: Mapping[str, Any]) -> str:
-    """One line a method and protocol: ``F-mIoU 31.2 [28.9, 33.4] (8 scenes, ceiling 97.1)``, metrics by commas."""
+    """One line a method and protocol: ``F-mIoU 31.2 [28.9, 33.4] (8 scenes, truth's score 97.1)``, by commas."""
     parts = []
     for name in result["headline"]:
         remarks = [_scenes_text(result) + " scenes"]
         if result["ceiling"] is not None:
-            remarks.append(f"ceiling {percent(result['ceiling'].get(name))}")
+            remarks.append(f"truth's score {percent(result['ceiling'].get(name))}")
         parts.append(f"{name} {_value_text(result, name)} ({', '.join(remarks)})")
     return ", ".join(parts)
 
@@ -56,7 +56,7 @@ def _protocol_table(rows: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any
     title = f"{first['protocol']} (version {first['version']})"
     if metrics["is_partial"]:
         title += f": PARTIAL, only the first {metrics['limit']} frames of each scene"
-    header = ["method", *names, f"ceiling ({' / '.join(names)})", "scenes", "covered at 2.5 / 5 / 10 cm"]
+    header = ["method", *names, f"truth's score ({' / '.join(names)})", "scenes", "covered at 2.5 / 5 / 10 cm"]
     body = [[row["method"], *(_value_text(row, name) for name in names), *_context(row, names)] for row in rows]
     body += _cheap_rows(rows, names, len(header))
     notes = [line for row in rows for line in _notes(row)]

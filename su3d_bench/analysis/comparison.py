@@ -275,9 +275,9 @@ def _own_remarks(left: Side, right: Side, protocol: str) -> list[str]:
 
 
 def _caveats(side: Side) -> list[str]:
-    """What must be known of a side's perception, and that a ceiling is one."""
+    """What must be known of a side's perception, and that the truth is one."""
     if side.method not in side.run.methods:
-        return [f"{side.name} is the ceiling: the truth itself"]
+        return [f"{side.name} is the truth itself, no system"]
     caveats = [record.caveat for (method, _), record in side.run.results.items() if method == side.method]
     return [f"{side.name}: {printable(caveat)}" for caveat in caveats if caveat]
 

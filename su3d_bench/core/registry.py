@@ -35,7 +35,7 @@ METHODS = {
     "oracle": "su3d_bench.baselines.oracle:Oracle",
     "command": "su3d_bench.baselines.command.method:Command",
 }
-CEILING_METHOD = "oracle"  # is told the truth: what it scores is the most that a protocol allows
+CEILING_METHOD = "oracle"  # is told the truth: what it scores stands beside every number, and is no bound
 GROUPS = {"dataset": "su3d_bench.datasets", "method": "su3d_bench.methods"}
 BUILT_IN = {"dataset": DATASETS, "method": METHODS}
 OF_THE_CLASS = {"dataset": ("name", "Options", "label_space", "variants"), "method": ("name", "Config")}

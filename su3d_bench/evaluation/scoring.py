@@ -212,14 +212,14 @@ def score_on_vertices(
         return SceneOutcome(score, ceiling, warnings=tuple(warnings))
     assert isinstance(content, VertexMasks)
     if rules.class_agnostic is not None:
-        is_scored = np.isin(labels, [entry.id for entry in rules.scored])
-        values = encode_without_classes(rules.class_agnostic, values % instance_ap.INSTANCES_PER_CLASS, is_scored)
+        values = encode_without_classes(rules, labels, values % instance_ap.INSTANCES_PER_CLASS)
     ids, named = _ids_of_masks(rules, content, labels, encoder)
     facts = mask_facts(content, content.scores, len(values))
     warnings = [
         *empty_warnings(scene, facts, content, content.keys),
         *duplicate_warnings(scene, facts, content.keys),
         *class_warnings(scene, rules, content.class_numbers, ids),
+        *_melted(scene, rules, truth.values),
         *named,
     ]
     return SceneOutcome(
@@ -229,6 +229,18 @@ def score_on_vertices(
         facts,
         tuple(warnings),
     )
+
+
+def _melted(scene: str, rules: ProtocolRules, values: Int64Array) -> list[str]:
+    """What must be said where a rule makes one object of those that share a number, as its original does."""
+    objects = np.unique(values[values >= instance_ap.INSTANCES_PER_CLASS])
+    n = len(objects) - len(np.unique(objects % instance_ap.INSTANCES_PER_CLASS))
+    if rules.class_agnostic != "everything" or not n:
+        return []
+    return [
+        f"{scene}: the instance numbers begin anew with each class, and {n} of {len(objects)} objects melt with another"
+        " of their number, as in the original, which takes values modulo 1000; number the objects of a scene through"
+    ]
 
 
 def _semantic_score(rules: ProtocolRules, labels: Int64Array, class_ids: np.ndarray) -> SceneScore:

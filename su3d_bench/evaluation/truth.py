@@ -222,7 +222,11 @@ class OpenLexTruths(SceneTruths):
 
 
 class TextTruths(SceneTruths):
-    """Labels of points without coordinates; whether values hold instances is told from all scenes together."""
+    """Labels of points without coordinates; whether values hold instances is told from all scenes together.
+
+    They do above the largest class id. Where all lie between 1000 and that, they are instances of the class 1 for a
+    protocol that needs instances or has no class of such an id, and class ids for the others; both with a doubt.
+    """
 
     has_points = False
 
@@ -243,9 +247,8 @@ class TextTruths(SceneTruths):
         requested = chosen if request.scenes else ()
         self.matches, self.remarks = match_scenes(sources, chosen, self.dataset_name, self.where, requested)
         self._values = {match.scene: read_values(self._files[match.scene]) for match in self.matches}
-        largest = max((int(values.max(initial=0)) for values in self._values.values()), default=0)
-        self._has_instances = largest > LARGEST_LABEL
-        self._largest_label = self._label(largest)
+        self._lowest, self._highest = _range(self._values.values())
+        self._largest = self._highest
         if self.matches and self.dataset_name is None and not request.protocols:
             raise ConfigError(
                 f"{self.where}: whose labels are these? name the protocol with --protocol or the dataset with --dataset"
@@ -256,29 +259,54 @@ class TextTruths(SceneTruths):
             return _why_no_queries(is_named=is_named)
         if rules.is_judged and not is_named:
             return f"{NOT_MEANT} texts"
-        facts = TruthFacts(self.where, None, (), has_points=False, has_instances=self._has_instances)
+        has_instances = self._has_instances(rules)
+        facts = TruthFacts(self.where, None, (), has_points=False, has_instances=has_instances)
         reason = why_not_truth(rules, facts)
+        if reason is not None and rules.needs_instances and not has_instances:
+            return self._why_no_instances()
         if reason is not None or is_named:
             return reason
         if self.dataset_name not in rules.datasets:
             return f"{NOT_MEANT} {self.dataset_name}"
-        variant = list_of_ids(self._largest_label)
+        variant = list_of_ids(self._largest_label(rules))
         fits = variant == rules.ground_truth or rules.ground_truth not in ID_LISTS
         return None if fits else f"the labels of the ground truth are '{variant}'"
 
     def of_scene(self, rules: ProtocolRules, scene: str) -> VertexTruth:
         if scene not in self._values:  # missed: the doubts speak of all that are scored
             self._values |= {name: read_values(file) for name, file in self._files.items() if name not in self._values}
-            self._largest_label = self._label(max(int(values.max(initial=0)) for values in self._values.values()))
+            _, self._largest = _range(self._values.values())
         values = self._values[scene]
-        labels = values // INSTANCES_PER_CLASS if self._has_instances else values
+        labels = values // INSTANCES_PER_CLASS if self._has_instances(rules) else values
         return VertexTruth(values, labels, self._doubts(rules))
 
-    def _label(self, value: int) -> int:
-        return value // INSTANCES_PER_CLASS if self._has_instances else value
+    @property
+    def _may_be_either(self) -> bool:
+        return INSTANCES_PER_CLASS < self._lowest <= self._highest <= LARGEST_LABEL
+
+    def _has_instances(self, rules: ProtocolRules) -> bool:
+        if not self._may_be_either:
+            return self._highest > LARGEST_LABEL
+        is_id = any(self._lowest <= entry.id <= self._highest for entry in rules.classes)
+        return rules.needs_instances or not is_id
+
+    def _largest_label(self, rules: ProtocolRules) -> int:
+        return self._largest // INSTANCES_PER_CLASS if self._has_instances(rules) else self._largest
+
+    def _why_no_instances(self) -> str:
+        if not self._highest:
+            return "needs instances, and every value of the ground truth is 0: nothing is annotated"
+        return (
+            f"needs instances, and the values of the ground truth, {self._lowest} to {self._highest}, are taken for "
+            f"class ids alone: class id * 1000 + instance is never below 1000, and above {LARGEST_LABEL} somewhere "
+            "unless all objects are of class 1"
+        )
 
     def _doubts(self, rules: ProtocolRules) -> tuple[str, ...]:
-        largest = self._largest_label
+        if self._may_be_either:
+            taken = "class 1 * 1000 + instance" if self._has_instances(rules) else "class ids"
+            return (f"every value of the ground truth is from {self._lowest} to {self._highest}: taken for {taken}",)
+        largest = self._largest_label(rules)
         if rules.ground_truth == "nyu40-vertices" and largest > LARGEST_NYU40_ID:
             return (
                 f"the ground truth holds the label {largest}, NYU40 ends at {LARGEST_NYU40_ID}: are these raw ids "
@@ -287,6 +315,13 @@ class TextTruths(SceneTruths):
         if rules.ground_truth == "scannet200-vertices" and largest <= LARGEST_NYU40_ID:
             return (f"the largest label of the ground truth is {largest}: are these NYU40 ids?",)
         return ()
+
+
+def _range(scenes: Iterable[Int64Array]) -> tuple[int, int]:
+    """The lowest value that is no 0, and the highest; both 0 where nothing is annotated."""
+    annotated = [values[values > 0] for values in scenes if values.any()]
+    lowest = min((int(values.min()) for values in annotated), default=0)
+    return lowest, max((int(values.max()) for values in annotated), default=0)
 
 
 def text_scenes(folder: Path) -> dict[str, Path]:

@@ -117,7 +117,7 @@ def _remarks(plan: Plan, outcomes: Sequence[MethodOutcome]) -> tuple[str, ...]:
     reported = {(outcome.scene, why) for outcome, _, why in reasons}
     for outcome in outcomes:
         if outcome.error is not None and outcome.scene not in failed and (outcome.scene, outcome.error) not in reported:
-            lines.append(f"{outcome.scene}: no ceiling: {outcome.error}")
+            lines.append(f"{outcome.scene}: no score of the truth: {outcome.error}")
     return tuple(dict.fromkeys(lines))
 
 

@@ -248,7 +248,7 @@ def test_two_methods_of_one_run_are_compared() -> None:
     found = compare("b:collector", "b:oracle")
     assert (found.protocols[0].left, found.protocols[0].right) == ("collector", "oracle")
     assert found.protocols[1].metrics["AP"].right == 1.0
-    assert "b:oracle is the ceiling: the truth itself" in found.remarks
+    assert "b:oracle is the truth itself, no system" in found.remarks
 
 
 def test_the_only_methods_of_two_runs_are_compared_whatever_their_names() -> None:

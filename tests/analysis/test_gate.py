@@ -15,7 +15,7 @@ import pytest
 from painted import colour_perception
 from places import SCENES
 
-from su3d_bench.analysis.gate import Reference, check, learn, read_reference
+from su3d_bench.analysis.gate import HIGHER_IS_BETTER, Reference, Value, check, learn, read_reference
 from su3d_bench.cli.main import main
 from su3d_bench.reports.gate import Finding, Verdict, github_lines, junit_xml, markdown, plain_lines
 from su3d_bench.runs import scene as scene_run
@@ -204,6 +204,56 @@ def test_the_tolerance_is_twice_the_spread_of_the_taught_runs(run: Path, made: P
     assert check(read_run(tmp_path / "third"), taught).is_passed
     lowered("metrics", "mAcc", by=0.0002)(tmp_path / "third")
     assert not check(read_run(tmp_path / "third"), taught).is_passed
+
+
+def one_metric(reference: Reference, name: str, value: Value, across_machines: float = 0.0) -> Reference:
+    """A reference that knows a single headline value of the first result, and no scenes, classes and costs."""
+    first, *others = reference.results
+    first = first.model_copy(update={"metrics": {name: value}, "scenes": {}, "classes": {}})
+    update = {"results": (first, *others), "costs": {}, "across_machines": across_machines}
+    return reference.model_copy(update=update)
+
+
+def measured(run: Path, name: str, value: float) -> Path:
+    edit(run / "metrics.json", lambda m: results_of(m)["metrics"].update({name: value}))
+    return run
+
+
+def test_a_value_that_differs_by_just_the_tolerance_passes_and_by_a_bit_more_fails(
+    run: Path, reference: Reference
+) -> None:
+    taught = one_metric(reference, "mAcc", Value(value=0.75, tolerance=0.25))
+    for value, is_passed in ((0.5, True), (1.0, True), (np.nextafter(0.5, 0), False)):
+        verdict = check(read_run(measured(run, "mAcc", float(value))), taught)
+        assert verdict.is_passed == is_passed
+        assert len(verdict.findings) == (not is_passed)
+
+
+@pytest.mark.parametrize(("own", "across"), [(0.25, 0.125), (0.125, 0.25)])
+def test_on_another_processor_the_larger_of_the_two_tolerances_counts(
+    own: float, across: float, run: Path, reference: Reference
+) -> None:
+    edit(run / "run.json", lambda r: r.update(processor="other"))
+    taught = one_metric(reference, "mAcc", Value(value=0.75, tolerance=own), across)
+    assert check(read_run(measured(run, "mAcc", 0.5)), taught).is_passed
+    assert not check(read_run(measured(run, "mAcc", 0.4375)), taught).is_passed
+
+
+def test_on_the_same_processor_the_tolerance_of_other_machines_does_not_count(run: Path, reference: Reference) -> None:
+    taught = one_metric(reference, "mAcc", Value(value=0.75, tolerance=0.125), 0.25)
+    assert not check(read_run(measured(run, "mAcc", 0.5)), taught).is_passed
+
+
+@pytest.mark.parametrize("value", [0.25, 0.75])
+def test_a_value_without_a_better_direction_may_move_in_neither(value: float, run: Path, reference: Reference) -> None:
+    assert "over-merged" not in HIGHER_IS_BETTER
+    taught = one_metric(reference, "over-merged", Value(value=0.5))
+    verdict = check(read_run(measured(run, "over-merged", value)), taught)
+    assert [(one.kind, one.text) for one in verdict.findings] == [("regression", "differs from the reference")]
+    assert not verdict.is_passed
+    taught = one_metric(reference, "mAcc", Value(value=0.5))
+    verdict = check(read_run(measured(run, "mAcc", value)), taught)
+    assert [one.kind for one in verdict.findings] == ["better" if value > 0.5 else "regression"]
 
 
 def busier(costs: Any, factor: float) -> None:

@@ -107,8 +107,32 @@ def test_labels_of_another_list_are_doubted(tmp_path: Path) -> None:
 def test_instance_protocols_refuse_a_truth_of_labels_alone(tmp_path: Path) -> None:
     write_truth(tmp_path / "gt", values=TRUTH // 1000)
     write_scannet_text(tmp_path / "pred", scene([CHAIR], [5]))
-    with pytest.raises(ConfigError, match=r"scannet-instance.*needs instances, the ground truth holds class ids alone"):
+    with pytest.raises(
+        ConfigError, match=r"scannet-instance.*needs instances, .* 1 to 7, are taken for class ids alone"
+    ):
         numbers(tmp_path)
+    write_truth(tmp_path / "gt", values=np.repeat([7, 1001, 0], 200))
+    with pytest.raises(ConfigError, match=r"7 to 1001, are taken for class ids alone: class id \* 1000 \+ instance is"):
+        numbers(tmp_path)
+    write_truth(tmp_path / "gt", values=np.zeros(600, int))
+    with pytest.raises(ConfigError, match=r"every value of the ground truth is 0: nothing is annotated"):
+        numbers(tmp_path)
+
+
+def test_low_values_that_can_be_instances_of_class_1_are_these_where_instances_are_needed(tmp_path: Path) -> None:
+    write_truth(tmp_path / "gt", values=np.repeat([1001, 1357, 0], 200))
+    write_scannet_text(tmp_path / "pred", scene([CHAIR, TABLE], [1, 1]))
+    found = numbers(tmp_path, "class-agnostic-segment3d")
+    assert found["metrics"] == {"ap": 1.0, "ap50": 1.0, "ap25": 1.0}
+    said(found, "every value of the ground truth is from 1001 to 1357: taken for class 1 * 1000 + instance")
+    write_truth(tmp_path / "labels", values=np.repeat([1163, 1170, 0], 200))  # object, bottle: ids of ScanNet200
+    (tmp_path / "points").mkdir()
+    (tmp_path / "points/scene0001_00.txt").write_text("1163\n" * 400 + "0\n" * 200)
+    for protocol, recall, taken in (("scannet200-semantic", 0.5, "class ids"), ("scannet-semantic", 0.0, "class 1 *")):
+        request = Request((tmp_path / "points",), ground_truth=tmp_path / "labels", protocols=(protocol,))
+        scored = evaluate(request).to_json()["protocols"][protocol]
+        assert scored["metrics"]["macc"] == recall
+        said(scored, f"every value of the ground truth is from 1163 to 1170: taken for {taken}")
 
 
 def test_labels_of_points_may_be_held_against_a_truth_with_instances(tmp_path: Path) -> None:
@@ -149,6 +173,29 @@ def test_masks_without_classes_are_scored_where_classes_do_not_count(tmp_path: P
     assert numbers(tmp_path, "class-agnostic-segment3d")["metrics"]["ap"] == 1.0
     with pytest.raises(PredictionError, match="scene0001_00: scannet-instance: needs classes"):
         numbers(tmp_path)
+
+
+def test_instance_numbers_that_begin_anew_with_each_class_stay_objects_where_the_original_keeps_them(
+    tmp_path: Path,
+) -> None:
+    write_truth(tmp_path / "gt", values=np.repeat([4001, 5001, 6001], 200))
+    write_scannet_text(tmp_path / "pred", scene([CHAIR, TABLE, np.arange(400, 600)], [5, 5, 5]))
+    for name in ("class-agnostic-open3dis", "class-agnostic-segment3d"):
+        found = numbers(tmp_path, name)
+        assert found["metrics"] == {"ap": 1.0, "ap50": 1.0, "ap25": 1.0}
+        assert not [line for line in found["warnings"] if "begin anew" in line]
+    melted = numbers(tmp_path, "class-agnostic-maskclustering")
+    assert melted["metrics"]["ap50"] == 0.0
+    assert "and 2 of 3 objects melt with another" in said(melted, "scene0001_00: the instance numbers begin anew")
+
+
+def test_a_method_may_exceed_the_score_of_the_truth_where_a_rule_counts_what_the_truth_leaves_out(
+    tmp_path: Path,
+) -> None:
+    write_truth(tmp_path / "gt", values=np.repeat([5001, 7002, 0], 200))
+    write_scannet_text(tmp_path / "pred", scene([CHAIR, TABLE, np.arange(400, 600)], [5, 7, 5]))
+    found = numbers(tmp_path, "class-agnostic-maskclustering")
+    assert found["metrics"]["ap"] == 1.0 > found["ceiling"]["ap"] == pytest.approx(2 / 3)
 
 
 def test_masks_of_class_0_alone_are_class_agnostic(tmp_path: Path) -> None:

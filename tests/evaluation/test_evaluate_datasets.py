@@ -137,7 +137,7 @@ def test_openlex3ds_queries_are_scored_against_its_release(tmp_path: Path, monke
     one = found["protocols"]["openlex3d-queries"]
     assert one["per_scene"]["room0"]["ap25"] > 0
     assert one["ceiling"] is None
-    assert said(one, "no ceiling is known: masks grow by the threshold")
+    assert said(one, "what the truth itself would score is not known: masks grow by the threshold")
     assert found["not_scored"]["replica-openmask3d"] == "is not meant for the labels of OpenLex3D"
     assert "visible" in found["not_scored"]["openlex3d-topn"]  # the cloud of visible points is not in this folder
     (tmp_path / "lex/replica/room0" / VISIBLE_NAME).write_text(header + tail)

@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
 import pytest
+from places import CASES
 from scored_room import instances
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, LabelSet, Partition
+from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, LabelSet, Masks, Partition
+from su3d_bench.metrics.instance.average_precision import combine as combine_counts
 from su3d_bench.metrics.instance.average_precision import per_scene
 from su3d_bench.metrics.instance.score import encode_without_classes
 from su3d_bench.metrics.protocols import load_protocol
@@ -17,6 +21,7 @@ from su3d_bench.metrics.scoring import combine, score_scene
 
 NAMES = ("class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d")
 CHAIR, WALL, OTHER = 2, 1, 1000  # 1000 is none of the 200
+IDS = [entry.id for entry in load_protocol("class-agnostic-open3dis").scored]
 LABELS = LabelSet("scannet", (CHAIR, WALL, OTHER), ("chair", "wall", "gadget"))
 N = 200
 
@@ -125,6 +130,55 @@ def test_results_name_the_one_class_object_and_no_group() -> None:
     assert told == ("not scored, because no scene has an instance of 100 points: 'object'",)
 
 
-def test_an_instance_id_that_the_encoding_cannot_hold_is_refused() -> None:
+def test_an_instance_id_or_more_objects_than_the_encoding_can_hold_are_refused() -> None:
+    rules = load_protocol("class-agnostic-segment3d")
     with pytest.raises(DataError, match="instance id 1000 would spill into the next class"):
-        encode_without_classes("annotated", np.array([1000]), np.array([True]))
+        encode_without_classes(rules, np.array([CHAIR]), np.array([1000]))
+    number = np.arange(1000)
+    assert encode_without_classes(rules, 1 + number[:999] // 500, 1 + number[:999] % 500).tolist()[-1] == 1999
+    with pytest.raises(DataError, match="has 1000 objects; without classes a scene may have 999"):
+        encode_without_classes(rules, 1 + number // 500, 1 + number % 500)
+
+
+# ---- what the originals answer where the order of objects counts, or numbers begin anew with each class
+
+CASE = "agnostic01_class_after_class"
+PROBLEMS = json.loads((CASES / f"{CASE}.json").read_text())["problems"]
+
+
+def problem(index: int) -> Iterator[tuple[np.ndarray, list[np.ndarray]]]:
+    """The truth, label * 1000 + instance, and the masks of each scene."""
+    with np.load(CASES / f"{CASE}.npz") as archive:
+        for s in range(PROBLEMS[index]["n_scenes"]):
+            values = archive[f"gt_{index}_{s}"]
+            packed = archive[f"masks_packed_{index}_{s}"]
+            yield values, [np.flatnonzero(row) for row in np.unpackbits(packed, axis=1)[:, : len(values)]]
+
+
+@pytest.mark.parametrize("name", ["open3dis", "segment3d"])
+@pytest.mark.parametrize("index", range(len(PROBLEMS)))
+def test_objects_are_matched_class_after_class_to_the_bits_of_the_original(index: int, name: str) -> None:
+    rules = load_protocol(f"class-agnostic-{name}")
+    scores = {}
+    for s, (values, masks) in enumerate(problem(index)):
+        labels = LabelSet(
+            "scannet", tuple(np.unique(values // 1000).tolist()), tuple(map(str, np.unique(values // 1000)))
+        )
+        points = np.random.default_rng(s).random((len(values), 3)).astype(np.float32)
+        truth = GroundTruth(points, values // 1000, values % 1000, labels, "scannet200-vertices", "made for a test")
+        scores[f"scene{s}"] = score_scene(rules, truth, instances(points, masks, None), None)
+    found = combine(rules, scores).metrics
+    assert [found["AP"], found["AP50"], found["AP25"]] == list(PROBLEMS[index][name].values())
+
+
+def test_the_cases_tell_the_order_of_instance_numbers_from_that_of_classes() -> None:
+    rules = load_protocol("class-agnostic-open3dis")
+    n_other = 0
+    for index in range(len(PROBLEMS)):
+        counts = []
+        for values, sets in problem(index):
+            melted = encode_without_classes(rules, np.where(np.isin(values // 1000, IDS), CHAIR, 0), values % 1000)
+            masks, ones = Masks.of_sets(sets), np.ones(len(sets))
+            counts.append(per_scene(melted, masks.indptr, masks.indices, ones.astype(int), ones, [1]))
+        n_other += combine_counts(counts).ap25 != PROBLEMS[index]["open3dis"]["ap25"]
+    assert n_other >= 10

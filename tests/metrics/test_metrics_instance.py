@@ -62,6 +62,17 @@ def is_same(value: float, expected: float | None) -> bool:
     return np.isnan(value) if expected is None else value == expected
 
 
+def test_a_number_above_all_others_gives_what_the_refused_infinity_would() -> None:
+    truth = np.repeat([5001, 5002, 7001], 200)
+    masks = [np.arange(200), np.arange(400, 600), np.arange(200, 400)]  # a hit, a false positive, a hit
+    indptr, indices = np.array([0, 200, 400, 600]), np.concatenate(masks)
+    for above in (0.9, 1e300):
+        counts = per_scene(truth, indptr, indices, np.full(3, 5), np.array([above, 0.8, 0.1]), [5, 7])
+        assert combine([counts]).of_class(0)[1] == pytest.approx((2 / 3 + 1 / 2 + 1 + 1) / 4)
+    with pytest.raises(PredictionError, match="instance 0: its confidence is inf; confidences are finite numbers"):
+        per_scene(truth, indptr, indices, np.full(3, 5), np.array([np.inf, 0.8, 0.1]), [5, 7])
+
+
 def test_the_thresholds_are_the_original_doubles() -> None:
     _, expected = load("inst01_basic")
     assert list(THRESHOLDS) == expected["official_py3_pr26"]["overlaps"]

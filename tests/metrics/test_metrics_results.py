@@ -255,7 +255,7 @@ def test_scores_of_another_version_are_refused() -> None:
     score = score_scene(ROOM, *noisy(0), None)
     newer: ProtocolRules = ROOM.model_copy(update={"version": ROOM.version + 1})
     with pytest.raises(
-        DataError, match="rooms/a: was scored under rooms-semantic version 1, not rooms-semantic version 2; score"
+        DataError, match="rooms/a: was scored under rooms-semantic version 2, not rooms-semantic version 3; score"
     ):
         combine(newer, {"rooms/a": score})
     with pytest.raises(DataError, match="no scene was scored"):

@@ -105,6 +105,18 @@ def test_a_partition_scores_as_the_same_instances() -> None:
         assert headline(name, truth, partition) == [1.0] * len(load_protocol(name).headline)
 
 
+def test_a_partition_into_nothing_scores_zero_and_one_beyond_its_features_is_refused() -> None:
+    truth = room()
+    nowhere = np.full(len(truth.points), -1, np.int32)
+    empty = Partition(truth.points, nowhere, np.zeros((0, OneHotEncoder().dim), np.float32))
+    for name in (*SEMANTIC, *INSTANCE):
+        assert headline(name, truth, empty) == [0.0] * len(load_protocol(name).headline)
+    one = replace(empty, features=np.ones((1, OneHotEncoder().dim), np.float32))
+    assert headline("rooms-instance", truth, one) == [0.0, 0.0, 0.0]
+    with pytest.raises(PredictionError, match="needs one row of its 1 features a point, -1 for none"):
+        headline("rooms-instance", truth, replace(one, instance=np.where(np.arange(len(nowhere)) == 5, 1, nowhere)))
+
+
 def test_dense_features_score_as_the_same_instances_under_a_semantic_protocol() -> None:
     truth = room()
     encoder = OneHotEncoder()

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from hypothesis.extra import numpy as hnp
 from places import CASES
 
 from su3d_bench.metrics.semantic.confusion import (
@@ -33,6 +32,7 @@ CONCEPTGRAPHS_CASES = {
     "scene B": (POOLING["B"], POOLING["keepB"], POOLING["metricsB"]),
     "pooled": (POOLING["all"], POOLING["keep_all"], POOLING["metrics_all"]),
 }
+FLOAT32_CASES = {case["what"]: case for case in GOLDEN["cg_float32"]["cases"]}
 SCANNET_CASES = ("sem01_all_classes", "sem02_missing_classes", "sem03_no_valid_gt", "sem04_perfect")
 
 
@@ -64,6 +64,19 @@ def test_float64_differs_from_the_golden_values_by_less_than_float32_rounding(ca
     ours = as_golden(conceptgraphs_metrics(np.array(confusion), np.array(keep)))
     for key, value in expected.items():
         np.testing.assert_allclose(ours[key], value, rtol=0, atol=6e-8)
+
+
+@pytest.mark.parametrize("what", FLOAT32_CASES)
+def test_float32_rounds_where_the_original_rounds(what: str) -> None:
+    confusion, expected = np.array(FLOAT32_CASES[what]["conf"]), FLOAT32_CASES[what]["metrics"]
+    assert as_golden(conceptgraphs_metrics(confusion, np.arange(len(confusion)), np.float32)) == expected
+
+
+def test_classes_above_a_level_are_counted_in_float32_by_default_too() -> None:
+    case = FLOAT32_CASES["an IoU of 3/20 is above 0.15"]
+    metrics = conceptgraphs_metrics(np.array(case["conf"]), np.arange(3))
+    assert metrics.iou[0] == 0.15
+    assert metrics.n_classes_above[0] == case["metrics"]["acc0.15"] == 3
 
 
 def test_the_printed_golden_figures_come_out() -> None:
@@ -117,12 +130,9 @@ def test_scannet_counts_a_predicted_only_class_as_zero_and_leaves_out_one_that_n
     assert np.isnan(metrics.iou[2])
 
 
-@given(st.data())
-def test_counts_of_parts_add_up_to_the_whole(data: st.DataObject) -> None:
-    n = data.draw(st.integers(0, 60))
-    cut = data.draw(st.integers(0, n))
-    truth = data.draw(hnp.arrays(np.int64, n, elements=st.integers(-1, 4)))
-    predicted = data.draw(hnp.arrays(np.int64, n, elements=st.integers(-1, 4)))
+@given(st.lists(st.tuples(st.integers(-1, 4), st.integers(-1, 4)), max_size=60), st.integers(0, 60))
+def test_counts_of_parts_add_up_to_the_whole(points: list[tuple[int, int]], cut: int) -> None:
+    truth, predicted = np.array(points, np.int64).reshape(-1, 2).T
     present = np.ones(5, bool)
     parts = [per_scene(truth[:cut], predicted[:cut], present), per_scene(truth[cut:], predicted[cut:], present)]
     assert np.array_equal(concatenate(parts).confusion, per_scene(truth, predicted, present).confusion)

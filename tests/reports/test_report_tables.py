@@ -50,9 +50,9 @@ def test_published_rows_can_be_left_out() -> None:
     assert len(table.rows) == 1
 
 
-def test_intervals_ceilings_and_scenes_are_shown_on_request() -> None:
+def test_intervals_scores_of_the_truth_and_scenes_are_shown_on_request() -> None:
     table = protocol_table([measured()], Shown(intervals=True, ceilings=True, scenes_count=True), [])
-    assert table.columns == ("mAcc", "F-mIoU", "mAcc ceil.", "F-mIoU ceil.", "scenes")
+    assert table.columns == ("mAcc", "F-mIoU", "mAcc (truth)", "F-mIoU (truth)", "scenes")
     assert texts(table) == [["opensu3d", "40.0 [35.0, 45.0]", "20.0", "98.0", "100.0", "8"]]
     assert protocol_table([measured()], Shown(), []).columns == ("mAcc", "F-mIoU")
 

@@ -47,7 +47,7 @@ def test_a_row_shows_value_interval_ceiling_scenes_and_coverage() -> None:
 
 def test_a_headline_reads_as_the_house_style_has_it() -> None:
     one = result(headline=["mAcc"])
-    assert headline(one) == "mAcc 40.8 [38.9, 42.6] (8 scenes, ceiling 97.1)"
+    assert headline(one) == "mAcc 40.8 [38.9, 42.6] (8 scenes, truth's score 97.1)"
 
 
 def test_columns_line_up_as_plain_text() -> None:

@@ -121,7 +121,7 @@ function dataTable({ caption, columns, rows, filter, tall, sortBy, descending, o
 }
 
 function whisker(value, interval, ceiling) {
-  // 0 to 100 %: a dot at the value, a line over its interval, a tick at the ceiling.
+  // 0 to 100 %: a dot at the value, a line over its interval, a tick at the truth's score.
   const width = 104, x = (v) => 2 + Math.min(1, Math.max(0, v)) * (width - 4);
   if (!isNumber(value)) return null;
   return svg('svg', { width, height: 10, viewBox: `0 0 ${width} 10`, 'aria-hidden': 'true' },

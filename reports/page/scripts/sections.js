@@ -117,8 +117,8 @@ const isPooled = (one) =>
   !!one.result && one.headline.every((metric) => one.result.metrics[metric] === one.result.pooled[metric]);
 
 function summarySection() {
-  part('summary', 'Summary', 'Per cent with the 95 % interval over scenes. The tick on a line is the ceiling: what the '
-    + 'truth itself scores. The best is bold where all rows are of the same scenes and frames.', (section) => {
+  part('summary', 'Summary', 'Per cent with the 95 % interval over scenes. The tick on a line is what the truth itself '
+    + 'scores, no bound. The best is bold where all rows are of the same scenes and frames.', (section) => {
     const warn = (...content) => section.append(h('p', { class: 'note warn' }, content));
     for (const [index, run] of RUNS.entries()) {
       const where = RUNS.length > 1 ? `${runNames[index]}: ` : '';
@@ -160,7 +160,7 @@ function summaryTable(rows) {
     columns: [
       { label: 'Method', value: nameOf },
       ...metrics.map(column),
-      { label: 'Ceiling', num: true, value: (one) => (one.ceiling ? one.ceiling[metrics[0]] : null),
+      { label: 'Truth’s score', num: true, value: (one) => (one.ceiling ? one.ceiling[metrics[0]] : null),
         show: (one) => (one.ceiling ? ceilings(one) : '–') },
       { label: 'Scenes', num: true, value: (one) => (one.result ? one.result.scenes.length : 0), show: scenesText },
       { label: 'Within 5 cm', num: true, value: covered, show: (one) => percent(covered(one)) },

@@ -47,7 +47,7 @@ def add_parser(actions: Any) -> None:
     ):
         parser.add_argument(f"--{name}", nargs="+", default=[], metavar=name[:-1].upper(), help=what)
     parser.add_argument("--intervals", action="store_true", help="show the 95 %% interval over scenes")
-    parser.add_argument("--ceilings", action="store_true", help="show what the truth itself scores")
+    parser.add_argument("--truth-scores", action="store_true", help="show what the truth itself scores")
     parser.add_argument(
         "--scenes-count", action="store_true", help="show the number of scenes even where none is missing"
     )
@@ -80,7 +80,7 @@ def _tables(arguments: argparse.Namespace) -> list[Table]:
     shown = Shown(
         metrics=tuple(arguments.metrics),
         intervals=arguments.intervals,
-        ceilings=arguments.ceilings,
+        ceilings=arguments.truth_scores,
         scenes_count=arguments.scenes_count,
         only_significant=arguments.significant,
     )

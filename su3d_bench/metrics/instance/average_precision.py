@@ -333,6 +333,7 @@ def _check_predictions(
         raise PredictionError(
             f"{n_predictions} labels, {len(indptr) - 1} masks, {len(scores)} scores; they must pair up"
         )
+    # the original ranks inf above all numbers; here it is taken for an overflow, in which order was lost (README.md)
     if not np.isfinite(scores).all():
         bad = int(np.flatnonzero(~np.isfinite(scores))[0])
         raise PredictionError(f"instance {bad}: its confidence is {scores[bad]}; confidences are finite numbers")

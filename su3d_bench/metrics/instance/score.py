@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -156,13 +156,11 @@ def _truth_and_labels(
     rules: ProtocolRules, truth: GroundTruth, prediction: Instances | Partition, encoder: Encoder | None
 ) -> tuple[Int64Array, list[int], Int64Array]:
     """The truth as label * 1000 + instance, the labels that are scored, and the label of each prediction."""
-    scored_ids = [entry.id for entry in rules.scored]
     if rules.class_agnostic is not None:
-        has_scored_class = np.isin(truth.semantic, scored_ids)
-        values = encode_without_classes(rules.class_agnostic, truth.instance, has_scored_class)
+        values = encode_without_classes(rules, truth.semantic, truth.instance)
         return values, [OBJECT], np.full(n_predictions(prediction), OBJECT)
     values = instance_ap.encode_ground_truth(truth.semantic, truth.instance)
-    return values, scored_ids, named_classes(rules, truth.semantic, prediction, encoder)
+    return values, [entry.id for entry in rules.scored], named_classes(rules, truth.semantic, prediction, encoder)
 
 
 def named_classes(
@@ -175,27 +173,36 @@ def named_classes(
     return np.where(classes >= 0, ids[classes], 0)
 
 
-def encode_without_classes(
-    rule: Literal["scored", "annotated", "everything"], instance: IntArray, has_scored_class: BoolArray
-) -> Int64Array:
-    """One value a point, 1000 + instance, and 0 where it is void.
+def encode_without_classes(rules: ProtocolRules, semantic: IntArray, instance: IntArray) -> Int64Array:
+    """One value a point, 1000 + the number of its object, and 0 where it is void, by the rule ``class_agnostic``.
 
-    ``scored``: what has no scored class is void. ``annotated``: only points without an instance are.
-    ``everything``: nothing is; the points without an instance are one more instance, of the value 1000.
+    ``scored``: what has no scored class is void. ``annotated``: only points without an instance are. Both number the
+    objects from 1, class after class and in each by instance number, in the order in which the originals match them;
+    equal instance numbers of two classes are two objects. ``everything``: nothing is void, points without an instance
+    are one more, of the value 1000, and equal instance numbers are one object, for the original takes them modulo 1000.
 
-    >>> instance, has_scored_class = np.array([0, 1, 2]), np.array([False, False, True])
-    >>> encode_without_classes("scored", instance, has_scored_class).tolist()
-    [0, 0, 1002]
-    >>> encode_without_classes("annotated", instance, has_scored_class).tolist()
-    [0, 1001, 1002]
-    >>> encode_without_classes("everything", instance, has_scored_class).tolist()
-    [1000, 1001, 1002]
+    >>> from su3d_bench.metrics.protocols import load_protocol
+    >>> semantic, instance = np.array([0, 1, 5, 2, 5]), np.array([0, 1, 1, 3, 2])  # 1 is the wall
+    >>> names = ("open3dis", "segment3d", "maskclustering")
+    >>> each = [load_protocol(f"class-agnostic-{name}") for name in names]
+    >>> [encode_without_classes(rules, semantic, instance).tolist() for rules in each]
+    [[0, 0, 1002, 1001, 1003], [0, 1001, 1003, 1002, 1004], [1000, 1001, 1001, 1003, 1002]]
     """
     values = instance_ap.encode_ground_truth(np.full(len(instance), OBJECT), instance)
-    if rule == "everything":
+    if rules.class_agnostic == "everything":
         values[np.asarray(instance) == 0] = OBJECT * instance_ap.INSTANCES_PER_CLASS
-    elif rule == "scored":
-        values[~has_scored_class] = 0
+        return values
+    label = np.asarray(semantic, np.int64)
+    if rules.class_agnostic == "scored":
+        label = class_index_of_ids(rules, label)
+        values[~np.append(scored_classes(rules), False)[label]] = 0
+    is_object = values > 0
+    key = label[is_object] * instance_ap.INSTANCES_PER_CLASS + np.asarray(instance)[is_object]
+    distinct, number = np.unique(key, return_inverse=True)
+    if len(distinct) >= instance_ap.INSTANCES_PER_CLASS:
+        most = instance_ap.INSTANCES_PER_CLASS - 1
+        raise DataError(f"ground truth: has {len(distinct)} objects; without classes a scene may have {most}")
+    values[is_object] = OBJECT * instance_ap.INSTANCES_PER_CLASS + 1 + number
     return values
 
 

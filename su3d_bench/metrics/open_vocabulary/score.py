@@ -34,11 +34,12 @@ from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.store.scratch import release_pages
 
+_NOT_KNOWN = "what the truth itself would score is not known"
 NO_CEILING = (
-    "no ceiling is known: masks grow by the threshold, over their neighbours too, and each query's best mask has "
+    f"{_NOT_KNOWN}: masks grow by the threshold, over their neighbours too, and each query's best mask has "
     "confidence 1, so that perfect masks with perfect features need not reach 1"
 )
-NO_QUERY_CEILING = "no ceiling is known: how well perfect masks are ranked is up to the encoder"
+NO_QUERY_CEILING = f"{_NOT_KNOWN}: how well perfect masks are ranked is up to the encoder"
 NEEDS_FEATURES = "needs features to compare with texts, and the prediction has none"
 _BLOCK_UNITS = 2048  # 2048 units x 3407 prompts of float64 are 56 MB
 

@@ -105,23 +105,33 @@ def conceptgraphs_metrics(
     (0.85, 0.7386)
     """
     kept: Int64Array = np.asarray(keep, np.int64)
-    square = confusion[np.ix_(kept, kept)]
-    n_none = confusion[kept, -1] if confusion.shape[1] > confusion.shape[0] else np.zeros(len(kept), confusion.dtype)
-    hit = np.diag(square).astype(dtype)
-    n_true = (square.sum(axis=1) + n_none).astype(dtype)
-    n_predicted = square.sum(axis=0).astype(dtype)
-    one = dtype(1)
-    recall = (hit / np.maximum(one, n_true)).astype(np.float64)
-    precision = (hit / np.maximum(one, n_predicted)).astype(np.float64)
-    iou = (hit / np.maximum(one, n_true + n_predicted - hit)).astype(np.float64)
+    square: NDArray[Any] = np.ascontiguousarray(confusion[np.ix_(kept, kept)]).astype(dtype)
+    has_none = confusion.shape[1] > confusion.shape[0]
+    n_none: NDArray[Any] = confusion[kept, -1].astype(dtype) if has_none else np.zeros(len(kept), dtype)
+    hit = np.diag(square)
+    # a sum beyond 2^24 rounds in float32 by its order: each row and each column by itself, as the original adds them
+    n_true: NDArray[Any] = np.array([row.sum() for row in square], dtype)
+    n_true += n_none
+    n_predicted = np.array([column.sum() for column in square.T], dtype)
+    union = np.maximum(dtype(1), n_true + n_predicted - hit)
+    recall = (hit / np.maximum(dtype(1), n_true)).astype(np.float64)
+    precision = (hit / np.maximum(dtype(1), n_predicted)).astype(np.float64)
+    iou = (hit / union).astype(np.float64)
     both = precision + recall
     f1 = np.divide(2 * precision * recall, both, out=np.zeros_like(both), where=both > 0)
-    n_points = n_true.astype(np.float64)
-    metrics = _with_means(kept, recall, precision, iou, f1, n_points)
-    if dtype is np.float32 and n_points.sum() > 0:
-        # the original rounds each weight, and a perfect prediction may then end in 0.9999999999999999
-        return replace(metrics, frequency_weighted_iou=float((n_points / n_points.sum() * iou).sum()))
+    metrics = _with_means(kept, recall, precision, iou, f1, n_true.astype(np.float64))
+    # the original's IoUs are float32, and one of 3/20 is above 0.15 there
+    iou_of_original = hit.astype(np.float32) / union.astype(np.float32)
+    metrics = replace(metrics, n_classes_above=_n_above(iou_of_original.astype(np.float64)))
+    n_points = square.sum() + n_none.sum()
+    if dtype is np.float32 and n_points > 0:
+        # in this order, after which a perfect prediction may end in 0.9999999999999999
+        return replace(metrics, frequency_weighted_iou=float((iou * n_true / n_points).sum()))
     return metrics
+
+
+def _n_above(iou: Float64Array) -> tuple[int, ...]:
+    return tuple(int((iou > level).sum()) for level in IOU_LEVELS)
 
 
 def scannet_metrics(confusion: IntArray) -> SemanticMetrics:
@@ -197,7 +207,7 @@ def _with_means(
         mean_f1=nan_mean(f1),
         mean_f1_conceptgraphs=nan_mean(f1_conceptgraphs),
         point_accuracy=float((n_true * np.nan_to_num(recall)).sum() / n_points) if n_points > 0 else float("nan"),
-        n_classes_above=tuple(int((iou > level).sum()) for level in IOU_LEVELS),
+        n_classes_above=_n_above(iou),
     )
 
 

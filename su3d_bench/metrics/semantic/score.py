@@ -270,7 +270,7 @@ def _point_owners(prediction: Prediction, takes_part: BoolArray) -> tuple[Int64A
         return rows, np.where(takes_part & has_feature(prediction), 0, -1)
     if isinstance(prediction, Partition):
         owner = prediction.instance.astype(np.int64)
-        owner[(owner >= 0) & ~takes_part[owner]] = -1
+        owner[(owner >= 0) & ~np.append(takes_part, True)[owner]] = -1  # of no rows at all there is not even a last one
         return owner, owner
     kept = np.flatnonzero(takes_part)
     first = transfer.first_owner(transfer.select(prediction, kept), len(prediction.points))

@@ -1,0 +1,459 @@
+"""Small faults planted in metrics, statistics, comparison and gate, one at a time: do the tests of the module notice?
+
+    python benchmarks/mutants.py --mutants 600
+    python benchmarks/mutants.py --mutants 40 --seed 3 --modules analysis/gate
+
+Every place of a module where one operator, constant, condition or statement can be another is a mutant; a sample of all
+of them is drawn by ``--seed``. Each is written into a copy of what git tracks here, and the tests of the module are run
+there until one fails. A mutant that passes them all survives. ``benchmarks/mutants.toml`` has the reasons of survivors
+that no test can or need kill; the exit status is 1 where a survivor has none there, or where more than ``MOST_SURVIVE``
+survive. Uncommitted changes of tracked files count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import builtins
+import os
+import queue
+import random
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from measured import write_measured
+
+ROOT = Path(__file__).resolve().parents[1]
+REASONS = ROOT / "benchmarks" / "mutants.toml"
+PACKAGE = "su3d_bench"
+MOST_SURVIVE = 0.05
+LONGEST = 10.0  # times what the tests of the module take as they are: beyond it a mutant runs for ever, and is noticed
+LEAST_S = 60.0
+
+_CURVES = ("test_metrics_instance", "test_metrics_kernels", "test_metrics_class_agnostic", "test_metrics_undefined")
+_SCORES = ("test_metrics_scoring", "test_metrics_results", "numerics/test_statistics")
+_TRANSFER = ("test_metrics_transfer", "test_metrics_neighbours", *_SCORES)
+_TEXTS = ("test_metrics_queries", "test_metrics_openlex3d")
+_QUESTIONS = ("test_annotation_protocol", "test_retrieval_protocol", "questions/test_reasoning_solver")
+_PROTOCOLS = ("test_protocols", "test_metrics_scoring", "evaluation/test_evaluate")
+# Of each module, or of all in a folder, the tests that must notice: the quick ones first. Names without a folder stand
+# in tests/metrics.
+GUARDS: dict[str, tuple[str, ...]] = {
+    "metrics/instance/": (*_CURVES, *_SCORES),
+    "metrics/semantic/": ("test_metrics_semantic", "test_metrics_undefined", "test_metrics_hovsg", *_SCORES),
+    "metrics/matching/checks.py": (*_SCORES, "evaluation/test_evaluate_checks", "evaluation/test_evaluate"),
+    "metrics/matching/": _TRANSFER,
+    "metrics/open_vocabulary/": _TEXTS,
+    "metrics/questions/": _QUESTIONS,
+    "metrics/attribution/": ("analysis/test_attribution", "analysis/test_attribution_runs"),
+    "metrics/costs.py": ("reports/test_timing_report",),
+    "metrics/fitness.py": _PROTOCOLS,
+    "metrics/protocols.py": _PROTOCOLS,
+    "metrics/protocol_files.py": _PROTOCOLS,
+    "metrics/metric.py": ("test_metrics_undefined", *_SCORES, "analysis/test_compare_pairs"),
+    "metrics/scoring.py": ("test_metrics_undefined", *_SCORES),
+    "numerics/statistics.py": (
+        "numerics/test_growth", "numerics/test_statistics", "test_metrics_undefined", "analysis/test_compare_pairs",
+        "analysis/test_compare",
+    ),
+    "analysis/comparison.py": ("analysis/test_compare_pairs", "analysis/test_compare"),
+    "analysis/sides.py": ("analysis/test_compare_pairs", "analysis/test_compare"),
+    "analysis/gate.py": ("analysis/test_gate",),
+}  # fmt: skip
+
+_SWAPPED_OPERATORS: dict[type[ast.AST], type[ast.AST]] = {
+    ast.Lt: ast.LtE, ast.LtE: ast.Lt, ast.Gt: ast.GtE, ast.GtE: ast.Gt, ast.Eq: ast.NotEq, ast.NotEq: ast.Eq,
+    ast.Is: ast.IsNot, ast.IsNot: ast.Is, ast.In: ast.NotIn, ast.NotIn: ast.In, ast.And: ast.Or, ast.Or: ast.And,
+    ast.Add: ast.Sub, ast.Sub: ast.Add, ast.Mult: ast.Div, ast.Div: ast.Mult, ast.FloorDiv: ast.Mult,
+    ast.Mod: ast.Mult, ast.Pow: ast.Mult, ast.BitAnd: ast.BitOr, ast.BitOr: ast.BitAnd,
+}  # fmt: skip
+_PAIRS = (
+    ("min", "max"), ("any", "all"), ("argmin", "argmax"), ("minimum", "maximum"), ("zeros", "ones"),
+    ("zeros_like", "ones_like"), ("floor", "ceil"), ("left", "right"), ("start", "end"), ("ascending", "descending"),
+)  # fmt: skip
+# Keywords that say how a thing is done, not what comes out.
+_NO_NUMBER = frozenset({"strict", "copy", "workers", "maxsize", "balanced_tree", "compact_nodes", "cache", "nogil"})
+# Sizes that say in what portions, or in which of two equal ways, a thing is computed: assignments with them stay.
+_PORTIONS = frozenset({
+    "AT_ONCE", "MANY_ROWS", "MOST_REMEMBERED_ROWS", "MOST_SHARED", "_BLOCK_ROWS", "_BLOCK_UNITS", "_MAX_CELLS",
+    "_MAX_NEIGHBOURS",
+})  # fmt: skip
+_LEFT_ALONE = (ast.Raise, ast.Assert, ast.JoinedStr, ast.Import, ast.ImportFrom, ast.Lambda)
+_SWAPPED_NAMES = {a: b for pair in _PAIRS for a, b in (pair, pair[::-1])}
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One fault: the bytes ``start`` to ``end`` of a module become ``text``; ``where`` is the function it lies in.
+
+    ``before`` and ``after`` are the lines from ``line`` on that it lies in, on one line.
+    """
+
+    module: str
+    where: str
+    line: int
+    start: int
+    end: int
+    text: str
+    before: str
+    after: str
+
+    @property
+    def key(self) -> tuple[str, str, str, str]:
+        """What names it whatever lines stand above it."""
+        return self.module, self.where, self.before, self.after
+
+    def __str__(self) -> str:
+        return f"{self.module}:{self.line} in {self.where}\n    - {self.before}\n    + {self.after}"
+
+
+class _Faults(ast.NodeVisitor):
+    """Every mutant of one module; texts, types, decorators and what is only said in errors are left alone."""
+
+    def __init__(self, module: str, source: str) -> None:
+        self.found: list[Mutant] = []
+        self._module, self._source = module, source.encode()
+        self._line_starts = [0]
+        for line in self._source.splitlines(keepends=True):
+            self._line_starts.append(self._line_starts[-1] + len(line))
+        self._names: list[str] = []
+        self.visit(ast.parse(source))
+
+    def _add(self, node: ast.expr | ast.stmt, after: ast.AST | str) -> None:
+        assert node.end_lineno is not None
+        assert node.end_col_offset is not None
+        start = self._line_starts[node.lineno - 1] + node.col_offset
+        end = self._line_starts[node.end_lineno - 1] + node.end_col_offset
+        text = after if isinstance(after, str) else ast.unparse(ast.fix_missing_locations(after))
+        if isinstance(after, ast.expr):
+            text = f"({text})"
+        head = self._source[self._line_starts[node.lineno - 1] : start].decode()
+        tail = self._source[end : self._line_starts[node.end_lineno]].decode()
+        before, after_line = (
+            " ".join(f"{head}{middle}{tail}".split()) for middle in (self._source[start:end].decode(), text)
+        )
+        where = ".".join(self._names) or "module"
+        self.found.append(Mutant(self._module, where, node.lineno, start, end, text, before, after_line))
+
+    # what holds others
+
+    def visit_FunctionDef(self, node: ast.FunctionDef) -> None:
+        self._names.append(node.name)
+        for default in (*node.args.defaults, *(one for one in node.args.kw_defaults if one is not None)):
+            self.visit(default)
+        for statement in node.body:
+            self.visit(statement)
+        self._names.pop()
+
+    def visit_ClassDef(self, node: ast.ClassDef) -> None:
+        self._names.append(node.name)
+        for statement in node.body:
+            self.visit(statement)
+        self._names.pop()
+
+    # what is left alone
+
+    def visit(self, node: ast.AST) -> None:
+        is_portion = isinstance(node, ast.Assign | ast.AnnAssign) and any(
+            isinstance(part, ast.Name) and part.id in _PORTIONS for part in ast.walk(node)
+        )
+        if not isinstance(node, _LEFT_ALONE) and not is_portion:
+            super().visit(node)
+
+    def visit_keyword(self, node: ast.keyword) -> None:
+        if node.arg not in _NO_NUMBER:
+            self.visit(node.value)
+
+    def visit_AnnAssign(self, node: ast.AnnAssign) -> None:
+        if node.value is not None:
+            self.visit(node.value)
+
+    def visit_Subscript(self, node: ast.Subscript) -> None:
+        # ``dict[str, int]`` in an assignment is a type; numbers are taken out of names in lower case
+        if not (isinstance(node.value, ast.Name) and (hasattr(builtins, node.value.id) or node.value.id[0].isupper())):
+            self.generic_visit(node)
+
+    # statements
+
+    def visit_Expr(self, node: ast.Expr) -> None:
+        if isinstance(node.value, ast.Call):
+            self._add(node, "pass")
+            self.generic_visit(node)
+
+    def visit_Assign(self, node: ast.Assign) -> None:
+        if all(isinstance(target, ast.Subscript | ast.Attribute) for target in node.targets):
+            self._add(node, "pass")
+        if not any(isinstance(target, ast.Name) and target.id.startswith("__") for target in node.targets):
+            self.generic_visit(node)
+
+    def visit_AugAssign(self, node: ast.AugAssign) -> None:
+        self._add(node, "pass")
+        swapped = _SWAPPED_OPERATORS.get(type(node.op))
+        if swapped is not None and not _is_text(node.value):
+            self._add(node, ast.AugAssign(node.target, swapped(), node.value))  # type: ignore[arg-type]
+        self.generic_visit(node)
+
+    def visit_Continue(self, node: ast.Continue) -> None:
+        self._add(node, "pass")
+
+    # expressions
+
+    def visit_Compare(self, node: ast.Compare) -> None:
+        for index, operator in enumerate(node.ops):
+            operators = [*node.ops]
+            operators[index] = _SWAPPED_OPERATORS[type(operator)]()  # type: ignore[call-overload]
+            self._add(node, ast.Compare(node.left, operators, node.comparators))
+        self.generic_visit(node)
+
+    def visit_BoolOp(self, node: ast.BoolOp) -> None:
+        self._add(node, ast.BoolOp(_SWAPPED_OPERATORS[type(node.op)](), node.values))  # type: ignore[arg-type]
+        self.generic_visit(node)
+
+    def visit_BinOp(self, node: ast.BinOp) -> None:
+        swapped = _SWAPPED_OPERATORS.get(type(node.op))
+        if swapped is not None and not _is_text(node.left) and not _is_text(node.right):
+            self._add(node, ast.BinOp(node.left, swapped(), node.right))  # type: ignore[arg-type]
+        self.generic_visit(node)
+
+    def visit_UnaryOp(self, node: ast.UnaryOp) -> None:
+        self._add(node, node.operand)
+        self.generic_visit(node)
+
+    def visit_IfExp(self, node: ast.IfExp) -> None:
+        self._add(node, ast.IfExp(node.test, node.orelse, node.body))
+        self.generic_visit(node)
+
+    def visit_If(self, node: ast.If) -> None:
+        if not isinstance(node.test, ast.Compare | ast.UnaryOp | ast.BoolOp):
+            self._add(node.test, ast.UnaryOp(ast.Not(), node.test))
+        self.generic_visit(node)
+
+    def visit_comprehension(self, node: ast.comprehension) -> None:
+        for test in node.ifs:
+            self._add(test, "True")
+        self.generic_visit(node)
+
+    def visit_Call(self, node: ast.Call) -> None:
+        function = node.func
+        name = function.attr if isinstance(function, ast.Attribute) else getattr(function, "id", "")
+        if name in _SWAPPED_NAMES and isinstance(function, ast.Attribute):
+            swapped = ast.Attribute(function.value, _SWAPPED_NAMES[name], ast.Load())
+            self._add(function, ast.unparse(swapped))
+        elif name in _SWAPPED_NAMES:
+            self._add(function, _SWAPPED_NAMES[name])
+        self.generic_visit(node)
+
+    def visit_Constant(self, node: ast.Constant) -> None:
+        value = node.value
+        if isinstance(value, bool):
+            self._add(node, repr(not value))
+        elif isinstance(value, int):
+            self._add(node, repr(value + 1))
+        elif isinstance(value, float):
+            self._add(node, repr(value * 1.5 if value else 1.0))
+        elif isinstance(value, str) and value in _SWAPPED_NAMES:
+            self._add(node, repr(_SWAPPED_NAMES[value]))
+
+
+def _is_text(node: ast.expr) -> bool:
+    return isinstance(node, ast.JoinedStr) or (isinstance(node, ast.Constant) and isinstance(node.value, str))
+
+
+def mutants_of(module: str, source: str) -> list[Mutant]:
+    """All faults that can be planted in ``source``, each once, as they stand there."""
+    return list(dict.fromkeys(_Faults(module, source).found))
+
+
+def planted(source: str, mutant: Mutant) -> str:
+    """The source with the fault in it."""
+    data = source.encode()
+    return (data[: mutant.start] + mutant.text.encode() + data[mutant.end :]).decode()
+
+
+def guards_of(module: str) -> tuple[str, ...]:
+    """The test files that must notice a fault in a module of the package."""
+    inside = module.removeprefix(f"{PACKAGE}/")
+    row = max((one for one in GUARDS if inside == one or (one.endswith("/") and inside.startswith(one))), key=len)
+    return tuple(f"tests/{name if '/' in name else f'metrics/{name}'}.py" for name in dict.fromkeys(GUARDS[row]))
+
+
+def modules_of(wanted: Sequence[str]) -> list[str]:
+    """The guarded modules whose path holds one of ``wanted``, or all."""
+    found = []
+    for row in GUARDS:
+        path = ROOT / PACKAGE / row
+        files = sorted(path.rglob("*.py")) if row.endswith("/") else [path]
+        found += [str(file.relative_to(ROOT)) for file in files if file.stat().st_size]
+    chosen = [module for module in dict.fromkeys(found) if not wanted or any(word in module for word in wanted)]
+    return sorted(chosen)
+
+
+# ---- copies in which the tests run
+
+
+def copy_tree(target: Path) -> None:
+    """What git tracks here, as it is on the disk, links as links."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout.decode()
+    for name in filter(None, listed.split("\0")):
+        source = ROOT / name
+        if not source.is_symlink() and not source.is_file():
+            continue
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(source, target / name, follow_symlinks=False)
+
+
+class Copy:
+    """A copy of the tree in which one fault at a time is planted."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._stamp = int(time.time())
+        copy_tree(folder)
+
+    def write(self, module: str, text: str) -> None:
+        path = self.folder / module
+        path.write_text(text, encoding="utf-8")
+        # compiled modules are told apart by size and whole seconds of this time, and mutants follow fast
+        self._stamp += 2
+        os.utime(path, (self._stamp, self._stamp))
+
+    def passes(self, tests: Sequence[str], limit_s: float) -> bool | None:
+        """Whether all ``tests`` pass; None where they take longer than ``limit_s``."""
+        options = ["-x", "-q", "-p", "no:cacheprovider", f"--basetemp={self.folder / '.tests'}"]
+        environment = os.environ | {"PYTHONPATH": str(self.folder), "HYPOTHESIS_STORAGE_DIRECTORY": os.devnull}
+        process = subprocess.Popen(
+            [sys.executable, "-m", "pytest", *options, *tests],
+            cwd=self.folder,
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        try:
+            return process.wait(timeout=limit_s) == 0
+        except subprocess.TimeoutExpired:
+            return None
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of a mutant: ``killed``, ``timed out`` (and so noticed) or ``survived``."""
+
+    mutant: Mutant
+    outcome: str
+    seconds: float
+
+
+def run_mutants(mutants: Sequence[Mutant], n_copies: int, folder: Path) -> Iterator[Verdict]:
+    """A verdict a mutant, as they come; ``RuntimeError`` where the tests fail without any fault."""
+    copies: queue.Queue[Copy] = queue.Queue()
+    for index in range(n_copies):
+        copies.put(Copy(folder / f"copy{index}"))
+    limits: dict[tuple[str, ...], float] = {}
+    first = copies.get()
+    for tests in dict.fromkeys(guards_of(mutant.module) for mutant in mutants):
+        begin = time.monotonic()
+        if not first.passes(tests, 3600.0):
+            raise RuntimeError(f"without a fault these fail: {' '.join(tests)}")
+        limits[tests] = max(LEAST_S, LONGEST * (time.monotonic() - begin))
+    copies.put(first)
+
+    def judge(mutant: Mutant) -> Verdict:
+        copy, begin = copies.get(), time.monotonic()
+        source = (ROOT / mutant.module).read_text(encoding="utf-8")
+        tests = guards_of(mutant.module)
+        try:
+            copy.write(mutant.module, planted(source, mutant))
+            passed = copy.passes(tests, limits[tests])
+        finally:
+            copy.write(mutant.module, source)
+            copies.put(copy)
+        outcome = "timed out" if passed is None else "survived" if passed else "killed"
+        return Verdict(mutant, outcome, time.monotonic() - begin)
+
+    with ThreadPoolExecutor(n_copies) as threads:
+        yield from threads.map(judge, mutants)
+
+
+# ---- reasons and report
+
+
+def read_reasons(path: Path) -> dict[tuple[str, str, str, str], str]:
+    """Why a survivor may survive, by its key."""
+    if not path.is_file():
+        return {}
+    rows = tomllib.loads(path.read_text(encoding="utf-8")).get("survivor", [])
+    return {(row["module"], row["where"], row["before"], row["after"]): row["why"] for row in rows}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--mutants", type=int, default=600, help="how many are drawn from all")
+    parser.add_argument("--seed", type=int, default=0, help="of the drawing")
+    parser.add_argument("--modules", nargs="+", default=[], help="only modules whose path holds one of these")
+    parser.add_argument("--copies", type=int, default=os.cpu_count() or 1, help="how many are judged at a time")
+    parser.add_argument("--json", type=Path, help="where the table is written")
+    parser.add_argument("--list", action="store_true", help="print the drawn mutants and stop")
+    arguments = parser.parse_args()
+    every = [
+        mutant
+        for module in modules_of(arguments.modules)
+        for mutant in mutants_of(module, (ROOT / module).read_text(encoding="utf-8"))
+    ]
+    drawn = random.Random(arguments.seed).sample(every, min(arguments.mutants, len(every)))
+    print(
+        f"{len(drawn)} of {len(every)} mutants of {len(modules_of(arguments.modules))} modules, seed {arguments.seed}"
+    )
+    if arguments.list:
+        print(*drawn, sep="\n")
+        return 0
+    verdicts = []
+    with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
+        for verdict in run_mutants(drawn, arguments.copies, Path(folder)):
+            verdicts.append(verdict)
+            if verdict.outcome != "killed":
+                print(f"{verdict.outcome}: {verdict.mutant}", flush=True)
+    return report(verdicts, arguments)
+
+
+def report(verdicts: Sequence[Verdict], arguments: argparse.Namespace) -> int:
+    """Print what survived and why it may; 1 where it may not."""
+    reasons = read_reasons(REASONS)
+    survivors = [verdict.mutant for verdict in verdicts if verdict.outcome == "survived"]
+    unexplained = [mutant for mutant in survivors if mutant.key not in reasons]
+    share = len(survivors) / max(1, len(verdicts))
+    print(f"\n{len(survivors)} of {len(verdicts)} survived ({100 * share:.1f} %; {100 * MOST_SURVIVE:g} % may)")
+    for mutant in survivors:
+        print(f"  {mutant}\n      {reasons.get(mutant.key, 'NO REASON in benchmarks/mutants.toml')}")
+    if arguments.json:
+        rows: list[list[str]] = []
+        for module in dict.fromkeys(sorted(verdict.mutant.module for verdict in verdicts)):
+            own = [verdict.outcome for verdict in verdicts if verdict.mutant.module == module]
+            counts = [own.count(outcome) for outcome in ("killed", "timed out", "survived")]
+            rows.append([module, str(len(own)), *map(str, counts)])
+        command = f"python benchmarks/mutants.py --mutants {arguments.mutants} --seed {arguments.seed}"
+        notes = [
+            f"`{mutant.module}`, `{mutant.where}`: `{mutant.before}` as `{mutant.after}`: "
+            f"{reasons.get(mutant.key, 'no reason given')}"
+            for mutant in survivors
+        ]
+        columns = ("module", "mutants", "killed", "timed out", "survived")
+        write_measured(arguments.json, "Planted faults", command, columns, rows, notes)
+    return int(bool(unexplained) or share > MOST_SURVIVE)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,105 @@
+"""Both sides of a comparison are taken over the same scenes: what scenes share does not widen the interval."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import pytest
+from painted import colour_perception
+from places import SCENES
+
+from su3d_bench.analysis.comparison import Comparison, SideNumbers, compare
+from su3d_bench.analysis.sides import Side
+from su3d_bench.cli.main import main
+from su3d_bench.metrics.metric import SceneScore
+from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.semantic.confusion import SemanticCounts
+from su3d_bench.runs import scene as scene_run
+
+RULES = load_protocol("rooms-semantic")
+COLLECTOR = f"{SCENES}/painted.py:Collector"
+CLASS = next(index for index, entry in enumerate(RULES.classes) if not RULES.is_ignored(entry.name))
+LEFT = {"painted/a": 100, "painted/b": 500, "painted/c": 900}  # points of a thousand that are called rightly
+GAIN = {"painted/a": 50, "painted/b": 60, "painted/c": 70}
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A run of three scenes and two methods; its own numbers do not matter here."""
+    out = tmp_path_factory.mktemp("pairs") / "run"
+    words = ["run", "--scenes", f"{SCENES}/painted.py:Painted/[abc]", "--methods", COLLECTOR, f"{COLLECTOR}@drop=2"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        options = ["--protocols", RULES.name, "--no-pictures", "--jobs", "1", "--quiet"]
+        assert main([*words, *options, "--out", str(out)]) == 0
+    return out
+
+
+class MadeNumbers(SideNumbers):
+    """Both sides with counts of our own in place of those of their runs."""
+
+    def __init__(self, left: Mapping[str, SceneScore], right: Mapping[str, SceneScore]) -> None:
+        super().__init__()
+        self._made = {"collector": left, "collector@drop=2": right}
+
+    def scores(self, side: Side) -> dict[str, dict[str, SceneScore]]:
+        return {RULES.name: dict(self._made[side.method])}
+
+
+def scored(n_right: Mapping[str, int]) -> dict[str, SceneScore]:
+    """One class of a thousand points a scene, ``n_right`` of which are called rightly."""
+    found = {}
+    for scene, n in n_right.items():
+        table = np.zeros((len(RULES.classes), len(RULES.classes) + 1), np.int64)
+        table[CLASS, [CLASS, -1]] = n, 1000 - n
+        counts = SemanticCounts(table, table.sum(axis=1) > 0)
+        found[scene] = SceneScore(RULES.name, RULES.version, counts, 1, 1000, np.zeros(3, np.int64), ())
+    return found
+
+
+def compared(folder: Path, left: Mapping[str, SceneScore], right: Mapping[str, SceneScore]) -> Comparison:
+    numbers = MadeNumbers(left, right)
+    return compare(f"{folder}:collector", f"{folder}:collector@drop=2", numbers=numbers, per_class=True)
+
+
+@pytest.mark.parametrize("order", [(0, 1, 2), (2, 1, 0), (1, 2, 0)])
+def test_the_interval_of_a_difference_is_of_the_scenes_differences(folder: Path, order: tuple[int, ...]) -> None:
+    names = list(LEFT)
+    right = scored({names[k]: LEFT[names[k]] + GAIN[names[k]] for k in order})
+    found = compared(folder, scored(LEFT), right).protocols[0].metrics["mAcc"]
+    assert found.difference == pytest.approx(0.06)
+    assert found.per_scene == pytest.approx({scene: gain / 1000 for scene, gain in GAIN.items()})
+    # the scenes lie 80 points apart, their differences two: with sides drawn apart the interval would be ten times this
+    assert found.interval is not None
+    low, high = found.interval
+    assert low < 0.06 < high
+    assert high - low < 0.06
+
+
+def test_the_interval_of_a_class_is_of_the_scenes_differences_too(folder: Path) -> None:
+    right = scored({scene: LEFT[scene] + GAIN[scene] for scene in LEFT})
+    found = compared(folder, scored(LEFT), right).protocols[0].classes[RULES.classes[CLASS].name]
+    low, high = found["recall"].interval or (0.0, 1.0)
+    assert low < 0.06 < high
+    assert high - low < 0.06
+
+
+def test_what_scenes_share_does_not_widen_the_interval(folder: Path) -> None:
+    alike = {scene: 400 + gain for scene, gain in GAIN.items()}
+    narrow = compared(folder, scored(dict.fromkeys(LEFT, 400)), scored(alike)).protocols[0].metrics["mAcc"]
+    wide = compared(folder, scored(LEFT), scored({s: LEFT[s] + GAIN[s] for s in LEFT})).protocols[0].metrics["mAcc"]
+    assert narrow.interval == pytest.approx(wide.interval)
+    swapped = compared(folder, scored({s: LEFT[s] + GAIN[s] for s in LEFT}), scored(LEFT)).protocols[0].metrics["mAcc"]
+    assert swapped.interval is not None
+    assert wide.interval == pytest.approx((-swapped.interval[1], -swapped.interval[0]))
+
+
+def test_scenes_that_one_side_lacks_take_no_part(folder: Path) -> None:
+    right = scored({scene: LEFT[scene] + GAIN[scene] for scene in ("painted/c", "painted/a")})
+    found = compared(folder, scored(LEFT), right).protocols[0]
+    assert found.scenes == ("painted/a", "painted/c")
+    assert found.metrics["mAcc"].difference == pytest.approx(0.06)
+    assert found.metrics["mAcc"].per_scene == pytest.approx({"painted/a": 0.05, "painted/c": 0.07})
+    assert any("alone has painted/b" in line for line in found.remarks)

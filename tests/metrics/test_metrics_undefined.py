@@ -1,0 +1,190 @@
+"""Values that are not defined: a class without truth, a scene in which nothing counts, sums that leave them out."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from su3d_bench.core.types import Float64Array, Int64Array
+from su3d_bench.metrics.instance import average_precision as instance_ap
+from su3d_bench.metrics.instance.average_precision import InstanceCounts
+from su3d_bench.metrics.instance.resampling import resampled_ap
+from su3d_bench.metrics.metric import SceneScore, Values, scene_mean
+from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.scoring import combine, metric_of, plain_json
+from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate, conceptgraphs_metrics
+from su3d_bench.numerics.statistics import nan_mean, row_means
+
+NAN = float("nan")
+ROOM, INSTANCE = load_protocol("rooms-semantic"), load_protocol("rooms-instance")
+N = len(ROOM.classes)
+# the first classes that count; what else the label set has does not matter here
+A, B, C = [index for index, entry in enumerate(ROOM.classes) if not ROOM.is_ignored(entry.name)][:3]
+
+
+def score(rules: ProtocolRules, counts: SemanticCounts | InstanceCounts) -> SceneScore:
+    return SceneScore(rules.name, rules.version, counts, 1, 0, np.zeros(3, np.int64), ())
+
+
+def confusion(rows: dict[int, dict[int, int]], *, present: Sequence[int] = ()) -> SemanticCounts:
+    """Points by true and predicted class; ``present``: classes that the scene has without a scored point."""
+    table = np.zeros((N, N + 1), np.int64)
+    for true, of_row in rows.items():
+        for predicted, n in of_row.items():
+            table[true, predicted] = n
+    is_present = table.sum(axis=1) > 0
+    is_present[list(present)] = True
+    return SemanticCounts(table, is_present)
+
+
+def masks(*classes: tuple[int, bool]) -> InstanceCounts:
+    """A scene with one instance of 100 points of each class, found by a perfect mask or not at all."""
+    ids = [INSTANCE.scored[index].id for index, _ in classes]
+    truth = np.repeat([one * 1000 + 1 for one in ids] or [0], 100)
+    found = [k for k, (_, is_found) in enumerate(classes) if is_found]
+    indices = np.concatenate([np.arange(0), *(np.arange(100 * k, 100 * k + 100) for k in found)])
+    labels = np.array([ids[k] for k in found], np.int64)
+    every_id = [entry.id for entry in INSTANCE.scored]
+    return instance_ap.per_scene(truth, np.arange(len(found) + 1) * 100, indices, labels, np.ones(len(found)), every_id)
+
+
+# ---- means
+
+
+def test_a_mean_leaves_out_what_is_undefined_and_is_undefined_where_all_is() -> None:
+    assert nan_mean(np.array([NAN, 0.2, NAN, 0.6])) == pytest.approx(0.4)
+    assert math.isnan(nan_mean(np.array([NAN, NAN])))
+    assert math.isnan(nan_mean(np.zeros(0)))
+    np.testing.assert_array_equal(row_means(np.array([[NAN, 0.5], [NAN, NAN], [0.0, 1.0]])), [0.5, NAN, 0.5])
+    mean = scene_mean([{"x": 0.5, "y": NAN}, {"x": NAN, "y": NAN}])
+    assert mean["x"] == 0.5
+    assert math.isnan(mean["y"])
+
+
+def test_no_file_holds_a_value_that_is_no_finite_number() -> None:
+    value = {"a": [NAN, math.inf, -math.inf, 0.5], "b": (NAN, {"c": 1})}
+    assert plain_json(value) == {"a": [None, None, None, 0.5], "b": [None, {"c": 1}]}
+
+
+# ---- scenes drawn
+
+
+WEIGHTS = np.array([[1, 1, 1], [0, 1, 1], [1, 0, 1], [1, 1, 0], [0, 0, 2], [0, 3, 0], [2, 0, 1]])
+
+
+def of_drawn(
+    rules: ProtocolRules, counts: Sequence[SemanticCounts | InstanceCounts], weights: Int64Array
+) -> list[Values]:
+    """The metrics over the scenes drawn, each as a scene of its own, by the function that knows no weights."""
+    metric = metric_of(rules)
+    return [metric.combine([counts[s] for s in range(len(counts)) for _ in range(n[s])]) for n in weights]
+
+
+def assert_as_drawn(found: dict[str, Float64Array], expected: list[Values], names: Sequence[str]) -> None:
+    for name in names:
+        np.testing.assert_allclose(found[name], [row[name] for row in expected], rtol=0, atol=1e-12, err_msg=name)
+
+
+def test_ap_over_drawn_scenes_leaves_out_classes_that_none_of_them_has() -> None:
+    counts = [masks((0, True), (1, True)), masks((1, False), (2, False)), masks()]
+    found = resampled_ap(counts, WEIGHTS, INSTANCE.thresholds)
+    expected = of_drawn(INSTANCE, counts, WEIGHTS)
+    assert_as_drawn(found, expected, ("AP", "AP50", "AP25"))
+    assert found["AP"][:4].tolist() == pytest.approx([(1 + 0.5 + 0) / 3, 0.0, 1.0, (1 + 0.5 + 0) / 3])
+    assert np.isnan(found["AP"][4])
+
+
+def test_semantic_values_over_drawn_scenes_leave_out_classes_that_none_of_them_has() -> None:
+    counts = [confusion({A: {A: 3, B: 1}}), confusion({B: {B: 2, N: 2}, C: {A: 5}}), confusion({})]
+    found = metric_of(ROOM).resampled(counts, WEIGHTS)
+    assert_as_drawn(dict(found), of_drawn(ROOM, counts, WEIGHTS), ("mAcc", "mIoU", "F-mIoU"))
+    assert found["mAcc"].tolist()[:4] == pytest.approx([(0.75 + 0.5 + 0) / 3, 0.25, 0.75, (0.75 + 0.5 + 0) / 3])
+    assert all(np.isnan(found[name][4]) for name in ("mAcc", "mIoU", "F-mIoU"))
+
+
+def test_a_mean_over_drawn_scenes_leaves_out_those_without_a_value() -> None:
+    rules = ROOM.model_copy(update={"aggregate": "scene-mean"})
+    rows = [{"mAcc": 0.2, "F-mIoU": 0.5}, {"mAcc": 0.8, "F-mIoU": NAN}, {"mAcc": NAN, "F-mIoU": NAN}]
+    found = metric_of(rules).resampled_headline([], rows, WEIGHTS)
+    np.testing.assert_allclose(found["mAcc"], [0.5, 0.8, 0.2, 0.5, NAN, 0.8, 0.2], atol=1e-12)
+    np.testing.assert_allclose(found["F-mIoU"], [0.5, NAN, 0.5, 0.5, NAN, NAN, 0.5], atol=1e-12)
+
+
+def test_a_class_of_a_single_point_has_values_in_the_scenes_that_have_it() -> None:
+    counts = [confusion({A: {A: 1}, B: {B: 3, N: 1}}), confusion({B: {B: 1}})]
+    found = metric_of(ROOM).resampled_classes(counts, np.array([[1, 1], [1, 0], [0, 1]]))
+    np.testing.assert_array_equal(found[ROOM.classes[A].name]["recall"], [1.0, 1.0, NAN])
+    np.testing.assert_array_equal(found[ROOM.classes[A].name]["IoU"], [1.0, 1.0, NAN])
+    np.testing.assert_array_equal(found[ROOM.classes[B].name]["recall"], [0.8, 0.75, 1.0])
+    assert set(found) == {ROOM.classes[A].name, ROOM.classes[B].name}
+
+
+# ---- results
+
+
+def test_a_scene_without_truth_has_no_value_and_moves_none() -> None:
+    scored = {"a": score(INSTANCE, masks((0, True), (1, False))), "b": score(INSTANCE, masks((0, True)))}
+    with_nothing = combine(INSTANCE, scored | {"c": score(INSTANCE, masks())})
+    assert math.isnan(with_nothing.per_scene["c"]["AP"])
+    without = combine(INSTANCE, scored)
+    assert with_nothing.metrics == without.metrics
+    assert with_nothing.scene_mean == without.scene_mean == {"AP": 0.75, "AP50": 0.75, "AP25": 0.75}
+    shown = json.loads(json.dumps(with_nothing.to_json(), allow_nan=False))
+    assert shown["per_scene"]["c"] == {"AP": None, "AP50": None, "AP25": None}
+    assert shown["per_class"][INSTANCE.scored[2].name]["AP"] is None
+
+
+def test_where_nothing_counts_the_numbers_are_undefined_and_have_no_interval() -> None:
+    result = combine(INSTANCE, {"a": score(INSTANCE, masks()), "b": score(INSTANCE, masks())})
+    assert all(math.isnan(result.metrics[name]) for name in INSTANCE.headline)
+    assert result.intervals == dict.fromkeys(INSTANCE.headline)
+    empty = combine(ROOM, {"a": score(ROOM, confusion({})), "b": score(ROOM, confusion({}))})
+    assert math.isnan(empty.metrics["F-mIoU"])
+    assert empty.intervals == {"mAcc": None, "F-mIoU": None}
+
+
+def test_an_undefined_scene_takes_no_part_in_an_interval() -> None:
+    rng = np.random.default_rng(1)
+    scored = {
+        f"s{k}": score(ROOM, confusion({A: {A: int(rng.integers(5, 30)), N: 10}, B: {B: 4, A: int(rng.integers(9))}}))
+        for k in range(6)
+    }
+    interval = combine(ROOM, scored | {"z": score(ROOM, confusion({}))}).intervals["mAcc"]
+    assert interval is not None
+    assert np.isfinite(interval).all()
+    assert interval[0] < combine(ROOM, scored).metrics["mAcc"] < interval[1]
+
+
+# ---- the column that ConceptGraphs slices away
+
+
+def test_what_is_called_a_class_without_points_is_sliced_away_from_the_pooled_rows_alone() -> None:
+    # eval_replica_semseg.py keeps the rows and columns of classes with points over all scenes: of six points of A that
+    # are called C, which the truth has and no scored point, nothing is left; of a scene's own keep_index C is one
+    one = confusion({A: {A: 4, C: 6}, B: {B: 3, A: 1}}, present=[C])
+    other = confusion({A: {A: 2}, B: {B: 1, N: 3}})
+    result = combine(ROOM, {"a": score(ROOM, one), "b": score(ROOM, other)})
+    keep = np.array([A, B])
+    whole = concatenate([one, other]).confusion
+    sliced = np.concatenate([whole[np.ix_(keep, keep)], whole[keep, -1:]], axis=1)
+    expected = conceptgraphs_metrics(sliced, np.arange(2))
+    assert result.pooled["mAcc"] == expected.mean_accuracy == pytest.approx((1.0 + 4 / 8) / 2)
+    assert result.pooled["F-mIoU"] == expected.frequency_weighted_iou
+    assert result.pooled["n_classes"] == 2
+    assert result.per_scene["a"]["mAcc"] == pytest.approx((0.4 + 0.75 + 0) / 3)
+    assert result.per_scene["b"]["mAcc"] == pytest.approx((1.0 + 0.25) / 2)
+
+
+def test_what_is_called_a_class_that_no_scene_has_stays_wrong() -> None:
+    result = combine(ROOM, {"a": score(ROOM, confusion({A: {A: 4, C: 6}}))})
+    assert result.pooled["mAcc"] == result.per_scene["a"]["mAcc"] == 0.4
+
+
+def test_a_class_with_points_in_another_scene_is_sliced_away_nowhere() -> None:
+    one, other = confusion({A: {A: 4, C: 6}}, present=[C]), confusion({C: {C: 5, A: 5}})
+    result = combine(ROOM, {"a": score(ROOM, one), "b": score(ROOM, other)})
+    assert result.pooled["mAcc"] == pytest.approx((0.4 + 0.5) / 2)
