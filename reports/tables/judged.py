@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from su3d_bench.core.errors import ConfigError, counted, printable
+from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, said_by
 from su3d_bench.reports.tables.model import (
     NOT_MEASURED,
     Cell,
@@ -14,6 +15,7 @@ from su3d_bench.reports.tables.model import (
     Table,
     TableRow,
     bracketed,
+    is_count,
     percent,
     signed,
     text_table,
@@ -21,7 +23,8 @@ from su3d_bench.reports.tables.model import (
 from su3d_bench.reports.tables.paper import Shown, protocol_table, reported_rows
 from su3d_bench.reports.tables.published import Figure, PaperTable, figures_of
 
-OWN_NAMES = {"merge-accuracy": "well-merged"}  # the paper's name: ours
+REFINED = "refined label (n')"
+WHO_DID = {"reasoning": ANSWERED_BY, "annotation": REFINED_BY}  # what a sheet's key says beside who judged
 
 
 @dataclass(frozen=True)
@@ -42,12 +45,15 @@ JUDGED: Mapping[PaperTable, JudgedLayout] = {
         "Labels and merging",
         ("label-accuracy", "merge-accuracy"),
         {
-            "direct label (n)": OWN_NAMES | {"label-accuracy": "label n"},
-            "refined label (n')": OWN_NAMES | {"label-accuracy": "label n'"},
+            "direct label (n)": {"label-accuracy": "label n", "merge-accuracy": "well-merged"},
+            REFINED: {"label-accuracy": "label n'", "merge-accuracy": "well-merged n'"},
         },
     ),
     "reasoning": JudgedLayout(
-        "reasoning", "Spatial reasoning", ("reasoning-accuracy", "objects"), {"": {"reasoning-accuracy": "answer"}}
+        "reasoning",
+        "Spatial reasoning",
+        ("reasoning-accuracy", "n_questions", "objects"),
+        {"": {"reasoning-accuracy": "answer", "n_questions": "n_answer"}},
     ),
 }
 
@@ -86,9 +92,11 @@ def _dataset_table(
         rows = [row for row in measured if row.protocol == protocol]
         if not any(row.per_scene for row in rows):
             continue
-        table = protocol_table([_part(row, name, layout) for row in rows for name in layout.parts], shown, [])
+        parts = [_part(row, name, layout) for row in rows for name in layout.parts]
+        table = protocol_table(parts, shown, [])
         judge = "people" if rows[0].is_by_people else "ground truth"
-        body += [_named(row, judge, layout) for row in table.rows]
+        scored = [part for part in parts if part.per_scene or part.failed]
+        body += [_named(*both, judge, layout) for both in zip(table.rows, scored, strict=True)]
         notes += [f"{judge}: {note}" for note in table.notes]
         columns = table.columns
     same = [figure for figure in figures if figure.dataset == dataset]
@@ -105,8 +113,7 @@ def _dataset_table(
 
 
 def _protocols(kind: str) -> str:
-    datasets = ("rooms",) if kind == "reasoning" else ("rooms", "replica", "scannet")
-    names = [f"{dataset}-{kind}" for dataset in datasets]
+    names = [f"{dataset}-{kind}" for dataset in ("rooms", "replica", "scannet")]
     return f"protocol {' or '.join(names)}"
 
 
@@ -127,9 +134,20 @@ def _part(row: Measured, part: str, layout: JudgedLayout) -> Measured:
     )
 
 
-def _named(row: TableRow, judge: str, layout: JudgedLayout) -> TableRow:
-    """``row`` with its judge, and each cell with the number's own name, by which a paper is checked."""
-    return replace(row, label=f"{row.label}, {judge}", group=judge, cells=tuple(_own(c, layout) for c in row.cells))
+def _named(row: TableRow, part: Measured, judge: str, layout: JudgedLayout) -> TableRow:
+    """``row`` with who made the labels or answers and its judge, and each cell with the number's own name, by which a
+    paper is checked."""
+    label = row.label.replace(REFINED, f"{REFINED[:-1]} {_refined_by(part)})" if _refined_by(part) else REFINED)
+    solvers = said_by(part.warnings, ANSWERED_BY)
+    label += f", answers by {' and '.join(solvers)}" if solvers else ""
+    return replace(row, label=f"{label}, {judge}", group=judge, cells=tuple(_own(c, layout) for c in row.cells))
+
+
+def _refined_by(part: Measured) -> str:
+    """What label n' is: a vote, or a model's name."""
+    who = [source.partition(" of ")[0] for source in said_by(part.warnings, REFINED_BY)]
+    said = ("is a vote" if one == "the vote" else f"by {one}" for one in who)
+    return " and ".join(dict.fromkeys(printable(one, 100) for one in said))
 
 
 def _own(cell: Cell, layout: JudgedLayout) -> Cell:
@@ -141,7 +159,8 @@ def _own(cell: Cell, layout: JudgedLayout) -> Cell:
     elif part not in layout.parts:
         return cell
     metric = layout.parts[part].get(cell.origin.metric, cell.origin.metric)
-    return replace(cell, origin=replace(cell.origin, method=method, metric=metric))
+    is_best = cell.is_best and not is_count(metric)  # more questions are no better
+    return replace(cell, is_best=is_best, origin=replace(cell.origin, method=method, metric=metric))
 
 
 SUBJECTS = {
@@ -196,7 +215,7 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
             "several people judged counts once, with the share of them that said so. "
             + (ABOUT_QUESTIONS if scores["kind"] == "questions" else ABOUT_TRUTH),
             f"set {scores['sheet_id']}{origin}; {judged}",
-            *([f"answers by {printable(scores['answered_by'], 100)}"] if scores["answered_by"] else []),
+            *([f"{WHO_DID[scores['kind']]}{printable(scores['answered_by'], 200)}"] if scores["answered_by"] else []),
             *([f"'cannot tell' is left out: at most {unclear} judgements of a number"] if unclear else []),
             *([f"no answers from {', '.join(scores['silent'])}"] if scores["silent"] else []),
         ),

@@ -152,7 +152,7 @@ class Measured:
 
     What people judged is of this form too, from ``scores.json`` instead. ``run`` is the folder as it was named;
     ``limit``: how many frames of a scene, 0 for all; ``ceilings`` are empty where there is none. ``per_scene`` is
-    scene -> metric -> value.
+    scene -> metric -> value; ``warnings`` are what was said of the numbers when they were made.
     """
 
     run: str
@@ -172,6 +172,7 @@ class Measured:
     profile: str | None = None
     encoder: str | None = None
     caveat: str | None
+    warnings: tuple[str, ...] = ()
 
     @property
     def is_by_people(self) -> bool:

@@ -13,6 +13,7 @@ from su3d_bench.core.errors import ConfigError, Su3dError, printable, reading, s
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.scoring import ProtocolResult, combine
+from su3d_bench.reports.tables.judged import WHO_DID
 from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.model import BY_PEOPLE, Measured, Origin, is_count
 from su3d_bench.reports.tables.timing import AnytimePoint
@@ -74,11 +75,13 @@ def _judged_by_people(path: Path) -> list[Measured]:
                 version=scores.schema_version,
                 kind=scores.kind,
                 headline=tuple(cell.metric for cell in cells),
-                metrics={cell.metric: cell.value for cell in cells},
+                metrics={cell.metric: cell.value for cell in cells}
+                | {f"n_{cell.metric}": float(cell.n_items) for cell in cells},
                 intervals={cell.metric: cell.interval for cell in cells},
                 per_scene={scene: {cell.metric: cell.per_scene.get(scene) for cell in cells} for scene in scenes},
                 n_planned=len(scenes),
                 caveat=_who_judged(scores, cells),
+                warnings=(f"{WHO_DID[scores.kind]}{scores.answered_by}",) if scores.answered_by else (),
             )
         )
     return measured
@@ -123,6 +126,7 @@ def _measured(run: str, limit: int, record: ResultRecord, nothing: Mapping[str, 
         profile=record.profile,
         encoder=record.encoder,
         caveat=record.caveat,
+        warnings=numbers.warnings,
     )
 
 

@@ -355,7 +355,10 @@ class AnnotationRules(_JudgedRules):
     """Names and shapes of masks."""
 
     values_of_metric: ClassVar[ValuesOfMetric] = {
-        "annotation": ("label n", "label n'", "well-merged", "under-merged", "over-merged")
+        "annotation": (
+            *("label n", "label n'", "well-merged", "under-merged", "over-merged"),
+            *("well-merged n'", "under-merged n'", "over-merged n'"),
+        )
     }
     goes_by_names = True
     needs = ("min_region_size", "synonyms", "merging")

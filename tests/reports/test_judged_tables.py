@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,12 @@ from su3d_bench.reports.tables.paper import Shown
 from su3d_bench.sheets.answers import check_answers
 from su3d_bench.sheets.scores import score, write_scores
 
-LABELS = [("right", "right", "well-merged"), ("wrong", "right", "well-merged"), ("wrong", "wrong", "over-merged")]
+LABELS = [
+    ("right", "right", "well-merged"),
+    ("wrong", "right", "well-merged"),
+    ("wrong", "wrong", "under-merged"),
+    ("wrong", "", "over-merged"),  # labels n' leave it out
+]
 
 
 @pytest.fixture(scope="module")
@@ -74,7 +80,7 @@ def test_table_v_has_a_row_for_each_label(folders: tuple[Path, Path], capsys: py
     (table,) = told(capsys, str(folders[1]), "--table", "V", "--no-published")
     assert table["columns"] == ["label-accuracy", "merge-accuracy", "scenes"]
     assert texts(table) == {
-        "opensu3d: direct label (n), people": ["33.3", "66.7", "1"],
+        "opensu3d: direct label (n), people": ["25.0", "50.0", "1"],
         "opensu3d: refined label (n'), people": ["66.7", "66.7", "1"],
     }
     origins = [cell["origin"] for row in table["rows"] for cell in row["cells"][:2]]
@@ -82,7 +88,29 @@ def test_table_v_has_a_row_for_each_label(folders: tuple[Path, Path], capsys: py
         ("opensu3d", "label n"),
         ("opensu3d", "well-merged"),
         ("opensu3d", "label n'"),
-        ("opensu3d", "well-merged"),
+        ("opensu3d", "well-merged n'"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("warning", "label"),
+    [
+        ("every scene: n': the vote of the names of 5 views, no language model", "(n' is a vote)"),
+        ("replica/a: n': the model gpt-4 of su3d-bench refine, names of 5 views", "(n' by the model gpt-4)"),
+        ("no label n': the map keeps no names of views", "(n')"),
+    ],
+)
+def test_the_row_of_label_n_prime_says_who_made_it(warning: str, label: str) -> None:
+    values = {"label n": 0.7, "label n'": 0.8, "well-merged": 0.5, "well-merged n'": 0.6}
+    row = replace(by_truth("opensu3d", "annotation", "replica", **values), warnings=(warning,))
+    (table,) = judged_table("V", [row], Shown(), with_published=True)
+    assert [(one.label, [cell.text for cell in one.cells[:2]]) for one in table.rows[:2]] == [
+        ("opensu3d: direct label (n), ground truth", ["70.0", "50.0"]),
+        (f"opensu3d: refined label {label}, ground truth", ["80.0", "60.0"]),
+    ]
+    assert [[cell.text for cell in one.cells[:2]] for one in table.rows if one.is_reported] == [
+        ["83", "87"],
+        ["87", "88"],
     ]
 
 
@@ -112,17 +140,24 @@ def test_reasoning_has_its_scores_above_the_papers(tmp_path: Path, capsys: pytes
     checked = check_answers(sheet, answered(sheet, key, {"ann": 0.0}))
     write_scores(tmp_path, score(sheet, key, checked.judgements))
     (table,) = told(capsys, str(tmp_path), "--table", "reasoning")
-    assert table["columns"] == ["reasoning-accuracy", "objects", "scenes"]
-    assert list(texts(table).values()) == [["75.0", "50.0", "1"]]
-    assert [row["cells"][0]["text"] for row in table["rows"] if row["is_reported"]] == ["83", "68"]
-    assert len({row["mark"] for row in table["rows"] if row["is_reported"]}) == 2
-    rows = [*measured_results([tmp_path]), by_truth("a: b", "reasoning", "rooms", answer=0.6, objects=0.5)]
+    assert table["columns"] == ["reasoning-accuracy", "n_questions", "objects", "scenes"]
+    assert list(texts(table).values()) == [["75.0", "4", "50.0", "1"]]
+    reported = [row for row in table["rows"] if row["is_reported"]]
+    assert [row["cells"][0]["text"] for row in reported] == ["83", "68"]
+    assert all("70 questions" in row["label"] for row in reported)
+    assert len({row["mark"] for row in reported}) == 2
+    told_by = "every scene: answers by the language model gpt-4"
+    truth = by_truth("a: b", "reasoning", "rooms", answer=0.6, n_answer=50.0, objects=0.5)
+    rows = [*measured_results([tmp_path]), replace(truth, warnings=(told_by,)), replace(truth, method="c")]
     tables = judged_table("reasoning", rows, Shown(), with_published=True)
-    assert [row.cells[0].text for row in tables[0].rows if not row.is_reported] == ["75.0", "60.0"]
+    measured_rows = [row for row in tables[0].rows if not row.is_reported]
+    assert [[cell.text for cell in row.cells[:2]] for row in measured_rows] == [["75.0", "4"], *2 * [["60.0", "50"]]]
+    assert measured_rows[1].label == "a: b, answers by the language model gpt-4, ground truth"
+    assert not any(row.cells[1].is_best for row in measured_rows)
     paper = tmp_path / "paper.tex"
     paper.write_text(latex(judged_table("reasoning", rows[:1], Shown(), with_published=True)))
     checks = check_paper(paper)
-    assert len(checks) == 3 and [check.fault for check in checks if check.fault] == []
+    assert len(checks) == 4 and [check.fault for check in checks if check.fault] == []
 
 
 def test_without_judged_rows_the_message_says_what_makes_them() -> None:
