@@ -15,7 +15,6 @@ from su3d_bench.reports.tables.model import (
     Table,
     TableRow,
     bracketed,
-    is_count,
     percent,
     signed,
     text_table,
@@ -50,10 +49,7 @@ JUDGED: Mapping[PaperTable, JudgedLayout] = {
         },
     ),
     "reasoning": JudgedLayout(
-        "reasoning",
-        "Spatial reasoning",
-        ("reasoning-accuracy", "n_questions", "objects"),
-        {"": {"reasoning-accuracy": "answer", "n_questions": "n_answer"}},
+        "reasoning", "Spatial reasoning", ("reasoning-accuracy", "objects"), {"": {"reasoning-accuracy": "answer"}}
     ),
 }
 
@@ -159,8 +155,7 @@ def _own(cell: Cell, layout: JudgedLayout) -> Cell:
     elif part not in layout.parts:
         return cell
     metric = layout.parts[part].get(cell.origin.metric, cell.origin.metric)
-    is_best = cell.is_best and not is_count(metric)  # more questions are no better
-    return replace(cell, is_best=is_best, origin=replace(cell.origin, method=method, metric=metric))
+    return replace(cell, origin=replace(cell.origin, method=method, metric=metric))
 
 
 SUBJECTS = {

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from su3d_bench.core.errors import ConfigError, printable, suggest
+from su3d_bench.metrics.questions.score import RELATIVE, said_by
 from su3d_bench.numerics.statistics import SignFlipTest, sign_flip_test
 from su3d_bench.reports.tables.model import (
     NOT_MEASURED,
@@ -246,6 +247,8 @@ def run_notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
         if row.profile:
             encoder = f", encoder {row.encoder}" if row.encoder else ""
             notes.setdefault(f"perception {row.profile}{encoder}", []).append(label)
+        for said in said_by(row.warnings, RELATIVE):
+            notes.setdefault(f"{RELATIVE}{said}", []).append(label)
     everyone = len(rows)
     return [
         f"{'all measured rows' if len(who) == everyone > 1 else ', '.join(who)}: {what}" for what, who in notes.items()

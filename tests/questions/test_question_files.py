@@ -127,7 +127,7 @@ def test_the_papers_queries_are_asked_of_its_13_scenes() -> None:
     found = paper_queries()
     assert len({one.scene for one in found}) == 13
     assert Counter(one.kind for one in found if one.scene == "replica/room0") == {
-        "instance": 16, "affordance": 11, "property": 12, "relative": 12,
+        "instance": 16, "affordance": 11, "property": 12, "relative": 12, "reasoning": 4,
     }  # fmt: skip
     assert not any(one.is_known for one in found)
 

@@ -140,24 +140,23 @@ def test_reasoning_has_its_scores_above_the_papers(tmp_path: Path, capsys: pytes
     checked = check_answers(sheet, answered(sheet, key, {"ann": 0.0}))
     write_scores(tmp_path, score(sheet, key, checked.judgements))
     (table,) = told(capsys, str(tmp_path), "--table", "reasoning")
-    assert table["columns"] == ["reasoning-accuracy", "n_questions", "objects", "scenes"]
-    assert list(texts(table).values()) == [["75.0", "4", "50.0", "1"]]
+    assert table["columns"] == ["reasoning-accuracy", "objects", "scenes"]
+    assert list(texts(table).values()) == [["75.0", "50.0", "1"]]
     reported = [row for row in table["rows"] if row["is_reported"]]
     assert [row["cells"][0]["text"] for row in reported] == ["83", "68"]
     assert all("70 questions" in row["label"] for row in reported)
     assert len({row["mark"] for row in reported}) == 2
     told_by = "every scene: answers by the language model gpt-4"
-    truth = by_truth("a: b", "reasoning", "rooms", answer=0.6, n_answer=50.0, objects=0.5)
+    truth = by_truth("a: b", "reasoning", "rooms", answer=0.6, objects=0.5)
     rows = [*measured_results([tmp_path]), replace(truth, warnings=(told_by,)), replace(truth, method="c")]
     tables = judged_table("reasoning", rows, Shown(), with_published=True)
     measured_rows = [row for row in tables[0].rows if not row.is_reported]
-    assert [[cell.text for cell in row.cells[:2]] for row in measured_rows] == [["75.0", "4"], *2 * [["60.0", "50"]]]
+    assert [row.cells[0].text for row in measured_rows] == ["75.0", "60.0", "60.0"]
     assert measured_rows[1].label == "a: b, answers by the language model gpt-4, ground truth"
-    assert not any(row.cells[1].is_best for row in measured_rows)
     paper = tmp_path / "paper.tex"
     paper.write_text(latex(judged_table("reasoning", rows[:1], Shown(), with_published=True)))
     checks = check_paper(paper)
-    assert len(checks) == 4 and [check.fault for check in checks if check.fault] == []
+    assert len(checks) == 3 and [check.fault for check in checks if check.fault] == []
 
 
 def test_without_judged_rows_the_message_says_what_makes_them() -> None:

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder, KnowsRelativeTexts
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Instances, Int64Array, Partition
 from su3d_bench.metrics.instance.score import NO_OBJECT, Covered, covered_objects, score_of_masks
 from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, text_features
@@ -29,6 +29,7 @@ from su3d_bench.metrics.questions.truths import (
 BY_NAME = ("property by name", "relative by name")  # kinds of text to which the name alone is the answer
 MERGES = WELL_MERGED, UNDER_MERGED, OVER_MERGED = "well-merged", "under-merged", "over-merged"
 REFINED_BY, ANSWERED_BY = "n': ", "answers by "  # so begin the remarks that name who did it
+RELATIVE = "relative: "  # so begins the remark on queries of that kind
 
 
 class ShareMetric(Metric[ShareCounts]):
@@ -99,12 +100,17 @@ class RetrievalMetric(ShareMetric):
         is_plain = ~np.isin(kinds, BY_NAME)
         rows["all"], rows["by name"] = is_right[is_plain], is_right[~is_plain]
         rows["reachable"] = np.array([not in_map.isdisjoint(question.answers) for question in truth.asked], bool)
-        warnings = [encoder_warning(self.rules, prediction, encoder)]
+        warnings = [encoder_warning(self.rules, prediction, encoder), _relative_remark(encoder)]
         asked_for = [answer for question in truth.asked for answer in question.answers]
         each = np.array([(question.by_chance, question.by_name) for question in truth.asked]).reshape(-1, 2).T
         cheap = {kind: each[:, kinds == kind] for kind in self.rules.value_names[:4]}
         cheap |= {"all": each[:, is_plain], "by name": each[:, ~is_plain]}
         return self._score(truth.scene, asked_for, prediction, rows, warnings, cheap)
+
+
+def _relative_remark(encoder: object) -> str | None:
+    """What must stand beside figures of relative queries; None where the encoder was not trained on such texts."""
+    return f"{RELATIVE}{encoder.relative_remark}" if isinstance(encoder, KnowsRelativeTexts) else None
 
 
 def first_instances(
@@ -170,7 +176,7 @@ class AnnotationMetric(ShareMetric):
 
 
 def said_by(warnings: Sequence[str], start: str) -> tuple[str, ...]:
-    """Who did it, by the remarks that begin with ``start`` behind the name of their scenes; each once.
+    """What the remarks say that begin with ``start`` behind the name of their scenes; each once.
 
     >>> said_by(["a/b: n': the vote", "every scene: answers by gpt", "c/d: n': the vote"], REFINED_BY)
     ('the vote',)

@@ -16,10 +16,11 @@ from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.questions.files.datasets import is_foreign, read_foreign
 from su3d_bench.questions.files.queries import COLUMNS, MORE_COLUMNS, read_query_rows
-from su3d_bench.questions.model import ALL_KINDS, KINDS, Question, new_question
+from su3d_bench.questions.model import ALL_KINDS, KINDS, REASONING, Question, new_question
 from su3d_bench.store.atomic import write_text
 
 PAPER = Path(__file__).parent / "paper_queries.toml"
+PAGE = "opensu3d.github.io"
 
 
 def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ...]:
@@ -57,14 +58,19 @@ def _each_once(questions: Sequence[Question]) -> tuple[Question, ...]:
 
 
 def paper_queries() -> tuple[Question, ...]:
-    """The queries that the paper's page shows, for each of its 13 scenes; no answers are published."""
+    """The queries that the paper's page shows, for each of its 13 scenes, and its questions to reasoning.
+
+    Of these alone an answer is published, in words.
+    """
     content = tomllib.loads(PAPER.read_text(encoding="utf-8"))
     kinds_and_texts = [(kind, text) for kind in KINDS for text in content["queries"][kind]]
-    return tuple(
-        new_question(scene, kind, text, None, "opensu3d.github.io")
-        for scene in content["scenes"]
-        for kind, text in kinds_and_texts
+    queries = (
+        new_question(scene, kind, text, None, PAGE) for scene in content["scenes"] for kind, text in kinds_and_texts
     )
+    asked = (
+        new_question(one["scene"], REASONING, one["text"], None, PAGE, one["reply"]) for one in content["reasoning"]
+    )
+    return (*queries, *asked)
 
 
 def check_form(path: Path) -> None:
