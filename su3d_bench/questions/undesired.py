@@ -13,7 +13,7 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from su3d_bench.core.errors import printable
+from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.types import Float64Array, Instances
 from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.questions.english import last_word
@@ -49,10 +49,12 @@ def _reason(name: str, nouns: set[str], fraction: float, config: FilterConfig) -
 
 def _map_fractions(instances: Instances) -> Float64Array:
     """The share (K,) of the map's box from above that the box of each instance has; 0 where the map has no area."""
-    if not len(instances.points):
-        return np.zeros(len(instances))
-    low, high = instances.points.min(axis=0), instances.points.max(axis=0)
-    area = float(np.prod((high - low)[:2].astype(np.float64)))
-    sides = (instances.boxes[:, 1, :2] - instances.boxes[:, 0, :2]).astype(np.float64)
-    answer: Float64Array = np.prod(sides, axis=1) / area if area > 0 else np.zeros(len(instances))
+    k, points, boxes = len(instances), instances.points, instances.boxes.astype(np.float64)
+    if boxes.shape != (k, 2, 3) or points.ndim != 2 or points.shape[1] != 3:
+        raise PredictionError(f"this map has boxes {boxes.shape} for {k} instances, and points {points.shape}")
+    if not len(points):
+        return np.zeros(k)
+    area = float(np.prod(np.ptp(points[:, :2], axis=0).astype(np.float64)))
+    sides = np.maximum(boxes[:, 1, :2] - boxes[:, 0, :2], 0.0)
+    answer: Float64Array = np.prod(sides, axis=1) / area if area > 0 else np.zeros(k)
     return answer
