@@ -53,9 +53,9 @@ def case(n_scene: int) -> Case:
 
 @cache
 def filled_map(n_scene: int) -> VoxelMap:
-    voxel_map = VoxelMap(EPS)
+    voxel_map = VoxelMap(EPS, "all")
     scene = case(n_scene).scene
-    voxel_map.insert(scene, np.ones(len(scene), np.int32), keep_density=False, refill=False)
+    voxel_map.insert(scene, np.ones(len(scene), np.int32))
     return voxel_map
 
 
@@ -79,9 +79,9 @@ def test_voxel_map_as_it_grows(benchmark: BenchmarkFixture, n_scene: int) -> Non
 def filled_device_map(n_scene: int, device: str) -> DeviceVoxelMap:
     from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap
 
-    device_map = DeviceVoxelMap(EPS, device)
+    device_map = DeviceVoxelMap(EPS, device, "all")
     for part in np.array_split(case(n_scene).scene, max(1, n_scene // 1_000_000)):
-        device_map.insert(part, np.ones(len(part), np.int32), keep_density=False, refill=False)
+        device_map.insert(part, np.ones(len(part), np.int32))
     return device_map
 
 

@@ -67,12 +67,12 @@ def wall(n_points: int, spacing_m: float) -> tuple[Float64Array, Int64Array]:
 
 
 def opensu3d(n_points: int) -> tuple[Method, Callable[[], None]]:
-    """Its map only takes what is new, and this view is not: nothing to undo."""
+    """Its map grows by what is new, and this view is not: nothing to undo."""
     method = OpenSU3D()
     method.start(SCENE)
     points, tile = wall(n_points, 0.02)
     for rows in np.array_split(np.arange(len(points)), max(1, n_points // 100_000)):
-        method._map.insert(points[rows], (tile[rows] + 1).astype(np.int32), keep_density=True, refill=True)
+        method._map.insert(points[rows], (tile[rows] + 1).astype(np.int32))
     return method, lambda: None
 
 

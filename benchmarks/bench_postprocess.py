@@ -14,6 +14,7 @@ import numpy as np
 from pytest_benchmark.fixture import BenchmarkFixture
 
 from su3d_bench.core.types import Float64Array, Int64Array
+from su3d_bench.opensu3d.config import OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.opensu3d.postprocess import cluster
 from su3d_bench.opensu3d.tracking import ImageRecord, View
@@ -35,14 +36,14 @@ def instance_points(generator: np.random.Generator, n: int) -> Float64Array:
 @cache
 def filled() -> OpenSU3D:
     generator = np.random.default_rng(0)
-    method = OpenSU3D()
+    method = OpenSU3D(OpenSU3DConfig(density="all"))
     hits: list[Int64Array] = []
     for k in range(N_INSTANCES):
         points = instance_points(generator, N_POINTS)
         if k % 10 == 0:
             points[: N_POINTS // 2, 2] += 1.9  # two boxes, each with half of the points
         points += [4.0 * (k % 15), 4.0 * (k // 15), 0.0]
-        placed = method._map.insert(points, np.full(N_POINTS, k + 1, np.int32), keep_density=False, refill=False)
+        placed = method._map.insert(points, np.full(N_POINTS, k + 1, np.int32))
         hits.append(placed)
     method._next_id = N_INSTANCES + 1
     for position in range(N_VIEWS):
@@ -50,6 +51,7 @@ def filled() -> OpenSU3D:
         method._images.append(
             ImageRecord(
                 frame_index=position,
+                rows=np.arange(N_INSTANCES),
                 scores=generator.random(N_INSTANCES),
                 names=("thing",) * N_INSTANCES,
                 captions=("",) * N_INSTANCES,

@@ -41,7 +41,7 @@ def filled(method: OpenSU3D, n_points: int) -> OpenSU3D:
         points = (np.column_stack([x.ravel(), y.ravel(), np.zeros(x.size)]) + 0.5) * VOXEL_M
         points += [-side * VOXEL_M / 2, -side * VOXEL_M / 2, DISTANCE_M - VOXEL_M / 2]
         ids = 1 + (x.ravel() // 50) + (y.ravel() // 50) * (side // 50 + 1)
-        method._map.insert(points, ids.astype(np.int32), keep_density=True, refill=True)
+        method._map.insert(points, ids.astype(np.int32))
     return method
 
 

@@ -91,7 +91,7 @@ def fill(method: OpenSU3D, n_points: int, n_instances: int) -> GroundTruth:
         for k in objects:
             n = n_points * (k + 1) // n_instances - n_points * k // n_instances
             points = faces(generator, n) + np.array([APART_M * (k % side), APART_M * (k // side), -10.0])
-            hits.append(method._map.insert(points, np.full(n, k + 1, np.int32), keep_density=False, refill=False))
+            hits.append(method._map.insert(points, np.full(n, k + 1, np.int32)))
             ids = np.full(len(points[::20]), CLASSES[k % len(CLASSES)].id, np.int32)
             truths.append((points[::20].astype(np.float32), ids, np.full(len(ids), k + 1, np.int32)))
         segment = np.repeat(np.arange(len(objects), dtype=np.int32), [len(each) for each in hits])

@@ -99,10 +99,10 @@ def maps(n_points: int) -> Iterator[Comparison]:
     scene, frame = case(n_points).scene, case(n_points).frame
 
     def match(device: str) -> Callable[[], Arrays]:
-        method = OpenSU3D(OpenSU3DConfig(eps=EPS))
+        method = OpenSU3D(OpenSU3DConfig(eps=EPS, density="all"))
         method.receive_device(device)
         for part in np.array_split(scene, max(1, n_points // 1_000_000)):
-            method._map.insert(part, np.ones(len(part), np.int32), keep_density=False, refill=False)
+            method._map.insert(part, np.ones(len(part), np.int32))
         return lambda: (method._map.nearest(frame),)
 
     def update(device: str) -> Callable[[], Arrays]:

@@ -84,7 +84,11 @@ class ObjectMap:
         k = region.detection
         self._n_created += 1
         seen = Sighting(
-            detections.frame_index, k, detections.names[k], detections.captions[k], float(detections.scores[k])
+            detections.frame_index,
+            detections.row_of(k),
+            detections.names[k],
+            detections.captions[k],
+            float(detections.scores[k]),
         )
         return MapObject(
             number=self._n_created,

@@ -210,7 +210,13 @@ class SAM3D:
         for k in visible.tolist():
             description = detections.names[k], detections.captions[k], float(detections.scores[k])
             self._views.append(
-                _View(detections.frame_index, k, int(n_pixels[k]), detections.crop_features[k, 0], *description)
+                _View(
+                    detections.frame_index,
+                    detections.row_of(k),
+                    int(n_pixels[k]),
+                    detections.crop_features[k, 0],
+                    *description,
+                )
             )
         rows = np.arange(len(visible))
         return GroupedCloud(points, group, rows, rows + first_view)

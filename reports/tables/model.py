@@ -146,6 +146,22 @@ def blocks_of(rows: Sequence[TableRow]) -> list[list[TableRow]]:
 BY_PEOPLE = "-people"  # ends the name of what stands in a protocol's place where people judged
 
 
+def confidence_notes(confidences: Mapping[str, str | None]) -> list[str]:
+    """Where the confidences behind average precision come from, for each row that has one; a mix is marked.
+
+    >>> confidence_notes({"a": "computed", "b": "1 for all", "c": "1 for all"})
+    ['MIXED CONFIDENCES: computed (a); 1 for all (b, c): these average precisions do not compare']
+    """
+    whose: dict[str, list[str]] = {}
+    for label, what in confidences.items():
+        if what is not None:
+            whose.setdefault(what, []).append(label)
+    if len(whose) < 2:
+        return [f"confidences: {what}" for what in whose]
+    told = "; ".join(f"{what} ({', '.join(labels)})" for what, labels in whose.items())
+    return [f"MIXED CONFIDENCES: {told}: these average precisions do not compare"]
+
+
 @dataclass(frozen=True, kw_only=True)
 class Measured:
     """The numbers of ``metrics.json`` for one method and protocol, as fractions, None where undefined.
@@ -171,6 +187,7 @@ class Measured:
     limit: int = 0
     profile: str | None = None
     encoder: str | None = None
+    confidences: str | None = None
     caveat: str | None
     warnings: tuple[str, ...] = ()
 

@@ -19,6 +19,7 @@ from su3d_bench.reports.tables.model import (
     Table,
     TableRow,
     bracketed,
+    confidence_notes,
     is_count,
     percent,
     some,
@@ -251,7 +252,11 @@ def run_notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
             notes.setdefault(f"{RELATIVE}{said}", []).append(label)
     everyone = len(rows)
     return [
-        f"{'all measured rows' if len(who) == everyone > 1 else ', '.join(who)}: {what}" for what, who in notes.items()
+        *(
+            f"{'all measured rows' if len(who) == everyone > 1 else ', '.join(who)}: {what}"
+            for what, who in notes.items()
+        ),
+        *confidence_notes({label: row.confidences for row, label in zip(rows, labels, strict=True)}),
     ]
 
 

@@ -17,7 +17,17 @@ from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.protocol_files import protocol_names
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import combine
-from su3d_bench.reports.tables.model import NOT_MEASURED, Cell, Origin, Table, TableRow, bracketed, percent, some
+from su3d_bench.reports.tables.model import (
+    NOT_MEASURED,
+    Cell,
+    Origin,
+    Table,
+    TableRow,
+    bracketed,
+    confidence_notes,
+    percent,
+    some,
+)
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 MOST_RUNS = 10_000
@@ -38,6 +48,7 @@ class Entry:
     intervals: tuple[tuple[float, float] | None, ...]
     data: tuple[tuple[str, str], ...]
     profile: str
+    confidences: str | None
     is_ceiling: bool
 
     @property
@@ -134,6 +145,7 @@ def _entries(name: str, run: FinishedRun, protocols: Sequence[str]) -> Iterator[
             intervals=tuple(result.intervals.get(key) for key in result.headline),
             data=tuple((scene, run.record.data_digests[scene]) for scene in sorted(result.scenes)),
             profile=printable(run.record.profile or "", 40),
+            confidences=None if record.confidences is None else printable(record.confidences, 80),
             is_ceiling="a ceiling, not a result" in (record.caveat or "") or method == CEILING_METHOD,
         )
 
@@ -205,6 +217,7 @@ def _table(board: Sequence[Entry], index: int, intervals: bool) -> Table:
     notes = [f"Scenes: {', '.join(first.scenes)}."]
     if any(entry.is_ceiling for entry in board):
         notes.append("Rows that were told the truth stand last and compete with none.")
+    notes += confidence_notes({f"{entry.method} of {entry.run}": entry.confidences for entry in rivals})
     return Table(
         name=f"leaderboard-{index + 1}",
         caption=f"{first.protocol}, version {first.version}, {scenes}; per cent.",

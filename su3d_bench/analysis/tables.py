@@ -125,6 +125,7 @@ def _measured(run: str, limit: int, record: ResultRecord, nothing: Mapping[str, 
         limit=limit,
         profile=record.profile,
         encoder=record.encoder,
+        confidences=record.confidences,
         caveat=record.caveat,
         warnings=numbers.warnings,
     )

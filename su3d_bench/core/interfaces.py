@@ -289,6 +289,14 @@ class CountsBytes(Protocol):
 
 
 @runtime_checkable
+class CountsLosses(Protocol):
+    """What the last update left out, by the name of its column in ``updates.csv``."""
+
+    @property
+    def losses(self) -> Mapping[str, int]: ...
+
+
+@runtime_checkable
 class HasFinishCosts(Protocol):
     """Numbers on the last ``finish`` that stand beside its time."""
 
@@ -352,6 +360,7 @@ ABILITIES = {
         CountsPoints,
         CountsInstances,
         CountsBytes,
+        CountsLosses,
         HasFinishCosts,
         HasInputs,
         HasCaveat,

@@ -175,7 +175,8 @@ class Detections:
     ``crop_features`` (K, R, D) float32, L2-normalised, crop r at ``crop_ratios[r]``;
     ``global_feature`` (D,) float32, of the whole image; ``name_features`` (K, D) float32, of the names as texts, where
     the method asked for them. ``score_scale``: ``published`` where scores mean what published thresholds were set for
-    (SAM's predicted IoU, a detector's confidence), ``own`` where they only order regions.
+    (SAM's predicted IoU, a detector's confidence), ``own`` where they only order regions. ``rows`` (K,): which row of
+    the file, or of all that was found in the image, each region is, where some were left out.
     """
 
     frame_index: int
@@ -189,10 +190,13 @@ class Detections:
     global_feature: Float32Array
     name_features: Float32Array | None = None
     score_scale: Literal["published", "own"] = "published"
+    rows: Int64Array | None = None
 
     def __post_init__(self) -> None:
         n = len(self.names)
         shapes = (len(self.masks), len(self.boxes), len(self.scores), len(self.captions), len(self.crop_features))
+        if self.rows is not None and len(self.rows) != n:
+            raise DataError(f"frame {self.frame_index}: {len(self.rows)} rows for {n} names")
         if self.masks.ndim != 3 or any(length != n for length in shapes):
             raise DataError(
                 f"frame {self.frame_index}: {n} names, but masks, boxes, scores, captions, features {shapes}"
@@ -208,6 +212,10 @@ class Detections:
     def __len__(self) -> int:
         return len(self.names)
 
+    def row_of(self, k: int) -> int:
+        """The row of region ``k`` in the file or image that it came from."""
+        return k if self.rows is None else int(self.rows[k])
+
     def check_of(self, frame: Frame) -> None:
         """Raises ``DataError`` where these are the detections of another frame, or their masks of another size."""
         if self.frame_index != frame.index:
@@ -222,18 +230,20 @@ class PerceptionNeeds:
     """What a method asks of perception.
 
     ``masks``: ``grounded`` (named objects), ``class-agnostic`` (every region) or ``none``; regions whose name is in
-    ``background_names`` or whose box covers more than ``max_box_fraction`` of the image are left out before any
-    feature is computed. A crop is the region's box grown by ``crop_padding_px`` on every side, then scaled by a ratio
-    about its centre, then clipped. ``name_features``: the names' text features too. ``true_proposals``: masks in 3D
-    made from the ground truth, which makes every number of the method a ceiling. ``automatic`` and ``grounding`` name
-    the settings with which the method's own program makes class-agnostic and grounded masks, for profiles that have
-    its models; others pay them no heed.
+    ``background_names`` (or, with ``background_by_head``, whose head noun is: "brick walls" are a wall) or whose box
+    covers more than ``max_box_fraction`` of the image are left out before any feature is computed. A crop is the
+    region's box grown by ``crop_padding_px`` on every side, then scaled by a ratio about its centre, then clipped.
+    ``name_features``: the names' text features too. ``true_proposals``: masks in 3D made from the ground truth, which
+    makes every number of the method a ceiling. ``automatic`` and ``grounding`` name the settings with which the
+    method's own program makes class-agnostic and grounded masks, for profiles that have its models; others pay them no
+    heed.
     """
 
     masks: Literal["grounded", "class-agnostic", "none"] = "grounded"
     crop_ratios: tuple[float, ...] = (1.0,)
     crop_padding_px: int = 0
     background_names: tuple[str, ...] = ()
+    background_by_head: bool = False
     max_box_fraction: float = 1.0
     name_features: bool = False
     true_proposals: bool = False
@@ -330,11 +340,11 @@ class Instances(Masks):
     """A map of K instances over M shared points, one mask an instance.
 
     ``points`` (M, 3) float32 m; ``scores`` (K,) float64; ``features`` (K, D) float32 where the method has features,
-    ``labels`` one class name each where the method itself decides, '' for what it leaves to the feature; ``boxes``
-    (K, 2, 3) float32 axis-aligned minimum and maximum corners; ``centroids`` (K, 3) float32; ``views`` (V, 2) int32
-    rows (frame index, detection index), those of instance k at ``view_indptr[k]:view_indptr[k + 1]``; where the method
-    keeps them, ``view_names`` and ``view_scores`` (V,) float64 are the names and prediction scores that perception
-    gave in those views.
+    ``labels`` one class name each where the method itself decides, '' for what it leaves to the feature; ``boxes`` (K,
+    2, 3) float32 axis-aligned minimum and maximum corners; ``centroids`` (K, 3) float32; ``views`` (V, 2) int32 rows
+    (frame index, row of the file or image that the detection came from), those of instance k at
+    ``view_indptr[k]:view_indptr[k + 1]``; where the method keeps them, ``view_names`` and ``view_scores`` (V,) float64
+    are the names and prediction scores that perception gave in those views.
     """
 
     points: Float32Array
@@ -347,7 +357,7 @@ class Instances(Masks):
     centroids: Float32Array
     view_indptr: Int64Array
     views: Int32Array
-    ids: Int32Array = field(default_factory=lambda: np.zeros(0, np.int32))
+    ids: Int64Array = field(default_factory=lambda: np.zeros(0, np.int64))
     view_names: tuple[str, ...] | None = None
     view_scores: Float64Array | None = None
 
@@ -410,7 +420,7 @@ class Instances(Masks):
             centroids=means if centroids is None else centroids,
             view_indptr=np.zeros(k + 1, np.int64) if views is None else starts_of(map(len, views)),
             views=np.array(rows, np.int32).reshape(-1, 2),
-            ids=np.array(ids, np.int32),
+            ids=np.array(ids, np.int64),
             view_names=view_names,
             view_scores=view_scores,
         )
@@ -450,10 +460,14 @@ Prediction = Instances | Partition | DenseFeatures
 
 @dataclass(frozen=True)
 class Regions:
-    """A segmenter's answer: masks, boxes and scores as in ``Detections``; names where the segmenter itself names."""
+    """A segmenter's answer: masks, boxes and scores as in ``Detections``; names where the segmenter itself names.
+
+    ``rows`` (K,): which rows of a file they are, where some of its rows are no regions.
+    """
 
     masks: BoolArray
     boxes: Float32Array
     scores: Float32Array
     names: tuple[str, ...] | None = None
     captions: tuple[str, ...] | None = None
+    rows: Int64Array | None = None

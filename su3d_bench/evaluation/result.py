@@ -10,13 +10,13 @@ import numpy as np
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
+from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
 from su3d_bench.metrics.matching.checks import MaskFacts
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.metrics.scoring import ProtocolResult, combine, combined_metrics, metric_of, plain_json
 
 SCHEMA = 1
-EVERY_CONFIDENCE = "every confidence is"
 # What the file calls the metrics; the first ones of each kind are its headline.
 KEYS = {
     "AP": "ap", "AP50": "ap50", "AP25": "ap25", "mAcc": "macc", "mIoU": "miou", "F-mIoU": "fmiou", "pAcc": "pacc",
@@ -209,7 +209,7 @@ def _form(rules: ProtocolRules, kept: SceneOutcomes, file_confidences: bool) -> 
         warnings=(),
     )
     lines = [*_scene_warnings(kept), *_confidence_warnings(rules, evaluation, file_confidences), *kept.warnings]
-    lines += [line for line in result.warnings if EVERY_CONFIDENCE not in line]  # said above, for all scenes at once
+    lines += [line for line in result.warnings if CONSTANT_CONFIDENCE not in line]  # said above, for all scenes at once
     return replace(evaluation, warnings=tuple(_once(lines)))
 
 
@@ -259,7 +259,7 @@ def _confidence_warnings(rules: ProtocolRules, evaluation: ProtocolEvaluation, f
         )
         return [f"the protocol has 1 for every confidence{differ}: AP of a class is then recall (1 + precision) / 2"]
     if confidences[0] == confidences[1] and sum(facts.n_masks for facts in evaluation.facts.values()) > 1:
-        return [f"{EVERY_CONFIDENCE} {confidences[0]:g}: AP of a class is then recall (1 + precision) / 2"]
+        return [f"{CONSTANT_CONFIDENCE} {confidences[0]:g}: AP of a class is then recall (1 + precision) / 2"]
     return []
 
 

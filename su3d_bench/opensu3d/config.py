@@ -14,9 +14,10 @@ from su3d_bench.core.types import PerceptionNeeds
 
 MultiScale = Literal["direct", "weighted"]
 MultiView = Literal["direct", "global"]
-Scheme = Literal["scheme1", "scheme2", "scheme3", "scheme4"]
+Scheme = Literal["scheme1", "scheme2", "scheme3", "scheme4", "scheme4-narrow"]
 OverlapRule = Literal["smaller-segment", "frame-segment", "as-printed"]
-InstanceScore = Literal["mean", "max", "top-m-sum"]
+Density = Literal["scene", "frame", "all"]
+InstanceScore = Literal["ones", "mean", "max", "top-m-sum"]
 BEST_FIT_RATIO = 1.0
 
 
@@ -31,12 +32,14 @@ class Fusion:
 
 _NARROW = (0.8, 1.0, 1.2)
 _WIDE = (1.0, 2.0, 4.0)
-# Scheme 4 is "the combination of updated multi-view and multi-scale": scheme 3's multi-scale, wide ratios included.
+# Scheme 4 is the "combination of updated multiview and multiscale features fusion formulation", so it keeps scheme 3's
+# crops; the paper names those for scheme 3 alone, which leaves the narrow ones possible too.
 SCHEMES: dict[Scheme, Fusion] = {
     "scheme1": Fusion("direct", "direct", _NARROW),
     "scheme2": Fusion("direct", "global", _NARROW),
     "scheme3": Fusion("weighted", "direct", _WIDE),
     "scheme4": Fusion("weighted", "global", _WIDE),
+    "scheme4-narrow": Fusion("weighted", "global", _NARROW),
 }
 
 INCREMENT = 0.2  # "a scaling ratio increment of 0.2"
@@ -72,11 +75,12 @@ class OpenSU3DConfig(BaseModel):
     # The paper's 20 px belong to 1200x680 images; other widths take the same share of the image. 0: pixels as they are.
     border_reference_width: int = Field(default=1200, ge=0)
     border_shape: Literal["disc", "square"] = "disc"
-    # What a ring's pixels that lie in another mask become in the map, once the matching has gone without them: points
-    # of that mask's instance, points of no instance, or none at all. The paper leaves it open.
-    border_pixels: Literal["owner", "background", "drop"] = "owner"
-    # Points of pixels in no mask: the paper back-projects every pixel.
+    # What a ring's pixels that lie in another mask become in the map: points of no instance, for M' holds the ring and
+    # Eq. 1 back-projects M'; points of that mask's instance, once the matching has gone without them; or none at all.
+    border_pixels: Literal["background", "owner", "drop"] = "background"
+    # Points of pixels in no mask: Eq. 1 back-projects every pixel.
     background_pixels: Literal["keep", "drop"] = "keep"
+    # The head nouns of what is left out: the paper's "walls" are "brick wall" to a tagger, and "wall lamp" is a lamp.
     background_names: Annotated[tuple[str, ...], Field(strict=False)] = ("wall", "floor", "ceiling", "ground", "roof")
     max_box_fraction: Fraction = 0.95
     scheme: Scheme = "scheme1"
@@ -86,29 +90,41 @@ class OpenSU3DConfig(BaseModel):
     top_m: int = Field(default=5, ge=1)
     depth_min: float = Field(default=0.0, ge=0)
     depth_max: Metres = 10.0
-    frame_voxel: float = Field(default=0.02, ge=0)
     eps: Metres = 0.02
+    # The frame cloud holds one point a voxel of this side and an ID; unset, of eps, and 0 for every pixel.
+    frame_voxel: float | None = Field(default=None, ge=0, allow_inf_nan=False)
     overlap_threshold: float = Field(default=0.3, ge=0)
     overlap_rule: OverlapRule = "smaller-segment"
-    keep_density: bool = True
-    # A point of an instance takes over a voxel that a point of no instance holds; the paper leaves it open.
-    refill_background: bool = True
+    # Which point goes where a new one meets a voxel of eps that is held: the scene's ("set of points from P'_scene can
+    # also be deleted to retain constant sparsity"), the new one, or neither.
+    density: Density = "scene"
     dbscan_eps: Metres = 0.1
     dbscan_min_points: int = Field(default=20, ge=1)
     split_fraction: Fraction = 0.8
-    # The paper ranks views, not instances; the sum of the top m scores over m puts what was seen once behind the rest.
-    instance_score: InstanceScore = "top-m-sum"
+    # The paper ranks views, not instances, and the set-up that it takes for AP, OpenMask3D's, gives 1 to every mask.
+    # The others are made of the detector's scores of an instance's views; top-m-sum is the sum of the best m over m.
+    instance_score: InstanceScore = "ones"
 
     @model_validator(mode="after")
-    def _best_fit_crop_exists(self) -> OpenSU3DConfig:
+    def _settings_agree(self) -> OpenSU3DConfig:
         fusion = self.fusion
         if fusion.multi_scale == "weighted" and BEST_FIT_RATIO not in fusion.crop_ratios:
             raise ValueError(
                 f"crop_ratios {fusion.crop_ratios} hold no 1.0; weighted multi-scale fusion compares with that crop"
             )
+        if self.border_pixels == "background" and self.background_pixels == "drop":
+            raise ValueError(
+                "border_pixels 'background' makes points of rings that background_pixels 'drop' leaves out; set "
+                "border_pixels to 'drop' or 'owner'"
+            )
         if self.depth_min >= self.depth_max:
             raise ValueError(f"depth_min {self.depth_min} m is not below depth_max {self.depth_max} m")
         return self
+
+    @property
+    def voxel_of_frame(self) -> float:
+        """Side in metres of the voxels of the frame cloud, 0 for none."""
+        return self.eps if self.frame_voxel is None else self.frame_voxel
 
     @property
     def fusion(self) -> Fusion:
@@ -121,8 +137,8 @@ class OpenSU3DConfig(BaseModel):
         )
 
     def effective(self) -> dict[str, Any]:
-        """The settings with the scheme's own written out, so that equal behaviour is equal."""
-        return {**self.model_dump(exclude={"scheme"}), **asdict(self.fusion)}
+        """The settings with what follows from others written out, so that equal behaviour is equal."""
+        return {**self.model_dump(exclude={"scheme"}), "frame_voxel": self.voxel_of_frame, **asdict(self.fusion)}
 
     @property
     def needs(self) -> PerceptionNeeds:
@@ -131,6 +147,7 @@ class OpenSU3DConfig(BaseModel):
             masks="grounded",
             crop_ratios=self.fusion.crop_ratios,
             background_names=self.background_names,
+            background_by_head=True,
             max_box_fraction=self.max_box_fraction,
         )
 

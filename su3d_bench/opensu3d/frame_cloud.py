@@ -59,24 +59,34 @@ class FrameCloud:
     """World points (N, 3) m, those inside masks first, then those of border rings, then those of no mask.
 
     ``owner`` (N,) holds detection indices, NO_DETECTION in no mask; the first ``n_inside`` points are the segments that
-    are matched and counted, the others have no instance in the ID image.
+    are matched and counted, the others have no instance in the ID image. ``n_swallowed`` detections lie in rings of
+    others with every pixel that smaller masks leave them, ``n_too_far`` pixels beyond ``depth_max``.
     """
 
     points: Float64Array
     owner: Int32Array
     n_inside: int
+    n_swallowed: int
+    n_too_far: int
 
 
 def frame_cloud(frame: Frame, masks: BoolArray, config: OpenSU3DConfig) -> FrameCloud:
     """P_frame of one image.
 
-    Where ``frame_voxel`` is above 0 it is reduced to the first point of each voxel and detection (in and out of rings).
+    Unless ``frame_voxel`` is 0 it is reduced to the first point of each voxel and detection (in and out of rings).
     """
     painted = paint(masks, config.border_in(frame.depth_m.shape[1]), config.border_shape)
     pixels = valid_depth(frame.depth_m, config.depth_min, config.depth_max)
     points, owner, rank = _cloud(frame, pixels, painted, config)
     order = np.argsort(rank, kind="stable")
-    return FrameCloud(points[order], owner[order], int(np.count_nonzero(rank == 0)))
+    in_masks, outside_rings = (
+        np.bincount(image.ravel() + 1, minlength=len(masks) + 1)[1:] for image in (painted.owner, painted.ids)
+    )
+    with np.errstate(invalid="ignore"):
+        n_too_far = int(np.count_nonzero(np.isfinite(frame.depth_m) & (frame.depth_m > config.depth_max)))
+    n_inside = int(np.count_nonzero(rank == 0))
+    n_swallowed = int(np.count_nonzero((in_masks > 0) & (outside_rings == 0)))
+    return FrameCloud(points[order], owner[order], n_inside, n_swallowed, n_too_far)
 
 
 def _cloud(
@@ -95,6 +105,6 @@ def _cloud(
         painted.owner,
         rings[config.border_pixels],
         config.background_pixels == "drop",
-        config.frame_voxel,
+        config.voxel_of_frame,
     )
     return cloud

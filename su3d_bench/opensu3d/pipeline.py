@@ -2,25 +2,31 @@
 
 from __future__ import annotations
 
+import logging
 import time
+from collections import Counter
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
 from su3d_bench.core.devices import CPU
+from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import MethodAbout, StageTimer
 from su3d_bench.core.types import Detections, Frame, Instances, Int32Array, Int64Array, PerceptionNeeds, SceneInfo
 from su3d_bench.opensu3d.association import assign_ids, count_overlaps, overlap_ratios
 from su3d_bench.opensu3d.config import SCHEMES, OpenSU3DConfig, crop_levels
 from su3d_bench.opensu3d.frame_cloud import NO_DETECTION, FrameCloud, frame_cloud
-from su3d_bench.opensu3d.postprocess import segments_of, to_instances
+from su3d_bench.opensu3d.postprocess import CONFIDENCES, IDS, segments_of, to_instances
 from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View, record_of
 from su3d_bench.opensu3d.voxel_map import NO_INSTANCE, VoxelMap
 from su3d_bench.store.scratch import Scratch
 
 if TYPE_CHECKING:
     from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap
+
+logger = logging.getLogger(__name__)
+logger.setLevel(logging.INFO)  # what is left out goes to the log of its scene
 
 
 class OpenSU3D:
@@ -37,7 +43,11 @@ class OpenSU3D:
         status="each step is tested on hand-worked cases; never run beside the original, and no figure of its paper "
         "has been reproduced",
     )
-    presets: ClassVar[Mapping[str, Mapping[str, str]]] = {scheme: {"scheme": scheme} for scheme in SCHEMES}
+    presets: ClassVar[Mapping[str, Mapping[str, str]]] = {
+        **{scheme: {"scheme": scheme} for scheme in SCHEMES},
+        "owner": {"border_pixels": "owner"},
+        **{f"score-{rule}": {"instance_score": rule} for rule in ("mean", "max", "top-m-sum")},
+    }
     # The paper's letters, as its ablation (Table I) varies them.
     short_names: ClassVar[Mapping[str, tuple[str, Callable[[Any], Any]]]] = {
         "m": ("top_m", lambda value: value),
@@ -54,15 +64,25 @@ class OpenSU3D:
     def _clear(self) -> None:
         self._scratch.close()
         self._scratch = Scratch()
-        self._map = _empty_map(self.config.eps, self._device)
+        self._map = _empty_map(self.config, self._device)
         self._table = TrackingTable(list)
         self._images: list[ImageRecord] = []
+        self._seeds: dict[int, int] = {}
         self._next_id = NO_INSTANCE + 1
+        self._n_detections = 0
+        self._losses: Counter[str] = Counter()  # of all updates
+        self.losses: dict[str, int] = {}  # of the last update
         self.postprocess_ms: float | None = None  # of the last ``finish``
 
     @property
     def needs(self) -> PerceptionNeeds:
         return self.config.needs
+
+    @property
+    def caveat(self) -> str | None:
+        """Where its confidences come from, unless they are 1."""
+        rule = self.config.instance_score
+        return None if rule == "ones" else f"confidence of an instance: {CONFIDENCES[rule]}; the paper defines none"
 
     @property
     def n_points(self) -> int:
@@ -91,13 +111,16 @@ class OpenSU3D:
         with timer.stage("match"):
             matched = self._map.nearest(cloud.points[: cloud.n_inside])
         with timer.stage("track"):
-            scene_id_of = self._track(cloud, matched, len(detections))
+            scene_id_of = self._track(cloud, matched, detections)
         with timer.stage("insert"):
             self._insert(cloud, matched, scene_id_of, detections)
+        self.losses = {"n_swallowed": cloud.n_swallowed, "n_too_far": cloud.n_too_far}
+        self._losses.update(self.losses)
+        self._n_detections += len(detections)
 
-    def _track(self, cloud: FrameCloud, matched: Int64Array, n_detections: int) -> Int32Array:
+    def _track(self, cloud: FrameCloud, matched: Int64Array, detections: Detections) -> Int32Array:
         """Scene id of each detection, NO_INSTANCE for those without a point; enters them into Q."""
-        scene_id_of = np.full(n_detections, NO_INSTANCE, np.int32)
+        scene_id_of = np.full(len(detections), NO_INSTANCE, np.int32)
         if cloud.n_inside == 0:
             return scene_id_of
         overlaps = count_overlaps(cloud.owner[: cloud.n_inside], self._map.ids_of(matched))
@@ -109,6 +132,10 @@ class OpenSU3D:
         n_scene = np.where(overlaps.best > NO_INSTANCE, inside[np.searchsorted(wanted, overlaps.best)], 0)
         ratios = overlap_ratios(overlaps, n_scene, self.config.overlap_rule)
         ids, self._next_id = assign_ids(overlaps, ratios, self.config.overlap_threshold, self._next_id)
+        if self._next_id > IDS:
+            raise DataError(
+                f"frame {detections.frame_index}: the map has more than {IDS - 1:,} instances to tell apart"
+            )
         scene_id_of[overlaps.segments] = ids
         for detection, scene_id in zip(overlaps.segments, ids, strict=True):
             self._table[int(scene_id)].append(View(len(self._images), int(detection)))
@@ -116,32 +143,56 @@ class OpenSU3D:
 
     def _insert(self, cloud: FrameCloud, matched: Int64Array, scene_id_of: Int32Array, detections: Detections) -> None:
         ids = np.append(scene_id_of, NO_INSTANCE).astype(np.int32)[cloud.owner]  # NO_DETECTION is the last
-        placed = self._map.insert(
-            cloud.points, ids, keep_density=self.config.keep_density, refill=self.config.refill_background
-        )
+        placed = self._map.insert(cloud.points, ids)
+        self._plant(cloud, placed, scene_id_of)
         hit = placed.copy()
         hit[: cloud.n_inside] = np.where(placed[: cloud.n_inside] >= 0, placed[: cloud.n_inside], matched)
         hit[cloud.owner == NO_DETECTION] = -1
         self._images.append(record_of(detections, self.config.fusion, cloud.owner, hit, self._scratch))
 
+    def _plant(self, cloud: FrameCloud, placed: Int64Array, scene_id_of: Int32Array) -> None:
+        """Keeps of each new scene id the map point in the middle of its first mask: the cluster there bears the id."""
+        for detection, scene_id in enumerate(scene_id_of.tolist()):
+            if scene_id == NO_INSTANCE or scene_id in self._seeds:
+                continue
+            own = np.flatnonzero((cloud.owner[: cloud.n_inside] == detection) & (placed[: cloud.n_inside] >= 0))
+            if len(own):
+                points = cloud.points[own]
+                offsets = points - np.median(points, axis=0)
+                self._seeds[scene_id] = int(placed[own[np.argmin((offsets**2).sum(axis=1))]])
+
     def finish(self) -> Instances:
         """The instances of the map so far, and its points of no instance."""
         start = time.perf_counter()
-        points, ids = self._map.points, self._map.ids
-        segments = segments_of(points, ids, self._table, self._images, self._next_id, self.config)
+        by_age = self._map.by_age
+        points, ids = self._map.points[by_age], self._map.ids[by_age]
+        segments = segments_of(points, ids, by_age, self._table, self._seeds, self._images, self.config)
         instances = to_instances(points, ids, segments, self._images, self.config)
         self.postprocess_ms = (time.perf_counter() - start) * 1e3
         return instances
 
     def close(self) -> None:
-        """Forgets the scene, and gives memory and disk space back."""
+        """Forgets the scene, says in the log what was left out of it, and gives memory and disk space back."""
+        if self._losses["n_swallowed"]:
+            logger.info(
+                "opensu3d: %d of %d detections lie whole in the rings of others (border_px %g)",
+                self._losses["n_swallowed"],
+                self._n_detections,
+                self.config.border_px,
+            )
+        if self._losses["n_too_far"]:
+            logger.info(
+                "opensu3d: %d pixels lie beyond depth_max %g m and are left out",
+                self._losses["n_too_far"],
+                self.config.depth_max,
+            )
         self._clear()
         self._scratch.close()
 
 
-def _empty_map(eps: float, device: str) -> VoxelMap | DeviceVoxelMap:
+def _empty_map(config: OpenSU3DConfig, device: str) -> VoxelMap | DeviceVoxelMap:
     if device == CPU:
-        return VoxelMap(eps)
+        return VoxelMap(config.eps, config.density)
     from su3d_bench.opensu3d.kernels.voxel_map_torch import DeviceVoxelMap
 
-    return DeviceVoxelMap(eps, device)
+    return DeviceVoxelMap(config.eps, device, config.density)

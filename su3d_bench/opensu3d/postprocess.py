@@ -2,48 +2,39 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
+from su3d_bench.core.english import with_article
 from su3d_bench.core.types import Float64Array, Instances, Int32Array, Int64Array, Masks, starts_of
 from su3d_bench.opensu3d.config import InstanceScore, OpenSU3DConfig
 from su3d_bench.opensu3d.feature_fusion import fuse_views
 from su3d_bench.opensu3d.tracking import ImageRecord, TrackingTable, View
 
 NOISE = -1
-# Spelt with a vowel but spoken with a consonant, and the other way round.
-_SPOKEN_WITH_CONSONANT = ("uni", "use", "usu", "usb", "uten", "util", "ukul", "eu", "ewe", "one", "once")
-_SPOKEN_WITH_VOWEL = ("hour", "heir", "honest", "honor", "honour")
-_LETTERS_WITH_VOWEL = "aefhilmnorsx"
+# Ids of clusters are above those of scene segments, which they show: 7000012 is a part of 12.
+IDS = 1_000_000
+CONFIDENCES: Mapping[InstanceScore, str] = {
+    "mean": "the mean score of its views",
+    "max": "the highest score of its views",
+    "top-m-sum": "the sum of its top m views' scores over m",
+}
 
 
 @dataclass(frozen=True)
 class Segment:
-    """One instance to be: its ``scene_id``, map points (sorted) and views in the order they came."""
+    """One instance to be: its ``id``, its points, the oldest first, and its views in the order they came."""
 
-    scene_id: int
+    id: int
     points: Int64Array
     views: tuple[View, ...]
 
 
-def article(name: str) -> str:
-    """The English indefinite article of ``name``: "a" bed, "an" indoor-plant, "a" utensil-holder, "an" LCD screen."""
-    first = name.strip().replace("-", " ").split(" ")[0]
-    spelt_out = len(first) == 1 or (first.isupper() and len(first) <= 3)
-    word = first.lower()
-    if spelt_out:
-        return "an" if word[0] in _LETTERS_WITH_VOWEL else "a"
-    if word.startswith(_SPOKEN_WITH_VOWEL):
-        return "an"
-    return "an" if word[:1] in set("aeiou") and not word.startswith(_SPOKEN_WITH_CONSONANT) else "a"
-
-
 def caption_of(name: str) -> str:
     """The caption of an object that nothing more is known of: "an {object} in a scene", with the right article."""
-    name = name.strip() or "object"
-    return f"{article(name)} {name} in a scene"
+    return f"{with_article(name.strip() or 'object')} in a scene"
 
 
 def cluster(points: Float64Array, config: OpenSU3DConfig) -> Int64Array:
@@ -63,12 +54,17 @@ def kept_clusters(labels: Int64Array, split_fraction: float) -> list[int]:
 def segments_of(
     points: Float64Array,
     ids: Int32Array,
+    index: Int64Array,
     table: TrackingTable,
+    seeds: Mapping[int, int],
     images: Sequence[ImageRecord],
-    next_id: int,
     config: OpenSU3DConfig,
 ) -> list[Segment]:
-    """Instances after clustering, split-off ones last with new ids from ``next_id`` on; what is noise is left out."""
+    """Instances after clustering, the largest cluster of each scene segment before all others; noise is left out.
+
+    ``index`` (N,) is each point's index in the map, by which views know what they hit, and by which clusters are told
+    apart: see ``id_of``.
+    """
     order = np.argsort(ids, kind="stable")
     kept: list[Segment] = []
     split_off: list[Segment] = []
@@ -81,12 +77,22 @@ def segments_of(
         views = tuple(table[scene_id])
         for rank, label in enumerate(clusters):
             members = own[labels == label]
-            hitting = views if len(clusters) == 1 else _views_that_hit(members, views, images)
-            if rank == 0:
-                kept.append(Segment(scene_id, members, hitting))
-            else:
-                split_off.append(Segment(next_id + len(split_off), members, hitting))
+            places = np.sort(index[members])
+            hitting = views if len(clusters) == 1 else _views_that_hit(places, views, images)
+            segment = Segment(id_of(scene_id, places, seeds.get(scene_id)), members, hitting)
+            (split_off if rank else kept).append(segment)
     return kept + split_off
+
+
+def id_of(scene_id: int, places: Int64Array, seed: int | None) -> int:
+    """The id of the cluster of segment ``scene_id`` whose points have the indices ``places``, ascending, in the map.
+
+    The segment's own where its ``seed`` is among them, else one of the cluster's first place: a place stays what it is
+    however the map grows, so an id never passes to another object, whenever and how often the map is asked for.
+    """
+    at = np.searchsorted(places, -1 if seed is None else seed)
+    is_home = seed is not None and at < len(places) and places[at] == seed
+    return scene_id if is_home else (int(places[0]) + 1) * IDS + scene_id
 
 
 def _views_that_hit(members: Int64Array, views: tuple[View, ...], images: Sequence[ImageRecord]) -> tuple[View, ...]:
@@ -106,7 +112,9 @@ def best_views(views: tuple[View, ...], images: Sequence[ImageRecord], m: int) -
 
 
 def instance_score(scores: Float64Array, rule: InstanceScore, m: int) -> float:
-    """Prediction score of an instance from the detector's scores of its views."""
+    """Confidence of an instance: 1, or what the ``rule`` makes of the detector's scores of its views."""
+    if rule == "ones":
+        return 1.0
     if rule == "max":
         return float(scores.max())
     if rule == "mean":
@@ -137,8 +145,8 @@ def to_instances(
         names=tuple(each.name for each in described),
         captions=tuple(each.caption for each in described),
         centroids=np.array([points[s.points].mean(axis=0) for s in segments], np.float32).reshape(len(segments), 3),
-        views=[[(images[view.position].frame_index, view.detection) for view in s.views] for s in segments],
-        ids=[segment.scene_id for segment in segments],
+        views=[[images[view.position].source_of(view.detection) for view in s.views] for s in segments],
+        ids=[segment.id for segment in segments],
         view_names=tuple(image.names[row] for image, row in views),
         view_scores=np.array([image.scores[row] for image, row in views], np.float64),
     )

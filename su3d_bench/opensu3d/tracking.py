@@ -31,12 +31,14 @@ TrackingTable = defaultdict[int, list[View]]
 class ImageRecord:
     """What one image said of its detections, kept for names, captions, scores and features.
 
+    ``rows`` (K,) are those of the file or image that they came from.
     What is large lies in a scratch file, so that memory does not grow with the images: ``multi_scale`` (K, D), the f_MS
     of its K detections, ``global_feature`` (1, D), its f_G, and ``hits``, the map points that detections hit, those of
     detection k in rows ``hit_indptr[k]`` to ``hit_indptr[k + 1]``.
     """
 
     frame_index: int
+    rows: Int64Array
     scores: Float64Array
     names: tuple[str, ...]
     captions: tuple[str, ...]
@@ -49,6 +51,10 @@ class ImageRecord:
     def n_dimensions(self) -> int:
         """D of its features."""
         return self.global_feature.shape[1]
+
+    def source_of(self, detection: int) -> tuple[int, int]:
+        """The frame of ``detection`` and its row in the file or image that it came from."""
+        return self.frame_index, int(self.rows[detection])
 
     def feature_of(self, detection: int) -> Float64Array:
         """f_MS (D,) of ``detection``."""
@@ -76,6 +82,7 @@ def record_of(
     pairs = _distinct((segment[is_hit].astype(np.int64) << 40) | hit[is_hit])
     return ImageRecord(
         detections.frame_index,
+        np.array([detections.row_of(k) for k in range(len(detections))], np.int64),
         detections.scores.astype(np.float64),
         # one text a name, not one an image
         tuple(map(sys.intern, map(str, detections.names))),

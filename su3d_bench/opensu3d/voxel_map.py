@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, Int32Array, Int64Array
+from su3d_bench.opensu3d.config import Density
 
 NO_INSTANCE = 0
 # Voxel coordinates are exact integers far beyond this; a coordinate above it is a pose in the wrong unit.
@@ -22,18 +23,22 @@ ROWS_OF_A_THREAD = 20_000  # some 2 ms of work; a thread takes 0.1 ms to start
 class VoxelMap:
     """Points (float64, metres) with ids, hashed by voxels of side ``eps``.
 
-    Arrays double when they are full; every other step costs what the view costs, however many points the map holds.
+    Arrays double when they are full; every other step costs what the view costs, however many points the map holds. A
+    point that is deleted gives its place in the arrays to the one that takes its voxel, so that memory is bounded by
+    the voxels that were seen, unless ``density`` is ``all``.
     """
 
-    def __init__(self, eps: float) -> None:
+    def __init__(self, eps: float, density: Density = "scene") -> None:
         self.eps = eps
+        self.density = density
         self._points = np.empty((1 << 12, 3))
         self._ids = np.empty(1 << 12, np.int32)
+        self._born = np.empty(1 << 12, np.int64)
         self._following = np.empty(1 << 12, np.int32)
         self._keys = np.empty((1 << 6, 3), np.int64)
         self._heads = np.empty((1 << 6, 512), np.int32)
         self._table = np.full(1 << 8, -1, np.int32)
-        self._counts = np.zeros(2, np.int64)
+        self._counts = np.zeros(3, np.int64)
 
     def __len__(self) -> int:
         return int(self._counts[0])
@@ -59,6 +64,11 @@ class VoxelMap:
         return self._points[: len(self)]
 
     @property
+    def by_age(self) -> Int64Array:
+        """Index of each point (N,), the one that came first before all others."""
+        return np.argsort(self._born[: len(self)], kind="stable")
+
+    @property
     def ids(self) -> Int32Array:
         """Instance id of each point, NO_INSTANCE for none; a view."""
         return self._ids[: len(self)]
@@ -71,7 +81,7 @@ class VoxelMap:
         return ids
 
     def nearest(self, queries: Float64Array) -> Int64Array:
-        """Index of the nearest point strictly within eps of each query, -1 where there is none; ties: the lowest."""
+        """Index of the nearest point strictly within eps of each query, -1 where there is none; ties: the oldest."""
         return self.nearest_counted(queries)[0]
 
     def nearest_counted(self, queries: Float64Array) -> tuple[Int64Array, int]:
@@ -82,7 +92,7 @@ class VoxelMap:
         answer = np.empty(len(queries), np.int64)
 
         def look_up(part: slice) -> int:
-            return int(_kernels.nearest(queries[part], self.eps, answer[part], *self._arrays))
+            return int(_kernels.nearest(queries[part], self.eps, answer[part], self._born, *self._arrays))
 
         return answer, sum(in_threads(look_up, len(queries)))
 
@@ -105,21 +115,22 @@ class VoxelMap:
         visited = _kernels.count_inside(*ends, row_of_id, self.eps, self.n_blocks, counts, self._ids, *self._arrays)
         return counts, int(visited)
 
-    def insert(self, points: Float64Array, ids: Int32Array, *, keep_density: bool, refill: bool) -> Int64Array:
-        """Adds points in order; gives the map index that each took, -1 where it was not added.
+    def insert(self, points: Float64Array, ids: Int32Array) -> Int64Array:
+        """Adds points in order; gives the map index that each took, -1 where it was left out.
 
-        With ``keep_density`` a point whose voxel is taken is not added; with ``refill`` too, it takes the voxel over
-        if it has an instance and the one that holds it has none.
+        Where one meets a voxel that is held, ``density`` says which goes: the held point (``scene``), which stays only
+        where it has an instance and the new one has none; the new one (``frame``); neither (``all``).
         """
         from su3d_bench.opensu3d.kernels import voxel_map as _kernels
 
         points, ids = checked_points(points), np.ascontiguousarray(ids, np.int32)
         self._reserve_points(len(self) + len(points))
         placed = np.empty(len(points), np.int64)
+        density = {"scene": _kernels.SCENE, "frame": _kernels.FRAME, "all": _kernels.ALL}[self.density]
         done = 0
         while True:
-            rules = self.eps, keep_density, refill
-            done = _kernels.insert(points, ids, done, *rules, placed, self._counts, self._ids, *self._arrays)
+            of_points = placed, self._counts, self._ids, self._born
+            done = _kernels.insert(points, ids, done, self.eps, density, *of_points, *self._arrays)
             if done == len(points):
                 return placed
             self._double_blocks()
@@ -130,6 +141,7 @@ class VoxelMap:
             return
         self._points = _grown(self._points, capacity, len(self))
         self._ids = _grown(self._ids, capacity, len(self))
+        self._born = _grown(self._born, capacity, len(self))
         self._following = _grown(self._following, capacity, len(self))
 
     def _double_blocks(self) -> None:

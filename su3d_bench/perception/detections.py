@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.interfaces import Encoder, StageTimer
 from su3d_bench.core.types import Detections, Float32Array, Frame, PerceptionNeeds, Regions
+from su3d_bench.perception.background import is_background
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.embedded.naming import Namer, colour_word, scene_caption
 from su3d_bench.perception.regions import CropEncoder
@@ -77,6 +78,7 @@ class Assembler:
             global_feature=self._crops.whole(frame, timer) if global_feature is None else global_feature,
             name_features=self.text_features(chosen.names) if needs.name_features else None,
             score_scale=self._score_scale,
+            rows=chosen.rows,
         )
 
     def named(
@@ -109,8 +111,12 @@ def regions_to_keep(
     names: Sequence[str], boxes: Float32Array, image_shape: tuple[int, ...], needs: PerceptionNeeds
 ) -> NDArray[np.intp]:
     """Indices of the regions whose name is no background name and whose box is not too large a part of the image."""
-    background = {name.lower() for name in needs.background_names}
-    is_named = np.array([name.lower() not in background for name in names], bool)
+    exact = {name.lower() for name in needs.background_names}
+    is_left_out = {
+        name: is_background(name, needs.background_names) if needs.background_by_head else name.lower() in exact
+        for name in set(names)
+    }
+    is_named = np.array([not is_left_out[name] for name in names], bool)
     areas = (boxes[:, 2] - boxes[:, 0]).astype(np.float64) * (boxes[:, 3] - boxes[:, 1])
     is_small = areas <= needs.max_box_fraction * image_shape[0] * image_shape[1]
     return np.flatnonzero(is_named & is_small)
@@ -125,4 +131,5 @@ def _at(regions: Regions, rows: NDArray[np.intp]) -> Regions:
     names, captions = (
         None if texts is None else tuple(texts[row] for row in rows) for texts in (regions.names, regions.captions)
     )
-    return Regions(regions.masks[rows], regions.boxes[rows], regions.scores[rows], names, captions)
+    sources = rows.astype(np.int64) if regions.rows is None else regions.rows[rows]
+    return Regions(regions.masks[rows], regions.boxes[rows], regions.scores[rows], names, captions, sources)

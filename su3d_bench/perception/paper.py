@@ -17,11 +17,32 @@ from su3d_bench.perception.models.masks.automatic_masks import AUTOMATIC_MASKS
 from su3d_bench.perception.models.masks.grounded_sam import (
     GROUNDED_MASKS,
     AutomaticSam,
+    GroundedConfig,
     GroundedSam,
     Networks,
     SamRegions,
 )
+from su3d_bench.perception.models.masks.tagging import Tagger
 from su3d_bench.perception.regions import cached_regions
+
+# opensu3d.tex, section IV-A.
+PAPER_ENCODER, PAPER_SEGMENTER, PAPER_VISION_MODEL = "clip-vit-h-14", "sam-vit-h", "gpt-4-vision-preview"
+
+
+def stand_ins(config: PaperConfig, tagger: Tagger, encoder: Encoder, captioner: Captioner | None) -> list[str]:
+    """What is computed here otherwise than in OpenSU3D's paper, a sentence each; nothing where all is the paper's."""
+    said = [tagger.caveat] if tagger.caveat else []
+    if config.segmenter != PAPER_SEGMENTER:
+        said.append(f"masks: {config.segmenter} stands in for the paper's {PAPER_SEGMENTER}")
+    if config.grounded != GroundedConfig():
+        said.append("boxes: their thresholds are not the paper's")
+    if encoder.name != PAPER_ENCODER:
+        said.append(f"features: {encoder.name} stands in for the paper's {PAPER_ENCODER}")
+    if captioner is None:
+        said.append("names and captions: the tagger's names and a template stand in for the paper's vision model")
+    elif captioner.vision_model != PAPER_VISION_MODEL:
+        said.append(f"names and captions: {captioner.vision_model} stands in for the paper's {PAPER_VISION_MODEL}")
+    return said
 
 
 class PaperPerception:
@@ -38,7 +59,7 @@ class PaperPerception:
         captioner: Captioner | None = None,
     ) -> None:
         self.encoder = encoder
-        self.caveat = networks.tagger.caveat
+        self.caveat: str | None = "; ".join(stand_ins(config, networks.tagger, encoder, captioner)) or None
         self._networks = networks
         self._captioner = captioner
         self._cache = cache

@@ -10,9 +10,9 @@ from typing import Any
 
 import numpy as np
 
+from su3d_bench.core.english import plural, with_article
 from su3d_bench.core.errors import ConfigError, printable, suggest
 from su3d_bench.numerics.relations import RELATIONS
-from su3d_bench.questions.english import plural, with_article
 from su3d_bench.questions.model import MADE_KINDS, REASONING, Question
 from su3d_bench.questions.reasoning.answers import Answer
 from su3d_bench.questions.reasoning.generated import generate_questions

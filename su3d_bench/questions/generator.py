@@ -18,8 +18,8 @@ from pathlib import Path
 
 import numpy as np
 
+from su3d_bench.core.english import with_article, words
 from su3d_bench.numerics.relations import RELATIONS
-from su3d_bench.questions.english import with_article, words
 from su3d_bench.questions.model import BY_NAME, KINDS, MADE_KINDS, Question, new_question
 from su3d_bench.questions.reasoning.named_objects import meant_by
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap

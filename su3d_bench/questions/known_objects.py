@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from su3d_bench.core.english import last_word, words
 from su3d_bench.core.types import GroundTruth, Int64Array, WholeObject
 from su3d_bench.perception.embedded.lexicon import GROUPS
-from su3d_bench.questions.english import last_word, words
 from su3d_bench.questions.reasoning.named_objects import meant_by
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap, is_room_surface
 from su3d_bench.questions.sight import WITHOUT_COLOUR, Sight, instance_rows

@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 
+from su3d_bench.core.english import words
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.types import Instances
 from su3d_bench.perception.language.captioner import REFINE, REFINE_FORM, list_of_names, reason_of
@@ -15,7 +16,6 @@ from su3d_bench.perception.language.chat import ChatRequest
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.language.parsing import chosen_name
-from su3d_bench.questions.english import words
 
 MOST_ANSWER_TOKENS = 200  # a name needs few; models that think aloud need more
 Source = Literal["model", "vote", "label"]

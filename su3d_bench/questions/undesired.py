@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.types import Float64Array, Instances
 from su3d_bench.opensu3d.config import OpenSU3DConfig
-from su3d_bench.questions.english import last_word
+from su3d_bench.perception.background import is_background
 
 _OF_IMAGES = OpenSU3DConfig()
 
@@ -26,7 +26,7 @@ class FilterConfig(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
-    # The paper's list, by the noun of a name, as for what is found in images.
+    # The paper's list, by the head noun of a name, as for what is found in images.
     background_names: Annotated[tuple[str, ...], Field(strict=False)] = _OF_IMAGES.background_names
     # The paper's share is of an image's area; the map has no image, so that of its floor plan stands here (ours).
     max_map_fraction: float = Field(default=_OF_IMAGES.max_box_fraction, gt=0, le=1)
@@ -34,13 +34,12 @@ class FilterConfig(BaseModel):
 
 def undesired(instances: Instances, names: Sequence[str], config: FilterConfig) -> tuple[str, ...]:
     """Why each instance is left out under its label n' in ``names``; '' where it stays."""
-    nouns = {last_word(name) for name in config.background_names}
     fractions = _map_fractions(instances)
-    return tuple(_reason(name, nouns, float(share), config) for name, share in zip(names, fractions, strict=True))
+    return tuple(_reason(name, float(share), config) for name, share in zip(names, fractions, strict=True))
 
 
-def _reason(name: str, nouns: set[str], fraction: float, config: FilterConfig) -> str:
-    if last_word(name) in nouns:
+def _reason(name: str, fraction: float, config: FilterConfig) -> str:
+    if is_background(name, config.background_names):
         return f"'{printable(name, 60)}' is background"
     if fraction > config.max_map_fraction:
         return f"its box has {100 * fraction:.0f} % of the map's area from above"

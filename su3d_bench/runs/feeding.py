@@ -15,7 +15,7 @@ from typing import Any, Generic, Self, TypeVar, overload
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.interfaces import Closes, Dataset, HasFinishCosts, HasSurface, Method
+from su3d_bench.core.interfaces import Closes, CountsLosses, Dataset, HasFinishCosts, HasSurface, Method
 from su3d_bench.core.timing import Timer, calibration_ms, memory_bytes
 from su3d_bench.core.types import (
     Detections,
@@ -209,6 +209,7 @@ class Feeding:
         total_ms = (time.perf_counter() - start) * 1e3
         row: Row = {"update": update, "frame": frame.index, "n_detections": len(detections)}
         row |= {name: int(getattr(method, name)) for name in SIZES if hasattr(method, name)}
+        row |= dict(method.losses) if isinstance(method, CountsLosses) else {}
         row |= {"rss_bytes": memory_bytes()}
         row |= {f"{name}_ms": round(ms, 3) for name, ms in timer.take().items()}
         return row | {"total_ms": round(total_ms, 3)}

@@ -21,6 +21,7 @@ from su3d_bench.core.digests import code_digest, git_state, package_versions
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.timing import hardware_line, processor_digest
+from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import SceneScore, combine, combined_metrics, plain_json, unpack_scores
 from su3d_bench.perception.profiles import PerceptionConfig
@@ -238,6 +239,7 @@ def _result(
     scored = {scene: scores[rules.name, scene] for scene in planned if (rules.name, scene) in scores}
     failed = {scene: mine[scene].error for scene in planned if mine[scene].error is not None}
     scenes = [scene for protocol, scene in scores if protocol == rules.name]
+    numbers = NumbersRecord(**combine(rules, scored).to_json()) if scored else None
     midway = [(share, _metrics_over(scenes, rules, counts)) for share, counts in early.items()]
     return ResultRecord(
         method=method,
@@ -253,9 +255,22 @@ def _result(
         failed=tuple(failed),
         unscored=tuple(scene for scene in planned if scene not in scored and scene not in failed),
         ceiling=None,
-        result=NumbersRecord(**combine(rules, scored).to_json()) if scored else None,
+        result=numbers,
         anytime=tuple(MidwayRecord(share, metrics) for share, metrics in midway if metrics) if early else None,
+        confidences=None if numbers is None else confidences_of(rules, numbers),
     )
+
+
+def confidences_of(rules: ProtocolRules, numbers: NumbersRecord) -> str | None:
+    """What ranks the predictions of an average precision; None where the protocol forms none."""
+    if rules.confidence is None:
+        return None
+    if rules.confidence != "prediction":
+        what = "1 for every instance" if rules.confidence == "ones" else "similarity to the query"
+        return f"{what}, by the protocol"
+    said = {warning.partition(": ")[0] for warning in numbers.warnings if CONSTANT_CONFIDENCE in warning}
+    are_equal = said >= {scene for scene, n in numbers.n_predictions.items() if n > 1}
+    return "the same for all instances of a scene" if are_equal else "computed by the method"
 
 
 def _protocol_names(job: SceneJob) -> list[str]:

@@ -136,7 +136,8 @@ class MidwayRecord:
 class ResultRecord:
     """One method under one protocol; ``encoder`` is null where the method named its instances itself.
 
-    ``result`` is null where no scene was scored; ``anytime`` is missing where no map midway was asked for.
+    ``result`` is null where no scene was scored; ``anytime`` is missing where no map midway was asked for;
+    ``confidences``: what ranked the predictions of an average precision, null where none was formed.
     """
 
     method: str
@@ -154,6 +155,7 @@ class ResultRecord:
     ceiling: Values | None
     result: NumbersRecord | None
     anytime: tuple[MidwayRecord, ...] | None = None
+    confidences: str | None = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -10,6 +10,7 @@ import pytest
 from bedroom_map import box
 from places import ROOT
 
+from su3d_bench.core.english import last_word
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.rooms.dataset import DEFAULT_SCENES, Rooms
 from su3d_bench.numerics.relations import (
@@ -23,7 +24,6 @@ from su3d_bench.numerics.relations import (
     is_left_of,
     may_be_between,
 )
-from su3d_bench.questions.english import last_word
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
 from su3d_bench.questions.reasoning.solver import Solver
 

@@ -12,15 +12,15 @@ from torch_devices import TORCH_ON_CPU, needs_torch, on_each_device
 from su3d_bench.cli.main import main
 from su3d_bench.core.timing import Timer
 from su3d_bench.metrics.matching.labelling import cosines, most_similar
-from su3d_bench.opensu3d.config import OpenSU3DConfig
+from su3d_bench.opensu3d.config import Density, OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
 
 
 @on_each_device
-@pytest.mark.parametrize("keep_density", [True, False])
-def test_a_map_fused_on_a_device_is_that_of_the_cpu_byte_for_byte(device: str, keep_density: bool) -> None:
-    config = OpenSU3DConfig(border_px=1, border_reference_width=0, keep_density=keep_density)
+@pytest.mark.parametrize("density", ["scene", "frame", "all"])
+def test_a_map_fused_on_a_device_is_that_of_the_cpu_byte_for_byte(device: str, density: Density) -> None:
+    config = OpenSU3DConfig(border_px=1, border_reference_width=0, density=density)
     views = [look(TWINS, index, x) for index, x in enumerate([0.0, 0.5, -0.5, 0.2])]
     maps = []
     for where in ("cpu", device):
@@ -121,10 +121,10 @@ def test_a_run_hands_its_device_to_the_method_and_writes_the_same_bytes(
     n_made = 0
 
     class Counted(device_kernels.DeviceVoxelMap):
-        def __init__(self, eps: float, device: str) -> None:
+        def __init__(self, eps: float, device: str, density: Density) -> None:
             nonlocal n_made
             n_made += 1
-            super().__init__(eps, device)
+            super().__init__(eps, device, density)
 
     monkeypatch.setattr(device_kernels, "DeviceVoxelMap", Counted)
     predictions = []

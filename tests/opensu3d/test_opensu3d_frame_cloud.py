@@ -75,7 +75,7 @@ def test_the_reduced_cloud_holds_the_first_point_of_each_voxel_and_detection() -
 
 
 def test_points_inside_masks_come_first_then_rings_then_background() -> None:
-    config = OpenSU3DConfig(border_px=3, border_reference_width=0, frame_voxel=0)
+    config = OpenSU3DConfig(border_px=3, border_reference_width=0, border_pixels="owner", frame_voxel=0)
     cloud = frame_cloud(frame_of(random_depth()), halves(), config)
     n_masked = np.count_nonzero(halves())
     n_ring = 3 * 16 + 2 + 2  # of the smaller mask, on the right: three columns beside it and a disc's corner above
@@ -83,3 +83,19 @@ def test_points_inside_masks_come_first_then_rings_then_background() -> None:
     assert (cloud.owner[n_masked:] == NO_DETECTION).all()
     assert cloud.n_inside == n_masked - n_ring
     assert (cloud.owner[cloud.n_inside : n_masked] == 0).all()
+    by_default = frame_cloud(
+        frame_of(random_depth()), halves(), config.model_copy(update={"border_pixels": "background"})
+    )
+    assert by_default.n_inside == cloud.n_inside == np.count_nonzero(by_default.owner != NO_DETECTION)
+    assert len(by_default.points) == len(cloud.points)  # a ring's pixels are back-projected too
+
+
+def test_the_voxels_of_the_frame_cloud_follow_eps_unless_they_are_set() -> None:
+    frame = frame_of(random_depth())
+    config = OpenSU3DConfig(border_px=0, eps=0.3)
+    assert config.effective()["frame_voxel"] == 0.3
+    followed = frame_cloud(frame, halves(), config)
+    np.testing.assert_array_equal(
+        followed.points, frame_cloud(frame, halves(), config.model_copy(update={"frame_voxel": 0.3})).points
+    )
+    assert len(followed.points) < len(frame_cloud(frame, halves(), OpenSU3DConfig(border_px=0)).points)

@@ -10,15 +10,16 @@ from scipy.spatial import cKDTree
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, Int64Array
+from su3d_bench.opensu3d.config import Density
 from su3d_bench.opensu3d.voxel_map import ROWS_OF_A_THREAD, VoxelMap
 
 EPS = 0.02
 
 
 def map_of(points: Float64Array, eps: float = EPS, ids: Int64Array | None = None) -> VoxelMap:
-    filled = VoxelMap(eps)
+    filled = VoxelMap(eps, "all")
     labels = np.ones(len(points), np.int32) if ids is None else np.asarray(ids, np.int32)
-    filled.insert(np.asarray(points, np.float64), labels, keep_density=False, refill=False)
+    filled.insert(np.asarray(points, np.float64), labels)
     return filled
 
 
@@ -90,9 +91,9 @@ def test_an_empty_map_matches_nothing() -> None:
 def test_matching_is_the_same_after_the_map_has_grown_many_times() -> None:
     rng = np.random.default_rng(5)
     points = rng.uniform(-4, 4, (40_000, 3))
-    grown = VoxelMap(0.1)
+    grown = VoxelMap(0.1, "all")
     for part in np.array_split(points, 17):
-        grown.insert(part, np.ones(len(part), np.int32), keep_density=False, refill=False)
+        grown.insert(part, np.ones(len(part), np.int32))
     queries = rng.uniform(-4, 4, (3000, 3))
     np.testing.assert_array_equal(grown.points, points)
     np.testing.assert_array_equal(grown.nearest(queries), map_of(points, 0.1).nearest(queries))
@@ -112,34 +113,75 @@ def test_matching_is_the_same_on_any_number_of_threads(n_threads: int, monkeypat
     assert visited_in_parts == visited
 
 
-def test_a_point_whose_voxel_is_taken_is_not_added() -> None:
-    filled = VoxelMap(EPS)
+@pytest.mark.parametrize(
+    ("density", "placed", "ids"),
+    [("scene", [0, 0, 1, 2], [2, 3, 4]), ("frame", [0, -1, 1, 2], [1, 3, 4]), ("all", [0, 1, 2, 3], [1, 2, 3, 4])],
+)
+def test_of_two_points_in_one_voxel_the_first_the_second_or_neither_goes(
+    density: Density, placed: list[int], ids: list[int]
+) -> None:
+    filled = VoxelMap(EPS, density)
     points = np.array([[0.001, 0.001, 0.001], [0.019, 0.019, 0.019], [0.021, 0.001, 0.001], [-0.001, 0.001, 0.001]])
-    placed = filled.insert(points, np.array([1, 2, 3, 4], np.int32), keep_density=True, refill=True)
-    assert placed.tolist() == [0, -1, 1, 2]
-    assert filled.ids.tolist() == [1, 3, 4]
+    assert filled.insert(points, np.array([1, 2, 3, 4], np.int32)).tolist() == placed
+    assert filled.ids.tolist() == ids
+    assert filled.points[0, 0] == (0.019 if density == "scene" else 0.001)
 
 
-def test_density_stays_constant_however_often_a_surface_is_seen() -> None:
+@pytest.mark.parametrize("density", ["scene", "frame"])
+def test_density_stays_constant_and_memory_bounded_however_often_a_surface_is_seen(density: Density) -> None:
     rng = np.random.default_rng(0)
-    filled = VoxelMap(EPS)
-    for _ in range(20):
+    filled = VoxelMap(EPS, density)
+    n_bytes = []
+    for _ in range(60):
         points = rng.uniform(0, 0.4, (4000, 3)) * [1, 1, 0]
-        filled.insert(points, np.ones(len(points), np.int32), keep_density=True, refill=True)
+        filled.insert(points, np.ones(len(points), np.int32))
+        n_bytes.append(filled.n_bytes)
     assert len(filled) <= 20 * 20
+    assert n_bytes[1] == n_bytes[-1]  # the first view found an empty map
     assert len(np.unique(np.floor(filled.points / EPS), axis=0)) == len(filled)
 
 
-@pytest.mark.parametrize(("refill", "expected"), [(True, [7, 5, 0]), (False, [0, 5, 0])])
-def test_an_instance_takes_over_a_voxel_of_no_instance_and_never_one_of_an_instance(
-    refill: bool, expected: list[int]
-) -> None:
-    filled = VoxelMap(EPS)
-    first = np.array([[0.01, 0, 0], [0.05, 0, 0], [0.09, 0, 0]])
-    filled.insert(first, np.array([0, 5, 0], np.int32), keep_density=True, refill=refill)
-    filled.insert(first + 0.001, np.array([7, 7, 0], np.int32), keep_density=True, refill=refill)
+@pytest.mark.parametrize(("density", "expected"), [("scene", [7, 8, 0, 9]), ("frame", [0, 5, 0, 9])])
+def test_a_point_of_no_instance_deletes_none_of_an_instance(density: Density, expected: list[int]) -> None:
+    """Voxels held by none, 5, none and 9 are met by 7, 8, none and none."""
+    filled = VoxelMap(EPS, density)
+    first = np.array([[0.01, 0, 0], [0.05, 0, 0], [0.09, 0, 0], [0.13, 0, 0]])
+    filled.insert(first, np.array([0, 5, 0, 9], np.int32))
+    placed = filled.insert(first + 0.001, np.array([7, 8, 0, 0], np.int32))
     assert filled.ids.tolist() == expected
-    assert filled.points[0, 0] == pytest.approx(0.011 if refill else 0.01)
+    assert placed.tolist() == ([0, 1, 2, -1] if density == "scene" else [-1] * 4)
+    moved = np.isclose(filled.points[:, 0], first[:, 0] + 0.001)
+    assert moved.tolist() == ([True, True, True, False] if density == "scene" else [False] * 4)
+
+
+seen = st.lists(st.tuples(st.integers(0, 5), st.integers(0, 3)), max_size=12)  # a voxel of six, and an id
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(seen, max_size=5), st.sampled_from(["scene", "frame", "all"]))
+def test_the_map_is_the_list_of_points_from_which_those_that_go_are_deleted(
+    views: list[list[tuple[int, int]]], density: Density
+) -> None:
+    filled, expected = VoxelMap(EPS, density), list[tuple[float, int]]()
+    for view in views:
+        x = np.array([(voxel + 0.1 + 0.05 * k) * EPS for k, (voxel, _) in enumerate(view)])
+        for place, (voxel, own) in zip(x, view, strict=True):
+            held = [each for each in expected if density != "all" and int(each[0] / EPS) == voxel]
+            if held and (density == "frame" or (own == 0 and held[0][1] != 0)):
+                continue
+            expected = [each for each in expected if each not in held] + [(float(place), own)]
+        filled.insert(np.column_stack([x, x * 0, x * 0]), np.array([own for _, own in view], np.int32))
+    found = [(float(filled.points[k, 0]), int(filled.ids[k])) for k in filled.by_age]
+    assert found == expected
+
+
+def test_of_equally_near_points_the_one_that_came_first_matches_wherever_it_is_kept() -> None:
+    filled = VoxelMap(EPS)
+    filled.insert(np.array([[0.012, 0, 0], [-0.01, 0, 0]]), np.array([1, 2], np.int32))
+    filled.insert(np.array([[0.01, 0, 0]]), np.array([3], np.int32))  # takes the place of the first of all
+    assert filled.ids.tolist() == [3, 2]
+    assert filled.by_age.tolist() == [1, 0]
+    assert filled.nearest(np.zeros((1, 3))).tolist() == [1]
 
 
 @settings(max_examples=60, deadline=None)
@@ -170,7 +212,7 @@ def test_matching_and_counting_visit_as_much_in_a_small_map_as_in_a_large_one() 
     visits = []
     for points in (room, np.concatenate([room, building])):
         filled = VoxelMap(EPS)
-        filled.insert(points, np.ones(len(points), np.int32), keep_density=True, refill=True)
+        filled.insert(points, np.ones(len(points), np.int32))
         _, voxels = filled.nearest_counted(queries)
         _, blocks = filled.count_inside_counted(np.zeros(3), np.array([2.0, 2.0, 0.1]), np.array([1], np.int32))
         visits.append((voxels, blocks))
@@ -180,7 +222,7 @@ def test_matching_and_counting_visit_as_much_in_a_small_map_as_in_a_large_one() 
 
 def test_the_bytes_of_a_map_are_those_of_its_arrays() -> None:
     filled = map_of(np.random.default_rng(0).uniform(0, 9, (20_000, 3)))
-    assert filled.n_bytes > 20_000 * (3 * 8 + 4 + 4)  # a point, its id and the next one of its voxel
+    assert filled.n_bytes > 20_000 * (3 * 8 + 4 + 8 + 4)  # a point, its id, its age and the next one of its voxel
     assert filled.n_bytes > VoxelMap(EPS).n_bytes
 
 
@@ -188,6 +230,6 @@ def test_a_point_that_is_not_finite_or_far_out_is_refused() -> None:
     for bad in (np.nan, np.inf, -1e9):
         points = np.array([[0.0, 0, 0], [0.0, bad, 0]])
         with pytest.raises(DataError, match="in metres"):
-            VoxelMap(EPS).insert(points, np.ones(2, np.int32), keep_density=True, refill=True)
+            VoxelMap(EPS).insert(points, np.ones(2, np.int32))
         with pytest.raises(DataError, match="in metres"):
             VoxelMap(EPS).nearest(points)

@@ -63,6 +63,7 @@ def test_regions_are_those_of_the_file_and_pictures_are_passed_over(tmp_path: Pa
     np.testing.assert_array_equal(found.regions.boxes, np.array([[20.5, 40, 60, 80], [90, 50, 160, 90]], np.float32))
     np.testing.assert_array_equal(found.regions.scores, np.array([0.97, 1], np.float32))
     assert found.features[1.0].argmax(axis=1).tolist() == [1, 3]
+    assert found.regions.rows is not None and found.regions.rows.tolist() == [0, 1]
 
 
 def test_a_frame_without_detections_has_no_regions(tmp_path: Path) -> None:

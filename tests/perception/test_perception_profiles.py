@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,6 @@ from su3d_bench.perception.embedded.naming import (
     colour_word,
     scene_caption,
     vocabulary,
-    with_article,
 )
 from su3d_bench.perception.profiles import PerceptionConfig, build_perception, resolve_profile
 
@@ -95,22 +95,9 @@ def test_regions_of_background_names_and_of_too_large_boxes_are_left_out() -> No
     needs = PerceptionNeeds(background_names=("Wall",), max_box_fraction=0.96)
     assert regions_to_keep(["wall", "cup", "cup"], boxes, (50, 100), needs).tolist() == [2]
     assert regions_to_keep([], boxes[:0], (50, 100), needs).tolist() == []
-
-
-@pytest.mark.parametrize(
-    ("noun", "expected"),
-    [
-        ("bed", "a bed"),
-        ("indoor-plant", "an indoor-plant"),
-        ("umbrella", "an umbrella"),
-        ("utensil-holder", "a utensil-holder"),
-        ("hourglass", "an hourglass"),
-        ("blinds", "blinds"),
-        ("orange chair", "an orange chair"),
-    ],
-)
-def test_the_article_is_right(noun: str, expected: str) -> None:
-    assert with_article(noun) == expected
+    assert regions_to_keep(["brick wall", "cup", "cup"], boxes, (50, 100), needs).tolist() == [0, 2]
+    by_head = replace(needs, background_by_head=True)
+    assert regions_to_keep(["brick wall", "cup", "cup"], boxes, (50, 100), by_head).tolist() == [2]
 
 
 def test_captions_name_the_colour_where_it_is_known() -> None:
@@ -118,6 +105,7 @@ def test_captions_name_the_colour_where_it_is_known() -> None:
     assert scene_caption("chair", "orange") == "an orange chair in a scene"
     assert scene_caption("blinds", "white") == "white blinds in a scene"
     assert scene_caption("indoor-plant") == "an indoor-plant in a scene"
+    assert scene_caption("") == "an object in a scene"
 
 
 def test_colour_words_are_those_of_the_pixels_under_the_mask() -> None:

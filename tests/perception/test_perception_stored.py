@@ -86,6 +86,7 @@ def test_captions_default_to_the_template_and_background_is_left_out(tmp_path: P
     needs = PerceptionNeeds(background_names=("chair",))
     found = perception(tmp_path, CountingEncoder(), tmp_path).detect(still_life(40), needs, Timer())
     assert found.captions == ("an indoor-plant in a scene",)
+    assert found.rows is not None and found.rows.tolist() == [1] and found.row_of(0) == 1
 
 
 def test_the_digest_moves_with_the_files(tmp_path: Path) -> None:

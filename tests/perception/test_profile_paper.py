@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -20,6 +21,7 @@ from su3d_bench.core.types import Instances, PerceptionNeeds, SceneInfo, UInt8Ar
 from su3d_bench.perception import paper as profile_paper
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.language.captioner import CropCaption
+from su3d_bench.perception.models.config import PaperConfig
 from su3d_bench.perception.models.masks.tagging import WORDS_CAVEAT
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, check_models, resolve_profile
 from su3d_bench.store.atomic import read_json
@@ -199,7 +201,25 @@ def test_what_moves_the_answer_moves_the_digest(models: Path, tmp_path: Path) ->
 
 
 def test_stand_ins_for_ram_are_said_beside_every_number(models: Path, tmp_path: Path) -> None:
-    assert built(config_of(models), tmp_path).caveat == WORDS_CAVEAT
+    caveat = built(config_of(models), tmp_path).caveat
+    assert caveat is not None and caveat.startswith(f"{WORDS_CAVEAT}; ")
+
+
+def test_the_profile_says_what_it_computes_otherwise_than_the_paper_and_nothing_else() -> None:
+    ram = SimpleNamespace(caveat=None)
+    encoder, captioner = SimpleNamespace(name="clip-vit-h-14"), SimpleNamespace(vision_model="gpt-4-vision-preview")
+    assert profile_paper.stand_ins(PaperConfig(), ram, encoder, captioner) == []  # type: ignore[arg-type]
+    assert profile_paper.stand_ins(PaperConfig(), ram, encoder, None) == [
+        "names and captions: the tagger's names and a template stand in for the paper's vision model"
+    ]
+    other = PaperConfig.model_validate({"segmenter": "sam-vit-b", "grounded": {"boxes": {"box_threshold": 0.3}}})
+    encoder.name, captioner.vision_model = "clip-vit-l-14", "some-model"
+    assert profile_paper.stand_ins(other, ram, encoder, captioner) == [  # type: ignore[arg-type]
+        "masks: sam-vit-b stands in for the paper's sam-vit-h",
+        "boxes: their thresholds are not the paper's",
+        "features: clip-vit-l-14 stands in for the paper's clip-vit-h-14",
+        "names and captions: some-model stands in for the paper's gpt-4-vision-preview",
+    ]
 
 
 def test_a_vision_model_gives_names_and_captions_where_it_is_asked_for(models: Path, tmp_path: Path) -> None:
@@ -207,7 +227,7 @@ def test_a_vision_model_gives_names_and_captions_where_it_is_asked_for(models: P
     from su3d_bench.perception.paper import PaperPerception
 
     class Describing:
-        digest = "describing"
+        digest = vision_model = "describing"
 
         def captions(self, crops: list[UInt8Array], names: tuple[str, ...]) -> list[CropCaption]:
             return [

@@ -5,8 +5,11 @@ from types import SimpleNamespace
 from typing import Any
 
 from su3d_bench.core.types import PerceptionNeeds, SceneInfo
+from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.reports.tables.run import headline, markdown_table
 from su3d_bench.runs.job import caveat_of
+from su3d_bench.runs.runner import confidences_of
+from su3d_bench.store.records import NumbersRecord
 
 
 def result(method: str = "opensu3d", **more: Any) -> dict[str, Any]:
@@ -92,3 +95,36 @@ def test_made_rooms_in_anothers_layout_are_said_to_be_such() -> None:
     assert said == "made rooms in the layout of replica, not its scenes"
     assert caveat_of(method, perception, replace(scene, image_domain="camera")) is None
     assert caveat_of(method, perception, replace(scene, dataset="rooms")) is None
+
+
+def numbers(*warned: str) -> NumbersRecord:
+    warnings = tuple(
+        f"{scene}: every confidence is 1: AP of a class is then recall (1 + precision) / 2" for scene in warned
+    )
+    return NumbersRecord(
+        scenes=("d/a", "d/b", "d/c"),
+        metrics={},
+        intervals={},
+        per_scene={},
+        per_class={},
+        n_predictions={"d/a": 7, "d/b": 4, "d/c": 1},
+        warnings=warnings,
+    )
+
+
+def test_where_confidences_come_from_is_told_by_the_protocol_or_seen_in_the_predictions() -> None:
+    own, ones = load_protocol("rooms-instance"), load_protocol("replica-openmask3d")
+    assert confidences_of(load_protocol("rooms-semantic"), numbers()) is None
+    assert confidences_of(ones, numbers()) == "1 for every instance, by the protocol"
+    assert confidences_of(load_protocol("query-ap"), numbers()) == "similarity to the query, by the protocol"
+    assert confidences_of(own, numbers("d/a", "d/b")) == "the same for all instances of a scene"
+    assert confidences_of(own, numbers("d/a")) == "computed by the method"
+
+
+def test_a_mix_of_confidences_is_shouted_and_one_kind_is_said() -> None:
+    ones, own = "the same for all instances of a scene", "computed by the method"
+    mixed = table(result("a", confidences=ones), result("b", confidences=own), result("c", confidences=ones))
+    assert f"- MIXED CONFIDENCES: {ones} (a, c); {own} (b): these average precisions do not compare" in mixed
+    alike = table(result("a", confidences=ones), result("b", confidences=ones), result("c", confidences=None))
+    assert f"- confidences: {ones}" in alike and "MIXED" not in alike
+    assert "onfidences" not in table(result("a"), result("b", confidences=None))

@@ -72,6 +72,13 @@ function notesOf(rows) {
     if (one.unscored.length) say(`not scored: ${one.unscored.join(', ')}`);
     (one.result ? one.result.warnings : []).forEach(say);
   }
+  const ranked = rows.filter((one) => one.confidences);
+  const kinds = [...new Set(ranked.map((one) => one.confidences))];
+  if (kinds.length === 1) lines.push(`confidences: ${kinds[0]}`);
+  if (kinds.length > 1) {
+    const told = kinds.map((kind) => `${kind} (${ranked.filter((one) => one.confidences === kind).map(nameOf).join(', ')})`);
+    lines.unshift(`MIXED CONFIDENCES: ${told.join('; ')}: these average precisions do not compare`);
+  }
   return [...new Set(lines)];
 }
 

@@ -28,6 +28,7 @@ from su3d_bench.metrics.protocols import AP_NAMES, ProtocolRules, TransferRules
 
 IntArray = NDArray[np.integer[Any]]
 
+CONSTANT_CONFIDENCE = "every confidence is"
 DUPLICATE_IOU = 0.9  # pairs above it are the same object twice; duplicates can raise AP under constant confidences
 OBJECT = 1  # the one label that all have where the protocol has no classes
 NO_OBJECT = 0
@@ -218,7 +219,7 @@ def _mask_warnings(rules: ProtocolRules, truth: GroundTruth, scored: ScoredMasks
     assert rules.min_region_size is not None
     warnings, scores = list[str](), scored.scores
     if rules.confidence == "prediction" and len(scores) > 1 and (scores == scores[0]).all():
-        warnings.append(f"every confidence is {scores[0]:g}: AP of a class is then recall (1 + precision) / 2")
+        warnings.append(f"{CONSTANT_CONFIDENCE} {scores[0]:g}: AP of a class is then recall (1 + precision) / 2")
     large = np.flatnonzero(scored.masks.sizes >= rules.min_region_size)
     pairs = transfer.duplicate_pairs(transfer.select(scored.masks, large), len(truth.points), DUPLICATE_IOU)
     if pairs:

@@ -2,7 +2,8 @@
 
 Space is cut into voxels of side ``eps``; 8x8x8 voxels are a block. ``table`` is an open-addressing hash of block
 coordinates; ``heads[block, voxel]`` starts the linked list of the voxel's points, the newest first, -1 where it is
-empty. Distances are float64 and summed x, y, z, as a KD-tree does.
+empty. ``born`` numbers points in the order in which they came. Distances are float64 and summed x, y, z, as a KD-tree
+does.
 """
 
 from __future__ import annotations
@@ -16,6 +17,7 @@ from su3d_bench.numerics.compiled import njit
 
 VOXELS = 512  # of a block
 UNKNOWN = -2
+SCENE, FRAME, ALL = 0, 1, 2  # which point goes where a new one meets a held voxel: the scene's, the frame's, none
 STEPS = (0, -1, 1, -2, 2)  # from a query's own voxel, the nearest first
 
 
@@ -38,12 +40,12 @@ def rehash(table, keys, n_blocks):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def insert(  # type: ignore[no-untyped-def]
-    new_points, new_ids, start, eps, keep_density, refill, placed, counts, ids, points, following, keys, heads, table
+    new_points, new_ids, start, eps, density, placed, counts, ids, born, points, following, keys, heads, table
 ):
     """Enters new points from ``start`` on; stops where the blocks run out and gives the point it stopped at.
 
-    ``counts`` holds the number of points and of blocks; ``placed`` takes the map index of each point that was added
-    or took over a voxel of no instance (id 0), ABSENT for the others.
+    ``counts`` holds the number of points, of blocks and of all points that ever came; ``placed`` takes the map index
+    of each point that was entered, that of a point that went where it took its place, ABSENT for the others.
     """
     bx, by, bz, block = np.int64(0), np.int64(0), np.int64(0), np.int32(ABSENT)
     for i in range(start, len(new_points)):
@@ -62,17 +64,19 @@ def insert(  # type: ignore[no-untyped-def]
                 counts[1] += 1
             block = table[slot]
         local = _local(vx, vy, vz)
-        target = heads[block, local] if keep_density else ABSENT
+        target = heads[block, local] if density != ALL else ABSENT
         placed[i] = ABSENT
+        born_as = counts[2]
+        counts[2] += 1
         if target == ABSENT:
             target = counts[0]
             following[target] = heads[block, local]
             heads[block, local] = target
             counts[0] += 1
-        elif not (refill and ids[target] == 0 and new_ids[i] != 0):
+        elif density == FRAME or (new_ids[i] == 0 and ids[target] != 0):
             continue
         points[target, 0], points[target, 1], points[target, 2] = x, y, z
-        ids[target] = new_ids[i]
+        ids[target], born[target] = new_ids[i], born_as
         placed[i] = target
     return len(new_points)
 
@@ -95,10 +99,10 @@ def _write_gaps(x, voxel, eps, gaps):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def nearest(queries, eps, answer, points, following, keys, heads, table):  # type: ignore[no-untyped-def]
+def nearest(queries, eps, answer, born, points, following, keys, heads, table):  # type: ignore[no-untyped-def]
     """Writes the nearest map point strictly within ``eps`` of each query into ``answer``, ABSENT where there is none.
 
-    Of equally near points the lowest index wins. Gives the number of voxels that were looked into.
+    Of equally near points the one that came first wins. Gives the number of voxels that were looked into.
     """
     visited = 0
     gaps_x, gaps_y, gaps_z = np.empty(5), np.empty(5), np.empty(5)
@@ -138,7 +142,9 @@ def nearest(queries, eps, answer, points, following, keys, heads, table):  # typ
                     while j != ABSENT:
                         dx, dy, dz = x - points[j, 0], y - points[j, 1], z - points[j, 2]
                         squared = dx * dx + dy * dy + dz * dz
-                        if squared < best_squared or (squared == best_squared and best != ABSENT and j < best):
+                        if squared < best_squared or (
+                            squared == best_squared and best != ABSENT and born[j] < born[best]
+                        ):
                             best, best_squared = j, squared
                         j = following[j]
         answer[i] = best

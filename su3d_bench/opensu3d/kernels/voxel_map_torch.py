@@ -15,6 +15,7 @@ from torch import Tensor
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, Int32Array, Int64Array
+from su3d_bench.opensu3d.config import Density
 from su3d_bench.opensu3d.voxel_map import checked_points, doubled
 
 ABSENT = -1
@@ -24,6 +25,7 @@ BITS = 21  # of a block's coordinate in its key, counted from the block of the f
 REACH = 1 << (BITS - 1)
 LARGEST_KEY = (1 << 63) - 1  # stands behind all keys, so that a search always ends at one
 LARGEST_ROW = (1 << 31) - 1
+NEVER = (1 << 63) - 1  # born after all points
 AT_ONCE = {"cpu": 1 << 14, "cuda": 1 << 18}  # queries; their neighbours fill the cache of a core, or 1 GB of a GPU
 
 
@@ -36,22 +38,33 @@ class _View(NamedTuple):
     place: Tensor
 
 
+class _Found(NamedTuple):
+    """Of each query the squared distance ``best`` so far, the point in ``answer`` and when that was ``born``."""
+
+    best: Tensor
+    answer: Tensor
+    born: Tensor
+
+
 class DeviceVoxelMap:
     """``VoxelMap`` on ``device``; arrays of the host go in and come out."""
 
-    def __init__(self, eps: float, device: str) -> None:
+    def __init__(self, eps: float, device: str, density: Density = "scene") -> None:
         self.eps = eps
+        self.density = density
         self._device = torch.device(device)
         # A tensor of the device: by a plain number, torch multiplies with the reciprocal, which rounds otherwise.
         self._side = torch.tensor(eps, dtype=torch.float64, device=self._device)
         self._points = self._empty((1 << 12, 3), torch.float64)
         self._ids = self._empty((1 << 12,), torch.int32)
+        self._born = self._empty((1 << 12,), torch.int64)
         self._following = self._empty((1 << 12,), torch.int32)
         self._heads = self._full((1 << 6) * VOXELS, ABSENT, torch.int32)
         self._keys = self._full(1, LARGEST_KEY, torch.int64)
         self._rows = self._full(1, NO_BLOCK, torch.int64)
         self._origin = self._full(3, 0, torch.int64)
         self._n_points = 0
+        self._n_given = 0
 
     def __len__(self) -> int:
         return self._n_points
@@ -72,6 +85,11 @@ class DeviceVoxelMap:
         return np.asarray(self._points[: len(self)].cpu().numpy().copy(), np.float64)
 
     @property
+    def by_age(self) -> Int64Array:
+        """Index of each point (N,), the one that came first before all others."""
+        return np.asarray(torch.argsort(self._born[: len(self)]).cpu().numpy(), np.int64)
+
+    @property
     def ids(self) -> Int32Array:
         """Instance id of each point, NO_INSTANCE for none; a copy."""
         return np.asarray(self._ids[: len(self)].cpu().numpy().copy(), np.int32)
@@ -83,7 +101,7 @@ class DeviceVoxelMap:
         return np.asarray(ids.cpu().numpy(), np.int32)
 
     def nearest(self, queries: Float64Array) -> Int64Array:
-        """Index of the nearest point strictly within eps of each query, -1 where there is none; ties: the lowest."""
+        """Index of the nearest point strictly within eps of each query, -1 where there is none; ties: the oldest."""
         queries = checked_points(queries)
         absent = np.full(len(queries), ABSENT, np.int64)
         if len(self) == 0:
@@ -113,39 +131,39 @@ class DeviceVoxelMap:
             at = _present(self._following[at])
         return np.asarray(counts[self._up(wanted.astype(np.int64))].cpu().numpy(), np.int64)
 
-    def insert(self, points: Float64Array, ids: Int32Array, *, keep_density: bool, refill: bool) -> Int64Array:
-        """Adds points in order; gives the map index that each took, -1 where it was not added.
-
-        With ``keep_density`` a point whose voxel is taken is not added; with ``refill`` too, it takes the voxel over
-        if it has an instance and the one that holds it has none.
-        """
+    def insert(self, points: Float64Array, ids: Int32Array) -> Int64Array:
+        """Adds points in order; gives the map index that each took, -1 where it was left out, as ``VoxelMap`` does."""
         points = checked_points(points)
         if len(points) == 0:
             return np.zeros(0, np.int64)
-        of_points = self._points, self._ids, self._following
-        self._points, self._ids, self._following = (_with_room(part, len(self) + len(points)) for part in of_points)
+        of_points = self._points, self._ids, self._born, self._following
+        self._points, self._ids, self._born, self._following = (
+            _with_room(part, len(self) + len(points)) for part in of_points
+        )
         new_points, new_ids = self._up(points), self._up(np.ascontiguousarray(ids, np.int32))
         slots = self._slots(new_points)
-        if not keep_density:
-            return np.asarray(self._append(new_points, new_ids, slots).cpu().numpy(), np.int64)
-        placed = self._fill(new_points, new_ids, slots)
-        if refill:
-            self._refill(new_points, new_ids, slots, placed)
+        if self.density == "all":
+            placed = self._append(new_points, new_ids, slots)
+        else:
+            placed = self._fill(new_points, new_ids, slots)
+        if self.density == "scene":
+            self._replace(new_points, new_ids, slots, placed)
+        self._n_given += len(points)
         return np.asarray(placed.cpu().numpy(), np.int64)
 
     def _nearest(self, points: Tensor) -> Tensor:
         best = torch.full((len(points),), self.eps * self.eps, dtype=torch.float64, device=self._device)
-        answer = self._full(len(points), LARGEST_ROW, torch.int64)
+        found = _Found(best, self._full(len(points), ABSENT, torch.int64), self._full(len(points), NEVER, torch.int64))
         view = self._view(points)
         every = torch.arange(len(points), device=self._device)
-        self._lower(view, every, torch.zeros_like(view.voxels), best, answer)
+        self._lower(view, every, torch.zeros_like(view.voxels), found)
         gaps = _squared_gaps(points, view.voxels, self._side)
-        self._look_around(view, every, gaps[:, :, 1:4], best, answer)
+        self._look_around(view, every, gaps[:, :, 1:4], found)
         # Where a query lies on the border of its voxel, up to rounding, the second voxel can hold a point within eps.
         on_border = (gaps[:, :, [0, 4]].amin(dim=(1, 2)) <= best).nonzero()[:, 0]
         if len(on_border):
-            self._look_around(view, on_border, gaps[on_border], best, answer)
-        return torch.where(answer == LARGEST_ROW, ABSENT, answer)
+            self._look_around(view, on_border, gaps[on_border], found)
+        return found.answer
 
     def _view(self, points: Tensor) -> _View:
         voxels = self._voxels(points)
@@ -156,17 +174,17 @@ class DeviceVoxelMap:
         rows[distinct < 0] = NO_BLOCK
         return _View(points, voxels, rows.view(-1), place * 27)
 
-    def _look_around(self, view: _View, queries: Tensor, gaps: Tensor, best: Tensor, answer: Tensor) -> None:
+    def _look_around(self, view: _View, queries: Tensor, gaps: Tensor, found: _Found) -> None:
         """Looks where ``gaps`` (Q, 3, S) to the voxels about ``queries`` (Q,) leave room for a nearer point."""
         x, y, z = gaps.unbind(1)
         bounds = (x[:, :, None, None] + y[:, None, :, None]) + z[:, None, None, :]
-        row, *steps = (bounds <= best[queries][:, None, None, None]).nonzero(as_tuple=True)
+        row, *steps = (bounds <= found.best[queries][:, None, None, None]).nonzero(as_tuple=True)
         step = torch.stack(steps, dim=1) - gaps.shape[2] // 2
         is_other = (step != 0).any(dim=1)
-        self._lower(view, queries[row[is_other]], step[is_other], best, answer)
+        self._lower(view, queries[row[is_other]], step[is_other], found)
 
-    def _lower(self, view: _View, query: Tensor, step: Tensor, best: Tensor, answer: Tensor) -> None:
-        """Lowers ``best`` (squared) and ``answer`` to the nearest points in voxels ``step`` (P, 3) from a query's."""
+    def _lower(self, view: _View, query: Tensor, step: Tensor, found: _Found) -> None:
+        """Lowers what was ``found`` to the nearest points in voxels ``step`` (P, 3) from a query's."""
         own = view.voxels[query]
         voxel = own + step
         row = view.rows[view.place[query] + _number((voxel >> 3) - (own >> 3) + 1, 3)]
@@ -176,12 +194,15 @@ class DeviceVoxelMap:
             offset = view.points[query] - self._points[at]
             offset *= offset
             squared = (offset[:, 0] + offset[:, 1]) + offset[:, 2]
-            nearest = best.scatter_reduce(0, query, squared, "amin")
-            answer[nearest < best] = LARGEST_ROW
+            nearest = found.best.scatter_reduce(0, query, squared, "amin")
+            found.born[nearest < found.best] = NEVER
             # At eps itself nothing matches: best starts there, and stays unless a point lies nearer.
             wins = (squared == nearest[query]) & (squared < self.eps * self.eps)
-            answer.scatter_reduce_(0, query[wins], at[wins], "amin")
-            best.copy_(nearest)
+            of_winner, winner = query[wins], at[wins]
+            found.born.scatter_reduce_(0, of_winner, self._born[winner], "amin")
+            is_oldest = self._born[winner] == found.born[of_winner]
+            found.answer[of_winner[is_oldest]] = winner[is_oldest]
+            found.best.copy_(nearest)
             at = self._following[at]
 
     def _slots(self, points: Tensor) -> Tensor:
@@ -213,25 +234,38 @@ class DeviceVoxelMap:
         self._heads[slots[is_first]] = index
         new = slice(len(self), len(self) + len(index))
         self._points[new], self._ids[new], self._following[new] = new_points[is_first], new_ids[is_first], ABSENT
+        self._born[new] = self._n_given + order[is_first].long()
         self._n_points += len(index)
         placed = self._full(len(slots), ABSENT, torch.int64)
         placed[is_first] = index.long()
         return placed
 
-    def _refill(self, new_points: Tensor, new_ids: Tensor, slots: Tensor, placed: Tensor) -> None:
-        """Lets the first point with an instance take each voxel whose holder has none; enters it into ``placed``."""
+    def _replace(self, new_points: Tensor, new_ids: Tensor, slots: Tensor, placed: Tensor) -> None:
+        """Lets new points take the voxels that are held, as if one came after the other; enters them into ``placed``.
+
+        A point of no instance takes a voxel until the first of an instance holds it; the last to take it stays.
+        """
         holder = self._heads[slots].long()
-        rows = ((new_ids != 0) & (self._ids[holder] == 0)).nonzero()[:, 0]
-        takes = self._is_lowest(slots[rows], rows.int())
-        self._heads[slots[rows]] = holder[rows].int()
-        rows, at = rows[takes], holder[rows][takes]
-        self._points[at], self._ids[at], placed[rows] = new_points[rows], new_ids[rows], at
+        order = torch.arange(len(slots), dtype=torch.int32, device=self._device)
+        is_instance = new_ids != 0
+        first_instance = self._lowest(slots, torch.where(is_instance, order, LARGEST_ROW))
+        rows = (is_instance | ((self._ids[holder] == 0) & (order < first_instance))).nonzero()[:, 0]
+        is_last = self._is_lowest(slots[rows], -order[rows])
+        self._heads[slots] = holder.int()
+        placed[rows] = holder[rows]
+        rows = rows[is_last]
+        at = holder[rows]
+        self._points[at], self._ids[at], self._born[at] = new_points[rows], new_ids[rows], self._n_given + rows
 
     def _is_lowest(self, slots: Tensor, order: Tensor) -> Tensor:
         """Whether each entry has the lowest ``order`` of its slot; the heads there are overwritten."""
+        return self._lowest(slots, order) == order
+
+    def _lowest(self, slots: Tensor, order: Tensor) -> Tensor:
+        """The lowest ``order`` of each entry's slot; the heads there are overwritten."""
         self._heads[slots] = LARGEST_ROW
         self._heads.scatter_reduce_(0, slots, order, "amin")
-        return self._heads[slots] == order
+        return self._heads[slots]
 
     def _append(self, new_points: Tensor, new_ids: Tensor, slots: Tensor) -> Tensor:
         """Adds all points, each at the head of its voxel's list; gives their indices."""
@@ -245,6 +279,7 @@ class DeviceVoxelMap:
         self._heads[ordered[is_last]] = entered[is_last]
         new = slice(len(self), len(self) + len(slots))
         self._points[new], self._ids[new] = new_points, new_ids
+        self._born[new] = self._n_given + torch.arange(len(slots), device=self._device)
         self._n_points += len(slots)
         return index.long()
 

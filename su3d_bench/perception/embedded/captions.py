@@ -12,6 +12,7 @@ from typing import TypeVar
 
 import numpy as np
 
+from su3d_bench.core.english import with_article
 from su3d_bench.perception.embedded.lexicon import (
     AFFORDANCES,
     COLOUR_WORDS,
@@ -22,7 +23,6 @@ from su3d_bench.perception.embedded.lexicon import (
     SURFACES,
     SYNONYMS,
 )
-from su3d_bench.perception.embedded.naming import with_article
 
 Word = TypeVar("Word")
 Generator = np.random.Generator

@@ -10,6 +10,7 @@ from importlib.resources import files
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
+from su3d_bench.core.english import with_article
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, UInt8Array
 from su3d_bench.perception.cache import content_key
@@ -29,11 +30,6 @@ COLOURS: tuple[tuple[str, tuple[int, int, int]], ...] = (
     ("brown", (110, 70, 40)),
     ("beige", (215, 195, 160)),
 )
-
-# Spelt with a vowel and spoken with a consonant, or the other way round.
-_CONSONANT_SOUND = ("uni", "use", "usu", "uten", "eu", "one", "ukulele")
-_VOWEL_SOUND = ("hour", "honest", "heir", "honor", "honour")
-_PLURAL = frozenset({"blinds", "pants", "shoes", "curtains", "scissors", "glasses", "clothes", "jeans", "stairs"})
 
 
 class NamingConfig(BaseModel):
@@ -57,26 +53,10 @@ def listed_words(text: str) -> tuple[str, ...]:
     return tuple(line for line in lines if line and not line.startswith("#"))
 
 
-def with_article(noun: str) -> str:
-    """``noun`` after its English article: "a bed", "an indoor-plant", "an hourglass", "a utensil-holder"; plurals bare.
-
-    >>> with_article("indoor-plant"), with_article("utensil-holder"), with_article("blinds")
-    ('an indoor-plant', 'a utensil-holder', 'blinds')
-    """
-    first = noun.strip().lower()
-    if first in _PLURAL:
-        return noun
-    is_vowel = first[:1] in tuple("aeiou") and not first.startswith(_CONSONANT_SOUND)
-    return f"{'an' if is_vowel or first.startswith(_VOWEL_SOUND) else 'a'} {noun}"
-
-
 def scene_caption(name: str, colour: str | None = None) -> str:
-    """The template caption of a region: "a green chair in a scene"."""
-    if colour is None:
-        return f"{with_article(name)} in a scene"
-    if name.lower() in _PLURAL:
-        return f"{colour} {name} in a scene"
-    return f"{with_article(f'{colour} {name}')} in a scene"
+    """The template caption of a region: "a green chair in a scene"; of one without a name, "an object in a scene"."""
+    name = name.strip() or "object"
+    return f"{with_article(name if colour is None else f'{colour} {name}')} in a scene"
 
 
 def colour_word(rgb: UInt8Array, mask: BoolArray) -> str | None:

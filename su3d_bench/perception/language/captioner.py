@@ -61,6 +61,7 @@ class Captioner:
     def __init__(self, model: LanguageModel, config: LanguageConfig) -> None:
         self._model = model
         self._config = config
+        self.vision_model = config.vision_model
         self.digest = content_key("captioner", config.model_dump_json(include=MOVES_CAPTIONS))
 
     def requests(self, crops: Sequence[UInt8Array]) -> list[ChatRequest]:

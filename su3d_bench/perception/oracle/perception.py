@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from su3d_bench.core.english import with_article
 from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
 from su3d_bench.core.types import (
     BoolArray,
@@ -16,7 +17,6 @@ from su3d_bench.core.types import (
 )
 from su3d_bench.perception.cache import FrameCache, content_key
 from su3d_bench.perception.detections import Assembler
-from su3d_bench.perception.embedded.naming import with_article
 from su3d_bench.perception.oracle.segmenter import OracleConfig, OracleSegmenter
 from su3d_bench.perception.regions import RegionsOnDemand, cached_regions, region_under
 

@@ -69,7 +69,7 @@ def _frame(content: Mapping[object, object], frame: Frame, where: str) -> Stored
     # SAM's predicted IoU may be a little above 1. A mask without pixels or a box without area is no region.
     kept = np.flatnonzero(masks.any(axis=(1, 2)) & (boxes[:, 2:] > boxes[:, :2]).all(axis=1))
     scores = np.clip(scores[kept], 0, 1).astype(np.float32)
-    regions = Regions(masks[kept], boxes[kept], scores, tuple(names[k] for k in kept))
+    regions = Regions(masks[kept], boxes[kept], scores, tuple(names[k] for k in kept), rows=kept.astype(np.int64))
     of_ratio = {} if features is None else {1.0: features[kept]}
     return StoredFrame(regions, of_ratio, made_by=FEATURES_ENCODER, made_at_px=FEATURES_PADDING_PX)
 

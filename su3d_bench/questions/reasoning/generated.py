@@ -17,10 +17,10 @@ from itertools import zip_longest
 
 import numpy as np
 
+from su3d_bench.core.english import is_countable, is_plural, plural, with_article, words
 from su3d_bench.core.types import Float64Array
 from su3d_bench.numerics.relations import Relation, gap_m
 from su3d_bench.perception.embedded.naming import vocabulary
-from su3d_bench.questions.english import is_countable, is_plural, plural, with_article, words
 from su3d_bench.questions.generator import extreme_of, is_flat
 from su3d_bench.questions.known_objects import plain_name
 from su3d_bench.questions.reasoning.answers import Answer

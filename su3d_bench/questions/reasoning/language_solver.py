@@ -12,13 +12,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from su3d_bench.core.digests import digest_json
+from su3d_bench.core.english import words
 from su3d_bench.core.types import Float64Array
 from su3d_bench.perception.language.captioner import STRATEGY, reason_of
 from su3d_bench.perception.language.chat import ChatRequest, Reply, n_tokens
 from su3d_bench.perception.language.client import LanguageModel
 from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.perception.language.parsing import answered, is_refusal
-from su3d_bench.questions.english import words
 from su3d_bench.questions.reasoning.answers import Answer, unsettled
 from su3d_bench.questions.reasoning.named_objects import meant_by
 from su3d_bench.questions.reasoning.question_words import Phrase, read_question

@@ -11,10 +11,10 @@ from functools import cache
 
 import numpy as np
 
+from su3d_bench.core.english import words
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.perception.embedded.lexicon import GROUPS, SYNONYMS
 from su3d_bench.perception.embedded.naming import vocabulary
-from su3d_bench.questions.english import words
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap, is_room_surface
 
 Words = tuple[str, ...]

@@ -7,12 +7,12 @@ from functools import cached_property
 
 import numpy as np
 
+from su3d_bench.core.english import last_word
 from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.types import BoolArray, Float64Array, Instances
 from su3d_bench.metrics.questions.score import labels_n
 from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.numerics.relations import BUILT_IN, FIXTURES, SURFACES, Relation, Relations, is_between, may_be_between
-from su3d_bench.questions.english import last_word
 
 MOST_NAME, MOST_CAPTION = 80, 400  # characters; a hostile map may hold texts of any length
 

@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import json
+import re
 import tomllib
 from typing import Any
 
 import pytest
 from places import ROOT
 
+from su3d_bench.core.english import is_countable, is_plural, plural, singular, with_article, words
 from su3d_bench.perception.embedded.lexicon import SYNONYMS
 from su3d_bench.perception.embedded.naming import vocabulary
-from su3d_bench.questions.english import is_countable, is_plural, plural, singular, with_article, words
 from su3d_bench.questions.known_objects import plain_name
 
 
@@ -67,3 +68,32 @@ def test_what_is_always_several_or_stuff_is_spoken_of_so() -> None:
         "blinds", "furniture", "an hourglass",
     )  # fmt: skip
     assert not is_countable("toilet paper") and is_countable("paper towel")
+
+
+@pytest.mark.parametrize(
+    ("noun", "expected"),
+    [
+        ("bed", "a bed"), ("indoor-plant", "an indoor-plant"), ("umbrella", "an umbrella"), ("urn", "an urn"),
+        ("utensil-holder", "a utensil-holder"), ("utility cart", "a utility cart"), ("hourglass", "an hourglass"),
+        ("house", "a house"), ("orange chair", "an orange chair"), ("Office chair", "an Office chair"),
+        ("unidentified object", "an unidentified object"), ("unicorn", "a unicorn"), ("urinal", "a urinal"),
+        ("one-seater sofa", "a one-seater sofa"), ("ewer", "a ewer"), ("8-seat table", "an 8-seat table"),
+        ("11-inch tablet", "an 11-inch tablet"), ("110-inch screen", "a 110-inch screen"),
+        ("3-seat sofa", "a 3-seat sofa"),
+        ("LCD screen", "an LCD screen"), ("lcd screen", "an lcd screen"), ("USB hub", "a USB hub"), ("TV", "a TV"),
+        ("tv-screen", "a tv-screen"), ("x-ray", "an x-ray"), ("L-shaped sofa", "an L-shaped sofa"),
+        ("U-shaped desk", "a U-shaped desk"), ("blinds", "blinds"), ("kitchen curtains", "kitchen curtains"),
+    ],
+)  # fmt: skip
+def test_the_article_is_the_one_that_is_spoken(noun: str, expected: str) -> None:
+    assert with_article(noun) == expected
+
+
+def test_the_program_has_one_function_for_the_article() -> None:
+    files = [
+        path for folder in ("su3d_bench", "reports", "datasets", "baselines") for path in (ROOT / folder).rglob("*.py")
+    ]
+    found = {
+        path for path in files if re.search(r"def \w*article|tuple\(.aeiou.\)\s*and|\ban? if ", path.read_text("utf-8"))
+    }
+    assert {path.name for path in found} <= {"english.py", "audit_page.py", "second_looks.py"}  # these two are HTML's

@@ -1,4 +1,4 @@
-"""English nouns in questions and names: one and several of a thing, articles, words that are compared.
+"""English nouns in names, captions and questions: one and several of a thing, articles, heads, words to compare.
 
 The tokenizer of the embedded text tower reduces plurals too, but roughly, and its trained weights hold it to that; what
 is asked and understood goes by these words.
@@ -7,8 +7,6 @@ is asked and understood goes by these words.
 from __future__ import annotations
 
 import re
-
-from su3d_bench.perception.embedded import naming
 
 IRREGULAR = {
     "person": "people", "man": "men", "woman": "women", "child": "children", "foot": "feet", "tooth": "teeth",
@@ -34,6 +32,20 @@ UNCOUNTABLE = frozenset(
 _ONE_IN_S = frozenset(("atlas", "bias", "canvas", "christmas", "gas", "lens", "series", "species"))
 _ENDS_IN_USE = frozenset(("house", "greenhouse", "dollhouse", "birdhouse", "mouse", "blouse", "fuse", "cause"))
 _ARTICLES = frozenset(("a", "an", "the"))
+# Spelt with a vowel but spoken with a consonant, but for some in "uni"; and the other way round.
+_SPOKEN_WITH_CONSONANT = ("uni", "use", "usu", "uten", "util", "uku", "urin", "uran", "eu", "ewe", "one", "once")
+_NOT_UNI = ("unid", "unim", "unin", "unill")
+_SPOKEN_WITH_VOWEL = ("hour", "heir", "honest", "honor", "honour")
+# Said letter by letter also where they are written small; capitals of up to three letters always are.
+_SPELT_OUT = frozenset(("atm", "hdmi", "hdtv", "hvac", "lcd", "led", "mp3", "usb"))
+# "to" is none of them: a window goes from floor to ceiling.
+_PREPOSITIONS = frozenset(
+    ("above", "against", "at", "behind", "below", "beneath", "beside", "between", "by", "for", "from", "in", "inside",
+     "near", "next", "of", "on", "over", "that", "under", "where", "which", "with", "without")
+)  # fmt: skip
+# What is a part of a wall is wall.
+_PARTS = frozenset(("area", "part", "patch", "piece", "portion", "section", "side", "strip", "surface"))
+_JOINED = re.compile(r"\s+(?:and|or)\s+|[,;/&|+]")
 _WORD = re.compile(r"[a-z0-9]+")
 
 
@@ -107,10 +119,48 @@ def is_plural(name: str) -> bool:
 
 
 def with_article(noun: str) -> str:
-    """A noun after "a" or "an"; names that mean several stand alone.
+    """A noun after "a" or "an", as it is spoken; names that mean several, and stuff, stand alone.
 
-    >>> with_article("indoor plant"), with_article("utensil holder"), with_article("blinds")
-    ('an indoor plant', 'a utensil holder', 'blinds')
+    >>> with_article("indoor-plant"), with_article("utensil holder"), with_article("blinds"), with_article("LCD screen")
+    ('an indoor-plant', 'a utensil holder', 'blinds', 'an LCD screen')
     """
-    first = noun.strip().lower()
-    return noun if is_plural(first) or not is_countable(first) else naming.with_article(noun)
+    name = noun.strip().lower()
+    if is_plural(name) or not is_countable(name):
+        return noun
+    return f"{'an' if _begins_with_vowel(noun.strip()) else 'a'} {noun}"
+
+
+def _begins_with_vowel(name: str) -> bool:
+    """Whether the first sound of ``name`` is a vowel."""
+    first = (re.findall(r"[^\W_]+", name) or [""])[0]
+    word = first.lower()
+    if len(first) == 1 or (first.isupper() and len(first) <= 3) or word in _SPELT_OUT:
+        return word[:1] in tuple("8aefhilmnorsx")
+    if word[0:1].isdigit():
+        return word.startswith("8") or re.match(r"1[18](\D|$)", word) is not None
+    if word.startswith(_SPOKEN_WITH_VOWEL):
+        return True
+    return word[:1] in tuple("aeiou") and not (
+        word.startswith(_SPOKEN_WITH_CONSONANT) and not word.startswith(_NOT_UNI)
+    )
+
+
+def head_phrases(name: str) -> list[tuple[str, ...]]:
+    """Of each thing that a name joins, its words up to and with the noun that says what it is, each in the singular.
+
+    >>> head_phrases("the tile walls of a room"), head_phrases("wall and floor"), head_phrases("floor lamp")
+    ([('tile', 'wall')], [('wall',), ('floor',)], [('floor', 'lamp')])
+    """
+    bare = re.sub(r"\([^)]*\)", " ", name.lower())
+    return [phrase for part in _JOINED.split(bare) if (phrase := _head_phrase(part))]
+
+
+def _head_phrase(text: str) -> tuple[str, ...]:
+    phrase = list(words(text))
+    for place, word in enumerate(phrase):
+        if word in _PREPOSITIONS:
+            is_part = word == "of" and place > 0 and phrase[place - 1] in _PARTS
+            return _head_phrase(" ".join(phrase[place + 1 :])) if is_part else tuple(phrase[:place])
+    while len(phrase) > 1 and (phrase[-1] in _PARTS or phrase[-1].isdigit()):
+        phrase.pop()
+    return tuple(phrase)
