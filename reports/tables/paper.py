@@ -341,6 +341,7 @@ def reported_rows(
         how = "as quoted in" if figure.read_from == "quoted" else "as reported in"
         source = f"{how} {figure.source}: {figure.setup}"
         source += f"; {figure.note}" if figure.note else ""
+        source += f"; {figure.system.words}"
         mark = marks.setdefault(source, _mark(len(marks)))
         cells = [Cell(value or NOT_MEASURED) for value in values]
         cells += [Cell("")] * (n_columns - len(cells))

@@ -36,10 +36,11 @@ def best(table: Table) -> list[list[bool]]:
 def test_measured_and_reported_rows_never_stand_without_a_mark() -> None:
     (table,) = paper_table("II", [measured()], Shown(), with_published=True)
     assert texts(table)[0] == ["opensu3d", "40.0", "20.0"]
-    assert texts(table)[-1] == ["opensu3d (as reported [c])", "42.6", "40.9"]
+    assert texts(table)[-1] == ["opensu3d (as reported [e])", "42.6", "40.9"]
     assert [row.is_reported for row in table.rows] == [False] + [True] * 5
     assert all(cell.origin is None and not cell.is_best for row in table.rows[1:] for cell in row.cells)
-    assert sum(note.startswith("[") and "OpenSU3D" in note for note in table.notes) == 3
+    assert sum(note.startswith("[") and "OpenSU3D" in note for note in table.notes) == 5
+    assert any("frames: every 5th (README at 5c4da70)" in note for note in table.notes)
     for text in (markdown([table]), html_page([table])):
         assert text.count("as reported [") == 5
     assert latex([table]).count("as reported, not measured here") == 1
