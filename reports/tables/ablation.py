@@ -47,7 +47,7 @@ class SweepRow:
 def ablation_table(
     measured: Sequence[Measured], sweep: Sequence[SweepRow], shown: Shown, *, with_published: bool
 ) -> Table:
-    """A row for each of ``sweep``, with its difference from the method's own row beneath each number.
+    """A row for each of ``sweep``, with its difference from the method's own row beside each number.
 
     Raises ``ConfigError`` where ``measured`` lacks one of its methods, or a protocol of either kind.
     """

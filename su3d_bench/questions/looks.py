@@ -18,7 +18,7 @@ from su3d_bench.questions.sight import COLOURS, WITHOUT_COLOUR, Sight
 # Things whose shape people name, by the last word: seen from above, or from the front where they hang flat.
 WITH_SHAPE = frozenset((
     "table", "desk", "nightstand", "stool", "ottoman", "bench", "rug", "mat", "carpet", "tray", "bin", "basket", "box",
-    "mirror", "clock", "picture", "painting", "poster", "cushion", "pillow",
+    "mirror", "clock", "picture", "painting", "poster", "window", "cushion", "pillow",
 ))  # fmt: skip
 SHAPES = frozenset(("round", "square", "rectangular"))
 # Things that have no height of their own, however they lie.
@@ -107,14 +107,19 @@ def _longest_way(corners: np.ndarray) -> float:
 
 # A word for more of a measure, one for less where people have one that says nothing else, and how much more the
 # extreme one of a name must have than every other; ours.
-SIZES: tuple[tuple[str, str, float], ...] = (("large", "small", 2.0), ("long", "", 1.5), ("tall", "", 1.5))
+SIZES: tuple[tuple[str, str, float], ...] = (
+    ("large", "small", 2.0),
+    ("long", "", 1.5),
+    ("wide", "narrow", 1.5),
+    ("tall", "", 1.5),
+)
 
 
 def measure_of(name: str, looks: Looks, word: str) -> float | None:
-    """How large, long or tall a thing of that name is, as people see it; None where they would not say so of it.
+    """How large, long, wide or tall a thing of that name is, as people see it; None where they would not say so of it.
 
-    Large is the volume, of what is flat the area of its face; what stands is not long, what lies flat not tall, and
-    what is soft neither.
+    Large is the volume, of what is flat the area of its face; what stands is wide and not long, what lies flat is not
+    tall, and what is soft is none of these three.
     """
     length, _, height = looks.sides.tolist()
     least, middle, longest = sorted(looks.sides.tolist())
@@ -122,6 +127,6 @@ def measure_of(name: str, looks: Looks, word: str) -> float | None:
         return middle * longest if looks.is_flat else least * middle * longest
     if last_word(name) in SOFT:
         return None
-    if word == "long":
-        return length if length >= height else None
+    if word in ("long", "wide"):
+        return length if (length >= height) == (word == "long") else None
     return None if height < FLAT_M or (looks.is_flat and height == least) else height

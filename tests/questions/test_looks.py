@@ -125,6 +125,8 @@ def test_sizes_in_a_scan_are_of_what_the_images_do_not_cut() -> None:
     assert asked(small, thing(2, "box", (0.37, 0.37, 0.37))) == {}  # 1.9 times the volume
     assert asked(thing(1, "shelf", (0.8, 0.3, 0.9)), thing(2, "shelf", (0.8, 0.3, 1.6)))["tall shelf"][1] == (2,)
     assert asked(thing(1, "bench", (1.0, 0.4, 0.4)), thing(2, "bench", (1.6, 0.4, 0.4)))["long bench"][1] == (2,)
+    doors = asked(thing(1, "door", (0.8, 0.1, 2.0)), thing(2, "door", (1.3, 0.1, 2.0)))
+    assert (doors["wide door"][1], doors["narrow door"][1]) == ((2,), (1,)) and "long door" not in doors
     assert asked(thing(1, "book", (0.3, 0.3, 0.3)), thing(2, "book", (0.4, 0.4, 0.4))) == {}  # a row, perhaps
 
 
