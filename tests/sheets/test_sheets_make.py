@@ -20,6 +20,7 @@ from su3d_bench.core.errors import ConfigError, DataError
 from su3d_bench.core.types import Frame, Instances
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.questions.truths import RefinedNames
+from su3d_bench.questions.files.files import figure_texts
 from su3d_bench.questions.model import new_question
 from su3d_bench.questions.reasoning.asking import built_in
 from su3d_bench.reports.pictures.items import (
@@ -371,6 +372,9 @@ def test_a_figure_has_its_words_as_text(
         question = "How many chairs are there?"
         assert main([*words, "--what", "reasoning", "--queries", question, "--out", "answer.svg"]) == 0
         assert question in (folder / "answer.svg").read_text()
+        assert main([*words, "--figure", "schemes", "--out", "schemes.svg"]) == 0
+        assert all(text in (folder / "schemes.svg").read_text() for text in figure_texts("schemes"))
+        assert main([*words, "--what", "labels", "--figure", "schemes", "--out", "x.svg"]) == 2
         assert main([*words, "--what", "labels", "--queries", "a", "--out", "x.svg"]) == 2
         assert main([*words, "--out", "x.svg"]) == 2
         assert main([*words, "--queries", "a", "--out", "x.gif"]) == 2

@@ -11,6 +11,7 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import DataError, printable
@@ -21,6 +22,7 @@ from su3d_bench.store.atomic import write_text
 
 PAPER = Path(__file__).parent / "paper_queries.toml"
 PAGE = "opensu3d.github.io"
+PAPER_FIGURES = ("comparison", "schemes", "teaser")
 
 
 def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ...]:
@@ -58,19 +60,35 @@ def _each_once(questions: Sequence[Question]) -> tuple[Question, ...]:
 
 
 def paper_queries() -> tuple[Question, ...]:
-    """The queries that the paper's page shows, for each of its 13 scenes, and its questions to reasoning.
+    """The queries that the paper's page shows, for each of its 13 scenes, and its questions to reasoning of one scene.
 
     Of these alone an answer is published, in words.
     """
-    content = tomllib.loads(PAPER.read_text(encoding="utf-8"))
-    kinds_and_texts = [(kind, text) for kind in KINDS for text in content["queries"][kind]]
+    content = _paper()
+    asked = [(kind, text) for kind in KINDS for text in content["queries"][kind]]
+    asked += [(kind, text) for name in PAPER_FIGURES for kind, text in content["figures"][name]]
     queries = (
-        new_question(scene, kind, text, None, PAGE) for scene in content["scenes"] for kind, text in kinds_and_texts
+        new_question(scene, kind, text, None, PAGE)
+        for scene in content["scenes"]
+        for kind, text in dict.fromkeys(asked)
     )
-    asked = (
+    reasoning = (
         new_question(one["scene"], REASONING, one["text"], None, PAGE, one["reply"]) for one in content["reasoning"]
     )
-    return (*queries, *asked)
+    return (*queries, *reasoning)
+
+
+def figure_texts(figure: str) -> tuple[str, ...]:
+    """The texts of a figure of the paper or its page, one of ``PAPER_FIGURES``, each once.
+
+    >>> figure_texts("teaser")
+    ('a musical instrument', 'which sink is closer to bed?')
+    """
+    return tuple(dict.fromkeys(text for _, text in _paper()["figures"][figure]))
+
+
+def _paper() -> dict[str, Any]:
+    return tomllib.loads(PAPER.read_text(encoding="utf-8"))
 
 
 def check_form(path: Path) -> None:

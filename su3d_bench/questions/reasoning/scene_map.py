@@ -13,6 +13,7 @@ from su3d_bench.core.types import BoolArray, Float64Array, Instances
 from su3d_bench.metrics.questions.score import labels_n
 from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.numerics.relations import BUILT_IN, FIXTURES, SURFACES, Relation, Relations, is_between, may_be_between
+from su3d_bench.questions.looks import Looks
 
 MOST_NAME, MOST_CAPTION = 80, 400  # characters; a hostile map may hold texts of any length
 
@@ -22,7 +23,8 @@ class MapObject:
     """One instance; ``centroid`` (3,) and ``box`` (2, 3), lowest and highest corner, in metres, z up.
 
     Of a truth: ``is_asked``, whether people can see it well enough to be asked about it; ``is_whole``, whether its box
-    is that of the thing itself and not of what a recording saw; ``is_cut``, whether it ends where the images ended.
+    is that of the thing itself and not of what a recording saw; ``is_cut``, whether it ends where the images ended;
+    ``looks``, of a recording alone.
     """
 
     id: int
@@ -34,6 +36,7 @@ class MapObject:
     is_asked: bool = True
     is_whole: bool = True
     is_cut: bool = False
+    looks: Looks | None = None
 
     @property
     def shown(self) -> str:
