@@ -175,6 +175,20 @@ def test_the_map_is_the_list_of_points_from_which_those_that_go_are_deleted(
     assert found == expected
 
 
+@pytest.mark.parametrize("density", ["scene", "frame", "all"])
+def test_an_insert_writes_into_no_point_but_those_that_it_places(density: Density) -> None:
+    rng = np.random.default_rng(4)
+    filled = VoxelMap(EPS, density)
+    filled.insert(rng.uniform(0, 2, (60_000, 3)) * [1, 1, 0.1], rng.integers(0, 9, 60_000).astype(np.int32))
+    points, ids = filled.points.copy(), filled.ids.copy()
+    new_points, new_ids = rng.uniform(0, 0.3, (900, 3)) * [1, 1, 0.1], rng.integers(0, 9, 900).astype(np.int32)
+    placed = filled.insert(new_points, new_ids)
+    untouched = np.setdiff1d(np.arange(len(ids)), placed)
+    np.testing.assert_array_equal(filled.points[untouched], points[untouched])
+    np.testing.assert_array_equal(filled.ids[untouched], ids[untouched])
+    assert (len(untouched) < len(ids)) == (density == "scene")
+
+
 def test_of_equally_near_points_the_one_that_came_first_matches_wherever_it_is_kept() -> None:
     filled = VoxelMap(EPS)
     filled.insert(np.array([[0.012, 0, 0], [-0.01, 0, 0]]), np.array([1, 2], np.int32))

@@ -26,7 +26,7 @@ from su3d_bench.baselines.conceptgraphs.config import MappingConfig
 from su3d_bench.baselines.conceptgraphs.method import ConceptGraphs
 from su3d_bench.cli.main import main
 from su3d_bench.core.timing import Timer
-from su3d_bench.opensu3d.config import OpenSU3DConfig
+from su3d_bench.opensu3d.config import Density, OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.runs import scene as scene_run
 
@@ -181,9 +181,10 @@ def test_the_defaults_are_those_of_the_commands_of_the_readme() -> None:
 # What it does unlike others
 
 
-def opensu3d_finds(views: list[list[Plate]]) -> int:
+def opensu3d_finds(views: list[list[Plate]], density: Density = "scene") -> int:
     """Objects of OpenSU3D on the same frames."""
-    method = OpenSU3D(OpenSU3DConfig(border_px=1, border_reference_width=0, crop_ratios=(1.0,)))
+    config = OpenSU3DConfig(border_px=1, border_reference_width=0, crop_ratios=(1.0,), density=density)
+    method = OpenSU3D(config)
     return len(mapped(method, views).finish())
 
 
@@ -214,7 +215,8 @@ def test_halves_of_an_object_stay_two_until_the_overlap_merge() -> None:
     assert mapped(ConceptGraphs(early), views).n_instances == 1
     assert found_by(views, late) == 1  # the last overlap merge joins them anyhow
     assert found_by(views, late.model_copy(update={"merge_overlap_thresh": 0.0})) == 2
-    assert opensu3d_finds(views) == 2
+    assert opensu3d_finds(views, density="frame") == 2
+    assert opensu3d_finds(views) == 1  # the whole takes the places of both halves
 
 
 def test_a_run_maps_painted_scenes_and_times_the_stages(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
