@@ -121,8 +121,8 @@ def measure_of(name: str, looks: Looks, word: str) -> float | None:
     Large is the volume, of what is flat the area of its face; what stands is wide and not long, what lies flat is not
     tall, and what is soft is none of these three.
     """
-    length, _, height = looks.sides.tolist()
-    least, middle, longest = sorted(looks.sides.tolist())
+    length, width, height = map(float, looks.sides)
+    least, middle, longest = sorted((length, width, height))
     if word == "large":
         return middle * longest if looks.is_flat else least * middle * longest
     if last_word(name) in SOFT:
