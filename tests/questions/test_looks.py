@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -32,7 +33,8 @@ def polygon(n_corners: int, height: float = 0.5) -> np.ndarray:
     return np.column_stack([flat, np.linspace(0, height, len(flat))])
 
 
-def words_of(name: str, points: np.ndarray, *, is_cut: bool = False) -> tuple[frozenset[str], frozenset[str]]:
+def words_of(name: str, points: np.ndarray, *, is_cut: bool = False) -> Any:
+    """The words for its shape that are sure, and those that may be."""
     looks = looks_of(name, points, None, is_cut=is_cut)
     return looks.words & SHAPES, looks.maybe & SHAPES
 
@@ -86,15 +88,16 @@ def test_a_colour_is_sure_in_all_lights_and_may_be_what_a_good_part_of_the_pixel
 
 
 def test_dark_and_light_things_are_so_in_every_light() -> None:
+    tones: Any = tones_of
     black, white, grey = (np.tile([float(value)] * 3, (100, 1)) for value in (30, 235, 150))
-    assert tones_of([black, black * 1.25]) == ({"dark"}, {"dark"})
-    assert tones_of([white, white / 1.25]) == ({"light-coloured"}, {"light-coloured"})
-    assert tones_of([grey, grey * 1.25]) == (frozenset(), {"light-coloured"})  # only in more light
-    assert tones_of([black[:3]]) == (frozenset(), TONES)
+    assert tones([black, black * 1.25]) == ({"dark"}, {"dark"})
+    assert tones([white, white / 1.25]) == ({"light-coloured"}, {"light-coloured"})
+    assert tones([grey, grey * 1.25]) == (frozenset(), {"light-coloured"})  # only in more light
+    assert tones([black[:3]]) == (frozenset(), TONES)
 
 
 def test_a_thing_is_long_or_tall_by_itself_where_it_plainly_is() -> None:
-    def build(name: str, *sides: float, is_cut: bool = False) -> tuple[frozenset[str], frozenset[str]]:
+    def build(name: str, *sides: float, is_cut: bool = False) -> Any:
         looks = looks_of(name, slab(*sides), None, is_cut=is_cut)
         return looks.words & BUILDS, looks.maybe & BUILDS
 
