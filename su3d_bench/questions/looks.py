@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.types import Float64Array
-from su3d_bench.numerics.relations import FLAT_M
+from su3d_bench.numerics.relations import FIXTURES, FLAT_M
 from su3d_bench.questions.english import last_word
 from su3d_bench.questions.sight import COLOURS, TONES, WITHOUT_COLOUR, Sight
 
@@ -73,9 +73,9 @@ def looks_of(name: str, points: Float64Array, sight: Sight | None, *, is_cut: bo
 
 
 def _build(name: str, sides: Float64Array) -> tuple[frozenset[str], frozenset[str]]:
-    """Whether a thing is long or tall by itself, for sure and perhaps; of what is soft nobody says so."""
+    """Whether a thing is long or tall by itself, for sure and perhaps; of what is soft or built in nobody says so."""
     length, width, height = map(float, sides)
-    if last_word(name) in SOFT:
+    if last_word(name) in SOFT | FIXTURES:
         return frozenset(), frozenset()
     rise, stretch = height / max(length, 1e-6), min(length / max(width, 1e-6), 2 * length / max(height, 1e-6))
     sure = [*(["tall"] if rise >= TALL else []), *(["long"] if stretch >= LONG else [])]

@@ -105,7 +105,7 @@ def test_a_thing_is_long_or_tall_by_itself_where_it_plainly_is() -> None:
     assert build("bench", 1.2, 0.4, 0.4) == ({"long"}, {"long"})
     assert build("shelf", 0.8, 0.5, 1.2) == (frozenset(), {"tall"})
     assert build("box", 0.4, 0.4, 0.4) == (frozenset(), frozenset())
-    assert build("blanket", 0.2, 0.2, 0.9) == (frozenset(), frozenset())
+    assert build("blanket", 0.2, 0.2, 0.9) == build("door", 0.9, 0.1, 2.0) == (frozenset(), frozenset())
     assert build("shelf", 0.8, 0.3, 1.6, is_cut=True) == (frozenset(), BUILDS)
 
 
