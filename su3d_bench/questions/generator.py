@@ -180,7 +180,9 @@ def _looks(objects: SceneMap) -> Iterator[_Asked]:
         for word in sorted({word for _, looks in known for word in looks.words}):
             answers = tuple(thing.id for thing, looks in known if word in looks.words)
             if len(answers) == sum(word in looks.maybe for _, looks in known):
-                yield _Asked("property", f"{word} {name}", answers, name)
+                others = [other for other in _table("names").get(name, ()) if set(_ids(objects, other)) == set(ids)]
+                for called in (name, *others):
+                    yield _Asked("property", f"{word} {called}", answers, name)
         if last_word(name) not in WITHOUT_SIZE and not any(thing.is_cut for thing in named):
             yield from _measured(name, known)
 

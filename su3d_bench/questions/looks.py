@@ -12,8 +12,8 @@ import numpy as np
 
 from su3d_bench.core.english import last_word
 from su3d_bench.core.types import Float64Array
-from su3d_bench.numerics.relations import FLAT_M
-from su3d_bench.questions.sight import COLOURS, WITHOUT_COLOUR, Sight
+from su3d_bench.numerics.relations import FIXTURES, FLAT_M
+from su3d_bench.questions.sight import COLOURS, TONES, WITHOUT_COLOUR, Sight
 
 # Things whose shape people name, by the last word: seen from above, or from the front where they hang flat.
 WITH_SHAPE = frozenset((
@@ -29,6 +29,9 @@ FLAT_SHARE = 0.2  # ours: a face stands upright where the thing is so much thinn
 ROUND, MAYBE_ROUND = 0.92, 0.80
 # Area over that of the smallest rectangle about it: a circle has 0.79, an octagon 0.83.
 STRAIGHT, MAYBE_STRAIGHT = 0.93, 0.86
+# Height over length; length over width, and twice that over the height.
+BUILDS = frozenset(("tall", "long"))
+TALL, MAYBE_TALL, LONG, MAYBE_LONG = 1.8, 1.3, 2.5, 1.8
 # Longer over shorter side of that rectangle.
 SQUARE, MAYBE_SQUARE = 1.1, 1.25
 
@@ -60,11 +63,24 @@ def looks_of(name: str, points: Float64Array, sight: Sight | None, *, is_cut: bo
         words, maybe = words - {"square", "rectangular"}, maybe | {"square", "rectangular"}
     if last_word(name) not in WITH_SHAPE:
         words, maybe = frozenset(), SHAPES
+    sure_build, maybe_build = (frozenset[str](), BUILDS) if is_cut else _build(name, sides)
+    words, maybe = words | sure_build, maybe | maybe_build
     has_colour = sight is not None and last_word(name) not in WITHOUT_COLOUR
     if sight is None or not has_colour:
-        return Looks(sides, words, maybe | COLOURS)
-    sure = frozenset((sight.colour,)) if sight.colour and sight.is_sure_colour else frozenset()
-    return Looks(sides, words | sure, maybe | sight.maybe_colours | sure)
+        return Looks(sides, words, maybe | COLOURS | TONES)
+    sure = sight.tones | ({sight.colour} if sight.colour and sight.is_sure_colour else set())
+    return Looks(sides, words | sure, maybe | sight.maybe_colours | sight.maybe_tones | sure)
+
+
+def _build(name: str, sides: Float64Array) -> tuple[frozenset[str], frozenset[str]]:
+    """Whether a thing is long or tall by itself, for sure and perhaps; of what is soft or built in nobody says so."""
+    length, width, height = map(float, sides)
+    if last_word(name) in SOFT | FIXTURES:
+        return frozenset(), frozenset()
+    rise, stretch = height / max(length, 1e-6), min(length / max(width, 1e-6), 2 * length / max(height, 1e-6))
+    sure = [*(["tall"] if rise >= TALL else []), *(["long"] if stretch >= LONG else [])]
+    maybe = [*(["tall"] if rise >= MAYBE_TALL else []), *(["long"] if stretch >= MAYBE_LONG else [])]
+    return frozenset(sure), frozenset(maybe)
 
 
 def _shape(points: Float64Array) -> tuple[Float64Array, frozenset[str], frozenset[str]]:
@@ -121,8 +137,8 @@ def measure_of(name: str, looks: Looks, word: str) -> float | None:
     Large is the volume, of what is flat the area of its face; what stands is wide and not long, what lies flat is not
     tall, and what is soft is none of these three.
     """
-    length, _, height = looks.sides.tolist()
-    least, middle, longest = sorted(looks.sides.tolist())
+    length, width, height = map(float, looks.sides)
+    least, middle, longest = sorted((length, width, height))
     if word == "large":
         return middle * longest if looks.is_flat else least * middle * longest
     if last_word(name) in SOFT:

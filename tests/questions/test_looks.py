@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
 
 from su3d_bench.questions.generator import generate
-from su3d_bench.questions.looks import SHAPES, Looks, looks_of, measure_of
+from su3d_bench.questions.looks import BUILDS, SHAPES, Looks, looks_of, measure_of
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
-from su3d_bench.questions.sight import COLOURS, Sight, maybe_colours
+from su3d_bench.questions.sight import COLOURS, TONES, Sight, maybe_colours, tones_of
 
 GENERATOR = np.random.default_rng(0)
 
@@ -32,9 +33,10 @@ def polygon(n_corners: int, height: float = 0.5) -> np.ndarray:
     return np.column_stack([flat, np.linspace(0, height, len(flat))])
 
 
-def words_of(name: str, points: np.ndarray, *, is_cut: bool = False) -> tuple[frozenset[str], frozenset[str]]:
+def words_of(name: str, points: np.ndarray, *, is_cut: bool = False) -> Any:
+    """The words for its shape that are sure, and those that may be."""
     looks = looks_of(name, points, None, is_cut=is_cut)
-    return looks.words, looks.maybe & SHAPES
+    return looks.words & SHAPES, looks.maybe & SHAPES
 
 
 @pytest.mark.parametrize("degrees", [0.0, 30.0, 45.0])
@@ -59,7 +61,7 @@ def test_a_thing_that_hangs_flat_is_seen_from_the_front() -> None:
     face = polygon(40)
     clock = np.column_stack([face[:, 0], GENERATOR.uniform(0, 0.03, len(face)), face[:, 1]])
     assert words_of("clock", clock) == ({"round"}, {"round"})
-    assert words_of("picture", slab(0.8, 0.02, 0.5))[0] == {"rectangular"}
+    assert words_of("picture", slab(0.8, 0.02, 0.5))[0] & SHAPES == {"rectangular"}
 
 
 def test_of_what_is_cut_or_small_or_not_said_of_such_things_no_shape_is_told() -> None:
@@ -80,9 +82,36 @@ def test_a_colour_is_sure_in_all_lights_and_may_be_what_a_good_part_of_the_pixel
     assert maybe_colours([red[:3]]) == COLOURS  # too few pixels to say anything
     sight = Sight(0.1, "red", True, False, frozenset(("red", "pink")))
     looks = looks_of("chair", slab(0.5, 0.5, 0.9), sight, is_cut=False)
-    assert looks.words == {"red"} and looks.maybe & COLOURS == {"red", "pink"}
+    assert looks.words & COLOURS == {"red"} and looks.maybe & COLOURS == {"red", "pink"}
     assert looks_of("picture", slab(0.8, 0.02, 0.5), sight, is_cut=False).maybe >= COLOURS
     assert looks_of("chair", slab(0.5, 0.5, 0.9), None, is_cut=False).maybe >= COLOURS  # never seen
+
+
+def test_dark_and_light_things_are_so_in_every_light() -> None:
+    tones: Any = tones_of
+    black, white, grey = (np.tile([float(value)] * 3, (100, 1)) for value in (30, 235, 150))
+    assert tones([black, black * 1.25]) == ({"dark"}, {"dark"})
+    assert tones([white, white / 1.25]) == ({"light-coloured"}, {"light-coloured"})
+    assert tones([grey, grey * 1.25]) == (frozenset(), {"light-coloured"})  # only in more light
+    assert tones([black[:3]]) == (frozenset(), TONES)
+
+
+def test_a_thing_is_long_or_tall_by_itself_where_it_plainly_is() -> None:
+    def build(name: str, *sides: float, is_cut: bool = False) -> Any:
+        looks = looks_of(name, slab(*sides), None, is_cut=is_cut)
+        return looks.words & BUILDS, looks.maybe & BUILDS
+
+    assert build("shelf", 0.8, 0.3, 1.6) == ({"tall"}, {"tall"})
+    assert build("bench", 1.2, 0.4, 0.4) == ({"long"}, {"long"})
+    assert build("shelf", 0.8, 0.5, 1.2) == (frozenset(), {"tall"})
+    assert build("box", 0.4, 0.4, 0.4) == (frozenset(), frozenset())
+    assert build("blanket", 0.2, 0.2, 0.9) == build("door", 0.9, 0.1, 2.0) == (frozenset(), frozenset())
+    assert build("shelf", 0.8, 0.3, 1.6, is_cut=True) == (frozenset(), BUILDS)
+
+
+def test_other_names_of_a_thing_are_asked_with_its_looks_too() -> None:
+    found = asked(thing(1, "sofa", (2.0, 0.8, 0.8), "red"), thing(2, "sofa", (2.0, 0.8, 0.8), "blue"))
+    assert found["red couch"] == found["red sofa"] == ("property", (1,))
 
 
 def thing(one: int, name: str, sides: tuple[float, float, float], words: str = "", maybe: str = "") -> MapObject:
