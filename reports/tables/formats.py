@@ -29,6 +29,7 @@ CSV_COLUMNS = (
     "protocol",
     "version",
     "metric",
+    "unit",
     "mark",
 )
 # A spreadsheet takes what begins so for a formula; an apostrophe before it makes it text.

@@ -7,7 +7,9 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 from su3d_bench.core.errors import ConfigError, counted, printable
+from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, said_by
 from su3d_bench.reports.tables.model import (
+    BY_PEOPLE,
     NOT_MEASURED,
     Cell,
     Measured,
@@ -18,10 +20,11 @@ from su3d_bench.reports.tables.model import (
     signed,
     text_table,
 )
-from su3d_bench.reports.tables.paper import Shown, protocol_table, reported_rows
+from su3d_bench.reports.tables.paper import PAPER_SCENES, Shown, other_setup, protocol_table, reported_rows
 from su3d_bench.reports.tables.published import Figure, PaperTable, figures_of
 
-OWN_NAMES = {"merge-accuracy": "well-merged"}  # the paper's name: ours
+REFINED = "refined label (n')"
+WHO_DID = {"reasoning": ANSWERED_BY, "annotation": REFINED_BY}  # what a sheet's key says beside who judged
 
 
 @dataclass(frozen=True)
@@ -42,8 +45,8 @@ JUDGED: Mapping[PaperTable, JudgedLayout] = {
         "Labels and merging",
         ("label-accuracy", "merge-accuracy"),
         {
-            "direct label (n)": OWN_NAMES | {"label-accuracy": "label n"},
-            "refined label (n')": OWN_NAMES | {"label-accuracy": "label n'"},
+            "direct label (n)": {"label-accuracy": "label n", "merge-accuracy": "well-merged"},
+            REFINED: {"label-accuracy": "label n'", "merge-accuracy": "well-merged n'"},
         },
     ),
     "reasoning": JudgedLayout(
@@ -52,8 +55,8 @@ JUDGED: Mapping[PaperTable, JudgedLayout] = {
 }
 
 
-def judged_table(number: PaperTable, results: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
-    """Such a table for each dataset: what people judged, what the ground truth judged, what the paper reports."""
+def judged_table(number: PaperTable, results: Sequence[Measured], shown: Shown, *, with_published: bool) -> Table:
+    """Such a table with the columns of each dataset: what people judged, what the truth judged, what papers report."""
     layout = JUDGED[number]
     rows = [row for row in results if row.kind == layout.kind]
     if not any(row.per_scene for row in rows):
@@ -62,51 +65,99 @@ def judged_table(number: PaperTable, results: Sequence[Measured], shown: Shown, 
             f"Table {number}: needs {_protocols(layout.kind)}, or scores of sheets of kind {layout.kind}; there are "
             f"{have}"
         )
-    tables = []
-    for dataset in dict.fromkeys(row.datasets for row in rows if row.per_scene):
-        figures = figures_of(is_wanted=with_published, table=number)
-        of_dataset = [row for row in rows if row.datasets == dataset or not row.per_scene]
-        tables.append(_dataset_table(number, layout, dataset, of_dataset, figures, shown))
-    return tables
-
-
-def _dataset_table(
-    number: PaperTable,
-    layout: JudgedLayout,
-    dataset: str,
-    measured: Sequence[Measured],
-    figures: Sequence[Figure],
-    shown: Shown,
-) -> Table:
-    shown = replace(shown, metrics=shown.metrics or layout.columns, scenes_count=True)
-    body: list[TableRow] = []
-    notes: list[str] = []
-    columns: tuple[str, ...] = ()
-    for protocol in sorted({row.protocol for row in measured}, key=lambda name: not name.endswith("-people")):
-        rows = [row for row in measured if row.protocol == protocol]
-        if not any(row.per_scene for row in rows):
-            continue
-        table = protocol_table([_part(row, name, layout) for row in rows for name in layout.parts], shown, [])
-        judge = "people" if rows[0].is_by_people else "ground truth"
-        body += [_named(row, judge, layout) for row in table.rows]
-        notes += [f"{judge}: {note}" for note in table.notes]
-        columns = table.columns
-    same = [figure for figure in figures if figure.dataset == dataset]
-    reported, sources = reported_rows(same or figures, shown.metrics, len(columns))
-    setup = "" if same or not figures else ", not the paper's data"
+    shown = replace(
+        shown, metrics=shown.metrics or layout.columns, only_significant=True, n_judged=True, unit="fraction"
+    )
+    names = list(dict.fromkeys(row.datasets for row in rows if row.per_scene))
+    parts = {
+        name: _of_dataset(layout, [row for row in rows if row.datasets == name or not row.per_scene], shown)
+        for name in names
+    }
+    columns = [column if len(names) == 1 else f"{name} {column}" for name in names for column in parts[name].columns]
+    reported, sources = _reported(figures_of(is_wanted=with_published, table=number), names, shown, parts)
+    # people judge the retrieval and labels of the paper, and its reasoning
+    judges = [] if all(row.is_by_people for row in rows) else ["judges"]
+    setup = other_setup(rows, is_its_protocol=True, datasets=tuple(PAPER_SCENES), more=judges)
     return Table(
-        name=f"{number}-{dataset}",
-        caption=f"{layout.subject} on {dataset}{setup}.",
+        name=f"{number}-{'-'.join(names)}",
+        caption=f"{layout.subject} on {', '.join(names)}{setup}.",
         head="method, judge",
-        columns=columns,
-        rows=(*body, *reported),
-        notes=(*notes, *sources),
+        columns=tuple(columns),
+        rows=(*_joined(list(parts.values())), *reported),
+        notes=(*_joined_notes(parts), *sources),
     )
 
 
+def _joined_notes(parts: Mapping[str, Table]) -> list[str]:
+    """The notes of all parts, each once, with the judges and data that it is about before it."""
+    places: dict[str, list[str]] = {}
+    for name, part in parts.items():
+        for judged in part.notes:
+            judge, _, note = judged.partition(": ")
+            places.setdefault(note, []).append(judge if len(parts) == 1 else f"{judge} on {name}")
+    return [f"{', '.join(where)}: {note}" for note, where in places.items()]
+
+
+def _of_dataset(layout: JudgedLayout, measured: Sequence[Measured], shown: Shown) -> Table:
+    """The part of a table that is of one dataset."""
+    body: list[TableRow] = []
+    notes: list[str] = []
+    columns: tuple[str, ...] = ()
+    for protocol in sorted({row.protocol for row in measured}, key=lambda name: not name.endswith(BY_PEOPLE)):
+        rows = [row for row in measured if row.protocol == protocol]
+        if not any(row.per_scene for row in rows):
+            continue
+        parts = [_part(row, name, layout) for row in rows for name in layout.parts]
+        table = protocol_table(parts, shown, [])
+        judge = "people" if rows[0].is_by_people else "ground truth"
+        scored = [part for part in parts if part.per_scene or part.failed]
+        body += [_named(*both, judge, layout) for both in zip(table.rows, scored, strict=True)]
+        notes += [f"{judge}: {note}" for note in table.notes]
+        columns = max(columns, table.columns, key=len)
+    return Table("", "", "", columns, tuple(body), tuple(notes))
+
+
+def _joined(parts: Sequence[Table]) -> list[TableRow]:
+    """The rows of several parts side by side, by label; what a part lacks is a dash there. People's rows come first."""
+    first = {row.label: row for part in parts for row in part.rows}
+    wide = []
+    for label, row in sorted(first.items(), key=lambda item: item[1].group != "people"):
+        own = [next((one.cells for one in part.rows if one.label == label), ()) for part in parts]
+        wide.append(replace(row, cells=_side_by_side(own, parts)))
+    return wide
+
+
+def _side_by_side(cells: Sequence[Sequence[Cell]], parts: Sequence[Table]) -> tuple[Cell, ...]:
+    filled = [
+        [*own, *[Cell(NOT_MEASURED)] * (len(part.columns) - len(own))] for own, part in zip(cells, parts, strict=True)
+    ]
+    return tuple(cell for own in filled for cell in own)
+
+
+def _reported(
+    figures: Sequence[Figure], names: Sequence[str], shown: Shown, parts: Mapping[str, Table]
+) -> tuple[list[TableRow], list[str]]:
+    """The paper's rows beneath, with the digits that it prints: each dataset's under its own columns.
+
+    All of them stand under those of other data alone.
+    """
+    if not any(figure.dataset in names for figure in figures):
+        return reported_rows(figures, shown.metrics, len(parts[names[0]].columns), as_fractions=True)
+    kept = [figure for figure in figures if figure.dataset in names and set(shown.metrics) & set(figure.values)]
+    rows, sources = reported_rows(kept, shown.metrics, len(shown.metrics), as_fractions=True)
+    of_label: dict[str, dict[str, TableRow]] = {}
+    for figure, row in zip(kept, rows, strict=True):
+        of_label.setdefault(row.label, {})[figure.dataset] = row
+    joined = []
+    for label, by_dataset in of_label.items():
+        own = [by_dataset[name].cells if name in by_dataset else () for name in names]
+        marks = ", ".join(dict.fromkeys(row.mark for row in by_dataset.values()))
+        joined.append(TableRow(label, _side_by_side(own, list(parts.values())), is_reported=True, mark=marks))
+    return joined, sources
+
+
 def _protocols(kind: str) -> str:
-    datasets = ("rooms",) if kind == "reasoning" else ("rooms", "replica", "scannet")
-    names = [f"{dataset}-{kind}" for dataset in datasets]
+    names = [f"{dataset}-{kind}" for dataset in ("rooms", "replica", "scannet")]
     return f"protocol {' or '.join(names)}"
 
 
@@ -114,22 +165,39 @@ def _part(row: Measured, part: str, layout: JudgedLayout) -> Measured:
     """``row`` with the metrics of one part under the names of their columns."""
     names = layout.parts[part]
     known = {column: name for column, name in names.items() if name in row.metrics}
+    of_labels = row.tests.get(("label", row.method))  # n' against n, over the same instances
+    others = [f"{row.method}: {other}" for other in layout.parts if other != part] if of_labels else []
     return replace(
         row,
         method=f"{row.method}: {part}" if part else row.method,
-        metrics=dict(row.metrics) | {column: row.metrics[name] for column, name in known.items()},
+        metrics=dict(row.metrics)
+        | {
+            f"{lead}{column}": row.metrics.get(f"{lead}{name}") for column, name in known.items() for lead in ("", "n_")
+        },
         intervals=dict(row.intervals) | {column: row.intervals.get(name) for column, name in known.items()},
         ceilings=dict(row.ceilings) | {column: row.ceilings.get(name) for column, name in known.items()},
         per_scene={
             scene: dict(values) | {column: values.get(name) for column, name in known.items()}
             for scene, values in row.per_scene.items()
         },
+        tests=dict(row.tests) | {("label-accuracy", other): of_labels for other in others if of_labels},
     )
 
 
-def _named(row: TableRow, judge: str, layout: JudgedLayout) -> TableRow:
-    """``row`` with its judge, and each cell with the number's own name, by which a paper is checked."""
-    return replace(row, label=f"{row.label}, {judge}", group=judge, cells=tuple(_own(c, layout) for c in row.cells))
+def _named(row: TableRow, part: Measured, judge: str, layout: JudgedLayout) -> TableRow:
+    """``row`` with who made the labels or answers and its judge, and each cell with the number's own name, by which a
+    paper is checked."""
+    label = row.label.replace(REFINED, f"{REFINED[:-1]} {_refined_by(part)})" if _refined_by(part) else REFINED)
+    solvers = said_by(part.warnings, ANSWERED_BY)
+    label += f", answers by {' and '.join(solvers)}" if solvers else ""
+    return replace(row, label=f"{label}, {judge}", group=judge, cells=tuple(_own(c, layout) for c in row.cells))
+
+
+def _refined_by(part: Measured) -> str:
+    """What label n' is: a vote, or a model's name."""
+    who = [source.partition(" of ")[0] for source in said_by(part.warnings, REFINED_BY)]
+    said = ("is a vote" if one == "the vote" else f"by {one}" for one in who)
+    return " and ".join(dict.fromkeys(printable(one, 100) for one in said))
 
 
 def _own(cell: Cell, layout: JudgedLayout) -> Cell:
@@ -196,7 +264,7 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
             "several people judged counts once, with the share of them that said so. "
             + (ABOUT_QUESTIONS if scores["kind"] == "questions" else ABOUT_TRUTH),
             f"set {scores['sheet_id']}{origin}; {judged}",
-            *([f"answers by {printable(scores['answered_by'], 100)}"] if scores["answered_by"] else []),
+            *([f"{WHO_DID[scores['kind']]}{printable(scores['answered_by'], 200)}"] if scores["answered_by"] else []),
             *([f"'cannot tell' is left out: at most {unclear} judgements of a number"] if unclear else []),
             *([f"no answers from {', '.join(scores['silent'])}"] if scores["silent"] else []),
         ),

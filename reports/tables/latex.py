@@ -51,6 +51,7 @@ SIZES = ((r"\small", 5.3), (r"\footnotesize", 4.9), (r"\scriptsize", 4.4))
 _ORIGIN = re.compile(
     r"% run=(?P<run>\S+) method=(?P<method>\S+) protocol=(?P<protocol>\S+) version=(?P<version>\d{1,6}) "
     r"metric=(?P<metric>\S+) what=(?P<what>value|ceiling|scenes) value=(?P<value>[0-9.e+-]{1,30})"
+    r"(?: unit=(?P<unit>percent|fraction))?"
     r"(?: interval=(?P<low>[0-9.e+-]{1,30}),(?P<high>[0-9.e+-]{1,30}))?\s*$"
 )
 _MARK = re.compile(r"% run=")
@@ -240,6 +241,7 @@ def origin_comment(origin: Origin) -> str:
     comment = " ".join(f"{name}={quote(value, safe=_SAFE)}" for name, value in parts)
     comment += f" version={origin.version} metric={quote(origin.metric, safe=_SAFE)} what={origin.what}"
     comment += f" value={origin.value!r}"
+    comment += "" if origin.unit == "percent" else f" unit={origin.unit}"
     if origin.interval is not None:
         comment += f" interval={origin.interval[0]!r},{origin.interval[1]!r}"
     return f"% {comment}"
@@ -280,6 +282,7 @@ def _origin(comment: str) -> Origin | None:
         return None
     fields: dict[str, Any] = match.groupdict()
     low, high = fields.pop("low"), fields.pop("high")
+    fields["unit"] = fields["unit"] or "percent"
     fields |= {name: unquote(fields[name]) for name in ("run", "method", "protocol", "metric")}
     try:
         fields |= {"version": int(fields["version"]), "value": float(fields["value"])}

@@ -6,9 +6,12 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
+from su3d_bench.numerics.statistics import SignFlipTest
+
 NOT_MEASURED = "-"
 Interval = tuple[float, float]
 What = Literal["value", "ceiling", "scenes"]
+Unit = Literal["percent", "fraction"]
 
 
 def percent(value: float | None) -> str:
@@ -54,7 +57,10 @@ def is_count(metric: str) -> bool:
 
 @dataclass(frozen=True)
 class Origin:
-    """Which number of which run a cell shows; ``value`` is a fraction, or the number of scored scenes."""
+    """Which number of which run a cell shows; ``value`` is a fraction, or the number of scored scenes.
+
+    ``unit``: in what the cell shows a share.
+    """
 
     run: str
     method: str
@@ -64,11 +70,12 @@ class Origin:
     what: What
     value: float
     interval: Interval | None = None
+    unit: Unit = "percent"
 
 
 @dataclass(frozen=True)
 class Cell:
-    """``text`` as it is shown, without the mark of the best, and ``beside`` it, an interval, which is never marked.
+    """``text`` as it is shown, without the mark of the best, and ``beside`` it what is never marked, as an interval.
 
     ``origin`` is None for what a paper reports.
     """
@@ -168,7 +175,8 @@ class Measured:
 
     What people judged is of this form too, from ``scores.json`` instead. ``run`` is the folder as it was named;
     ``limit``: how many frames of a scene, 0 for all; ``ceilings`` are empty where there is none. ``per_scene`` is
-    scene -> metric -> value.
+    scene -> metric -> value; ``warnings`` are what was said of the numbers when they were made, ``tests`` what people's
+    judgements of the same items say, by metric and other method.
     """
 
     run: str
@@ -189,6 +197,8 @@ class Measured:
     encoder: str | None = None
     confidences: str | None = None
     caveat: str | None
+    warnings: tuple[str, ...] = ()
+    tests: Mapping[tuple[str, str], SignFlipTest] = field(default_factory=dict)
 
     @property
     def is_by_people(self) -> bool:

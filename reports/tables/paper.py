@@ -1,4 +1,4 @@
-"""The tables of OpenSU3D's paper and any other selection, from measured results and what papers report."""
+"""Tables II and III of OpenSU3D's paper and any other selection, from measured results and what papers report."""
 
 from __future__ import annotations
 
@@ -8,7 +8,10 @@ from functools import partial
 
 import numpy as np
 
-from su3d_bench.core.errors import ConfigError, printable, suggest
+from su3d_bench.core.errors import ConfigError, counted, printable, suggest
+from su3d_bench.metrics.protocol_files import protocol_names
+from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.questions.score import RELATIVE, said_by
 from su3d_bench.numerics.statistics import SignFlipTest, sign_flip_test
 from su3d_bench.reports.tables.model import (
     NOT_MEASURED,
@@ -17,6 +20,7 @@ from su3d_bench.reports.tables.model import (
     Origin,
     Table,
     TableRow,
+    Unit,
     bracketed,
     confidence_notes,
     is_count,
@@ -26,16 +30,20 @@ from su3d_bench.reports.tables.model import (
 from su3d_bench.reports.tables.published import Figure, PaperTable, figures_of
 
 LEVEL = 0.05
-PAPER_DATA = "replica"  # of Tables II and III
+PAPER_PROFILE = "paper"
+PAPER_SCENES: Mapping[str, tuple[str, ...]] = {
+    "replica": ("office0", "office1", "office2", "office3", "office4", "room0", "room1", "room2"),
+    "scannet": ("scene0000_00", "scene0034_00", "scene0164_03", "scene0525_01", "scene0549_00"),
+}
 
 
 @dataclass(frozen=True)
 class Layout:
-    """A table of the paper: its metrics, the protocol of its set-up, and its subject."""
+    """A table of the paper, or half of one: its metrics, the protocol of its set-up, and its subject."""
 
     metrics: tuple[str, ...]
     protocol: str
-    subject: str
+    subject: str = ""
 
 
 LAYOUTS: Mapping[PaperTable, Layout] = {
@@ -46,13 +54,18 @@ LAYOUTS: Mapping[PaperTable, Layout] = {
 
 @dataclass(frozen=True)
 class Shown:
-    """What stands in the cells, and which best values are marked."""
+    """What stands in the cells, and which best values are marked; ``unit``: in which shares stand there.
+
+    ``n_judged``: beside a share, of how many questions or instances it is.
+    """
 
     metrics: tuple[str, ...] = ()
     intervals: bool = False
     ceilings: bool = False
     scenes_count: bool = False
     only_significant: bool = False
+    n_judged: bool = False
+    unit: Unit = "percent"
 
 
 def paper_table(number: PaperTable, measured: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
@@ -77,11 +90,46 @@ def paper_table(number: PaperTable, measured: Sequence[Measured], shown: Shown, 
         rows = [row for row in fitting if row.protocol == name]
         table = protocol_table(rows, replace(shown, metrics=metrics), figures)
         where = next((row.datasets for row in rows if row.per_scene), "no scene")
-        setup = "" if name == layout.protocol else ", not the paper's set-up"
-        setup += " and data" if setup and where != PAPER_DATA else ""
+        setup = other_setup(rows, is_its_protocol=name == layout.protocol)
         caption = f"{layout.subject} on {where}, {name}{setup}."
         tables.append(replace(table, name=f"{number}-{name}", caption=caption))
     return tables
+
+
+def other_setup(
+    rows: Sequence[Measured],
+    *,
+    is_its_protocol: bool,
+    datasets: Sequence[str] = ("replica",),
+    more: Sequence[str] = (),
+) -> str:
+    """What a caption adds where ``rows`` were not made as the paper's were, and in what they differ; else nothing.
+
+    ``datasets``: those of the paper's table; ``more``: what else is known to differ.
+    """
+    scored = [row for row in rows if row.per_scene]
+    profiles = {row.profile for row in scored} - {None}
+    differs = [
+        *([] if is_its_protocol else ["protocol"]),
+        *([] if all(row.scenes == _papers_scenes(row, datasets) for row in scored) else ["scenes"]),
+        *(["frames"] if any(row.limit for row in scored) else []),
+        *(["perception"] if profiles - {PAPER_PROFILE} else []),
+        *(["encoder"] if profiles <= {PAPER_PROFILE} and not all(map(_has_its_encoder, scored)) else []),
+        *more,
+    ]
+    return f"; not the paper's set-up: other {', '.join(differs)}" if differs else ""
+
+
+def _papers_scenes(row: Measured, datasets: Sequence[str]) -> set[str]:
+    """The paper's scenes of the data of ``row``, none where its table has no such data."""
+    names = PAPER_SCENES.get(row.datasets, ()) if row.datasets in datasets else ()
+    return {f"{row.datasets}/{name}" for name in names}
+
+
+def _has_its_encoder(row: Measured) -> bool:
+    """Whether the features are of the encoder that the protocol names, as far as both name one."""
+    is_known = row.encoder is not None and row.protocol in protocol_names()
+    return not is_known or load_protocol(row.protocol).encoder in (None, row.encoder)
 
 
 def selection_tables(measured: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
@@ -144,7 +192,12 @@ def units(row: Measured, shown: Shown) -> str:
     if shown.intervals:
         interval = f"; in brackets the 95 % interval over {'items' if row.is_by_people else 'scenes'}"
     ceiling = "; (truth): what the truth itself scores" if shown.ceilings else ""
-    return f"Protocol {row.protocol}, version {row.version}, on {row.datasets}; per cent{interval}{ceiling}."
+    unit = "per cent" if shown.unit == "percent" else "shares of 1"
+    n = "; n: how many were judged" if shown.n_judged else ""
+    scenes = counted(len(row.per_scene), "scene")
+    return (
+        f"Protocol {row.protocol}, version {row.version}, on {row.datasets} ({scenes}); {unit}{interval}{ceiling}{n}."
+    )
 
 
 def _are_alike(rows: Sequence[Measured]) -> bool:
@@ -171,13 +224,15 @@ def cells_of(row: Measured, shown: Shown, best: set[str]) -> list[Cell]:
     for name in shown.metrics:
         interval = row.intervals.get(name) if shown.intervals else None
         value = row.metrics.get(name)
-        beside = bracketed(interval, partial(shown_as, name))
-        origin = None if value is None else _origin(row, name, value, interval=interval)
-        cells.append(Cell(shown_as(name, value), beside, name in best, origin))
+        beside = bracketed(interval, partial(shown_as, name, unit=shown.unit))
+        n_judged = row.metrics.get(f"n_{name}") if shown.n_judged else None
+        beside += "" if n_judged is None else f" n={n_judged:.0f}"
+        origin = None if value is None else replace(_origin(row, name, value, interval), unit=shown.unit)
+        cells.append(Cell(shown_as(name, value, shown.unit), beside.lstrip(), name in best, origin))
     for name in shown.metrics if shown.ceilings else ():
         value = row.ceilings.get(name)
-        origin = None if value is None else replace(_origin(row, name, value), what="ceiling")
-        cells.append(Cell(shown_as(name, value), origin=origin))
+        origin = None if value is None else replace(_origin(row, name, value), what="ceiling", unit=shown.unit)
+        cells.append(Cell(shown_as(name, value, shown.unit), origin=origin))
     if shown.scenes_count:
         n = float(len(row.per_scene))
         cells.append(Cell(row.scenes_text, origin=replace(_origin(row, "scenes", n), what="scenes")))
@@ -188,9 +243,15 @@ def _origin(row: Measured, metric: str, value: float, interval: tuple[float, flo
     return Origin(row.run, row.method, row.protocol, row.version, metric, "value", value, interval)
 
 
-def shown_as(metric: str, value: float | None) -> str:
-    """``value`` as a table shows it: a share in per cent, a count as it is."""
-    return percent(value) if value is None or not is_count(metric) else f"{value:.1f}".removesuffix(".0")
+def shown_as(metric: str, value: float | None, unit: Unit = "percent") -> str:
+    """``value`` as a table shows it: a share in its unit, a count as it is.
+
+    >>> shown_as("AP", 0.1234), shown_as("AP", 0.1234, "fraction"), shown_as("n_classes", 12.0)
+    ('12.3', '0.123', '12')
+    """
+    if value is not None and is_count(metric):
+        return f"{value:.1f}".removesuffix(".0")
+    return percent(value) if value is None or unit == "percent" else f"{value:.3f}"
 
 
 def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int]], str | None]:
@@ -213,7 +274,7 @@ def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int
             continue
         best = {k for k in competing if percent(rows[k].metrics.get(name)) == percent(float(values[order[0]]))}
         if shown.only_significant:
-            test = sign_flip_test(_of_scenes(rows[order[0]], name) - _of_scenes(rows[order[1]], name))
+            test = _paired_test(rows[order[0]], rows[order[1]], name)
             tests.append(test)
             best = best if len(best) == 1 and test is not None and test.p < LEVEL else set()
         if len(best) < len(competing):
@@ -221,13 +282,29 @@ def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int
     if not shown.only_significant:
         return marked, "Bold: the highest measured value." if any(marked.values()) else None
     smallest = min((test.smallest_p for test in tests if test is not None), default=1.0)
+    over = "items" if rows[0].is_by_people and any(row.tests for row in rows) else "scenes"
+    if smallest >= LEVEL:
+        return marked, nothing_can_be_marked(over, smallest)
     return marked, (
-        "Bold: the highest measured value where it differs from the second (two-sided sign-flip test over scenes, "
-        f"p < {LEVEL}; with these scenes p cannot be below {smallest:.2g})."
+        f"Bold: the highest measured value where it differs from the second (two-sided sign-flip test over {over}, "
+        f"p < {LEVEL}; with these {over} p cannot be below {smallest:.2g})."
     )
 
 
-def _of_scenes(row: Measured, metric: str) -> np.ndarray:
+def nothing_can_be_marked(over: str, smallest: float) -> str:
+    """What is said, once, where no difference over so few could be told from chance."""
+    return f"No best is marked: with so few {over} no difference can have p < {LEVEL} (the least is {smallest:.2g})."
+
+
+def _paired_test(row: Measured, other: Measured, metric: str) -> SignFlipTest | None:
+    """People's over the same items where they judged, else over the scenes that both have a value for."""
+    if row.is_by_people and (row.tests or other.tests):
+        return row.tests.get((metric, other.method))
+    return sign_flip_test(of_scenes(row, metric) - of_scenes(other, metric))
+
+
+def of_scenes(row: Measured, metric: str) -> np.ndarray:
+    """The value of each scene, by the scene's name; NaN where there is none."""
     values = [row.per_scene[scene].get(metric) for scene in sorted(row.per_scene)]
     return np.array([np.nan if value is None else value for value in values], np.float64)
 
@@ -247,6 +324,8 @@ def run_notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
         if row.profile:
             encoder = f", encoder {row.encoder}" if row.encoder else ""
             notes.setdefault(f"perception {row.profile}{encoder}", []).append(label)
+        for said in said_by(row.warnings, RELATIVE):
+            notes.setdefault(f"{RELATIVE}{said}", []).append(label)
     everyone = len(rows)
     return [
         *(
@@ -270,6 +349,7 @@ def reported_rows(
         how = "as quoted in" if figure.read_from == "quoted" else "as reported in"
         source = f"{how} {figure.source}: {figure.setup}"
         source += f"; {figure.note}" if figure.note else ""
+        source += f"; {figure.system.words}"
         mark = marks.setdefault(source, _mark(len(marks)))
         cells = [Cell(value or NOT_MEASURED) for value in values]
         cells += [Cell("")] * (n_columns - len(cells))
@@ -286,85 +366,3 @@ def _mark(k: int) -> str:
     """
     letter = chr(ord("a") + k % 26)
     return letter if k < 26 else _mark(k // 26 - 1) + letter
-
-
-SIDES = (LAYOUTS["II"], LAYOUTS["III"])  # its columns are those of Tables II and III together
-METRICS = tuple(name for side in SIDES for name in side.metrics)
-
-
-@dataclass(frozen=True)
-class SweepRow:
-    """A value of a parameter, and the method of the run that has it."""
-
-    parameter: str
-    value: str
-    method: str
-
-
-def ablation_table(
-    measured: Sequence[Measured], sweep: Sequence[SweepRow], shown: Shown, *, with_published: bool
-) -> Table:
-    """A row for each of ``sweep``, the best of each parameter marked.
-
-    Raises ``ConfigError`` where ``found`` lacks one of its methods, or a protocol of either kind.
-    """
-    sides = [_of_protocol(measured, side) for side in SIDES]
-    looks = [replace(shown, metrics=side.metrics, ceilings=False, scenes_count=False) for side in SIDES]
-    rows: list[TableRow] = []
-    notes: dict[str, None] = {}
-    marks: dict[str, None] = {}
-    for parameter in dict.fromkeys(row.parameter for row in sweep):
-        members = [row for row in sweep if row.parameter == parameter]
-        halves = [_cells(members, side, look, marks) for side, look in zip(sides, looks, strict=True)]
-        rows += [
-            TableRow(f"{parameter} = {member.value}", (*left, *right), group=parameter)
-            for member, left, right in zip(members, *halves, strict=True)
-        ]
-    used = {row.method for row in sweep}
-    for side, look in zip(sides, looks, strict=True):
-        own = [row for method, row in side.items() if method in used]
-        notes[f"{', '.join(look.metrics)}: {units(own[0], look)}"] = None
-        labels = [row.method if row.is_whole else f"{row.method} ({row.scenes_text} scenes)" for row in own]
-        notes |= dict.fromkeys(run_notes(own, labels))
-    is_papers = with_published and sweep[0].method.partition("@")[0] == "opensu3d"
-    figures = figures_of(is_wanted=is_papers, table="I")
-    reported, sources = reported_rows(figures, METRICS, len(METRICS))
-    body = (*rows, *map(_named, reported))
-    return Table("I", "Ablation of single parameters.", "parameter", METRICS, body, (*notes, *marks, *sources))
-
-
-def _of_protocol(measured: Sequence[Measured], side: Layout) -> dict[str, Measured]:
-    """Method -> its numbers under the protocol of that side's set-up, or the first that has its metrics."""
-    fitting = [row for row in measured if all(name in row.metrics for name in side.metrics)]
-    if not fitting:
-        raise ConfigError(f"Table I: needs {', '.join(side.metrics)}; score the sweep under {side.protocol} too")
-    names = [row.protocol for row in fitting]
-    chosen = side.protocol if side.protocol in names else names[0]
-    members: dict[str, Measured] = {}
-    for row in fitting:
-        if row.protocol == chosen and members.setdefault(row.method, row) is not row:
-            raise ConfigError(f"Table I: {row.method} is in {members[row.method].run} and {row.run}; name one of them")
-    return members
-
-
-def _cells(
-    sweep: Sequence[SweepRow], side: Mapping[str, Measured], shown: Shown, marks: dict[str, None]
-) -> list[list[Cell]]:
-    """The cells of one parameter's rows; what must be said of the best of them is entered in ``marks``."""
-    for entry in sweep:
-        if entry.method not in side:
-            raise ConfigError(
-                f"Table I: no scores of {entry.method} for {', '.join(shown.metrics)}; run the sweep again, it goes on "
-                "where it stopped"
-            )
-    rows = [side[row.method] for row in sweep]
-    best, why = best_rows(rows, shown)
-    marks |= {why: None} if why else {}
-    return [
-        cells_of(row, shown, {name for name in shown.metrics if k in best.get(name, ())}) for k, row in enumerate(rows)
-    ]
-
-
-def _named(row: TableRow) -> TableRow:
-    parameter, _, value = row.label.partition("=")
-    return replace(row, label=f"{parameter} = {value}", group=parameter)

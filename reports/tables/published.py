@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Mapping
 from decimal import Decimal
 from functools import cache
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
-from su3d_bench.core.errors import ConfigError, printable, reading
+from su3d_bench.core.errors import ConfigError, printable, reading, suggest
 
 FILE = Path(__file__).resolve().parent / "published.toml"
 MOST_BYTES = 1 << 20
@@ -18,8 +19,40 @@ Number = Annotated[str, Field(pattern=r"^\d*\.?\d+$")]  # as printed: the number
 PaperTable = Literal["I", "II", "III", "IV", "V", "reasoning"]  # the last is of the text alone
 
 
+OPEN = "open"  # no source that was read says it
+Fact = Annotated[str, Field(min_length=1, max_length=200)]
+
+
+class System(BaseModel):
+    """What made a printed number, as far as a source says.
+
+    ``labels`` a mask or point; ``time`` of a scene or frame, with hardware; ``frames`` that were used; ``proposals``:
+    what finds masks, and on what it was trained.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
+
+    name: Annotated[str, Field(min_length=1)] = OPEN
+    labels: Fact = OPEN
+    time: Fact = OPEN
+    frames: Fact = OPEN
+    proposals: Fact = OPEN
+
+    @property
+    def words(self) -> str:
+        """What is known, and then what is open.
+
+        >>> System(labels="one").words
+        'labels a mask: one; time, frames, proposals: open'
+        """
+        facts = {"labels a mask": self.labels, "time": self.time, "frames": self.frames, "proposals": self.proposals}
+        known = [f"{what}: {fact}" for what, fact in facts.items() if fact != OPEN]
+        unknown = ", ".join(what for what, fact in facts.items() if fact == OPEN)
+        return "; ".join([*known, *([f"{unknown}: {OPEN}"] if unknown else [])])
+
+
 class Figure(BaseModel):
-    """One printed row: ``values`` is metric -> number as printed, in ``unit``.
+    """One printed row: ``values`` is metric -> number as printed, in ``unit``; ``system`` is what made it.
 
     ``table`` and ``row``: the table of OpenSU3D's paper in which it stands, and its label there. ``protocol``: ours
     that comes nearest to the set-up. ``read_from``: the paper itself, or somebody who quotes it.
@@ -34,6 +67,7 @@ class Figure(BaseModel):
     read_from: Literal["paper", "quoted"] = "paper"
     unit: Literal["percent", "fraction"] = "percent"
     values: Annotated[dict[str, Number], Field(min_length=1)]
+    system: System = System()
     protocol: str | None = None
     table: PaperTable | None = None
     row: str | None = None
@@ -55,6 +89,7 @@ class _File(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True, strict=True)
 
     figure: tuple[Figure, ...]
+    system: tuple[System, ...] = ()
 
 
 def read_published(path: Path = FILE) -> tuple[Figure, ...]:
@@ -70,21 +105,34 @@ def read_published(path: Path = FILE) -> tuple[Figure, ...]:
         raise ConfigError(f"{shown}: is no TOML: {printable(str(error), 200)}") from error
     try:
         # as a Python value, not through JSON: a number that is no text must stay a number, to be refused
-        return _File.model_validate({**table, "figure": tuple(table.get("figure", ()))}).figure
+        lists = {name: tuple(table.get(name, ())) for name in ("figure", "system")}
+        systems = {entry["name"]: entry for entry in lists["system"] if isinstance(entry, dict) and "name" in entry}
+        lists["figure"] = tuple(_with_system(entry, systems, shown, k) for k, entry in enumerate(lists["figure"], 1))
+        return _File.model_validate({**table, **lists}).figure
     except (ValidationError, TypeError) as error:
         raise ConfigError(_explain(error, table, shown)) from error
 
 
+def _with_system(entry: object, systems: Mapping[str, object], shown: str, number: int) -> object:
+    """An entry of the file with its system itself in place of the name."""
+    if not isinstance(entry, dict) or not isinstance(entry.get("system"), str):
+        return entry
+    if entry["system"] not in systems:
+        name = printable(entry["system"], 60)
+        raise ConfigError(f"{shown}: figure {number}: no [[system]] is called '{name}'{suggest(name, systems)}")
+    return {**entry, "system": systems[entry["system"]]}
+
+
 def _explain(error: ValidationError | TypeError, table: dict[str, object], shown: str) -> str:
     if isinstance(error, TypeError):
-        return f"{shown}: 'figure' is no list; write each as [[figure]]"
+        return f"{shown}: 'figure' or 'system' is no list; write each as [[figure]] or [[system]]"
     faults = error.errors()
     # a misspelt key is also a missing one; the misspelling says more
     first = next((fault for fault in faults if fault["type"] == "extra_forbidden"), faults[0])
     place = [str(part) for part in first["loc"]]
     where = shown
     if len(place) > 1:
-        where = f"{shown}: figure {int(place[1]) + 1}"
+        where = f"{shown}: {place[0]} {int(place[1]) + 1}"
     key = printable(".".join(place[2:]) or ".".join(place), 100)
     reason = first["msg"][:1].lower() + first["msg"][1:]
     value = "" if first["type"] in {"missing", "extra_forbidden"} else f" = {printable(repr(first['input']), 80)}"

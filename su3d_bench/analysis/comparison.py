@@ -27,6 +27,7 @@ from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.metric import Counts, SceneScore
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, RELATIVE, said_by
 from su3d_bench.metrics.scoring import ProtocolResult, combine, metric_of, plain_json
 from su3d_bench.numerics.statistics import SignFlipTest, percentile_interval, resample_weights, sign_flip_test
 from su3d_bench.runs.finished import FinishedRun
@@ -269,6 +270,9 @@ def _own_remarks(left: Side, right: Side, protocol: str) -> list[str]:
         record = side.run.results.get((side.method, protocol))
         if record is not None and record.failed:
             lines.append(f"INCOMPLETE: {side.name} failed on {_some(record.failed)}")
+        warnings = () if record is None or record.result is None else record.result.warnings
+        for start in (RELATIVE, ANSWERED_BY, REFINED_BY):
+            lines += [f"{side.name}: {start}{printable(said, 200)}" for said in said_by(warnings, start)]
     if load_protocol(protocol).digest != left.run.protocols[protocol].digest:
         lines.append(f"the rules of {protocol} here are not to the letter those that scored both runs (same version)")
     return lines

@@ -13,12 +13,14 @@ from su3d_bench.core.errors import ConfigError, Su3dError, printable, reading, s
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.scoring import ProtocolResult, combine
+from su3d_bench.numerics.statistics import SignFlipTest
+from su3d_bench.reports.tables.judged import WHO_DID
 from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.model import BY_PEOPLE, Measured, Origin, is_count
 from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.sheets.scores import FILE as SCORES_FILE
-from su3d_bench.sheets.scores import ScoreCell, Scores, read_scores
+from su3d_bench.sheets.scores import LABEL_METRICS, ScoreCell, Scores, read_scores
 from su3d_bench.store.atomic import is_file
 from su3d_bench.store.records import NumbersRecord, ResultRecord
 
@@ -74,14 +76,29 @@ def _judged_by_people(path: Path) -> list[Measured]:
                 version=scores.schema_version,
                 kind=scores.kind,
                 headline=tuple(cell.metric for cell in cells),
-                metrics={cell.metric: cell.value for cell in cells},
+                metrics={cell.metric: cell.value for cell in cells}
+                | {f"n_{cell.metric}": float(cell.n_items) for cell in cells},
                 intervals={cell.metric: cell.interval for cell in cells},
                 per_scene={scene: {cell.metric: cell.per_scene.get(scene) for cell in cells} for scene in scenes},
                 n_planned=len(scenes),
                 caveat=_who_judged(scores, cells),
+                warnings=(f"{WHO_DID[scores.kind]}{scores.answered_by}",) if scores.answered_by else (),
+                tests=_tests_of(scores, dataset, method),
             )
         )
     return measured
+
+
+def _tests_of(scores: Scores, dataset: str, method: str) -> dict[tuple[str, str], SignFlipTest]:
+    """The tests of a method by metric and the other method; that of its own two labels by itself."""
+    found = {}
+    labels = [f"{method} {name}" for name in LABEL_METRICS]
+    for test in scores.tests:
+        pair = [test.left, test.right]
+        if test.dataset == dataset and (method in pair or pair == labels):
+            other = method if pair == labels else pair[1 - pair.index(method)]
+            found[test.metric, other] = SignFlipTest(test.p, test.smallest_p, test.n_differ, test.is_exact)
+    return found
 
 
 def _who_judged(scores: Scores, cells: Sequence[ScoreCell]) -> str:
@@ -124,6 +141,7 @@ def _measured(run: str, limit: int, record: ResultRecord, nothing: Mapping[str, 
         encoder=record.encoder,
         confidences=record.confidences,
         caveat=record.caveat,
+        warnings=numbers.warnings,
     )
 
 
@@ -302,7 +320,7 @@ def _check(cell: PrintedCell, file: str, recomputed: _Recomputed) -> CellCheck:
     numbers = _numbers(cell.origin, result)
     if numbers is None:
         return CellCheck(file, cell.line, text, None, f"the run has no '{printable(cell.origin.metric, 60)}'")
-    given = " ".join(f"{number:.4f}".rstrip("0").rstrip(".") for number in numbers)
+    given = " ".join(f"{number:.6f}".rstrip("0").rstrip(".") for number in numbers)
     printed = cell.numbers[: len(numbers)]
     if len(printed) < len(numbers):
         return CellCheck(file, cell.line, text, given, "shows fewer numbers than its comment")
@@ -314,7 +332,7 @@ def _check(cell: PrintedCell, file: str, recomputed: _Recomputed) -> CellCheck:
 
 
 def _numbers(origin: Origin, result: ProtocolResult | Measured) -> list[float] | None:
-    """What the cell should show: per cent or a count, then its interval where shown; None where the run lacks it."""
+    """What the cell should show: a share in its unit or a count, then its interval; None where the run lacks it."""
     if origin.what == "scenes":
         return [float(len(result.scenes))]
     value = result.metrics.get(origin.metric)
@@ -323,5 +341,5 @@ def _numbers(origin: Origin, result: ProtocolResult | Measured) -> list[float] |
     interval = result.intervals.get(origin.metric) if origin.interval is not None else None
     if origin.interval is not None and interval is None:
         return None
-    scale = 1.0 if is_count(origin.metric) else 100.0
+    scale = 1.0 if is_count(origin.metric) or origin.unit == "fraction" else 100.0
     return [scale * value, *(scale * end for end in interval or ())]

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from collections.abc import Sequence
 
     from su3d_bench.core.types import Instances
+    from su3d_bench.metrics.questions.truths import RefinedNames
     from su3d_bench.questions.reasoning.answers import Answer
     from su3d_bench.questions.reasoning.scene_map import SceneMap
     from su3d_bench.store.run_folder import JobFolder, RunFolder
@@ -98,7 +99,7 @@ def call(arguments: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def _refined(job: JobFolder, wanted: str) -> tuple[Sequence[str] | None, str]:
+def _refined(job: JobFolder, wanted: str) -> tuple[RefinedNames | None, str]:
     """Labels n' where they are wanted and there, and which names these are."""
     from su3d_bench.questions.refined_names import read_records
 
@@ -107,7 +108,9 @@ def _refined(job: JobFolder, wanted: str) -> tuple[Sequence[str] | None, str]:
         if wanted == "refined":
             raise StoreError(f"{job.path}: has no labels n'; make them with su3d-bench refine")
         return None, "labels n"
-    return records.refined, f"labels n' by {records.model or 'vote'}"
+    n_left_out = sum(bool(name.left_out) for name in records.names)
+    without = f", without {n_left_out} that it leaves out" if n_left_out else ""
+    return records.refined, f"labels n' by {records.model or 'vote'}{without}"
 
 
 def _estimate(scene: SceneMap, run: RunFolder, arguments: argparse.Namespace) -> int:

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import argparse
 import textwrap
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.common import add_verb, answer, answer_either, answer_json
 from su3d_bench.core.errors import EXIT_DONE
+
+if TYPE_CHECKING:
+    from su3d_bench.reports.tables.published import Figure
 
 WIDTH = 118
 
@@ -64,9 +67,10 @@ def _show(arguments: argparse.Namespace) -> int:
     method = registry.load("method", arguments.name)
     defaults = method.Config().model_dump(mode="json")
     row = _about(method.name, method)
-    figures = [figure.model_dump(mode="json", exclude_none=True) for figure in figures_of(method=method.name)]
+    figures = figures_of(method=method.name)
     if arguments.json:
-        answer_json({**row, "settings": defaults, "published": figures})
+        published = [figure.model_dump(mode="json", exclude_none=True) for figure in figures]
+        answer_json({**row, "settings": defaults, "published": published})
         return EXIT_DONE
     leaves = [(("method", method.name, *path), value, _remark(method, path)) for path, value in flatten(defaults)]
     answer("\n".join(f"# {line}" for line in _lines(row)))
@@ -77,11 +81,11 @@ def _show(arguments: argparse.Namespace) -> int:
     return EXIT_DONE
 
 
-def _figure_lines(figure: dict[str, Any]) -> list[str]:
-    values = ", ".join(f"{name} {value}" for name, value in figure["values"].items())
-    row = f" [{figure['row']}]" if "row" in figure else ""
-    note = f"; {figure['note']}" if "note" in figure else ""
-    text = f"{values}{row}: {figure['source']}: {figure['setup']}{note}"
+def _figure_lines(figure: Figure) -> list[str]:
+    values = ", ".join(f"{name} {value}" for name, value in figure.values.items())
+    row = f" [{figure.row}]" if figure.row else ""
+    note = f"; {figure.note}" if figure.note else ""
+    text = f"{values}{row}: {figure.source}: {figure.setup}{note}; {figure.system.words}"
     return textwrap.wrap(text, WIDTH, subsequent_indent="    ")
 
 

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from su3d_bench.core.types import Instances
     from su3d_bench.questions.refined_names import NameRecords
     from su3d_bench.questions.refinement import RefinedName, TopNames
+    from su3d_bench.questions.undesired import FilterConfig
     from su3d_bench.store.run_folder import JobFolder, RunFolder
 
 REFINERS = ("vote", "model")
@@ -32,7 +33,8 @@ def add_parser(verbs: Any) -> None:
     parser = add_verb(
         verbs,
         "refine",
-        "Give each instance of a run's maps one name out of the names of its best views (label n').",
+        "Give each instance of a run's maps one name out of the names of its best views (label n'), and leave out what "
+        "is large background under it.",
         (
             "su3d-bench refine runs/my-run",
             "su3d-bench refine runs/my-run --refiner model --model llama3.1 --base-url http://localhost:11434/v1",
@@ -49,6 +51,19 @@ def add_parser(verbs: Any) -> None:
         help="vote: by the sum of the scores, without a model; model: a language model, as in the paper",
     )
     parser.add_argument("--top-m", type=int, default=5, metavar="N", help="views that have a say (default: 5)")
+    parser.add_argument(
+        "--background-names",
+        nargs="*",
+        metavar="NAME",
+        help="nouns of what label n' leaves out (default: those that the paper leaves out of images); none: nothing",
+    )
+    parser.add_argument(
+        "--max-map-fraction",
+        type=float,
+        metavar="SHARE",
+        help="an instance whose box covers more of the map from above is left out (default: 0.95, the paper's share of "
+        "an image); 1: none is",
+    )
     add_language_flags(parser)
 
 
@@ -58,6 +73,7 @@ def call(arguments: argparse.Namespace) -> int:
 
     if arguments.top_m < 1:
         raise ConfigError(f"--top-m {arguments.top_m}: at least 1 view must have a say")
+    config = _filter(arguments)
     jobs = _jobs(arguments)
     maps = {scene: _map(job) for scene, job in jobs.items()}
     tops = {scene: top_names(instances, arguments.top_m) for scene, instances in maps.items()}
@@ -66,13 +82,23 @@ def call(arguments: argparse.Namespace) -> int:
     refined, model = _refine(tops, arguments)
     made: dict[str, NameRecords] = {}
     for scene, job in jobs.items():
-        ids = maps[scene].ids.tolist() if len(maps[scene].ids) else range(len(maps[scene]))
-        records = records_of(job, list(ids), tops[scene], refined[scene], arguments.refiner, model, arguments.top_m)
+        chosen = tops[scene], refined[scene], arguments.refiner, model, arguments.top_m
+        records = records_of(job, maps[scene], *chosen, config)
         path = write_records(job, records)
         made[scene] = records
         remark(f"{scene}: {path}", quiet=arguments.quiet)
     _answer(made, arguments)
     return EXIT_DONE
+
+
+def _filter(arguments: argparse.Namespace) -> FilterConfig:
+    from su3d_bench.questions.undesired import FilterConfig
+
+    share = arguments.max_map_fraction
+    if share is not None and not 0 < share <= 1:
+        raise ConfigError(f"--max-map-fraction {share}: expected a share above 0, 1 at most")
+    given = {"background_names": arguments.background_names, "max_map_fraction": share}
+    return FilterConfig.model_validate({name: value for name, value in given.items() if value is not None})
 
 
 def _jobs(arguments: argparse.Namespace) -> dict[str, JobFolder]:
@@ -156,6 +182,9 @@ def _answer(made: dict[str, NameRecords], arguments: argparse.Namespace) -> None
         answer(f"{scene}: {len(records.names)} instances, {len(changed)} names changed")
         for name in changed:
             answer(f"  {name.id:>4}  {name.label} -> {name.refined}")
+        for name in records.names:
+            if name.left_out:
+                answer(f"  {name.id:>4}  left out: {name.left_out}")
         if kept:
             reasons = ", ".join(dict.fromkeys(name.reason for name in kept))
             remark(f"{scene}: label n stays for {len(kept)} instances: {reasons}", quiet=arguments.quiet)

@@ -57,6 +57,12 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
         "--pictures", action=argparse.BooleanOptionalAction, help="draw the maps into the run folder (default: yes)"
     )
     parser.add_argument(
+        "--solver",
+        choices=("built-in", "llm"),
+        help="who answers under reasoning protocols: built-in (geometry alone, the default), or llm, the text model of "
+        "perception.language",
+    )
+    parser.add_argument(
         "--offline", action=argparse.BooleanOptionalAction, help="use stored replies of language models, ask nobody"
     )
     parser.add_argument(

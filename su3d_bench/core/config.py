@@ -93,7 +93,8 @@ class RunConfig(BaseModel):
 
     ``protocols`` empty: those of each dataset; ``stride`` 0: the method's own; ``jobs`` 0: one a scene, at most one a
     CPU core; ``limit`` 0: all frames, otherwise the first ``limit`` frames of each scene, and the run is partial;
-    ``offline``: no language model is asked, replies that are stored with the run are used;
+    ``solver``: who answers the questions of reasoning protocols, geometry alone or the text model of
+    ``perception.language``; ``offline``: no language model is asked, replies that are stored with the run are used;
     ``anytime``: shares of the updates after which the map so far is scored too, such as 0.1 0.25 0.5;
     ``executor`` auto: this process for one job, else processes; ``ray_address`` empty: that of ``RAY_ADDRESS``, or the
     cluster on this machine; ``retries``: of a scene whose machine was lost; ``slurm``: KEY=VALUE of submitit.
@@ -110,6 +111,7 @@ class RunConfig(BaseModel):
     limit: int = Field(default=0, ge=0)
     jobs: int = Field(default=0, ge=0)
     pictures: bool = True
+    solver: Literal["built-in", "llm"] = "built-in"
     offline: bool = False
     anytime: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = ()
     executor: Literal["auto", "inline", "processes", "ray", "slurm"] = "auto"

@@ -394,6 +394,14 @@ class Encoder(Protocol):
         ...
 
 
+@runtime_checkable
+class KnowsRelativeTexts(Protocol):
+    """An encoder that was trained on texts of the form of the relative queries; ``relative_remark`` says so."""
+
+    @property
+    def relative_remark(self) -> str: ...
+
+
 class Segmenter(Protocol):
     name: str
     digest: str

@@ -232,6 +232,8 @@ class ProtocolRules(_Strict):
             raise ValueError("transfer.cap_m: 'each-mask' needs one, and no evaluation_voxel_m")
         if transfer.neighbours > 1 and not self.takes_votes:
             raise ValueError("transfer.neighbours: belongs to kind 'semantic'")
+        if transfer.neighbours > 1 and transfer.evaluation_voxel_m > 0:
+            raise ValueError("transfer.evaluation_voxel_m: of neighbours that vote nothing is left out; set it to 0")
         if self.is_judged and transfer.cap_m is None:
             raise ValueError(f"transfer.cap_m: kind '{self.kind}' needs one")
 
@@ -281,7 +283,7 @@ class SemanticRules(ProtocolRules):
     values_of_metric: ClassVar[ValuesOfMetric] = dict.fromkeys(
         ("conceptgraphs", "scannet", "hovsg"), ("mAcc", "mIoU", "F-mIoU")
     )
-    candidates = ("object-points", "map-points")
+    candidates = ("object-points",)
     takes_dense = True
     names_points = True
     takes_votes = True
@@ -355,7 +357,10 @@ class AnnotationRules(_JudgedRules):
     """Names and shapes of masks."""
 
     values_of_metric: ClassVar[ValuesOfMetric] = {
-        "annotation": ("label n", "label n'", "well-merged", "under-merged", "over-merged")
+        "annotation": (
+            *("label n", "label n'", "well-merged", "under-merged", "over-merged"),
+            *("well-merged n'", "under-merged n'", "over-merged n'"),
+        )
     }
     goes_by_names = True
     needs = ("min_region_size", "synonyms", "merging")

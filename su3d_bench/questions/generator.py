@@ -18,8 +18,10 @@ from pathlib import Path
 
 import numpy as np
 
-from su3d_bench.core.english import with_article, words
+from su3d_bench.core.english import last_word, with_article, words
 from su3d_bench.numerics.relations import RELATIONS
+from su3d_bench.questions.known_objects import is_called
+from su3d_bench.questions.looks import SIZES, Looks, measure_of
 from su3d_bench.questions.model import BY_NAME, KINDS, MADE_KINDS, Question, new_question
 from su3d_bench.questions.reasoning.named_objects import meant_by
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
@@ -29,6 +31,7 @@ SOURCE = "generated"
 MAX_ANSWER_SHARE = 1 / 3  # ours: what more objects answer asks for nothing
 TWICE = 2.0  # ours: volume, as a multiple of the others', from which anybody calls a thing large
 FLAT_SHARE = 0.2  # ours: a thing is flat whose least side is so much of the next; nobody speaks of its volume
+WITHOUT_SIZE = frozenset(("book",))  # in scans they are annotated by the row
 BETWEEN_M = 2.0  # ours: nobody looks farther for what something is between
 
 
@@ -54,7 +57,7 @@ def generate(scene: str, objects: SceneMap, per_kind: int | None = None) -> tupl
     limit = max(1, int(len(objects) * MAX_ANSWER_SHARE))
     made = []
     for (kind, text, name), ids in right.items():
-        named = {thing.id for thing in objects.objects if thing.name == name}
+        named = set(_called(objects, name)) if name else set[int]()
         is_plain = all(objects.by_id(object_id).is_asked for object_id in ids | named)
         if len(ids) <= limit and is_plain and text not in doubtful:
             own_kind = BY_NAME.get(kind, kind) if named == ids else kind
@@ -106,6 +109,7 @@ def _texts(objects: SceneMap) -> Iterator[_Asked]:
         yield _Asked("affordance", phrase, tuple(thing for name in classes for thing in _called(objects, name)))
     yield from _sizes(objects)
     yield from _adjectives(objects)
+    yield from _looks(objects)
     yield from _relations(objects)
     yield from _between(objects)
 
@@ -121,7 +125,7 @@ def _called(objects: SceneMap, name: str) -> tuple[int, ...]:
 
 
 def _sizes(objects: SceneMap) -> Iterator[_Asked]:
-    """Large and small things among those of one name."""
+    """Large and small things among those of one name, where their boxes are those of the things themselves."""
     for name, n in Counter(thing.name for thing in objects.objects).items():
         named = [thing for thing in objects.objects if thing.name == name]
         if n < 2 or not all(thing.is_whole for thing in named) or any(map(is_flat, named)):
@@ -155,9 +159,49 @@ def _adjectives(objects: SceneMap) -> Iterator[_Asked]:
     without_colour = {thing.name for thing in objects.objects if not words_of[thing.id] & COLOURS}
     without_material = {thing.name for thing in objects.objects if not words_of[thing.id] - COLOURS}
     for thing in objects.objects:
-        for word in sorted(words_of[thing.id]):
+        for word in sorted(words_of[thing.id]) if thing.looks is None else ():
             if thing.name not in (without_colour if word in COLOURS else without_material):
                 yield _Asked("property", f"{word} {thing.name}", (thing.id,), thing.name)
+
+
+def _looks(objects: SceneMap) -> Iterator[_Asked]:
+    """Shapes, colours and sizes in a recording: of those of one name, or whose names end with one word.
+
+    A word is asked where it is sure of the answers and nobody would say it of another. Sizes are of what is seen whole.
+    """
+    names = {thing.name for thing in objects.objects}
+    heads = Counter(last_word(name) for name in names)
+    for name in sorted(names | {head for head, n in heads.items() if n > 1 and head}):
+        ids = _called(objects, name)
+        named = [objects.by_id(object_id) for object_id in ids]
+        known = [(thing, thing.looks) for thing in named if thing.looks is not None]
+        if len(known) < len(named) or not all(is_called(name, thing.name) for thing in named):
+            continue
+        for word in sorted({word for _, looks in known for word in looks.words}):
+            answers = tuple(thing.id for thing, looks in known if word in looks.words)
+            if len(answers) == sum(word in looks.maybe for _, looks in known):
+                others = [other for other in _table("names").get(name, ()) if set(_ids(objects, other)) == set(ids)]
+                for called in (name, *others):
+                    yield _Asked("property", f"{word} {called}", answers, name)
+        if last_word(name) not in WITHOUT_SIZE and not any(thing.is_cut for thing in named):
+            yield from _measured(name, known)
+
+
+def _measured(name: str, known: Sequence[tuple[MapObject, Looks]]) -> Iterator[_Asked]:
+    """The one that is large, small, long or tall beside every other of its name."""
+    if len(known) < 2 or len({looks.is_flat for _, looks in known}) > 1:
+        return
+    for more, less, factor in SIZES:
+        values = [
+            (thing.id, value) for thing, looks in known if (value := measure_of(thing.name, looks, more)) is not None
+        ]
+        if len(values) < len(known):
+            continue
+        ranked = sorted(values, key=lambda pair: pair[1])
+        if ranked[-1][1] >= factor * ranked[-2][1]:
+            yield _Asked("property", f"{more} {name}", (ranked[-1][0],), name)
+        if less and factor * ranked[0][1] <= ranked[1][1]:
+            yield _Asked("property", f"{less} {name}", (ranked[0][0],), name)
 
 
 def _relations(objects: SceneMap) -> Iterator[_Asked]:

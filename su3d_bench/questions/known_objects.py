@@ -7,8 +7,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from su3d_bench.core.english import last_word, words
-from su3d_bench.core.types import GroundTruth, Int64Array, WholeObject
+from su3d_bench.core.types import Float64Array, GroundTruth, Int64Array, WholeObject
 from su3d_bench.perception.embedded.lexicon import GROUPS
+from su3d_bench.questions.looks import looks_of
 from su3d_bench.questions.reasoning.named_objects import meant_by
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap, is_room_surface
 from su3d_bench.questions.sight import WITHOUT_COLOUR, Sight, instance_rows
@@ -42,6 +43,10 @@ def known_objects(
         is_sure = sight is not None and (known.colour == sight.colour or (not known.colour and sight.is_sure_colour))
         colour = colour if is_sure else ""  # in the light of the room it may look like another
         words = [*([colour] if colour else []), *known.adjectives]
+        is_cut = whole is None and sight is not None and sight.is_cut
+        looks = None
+        if whole is None and seen is not None:
+            looks = looks_of(known.name, _without_strays(truth, rows_of[known.id]), sight, is_cut=is_cut)
         things.append(
             MapObject(
                 known.id,
@@ -51,7 +56,8 @@ def known_objects(
                 known.box,
                 is_asked=is_asked,
                 is_whole=whole is not None,
-                is_cut=whole is None and sight is not None and sight.is_cut,
+                is_cut=is_cut,
+                looks=looks,
             )
         )
     return SceneMap(tuple(things))
@@ -61,8 +67,21 @@ def _of_vertices(truth: GroundTruth, instance: int, rows: Int64Array) -> WholeOb
     class_id = int(np.bincount(truth.semantic[rows].clip(min=0)).argmax())
     if class_id == 0:
         return None
-    box = np.percentile(truth.points[rows].astype(np.float64), [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0)
-    return WholeObject(instance, plain_name(truth.labels.name_of(class_id)), box)
+    return WholeObject(instance, plain_name(truth.labels.name_of(class_id)), _box_of(truth, rows))
+
+
+def _box_of(truth: GroundTruth, rows: Int64Array) -> Float64Array:
+    box: Float64Array = np.percentile(
+        truth.points[rows].astype(np.float64), [STRAY_PERCENT, 100 - STRAY_PERCENT], axis=0
+    )
+    return box
+
+
+def _without_strays(truth: GroundTruth, rows: Int64Array) -> Float64Array:
+    """The points of an object within the box that is taken for it."""
+    points, (low, high) = truth.points[rows].astype(np.float64), _box_of(truth, rows)
+    kept: Float64Array = points[((points >= low) & (points <= high)).all(axis=1)]
+    return kept
 
 
 def plain_name(name: str) -> str:

@@ -15,17 +15,18 @@ from su3d_bench.core.types import Instances
 from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.questions.refinement import RefinedName, TopNames
 from su3d_bench.questions.truths import voted_names
+from su3d_bench.questions.undesired import FilterConfig, undesired
 from su3d_bench.store.atomic import read_json, write_json
 from su3d_bench.store.run_folder import JobFolder
 
 log = logging.getLogger(__name__)
 FILE_NAME = "refined_names.json"
-SCHEMA = 1
+SCHEMA = 2
 Refiner = Literal["vote", "model"]
 
 
 class NameRecord(BaseModel):
-    """Labels n and n' of one instance, and the names that n' was chosen from."""
+    """Labels n and n' of one instance, the names that n' was chosen from, and why n' leaves it out, '' where not."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -36,10 +37,14 @@ class NameRecord(BaseModel):
     reason: str
     candidates: tuple[str, ...]
     request: str
+    left_out: str
 
 
 class NameRecords(BaseModel):
-    """Labels n' of a map; ``prediction_sha256`` ties them to it, ``model`` is empty for the vote."""
+    """Labels n' of a map and the filter that goes with them; ``prediction_sha256`` ties them to the map.
+
+    ``model`` is empty for the vote.
+    """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -48,34 +53,44 @@ class NameRecords(BaseModel):
     refiner: Refiner
     model: str
     top_m: int
+    filter: FilterConfig
     names: tuple[NameRecord, ...]
 
     @property
-    def refined(self) -> tuple[str, ...]:
-        return tuple(record.refined for record in self.names)
+    def refined(self) -> RefinedNames:
+        who = f"the model {self.model}" if self.refiner == "model" else "the vote"
+        return RefinedNames(
+            tuple(record.refined for record in self.names),
+            f"{who} of su3d-bench refine, names of {self.top_m} views",
+            tuple(record.left_out for record in self.names),
+        )
 
 
 def records_of(
     job: JobFolder,
-    ids: Sequence[int],
+    instances: Instances,
     tops: Sequence[TopNames],
     refined: Sequence[RefinedName],
     refiner: Refiner,
     model: str,
     top_m: int,
+    config: FilterConfig,
 ) -> NameRecords:
-    """The records of one map, an instance each."""
+    """The records of one map, an instance each; what is large background under its label n' is left out."""
+    ids = instances.ids.tolist() if len(instances.ids) else range(len(instances))
+    left_out = undesired(instances, [name.name for name in refined], config)
     names = tuple(
         NameRecord(
-            id=int(one_id),
+            id=one_id,
             label=top.label,
             refined=name.name,
             source=name.source,
             reason=name.reason,
             candidates=top.names,
             request=name.key,
+            left_out=reason,
         )
-        for one_id, top, name in zip(ids, tops, refined, strict=True)
+        for one_id, top, name, reason in zip(ids, tops, refined, left_out, strict=True)
     )
     return NameRecords(
         schema_version=SCHEMA,
@@ -83,6 +98,7 @@ def records_of(
         refiner=refiner,
         model=model,
         top_m=top_m,
+        filter=config,
         names=names,
     )
 
@@ -100,7 +116,10 @@ def read_records(job: JobFolder) -> NameRecords | None:
     if not path.is_file():
         return None
     try:
-        records = NameRecords.model_validate(read_json(path))
+        content = read_json(path)
+        if isinstance(content, dict) and content.get("schema_version") == 1:
+            raise StoreError(f"{path}: knows no filter of large background yet; give su3d-bench refine again")
+        records = NameRecords.model_validate(content)
     except (ValidationError, RecursionError) as error:
         raise StoreError(f"{path}: is not as su3d-bench refine writes it; give that command again") from error
     if records.schema_version != SCHEMA or records.prediction_sha256 != digest_file(job.prediction):
@@ -123,5 +142,4 @@ def refined_names(job: JobFolder, instances: Instances) -> RefinedNames | None:
         records = None
     if records is None or len(records.names) != len(instances):
         return voted_names(instances)
-    who = f"the model {records.model}" if records.refiner == "model" else "the vote"
-    return RefinedNames(records.refined, f"{who} of su3d-bench refine, names of {records.top_m} views")
+    return records.refined

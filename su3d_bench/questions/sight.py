@@ -5,7 +5,7 @@ People are asked only about what they can see: an object that no frame shows lar
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -25,6 +25,7 @@ BORDER_SHARE = 0.05  # of the image's longer side
 # Things whose colour is that of what they show, or of their frame, and nobody's name for them.
 WITHOUT_COLOUR = frozenset(("picture", "painting", "poster", "photo", "mirror", "window", "screen", "tv", "monitor"))
 MIN_SHARE = 0.6  # ours: of the pixels of an object that have the same word
+MAYBE_SHARE = 0.2  # ours: of so many somebody may name the object by that word
 # CIELAB, all ours: below this chroma a colour is black, grey or white, by its lightness.
 GREY_CHROMA, BLACK_L, WHITE_L = 12.0, 25.0, 75.0
 HUES_DEGREES = (
@@ -33,20 +34,26 @@ HUES_DEGREES = (
 COLOURS = frozenset(("black", "grey", "white", "brown", "beige", "pink", *(name for _, name in HUES_DEGREES)))
 BROWN_L, BROWN_CHROMA, BEIGE_CHROMA = 60.0, 45.0, 30.0  # a dull dark orange is brown, a pale orange or yellow beige
 PINK_L = 60.0  # a light red is pink
+DARK_L, LIGHT_L = 35.0, 70.0  # whatever the hue
+TONES = frozenset(("dark", "light-coloured"))
 
 
 @dataclass(frozen=True)
 class Sight:
     """``share``: the largest part of an image that an object fills; ``colour``: a word, empty where none fits.
 
-    ``is_sure_colour``: whether it is the same in a little other light. ``is_cut``: whether a side of the object's box
-    was seen only where the images end.
+    ``is_sure_colour``: whether it is the same in a little other light; ``maybe_colours``: what a good part of its
+    pixels has in one of these lights; ``tones`` and ``maybe_tones``: dark or light, likewise. ``is_cut``: whether a
+    side of its box was seen only where the images end.
     """
 
     share: float
     colour: str
     is_sure_colour: bool = False
     is_cut: bool = False
+    maybe_colours: frozenset[str] = frozenset()
+    tones: frozenset[str] = frozenset()
+    maybe_tones: frozenset[str] = frozenset()
 
     @property
     def is_plain(self) -> bool:
@@ -81,8 +88,11 @@ def sights(dataset: Any, scene: str, truth: GroundTruth, min_vertices: int) -> M
     for instance in sorted(shares):
         rgb, own = np.concatenate(pixels[instance]), owner == instance
         word = colour_word(rgb)
-        is_sure = all(colour_word((rgb * light).clip(max=255.0)) == word for light in (1 / OTHER_LIGHT, OTHER_LIGHT))
-        found[instance] = Sight(shares[instance], word, is_sure, _is_cut(points[own], is_inside[own]))
+        lights = [(rgb * light).clip(max=255.0) for light in (1 / OTHER_LIGHT, OTHER_LIGHT)]
+        is_sure = all(colour_word(lit) == word for lit in lights)
+        tones = tones_of([rgb, *lights])
+        is_cut = _is_cut(points[own], is_inside[own])
+        found[instance] = Sight(shares[instance], word, is_sure, is_cut, maybe_colours([rgb, *lights]), *tones)
     return found
 
 
@@ -147,11 +157,37 @@ def colour_word(rgb: Float64Array) -> str:
     return str(words[best]) if counts[best] >= MIN_SHARE * len(rgb) else ""
 
 
-def _words_of(rgb: Float64Array) -> np.ndarray:
-    """The word for each pixel, by lightness, chroma and hue in CIELAB."""
+def maybe_colours(lights: Sequence[Float64Array]) -> frozenset[str]:
+    """The words of a good part of the same pixels (N, 3) in one of several lights; all words where they are too few."""
+    if len(lights[0]) < MIN_PIXELS:
+        return COLOURS
+    found = set()
+    for rgb in lights:
+        words, counts = np.unique(_words_of(rgb), return_counts=True)
+        found |= set(words[counts >= MAYBE_SHARE * len(rgb)].tolist())
+    return frozenset(found)
+
+
+def tones_of(lights: Sequence[Float64Array]) -> tuple[frozenset[str], frozenset[str]]:
+    """Whether most of the same pixels (N, 3) are dark or light in all of several lights, and a good part in one."""
+    if len(lights[0]) < MIN_PIXELS:
+        return frozenset(), TONES
+    lightness = np.stack([_lab(rgb)[:, 0] for rgb in lights])
+    shares = {"dark": (lightness < DARK_L).mean(axis=1), "light-coloured": (lightness > LIGHT_L).mean(axis=1)}
+    sure = frozenset(tone for tone, share in shares.items() if share.min() >= MIN_SHARE)
+    return sure, frozenset(tone for tone, share in shares.items() if share.max() >= MAYBE_SHARE)
+
+
+def _lab(rgb: Float64Array) -> Float64Array:
     import cv2
 
-    lab = cv2.cvtColor((rgb / 255.0).astype(np.float32)[None], cv2.COLOR_RGB2LAB)[0].astype(np.float64)
+    lab: Float64Array = cv2.cvtColor((rgb / 255.0).astype(np.float32)[None], cv2.COLOR_RGB2LAB)[0].astype(np.float64)
+    return lab
+
+
+def _words_of(rgb: Float64Array) -> np.ndarray:
+    """The word for each pixel, by lightness, chroma and hue in CIELAB."""
+    lab = _lab(rgb)
     lightness, chroma = lab[:, 0], np.hypot(lab[:, 1], lab[:, 2])
     hue = np.degrees(np.arctan2(lab[:, 2], lab[:, 1])) % 360
     ends = np.array([end for end, _ in HUES_DEGREES])

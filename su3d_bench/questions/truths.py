@@ -6,8 +6,6 @@ from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import numpy as np
-
 from su3d_bench.core.errors import GroundTruthMissing
 from su3d_bench.core.interfaces import Encoder, HasQueries, KnowsObjects
 from su3d_bench.core.types import GroundTruth, Instances
@@ -25,11 +23,11 @@ from su3d_bench.metrics.scoring import QuestionTruth
 from su3d_bench.questions.generator import chosen, generate, right_by_name
 from su3d_bench.questions.known_objects import is_called, known_objects
 from su3d_bench.questions.model import Question, new_question
+from su3d_bench.questions.reasoning.asking import BUILT_IN, MapSolver, built_in, given_answer
 from su3d_bench.questions.reasoning.generated import generate_questions
-from su3d_bench.questions.reasoning.named_objects import nearest_by
 from su3d_bench.questions.reasoning.scene_map import SceneMap, map_of
-from su3d_bench.questions.reasoning.solver import Solver
 from su3d_bench.questions.sight import sights
+from su3d_bench.questions.undesired import FilterConfig, undesired
 
 Refine = Callable[[Instances], RefinedNames | None]
 MIN_VERTICES = 100  # ScanNet's smallest instance that counts
@@ -56,15 +54,24 @@ def own_questions(dataset: Any, scene: str) -> tuple[Question, ...]:
 
 
 def question_truth(
-    rules: ProtocolRules, dataset: Any, scene: str, truth: GroundTruth, refine: Refine | None = None
+    rules: ProtocolRules,
+    dataset: Any,
+    scene: str,
+    truth: GroundTruth,
+    refine: Refine | None = None,
+    solver: MapSolver | None = None,
 ) -> QuestionTruth:
-    """The truth of a scene under a protocol that asks questions; ``refine`` gives labels n', by vote where absent."""
+    """The truth of a scene under a protocol that asks questions.
+
+    ``refine`` gives labels n', by vote where absent; ``solver`` answers questions to reasoning, the built-in one where
+    absent.
+    """
     assert rules.min_region_size is not None
     if rules.kind == "annotation":
         return _annotation_truth(rules.min_region_size, truth, refine or voted_names)
     objects = scene_objects(dataset, scene, truth, rules.min_region_size)
     if rules.kind == "reasoning":
-        return _reasoning_truth(rules, truth, objects, refine or voted_names)
+        return _reasoning_truth(rules, truth, objects, refine or voted_names, solver)
     if rules.questions == "dataset":
         questions = own_questions(dataset, scene)
     else:
@@ -95,16 +102,10 @@ def _annotation_truth(min_vertices: int, truth: GroundTruth, refine: Refine) -> 
     return AnnotationTruth(truth, tuple(name_of), lambda label, object_id: is_called(label, name_of[object_id]), refine)
 
 
-def _reasoning_truth(rules: ProtocolRules, truth: GroundTruth, objects: SceneMap, refine: Refine) -> ReasoningTruth:
+def _reasoning_truth(
+    rules: ProtocolRules, truth: GroundTruth, objects: SceneMap, refine: Refine, solver: MapSolver | None
+) -> ReasoningTruth:
     questions = generate_questions(objects, n_each=rules.per_kind or len(objects) ** 2)
-    texts = [question.text for question in questions]
-
-    def solve(instances: Instances, encoder: Encoder | None) -> Sequence[GivenAnswer]:
-        refined = refine(instances)
-        scene = map_of(instances, None if refined is None else refined.names)
-        solver = Solver(scene, None, None if encoder is None else nearest_by(encoder))
-        return [_given(solver.answer(text), {thing.id: thing.row for thing in scene.objects}) for text in texts]
-
     known = {thing.id for thing in objects.objects}
     true = [
         TrueAnswer(
@@ -113,15 +114,13 @@ def _reasoning_truth(rules: ProtocolRules, truth: GroundTruth, objects: SceneMap
         )
         for question in questions
     ]  # fmt: skip
-    return ReasoningTruth(truth, tuple(true), solve)
 
+    def solve(instances: Instances, encoder: Encoder | None) -> Sequence[GivenAnswer]:
+        scene = map_of(instances, refine(instances))
+        answers = (solver.ask if solver else built_in(encoder))(scene, [question.text for question in true])
+        return [given_answer(*both, scene) for both in zip(true, answers, strict=True)]
 
-def _given(answer: Any, row_of: dict[int, int]) -> GivenAnswer:
-    return GivenAnswer(
-        answer.value,
-        np.array([row_of[object_id] for object_id in answer.object_ids], np.int64),
-        bool(answer.is_settled),
-    )
+    return ReasoningTruth(truth, tuple(true), solve, solver.name if solver else BUILT_IN)
 
 
 def voted_names(instances: Instances) -> RefinedNames | None:
@@ -131,7 +130,8 @@ def voted_names(instances: Instances) -> RefinedNames | None:
     if instances.view_names is None or instances.view_scores is None:
         return None
     names = tuple(vote(top).name for top in top_names(instances, MOST_NAMES))
-    return RefinedNames(names, f"the vote of the names of {MOST_NAMES} views, no language model")
+    left_out = undesired(instances, names, FilterConfig())
+    return RefinedNames(names, f"the vote of the names of {MOST_NAMES} views, no language model", left_out)
 
 
 def questions_of(dataset: Any, scene: str, *, per_kind: int | None = None, own: bool = True) -> tuple[Question, ...]:

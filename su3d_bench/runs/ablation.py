@@ -16,7 +16,7 @@ from su3d_bench.core import registry
 from su3d_bench.core.config import parse_value, toml_value
 from su3d_bench.core.errors import ConfigError, StoreError, suggest
 from su3d_bench.core.interfaces import HasShortNames
-from su3d_bench.reports.tables.paper import SweepRow
+from su3d_bench.reports.tables.ablation import SweepRow
 from su3d_bench.store.atomic import read_json, write_json
 
 FILE = "ablation.json"
@@ -25,14 +25,7 @@ _COMMA_OUTSIDE_BRACKETS = re.compile(r",(?![^\[]*\])")
 Short = tuple[str, Callable[[Any], Any]]
 
 
-@dataclass(frozen=True)
-class AblationRow(SweepRow):
-    """A row, its value as it was asked for; ``is_default`` where the method has it anyway."""
-
-    is_default: bool
-
-
-_ROWS = TypeAdapter(tuple[AblationRow, ...])
+_ROWS = TypeAdapter(tuple[SweepRow, ...])
 
 
 @dataclass(frozen=True)
@@ -43,7 +36,7 @@ class _Choice:
     value: Any
 
 
-def ablation_rows(method: str, vary: Sequence[str], *, is_grid: bool) -> tuple[AblationRow, ...]:
+def ablation_rows(method: str, vary: Sequence[str], *, is_grid: bool) -> tuple[SweepRow, ...]:
     """The rows of a sweep: each ``KEY=V1,V2`` of ``vary`` on its own, or every combination where ``is_grid``.
 
     ``KEY`` is a setting of the method or a short name that its class has in ``short_names``; values are TOML. Rows
@@ -85,7 +78,7 @@ def _choices(method: str, method_class: Any, text: str) -> list[_Choice]:
     return choices
 
 
-def _row(method_class: Any, combination: Sequence[_Choice], names: dict[str, str]) -> AblationRow:
+def _row(method_class: Any, combination: Sequence[_Choice], names: dict[str, str]) -> SweepRow:
     """``names``: what settings are called by their effect; a new one is entered."""
     keys = [choice.key for choice in combination]
     if len(set(keys)) < len(keys):
@@ -99,7 +92,7 @@ def _row(method_class: Any, combination: Sequence[_Choice], names: dict[str, str
         text = f"{combination[0].parameter}={combination[0].text}"
         raise ConfigError(f"--vary {text}: {reason[:1].lower()}{reason[1:]}") from error
     variant = ",".join(f"{key}={_bare(value)}" for key, value in values.items()).replace(" ", "")
-    return AblationRow(
+    return SweepRow(
         parameter=" x ".join(choice.parameter for choice in combination),
         value=" x ".join(choice.text for choice in combination),
         method=names.setdefault(effective, f"{method_class.name}@{variant}"),
@@ -117,12 +110,12 @@ def _bare(value: Any) -> str:
     return value if isinstance(value, str) and re.fullmatch(r"[A-Za-z][A-Za-z0-9_-]*", value) else toml_value(value)
 
 
-def write_rows(folder: Path, rows: Sequence[AblationRow]) -> None:
+def write_rows(folder: Path, rows: Sequence[SweepRow]) -> None:
     """Leave the rows beside the run's metrics, for whoever makes a table of them."""
     write_json(folder / FILE, {"rows": [asdict(row) for row in rows]})
 
 
-def read_rows(folder: Path) -> tuple[AblationRow, ...]:
+def read_rows(folder: Path) -> tuple[SweepRow, ...]:
     """The rows that ``write_rows`` left; ``StoreError`` where the run is no sweep."""
     if not (folder / FILE).is_file():
         raise StoreError(f"{folder}: holds no {FILE}; make a sweep with su3d-bench ablate --vary KEY=V1,V2")

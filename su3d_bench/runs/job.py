@@ -15,7 +15,8 @@ from su3d_bench.core.errors import StoreError
 from su3d_bench.core.interfaces import HasCaveat, HasInputs, HasOwnPerception, Method, ReadsMadeRooms
 from su3d_bench.core.types import SceneInfo
 from su3d_bench.metrics.protocols import load_protocol
-from su3d_bench.perception.profiles import Perception
+from su3d_bench.perception.profiles import Perception, PerceptionConfig
+from su3d_bench.questions.reasoning.language_solver import answers_digest
 from su3d_bench.questions.refined_names import refined_digest
 from su3d_bench.store.run_folder import JobFolder
 
@@ -54,6 +55,7 @@ class SceneJob:
     cache_root: Path
     index: int = 0
     is_offline: bool = False
+    solver: str = "built-in"
 
     @property
     def scene_name(self) -> str:
@@ -171,6 +173,8 @@ class JobInputs:
         key = {"predict": digest_json(predict_key), "encoder": self.perception.encoder.digest}
         key |= {"pictures": str(self.job.pictures)}
         key |= {f"protocol.{name}": protocol.digest for name, protocol in rules.items()}
+        if self.job.solver == "llm" and any(protocol.answers is not None for protocol in rules.values()):
+            key["solver"] = answers_digest(PerceptionConfig.model_validate_json(self.job.perception).language)
         return key | refined_digest(folder) if any(protocol.goes_by_names for protocol in rules.values()) else key
 
     def outcome(self, remarks: Mapping[str, Any], *, was_resumed: bool) -> MethodOutcome:

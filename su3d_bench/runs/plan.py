@@ -156,6 +156,10 @@ def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | s
         perception.model_dump_json(),
         protocols_of_run(config.protocols, list(datasets.values())),
     )
+    if config.solver == "llm" and not any(map(asks_questions, parts.protocols.values())):
+        raise ConfigError(
+            "--solver llm: answers the questions of reasoning protocols; add such as --protocols rooms-reasoning"
+        )
     store = out if isinstance(out, str) else None
     folder = _folder(out, config, parts)
     named = os.environ.get("SU3D_DATA") or ""
@@ -242,6 +246,11 @@ def protocols_of_run(wanted: Sequence[str], targets: Sequence[str]) -> dict[str,
     }
 
 
+def asks_questions(protocols: Sequence[str]) -> bool:
+    """Whether one of ``protocols`` puts questions to the map."""
+    return any(load_protocol(name).answers is not None for name in protocols)
+
+
 def _folder(out: Path | str | None, config: RunConfig, parts: _Parts) -> Path:
     if isinstance(out, str):
         return mirror_of(out, cache_root())
@@ -273,6 +282,7 @@ def _scene_job(config: RunConfig, parts: _Parts, folder: Path, root: Path, targe
         data_root=root,
         cache_root=cache_root(),
         is_offline=config.offline,
+        solver=config.solver,
     )
 
 

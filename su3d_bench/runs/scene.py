@@ -31,7 +31,10 @@ from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Prediction, 
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import SceneScore, Truth, pack_scores, score_scene
+from su3d_bench.perception.language.client import ChatClient
+from su3d_bench.perception.language.reply_store import ReplyStore
 from su3d_bench.perception.profiles import Perception, PerceptionConfig, build_perception, resolve_profile
+from su3d_bench.questions.reasoning.asking import MapSolver, by_language_model
 from su3d_bench.questions.refined_names import refined_names
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.reports.pictures.maps import draw_scene
@@ -153,6 +156,15 @@ class _Scene:
     def perception_config(self) -> PerceptionConfig:
         config: PerceptionConfig = PerceptionConfig.model_validate_json(self.job.perception)
         return config
+
+    @cached_property
+    def solver(self) -> MapSolver | None:
+        """Who answers questions about maps; None: the built-in solver."""
+        if self.job.solver == "built-in":
+            return None
+        config = self.perception_config.language
+        client = ChatClient(config, ReplyStore(self.job.folder / "language"), offline=self.job.is_offline)
+        return by_language_model(client, config)
 
     def perception(self, info: SceneInfo) -> Perception:
         config = self.perception_config
@@ -294,7 +306,7 @@ class _Scene:
         if not rules.is_judged:
             return truth
         refine = None if refined_in is None else partial(refined_names, refined_in)
-        return question_truth(rules, self.dataset, self.job.scene_name, truth, refine)
+        return question_truth(rules, self.dataset, self.job.scene_name, truth, refine, self.solver)
 
     def _prediction_in_words_of(self, truth: GroundTruth, part: Part, prediction: Prediction) -> Prediction:
         """``prediction``; that of a method that was told the truth is told anew where ``truth`` names its classes

@@ -27,10 +27,9 @@ from su3d_bench.perception.language.config import LanguageConfig
 from su3d_bench.questions.generator import chosen, generate
 from su3d_bench.questions.model import KINDS, REASONING, Question, question_id
 from su3d_bench.questions.reasoning.answers import Answer, unsettled
+from su3d_bench.questions.reasoning.asking import AskMap, given_answer
 from su3d_bench.questions.reasoning.language_solver import LanguageSolver
-from su3d_bench.questions.reasoning.named_objects import nearest_by
 from su3d_bench.questions.reasoning.scene_map import SceneMap
-from su3d_bench.questions.reasoning.solver import Solver
 from su3d_bench.questions.retrieval import rank_all
 from su3d_bench.questions.truths import own_questions, question_truth, scene_objects
 from su3d_bench.sheets.items import RIGHT, WRONG, SheetKind
@@ -38,6 +37,7 @@ from su3d_bench.sheets.run_source import RunSource, mask_digest
 
 MOST_TEXT = 1000  # characters of a query, a label or an answer that a sheet shows
 NO_LABEL = "(no label)"
+NO_ANSWER = "(no answer)"
 
 
 @dataclass(frozen=True)
@@ -138,16 +138,20 @@ def retrieval_drafts(source: RunSource, scene: str, questions: Sequence[Question
 
 
 def annotation_drafts(source: RunSource, scene: str, n_most: int, random: np.random.Generator) -> list[Draft]:
-    """At most ``n_most`` instances a scene, drawn with ``random``, each with its labels n and n' in drawn order."""
+    """At most ``n_most`` instances a scene, drawn with ``random``, each with its labels n and n' in drawn order.
+
+    What the filter of labels n' leaves out has label n alone.
+    """
     rules = source.rules(scene, "annotation")
     truth = source.truth(scene, rules)
     draft_of: dict[bytes, Draft] = {}
     for method in source.methods:
         instances = source.instances(scene, method)
         judge = _annotation_judge(source, scene, rules, truth, instances)
-        labels = [labels_n(instances), source.refined(scene, method)]
+        own, refined = labels_n(instances), source.refined(scene, method)
         for row in range(len(instances)):
-            names = [printable(label[row], MOST_TEXT) or NO_LABEL for label in labels if label is not None]
+            labels = [own[row], *([refined.names[row]] if refined is not None and refined.is_kept[row] else [])]
+            names = [printable(label, MOST_TEXT) or NO_LABEL for label in labels]
             key = mask_digest(instances, [row]) + "\0".join(names).encode()
             if key in draft_of:
                 draft_of[key] = also(draft_of[key], method, id_of(instances, row))
@@ -220,25 +224,6 @@ def id_of(instances: Instances, row: int) -> int:
     return int(instances.ids[row]) if len(instances.ids) else row
 
 
-NO_ANSWER = "(no answer)"
-AskMap = Callable[[SceneMap, Sequence[str]], Sequence[Answer]]
-
-
-def built_in(encoder: Encoder | None) -> AskMap:
-    """Answers by geometry alone; ``encoder`` finds the nearest name."""
-
-    def ask(scene: SceneMap, questions: Sequence[str]) -> Sequence[Answer]:
-        solver = Solver(scene, None, None if encoder is None else nearest_by(encoder))
-        return [solver.answer(question) for question in questions]
-
-    return ask
-
-
-def by_language_model(model: LanguageModel, config: LanguageConfig) -> AskMap:
-    """Answers of a language model, several questions at once."""
-    return lambda scene, questions: LanguageSolver(scene, model, config).answers(questions)
-
-
 def requests_into(requests: list[ChatRequest], model: LanguageModel, config: LanguageConfig) -> AskMap:
     """Puts what a language model would be asked into ``found`` and asks nobody."""
 
@@ -289,7 +274,8 @@ def reasoning_drafts(
                 continue
             automatic = {}
             if covered is not None and rules is not None:
-                automatic = _judged_answer(rules, known[place], answer, rows, covered)
+                true = known[place]
+                automatic = _judged_answer(rules, true, given_answer(true, answer, a_map), covered)
             groups[key] = shown.draft(text, known[place].kind if known else REASONING, answer, automatic)
     return list(groups.values())
 
@@ -352,22 +338,10 @@ class _Shown:
         )
 
 
-def _judged_answer(
-    rules: ProtocolRules, true: TrueAnswer, answer: Answer, rows: Sequence[int], covered: Covered
-) -> dict[str, str]:
+def _judged_answer(rules: ProtocolRules, true: TrueAnswer, given: GivenAnswer, covered: Covered) -> dict[str, str]:
     assert rules.answers is not None
-    given = GivenAnswer(_value(true, answer), np.array(rows, np.int64), answer.is_settled)
     main = covered.main_object
     judgements = {"answer": judged(is_answer_right(rules.answers, true, given, main))}
     if true.object_ids:
         judgements["objects"] = judged(are_objects_right(true, given, main))
     return judgements
-
-
-def _value(true: TrueAnswer, answer: Answer) -> float | int | bool | None:
-    """What the answer says; the words of a language model are read for their yes or no, or their first number."""
-    if true.value is None or answer.solver == "built-in":
-        return answer.value
-    value = answer.said(true.value)
-    is_count = value is not None and not isinstance(true.value, float | bool) and value == int(value)
-    return int(value) if is_count and value is not None else value

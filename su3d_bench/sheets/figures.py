@@ -12,12 +12,12 @@ from su3d_bench.core.errors import printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float64Array, Frame, Instances, UInt8Array
 from su3d_bench.metrics.questions.score import labels_n
+from su3d_bench.questions.reasoning.asking import built_in
 from su3d_bench.questions.retrieval import rank_all
 from su3d_bench.reports.pictures.figures import Cell, GridRow
 from su3d_bench.reports.pictures.items import Tag, seen_in
 from su3d_bench.reports.pictures.map_views import DrawnMap, MapView, drawn_map, pale
 from su3d_bench.reports.pictures.maps import ROOM_SURFACES, Scale, class_colours, similarity_colours
-from su3d_bench.sheets.drafts import built_in
 from su3d_bench.sheets.drawing import ANSWER_COLOUR, OTHER_COLOUR, tags_of
 from su3d_bench.sheets.run_source import RunSource
 
@@ -69,8 +69,10 @@ class Figures:
             cells: list[Cell] = []
             for method, shown, view in zip(self._source.methods, maps, views, strict=True):
                 own: Labels = labels_n(shown.instances)
-                both = [own, self._source.refined(scene, method) or own]
-                palette = class_colours(list(dict.fromkeys(name for names in both for name in names)))
+                refined = self._source.refined(scene, method)
+                both = [own, own if refined is None else np.where(refined.is_kept, refined.names, "").tolist()]
+                palette = class_colours(list(dict.fromkeys(name for names in both for name in names if name)))
+                palette[""] = (UNSEEN, UNSEEN, UNSEEN)  # without a name, or left out under label n'
                 for names in both:
                     colours = np.array([palette[name] for name in names], np.uint8).reshape(-1, 3)
                     cells.append(Cell(shown.paint(view, colours), _name_tags(shown, view, names, colours)))

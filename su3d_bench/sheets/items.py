@@ -186,7 +186,7 @@ class KeyItem(_Strict):
 @dataclass(frozen=True)
 class Key(_Strict):
     """What the maintainer keeps: ``sheet_id`` ties it to its sheet, ``run`` names the run folder, ``run_digest`` its
-    code; ``answered_by``: who gave the answers of reasoning sheets."""
+    code; ``answered_by``: who gave the answers of reasoning sheets, or labels n'."""
 
     sheet_id: str
     kind: SheetKind

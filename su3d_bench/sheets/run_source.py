@@ -23,6 +23,7 @@ from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.instance.score import Covered, covered_objects
 from su3d_bench.metrics.protocol_files import protocol_names
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.questions.reasoning.scene_map import SceneMap, map_of
 from su3d_bench.questions.refined_names import refined_names
 from su3d_bench.runs.finished import FinishedRun, read_run
@@ -79,13 +80,12 @@ class RunSource:
             )
         return prediction
 
-    def refined(self, scene: str, method: str) -> tuple[str, ...] | None:
+    def refined(self, scene: str, method: str) -> RefinedNames | None:
         """Labels n' of the map's instances; None where nobody made them."""
-        names = refined_names(self.run.folder.job(scene, method), self.instances(scene, method))
-        return None if names is None else tuple(names.names)
+        return refined_names(self.run.folder.job(scene, method), self.instances(scene, method))
 
     def scene_map(self, scene: str, method: str) -> SceneMap:
-        """The map as questions are put to it, under labels n' where it has them."""
+        """The map as questions are put to it, under labels n' and without what they leave out, where it has them."""
         return map_of(self.instances(scene, method), self.refined(scene, method))
 
     def frames(self, scene: str, method: str) -> tuple[Frame, ...]:

@@ -34,12 +34,11 @@ Reason = Literal["annotators disagree", "against the truth", "not right"]
 SCHEMA = 1
 STEPS = (1, 2, 6, 12, 60)  # of which shares of up to 1, 2, 3, 4, 6 judges, and their differences, are whole numbers
 MOST_STEPS = 50_000  # a distribution of 100,001 sums, some seconds for as many items
-WELL_MERGED, UNDER_MERGED, OVER_MERGED = MERGES[:3]
 OF_ALL_KINDS = "all"
 LABEL_METRICS = (f"label {LABELS[0]}", f"label {LABELS[1]}")
 # As the protocols that let the ground truth judge call the same numbers.
 METRICS = (
-    *(*ALL_KINDS, OF_ALL_KINDS, *LABEL_METRICS, WELL_MERGED, UNDER_MERGED, OVER_MERGED),
+    *(*ALL_KINDS, OF_ALL_KINDS, *LABEL_METRICS, *MERGES[:3], *(f"{name} {LABELS[1]}" for name in MERGES[:3])),
     *("sense", "wording", "answer", "objects", WHOLE, ARGUABLE),
 )
 _PLACE = ["method", "dataset", "metric"]  # of a cell
@@ -227,7 +226,10 @@ def _metrics(key: KeyItem, ask: str) -> list[tuple[str, str]]:
     if ask == "retrieval":
         return [(key.question_kind, RIGHT), (OF_ALL_KINDS, RIGHT)]
     if ask == "merging":
-        return [(name, name) for name in (WELL_MERGED, UNDER_MERGED, OVER_MERGED)]
+        # what labels n' leave out has no label n', and does not count in the merging under them
+        is_kept = any(LABELS[1] in named for named in key.stands_for.values())
+        ends = ("", f" {LABELS[1]}") if is_kept else ("",)
+        return [(f"{name}{end}", name) for end in ends for name in MERGES[:3]]
     if ask in key.stands_for:
         return [(f"label {name}", RIGHT) for name in key.stands_for[ask]]
     if ask == WHOLE:

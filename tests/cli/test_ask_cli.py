@@ -18,6 +18,7 @@ from scored_room import instances
 
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.core.types import Instances
+from su3d_bench.questions.undesired import FilterConfig
 from su3d_bench.reports.pictures import answers as reasoning_picture
 from su3d_bench.reports.pictures.answers import SpokenOf, draw_reasoning
 from su3d_bench.store.atomic import write_json
@@ -246,6 +247,37 @@ def test_labels_n_prime_by_a_model_are_asked_for_once(
     assert main([*words, "--offline"]) == 0
     assert (job.path / "refined_names.json").read_bytes() == records
     assert server.n_asked == 4
+
+
+def test_what_is_background_under_label_n_prime_is_left_out(
+    job: JobFolder, server: ChatServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    server.answer = lambda body: Answered("tile wall" if "basin" in body["messages"][1]["content"] else "furniture")
+    words = ["refine", "runs/made", "--refiner", "model", "--model", "tiny", "--base-url", server.url]
+    assert main(words) == 0
+    assert "30  left out: 'tile wall' is background" in capsys.readouterr().out
+    assert main(["ask", SCENE, "How many things are there?", "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["value"], told["object_ids"]) == (3, [10, 20, 40])
+    assert told["names"] == "labels n' by tiny, without 1 that it leaves out"
+    assert main([*words, "--background-names", "bed"]) == 0
+    assert "left out" not in capsys.readouterr().out
+    assert main([*words, "--max-map-fraction", "0.05", "--json"]) == 0
+    records = json.loads(capsys.readouterr().out)[SCENE]
+    assert records["filter"] == {"background_names": list(FilterConfig().background_names), "max_map_fraction": 0.05}
+    assert [bool(one["left_out"]) for one in records["names"]] == [True, False, True, False]
+    assert main([*words, "--max-map-fraction", "0"]) == 2
+    assert "--max-map-fraction 0.0: expected a share above 0" in capsys.readouterr().err
+
+
+def test_labels_n_prime_of_an_earlier_version_are_made_again(
+    job: JobFolder, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["refine", "runs/made"]) == 0
+    path = job.path / "refined_names.json"
+    path.write_text(path.read_text().replace('"schema_version": 2', '"schema_version": 1'))
+    assert main(["ask", SCENE, "Where is the sofa?"]) == 2
+    assert "knows no filter of large background yet; give su3d-bench refine again" in capsys.readouterr().err
 
 
 def test_a_refinement_over_a_failing_server_ends_complete(

@@ -20,6 +20,7 @@ from su3d_bench.metrics.scoring import metric_of, score_scene
 from su3d_bench.questions.refined_names import FILE_NAME, records_of, refined_digest, refined_names, write_records
 from su3d_bench.questions.refinement import RefinedName, TopNames
 from su3d_bench.questions.truths import Refine, question_truth, voted_names
+from su3d_bench.questions.undesired import FilterConfig
 from su3d_bench.store.atomic import write_bytes
 from su3d_bench.store.run_folder import JobFolder
 
@@ -70,6 +71,33 @@ def test_refined_names_are_those_that_are_handed_in() -> None:
     prediction = named(("couch",) * len(NAMES))
     assert (values(prediction, lambda _: right)["label n"], values(prediction, lambda _: right)["label n'"]) == (0, 1)
     assert "n': the model m" in " ".join(score_scene(RULES, truth(lambda _: right), prediction, None).warnings)
+
+
+def test_what_labels_n_prime_leave_out_counts_before_and_not_after() -> None:
+    chair, table = np.flatnonzero(TRUTH.instance == 2), np.flatnonzero(TRUTH.instance == 4)
+    both = np.concatenate([chair[:60], np.flatnonzero(TRUTH.instance == 3)])  # over-merged: of two chairs
+    masks = [chair[60:], both, table, np.flatnonzero(TRUTH.instance == 5)]
+    prediction = instances(TRUTH.points, masks, ["chair", "chair", "chair", "lamp"])
+    refined = RefinedNames(("chair", "wall", "table", "lamp"), "the model m", ("", "'wall' is background", "", ""))
+    found = values(prediction, lambda _: refined)
+    assert [found[name] for name in ("label n", "label n'", "n_label n", "n_label n'")] == [0.75, 1.0, 4, 3]
+    assert (found["over-merged"], found["over-merged n'"]) == (0.25, 0.0)
+    assert found["well-merged n'"] == found["n_well-merged n'"] / 3 == 1.0
+    said = " ".join(score_scene(RULES, truth(lambda _: refined), prediction, None).warnings)
+    assert "n' leaves out 1 of 4 instances: 'wall' is background" in said
+
+
+def test_what_covers_a_part_is_whole_once_the_rest_is_left_out() -> None:
+    chair = np.flatnonzero(TRUTH.instance == 2)
+    prediction = instances(TRUTH.points, [chair[:80], chair[80:]], ["chair", "chair"])
+    found = values(prediction, lambda _: RefinedNames(("chair", "floor"), "the model m", ("", "'floor' is background")))
+    assert (found["under-merged"], found["well-merged n'"]) == (1.0, 1.0)
+
+
+def test_the_vote_leaves_out_what_is_background_under_it() -> None:
+    voted = voted_names(replace(named(("chair", *["wall"] * 7)), view_scores=np.tile([0.9, 0.1], 8)))
+    assert voted is not None
+    assert voted.is_kept.tolist() == [True, *[False] * 7]
 
 
 def test_the_vote_takes_the_name_of_most_weight() -> None:
@@ -139,10 +167,11 @@ def test_labels_of_the_file_beside_a_map_are_taken_while_it_is_that_maps(tmp_pat
     assert refined_digest(job) == {}
     assert "vote" in (refined_names(job, prediction) or RefinedNames((), "")).source
     tops = [TopNames("chair", ("chair",), (1.0,))] * 8
-    records = records_of(job, range(8), tops, [RefinedName("sofa", "model", "")] * 8, "model", "m", 5)
+    records = records_of(job, prediction, tops, [RefinedName("sofa", "model", "")] * 8, "model", "m", 5, FilterConfig())
     write_records(job, records)
     found = refined_names(job, prediction)
-    assert found == RefinedNames(("sofa",) * 8, "the model m of su3d-bench refine, names of 5 views")
+    source = "the model m of su3d-bench refine, names of 5 views"
+    assert found == RefinedNames(("sofa",) * 8, source, ("",) * 8)
     assert set(refined_digest(job)) == {"refined"}
     write_bytes(job.prediction, b"another map")
     assert "vote" in (refined_names(job, prediction) or RefinedNames((), "")).source

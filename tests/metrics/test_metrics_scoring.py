@@ -117,6 +117,33 @@ def test_a_partition_into_nothing_scores_zero_and_one_beyond_its_features_is_ref
         headline("rooms-instance", truth, replace(one, instance=np.where(np.arange(len(nowhere)) == 5, 1, nowhere)))
 
 
+def test_openmask3ds_classes_encoder_and_vertices_give_the_truth_itself_one_and_an_empty_map_nothing() -> None:
+    rules, instance = load_protocol("replica-openmask3d-semantic"), load_protocol("replica-openmask3d")
+    assert (rules.classes, rules.prompt, rules.encoder) == (instance.classes, instance.prompt, instance.encoder)
+    assert (rules.vocabulary, rules.ground_truth) == (instance.vocabulary, instance.ground_truth)
+    truth = room()
+    assert headline(rules.name, truth, truth_as_prediction(truth, with_labels=False)) == [1.0, 1.0]
+    assert headline(rules.name, truth, nothing(truth)) == [0.0, 0.0]
+
+
+def test_each_object_keeps_its_first_point_a_voxel_where_a_semantic_protocol_says_so() -> None:
+    truth = room()
+    chair, table = (truth.semantic[np.flatnonzero(truth.instance == k)[0]] for k in (2, 4))
+    points = np.array([[0.0, 0, 0], [0.024, 0, 0], [0.03, 0, 0]], np.float32)  # the first two share a voxel of 0.025
+    target, own = points[1:2] - np.float32(0.001), np.array([1], np.int32)
+    scene = replace(truth, points=target, semantic=np.array([chair], np.int32), instance=own)
+    features = np.stack([OneHotEncoder().feature(name) for name in ("chair", "table")])
+    both = Partition(points, np.array([0, 0, 1], np.int32), features)
+    assert chair != table
+    rules = load_protocol("replica-openmask3d-semantic")
+    whole = rules.model_copy(update={"transfer": rules.transfer.model_copy(update={"evaluation_voxel_m": 0.0})})
+    recalls = [
+        combine(one, {"room": score_scene(one, scene, both, OneHotEncoder())}).per_class["chair"]["recall"]
+        for one in (whole, rules)
+    ]
+    assert recalls == [1.0, 0.0]  # the chair's second point is gone, and the table's is nearest
+
+
 def test_dense_features_score_as_the_same_instances_under_a_semantic_protocol() -> None:
     truth = room()
     encoder = OneHotEncoder()

@@ -20,9 +20,11 @@ NAMES = {
     "class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d", "openlex3d-queries",
     "openlex3d-ranking", "openlex3d-topn", "query-ap", "replica-conceptgraphs-ex1", "replica-conceptgraphs-ex4",
     "replica-conceptgraphs-ex6", "replica-hovsg", "replica-hovsg-exact", "replica-mesh-ex6", "replica-openmask3d",
-    "replica-openmask3d-released", "replica-ovo51", "rooms-instance", "rooms-semantic", "scannet-instance",
+    "replica-openmask3d-released", "replica-openmask3d-semantic",
+    "replica-ovo51", "rooms-instance", "rooms-semantic", "scannet-instance",
     "scannet-semantic", "scannet200-instance", "scannet200-semantic", "rooms-retrieval", "replica-retrieval",
     "scannet-retrieval", "rooms-annotation", "replica-annotation", "scannet-annotation", "rooms-reasoning",
+    "replica-reasoning", "scannet-reasoning",
 }  # fmt: skip
 
 
@@ -45,7 +47,9 @@ def test_every_rule_that_is_taken_from_an_original_says_from_where(name: str) ->
 
 
 def test_each_dataset_has_its_default_protocols() -> None:
-    assert protocols_for("rooms") == ["replica-mesh-ex6", "replica-openmask3d", "rooms-instance", "rooms-semantic"]
+    assert protocols_for("rooms") == [
+        "replica-mesh-ex6", "replica-openmask3d", "replica-openmask3d-semantic", "rooms-instance", "rooms-semantic",
+    ]  # fmt: skip
     assert protocols_for("scannet") == [
         "class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d", "scannet-instance",
         "scannet-semantic", "scannet200-instance", "scannet200-semantic",
@@ -175,6 +179,8 @@ FAULTS = (
     ("instance", "0.9000000000000004, 0.25,", "0.9", "thresholds: 0.25 and 0.5 must be among them"),
     ("instance", '"map-points"', '"object-points"', "kind 'instance' takes 'map-points'"),
     ("instance", "version = 1", "version = ", "mine.toml: is no valid TOML"),
+    ("semantic", '"object-points"', '"map-points"', "kind 'semantic' takes 'object-points'"),
+    ("semantic", "voxel_m = 0.0", "voxel_m = 0.02\nneighbours = 5", "of neighbours that vote nothing is left out"),
     ("semantic", 'vocabulary = "scored"', "# none", "vocabulary: belongs to protocols that choose among classes"),
     ("semantic", "version = 1", 'version = 1\nprompts = ["{}"]', "prompt: give either prompt or prompts"),
     ("semantic", 'metric = "conceptgraphs"', 'metric = "query-ap"', "kind 'semantic' needs metric 'conceptgraphs' or"),

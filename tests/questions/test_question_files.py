@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import tomllib
 from collections import Counter
 from pathlib import Path
 
@@ -11,8 +12,18 @@ from damage import damages, outcomes, truncations
 from places import SCENES
 
 from su3d_bench.cli.main import main
+from su3d_bench.cli.sheets.pictures import FIGURES
 from su3d_bench.core.errors import DataError
-from su3d_bench.questions.files.files import csv_text, paper_queries, read_questions, toml_text, write_questions
+from su3d_bench.questions.files.files import (
+    PAPER,
+    PAPER_FIGURES,
+    csv_text,
+    figure_texts,
+    paper_queries,
+    read_questions,
+    toml_text,
+    write_questions,
+)
 from su3d_bench.questions.model import KINDS, new_question
 
 HOSTILE = ("<script>alert(1)</script>", '=HYPERLINK("x","y")', "\u202eright to left", '😀, "chair"', "x" * 10_000)
@@ -127,9 +138,20 @@ def test_the_papers_queries_are_asked_of_its_13_scenes() -> None:
     found = paper_queries()
     assert len({one.scene for one in found}) == 13
     assert Counter(one.kind for one in found if one.scene == "replica/room0") == {
-        "instance": 16, "affordance": 11, "property": 12, "relative": 12,
+        "instance": 24, "affordance": 13, "property": 13, "relative": 18, "reasoning": 5,
     }  # fmt: skip
     assert not any(one.is_known for one in found)
+    assert len({one.id for one in found}) == len(found)
+
+
+def test_the_texts_of_both_figures_and_the_teaser_are_among_them() -> None:
+    counts = [len(tomllib.loads(PAPER.read_text())["figures"][name]) for name in PAPER_FIGURES]
+    assert counts == [16, 6, 2]  # as often as the page has them
+    assert [len(figure_texts(name)) for name in PAPER_FIGURES] == [14, 6, 2]  # one text stands there three times
+    texts = {one.text for one in paper_queries()}
+    assert {text for name in PAPER_FIGURES for text in figure_texts(name)} <= texts
+    assert {"an empty vase", "a picture on wall", "plant on shelf", "which sink is closer to bed?"} <= texts
+    assert PAPER_FIGURES == FIGURES
 
 
 def test_the_verb_shows_a_set_without_its_control_characters(

@@ -14,6 +14,7 @@ from scored_room import instances
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.datasets.rooms.dataset import Rooms
+from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.questions.reasoning.answers import Answer
 from su3d_bench.questions.reasoning.generated import generate_questions
 from su3d_bench.questions.reasoning.question_words import Phrase, read_phrase
@@ -242,6 +243,6 @@ def test_a_map_is_named_by_n_prime_then_by_label_then_by_n() -> None:
     assert [one.name for one in map_of(made).objects] == ["lamp"]  # a box that is not finite is left out
     sound = replace(made, boxes=np.zeros((2, 2, 3), np.float32))
     assert [one.name for one in map_of(sound).objects] == ["lamp", "couch"]
-    assert [one.name for one in map_of(sound, ("a", "b")).objects] == ["a", "b"]
+    assert [one.name for one in map_of(sound, RefinedNames(("a", "b"), "test")).objects] == ["a", "b"]
     with pytest.raises(PredictionError, match="two instances of one id"):
         map_of(replace(sound, ids=np.array([3, 3], np.int32)))

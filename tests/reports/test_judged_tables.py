@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,14 +14,19 @@ from simulated_annotators import RATES, SCHEMES, annotation_set, answered, reaso
 from su3d_bench.analysis.tables import check_paper, measured_results
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.reports.tables.judged import judged_table
+from su3d_bench.reports.tables.judged import KINDS, judged_table
 from su3d_bench.reports.tables.latex import latex
 from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.paper import Shown
 from su3d_bench.sheets.answers import check_answers
 from su3d_bench.sheets.scores import score, write_scores
 
-LABELS = [("right", "right", "well-merged"), ("wrong", "right", "well-merged"), ("wrong", "wrong", "over-merged")]
+LABELS = [
+    ("right", "right", "well-merged"),
+    ("wrong", "right", "well-merged"),
+    ("wrong", "wrong", "under-merged"),
+    ("wrong", "", "over-merged"),  # labels n' leave it out
+]
 
 
 @pytest.fixture(scope="module")
@@ -62,49 +68,118 @@ def texts(table: Any) -> dict[str, list[str]]:
 
 def test_table_iv_is_made_of_what_people_judged(folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
     (table,) = told(capsys, str(folders[0]), "--table", "IV")
-    assert table["columns"] == ["instance", "affordance", "property", "relative", "scenes"]
-    assert texts(table) == {f"{one}, people": [f"{100 * RATES[one]:.1f}"] * 4 + ["1"] for one in SCHEMES}
-    assert [row["cells"][0]["is_best"] for row in table["rows"][:4]] == [False, False, False, True]
+    assert table["columns"] == ["instance", "affordance", "property", "relative"]
+    assert texts(table) == {f"{one}, people": [f"{RATES[one]:.3f}"] * 4 for one in SCHEMES}
+    assert {cell["beside"] for row in table["rows"][:4] for cell in row["cells"]} == {"n=10"}
+    assert not any(cell["is_best"] for row in table["rows"] for cell in row["cells"])  # 9 of 10 against 7 of 10
+    assert sum("with so few items no difference" in note for note in table["notes"]) == 1
     assert any("judged by 1 person, 40 items" in note for note in table["notes"])
     assert sum(row["is_reported"] for row in table["rows"]) == 8
-    assert "not the paper's data" in table["caption"]  # the rooms
+    assert table["caption"] == "Retrieval by text on rooms; not the paper's set-up: other scenes."
+
+
+def test_the_best_that_people_see_is_marked_by_the_test_over_the_items_that_they_judged(tmp_path: Path) -> None:
+    sheet, key = retrieval_set(160)
+    checked = check_answers(sheet, answered(sheet, key, {"ann": 0.0}))
+    write_scores(tmp_path, score(sheet, key, checked.judgements))
+    table = judged_table("IV", measured_results([tmp_path]), Shown(), with_published=False)
+    assert [row.cells[0].is_best for row in table.rows] == [False, False, False, True]  # 36 of 40 against 28
+    assert any("sign-flip test over items" in note for note in table.notes)
 
 
 def test_table_v_has_a_row_for_each_label(folders: tuple[Path, Path], capsys: pytest.CaptureFixture[str]) -> None:
     (table,) = told(capsys, str(folders[1]), "--table", "V", "--no-published")
-    assert table["columns"] == ["label-accuracy", "merge-accuracy", "scenes"]
+    assert table["columns"] == ["label-accuracy", "merge-accuracy"]
     assert texts(table) == {
-        "opensu3d: direct label (n), people": ["33.3", "66.7", "1"],
-        "opensu3d: refined label (n'), people": ["66.7", "66.7", "1"],
+        "opensu3d: direct label (n), people": ["0.250", "0.500"],
+        "opensu3d: refined label (n'), people": ["0.667", "0.667"],
     }
     origins = [cell["origin"] for row in table["rows"] for cell in row["cells"][:2]]
     assert [(one["method"], one["metric"]) for one in origins] == [
         ("opensu3d", "label n"),
         ("opensu3d", "well-merged"),
         ("opensu3d", "label n'"),
-        ("opensu3d", "well-merged"),
+        ("opensu3d", "well-merged n'"),
+    ]
+
+
+@pytest.mark.parametrize(
+    ("warning", "label"),
+    [
+        ("every scene: n': the vote of the names of 5 views, no language model", "(n' is a vote)"),
+        ("replica/a: n': the model gpt-4 of su3d-bench refine, names of 5 views", "(n' by the model gpt-4)"),
+        ("no label n': the map keeps no names of views", "(n')"),
+    ],
+)
+def test_the_row_of_label_n_prime_says_who_made_it(warning: str, label: str) -> None:
+    values = {"label n": 0.7, "label n'": 0.8, "well-merged": 0.5, "well-merged n'": 0.6}
+    row = replace(by_truth("opensu3d", "annotation", "replica", **values), warnings=(warning,))
+    table = judged_table("V", [row], Shown(), with_published=True)
+    assert [(one.label, [cell.text for cell in one.cells[:2]]) for one in table.rows[:2]] == [
+        ("opensu3d: direct label (n), ground truth", ["0.700", "0.500"]),
+        (f"opensu3d: refined label {label}, ground truth", ["0.800", "0.600"]),
+    ]
+    assert [[cell.text for cell in one.cells[:2]] for one in table.rows if one.is_reported] == [
+        ["0.83", "0.87"],
+        ["0.87", "0.88"],
     ]
 
 
 def test_people_and_ground_truth_stand_apart_in_one_table(folders: tuple[Path, Path]) -> None:
     people = measured_results([folders[0]])
     truth = by_truth(SCHEMES[0], "retrieval", "rooms", instance=0.99, affordance=0.9, property=0.8, relative=0.1)
-    (table,) = judged_table("IV", [truth, *people], Shown(), with_published=False)
+    table = judged_table("IV", [truth, *people], Shown(), with_published=False)
     assert [(row.label, row.group) for row in table.rows] == [
         *((f"{one}, people", "people") for one in SCHEMES),
         (f"{SCHEMES[0]}, ground truth", "ground truth"),
     ]
-    assert [row.cells[0].is_best for row in table.rows] == [False, False, False, True, False]
 
 
-def test_each_dataset_has_a_table_with_the_papers_rows_for_it() -> None:
+def test_both_datasets_stand_in_one_table_of_eight_columns_with_the_papers_digits() -> None:
     values = {"instance": 0.8, "affordance": 0.7, "property": 0.6, "relative": 0.5}
-    rows = [by_truth("opensu3d", "retrieval", dataset, **values) for dataset in ("replica", "scannet")]
-    tables = judged_table("IV", rows, Shown(), with_published=True)
-    assert [one.name for one in tables] == ["IV-replica", "IV-scannet"]
-    reported = [row for row in tables[1].rows if row.is_reported]
-    assert [cell.text for cell in reported[-1].cells[:4]] == ["90", "70", "70", "70"]  # scheme 4 on ScanNet
-    assert all("not the paper's" not in one.caption for one in tables)
+    n = {f"n_{kind}": 40.0 + k for k, kind in enumerate(values)}
+    rows = [by_truth("opensu3d", "retrieval", dataset, **values, **n) for dataset in ("replica", "scannet")]
+    table = judged_table("IV", rows, Shown(), with_published=True)
+    assert table.name == "IV-replica-scannet"
+    assert table.columns == tuple(f"{dataset} {kind}" for dataset in ("replica", "scannet") for kind in values)
+    own, *reported = table.rows
+    assert [cell.whole for cell in own.cells[:4]] == ["0.800 n=40", "0.700 n=41", "0.600 n=42", "0.500 n=43"]
+    assert [row.label for row in reported] == [f"scheme{k}" for k in range(1, 5)]
+    assert [cell.text for cell in reported[-1].cells] == ["0.8", "0.9", "0.9", "0.6", "0.9", "0.7", "0.7", "0.7"]
+    assert reported[0].mark == "a, b" and sum(note.startswith("[") for note in table.notes) == 2
+    assert table.caption.endswith("; not the paper's set-up: other scenes, perception, judges.")
+
+
+def test_a_part_that_one_dataset_lacks_is_a_dash_there() -> None:
+    def values(label: float, refined: float, merged: float) -> dict[str, float]:
+        return {"label n": label, "label n'": refined, "well-merged": merged, "well-merged n'": merged}
+
+    rows = [
+        by_truth("opensu3d", "annotation", "replica", **values(0.5, 0.6, 0.7)),
+        by_truth("sam3d", "annotation", "scannet", **values(0.4, 0.4, 0.9)),
+    ]
+    table = judged_table("V", rows, Shown(), with_published=True)
+    assert [[cell.text for cell in row.cells] for row in table.rows] == [
+        ["0.500", "0.700", "-", "-"],
+        ["0.600", "0.700", "-", "-"],
+        ["-", "-", "0.400", "0.900"],
+        ["-", "-", "0.400", "0.900"],
+        ["0.83", "0.87", "0.75", "0.85"],
+        ["0.87", "0.88", "0.84", "0.87"],
+    ]
+
+
+def test_a_best_of_one_of_four_over_none_is_not_marked_and_a_clear_one_is() -> None:
+    def both(other: float) -> list[bool]:
+        rows = [by_truth("opensu3d", "retrieval", "replica", **dict.fromkeys(KINDS, value)) for value in (0.25, other)]
+        rows[0] = replace(rows[0], method="sam3d", per_scene={scene: {} for scene in SCENES[1:]})
+        one = {SCENES[0]: dict.fromkeys(KINDS, 1.0)} | {scene: dict.fromkeys(KINDS, 0.0) for scene in SCENES[1:]}
+        rows[0] = replace(rows[0], per_scene=one)
+        table = judged_table("IV", rows, Shown(), with_published=False)
+        return [row.cells[0].is_best for row in table.rows]
+
+    assert both(0.0) == [False, False]
+    assert both(0.9) == [False, True]
 
 
 def test_reasoning_has_its_scores_above_the_papers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -112,17 +187,23 @@ def test_reasoning_has_its_scores_above_the_papers(tmp_path: Path, capsys: pytes
     checked = check_answers(sheet, answered(sheet, key, {"ann": 0.0}))
     write_scores(tmp_path, score(sheet, key, checked.judgements))
     (table,) = told(capsys, str(tmp_path), "--table", "reasoning")
-    assert table["columns"] == ["reasoning-accuracy", "objects", "scenes"]
-    assert list(texts(table).values()) == [["75.0", "50.0", "1"]]
-    assert [row["cells"][0]["text"] for row in table["rows"] if row["is_reported"]] == ["83", "68"]
-    assert len({row["mark"] for row in table["rows"] if row["is_reported"]}) == 2
-    rows = [*measured_results([tmp_path]), by_truth("a: b", "reasoning", "rooms", answer=0.6, objects=0.5)]
-    tables = judged_table("reasoning", rows, Shown(), with_published=True)
-    assert [row.cells[0].text for row in tables[0].rows if not row.is_reported] == ["75.0", "60.0"]
+    assert table["columns"] == ["reasoning-accuracy", "objects"]
+    assert list(texts(table).values()) == [["0.750", "0.500"]]
+    reported = [row for row in table["rows"] if row["is_reported"]]
+    assert [row["cells"][0]["text"] for row in reported] == ["0.83", "0.68"]
+    assert all("70 questions" in row["label"] for row in reported)
+    assert len({row["mark"] for row in reported}) == 2
+    told_by = "every scene: answers by the language model gpt-4"
+    truth = by_truth("a: b", "reasoning", "rooms", answer=0.6, n_answer=50.0, objects=0.5)
+    rows = [*measured_results([tmp_path]), replace(truth, warnings=(told_by,)), replace(truth, method="c")]
+    both = judged_table("reasoning", rows, Shown(), with_published=True)
+    measured_rows = [row for row in both.rows if not row.is_reported]
+    assert [row.cells[0].whole for row in measured_rows] == ["0.750 n=4", "0.600 n=50", "0.600 n=50"]
+    assert measured_rows[1].label == "a: b, answers by the language model gpt-4, ground truth"
     paper = tmp_path / "paper.tex"
-    paper.write_text(latex(judged_table("reasoning", rows[:1], Shown(), with_published=True)))
+    paper.write_text(latex([judged_table("reasoning", rows[:1], Shown(), with_published=True)]))
     checks = check_paper(paper)
-    assert len(checks) == 3 and [check.fault for check in checks if check.fault] == []
+    assert len(checks) == 2 and [check.fault for check in checks if check.fault] == []
 
 
 def test_without_judged_rows_the_message_says_what_makes_them() -> None:
@@ -137,15 +218,15 @@ def test_a_paper_with_peoples_numbers_is_checked_against_their_scores(
     rows = measured_results(folders)
     shown = Shown(intervals=True)
     tables = [
-        *judged_table("IV", rows, shown, with_published=True),
-        *judged_table("V", rows, shown, with_published=True),
+        judged_table("IV", rows, shown, with_published=True),
+        judged_table("V", rows, shown, with_published=True),
     ]
     paper = tmp_path / "paper.tex"
     paper.write_text(latex(tables))
     checks = check_paper(paper)
-    assert len(checks) == 4 * 5 + 2 * 3
+    assert len(checks) == 4 * 4 + 2 * 2
     assert [check.fault for check in checks if check.fault] == []
-    paper.write_text(latex(tables).replace("& 90.0", "& 91.0").replace("& \\textbf{90.0}", "& \\textbf{91.0}"))
+    paper.write_text(latex(tables).replace("& 0.900", "& 0.901"))
     assert sum(check.fault is not None for check in check_paper(paper)) == 4
 
 

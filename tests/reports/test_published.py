@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import pytest
 
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.metrics.protocols import load_protocol
-from su3d_bench.reports.tables.published import Figure, figures_of, published, read_published
+from su3d_bench.reports.tables.published import FILE, Figure, figures_of, published, read_published
 
 WHOLE = """
 [[figure]]
@@ -17,6 +18,11 @@ dataset = "replica"
 setup = "8 scenes"
 source = "A paper, Table I"
 values = { AP = "1.0" }
+"""
+KNOWN = """
+[[system]]
+name = "b"
+labels = "one"
 """
 
 
@@ -58,6 +64,42 @@ def test_tables_iv_and_v_and_reasoning_are_as_printed() -> None:
     assert reasoning == ["0.83", "0.68"]
 
 
+def test_what_is_not_in_the_papers_is_open() -> None:
+    for one in published():
+        if one.table == "I":
+            assert "scheme 1" not in one.setup and "ViT-H" not in one.setup and "open" in one.setup
+    (third,) = [one for one in figures_of(method="opensu3d") if one.table == "III"]
+    assert "which encoder is open" in third.setup and "scheme 1" in third.setup  # its text says simple fusion
+    scannet = [one for one in published() if one.dataset == "scannet" and "HOV-SG" in one.source]
+    assert len(scannet) == 3 and all("encoders is open" in one.setup for one in scannet)
+
+
+def test_each_number_is_attributed_to_where_it_was_read() -> None:
+    sources = {(one.method, one.dataset): one for one in published() if one.table is None}
+    assert "issue 22" in sources["openmask3d", "scannet200"].source
+    assert "issue 37" in sources["Open3DIS (2D and 3D)", "scannet200"].source
+    yolo = sources["Open-YOLO 3D", "scannet200"]
+    assert "README for AP, third-party" in yolo.source and "does not print AP50 and AP25" in (yolo.note or "")
+    of_paper = sources["OpenIns3D, snapshots", "replica"]
+    assert tuple(of_paper.values.values()) == ("13.6", "18.0", "19.7")
+    of_code = sources["OpenIns3D, snapshots, released code", "replica"]
+    assert tuple(of_code.values.values()) == ("15.4", "19.5", "25.2") and "13.6" in (of_code.note or "")
+    quoting = [one for one in published() if one.source.startswith("OpenIns3D's README, quoting")]
+    assert {one.dataset for one in quoting} == {"replica"}
+
+
+def test_every_row_says_how_many_labels_what_time_which_frames_and_what_trained_the_proposals() -> None:
+    by_method = {(one.method, one.dataset): one.system for one in published() if one.table is None}
+    assert by_method["Open3DIS (2D and 3D)", "scannet200"].labels.startswith("the 300 best pairs")
+    assert by_method["Open-YOLO 3D", "scannet200"].time == "22 s a scene, NVIDIA A100 40 GB"
+    assert by_method["conceptgraphs", "replica"].labels == "one"
+    assert by_method["DynamicGSG", "replica"].words == "labels a mask, time, frames, proposals: open"
+    text = FILE.read_text()
+    assert text.count("\nsystem = ") == text.count("[[figure]]") == len(published())
+    names = re.findall(r'\[\[system\]\]\nname = "(.*)"', text)
+    assert len(names) == text.count("[[system]]") == len(set(names))
+
+
 def test_every_protocol_that_a_figure_names_exists() -> None:
     for name in {one.protocol for one in published() if one.protocol is not None}:
         assert load_protocol(name).name == name
@@ -92,7 +134,13 @@ def test_a_percentage_stays_as_printed() -> None:
             "figure 1: table = 'VI': input should be 'I', 'II', 'III', 'IV', 'V' or 'reasoning'",
         ),
         (WHOLE.replace('"A paper', '"A \\u001b[31m'), ""),
-        ("figure = 3", "'figure' is no list; write each as [[figure]]"),
+        ("figure = 3", "'figure' or 'system' is no list; write each as [[figure]] or [[system]]"),
+        (
+            WHOLE.replace("values", 'system = "bb"\nvalues') + KNOWN,
+            "figure 1: no [[system]] is called 'bb'; did you mean",
+        ),
+        (WHOLE + KNOWN + "seconds = 3\n", "system 1: seconds: extra inputs are not permitted"),
+        (WHOLE + KNOWN.replace("one", ""), "system 1: labels = '': string should have at least 1 character"),
         ("figure = [", "is no TOML"),
         ("more = 1\n" + WHOLE, "more: extra inputs are not permitted"),
         ("x = " + "[" * 3000, "is no TOML"),

@@ -14,10 +14,11 @@ from pathlib import Path
 import pytest
 from measured_rows import measured, measured_instances
 
+from su3d_bench.reports.tables.ablation import SweepRow, ablation_table
 from su3d_bench.reports.tables.formats import FORMATS, csv_text, html_page, markdown
 from su3d_bench.reports.tables.latex import escape, latex, origin_comment, printed_cells
 from su3d_bench.reports.tables.model import Cell, Origin, Prose, Table, TableRow, text_table
-from su3d_bench.reports.tables.paper import Shown, SweepRow, ablation_table, paper_table, protocol_table
+from su3d_bench.reports.tables.paper import Shown, paper_table, protocol_table
 from su3d_bench.reports.tables.published import Figure
 
 HOSTILE = (

@@ -4,23 +4,25 @@ from __future__ import annotations
 
 import csv
 import io
+from dataclasses import replace
 from typing import Any
 
 import pytest
 from measured_rows import SCENES, measured, measured_instances
 
 from su3d_bench.core.errors import ConfigError
+from su3d_bench.reports.tables.ablation import SweepRow, ablation_table
 from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
 from su3d_bench.reports.tables.latex import latex
-from su3d_bench.reports.tables.model import Table
+from su3d_bench.reports.tables.model import Measured, Table
 from su3d_bench.reports.tables.paper import (
     Shown,
-    SweepRow,
-    ablation_table,
     paper_table,
     protocol_table,
     selection_tables,
 )
+
+SEMANTIC = "replica-openmask3d-semantic"
 
 
 def texts(table: Table) -> list[list[str]]:
@@ -34,10 +36,11 @@ def best(table: Table) -> list[list[bool]]:
 def test_measured_and_reported_rows_never_stand_without_a_mark() -> None:
     (table,) = paper_table("II", [measured()], Shown(), with_published=True)
     assert texts(table)[0] == ["opensu3d", "40.0", "20.0"]
-    assert texts(table)[-1] == ["opensu3d (as reported [c])", "42.6", "40.9"]
+    assert texts(table)[-1] == ["opensu3d (as reported [e])", "42.6", "40.9"]
     assert [row.is_reported for row in table.rows] == [False] + [True] * 5
     assert all(cell.origin is None and not cell.is_best for row in table.rows[1:] for cell in row.cells)
-    assert sum(note.startswith("[") and "OpenSU3D" in note for note in table.notes) == 3
+    assert sum(note.startswith("[") and "OpenSU3D" in note for note in table.notes) == 5
+    assert any("frames: every 5th (README at 5c4da70)" in note for note in table.notes)
     for text in (markdown([table]), html_page([table])):
         assert text.count("as reported [") == 5
     assert latex([table]).count("as reported, not measured here") == 1
@@ -62,7 +65,7 @@ def test_missing_scenes_and_partial_runs_are_shown_unasked() -> None:
     seven = measured(per_scene=few, failed=(SCENES[3],))
     table = protocol_table([seven, measured("sam3d", 0.5)], Shown(), [])
     assert [row[-1] for row in texts(table)] == ["7/8", "8"]
-    assert "opensu3d: INCOMPLETE: failed on replica/room3" in table.notes
+    assert f"opensu3d: INCOMPLETE: failed on {SCENES[3]}" in table.notes
     partial = protocol_table([measured(limit=20)], Shown(), [])
     assert texts(partial)[0][-1] == "8 partial"
     assert "opensu3d: PARTIAL: only the first 20 frames of each scene" in partial.notes
@@ -126,7 +129,7 @@ def test_three_scenes_can_make_nothing_significant_and_the_note_says_so() -> Non
     rows = [measured(per_scene=three, n_planned=3), measured("sam3d", 0.9, per_scene=more, n_planned=3)]
     table = protocol_table(rows, Shown(only_significant=True), [])
     assert not any(map(any, best(table)))
-    assert any("p cannot be below 0.25" in note for note in table.notes)
+    assert any("with so few scenes no difference can have p < 0.05 (the least is 0.25)" in note for note in table.notes)
 
 
 def test_one_method_of_two_runs_is_told_apart_by_the_run() -> None:
@@ -154,9 +157,19 @@ def test_a_metric_that_one_row_alone_has_is_a_dash_in_the_others() -> None:
 def test_the_papers_protocol_is_taken_where_it_is_there_and_others_say_that_they_are_not_it() -> None:
     own = measured(protocol="rooms-semantic")
     (table,) = paper_table("II", [own, measured()], Shown(), with_published=False)
-    assert table.caption == "Semantic segmentation on replica, replica-conceptgraphs-ex6."
+    told = "Semantic segmentation on replica, replica-conceptgraphs-ex6"
+    assert table.caption == f"{told}; not the paper's set-up: other perception."
+    whole = measured(profile="paper", encoder="ViT-H-14/laion2b_s32b_b79k")
+    assert paper_table("II", [whole], Shown(), with_published=False)[0].caption == f"{told}."
+    others = [
+        (measured(profile="paper", encoder="ViT-L-14-336/openai"), "encoder"),
+        (measured(profile="paper", limit=20, encoder=whole.encoder), "frames"),
+        (measured(profile="paper", encoder=whole.encoder, per_scene={"replica/kitchen0": {}}), "scenes"),
+    ]
+    for row, other_thing in others:
+        assert paper_table("II", [row], Shown(), with_published=False)[0].caption.endswith(f": other {other_thing}.")
     (other,) = paper_table("II", [own], Shown(), with_published=False)
-    assert other.caption == "Semantic segmentation on replica, rooms-semantic, not the paper's set-up."
+    assert other.caption.endswith("rooms-semantic; not the paper's set-up: other protocol, perception.")
     with pytest.raises(ConfigError, match="Table III: needs AP, AP50, AP25"):
         paper_table("III", [own], Shown(), with_published=False)
 
@@ -168,23 +181,80 @@ def test_every_protocol_of_a_selection_has_a_table_of_its_own() -> None:
     assert [any(row.is_reported for row in table.rows) for table in tables] == [False, True]
 
 
-def test_table_i_marks_the_best_of_each_parameter_and_shows_the_method_itself_in_each() -> None:
-    sweep = [
-        SweepRow("m", "1", "opensu3d@top_m=1"),
-        SweepRow("m", "5", "opensu3d"),
-        SweepRow("k", "3", "opensu3d"),
-        SweepRow("k", "1", "opensu3d@crop_ratios=[1.0]"),
-    ]
-    values = {"opensu3d": 0.4, "opensu3d@top_m=1": 0.3, "opensu3d@crop_ratios=[1.0]": 0.45, "other": 0.9}
-    found = [make(name, value) for name, value in values.items() for make in (measured, measured_instances)]
-    table = ablation_table(found, sweep, Shown(), with_published=True)
+SWEEP = [
+    SweepRow("m", "1", "opensu3d@top_m=1"),
+    SweepRow("m", "5", "opensu3d", is_default=True),
+    SweepRow("k", "3", "opensu3d", is_default=True),
+    SweepRow("k", "1", "opensu3d@crop_ratios=[1.0]"),
+]
+
+
+def swept(scenes: tuple[str, ...], **accuracy: float) -> list[Measured]:
+    """The rows of ``SWEEP`` on some scenes: each a little apart from the method's own, in every scene alike."""
+    names = {"own": "opensu3d", "m1": "opensu3d@top_m=1", "k1": "opensu3d@crop_ratios=[1.0]"}
+    rows = []
+    for short, name in names.items():
+        for make in (measured, measured_instances):
+            row = make(name, accuracy[short])
+            kept = {scene: row.per_scene[scene] for scene in scenes}
+            rows.append(replace(row, per_scene=kept, n_planned=len(scenes)))
+    return [replace(row, protocol=SEMANTIC) if row.kind == "semantic" else row for row in rows]
+
+
+def test_table_i_holds_each_row_against_the_methods_own_with_holms_correction() -> None:
+    table = ablation_table(swept(SCENES, own=0.4, m1=0.3, k1=0.45), SWEEP, Shown(), with_published=True)
     own = [row for row in table.rows if not row.is_reported]
     assert [row.label for row in own] == ["m = 1", "m = 5", "k = 3", "k = 1"]
     assert [cell.text for cell in own[1].cells] == ["40.0", "20.0", "40.0", "40.0", "40.0"]
+    # two other rows: each p of 2 / 2**8 counts twice, then at least as much
+    assert [row.cells[0].beside for row in own] == ["(-10.0, p 0.016)", "", "", "(+5.0, p 0.016)"]
     assert [row.cells[0].is_best for row in own] == [False, True, False, True]
     assert {row.label for row in table.rows if row.is_reported} >= {"m = 10", "ratios = 0.1,1,1.1"}
-    assert latex([table]).count(r"\midrule") == 2 + 3
+    assert latex([table]).count(r"\midrule") == 2 * (2 + 3)  # in two halves, for the width
+    assert any("Holm's correction over the 2 other rows" in note for note in table.notes)
+    assert table.caption == (
+        "Ablation of single parameters on replica, replica-openmask3d-semantic and replica-openmask3d; not the "
+        "paper's set-up: other perception."
+    )
+
+
+def test_table_i_marks_no_best_that_does_not_differ() -> None:
+    rows = swept(SCENES, own=0.4, m1=0.4001, k1=0.45)
+    mixed = {scene: {"mAcc": 0.4 + (0.2 if k % 2 else -0.1), "F-mIoU": 0.2} for k, scene in enumerate(SCENES)}
+    rows = [
+        replace(row, per_scene=mixed) if (row.method, row.kind) == (SWEEP[0].method, "semantic") else row
+        for row in rows
+    ]
+    table = ablation_table(rows, SWEEP, Shown(), with_published=False)
+    assert [row.cells[0].is_best for row in table.rows] == [False, False, False, True]
+    assert [row.cells[2].is_best for row in table.rows] == [True, False, False, True]  # 0.0001 in every scene alike
+
+
+def test_table_i_marks_nothing_where_no_difference_could_be_told_and_says_so_once() -> None:
+    table = ablation_table(swept(SCENES[:6], own=0.4, m1=0.3, k1=0.45), SWEEP, Shown(), with_published=False)
+    assert not any(map(any, best(table)))  # 2 / 2**6 is below 0.05, twice that is not
+    assert sum("No best is marked" in note for note in table.notes) == 1
+    assert any("(the least is 0.062)" in note for note in table.notes)
+
+
+def test_table_i_names_what_is_missing_and_compares_nothing_with_a_row_that_is_not_there() -> None:
+    found = swept(SCENES, own=0.4, m1=0.3, k1=0.45)
+    alone = ablation_table(found, SWEEP[:1], Shown(), with_published=False)
+    assert alone.rows[0].cells[0].beside == "" and any("none is compared" in note for note in alone.notes)
     with pytest.raises(ConfigError, match="Table I: no scores of gone"):
         ablation_table(found, [SweepRow("m", "1", "gone")], Shown(), with_published=False)
     with pytest.raises(ConfigError, match="Table I: needs AP, AP50, AP25"):
-        ablation_table([measured()], sweep, Shown(), with_published=False)
+        ablation_table([measured()], SWEEP, Shown(), with_published=False)
+    few = [
+        replace(row, per_scene={SCENES[0]: row.per_scene[SCENES[0]]}) if row.method == SWEEP[0].method else row
+        for row in found
+    ]
+    other = ablation_table(few, SWEEP, Shown(), with_published=False)
+    assert any("different scenes" in note for note in other.notes) and not any(map(any, best(other)))
+    (half, *_) = ablation_table(
+        [replace(row, protocol="mine") if row.kind == "semantic" else row for row in found],
+        SWEEP,
+        Shown(),
+        with_published=False,
+    ).caption.split(".")
+    assert "mine and replica-openmask3d; not the paper's set-up: other protocol, perception" in half

@@ -17,9 +17,12 @@ from PIL import Image
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, DataError
-from su3d_bench.core.types import Frame
+from su3d_bench.core.types import Frame, Instances
 from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.questions.truths import RefinedNames
+from su3d_bench.questions.files.files import figure_texts
 from su3d_bench.questions.model import new_question
+from su3d_bench.questions.reasoning.asking import built_in
 from su3d_bench.reports.pictures.items import (
     ItemParts,
     Panel,
@@ -35,7 +38,8 @@ from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.executors.local import run_processes
 from su3d_bench.runs.finished import read_run
-from su3d_bench.sheets.drafts import annotation_drafts, built_in, reasoning_drafts, retrieval_drafts
+from su3d_bench.sheets import run_source
+from su3d_bench.sheets.drafts import annotation_drafts, reasoning_drafts, retrieval_drafts
 from su3d_bench.sheets.drawing import Artist, SceneDrafts, _lost, draw_all, draw_scene
 from su3d_bench.sheets.items import (
     ANSWER_COLUMNS,
@@ -212,9 +216,6 @@ def test_labels_are_asked_in_drawn_order_and_equal_ones_once(
     assert {one.stands_for["label 1"] for one in same} <= {("n", "n'"), ("n",)}
     judged = [one for one in same if one.automatic]
     assert judged and all(one.automatic["label 1"] == "right" for one in judged)
-    from su3d_bench.metrics.questions.truths import RefinedNames
-    from su3d_bench.sheets import run_source
-
     names = {"refined_names": lambda job, found: RefinedNames(("<b>lamp</b>",) * len(found), "test")}
     for name, value in names.items():
         monkeypatch.setattr(run_source, name, value)
@@ -225,6 +226,20 @@ def test_labels_are_asked_in_drawn_order_and_equal_ones_once(
         if one.automatic:
             assert {one.stands_for[ask]: one.automatic[ask] for ask in ("label 1", "label 2")} == {
                 ("n",): "right", ("n'",): "wrong"}  # fmt: skip
+
+
+def test_what_labels_n_prime_leave_out_is_asked_about_under_label_n_alone(
+    source: RunSource, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without_first(job: object, found: Instances) -> RefinedNames:
+        return RefinedNames(("lamp",) * len(found), "test", ("'wall' is background", *[""] * (len(found) - 1)))
+
+    n = len(source.scene_map("painted/a", METHODS[0]))
+    monkeypatch.setattr(run_source, "refined_names", without_first)
+    drafts = [one for one in annotation_drafts(source, "painted/a", 50, np.random.default_rng(0)) if 0 in one.rows]
+    assert {one.asks for one in drafts} == {("label 1", "merging")}
+    assert {one.stands_for["label 1"] for one in drafts} == {("n",)}
+    assert len(source.scene_map("painted/a", METHODS[0])) == n - 1
 
 
 def test_answers_that_maps_share_are_judged_once(source: RunSource) -> None:
@@ -357,6 +372,9 @@ def test_a_figure_has_its_words_as_text(
         question = "How many chairs are there?"
         assert main([*words, "--what", "reasoning", "--queries", question, "--out", "answer.svg"]) == 0
         assert question in (folder / "answer.svg").read_text()
+        assert main([*words, "--figure", "schemes", "--out", "schemes.svg"]) == 0
+        assert all(text in (folder / "schemes.svg").read_text() for text in figure_texts("schemes"))
+        assert main([*words, "--what", "labels", "--figure", "schemes", "--out", "x.svg"]) == 2
         assert main([*words, "--what", "labels", "--queries", "a", "--out", "x.svg"]) == 2
         assert main([*words, "--out", "x.svg"]) == 2
         assert main([*words, "--queries", "a", "--out", "x.gif"]) == 2

@@ -147,9 +147,10 @@ def test_labels_and_merging_of_the_paper_come_from_the_blinded_questions() -> No
     found = scored(sheet, key, answered(sheet, key, {"ann": 0.0}))
     people = cells_of(found)
     shares = {metric: cell.value for (_, metric), cell in people.items()}
-    names = ["label n", "label n'", "well-merged", "under-merged", "over-merged"]
+    merges = ["well-merged", "under-merged", "over-merged"]
+    names = ["label n", "label n'", *merges, *(f"{name} n'" for name in merges)]
     assert list(shares) == names
-    assert [shares[name] for name in names] == pytest.approx([2 / 5, 3 / 5, 3 / 5, 1 / 5, 1 / 5])
+    assert [shares[name] for name in names] == pytest.approx([2 / 5, 3 / 5, *2 * [3 / 5, 1 / 5, 1 / 5]])
     assert {cell.n_items for cell in people.values()} == {5}
     (test,) = found.tests
     assert (test.left, test.right) == ("opensu3d label n", "opensu3d label n'")
@@ -161,6 +162,14 @@ def test_labels_and_merging_of_the_paper_come_from_the_blinded_questions() -> No
         "label": (8, 8, "right"),
         "merging": (5, 5, "well-merged"),
     }
+
+
+def test_what_labels_n_prime_leave_out_counts_before_and_not_after() -> None:
+    sheet, key = annotation_set([("right", "right", "well-merged"), ("wrong", "", "over-merged")])
+    people = cells_of(scored(sheet, key, answered(sheet, key, {"ann": 0.0})))
+    names = ("label n", "label n'", "well-merged", "well-merged n'", "over-merged n'")
+    assert [value(people["opensu3d", name]) for name in names] == [0.5, 1.0, 0.5, 1.0, 0.0]
+    assert [people["opensu3d", name].n_items for name in names] == [2, 1, 2, 1, 1]
 
 
 def test_answers_and_objects_of_reasoning_are_counted_apart() -> None:

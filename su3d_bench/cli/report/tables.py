@@ -73,8 +73,9 @@ def call(arguments: argparse.Namespace) -> int:
 
 def _tables(arguments: argparse.Namespace) -> list[Table]:
     from su3d_bench.analysis.tables import choose, is_scores, measured_results
+    from su3d_bench.reports.tables.ablation import ablation_table
     from su3d_bench.reports.tables.judged import JUDGED, judged_table
-    from su3d_bench.reports.tables.paper import Shown, ablation_table, paper_table, selection_tables
+    from su3d_bench.reports.tables.paper import Shown, paper_table, selection_tables
     from su3d_bench.runs.ablation import read_rows
 
     shown = Shown(
@@ -94,7 +95,7 @@ def _tables(arguments: argparse.Namespace) -> list[Table]:
             sweep = [row for run in arguments.runs if not is_scores(run) for row in read_rows(run)]
             tables.append(ablation_table(measured, sweep, shown, with_published=with_published))
         elif number in JUDGED:
-            tables += judged_table(number, measured, shown, with_published=with_published)
+            tables.append(judged_table(number, measured, shown, with_published=with_published))
         else:
             tables += paper_table(number, measured, shown, with_published=with_published)
     return tables

@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from su3d_bench.core.interfaces import Encoder
     from su3d_bench.perception.language.chat import ChatRequest
     from su3d_bench.questions.model import Question
-    from su3d_bench.sheets.drafts import AskMap, Draft
+    from su3d_bench.questions.reasoning.asking import AskMap
+    from su3d_bench.sheets.drafts import Draft
     from su3d_bench.sheets.drawing import PictureSource
     from su3d_bench.sheets.items import SheetKind
     from su3d_bench.sheets.making import Origin
@@ -121,8 +122,8 @@ def call(arguments: argparse.Namespace) -> int:
         sources: dict[SheetKind, RunSource] = {kind: _judgeable(source, kind, arguments.quiet) for kind in of_run}
         if arguments.dry_run:
             return _estimate(sources["reasoning"], left_out, arguments)
-        drafts, answered_by = _drafts(sources, left_out, arguments)
-        origins = {kind: _origin(kind, mine, answered_by) for kind, mine in sources.items()}
+        drafts, made_by = _drafts(sources, left_out, arguments)
+        origins = {kind: _origin(kind, mine, made_by.get(kind, "")) for kind, mine in sources.items()}
         drawn = _drawn(source, source.run.name, drafts, arguments)
     if QUESTIONS in kinds:
         truth = _truth(arguments)
@@ -212,8 +213,8 @@ def _questions(
 
 def _drafts(
     sources: Mapping[SheetKind, RunSource], left_out: Collection[str], arguments: argparse.Namespace
-) -> tuple[dict[SheetKind, list[Draft]], str]:
-    """What is judged, and who answered the questions of reasoning sheets."""
+) -> tuple[dict[SheetKind, list[Draft]], dict[SheetKind, str]]:
+    """What is judged, and who answered the questions of reasoning sheets or made labels n'."""
     import numpy as np
 
     from su3d_bench.sheets.drafts import annotation_drafts, questions_of, reasoning_drafts, retrieval_drafts
@@ -226,11 +227,14 @@ def _drafts(
     needs_encoder = "retrieval" in sources or ("reasoning" in sources and arguments.solver != "llm")
     encoder = source.run.encoder(arguments.device) if needs_encoder else None
     ask, answered_by = _ask_map(source, encoder, arguments) if "reasoning" in sources else (None, "")
+    labelled_by: dict[str, None] = {}
     for scene in source.scenes:  # all kinds of one scene together, for they share its truth
         for kind, mine in sources.items():
             n_most = arguments.per_kind or PER_KIND[kind]
             if kind == "annotation":
                 drafts_of[kind] += annotation_drafts(mine, scene, n_most, random)
+                found = (mine.refined(scene, method) for method in mine.methods)
+                labelled_by |= dict.fromkeys(refined.source for refined in found if refined is not None)
             elif kind == "reasoning":
                 assert ask is not None
                 drafts_of[kind] += reasoning_drafts(mine, scene, given, n_most, ask, left_out)
@@ -241,17 +245,17 @@ def _drafts(
                 drafts_of[kind] += retrieval_drafts(mine, scene, questions, encoder)
     for drafts in drafts_of.values():
         check_split(len(drafts), arguments.annotators, arguments.overlap)
-    return drafts_of, answered_by
+    return drafts_of, {"reasoning": answered_by, "annotation": " and ".join(labelled_by)}
 
 
 def _ask_map(source: RunSource, encoder: Encoder | None, arguments: argparse.Namespace) -> tuple[AskMap, str]:
     """Who answers the questions of reasoning sheets, and how the key calls them."""
-    from su3d_bench.sheets.drafts import built_in, by_language_model
+    from su3d_bench.questions.reasoning.asking import BUILT_IN, built_in, by_language_model
 
     if arguments.solver != "llm":
-        return built_in(encoder), "the built-in solver"
+        return built_in(encoder), BUILT_IN
     client, config = chat_client(arguments, source.run.folder)
-    return by_language_model(client, config), config.text_model
+    return by_language_model(client, config).ask, config.text_model
 
 
 def _estimate(source: RunSource, left_out: Collection[str], arguments: argparse.Namespace) -> int:
@@ -304,12 +308,11 @@ def _drawn(
     return {kind: list(islice(remaining, len(of_kind))) for kind, of_kind in drafts.items()}
 
 
-def _origin(kind: SheetKind, source: RunSource, answered_by: str) -> Origin:
+def _origin(kind: SheetKind, source: RunSource, made_by: str) -> Origin:
     from su3d_bench.sheets.making import Origin
 
     rules = {rules.name for scene in source.scenes if (rules := source.rules(scene, kind)) is not None}
-    by = answered_by if kind == "reasoning" else ""
-    return Origin(source.run.name, source.run.record.code, source.methods, ", ".join(sorted(rules)), by)
+    return Origin(source.run.name, source.run.record.code, source.methods, ", ".join(sorted(rules)), made_by)
 
 
 def _write(

@@ -12,6 +12,7 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError
 NAME = "pictures"
 SUBJECTS = ("similarity", "labels", "reasoning")
 MOST_ROWS = 40  # of one figure
+FIGURES = ("comparison", "schemes", "teaser")  # as questions/files/files.py has them
 
 
 def add_parser(actions: Any) -> None:
@@ -21,7 +22,7 @@ def add_parser(actions: Any) -> None:
         "Draw a figure of a run for print: similarity to texts, labels n and n', or answers with their objects.",
         (
             "su3d-bench sheets pictures runs/my-run --queries 'plant on shelf' 'place to sit' --out heat.pdf",
-            "su3d-bench sheets pictures runs/my-run --what labels --scenes rooms/living0 --out labels.png",
+            "su3d-bench sheets pictures runs/my-run --figure schemes --scenes replica/room0 --out schemes.pdf",
         ),
         call,
     )
@@ -29,6 +30,9 @@ def add_parser(actions: Any) -> None:
     parser.add_argument("--out", type=Path, required=True, metavar="FILE", help="a .pdf, .png or .svg file")
     parser.add_argument("--what", choices=SUBJECTS, default="similarity", help="what is drawn (default: similarity)")
     parser.add_argument("--queries", nargs="+", default=[], metavar="TEXT", help="texts, or questions to be answered")
+    parser.add_argument(
+        "--figure", choices=FIGURES, help="the texts of the paper's figure, or of its page's teaser, before --queries"
+    )
     parser.add_argument("--scenes", nargs="+", default=[], metavar="S", help="rows (default: the run's first scene)")
     parser.add_argument("--methods", nargs="+", default=[], metavar="M", help="columns (default: all of the run)")
     parser.add_argument("--photo", action="store_true", help="a first column with the colours that the frames saw")
@@ -38,13 +42,15 @@ def add_parser(actions: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
+    from su3d_bench.questions.files.files import figure_texts
     from su3d_bench.reports.pictures.figures import draw_grid
     from su3d_bench.reports.pictures.maps import scale_stops
     from su3d_bench.runs.finished import read_run
     from su3d_bench.sheets.figures import Figures
     from su3d_bench.sheets.run_source import RunSource
 
-    texts = [query.strip() for query in arguments.queries]
+    of_figure = () if arguments.figure is None else figure_texts(arguments.figure)
+    texts = [*of_figure, *(query.strip() for query in arguments.queries)]
     if (arguments.what == "labels") == bool(texts) or not all(texts):
         what = "labels take none" if arguments.what == "labels" else f"{arguments.what} needs at least one, not empty"
         raise ConfigError(f"--queries: {what}")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import ClassVar
 
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError
-from su3d_bench.core.interfaces import Encoder
+from su3d_bench.core.interfaces import Encoder, KnowsRelativeTexts
 from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Instances, Int64Array, Partition
 from su3d_bench.metrics.instance.score import NO_OBJECT, Covered, covered_objects, score_of_masks
 from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, text_features
@@ -26,7 +27,9 @@ from su3d_bench.metrics.questions.truths import (
 )
 
 BY_NAME = ("property by name", "relative by name")  # kinds of text to which the name alone is the answer
-WELL_MERGED, UNDER_MERGED, OVER_MERGED = "well-merged", "under-merged", "over-merged"
+MERGES = WELL_MERGED, UNDER_MERGED, OVER_MERGED = "well-merged", "under-merged", "over-merged"
+REFINED_BY, ANSWERED_BY = "n': ", "answers by "  # so begin the remarks that name who did it
+RELATIVE = "relative: "  # so begins the remark on queries of that kind
 
 
 class ShareMetric(Metric[ShareCounts]):
@@ -97,12 +100,17 @@ class RetrievalMetric(ShareMetric):
         is_plain = ~np.isin(kinds, BY_NAME)
         rows["all"], rows["by name"] = is_right[is_plain], is_right[~is_plain]
         rows["reachable"] = np.array([not in_map.isdisjoint(question.answers) for question in truth.asked], bool)
-        warnings = [encoder_warning(self.rules, prediction, encoder)]
+        warnings = [encoder_warning(self.rules, prediction, encoder), _relative_remark(encoder)]
         asked_for = [answer for question in truth.asked for answer in question.answers]
         each = np.array([(question.by_chance, question.by_name) for question in truth.asked]).reshape(-1, 2).T
         cheap = {kind: each[:, kinds == kind] for kind in self.rules.value_names[:4]}
         cheap |= {"all": each[:, is_plain], "by name": each[:, ~is_plain]}
         return self._score(truth.scene, asked_for, prediction, rows, warnings, cheap)
+
+
+def _relative_remark(encoder: object) -> str | None:
+    """What must stand beside figures of relative queries; None where the encoder was not trained on such texts."""
+    return f"{RELATIVE}{encoder.relative_remark}" if isinstance(encoder, KnowsRelativeTexts) else None
 
 
 def first_instances(
@@ -132,7 +140,8 @@ def judge_retrieval(main_object: Int64Array, first: Int64Array, questions: Seque
 class AnnotationMetric(ShareMetric):
     """Are the names n and n' of instances right, and how were their masks merged?
 
-    Judged are instances whose main object is among ``truth.object_ids``; an empty name is a wrong one.
+    Judged are instances whose main object is among ``truth.object_ids``; an empty name is a wrong one. Under n' the map
+    is without the instances that the filter of these labels leaves out, in ``label n'`` and ``well-merged n'`` alike.
     """
 
     truth = AnnotationTruth
@@ -143,16 +152,37 @@ class AnnotationMetric(ShareMetric):
         objects = covered.main_object
         judged = np.flatnonzero(np.isin(objects, truth.object_ids))
         refined = truth.refined(prediction)
-        merges = np.array(judge_merging(self.rules.merging, covered))[judged]
+        names = [""] * len(objects) if refined is None else refined.names
+        kept = np.flatnonzero([] if refined is None else refined.is_kept)
+        still = kept[np.isin(objects[kept], truth.object_ids)]
+        merges = np.array(judge_merging(self.rules.merging, covered), object)
+        after = np.full(len(objects), "", object)
+        after[kept] = judge_merging(self.rules.merging, replace(covered, n_shared=covered.n_shared[kept]))
         rows = {
             "label n": _are_called(truth, labels_n(prediction), objects, judged),
-            "label n'": np.zeros(0, bool) if refined is None else _are_called(truth, refined.names, objects, judged),
-            **{name: merges == name for name in (WELL_MERGED, UNDER_MERGED, OVER_MERGED)},
+            "label n'": _are_called(truth, names, objects, still),
+            **{name: merges[judged] == name for name in MERGES},
+            **{f"{name} n'": after[still] == name for name in MERGES},
         }
-        warnings = ["no label n': the map keeps no names of views" if refined is None else f"n': {refined.source}"]
+        warnings = [
+            "no label n': the map keeps no names of views" if refined is None else f"{REFINED_BY}{refined.source}"
+        ]
+        if refined is not None and len(kept) < len(objects):
+            reasons = ", ".join(dict.fromkeys(reason for reason in refined.left_out if reason))
+            warnings.append(f"n' leaves out {len(objects) - len(kept)} of {len(objects)} instances: {reasons}")
         if len(judged) < len(objects):
             warnings.append("not judged: instances that stand for no object, a small one, or a wall, floor or ceiling")
         return self._score(truth.scene, truth.object_ids, prediction, rows, warnings)
+
+
+def said_by(warnings: Sequence[str], start: str) -> tuple[str, ...]:
+    """What the remarks say that begin with ``start`` behind the name of their scenes; each once.
+
+    >>> said_by(["a/b: n': the vote", "every scene: answers by gpt", "c/d: n': the vote"], REFINED_BY)
+    ('the vote',)
+    """
+    parts = [warning.partition(start) for warning in warnings]
+    return tuple(dict.fromkeys(who for before, _, who in parts if who and (not before or before.endswith(": "))))
 
 
 def labels_n(instances: Instances) -> tuple[str, ...]:
@@ -207,7 +237,9 @@ class ReasoningMetric(ShareMetric):
             "objects": np.array([are_objects_right(*pair, main) for pair in pairs if pair[0].object_ids], bool),
         }
         is_open = any(not given.is_settled for given in answers)
-        warnings = ["questions that the solver could not settle count as wrong"] if is_open else []
+        warnings = [f"{ANSWERED_BY}{truth.solver}"]
+        if is_open:
+            warnings.append("questions that the solver could not settle count as wrong")
         named = [object_id for question in truth.asked for object_id in question.object_ids]
         cheap = {"answer": np.array([(q.by_chance, q.by_name) for q in truth.asked]).reshape(-1, 2).T}
         return self._score(truth.scene, named, prediction, rows, warnings, cheap)

@@ -5,8 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import GroundTruth, Instances, Int64Array
+from su3d_bench.core.types import BoolArray, GroundTruth, Instances, Int64Array
 
 
 @dataclass(frozen=True)
@@ -33,10 +35,19 @@ class RetrievalTruth:
 
 @dataclass(frozen=True)
 class RefinedNames:
-    """Labels n' of a map, one an instance, and who chose them."""
+    """Labels n' of a map, one an instance, and who chose them.
+
+    ``left_out``: why the filter that goes with these labels leaves an instance out, '' where it stays; empty: all stay.
+    """
 
     names: tuple[str, ...]
     source: str
+    left_out: tuple[str, ...] = ()
+
+    @property
+    def is_kept(self) -> BoolArray:
+        """Whether (K,) an instance is one of the map under labels n'."""
+        return np.array([not reason for reason in self.left_out or ("",) * len(self.names)], bool)
 
 
 @dataclass(frozen=True)
@@ -79,8 +90,9 @@ class GivenAnswer:
 
 @dataclass(frozen=True)
 class ReasoningTruth:
-    """Questions with true answers, and the solver that is asked about a map."""
+    """Questions with true answers, and how a map is asked; ``solver`` names who answers."""
 
     scene: GroundTruth
     asked: tuple[TrueAnswer, ...]
     solve: Callable[[Instances, Encoder | None], Sequence[GivenAnswer]]
+    solver: str

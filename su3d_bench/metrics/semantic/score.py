@@ -22,6 +22,7 @@ from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, Values, presen
 from su3d_bench.metrics.protocols import ClassEntry, ProtocolRules
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, SemanticMetrics
+from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.numerics.statistics import nan_mean
 from su3d_bench.store.scratch import row_blocks
 
@@ -190,6 +191,8 @@ def call_points(
         predicted, distance_m = transfer_votes(rules, prediction, classes, targets, is_wanted)
     else:
         owner, rank = _point_owners(prediction, _taking_part(rules, classes, is_scored))
+        if rules.transfer.evaluation_voxel_m > 0 and not transfer.are_same_points(prediction.points, targets):
+            rank = _one_a_voxel(prediction.points, owner, rank, rules.transfer.evaluation_voxel_m)
         mask, distance_m = transfer.transfer_values(prediction.points, owner, rank, targets, is_wanted)
         if rules.transfer.cap_m is not None:
             mask = np.where(distance_m <= rules.transfer.cap_m, mask, -1)
@@ -276,6 +279,17 @@ def _point_owners(prediction: Prediction, takes_part: BoolArray) -> tuple[Int64A
     first = transfer.first_owner(transfer.select(prediction, kept), len(prediction.points))
     owner = np.where(first >= 0, kept[first], -1) if len(kept) else first
     return owner, owner
+
+
+def _one_a_voxel(points: transfer.Points, owner: Int64Array, rank: Int64Array, voxel_m: float) -> Int64Array:
+    """``rank`` (N,) where each object keeps its first point a voxel, -1 for all others."""
+    taking = np.flatnonzero(rank >= 0)
+    voxel = transfer.row_ids(voxel_coordinates(points[taking], voxel_m))
+    n_voxels = int(voxel.max(initial=0)) + 1
+    _, first = np.unique(owner[taking] * n_voxels + voxel, return_index=True)
+    kept = np.full(len(rank), -1, np.int64)
+    kept[taking[first]] = rank[taking[first]]
+    return kept
 
 
 def has_feature(prediction: DenseFeatures) -> BoolArray:

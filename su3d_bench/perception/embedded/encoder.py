@@ -61,6 +61,11 @@ class EmbeddedEncoder:
 
     name = "su3d-embedded"
     dim = DIM
+    # questions/generator.py asks for "cushion on a sofa"; captions.py tells of "cushion on sofa", of the same relations
+    relative_remark = (
+        "relation words and the pattern of these queries are those of the captions that the embedded encoder was "
+        "trained on"
+    )
 
     def __init__(self, folder: Path | None = None, device: str = "cpu") -> None:
         self._folder = Path(__file__).parent / "weights" if folder is None else folder

@@ -9,7 +9,7 @@ from __future__ import annotations
 import ast
 import json
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -79,11 +79,12 @@ class Described:
 
 @dataclass(frozen=True)
 class Answered:
-    """An answer in words, the ids of the objects that it names, the model's reasons."""
+    """An answer in words, the ids of the objects that it names and of what these were held against, the reasons."""
 
     text: str
     object_ids: tuple[int, ...]
     reasons: str
+    reference_ids: tuple[int, ...] = ()
 
 
 def is_refusal(text: str) -> bool:
@@ -137,19 +138,25 @@ def answered(text: str, known_ids: Sequence[int]) -> Answered | None:
         answer = value.get("answer")
         if not isinstance(answer, str | int | float | bool):
             continue
-        ids = value.get("object_ids", value.get("ids", ()))
-        given = [str(value) for value in ids if isinstance(value, int | str)] if isinstance(ids, list) else []
-        numbers = dict.fromkeys(int(value.lstrip("#")) for value in given if re.fullmatch(r"#?\d{1,9}", value))
         reasons = value.get("reasoning", "")
         shown = ("yes" if answer else "no") if isinstance(answer, bool) else str(answer)
+        object_ids = _ids(value.get("object_ids", value.get("ids", ())), known)
         return Answered(
             printable(shown, 1000),
-            tuple(number for number in numbers if number in known),
+            object_ids,
             printable(reasons if isinstance(reasons, str) else "", 2000),
+            tuple(number for number in _ids(value.get("reference_ids", ()), known) if number not in object_ids),
         )
     groups = [match[1] for match in _OBJECT_ID.finditer(plain)]
     numbers = dict.fromkeys(int(number) for group in groups for number in re.findall(r"\d+", group))
     return Answered(printable(plain, 1000), tuple(number for number in numbers if number in known), "")
+
+
+def _ids(listed: Any, known: Collection[int]) -> tuple[int, ...]:
+    """Those of ``listed`` that are ``known``, each once."""
+    given = [str(value) for value in listed if isinstance(value, int | str)] if isinstance(listed, list) else []
+    numbers = dict.fromkeys(int(value.lstrip("#")) for value in given if re.fullmatch(r"#?\d{1,9}", value))
+    return tuple(number for number in numbers if number in known)
 
 
 def clean_name(text: str) -> str | None:

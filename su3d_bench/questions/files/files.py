@@ -11,15 +11,18 @@ import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.questions.files.datasets import is_foreign, read_foreign
 from su3d_bench.questions.files.queries import COLUMNS, MORE_COLUMNS, read_query_rows
-from su3d_bench.questions.model import ALL_KINDS, KINDS, Question, new_question
+from su3d_bench.questions.model import ALL_KINDS, KINDS, REASONING, Question, new_question
 from su3d_bench.store.atomic import write_text
 
 PAPER = Path(__file__).parent / "paper_queries.toml"
+PAGE = "opensu3d.github.io"
+PAPER_FIGURES = ("comparison", "schemes", "teaser")
 
 
 def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ...]:
@@ -57,14 +60,35 @@ def _each_once(questions: Sequence[Question]) -> tuple[Question, ...]:
 
 
 def paper_queries() -> tuple[Question, ...]:
-    """The queries that the paper's page shows, for each of its 13 scenes; no answers are published."""
-    content = tomllib.loads(PAPER.read_text(encoding="utf-8"))
-    kinds_and_texts = [(kind, text) for kind in KINDS for text in content["queries"][kind]]
-    return tuple(
-        new_question(scene, kind, text, None, "opensu3d.github.io")
+    """The queries that the paper's page shows, for each of its 13 scenes, and its questions to reasoning of one scene.
+
+    Of these alone an answer is published, in words.
+    """
+    content = _paper()
+    asked = [(kind, text) for kind in KINDS for text in content["queries"][kind]]
+    asked += [(kind, text) for name in PAPER_FIGURES for kind, text in content["figures"][name]]
+    queries = (
+        new_question(scene, kind, text, None, PAGE)
         for scene in content["scenes"]
-        for kind, text in kinds_and_texts
+        for kind, text in dict.fromkeys(asked)
     )
+    reasoning = (
+        new_question(one["scene"], REASONING, one["text"], None, PAGE, one["reply"]) for one in content["reasoning"]
+    )
+    return (*queries, *reasoning)
+
+
+def figure_texts(figure: str) -> tuple[str, ...]:
+    """The texts of a figure of the paper or its page, one of ``PAPER_FIGURES``, each once.
+
+    >>> figure_texts("teaser")
+    ('a musical instrument', 'which sink is closer to bed?')
+    """
+    return tuple(dict.fromkeys(text for _, text in _paper()["figures"][figure]))
+
+
+def _paper() -> dict[str, Any]:
+    return tomllib.loads(PAPER.read_text(encoding="utf-8"))
 
 
 def check_form(path: Path) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -11,7 +10,10 @@ import numpy as np
 from su3d_bench.core.english import last_word
 from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.types import BoolArray, Float64Array, Instances
+from su3d_bench.metrics.questions.score import labels_n
+from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.numerics.relations import BUILT_IN, FIXTURES, SURFACES, Relation, Relations, is_between, may_be_between
+from su3d_bench.questions.looks import Looks
 
 MOST_NAME, MOST_CAPTION = 80, 400  # characters; a hostile map may hold texts of any length
 
@@ -21,7 +23,8 @@ class MapObject:
     """One instance; ``centroid`` (3,) and ``box`` (2, 3), lowest and highest corner, in metres, z up.
 
     Of a truth: ``is_asked``, whether people can see it well enough to be asked about it; ``is_whole``, whether its box
-    is that of the thing itself and not of what a recording saw; ``is_cut``, whether it ends where the images ended.
+    is that of the thing itself and not of what a recording saw; ``is_cut``, whether it ends where the images ended;
+    ``looks``, of a recording alone.
     """
 
     id: int
@@ -33,6 +36,7 @@ class MapObject:
     is_asked: bool = True
     is_whole: bool = True
     is_cut: bool = False
+    looks: Looks | None = None
 
     @property
     def shown(self) -> str:
@@ -132,13 +136,14 @@ class SceneMap:
         return centre
 
 
-def map_of(instances: Instances, refined: Sequence[str] | None = None) -> SceneMap:
+def map_of(instances: Instances, refined: RefinedNames | None = None) -> SceneMap:
     """The map of ``instances``; names are n' where ``refined`` gives them, else the method's own label, else n.
 
-    Instances without a finite box are left out; without ids of their own they are numbered from 0.
+    What the filter of labels n' leaves out is left out, and so is what has no finite box; without ids of their own
+    instances are numbered from 0.
     """
     k = len(instances)
-    names = _names(instances, refined)
+    names = labels_n(instances) if refined is None else refined.names
     ids = instances.ids if len(instances.ids) else np.arange(k)
     boxes, centroids = instances.boxes.astype(np.float64), instances.centroids.astype(np.float64)
     if boxes.shape != (k, 2, 3) or centroids.shape != (k, 3) or len(ids) != k:
@@ -146,6 +151,7 @@ def map_of(instances: Instances, refined: Sequence[str] | None = None) -> SceneM
     if len(set(ids.tolist())) != k:
         raise PredictionError("this map has two instances of one id, so an answer could name neither")
     is_sound = np.isfinite(boxes).all(axis=(1, 2)) & np.isfinite(centroids).all(axis=1)
+    is_sound &= True if refined is None else refined.is_kept
     return SceneMap(
         tuple(
             MapObject(
@@ -159,10 +165,3 @@ def map_of(instances: Instances, refined: Sequence[str] | None = None) -> SceneM
             for row in np.flatnonzero(is_sound)
         )
     )
-
-
-def _names(instances: Instances, refined: Sequence[str] | None) -> tuple[str, ...]:
-    if refined is not None:
-        return tuple(refined)
-    labels = instances.labels or ("",) * len(instances)
-    return tuple(label or name for label, name in zip(labels, instances.names, strict=True))

@@ -23,6 +23,7 @@ from su3d_bench.perception.language.parsing import Described, answered, chosen_n
 from su3d_bench.perception.language.reply_store import ReplyStore
 from su3d_bench.questions.refined_names import read_records, records_of, write_records
 from su3d_bench.questions.refinement import ModelRefiner, TopNames, top_names, vote
+from su3d_bench.questions.undesired import FilterConfig
 from su3d_bench.store.predictions import prediction_arrays, prediction_from_arrays, write_prediction
 from su3d_bench.store.run_folder import JobFolder
 
@@ -255,10 +256,10 @@ def test_labels_n_prime_belong_to_one_map(tmp_path: Path) -> None:
     assert read_records(job) is None
     write_prediction(job.prediction, seen())
     tops = top_names(seen(), 3)
-    records = records_of(job, [4, 9], tops, [vote(top) for top in tops], "vote", "", 3)
+    records = records_of(job, seen(), tops, [vote(top) for top in tops], "vote", "", 3, FilterConfig())
     path = write_records(job, records)
     assert read_records(job) == records
-    assert records.refined == ("couch", "thing")
+    assert records.refined.names == ("couch", "thing")
     write_prediction(job.prediction, replace(seen(), names=("a", "b")))
     with pytest.raises(StoreError, match="belongs to another map"):
         read_records(job)

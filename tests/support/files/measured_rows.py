@@ -8,7 +8,7 @@ from typing import Any
 
 from su3d_bench.reports.tables.model import Measured
 
-SCENES = tuple(f"replica/room{k}" for k in range(8))
+SCENES = tuple(f"replica/{kind}{k}" for kind, n in (("office", 5), ("room", 3)) for k in range(n))
 
 
 def measured(method: str = "opensu3d", accuracy: float = 0.4, **more: Any) -> Measured:

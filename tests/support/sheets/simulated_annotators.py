@@ -52,13 +52,13 @@ def retrieval_set(
 def annotation_set(truths: Sequence[tuple[str, str, str]], annotators: Sequence[str] = ("ann",)) -> tuple[Sheet, Key]:
     """One instance for each (label n, label n', merging) of the truth; equal labels are asked once.
 
-    Where they are not, label 1 is n' in every other item.
+    Where they are not, label 1 is n' in every other item. An empty label n': these labels leave the instance out.
     """
     items: list[SheetItem] = []
     keys: list[KeyItem] = []
     for k, (first, second, merging) in enumerate(truths):
-        if first == second:
-            stands_for: dict[str, tuple[str, ...]] = {"label 1": ("n", "n'")}
+        if second in ("", first):
+            stands_for: dict[str, tuple[str, ...]] = {"label 1": ("n", "n'") if second else ("n",)}
             automatic = {"label 1": first, "merging": merging}
         elif k % 2:
             stands_for = {"label 1": ("n'",), "label 2": ("n",)}

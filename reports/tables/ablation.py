@@ -1,0 +1,190 @@
+"""Table I of OpenSU3D's paper: a sweep over single parameters, each value held against the method's own."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from su3d_bench.core.errors import ConfigError, counted
+from su3d_bench.numerics.holm import holm
+from su3d_bench.numerics.statistics import sign_flip_test
+from su3d_bench.reports.tables.model import Cell, Measured, Table, TableRow, signed
+from su3d_bench.reports.tables.paper import (
+    LAYOUTS,
+    LEVEL,
+    Layout,
+    Shown,
+    cells_of,
+    nothing_can_be_marked,
+    of_scenes,
+    other_setup,
+    reported_rows,
+    run_notes,
+    units,
+)
+from su3d_bench.reports.tables.published import figures_of
+
+# Table I: all of it in OpenMask3D's set-up, as the paper's text has it.
+SIDES = (Layout(LAYOUTS["II"].metrics, "replica-openmask3d-semantic"), LAYOUTS["III"])
+METRICS = tuple(name for side in SIDES for name in side.metrics)
+
+
+@dataclass(frozen=True)
+class SweepRow:
+    """A value of a parameter as it was asked for, and the method of the run that has it.
+
+    ``is_default`` where the method has it anyway.
+    """
+
+    parameter: str
+    value: str
+    method: str
+    is_default: bool = False
+
+
+def ablation_table(
+    measured: Sequence[Measured], sweep: Sequence[SweepRow], shown: Shown, *, with_published: bool
+) -> Table:
+    """A row for each of ``sweep``, with its difference from the method's own row beside each number.
+
+    Raises ``ConfigError`` where ``measured`` lacks one of its methods, or a protocol of either kind.
+    """
+    parameters = dict.fromkeys(row.parameter for row in sweep)
+    sweep = [row for parameter in parameters for row in sweep if row.parameter == parameter]
+    sides = [_of_protocol(measured, side) for side in SIDES]
+    for side, members in zip(SIDES, sides, strict=True):
+        _refuse_missing(sweep, members, side)
+    looks = [replace(shown, metrics=side.metrics, ceilings=False, scenes_count=False) for side in SIDES]
+    halves = [_half(sweep, members, look) for members, look in zip(sides, looks, strict=True)]
+    rows = [
+        TableRow(f"{member.parameter} = {member.value}", (*left, *right), group=member.parameter)
+        for member, left, right in zip(sweep, *(half.cells for half in halves), strict=True)
+    ]
+    used = [[side[name] for name in dict.fromkeys(row.method for row in sweep)] for side in sides]
+    notes: dict[str, None] = {}
+    for own, look in zip(used, looks, strict=True):
+        notes[f"{', '.join(look.metrics)}: {units(own[0], look)}"] = None
+        labels = [row.method if row.is_whole else f"{row.method} ({row.scenes_text} scenes)" for row in own]
+        notes |= dict.fromkeys(run_notes(own, labels))
+    notes |= dict.fromkeys(note for half in halves for note in half.notes)
+    is_papers = with_published and sweep[0].method.partition("@")[0] == "opensu3d"
+    figures = figures_of(is_wanted=is_papers, table="I")
+    reported, sources = reported_rows(figures, METRICS, len(METRICS))
+    protocols = dict.fromkeys(rows_of[0].protocol for rows_of in used)
+    is_its_protocol = tuple(protocols) == tuple(side.protocol for side in SIDES)
+    setup = other_setup([row for rows_of in used for row in rows_of], is_its_protocol=is_its_protocol)
+    caption = f"Ablation of single parameters on {used[0][0].datasets}, {' and '.join(protocols)}{setup}."
+    return Table("I", caption, "parameter", METRICS, (*rows, *map(_named, reported)), (*notes, *sources))
+
+
+def _of_protocol(measured: Sequence[Measured], side: Layout) -> dict[str, Measured]:
+    """Method -> its numbers under the protocol of that side's set-up, or the first that has its metrics."""
+    fitting = [row for row in measured if all(name in row.metrics for name in side.metrics)]
+    if not fitting:
+        raise ConfigError(f"Table I: needs {', '.join(side.metrics)}; score the sweep under {side.protocol} too")
+    names = [row.protocol for row in fitting]
+    chosen = side.protocol if side.protocol in names else names[0]
+    members: dict[str, Measured] = {}
+    for row in fitting:
+        if row.protocol == chosen and members.setdefault(row.method, row) is not row:
+            raise ConfigError(f"Table I: {row.method} is in {members[row.method].run} and {row.run}; name one of them")
+    return members
+
+
+def _refuse_missing(sweep: Sequence[SweepRow], members: Mapping[str, Measured], side: Layout) -> None:
+    for entry in sweep:
+        if entry.method not in members:
+            raise ConfigError(
+                f"Table I: no scores of {entry.method} for {', '.join(side.metrics)}; run the sweep again, it goes on "
+                "where it stopped"
+            )
+
+
+@dataclass(frozen=True)
+class _Half:
+    """The cells of one side of Table I, a row for each of the sweep, and what must be said of them."""
+
+    cells: list[list[Cell]]
+    notes: tuple[str, ...]
+
+
+def _half(sweep: Sequence[SweepRow], members: Mapping[str, Measured], shown: Shown) -> _Half:
+    own_name = next((row.method for row in sweep if row.is_default), None)
+    if own_name is None:
+        note = "No row has the method's own values, so that none is compared or marked."
+        return _Half([cells_of(members[row.method], shown, set()) for row in sweep], (note,))
+    own = members[own_name]
+    others = [members[name] for name in dict.fromkeys(row.method for row in sweep) if name != own_name]
+    if any((row.scenes, row.limit) != (own.scenes, own.limit) for row in others):
+        note = "The rows are of different scenes or frames, so that none is compared or marked."
+        return _Half([cells_of(members[row.method], shown, set()) for row in sweep], (note,))
+    compared = {name: _compared(own, others, name) for name in shown.metrics}
+    cells = []
+    for entry in sweep:
+        row = members[entry.method]
+        group = [members[member.method] for member in sweep if member.parameter == entry.parameter]
+        best = {name for name in shown.metrics if _is_best(row, own, group, name, compared[name])}
+        cells.append([_beside(cell, compared, name, row) for cell, name in _named_cells(row, shown, best)])
+    smallest = min((one.smallest_p for of_metric in compared.values() for one in of_metric.values()), default=1.0)
+    difference = (
+        f"In parentheses: the mean difference to {own_name} over scenes, in points, and its p (two-sided sign-flip "
+        f"test, Holm's correction over the {counted(len(others), 'other row')} of the sweep, each metric by itself)"
+    )
+    if smallest >= LEVEL:
+        return _Half(cells, (f"{difference}.", nothing_can_be_marked("scenes", smallest)))
+    bold = (
+        f"Bold: the highest of its parameter where p < {LEVEL}; of {own_name} where all others of the parameter differ"
+    )
+    return _Half(cells, (f"{difference}. {bold}.",))
+
+
+@dataclass(frozen=True)
+class _Difference:
+    """From the method's own row: the mean over scenes, and ``p`` and the least possible one after Holm's correction."""
+
+    mean: float
+    p: float
+    smallest_p: float
+
+
+def _compared(own: Measured, others: Sequence[Measured], metric: str) -> dict[str, _Difference]:
+    """Method -> its difference from ``own``, of the others that have a scene in common with it."""
+    changes = {row.method: of_scenes(row, metric) - of_scenes(own, metric) for row in others}
+    tests = {method: test for method, change in changes.items() if (test := sign_flip_test(change)) is not None}
+    adjusted = holm([test.p for test in tests.values()])
+    return {
+        method: _Difference(float(np.nanmean(changes[method])), p, min(1.0, len(tests) * test.smallest_p))
+        for (method, test), p in zip(tests.items(), adjusted, strict=True)
+    }
+
+
+def _is_best(
+    row: Measured, own: Measured, group: Sequence[Measured], metric: str, compared: Mapping[str, _Difference]
+) -> bool:
+    """Whether a row has the highest value of its parameter and stands out."""
+    values = [member.metrics.get(metric) for member in group]
+    known = [value for value in values if value is not None]
+    if len(known) < 2 or row.metrics.get(metric) != max(known):
+        return False
+    rivals = [row] if row is not own else [member for member in group if member is not own]
+    return all(member.method in compared and compared[member.method].p < LEVEL for member in rivals)
+
+
+def _named_cells(row: Measured, shown: Shown, best: set[str]) -> list[tuple[Cell, str]]:
+    return list(zip(cells_of(row, shown, best), shown.metrics, strict=True))
+
+
+def _beside(cell: Cell, compared: Mapping[str, Mapping[str, _Difference]], metric: str, row: Measured) -> Cell:
+    """``cell`` with its difference from the method's own row."""
+    difference = compared[metric].get(row.method)
+    if difference is None:
+        return cell
+    text = f"({signed(difference.mean)}, p {difference.p:.2g})"
+    return replace(cell, beside=f"{cell.beside} {text}".lstrip())
+
+
+def _named(row: TableRow) -> TableRow:
+    parameter, _, value = row.label.partition("=")
+    return replace(row, label=f"{parameter} = {value}", group=parameter)

@@ -1,0 +1,169 @@
+"""What vertices and frames say of a thing in a scan: its sides, and words for its shape, colour and size."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from su3d_bench.questions.generator import generate
+from su3d_bench.questions.looks import BUILDS, SHAPES, Looks, looks_of, measure_of
+from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.questions.sight import COLOURS, TONES, Sight, maybe_colours, tones_of
+
+GENERATOR = np.random.default_rng(0)
+
+
+def slab(length: float, width: float, height: float, degrees: float = 0.0) -> np.ndarray:
+    """Points (4000, 3) of a block, turned about the upright."""
+    points = GENERATOR.uniform(-0.5, 0.5, (4000, 3)) * (length, width, height)
+    turn = np.deg2rad(degrees)
+    rotation = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    return np.asarray(points @ rotation.T)
+
+
+def polygon(n_corners: int, height: float = 0.5) -> np.ndarray:
+    """Points of an upright prism with a regular footprint, 1 m across."""
+    turns = 2 * np.pi * np.arange(n_corners) / n_corners
+    corners = np.stack([np.cos(turns), np.sin(turns)], axis=1) / 2
+    shares = GENERATOR.dirichlet(np.full(n_corners, 0.5), 6000)
+    flat = np.concatenate([shares @ corners, corners])
+    return np.column_stack([flat, np.linspace(0, height, len(flat))])
+
+
+def words_of(name: str, points: np.ndarray, *, is_cut: bool = False) -> Any:
+    """The words for its shape that are sure, and those that may be."""
+    looks = looks_of(name, points, None, is_cut=is_cut)
+    return looks.words & SHAPES, looks.maybe & SHAPES
+
+
+@pytest.mark.parametrize("degrees", [0.0, 30.0, 45.0])
+def test_the_sides_of_a_thing_are_its_own_however_it_is_turned(degrees: float) -> None:
+    sides = looks_of("desk", slab(1.6, 0.8, 0.7, degrees), None, is_cut=False).sides
+    assert sides == pytest.approx([1.6, 0.8, 0.7], abs=0.03)
+
+
+def test_round_square_and_rectangular_faces_have_their_words() -> None:
+    assert words_of("table", polygon(40)) == ({"round"}, {"round"})
+    assert words_of("table", slab(1, 1, 0.7, 20)) == ({"square"}, {"square"})
+    assert words_of("table", slab(1.4, 0.8, 0.7, 20)) == ({"rectangular"}, {"rectangular"})
+
+
+def test_what_is_between_two_shapes_is_neither_for_sure_and_may_be_both() -> None:
+    assert words_of("table", polygon(8)) == (frozenset(), {"round"})  # an octagon
+    assert words_of("table", slab(1.18, 1, 0.7)) == (frozenset(), {"square", "rectangular"})
+    assert words_of("table", polygon(3)) == (frozenset(), frozenset())  # a triangle is none of them
+
+
+def test_a_thing_that_hangs_flat_is_seen_from_the_front() -> None:
+    face = polygon(40)
+    clock = np.column_stack([face[:, 0], GENERATOR.uniform(0, 0.03, len(face)), face[:, 1]])
+    assert words_of("clock", clock) == ({"round"}, {"round"})
+    assert words_of("picture", slab(0.8, 0.02, 0.5))[0] & SHAPES == {"rectangular"}
+
+
+def test_of_what_is_cut_or_small_or_not_said_of_such_things_no_shape_is_told() -> None:
+    assert words_of("table", polygon(40), is_cut=True) == (frozenset(), SHAPES)
+    assert words_of("table", slab(0.15, 0.15, 0.1)) == (frozenset(), SHAPES)
+    assert words_of("chair", slab(0.5, 0.5, 0.9)) == (frozenset(), SHAPES)
+
+
+def test_a_rug_may_go_on_under_the_furniture_so_that_it_is_round_or_nothing_for_sure() -> None:
+    assert words_of("rug", polygon(40, height=0.01))[0] == {"round"}
+    assert words_of("rug", slab(2, 1, 0.01)) == (frozenset(), {"square", "rectangular"})
+
+
+def test_a_colour_is_sure_in_all_lights_and_may_be_what_a_good_part_of_the_pixels_has_in_one() -> None:
+    red, blue = np.tile([200.0, 40.0, 40.0], (70, 1)), np.tile([50.0, 90.0, 180.0], (30, 1))
+    assert maybe_colours([np.concatenate([red, blue])]) == {"red", "blue"}
+    assert maybe_colours([np.concatenate([red, blue[:15]])]) == {"red"}
+    assert maybe_colours([red[:3]]) == COLOURS  # too few pixels to say anything
+    sight = Sight(0.1, "red", True, False, frozenset(("red", "pink")))
+    looks = looks_of("chair", slab(0.5, 0.5, 0.9), sight, is_cut=False)
+    assert looks.words & COLOURS == {"red"} and looks.maybe & COLOURS == {"red", "pink"}
+    assert looks_of("picture", slab(0.8, 0.02, 0.5), sight, is_cut=False).maybe >= COLOURS
+    assert looks_of("chair", slab(0.5, 0.5, 0.9), None, is_cut=False).maybe >= COLOURS  # never seen
+
+
+def test_dark_and_light_things_are_so_in_every_light() -> None:
+    tones: Any = tones_of
+    black, white, grey = (np.tile([float(value)] * 3, (100, 1)) for value in (30, 235, 150))
+    assert tones([black, black * 1.25]) == ({"dark"}, {"dark"})
+    assert tones([white, white / 1.25]) == ({"light-coloured"}, {"light-coloured"})
+    assert tones([grey, grey * 1.25]) == (frozenset(), {"light-coloured"})  # only in more light
+    assert tones([black[:3]]) == (frozenset(), TONES)
+
+
+def test_a_thing_is_long_or_tall_by_itself_where_it_plainly_is() -> None:
+    def build(name: str, *sides: float, is_cut: bool = False) -> Any:
+        looks = looks_of(name, slab(*sides), None, is_cut=is_cut)
+        return looks.words & BUILDS, looks.maybe & BUILDS
+
+    assert build("shelf", 0.8, 0.3, 1.6) == ({"tall"}, {"tall"})
+    assert build("bench", 1.2, 0.4, 0.4) == ({"long"}, {"long"})
+    assert build("shelf", 0.8, 0.5, 1.2) == (frozenset(), {"tall"})
+    assert build("box", 0.4, 0.4, 0.4) == (frozenset(), frozenset())
+    assert build("blanket", 0.2, 0.2, 0.9) == build("door", 0.9, 0.1, 2.0) == (frozenset(), frozenset())
+    assert build("shelf", 0.8, 0.3, 1.6, is_cut=True) == (frozenset(), BUILDS)
+
+
+def test_other_names_of_a_thing_are_asked_with_its_looks_too() -> None:
+    found = asked(thing(1, "sofa", (2.0, 0.8, 0.8), "red"), thing(2, "sofa", (2.0, 0.8, 0.8), "blue"))
+    assert found["red couch"] == found["red sofa"] == ("property", (1,))
+
+
+def thing(one: int, name: str, sides: tuple[float, float, float], words: str = "", maybe: str = "") -> MapObject:
+    low = np.array([4.0 * one, 0, 0])
+    box = np.array([low, low + sides])
+    sure = frozenset(words.split())
+    looks = Looks(np.array(sides), sure, sure | frozenset(maybe.split()))
+    return MapObject(one, name, "", box.mean(axis=0), box, is_whole=False, looks=looks)
+
+
+def asked(*things: MapObject) -> dict[str, tuple[str, tuple[int, ...] | None]]:
+    others = [thing(100 + k, f"thing{k}", (0.5, 0.5, 0.5)) for k in range(12)]
+    questions = generate("a/b", SceneMap((*things, *others)))
+    return {one.text: (one.kind, one.answers) for one in questions if one.kind.startswith("property")}
+
+
+def test_a_word_is_asked_where_it_is_sure_of_the_answers_and_nobody_would_say_it_of_another() -> None:
+    table = (1.0, 1.0, 0.7)
+    pair = thing(1, "table", table, "round red"), thing(2, "table", table, "rectangular", "brown")
+    assert asked(*pair) == {
+        "round table": ("property", (1,)), "red table": ("property", (1,)), "rectangular table": ("property", (2,)),
+    }  # fmt: skip
+    doubtful = thing(2, "table", table, "rectangular", "round red")
+    assert set(asked(pair[0], doubtful)) == {"rectangular table"}
+    assert asked(pair[0])["round table"] == ("property by name", (1,))
+    three = asked(*pair, thing(3, "table", table, "round"))
+    assert three["round table"] == ("property", (1, 3))  # all that it is sure of
+
+
+def test_names_that_end_with_one_word_are_told_apart_by_their_looks_too() -> None:
+    sides = (1.0, 0.6, 0.5)
+    found = asked(thing(1, "coffee table", sides, "round"), thing(2, "side table", sides, "square"))
+    assert found["round table"] == ("property", (1,)) and found["round coffee table"] == ("property by name", (1,))
+
+
+def test_sizes_in_a_scan_are_of_what_the_images_do_not_cut() -> None:
+    small, large = thing(1, "box", (0.3, 0.3, 0.3)), thing(2, "box", (0.4, 0.4, 0.4))
+    assert asked(small, large) == {"large box": ("property", (2,)), "small box": ("property", (1,))}
+    assert asked(small, replace(large, is_cut=True)) == {}
+    assert asked(small, thing(2, "box", (0.37, 0.37, 0.37))) == {}  # 1.9 times the volume
+    assert asked(thing(1, "shelf", (0.8, 0.3, 0.9)), thing(2, "shelf", (0.8, 0.3, 1.6)))["tall shelf"][1] == (2,)
+    assert asked(thing(1, "bench", (1.0, 0.4, 0.4)), thing(2, "bench", (1.6, 0.4, 0.4)))["long bench"][1] == (2,)
+    doors = asked(thing(1, "door", (0.8, 0.1, 2.0)), thing(2, "door", (1.3, 0.1, 2.0)))
+    assert (doors["wide door"][1], doors["narrow door"][1]) == ((2,), (1,)) and "long door" not in doors
+    assert asked(thing(1, "book", (0.3, 0.3, 0.3)), thing(2, "book", (0.4, 0.4, 0.4))) == {}  # a row, perhaps
+
+
+def test_large_is_the_face_of_what_is_flat_and_soft_things_are_neither_long_nor_tall() -> None:
+    flat = looks_of("picture", slab(0.8, 0.02, 0.5), None, is_cut=False)
+    assert measure_of("picture", flat, "large") == pytest.approx(0.4, abs=0.02)
+    block = looks_of("box", slab(0.8, 0.5, 0.5), None, is_cut=False)
+    assert measure_of("box", block, "large") == pytest.approx(0.2, abs=0.01)
+    assert measure_of("box", block, "tall") is not None and measure_of("blanket", block, "tall") is None
+    rug = looks_of("rug", slab(2, 1, 0.02), None, is_cut=False)
+    assert measure_of("rug", rug, "tall") is None and measure_of("rug", rug, "long") == pytest.approx(2, abs=0.03)

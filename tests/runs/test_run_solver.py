@@ -1,0 +1,129 @@
+"""A language model as the solver of a run: asked once, kept with the run, named beside its numbers."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from chat_server import KEY, Answered, Body, ChatServer, chat_server
+from made_sheets import COLLECTOR, PAINTED
+from painted import colour_perception
+
+from su3d_bench.cli.main import main
+from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
+from su3d_bench.questions.reasoning.solver import Solver
+from su3d_bench.runs import resume as finished_scenes
+from su3d_bench.runs import scene as scene_run
+from su3d_bench.store.run_folder import RunFolder
+
+RUN = ["run", "--scenes", f"{PAINTED}/a", "--methods", COLLECTOR, "--no-pictures", "--jobs", "1", "--quiet"]
+ASKED = ["--protocols", "rooms-reasoning"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
+    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("OPENAI_API_KEY", KEY)
+    monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
+    for module in (scene_run, finished_scenes):
+        monkeypatch.setattr(module, "build_perception", colour_perception)
+    return tmp_path
+
+
+@pytest.fixture(scope="module")
+def shared() -> Iterator[ChatServer]:
+    with chat_server() as server:
+        yield server
+
+
+@pytest.fixture
+def server(shared: ChatServer) -> ChatServer:
+    pytest.importorskip("openai", reason="the models extra is not installed")
+    shared.bodies.clear()
+    shared.script.clear()
+    shared.answer = geometry
+    return shared
+
+
+def geometry(body: Body) -> Answered:
+    """What a language model says that reasons as the built-in solver does, in words alone."""
+    listed, _, question = body["messages"][-1]["content"].partition("\n\nQuestion: ")
+    lines = [json.loads(line) for line in listed.splitlines() if line.startswith("{")]
+    scene = SceneMap(
+        tuple(
+            MapObject(
+                line["ID"], line["Name"], "", np.array(line["Centroid"]), np.array(line["Bounding Box"], np.float64)
+            )
+            for line in lines
+        )
+    )
+    found = Solver(scene).answer(question)
+    value = {True: "yes", False: "no"}.get(found.value) if isinstance(found.value, bool) else found.value
+    words = found.text if value is None else str(value)
+    told = {"answer": words, "object_ids": found.object_ids, "reference_ids": found.reference_ids}
+    return Answered(json.dumps(told))
+
+
+def llm(server: ChatServer, *more: str) -> list[str]:
+    settings = {"base_url": server.url, "text_model": "tiny", "max_retries": 0, "backoff_s": 0.001}
+    told = [f"perception.language.{name}={value}" for name, value in settings.items()]
+    return [*RUN, *ASKED, "--solver", "llm", "--out", "run", *more, "--set", *told]
+
+
+def result(folder: Path) -> Any:
+    (found,) = json.loads((folder / "metrics.json").read_text())["results"]
+    return found["result"]
+
+
+def test_a_language_model_answers_in_a_run_and_its_replies_are_asked_for_once(
+    folder: Path, server: ChatServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main([*RUN, *ASKED, "--out", "geometry"]) == 0
+    assert main(llm(server)) == 0
+    by_geometry, by_model = result(folder / "geometry"), result(folder / "run")
+    assert by_model["metrics"] == by_geometry["metrics"]
+    assert by_model["metrics"]["n_answer"] > 5
+    assert by_geometry["warnings"][0] == "painted/a: answers by the built-in solver"
+    assert by_model["warnings"][0] == "painted/a: answers by the language model tiny"
+    n_asked = server.n_asked
+    assert n_asked == len(list((folder / "run" / "language").glob("*.json")))
+    metrics = (folder / "run" / "metrics.json").read_bytes()
+    RunFolder(folder / "run").job("painted/a", "collector").counts.unlink()  # to be scored again
+    assert main(llm(server, "--offline")) == 0
+    assert (server.n_asked, (folder / "run" / "metrics.json").read_bytes()) == (n_asked, metrics)
+    capsys.readouterr()
+    assert main(["report", "tables", "geometry", "run", "--table", "reasoning", "--format", "markdown"]) == 0
+    table = capsys.readouterr().out
+    assert "answers by the built-in solver, ground truth" in table
+    assert "answers by the language model tiny, ground truth" in table
+    assert table.count("70 questions over Replica and ScanNet together") == 2
+
+
+def test_another_solver_scores_the_same_map_again(folder: Path, server: ChatServer) -> None:
+    assert main([*RUN, *ASKED, "--out", "run"]) == 0
+    seal = folder.joinpath("run").rglob("prediction.npz")
+    made = {path: path.stat().st_mtime_ns for path in seal}
+    server.answer = lambda body: Answered('{"answer": "I cannot determine this", "object_ids": []}')
+    assert main(llm(server)) == 0
+    assert result(folder / "run")["metrics"]["answer"] == 0.0
+    assert "painted/a: questions that the solver could not settle count as wrong" in result(folder / "run")["warnings"]
+    assert {path: path.stat().st_mtime_ns for path in made} == made
+
+
+def test_offline_answers_from_the_kept_replies_alone(
+    folder: Path, server: ChatServer, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(llm(server, "--offline")) == 2
+    assert "holds no reply to this ask request of model 'tiny'" in capsys.readouterr().err
+    assert server.n_asked == 0
+
+
+def test_a_solver_that_nobody_asks_is_refused(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*RUN, "--protocols", "rooms-instance", "--solver", "llm"]) == 2
+    assert "--solver llm: answers the questions of reasoning protocols; add such as" in capsys.readouterr().err
