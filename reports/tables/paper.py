@@ -18,6 +18,7 @@ from su3d_bench.reports.tables.model import (
     Table,
     TableRow,
     bracketed,
+    few_scenes,
     is_count,
     percent,
     some,
@@ -142,6 +143,8 @@ def units(row: Measured, shown: Shown) -> str:
     interval = ""
     if shown.intervals:
         interval = f"; in brackets the 95 % interval over {'items' if row.is_by_people else 'scenes'}"
+        rough = None if row.is_by_people else few_scenes(len(row.scenes))
+        interval += f" ({rough})" if rough else ""
     ceiling = "; ceil.: what the truth itself scores" if shown.ceilings else ""
     return f"Protocol {row.protocol}, version {row.version}, on {row.datasets}; per cent{interval}{ceiling}."
 

@@ -6,7 +6,16 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from su3d_bench.reports.tables.formats import markdown
-from su3d_bench.reports.tables.model import NOT_MEASURED, Prose, Table, percent, some, text_table, with_interval
+from su3d_bench.reports.tables.model import (
+    NOT_MEASURED,
+    Prose,
+    Table,
+    few_scenes,
+    percent,
+    some,
+    text_table,
+    with_interval,
+)
 
 # What stands below the methods: the prefix of a metric's name, and what the row is called.
 CHEAP = {"chance": "by chance", "names-alone": "by names alone"}
@@ -51,6 +60,8 @@ def _protocol_table(rows: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any
     body = [[row["method"], *(_value_text(row, name) for name in names), *_context(row, names)] for row in rows]
     body += _cheap_rows(rows, names, len(header))
     notes = [line for row in rows for line in _notes(row)]
+    n_scenes = [row["result"]["n_scenes"] for row in rows if row["result"] and any(row["result"]["intervals"].values())]
+    notes += [line for line in (few_scenes(min(n_scenes, default=0)),) if line]
     return text_table(str(first["protocol"]), [header, *body], heading=title, notes=notes)
 
 

@@ -9,9 +9,8 @@ from itertools import combinations
 import numpy as np
 
 from su3d_bench.core.types import Float64Array, Int64Array
-from su3d_bench.numerics.statistics import bootstrap_interval
+from su3d_bench.numerics.statistics import DIFFERENCE, Interval, jackknife_interval, leave_one_out
 
-Interval = tuple[float, float]
 Ratings = Mapping[str, Mapping[str, str]]  # item -> annotator -> answer
 
 
@@ -31,7 +30,7 @@ class Agreement:
     """What can be said of one question: its items with two answers or more, and the coefficients over them.
 
     ``fleiss`` is of the ``n_fleiss`` items with ``n_raters`` answers each, the number that most of them have. ``alpha``
-    is Krippendorff's for nominal data, of all; its ``interval`` is over resampled items. None: undefined, for want of
+    is Krippendorff's for nominal data, of all; its ``interval`` is over items. None: undefined, for want of
     items or because nobody ever chose a second answer.
     """
 
@@ -60,7 +59,9 @@ def agreement(ratings: Ratings) -> Agreement:
     alpha = krippendorff_alpha(counts)
     interval = None
     if alpha is not None:
-        interval = bootstrap_interval(lambda weights: _alphas(counts, weights), len(counts))
+        # Fleiss and Davies, Jackknifing functions of multinomial frequencies, Am. J. of Epidemiology 115 (1982)
+        values = _alphas(counts, leave_one_out(len(counts)))
+        interval = jackknife_interval(values, bounds=DIFFERENCE)
     return Agreement(
         n_annotators=len(annotators),
         n_items=len(counts),
