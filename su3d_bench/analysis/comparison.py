@@ -349,17 +349,24 @@ def _remarks(left: FinishedRun, right: FinishedRun, methods: Set[str]) -> list[s
             lines.append(f"PARTIAL: {run} has only the first {side.limit} frames of each scene")
         if side.is_incomplete:
             lines.append(f"INCOMPLETE: {run} lacks scenes that failed")
-    changed = []
-    for path in dict.fromkeys([*left.settings, *right.settings]):
-        pair = (left.settings.get(path, "not set"), right.settings.get(path, "not set"))
-        is_aside = path[0] in _SETTINGS_ASIDE or (path[0] == "method" and methods.isdisjoint(path[1:2]))
-        if not is_aside and pair[0] != pair[1]:
-            changed.append(printable(f"{'.'.join(path)} {pair[0]} and {pair[1]}", 120))
-    if changed:
+    if changed := settings_that_differ(left, right, methods):
         lines.append("settings that differ: " + "; ".join(changed[:6]) + _more(len(changed) - 6))
     if left.record.code != right.record.code:
         lines.append("the runs were made by different versions of the code")
     return lines
+
+
+def settings_that_differ(
+    left: FinishedRun, right: FinishedRun, methods: Set[str], aside: Sequence[str] = ()
+) -> list[str]:
+    """What moves numbers and is set otherwise in the two runs, with both values, but for the keys ``aside``."""
+    changed = []
+    for path in dict.fromkeys([*left.settings, *right.settings]):
+        pair = (left.settings.get(path, "not set"), right.settings.get(path, "not set"))
+        is_aside = path[0] in _SETTINGS_ASIDE or (path[0] == "method" and methods.isdisjoint(path[1:2]))
+        if not is_aside and ".".join(path) not in aside and pair[0] != pair[1]:
+            changed.append(printable(f"{'.'.join(path)} {pair[0]} and {pair[1]}", 120))
+    return changed
 
 
 def _some(names: Sequence[str]) -> str:
