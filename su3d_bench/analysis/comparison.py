@@ -155,7 +155,7 @@ class SideNumbers:
 
 @dataclass(frozen=True)
 class OverScenes:
-    """``without_each``: each headline metric (1 + S,) over all scenes, then without each in turn."""
+    """``without_each``: each headline metric (1 + G,) over all scenes, then without each in turn."""
 
     result: ProtocolResult
     counts: Sequence[Counts]
@@ -295,7 +295,7 @@ def form_difference(
     right_of_scene: Float64Array,
     without_each: Float64Array,
 ) -> Difference:
-    """The difference of one value; ``without_each`` (1 + S,) holds it over all scenes, then without each in turn."""
+    """The difference of one value; ``without_each`` (1 + G,) holds it over all scenes, then without each in turn."""
     differences: Float64Array = right_of_scene - left_of_scene
     numbers = differences[~np.isnan(differences)]
     return Difference(

@@ -22,7 +22,7 @@ from su3d_bench.numerics.power import (
     variance_of,
     variance_range,
 )
-from su3d_bench.numerics.statistics import NO_SPREAD, Interval, pseudo_values
+from su3d_bench.numerics.statistics import NO_SPREAD, Interval, has_part, pseudo_values
 from su3d_bench.runs.finished import FinishedRun, read_run
 
 SCHEMA = 1
@@ -174,9 +174,10 @@ def _refuse_other_requests(sides: Sequence[tuple[Side, Side]]) -> None:
 def _plan_metric(
     without_each: Float64Array, of_scenes: Float64Array, points: Sequence[float], power: float
 ) -> MetricPlan:
-    """``without_each`` (R, 1 + S) of each run's difference, ``of_scenes`` (R, S) that of each scene alone."""
-    has_part: BoolArray = (~np.isnan(of_scenes) | (without_each[:, 1:] != without_each[:, :1])).any(axis=0)
-    pseudo = np.array([pseudo_values(np.append(row[0], row[1:][has_part])) for row in without_each])
+    """``without_each`` (R, 1 + G) of each run's difference, ``of_scenes`` (R, S) that of each scene alone."""
+    rows = list(zip(without_each, ~np.isnan(of_scenes), strict=True))
+    is_part: BoolArray = np.array([has_part(*row) for row in rows]).any(axis=0)
+    pseudo = np.array([pseudo_values(values, is_part) for values, _ in rows])
     difference = float(without_each[:, 0].mean())
     if pseudo.shape[1] < 2 or not np.isfinite(pseudo).all():
         return MetricPlan(difference, None, None, ())

@@ -14,6 +14,7 @@ from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 LEVEL = 0.95
 ALPHA = 0.05  # a two-sided p below it is called a difference
 FEW_SCENES = 10  # below it an interval is said to be rough: docs/statistics.md shows how often it holds the truth
+MOST_GROUPS = 500  # scenes that are left out one by one; ScanNet's validation has 312
 NO_SPREAD = 1e-12  # pseudo-values of fractions that differ by less differ by rounding
 SEED = 0
 N_RESAMPLES = 1000  # of the blocks of a growth's slope
@@ -26,30 +27,49 @@ SHARE, DIFFERENCE = (0.0, 1.0), (-1.0, 1.0)  # between which a fraction lies, an
 Interval = tuple[float, float]
 
 
+def _group_of_scene(n_scenes: int) -> Int64Array:
+    """With which scenes each (S,) is left out: alone, or with those that stand ``MOST_GROUPS`` after it."""
+    return np.arange(n_scenes) % min(n_scenes, MOST_GROUPS)
+
+
 @lru_cache(maxsize=1)  # every method and protocol of a run asks for the same
 def leave_one_out(n_scenes: int) -> Int64Array:
-    """How often each scene is counted (1 + S, S): all of them, then all but the first, and so on; read-only.
+    """How often each scene is counted (1 + G, S): all of them, then all but the first, and so on; read-only.
+
+    More than ``MOST_GROUPS`` scenes are left out in as many groups: each has a part in one of them.
 
     >>> leave_one_out(2).tolist()
     [[1, 1], [0, 1], [1, 0]]
     """
-    weights: Int64Array = np.concatenate([np.ones((1, n_scenes)), 1 - np.eye(n_scenes)]).astype(np.int64)
+    groups = np.arange(min(n_scenes, MOST_GROUPS))
+    left_out = groups[:, None] == _group_of_scene(n_scenes)
+    weights: Int64Array = np.concatenate([np.ones((1, n_scenes), bool), ~left_out]).astype(np.int64)
     weights.flags.writeable = False
     return weights
 
 
-def pseudo_values(values: Float64Array, has_value: BoolArray | None = None) -> Float64Array:
-    """Tukey's jackknife pseudo-value of each scene that has a part in a number, from ``values`` (1 + S,).
+def has_part(values: Float64Array, has_value: BoolArray) -> BoolArray:
+    """Which of the G scenes, or groups of them, have a part in a number, from its ``values`` (1 + G,) without each.
 
-    The first value is of all scenes, the others are of all but one. Where ``has_value`` (S,) is given, a scene has a
-    part that has a value of its own or without which the number is another.
-    Source: Miller, The jackknife: a review, Biometrika 61 (1974), equation 2.2.
+    One has that holds a scene with a value of its own, as ``has_value`` (S,) says, or without which the number is
+    another.
+    """
+    n_with_value = np.bincount(_group_of_scene(len(has_value)), weights=has_value, minlength=len(values) - 1)
+    is_part: BoolArray = (n_with_value > 0) | (values[1:] != values[0])
+    return is_part
+
+
+def pseudo_values(values: Float64Array, is_part: BoolArray | None = None) -> Float64Array:
+    """Tukey's jackknife pseudo-values of a number, from its ``values`` (1 + G,): over all, then without each scene.
+
+    Of scenes that have no part in it, as ``is_part`` (G,) says, there is none.
+    Source: Miller, The jackknife: a review, Biometrika 61 (1974), equation 2.2; groups of scenes are in it too.
 
     >>> pseudo_values(np.array([0.5, 0.6, 0.4])).round(12).tolist()  # of a mean they are the values themselves
     [0.4, 0.6]
     """
     whole, left_out = values[0], values[1:]
-    kept = left_out if has_value is None else left_out[has_value | (left_out != whole)]
+    kept = left_out if is_part is None else left_out[is_part]
     pseudo: Float64Array = len(kept) * whole - (len(kept) - 1) * kept
     return pseudo
 
@@ -61,11 +81,12 @@ def jackknife_interval(
     bounds: Interval = SHARE,
     level: float = LEVEL,
 ) -> Interval | None:
-    """The t interval around a number over scenes, its standard error from the pseudo-values of ``values`` (1 + S,).
+    """The t interval around a number over scenes, its standard error from the pseudo-values of ``values`` (1 + G,).
 
-    It is around the value itself rather than the mean of the pseudo-values, which covers the truth less often at few
-    scenes (benchmarks/coverage_of_intervals.py has both). It ends at ``bounds``. None for a single scene, where a scene
-    left out leaves nothing to score, and where the scenes do not differ, which tells nothing of others.
+    With ``has_value`` (S,) scenes that have no part in the number are left aside. It is around the value itself rather
+    than the mean of the pseudo-values, which covers the truth less often at few scenes
+    (benchmarks/coverage_of_intervals.py has both), and ends at ``bounds``. None for a single scene, where a scene left
+    out leaves nothing to score, and where the scenes do not differ, which tells nothing of others.
     Source: Efron and Tibshirani, An Introduction to the Bootstrap (1993), chapter 11; the t quantile after Tukey.
 
     >>> means = np.array([0.5, 0.55, 0.5, 0.45])  # of 0.4, 0.5 and 0.6, and without each of them
@@ -73,7 +94,7 @@ def jackknife_interval(
     >>> round(low, 4), round(high, 4)
     (0.2516, 0.7484)
     """
-    pseudo = pseudo_values(values, has_value)
+    pseudo = pseudo_values(values, None if has_value is None else has_part(values, has_value))
     if len(pseudo) < 2 or not np.isfinite(pseudo).all():
         return None
     spread = float(pseudo.std(ddof=1))

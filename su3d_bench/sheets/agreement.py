@@ -60,7 +60,7 @@ def agreement(ratings: Ratings) -> Agreement:
     interval = None
     if alpha is not None:
         # Fleiss and Davies, Jackknifing functions of multinomial frequencies, Am. J. of Epidemiology 115 (1982)
-        values = _alphas(counts, leave_one_out(len(counts)))
+        values = krippendorff_alphas(counts, leave_one_out(len(counts)))
         interval = jackknife_interval(values, bounds=DIFFERENCE)
     return Agreement(
         n_annotators=len(annotators),
@@ -123,10 +123,10 @@ def krippendorff_alpha(counts: Int64Array) -> float | None:
     pairable = counts[counts.sum(axis=1) >= 2]
     if not len(pairable) or np.count_nonzero(pairable.sum(axis=0)) < 2:
         return None
-    return float(_alphas(pairable, np.ones((1, len(pairable)), np.int64))[0])
+    return float(krippendorff_alphas(pairable, np.ones((1, len(pairable)), np.int64))[0])
 
 
-def _alphas(counts: Int64Array, weights: Int64Array) -> Float64Array:
+def krippendorff_alphas(counts: Int64Array, weights: Int64Array) -> Float64Array:
     """Alpha for each row of how often each item is drawn (R, N); NaN where only one answer is left."""
     sizes = counts.sum(axis=1)
     # o_cc, the diagonal of the coincidence matrix: ordered pairs of equal answers in an item, over its size less one

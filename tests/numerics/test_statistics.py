@@ -15,6 +15,8 @@ from su3d_bench.metrics.instance import resampling
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.numerics.statistics import (
     DIFFERENCE,
+    MOST_GROUPS,
+    has_part,
     holm,
     jackknife_interval,
     leave_one_out,
@@ -95,6 +97,24 @@ def test_wilson_s_interval_is_that_of_scipy(n_right: int, n: int, low: float, hi
 def test_a_quantile_of_infinite_freedom_is_the_normal_one() -> None:
     assert t_quantile(0.975, np.inf) == pytest.approx(scipy.stats.norm.ppf(0.975), rel=1e-12)
     assert t_quantile(0.9, 5.5) == pytest.approx(scipy.stats.t.ppf(0.9, 5.5), rel=1e-9)
+
+
+def test_very_many_scenes_are_left_out_in_groups_and_give_nearly_the_same() -> None:
+    rng = np.random.default_rng(4)
+    values = rng.random(1700)
+    weights = leave_one_out(1700)
+    assert weights.shape == (1 + MOST_GROUPS, 1700)
+    assert ((weights == 0).sum(axis=0) == 1).all()  # each scene is left out once
+    found = jackknife_interval(weights @ values / weights.sum(axis=1), np.ones(1700, bool))
+    np.testing.assert_allclose(found or (0, 0), mean_interval(values) or (1, 1), atol=0.002)
+
+
+def test_a_group_has_a_part_where_one_of_its_scenes_has() -> None:
+    has_value = np.zeros(MOST_GROUPS + 2, bool)
+    has_value[[1, MOST_GROUPS]] = True  # the latter stands in the first group
+    values = np.full(1 + MOST_GROUPS, 0.5)
+    values[3] = 0.4
+    assert np.flatnonzero(has_part(values, has_value)).tolist() == [0, 1, 2]
 
 
 # ---- many at once
