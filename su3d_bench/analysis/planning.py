@@ -176,7 +176,7 @@ def _plan_metric(
 ) -> MetricPlan:
     """``without_each`` (R, 1 + G) of each run's difference, ``of_scenes`` (R, S) that of each scene alone."""
     rows = list(zip(without_each, ~np.isnan(of_scenes), strict=True))
-    is_part: BoolArray = np.array([has_part(*row) for row in rows]).any(axis=0)
+    is_part: BoolArray = np.asarray(np.any([has_part(*row) for row in rows], axis=0))
     pseudo = np.array([pseudo_values(values, is_part) for values, _ in rows])
     difference = float(without_each[:, 0].mean())
     if pseudo.shape[1] < 2 or not np.isfinite(pseudo).all():
