@@ -9,7 +9,7 @@ from functools import partial
 import numpy as np
 
 from su3d_bench.core.errors import ConfigError, printable, suggest
-from su3d_bench.numerics.statistics import SignFlipTest, sign_flip_test
+from su3d_bench.numerics.statistics import SignFlipTest, holm, sign_flip_test
 from su3d_bench.reports.tables.model import (
     NOT_MEASURED,
     Cell,
@@ -207,7 +207,7 @@ def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int
     if len({(rows[k].scenes, rows[k].limit) for k in competing}) > 1:
         return {}, "The rows are of different scenes or frames, so that none is marked as the best."
     marked: dict[str, set[int]] = {}
-    tests: list[SignFlipTest | None] = []
+    tests: dict[str, SignFlipTest | None] = {}
     for name in shown.metrics:
         values = np.array([np.nan if row.metrics.get(name) is None else row.metrics[name] for row in rows], np.float64)
         order = sorted(competing, key=lambda k: -np.nan_to_num(values[k], nan=-1.0))
@@ -215,17 +215,19 @@ def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int
             continue
         best = {k for k in competing if percent(rows[k].metrics.get(name)) == percent(float(values[order[0]]))}
         if shown.only_significant:
-            test = sign_flip_test(_of_scenes(rows[order[0]], name) - _of_scenes(rows[order[1]], name))
-            tests.append(test)
-            best = best if len(best) == 1 and test is not None and test.p < LEVEL else set()
+            tests[name] = sign_flip_test(_of_scenes(rows[order[0]], name) - _of_scenes(rows[order[1]], name))
         if len(best) < len(competing):
             marked[name] = best
     if not shown.only_significant:
         return marked, "Bold: the highest measured value." if any(marked.values()) else None
-    smallest = min((test.smallest_p for test in tests if test is not None), default=1.0)
+    for name, p in zip(tests, holm([None if test is None else test.p for test in tests.values()]), strict=True):
+        if name in marked and (len(marked[name]) > 1 or p is None or p >= LEVEL):
+            marked[name] = set()
+    smallest = min((test.smallest_p for test in tests.values() if test is not None), default=1.0)
+    corrected = f", corrected by Holm for {len(tests)} metrics" if len(tests) > 1 else ""
     return marked, (
         "Bold: the highest measured value where it differs from the second (two-sided sign-flip test over scenes, "
-        f"p < {LEVEL}; with these scenes p cannot be below {smallest:.2g})."
+        f"p < {LEVEL}{corrected}; with these scenes p cannot be below {smallest:.2g})."
     )
 
 

@@ -9,7 +9,7 @@ from itertools import combinations
 import numpy as np
 
 from su3d_bench.core.types import Float64Array, Int64Array
-from su3d_bench.numerics.statistics import DIFFERENCE, Interval, jackknife_interval, leave_one_out
+from su3d_bench.numerics.statistics import DIFFERENCE, LEAST_ITEMS, Interval, jackknife_interval, leave_one_out
 
 Ratings = Mapping[str, Mapping[str, str]]  # item -> annotator -> answer
 
@@ -30,8 +30,8 @@ class Agreement:
     """What can be said of one question: its items with two answers or more, and the coefficients over them.
 
     ``fleiss`` is of the ``n_fleiss`` items with ``n_raters`` answers each, the number that most of them have. ``alpha``
-    is Krippendorff's for nominal data, of all; its ``interval`` is over items. None: undefined, for want of
-    items or because nobody ever chose a second answer.
+    is Krippendorff's for nominal data, of all; its ``interval`` is over items, of at least ten. None: undefined, for
+    want of items or because nobody ever chose a second answer.
     """
 
     n_annotators: int
@@ -58,7 +58,7 @@ def agreement(ratings: Ratings) -> Agreement:
     even = counts[sizes == n_raters]
     alpha = krippendorff_alpha(counts)
     interval = None
-    if alpha is not None:
+    if alpha is not None and len(counts) >= LEAST_ITEMS:
         # Fleiss and Davies, Jackknifing functions of multinomial frequencies, Am. J. of Epidemiology 115 (1982)
         values = krippendorff_alphas(counts, leave_one_out(len(counts)))
         interval = jackknife_interval(values, bounds=DIFFERENCE)

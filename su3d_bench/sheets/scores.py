@@ -17,7 +17,14 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.types import Float64Array, Int64Array
-from su3d_bench.numerics.statistics import DIFFERENCE, Interval, mean_interval, share_interval, sign_flip_test
+from su3d_bench.numerics.statistics import (
+    DIFFERENCE,
+    LEAST_ITEMS,
+    Interval,
+    mean_interval,
+    share_interval,
+    sign_flip_test,
+)
 from su3d_bench.questions.model import ALL_KINDS
 from su3d_bench.sheets.agreement import Agreement, agreement, cohen_kappa
 from su3d_bench.sheets.answers import LABELS, Judgement
@@ -297,7 +304,7 @@ def _test(
         dataset=dataset,
         metric=metric,
         difference=float(changes.mean()) if len(changes) else 0.0,
-        interval=mean_interval(changes, DIFFERENCE),
+        interval=mean_interval(changes, DIFFERENCE) if len(changes) >= LEAST_ITEMS else None,
         n_items=len(changes),
         n_differ=int(np.count_nonzero(changes)),
         p=p,
