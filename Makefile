@@ -24,6 +24,7 @@ proofs: $(VENV)/test
 	$(BIN)/python -m pytest -q -n auto -m proof
 	SU3D_FUZZ_EXAMPLES=60 $(BIN)/python -m pytest -q -n auto tests/fuzz
 	$(BIN)/python benchmarks/fuzz.py --inputs 100000 --seed 1 --json build/measured/fuzz.json
+	$(BIN)/python benchmarks/coverage_of_intervals.py
 	$(BIN)/python benchmarks/kill_at_random.py --kills 200 --json build/measured/kills.json
 	if [ "$$(id -u)" = 0 ]; then $(BIN)/python benchmarks/full_disk.py --disks 20; fi
 

@@ -6,9 +6,18 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from su3d_bench.core.errors import counted
-from su3d_bench.reports.tables.model import NOT_MEASURED, Prose, Table, bracketed, percent, signed, text_table
+from su3d_bench.reports.tables.model import (
+    NOT_MEASURED,
+    Prose,
+    Table,
+    bracketed,
+    few_scenes,
+    percent,
+    signed,
+    text_table,
+)
 
-MANY_CLASSES = "p of single classes are not corrected for the number of classes: a few are small by chance"
+HEADER = ["p", "p of all", "smallest p", "better / equal / worse", "A", "B", "B - A", "mean over scenes"]
 
 
 def comparison_tables(comparison: Mapping[str, Any]) -> list[Table | Prose]:
@@ -23,7 +32,7 @@ def _protocol_parts(compared: Mapping[str, Any]) -> list[Table | Prose]:
     left, right, name = compared["left"], compared["right"], compared["protocol"]
     pair = left if left == right else f"{left} (A), {right} (B)"
     title = f"{name} (version {compared['version']}): {pair}, {counted(len(compared['scenes']), 'scene')}"
-    header = ["metric", "A", "B", "B - A", "mean over scenes", "p", "smallest p", "better / equal / worse"]
+    header = ["metric", *HEADER]
     rows = [[metric, *_cells(value)] for metric, value in compared["metrics"].items()]
     class_rows = [
         [class_name, column, *_cells(value)]
@@ -43,13 +52,14 @@ def _cells(value: Mapping[str, Any]) -> list[str]:
     changes = list(value["per_scene"].values())
     counts = (sum(d > 0 for d in changes), sum(d == 0 for d in changes), sum(d < 0 for d in changes))
     return [
+        _probability(value["p"]),
+        _probability(value["p_of_all"]),
+        _probability(value["smallest_p"]),
+        " / ".join(map(str, counts)),
         percent(value["left"]),
         percent(value["right"]),
         difference,
         signed(value["mean_of_scenes"]),
-        _probability(value["p"]),
-        _probability(value["smallest_p"]),
-        " / ".join(map(str, counts)),
     ]
 
 
@@ -65,11 +75,16 @@ def _notes(compared: Mapping[str, Any]) -> Sequence[str]:
     elif tests:
         how = "all patterns of signs" if all(value["is_exact"] for value in tests) else "100000 drawn patterns of signs"
         notes.append(
-            f"[..]: 95 % over resampled scenes, the same on both sides; p: two-sided sign-flip test of the mean over "
-            f"scenes, {how}"
+            f"p: two-sided sign-flip test of the mean over scenes, {how}; p of all: corrected by Holm for all metrics "
+            "that are compared here, or all classes; [..]: 95 % t interval from the differences without each scene"
         )
+        notes += [line for line in (few_scenes(len(compared["scenes"])),) if line]
+        notes += [f"{name}: {d['disagreement']}" for name, d in compared["metrics"].items() if d["disagreement"]]
     if compared["classes"]:
-        n_equal = sum(not any(v["per_scene"].values()) for each in compared["classes"].values() for v in each.values())
+        values = [(name, v) for name, columns in compared["classes"].items() for v in columns.values()]
+        n_equal = sum(not any(v["per_scene"].values()) for _, v in values)
         notes.append(f"{n_equal} values of classes that no scene changes are left out")
-        notes.append(MANY_CLASSES)
+        odd = dict.fromkeys(name for name, v in values if v["disagreement"])
+        if odd:
+            notes.append(f"interval and test disagree, and the test decides, for {', '.join(odd)}")
     return notes

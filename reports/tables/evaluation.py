@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from typing import Any
 
 from su3d_bench.core.errors import counted, printable
-from su3d_bench.reports.tables.model import NOT_MEASURED, Prose, Table, percent, text_table, with_interval
+from su3d_bench.reports.tables.model import NOT_MEASURED, Prose, Table, few_scenes, percent, text_table, with_interval
 
 NAMES = {"ap": "AP", "ap50": "AP50", "ap25": "AP25", "macc": "mAcc", "miou": "mIoU", "fmiou": "F-mIoU"}
 MOST_NOTES = 12  # warnings that are printed; the file has all
@@ -62,6 +62,8 @@ def _context(scored: Mapping[str, Any]) -> Iterable[str]:
     else:
         shares = " / ".join(percent(share) for share in scored["coverage"].values())
         yield f"scored points with a predicted one within 2.5 / 5 / 10 cm: {shares} %"
+    if any(scored["intervals"].values()) and (line := few_scenes(int(scored["n_scenes"]))):
+        yield line
     warnings = scored["warnings"]
     yield from (f"WARNING: {printable(line)}" for line in warnings[:MOST_NOTES])
     if len(warnings) > MOST_NOTES:

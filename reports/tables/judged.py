@@ -8,6 +8,7 @@ from typing import Any
 
 from su3d_bench.core.errors import ConfigError, counted, printable
 from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, said_by
+from su3d_bench.numerics.statistics import holm
 from su3d_bench.reports.tables.model import (
     BY_PEOPLE,
     NOT_MEASURED,
@@ -260,7 +261,7 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
         columns=tuple(metrics),
         rows=tuple(rows),
         notes=(
-            "Per cent; in brackets the 95 % interval over resampled items, then the number of items. An item that "
+            "Per cent; in brackets Wilson's 95 % interval over items, then the number of items. An item that "
             "several people judged counts once, with the share of them that said so. "
             + (ABOUT_QUESTIONS if scores["kind"] == "questions" else ABOUT_TRUTH),
             f"set {scores['sheet_id']}{origin}; {judged}",
@@ -280,13 +281,15 @@ def _accuracy(cell: Mapping[str, Any] | None) -> Cell:
 def _tests(tests: Sequence[Mapping[str, Any]]) -> Table:
     rows = []
     differing = [test for test in tests if test["n_differ"]]
-    for test in differing[:SHOWN_TESTS]:
+    corrected = holm([test["p"] for test in differing])
+    for test, of_all in zip(differing[:SHOWN_TESTS], corrected, strict=False):
         texts = (test["metric"], str(test["n_items"]), str(test["n_differ"]))
         p = f"{test['p']:.3g}" if test["is_exact"] else f"about {test['p']:.2g}"
         cells = (
             *map(Cell, texts),
             Cell(signed(test["difference"]), bracketed(test["interval"], signed)),
             Cell(p),
+            Cell(f"{of_all:.3g}"),
             Cell(f"{test['smallest_p']:.2g}"),
         )
         rows.append(TableRow(f"{test['right']} - {test['left']} ({test['dataset']})", cells))
@@ -295,11 +298,11 @@ def _tests(tests: Sequence[Mapping[str, Any]]) -> Table:
         name="differences",
         caption="Differences between methods, as people judged them.",
         head="difference",
-        columns=("metric", "n", "differ", "points", "p", "smallest p"),
+        columns=("metric", "n", "differ", "points", "p", "p of all", "smallest p"),
         rows=tuple(rows),
         notes=(
-            "p: two-sided sign-flip test over what differs (McNemar's exact test where each is judged once); smallest "
-            "p: the least that so many can give; not corrected for the number of tests",
+            "p: two-sided sign-flip test over what differs (McNemar's exact test where each is judged once); p of all: "
+            "corrected by Holm for all comparisons in which anything differs; smallest p: the least that so many give",
             *([f"{n_same} of {len(tests)} comparisons are left out: nothing differs"] if n_same else []),
             *([f"{n_more} more differences are in scores.json"] if n_more else []),
         ),
@@ -323,7 +326,7 @@ def _agreements(agreements: Sequence[Mapping[str, Any]]) -> Table:
         rows=tuple(rows),
         notes=(
             "1: they agree on all, 0: as chance would have it; over items with two answers or more; 'cannot tell' is "
-            "an answer; in brackets the 95 % interval over resampled items",
+            "an answer; in brackets the 95 % interval over items",
         ),
     )
 

@@ -6,10 +6,9 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal
 
-from su3d_bench.numerics.statistics import SignFlipTest
+from su3d_bench.numerics.statistics import FEW_SCENES, Interval, SignFlipTest
 
 NOT_MEASURED = "-"
-Interval = tuple[float, float]
 What = Literal["value", "ceiling", "scenes"]
 Unit = Literal["percent", "fraction"]
 
@@ -38,6 +37,17 @@ def bracketed(interval: Sequence[float] | None, show: Callable[[float], str] = p
     ('[10.0, 25.0]', '')
     """
     return "" if interval is None else f"[{show(interval[0])}, {show(interval[1])}]"
+
+
+def few_scenes(n_scenes: int) -> str | None:
+    """What must stand beneath intervals over so few scenes; None where they are enough, or where none has any.
+
+    >>> few_scenes(4)
+    'intervals over 4 scenes are rough, as all over fewer than 10: docs/statistics.md'
+    """
+    if not 1 < n_scenes < FEW_SCENES:
+        return None
+    return f"intervals over {n_scenes} scenes are rough, as all over fewer than {FEW_SCENES}: docs/statistics.md"
 
 
 def with_interval(value: float | None, interval: Sequence[float] | None) -> str:

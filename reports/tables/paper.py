@@ -12,7 +12,7 @@ from su3d_bench.core.errors import ConfigError, counted, printable, suggest
 from su3d_bench.metrics.protocol_files import protocol_names
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.questions.score import RELATIVE, said_by
-from su3d_bench.numerics.statistics import SignFlipTest, sign_flip_test
+from su3d_bench.numerics.statistics import SignFlipTest, holm, sign_flip_test
 from su3d_bench.reports.tables.model import (
     NOT_MEASURED,
     Cell,
@@ -23,6 +23,7 @@ from su3d_bench.reports.tables.model import (
     Unit,
     bracketed,
     confidence_notes,
+    few_scenes,
     is_count,
     percent,
     some,
@@ -191,6 +192,8 @@ def units(row: Measured, shown: Shown) -> str:
     interval = ""
     if shown.intervals:
         interval = f"; in brackets the 95 % interval over {'items' if row.is_by_people else 'scenes'}"
+        rough = None if row.is_by_people else few_scenes(len(row.scenes))
+        interval += f" ({rough})" if rough else ""
     ceiling = "; (truth): what the truth itself scores" if shown.ceilings else ""
     unit = "per cent" if shown.unit == "percent" else "shares of 1"
     n = "; n: how many were judged" if shown.n_judged else ""
@@ -266,7 +269,7 @@ def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int
     if len({(rows[k].scenes, rows[k].limit) for k in competing}) > 1:
         return {}, "The rows are of different scenes or frames, so that none is marked as the best."
     marked: dict[str, set[int]] = {}
-    tests: list[SignFlipTest | None] = []
+    tests: dict[str, SignFlipTest | None] = {}
     for name in shown.metrics:
         values = np.array([np.nan if row.metrics.get(name) is None else row.metrics[name] for row in rows], np.float64)
         order = sorted(competing, key=lambda k: -np.nan_to_num(values[k], nan=-1.0))
@@ -274,20 +277,22 @@ def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int
             continue
         best = {k for k in competing if percent(rows[k].metrics.get(name)) == percent(float(values[order[0]]))}
         if shown.only_significant:
-            test = _paired_test(rows[order[0]], rows[order[1]], name)
-            tests.append(test)
-            best = best if len(best) == 1 and test is not None and test.p < LEVEL else set()
+            tests[name] = _paired_test(rows[order[0]], rows[order[1]], name)
         if len(best) < len(competing):
             marked[name] = best
     if not shown.only_significant:
         return marked, "Bold: the highest measured value." if any(marked.values()) else None
-    smallest = min((test.smallest_p for test in tests if test is not None), default=1.0)
+    for name, p in zip(tests, holm([None if test is None else test.p for test in tests.values()]), strict=True):
+        if name in marked and (len(marked[name]) > 1 or p is None or p >= LEVEL):
+            marked[name] = set()
+    smallest = min((test.smallest_p for test in tests.values() if test is not None), default=1.0)
+    corrected = f", corrected by Holm for {len(tests)} metrics" if len(tests) > 1 else ""
     over = "items" if rows[0].is_by_people and any(row.tests for row in rows) else "scenes"
     if smallest >= LEVEL:
         return marked, nothing_can_be_marked(over, smallest)
     return marked, (
         f"Bold: the highest measured value where it differs from the second (two-sided sign-flip test over {over}, "
-        f"p < {LEVEL}; with these {over} p cannot be below {smallest:.2g})."
+        f"p < {LEVEL}{corrected}; with these {over} p cannot be below {smallest:.2g})."
     )
 
 

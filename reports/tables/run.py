@@ -11,6 +11,7 @@ from su3d_bench.reports.tables.model import (
     Prose,
     Table,
     confidence_notes,
+    few_scenes,
     percent,
     some,
     text_table,
@@ -61,6 +62,8 @@ def _protocol_table(rows: Sequence[Mapping[str, Any]], metrics: Mapping[str, Any
     body += _cheap_rows(rows, names, len(header))
     notes = [line for row in rows for line in _notes(row)]
     notes += confidence_notes({str(row["method"]): row.get("confidences") for row in rows})
+    n_scenes = [row["result"]["n_scenes"] for row in rows if row["result"] and any(row["result"]["intervals"].values())]
+    notes += [line for line in (few_scenes(min(n_scenes, default=0)),) if line]
     return text_table(str(first["protocol"]), [header, *body], heading=title, notes=notes)
 
 

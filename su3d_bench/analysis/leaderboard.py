@@ -12,11 +12,14 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+import numpy as np
+
 from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.protocol_files import protocol_names
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import combine
+from su3d_bench.numerics.statistics import Interval, rank_intervals
 from su3d_bench.reports.tables.model import (
     NOT_MEASURED,
     Cell,
@@ -25,6 +28,7 @@ from su3d_bench.reports.tables.model import (
     TableRow,
     bracketed,
     confidence_notes,
+    few_scenes,
     percent,
     some,
 )
@@ -33,11 +37,16 @@ from su3d_bench.runs.finished import FinishedRun, read_run
 MOST_RUNS = 10_000
 MOST_NAMED = 4  # methods of what is left out
 MOST_FOLDERS = 1_000_000  # a folder that holds more was not meant
+MOST_RANKED = 60  # rows whose ranks have an interval: 1,770 tests of pairs, some minutes at worst
 
 
 @dataclass(frozen=True)
 class Entry:
-    """One number of one run that may stand in a ranking; values are fractions, in the order of ``headline``."""
+    """One number of one run that may stand in a ranking; values are fractions, in the order of ``headline``.
+
+    ``of_scenes``: the first headline metric of each scene, by which it is told which ranks differ. ``ranks``: the best
+    and the worst that it may have among those that are no ceiling; None where that was not asked for.
+    """
 
     run: str
     method: str
@@ -45,11 +54,13 @@ class Entry:
     version: int
     headline: tuple[str, ...]
     values: tuple[float | None, ...]
-    intervals: tuple[tuple[float, float] | None, ...]
+    intervals: tuple[Interval | None, ...]
+    of_scenes: tuple[float | None, ...]
     data: tuple[tuple[str, str], ...]
     profile: str
     confidences: str | None
     is_ceiling: bool
+    ranks: tuple[int, int] | None = None
 
     @property
     def scenes(self) -> tuple[str, ...]:
@@ -73,8 +84,11 @@ class Leaderboard:
     refused: tuple[Refused, ...]
 
 
-def leaderboard(folder: Path, protocols: Sequence[str] = ()) -> Leaderboard:
-    """The rankings of all runs below ``folder``, of all protocols or only ``protocols``; links are not followed."""
+def leaderboard(folder: Path, protocols: Sequence[str] = (), *, with_ranks: bool = False) -> Leaderboard:
+    """The rankings of all runs below ``folder``, of all protocols or only ``protocols``; links are not followed.
+
+    ``with_ranks``: the ranks that each row of up to ``MOST_RANKED`` may have are found, from tests of all pairs.
+    """
     entries: list[Entry] = []
     refused: list[Refused] = []
     for path in _runs_below(folder):
@@ -91,7 +105,8 @@ def leaderboard(folder: Path, protocols: Sequence[str] = ()) -> Leaderboard:
     boards: list[tuple[Entry, ...]] = []
     for key in dict.fromkeys((entry.protocol, entry.scenes) for entry in entries):
         alike, others = _of_same_data([entry for entry in entries if (entry.protocol, entry.scenes) == key])
-        boards.append(tuple(sorted(alike, key=_rank)))
+        board = tuple(sorted(alike, key=_rank))
+        boards.append(ranked(board) if with_ranks else board)
         refused += others
     return Leaderboard(tuple(boards), tuple(refused))
 
@@ -143,6 +158,7 @@ def _entries(name: str, run: FinishedRun, protocols: Sequence[str]) -> Iterator[
             headline=result.headline,
             values=tuple(recomputed["metrics"].get(key) for key in result.headline),
             intervals=tuple(result.intervals.get(key) for key in result.headline),
+            of_scenes=tuple(recomputed["per_scene"][scene][result.headline[0]] for scene in sorted(result.scenes)),
             data=tuple((scene, run.record.data_digests[scene]) for scene in sorted(result.scenes)),
             profile=printable(run.record.profile or "", 40),
             confidences=None if record.confidences is None else printable(record.confidences, 80),
@@ -183,6 +199,18 @@ def _rank(entry: Entry) -> tuple[bool, float, str, str]:
     return entry.is_ceiling, -(first if first is not None else -1.0), entry.method, entry.run
 
 
+def ranked(board: tuple[Entry, ...]) -> tuple[Entry, ...]:
+    """The board with the ranks that each row may have; unchanged where nothing competes, or too many rows do."""
+    rivals = [entry for entry in board if not entry.is_ceiling]
+    if not 1 < len(rivals) <= MOST_RANKED:
+        return board
+    ranks = rank_intervals([np.array(entry.of_scenes, np.float64) for entry in rivals])
+    return (
+        *(replace(entry, ranks=of_entry) for entry, of_entry in zip(rivals, ranks, strict=True)),
+        *(entry for entry in board if entry.is_ceiling),
+    )
+
+
 def tables(board_of_runs: Leaderboard, *, intervals: bool) -> list[Table]:
     """One table a ranking; what was refused stands beneath the last one."""
     made = [_table(board, index, intervals) for index, board in enumerate(board_of_runs.boards)]
@@ -209,23 +237,42 @@ def _table(board: Sequence[Entry], index: int, intervals: bool) -> Table:
         max((percent(value) for entry in rivals if (value := entry.values[k]) is not None), key=float, default="")
         for k in range(len(first.headline))
     ]
+    has_ranks = any(entry.ranks for entry in board)
     rows = []
     for entry in board:
         cells = [_cell(entry, k, best[k], intervals) for k in range(len(first.headline))]
-        rows.append(TableRow(entry.method, (*cells, Cell(entry.profile), Cell(entry.run)), group=str(entry.is_ceiling)))
+        ranks = [Cell(_ranks_text(entry))] if has_ranks else []
+        about = (*cells, *ranks, Cell(entry.profile), Cell(entry.run))
+        rows.append(TableRow(entry.method, about, group=str(entry.is_ceiling)))
     scenes = counted(len(first.scenes), "scene")
     notes = [f"Scenes: {', '.join(first.scenes)}."]
     if any(entry.is_ceiling for entry in board):
         notes.append("Rows that were told the truth stand last and compete with none.")
     notes += confidence_notes({f"{entry.method} of {entry.run}": entry.confidences for entry in rivals})
+    if has_ranks:
+        notes.append(
+            f"Rank: from which to which it may go by {first.headline[0]}, with 95 % for all rows together: sign-flip "
+            "tests of all pairs over scenes, corrected by Holm."
+        )
+    elif intervals and len(rivals) > MOST_RANKED:
+        notes.append(f"No ranks: {len(rivals)} rows are more than the {MOST_RANKED} whose pairs are all tested.")
+    if intervals and (rough := few_scenes(len(first.scenes))):
+        notes.append(f"{rough[:1].upper()}{rough[1:]}.")
     return Table(
         name=f"leaderboard-{index + 1}",
         caption=f"{first.protocol}, version {first.version}, {scenes}; per cent.",
         head="method",
-        columns=(*first.headline, "profile", "run"),
+        columns=(*first.headline, *(["rank"] if has_ranks else []), "profile", "run"),
         rows=tuple(rows),
         notes=tuple(notes),
     )
+
+
+def _ranks_text(entry: Entry) -> str:
+    if entry.ranks is None:
+        return NOT_MEASURED
+    best, worst = entry.ranks
+    return str(best) if best == worst else f"{best} to {worst}"
 
 
 def _cell(entry: Entry, k: int, best: str, intervals: bool) -> Cell:

@@ -13,7 +13,7 @@ def add_parser(verbs: Any) -> None:
     parser = add_verb(
         verbs,
         "compare",
-        "Compare two runs over their common scenes: differences with interval and exact test.",
+        "Compare two runs over their common scenes: exact test, and differences with interval.",
         (
             "su3d-bench compare runs/before runs/after --per-class",
             "su3d-bench compare runs/my-run:opensu3d runs/my-run:oracle --protocol rooms-instance --json",

@@ -28,6 +28,7 @@ VERBS = (
     "evaluate",
     "check",
     "compare",
+    "plan",
     "attribute",
     "report",
     "sheets",

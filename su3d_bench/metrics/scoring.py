@@ -29,7 +29,7 @@ from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.metrics.questions.score import AnnotationMetric, ReasoningMetric, RetrievalMetric
 from su3d_bench.metrics.questions.truths import AnnotationTruth, ReasoningTruth, RetrievalTruth
 from su3d_bench.metrics.semantic.score import SemanticMetric
-from su3d_bench.numerics.statistics import percentile_interval, resample_weights
+from su3d_bench.numerics.statistics import jackknife_interval, leave_one_out
 from su3d_bench.store.atomic import read_arrays
 
 __all__ = ["SceneScore", "Truth", "combine", "metric_of", "pack_scores", "score_scene", "unpack_scores"]
@@ -96,8 +96,9 @@ class ProtocolResult:
     """The numbers of one method under one protocol, as fractions, NaN where undefined.
 
     ``metrics`` is ``pooled`` or ``scene_mean``, whichever the protocol reports; ``intervals`` belong to it, for the
-    headline metrics, and are ``None`` for a single scene. ``coverage``: by radius in metres, the share of scored points
-    without a predicted point that near. ``groups`` holds head, common and tail where the protocol has them.
+    headline metrics, and are ``None`` where ``jackknife_interval`` has none, as for a single scene. ``coverage``: by
+    radius in metres, the share of scored points without a predicted point that near. ``groups`` holds head, common and
+    tail where the protocol has them.
     """
 
     protocol: str
@@ -148,8 +149,11 @@ def combine(rules: ProtocolRules, scores: Mapping[str, SceneScore], *, with_inte
     mean = scene_mean(rows)
     intervals: dict[str, tuple[float, float] | None] = dict.fromkeys(rules.headline)
     if with_intervals and len(ordered) > 1:
-        resampled = metric.resampled_headline(counts, rows, resample_weights(len(ordered)))
-        intervals = {name: percentile_interval(resampled[name]) for name in rules.headline}
+        without_each = metric.resampled_headline(counts, rows, leave_one_out(len(ordered)))
+        intervals = {
+            name: jackknife_interval(without_each[name], ~np.isnan([row[name] for row in rows]))
+            for name in rules.headline
+        }
     return ProtocolResult(
         protocol=rules.name,
         version=rules.version,

@@ -1,72 +1,147 @@
-"""Uncertainty of a number that is formed from several scenes."""
+"""How sure numbers over several scenes or items are: intervals, tests, ranks; and how costs grow."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from itertools import combinations
 
 import numpy as np
 
-from su3d_bench.core.types import Float64Array, Int64Array
+from su3d_bench.core.types import BoolArray, Float64Array, Int64Array
 
-N_RESAMPLES = 1000
-SEED = 0
 LEVEL = 0.95
+ALPHA = 0.05  # a two-sided p below it is called a difference
+FEW_SCENES = 10  # below it an interval is said to be rough: docs/statistics.md shows how often it holds the truth
+MOST_GROUPS = 500  # scenes that are left out one by one; the largest validation set in use has 312
+LEAST_ITEMS = 10  # of fewer a t interval of a change or an agreement holds the truth in less than 90 of 100 sets
+NO_SPREAD = 1e-12  # pseudo-values of fractions that differ by less differ by rounding
+SEED = 0
+N_RESAMPLES = 1000  # of the blocks of a growth's slope
 MAX_EXACT_PAIRS = 40  # two halves of 2^20 sums, 8 MB each
 N_FLIPS = 100_000  # patterns drawn where there are more pairs
 FLAT_EXPONENT = 0.1  # at most 7 % more for a size twice as large: what a reader of a plot calls flat
 MIN_FIT = 8
 LEAST_SPREAD = 1e-9  # of a resample's sizes, over that of all: below it a slope would be made of rounding
+SHARE, DIFFERENCE = (0.0, 1.0), (-1.0, 1.0)  # between which a fraction lies, and a difference of two
+Interval = tuple[float, float]
+
+
+def _group_of_scene(n_scenes: int) -> Int64Array:
+    """With which scenes each (S,) is left out: alone, or with those that stand ``MOST_GROUPS`` after it."""
+    return np.arange(n_scenes) % min(n_scenes, MOST_GROUPS)
 
 
 @lru_cache(maxsize=1)  # every method and protocol of a run asks for the same
-def resample_weights(n_scenes: int, n_resamples: int = N_RESAMPLES, seed: int = SEED) -> Int64Array:
-    """How often each scene is drawn (R, S) when as many scenes as there are, are drawn with replacement; read-only.
+def leave_one_out(n_scenes: int) -> Int64Array:
+    """How often each scene is counted (1 + G, S): all of them, then all but the first, and so on; read-only.
 
-    >>> resample_weights(4, n_resamples=2).sum(axis=1).tolist()
-    [4, 4]
+    More than ``MOST_GROUPS`` scenes are left out in as many groups: each has a part in one of them.
+
+    >>> leave_one_out(2).tolist()
+    [[1, 1], [0, 1], [1, 0]]
     """
-    shares = np.full(n_scenes, 1.0 / n_scenes)
-    weights: Int64Array = np.random.default_rng(seed).multinomial(n_scenes, shares, size=n_resamples).astype(np.int64)
+    groups = np.arange(min(n_scenes, MOST_GROUPS))
+    left_out = groups[:, None] == _group_of_scene(n_scenes)
+    weights: Int64Array = np.concatenate([np.ones((1, n_scenes), bool), ~left_out]).astype(np.int64)
     weights.flags.writeable = False
     return weights
 
 
-def bootstrap_interval(
-    statistic: Callable[[Int64Array], Float64Array],
-    n_scenes: int,
-    n_resamples: int = N_RESAMPLES,
-    seed: int = SEED,
+def has_part(values: Float64Array, has_value: BoolArray) -> BoolArray:
+    """Which of the G scenes, or groups of them, have a part in a number, from its ``values`` (1 + G,) without each.
+
+    One has that holds a scene with a value of its own, as ``has_value`` (S,) says, or without which the number is
+    another.
+    """
+    n_with_value = np.bincount(_group_of_scene(len(has_value)), weights=has_value, minlength=len(values) - 1)
+    is_part: BoolArray = (n_with_value > 0) | (values[1:] != values[0])
+    return is_part
+
+
+def pseudo_values(values: Float64Array, is_part: BoolArray | None = None) -> Float64Array:
+    """Tukey's jackknife pseudo-values of a number, from its ``values`` (1 + G,): over all, then without each scene.
+
+    Of scenes that have no part in it, as ``is_part`` (G,) says, there is none.
+    Source: Miller, The jackknife: a review, Biometrika 61 (1974), equation 2.2; groups of scenes are in it too.
+
+    >>> pseudo_values(np.array([0.5, 0.6, 0.4])).round(12).tolist()  # of a mean they are the values themselves
+    [0.4, 0.6]
+    """
+    whole, left_out = values[0], values[1:]
+    kept = left_out if is_part is None else left_out[is_part]
+    pseudo: Float64Array = len(kept) * whole - (len(kept) - 1) * kept
+    return pseudo
+
+
+def jackknife_interval(
+    values: Float64Array,
+    has_value: BoolArray | None = None,
+    *,
+    bounds: Interval = SHARE,
     level: float = LEVEL,
-) -> tuple[float, float] | None:
-    """The percentile interval of ``statistic`` over resampled scenes; ``None`` for a single scene.
+) -> Interval | None:
+    """The t interval around a number over scenes, its standard error from the pseudo-values of ``values`` (1 + G,).
 
-    ``statistic`` takes the weights (R, S) of ``resample_weights`` and gives one value a resample; NaN values, of
-    resamples in which nothing could be scored, are left out. With nothing left the answer is ``None`` too.
+    With ``has_value`` (S,) scenes that have no part in the number are left aside. It is around the value itself rather
+    than the mean of the pseudo-values, which covers the truth less often at few scenes
+    (benchmarks/coverage_of_intervals.py has both), and ends at ``bounds``. None for a single scene, where a scene left
+    out leaves nothing to score, and where the scenes do not differ, which tells nothing of others.
+    Source: Efron and Tibshirani, An Introduction to the Bootstrap (1993), chapter 11; the t quantile after Tukey.
 
-    >>> values = np.array([0.2, 0.4, 0.9])
-    >>> low, high = bootstrap_interval(lambda weights: weights @ values / 3, n_scenes=3)
-    >>> 0.2 <= low < 0.5 < high <= 0.9
-    True
+    >>> means = np.array([0.5, 0.55, 0.5, 0.45])  # of 0.4, 0.5 and 0.6, and without each of them
+    >>> low, high = jackknife_interval(means)
+    >>> round(low, 4), round(high, 4)
+    (0.2516, 0.7484)
     """
-    if n_scenes < 2:
+    pseudo = pseudo_values(values, None if has_value is None else has_part(values, has_value))
+    if len(pseudo) < 2 or not np.isfinite(pseudo).all():
         return None
-    return percentile_interval(statistic(resample_weights(n_scenes, n_resamples, seed)), level)
+    spread = float(pseudo.std(ddof=1))
+    if spread <= NO_SPREAD:
+        return None
+    half = t_quantile((1.0 + level) / 2.0, len(pseudo) - 1) * spread / np.sqrt(len(pseudo))
+    return max(bounds[0], float(values[0] - half)), min(bounds[1], float(values[0] + half))
 
 
-def percentile_interval(values: Float64Array, level: float = LEVEL) -> tuple[float, float] | None:
-    """The central ``level`` of resampled values, without their NaN; ``None`` where nothing is left.
+def mean_interval(values: Float64Array, bounds: Interval = SHARE) -> Interval | None:
+    """The t interval of a mean; None for fewer than two values, and where all are equal."""
+    n = len(values)
+    if n < 2:
+        return None
+    total = values.sum()
+    return jackknife_interval(np.append(total / n, (total - values) / (n - 1)), bounds=bounds)
 
-    >>> percentile_interval(np.array([0.0, 1.0, np.nan]), level=0.5)
-    (0.25, 0.75)
+
+def share_interval(share: float, n: int, level: float = LEVEL) -> Interval | None:
+    """Wilson's interval of a share of ``n`` things that were drawn, each of which speaks for it or not.
+
+    Of things that speak for it in part, the share of several judges, it is too wide rather than too narrow. None of
+    nothing. Source: Wilson, JASA 22 (1927); Brown, Cai and DasGupta, Statistical Science 16 (2001), advise it.
+
+    >>> low, high = share_interval(1.0, 10)
+    >>> round(low, 3), high
+    (0.722, 1.0)
     """
-    numbers = values[~np.isnan(values)]
-    if not len(numbers):
+    if n < 1:
         return None
-    tail = (1.0 - level) / 2.0
-    low, high = np.quantile(numbers, [tail, 1.0 - tail])
-    return float(low), float(high)
+    z = t_quantile((1.0 + level) / 2.0, np.inf)
+    middle = (share + z * z / (2 * n)) / (1 + z * z / n)
+    half = z / (1 + z * z / n) * np.sqrt(max(0.0, share * (1 - share)) / n + z * z / (4 * n * n))
+    # the ends of 0 and 1 are exact; only rounding moves them
+    return (0.0 if share <= 0 else float(middle - half)), (1.0 if share >= 1 else float(middle + half))
+
+
+def t_quantile(level: float, n_free: float) -> float:
+    """The quantile of Student's t with ``n_free`` degrees of freedom, of the normal distribution where infinite.
+
+    >>> round(t_quantile(0.975, 3), 3), round(t_quantile(0.975, np.inf), 3)
+    (3.182, 1.96)
+    """
+    from scipy.special import ndtri, stdtrit
+
+    return float(ndtri(level) if np.isinf(n_free) else stdtrit(n_free, level))
 
 
 def nan_mean(values: Float64Array) -> float:
@@ -140,6 +215,48 @@ def _n_sums_from(pairs: Float64Array, least: float) -> int:
         halves.append(np.sort(sums))
     below = np.searchsorted(halves[1], least - halves[0], side="left")
     return int((len(halves[1]) - below).sum())
+
+
+def holm(values: Sequence[float | None]) -> list[float | None]:
+    """Each p as it counts among all of ``values``: below 0.05, it is a difference though so many were looked at.
+
+    None, where there is no test, stays None and counts for nothing.
+    Source: Holm, A simple sequentially rejective multiple test procedure, Scandinavian Journal of Statistics 6 (1979).
+
+    >>> [None if p is None else round(p, 3) for p in holm([0.01, 0.04, None, 0.03])]
+    [0.03, 0.06, None, 0.06]
+    """
+    known = sorted((p, index) for index, p in enumerate(values) if p is not None)
+    adjusted: list[float | None] = [None] * len(values)
+    largest = 0.0
+    for rank, (p, index) in enumerate(known):
+        largest = max(largest, min(1.0, (len(known) - rank) * p))
+        adjusted[index] = largest
+    return adjusted
+
+
+def rank_intervals(values: Sequence[Float64Array], alpha: float = ALPHA) -> list[tuple[int, int]]:
+    """The best and the worst rank that each of K rows may have, whose ``values`` (S,) are of the same scenes.
+
+    A row ranks below each that is better by the sign-flip test of their paired differences, corrected by Holm over all
+    pairs; all ranks together hold the true ones with a probability of at least 1 - ``alpha``.
+    Source: Mogstad, Romano, Shaikh and Wilhelm, Inference for Ranks, Review of Economic Studies 91 (2024).
+
+    >>> far = [np.arange(10) / 100 + level for level in (0.8, 0.1)]
+    >>> rank_intervals([*far, far[1] + 1e-3 * (-1) ** np.arange(10)])
+    [(1, 1), (2, 3), (2, 3)]
+    """
+    pairs = list(combinations(range(len(values)), 2))
+    differences = [values[j] - values[i] for i, j in pairs]
+    tests = [sign_flip_test(of_pair) for of_pair in differences]
+    corrected = holm([None if test is None else test.p for test in tests])
+    n_better, n_worse = [0] * len(values), [0] * len(values)
+    for (i, j), p, of_pair in zip(pairs, corrected, differences, strict=True):
+        if p is not None and p < alpha:
+            better, worse = (j, i) if np.nansum(of_pair) > 0 else (i, j)
+            n_worse[better] += 1
+            n_better[worse] += 1
+    return [(1 + n_better[k], len(values) - n_worse[k]) for k in range(len(values))]
 
 
 @dataclass(frozen=True)

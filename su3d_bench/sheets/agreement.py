@@ -9,9 +9,8 @@ from itertools import combinations
 import numpy as np
 
 from su3d_bench.core.types import Float64Array, Int64Array
-from su3d_bench.numerics.statistics import bootstrap_interval
+from su3d_bench.numerics.statistics import DIFFERENCE, LEAST_ITEMS, Interval, jackknife_interval, leave_one_out
 
-Interval = tuple[float, float]
 Ratings = Mapping[str, Mapping[str, str]]  # item -> annotator -> answer
 
 
@@ -31,8 +30,8 @@ class Agreement:
     """What can be said of one question: its items with two answers or more, and the coefficients over them.
 
     ``fleiss`` is of the ``n_fleiss`` items with ``n_raters`` answers each, the number that most of them have. ``alpha``
-    is Krippendorff's for nominal data, of all; its ``interval`` is over resampled items. None: undefined, for want of
-    items or because nobody ever chose a second answer.
+    is Krippendorff's for nominal data, of all; its ``interval`` is over items, of at least ten. None: undefined, for
+    want of items or because nobody ever chose a second answer.
     """
 
     n_annotators: int
@@ -59,8 +58,10 @@ def agreement(ratings: Ratings) -> Agreement:
     even = counts[sizes == n_raters]
     alpha = krippendorff_alpha(counts)
     interval = None
-    if alpha is not None:
-        interval = bootstrap_interval(lambda weights: _alphas(counts, weights), len(counts))
+    if alpha is not None and len(counts) >= LEAST_ITEMS:
+        # Fleiss and Davies, Jackknifing functions of multinomial frequencies, Am. J. of Epidemiology 115 (1982)
+        values = krippendorff_alphas(counts, leave_one_out(len(counts)))
+        interval = jackknife_interval(values, bounds=DIFFERENCE)
     return Agreement(
         n_annotators=len(annotators),
         n_items=len(counts),
@@ -122,10 +123,10 @@ def krippendorff_alpha(counts: Int64Array) -> float | None:
     pairable = counts[counts.sum(axis=1) >= 2]
     if not len(pairable) or np.count_nonzero(pairable.sum(axis=0)) < 2:
         return None
-    return float(_alphas(pairable, np.ones((1, len(pairable)), np.int64))[0])
+    return float(krippendorff_alphas(pairable, np.ones((1, len(pairable)), np.int64))[0])
 
 
-def _alphas(counts: Int64Array, weights: Int64Array) -> Float64Array:
+def krippendorff_alphas(counts: Int64Array, weights: Int64Array) -> Float64Array:
     """Alpha for each row of how often each item is drawn (R, N); NaN where only one answer is left."""
     sizes = counts.sum(axis=1)
     # o_cc, the diagonal of the coincidence matrix: ordered pairs of equal answers in an item, over its size less one

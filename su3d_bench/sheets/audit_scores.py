@@ -7,10 +7,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from su3d_bench.core.errors import DataError, printable, reading, suggest
-from su3d_bench.numerics.statistics import percentile_interval, resample_weights
+from su3d_bench.numerics.statistics import share_interval
 from su3d_bench.reports.tables.model import Cell, Table, TableRow, bracketed, percent
 from su3d_bench.sheets.answers import MOST_TEXT_BYTES, cell_text, csv_rows
 
@@ -86,7 +84,7 @@ def audit_table(verdicts: Sequence[Verdict]) -> Table:
         ("judged", "right", "right or arguable", "wrong"),
         tuple(TableRow(kind, _cells(of_kind[kind])) for kind in kinds),
         (
-            "in brackets: 95 % bootstrap interval over questions",
+            "in brackets: Wilson's 95 % interval over questions",
             *([f"{n_open} of {len(verdicts)} questions are not judged yet"] if n_open else []),
             *(one.line for one in faults),
         ),
@@ -115,7 +113,5 @@ def _cells(verdicts: Sequence[str]) -> tuple[Cell, ...]:
 
 
 def _share(is_so: Sequence[bool]) -> Cell:
-    values = np.array(is_so, np.float64)
-    draws = resample_weights(len(values)).astype(np.float64)
-    interval = percentile_interval(draws @ values / len(values)) if len(values) > 1 else None
-    return Cell(percent(float(values.mean())), bracketed(interval))
+    share = sum(is_so) / len(is_so)
+    return Cell(percent(share), bracketed(share_interval(share, len(is_so))))

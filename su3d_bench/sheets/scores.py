@@ -9,7 +9,6 @@ import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from functools import lru_cache
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -18,9 +17,16 @@ import numpy as np
 
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.types import Float64Array, Int64Array
-from su3d_bench.numerics.statistics import percentile_interval, resample_weights, sign_flip_test
+from su3d_bench.numerics.statistics import (
+    DIFFERENCE,
+    LEAST_ITEMS,
+    Interval,
+    mean_interval,
+    share_interval,
+    sign_flip_test,
+)
 from su3d_bench.questions.model import ALL_KINDS
-from su3d_bench.sheets.agreement import Agreement, Interval, agreement, cohen_kappa
+from su3d_bench.sheets.agreement import Agreement, agreement, cohen_kappa
 from su3d_bench.sheets.answers import LABELS, Judgement
 from su3d_bench.sheets.items import ARGUABLE, CANNOT_TELL, MERGES, RIGHT, Key, KeyItem, Sheet, SheetKind, read_record
 from su3d_bench.sheets.verdicts import WHOLE, whole_verdicts
@@ -48,9 +54,9 @@ _PLACE = ["method", "dataset", "metric"]  # of a cell
 class ScoreCell:
     """One number: the mean over ``n_items`` items of the share of an item's judgements that speak for it.
 
-    "Cannot tell" is left out and counted. ``value`` is None where nothing remains; ``interval`` is over resampled
-    items, None for a single one. ``per_scene``: the same mean of each scene. ``judge``: ``automatic`` is the ground
-    truth's answer to the very same items.
+    "Cannot tell" is left out and counted. ``value`` is None where nothing remains, and so is its ``interval``, which is
+    over items. ``per_scene``: the same mean of each scene. ``judge``: ``automatic`` is the ground truth's answer to the
+    very same items.
     """
 
     judge: Judge
@@ -256,25 +262,12 @@ def _cell(judge: Judge, place: tuple[str, str, str], group: pandas.DataFrame) ->
         dataset=dataset,
         metric=metric,
         value=float(means.mean()) if len(means) else None,
-        interval=_interval(means),
+        interval=share_interval(float(means.mean()), len(means)) if len(means) else None,
         n_items=len(clear),
         n_judgements=int(group["n_clear"].sum()),
         n_cannot_tell=int((group["n"] - group["n_clear"]).sum()),
         per_scene={scene: float(shares.to_numpy().mean()) for scene, shares in clear.groupby("scene")["share"]},
     )
-
-
-def _interval(means: Float64Array) -> Interval | None:
-    """Of the mean, over items drawn with replacement; None for a single one."""
-    if len(means) < 2:
-        return None
-    return percentile_interval(_draws(len(means)) @ means / len(means))
-
-
-@lru_cache(maxsize=4)
-def _draws(n_items: int) -> Float64Array:
-    """How often each item is drawn (R, N), the same for every number of as many items."""
-    return resample_weights(n_items).astype(np.float64)
 
 
 def _tests(sheet: Sheet, key: Key, clear: pandas.DataFrame) -> Iterator[PairTest]:
@@ -313,7 +306,7 @@ def _test(
         dataset=dataset,
         metric=metric,
         difference=float(changes.mean()) if len(changes) else 0.0,
-        interval=_interval(changes),
+        interval=mean_interval(changes, DIFFERENCE) if len(changes) >= LEAST_ITEMS else None,
         n_items=len(changes),
         n_differ=int(np.count_nonzero(changes)),
         p=p,

@@ -7,6 +7,7 @@ import itertools
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,19 +17,23 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from painted import colour_perception
 from places import SCENES
+from scored_room import noisy_scores
 
+import su3d_bench.analysis.comparison
 import su3d_bench.reports.tables.model
-from su3d_bench.analysis.comparison import compare
+from su3d_bench.analysis.comparison import Difference, compare, form_difference
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, StoreError
+from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.protocols import load_protocol
-from su3d_bench.metrics.scoring import metric_of
+from su3d_bench.metrics.scoring import SceneScore, metric_of, pack_scores
 from su3d_bench.metrics.semantic import confusion as semantic
-from su3d_bench.numerics.statistics import MAX_EXACT_PAIRS, SignFlipTest, resample_weights, sign_flip_test
+from su3d_bench.numerics.statistics import MAX_EXACT_PAIRS, SignFlipTest, sign_flip_test
 from su3d_bench.reports.tables.comparison import comparison_tables
 from su3d_bench.reports.tables.formats import markdown
 from su3d_bench.runs import scene as scene_run
+from su3d_bench.store.run_folder import RunFolder
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 COLLECTOR = f"{SCENES}/painted.py:Collector"
@@ -101,7 +106,9 @@ def test_values_over_drawn_scenes_are_those_of_the_scenes_together() -> None:
         labels, scores = rng.choice(ids, 10), rng.integers(1, 4, 10) / 4
         scored = [entry.id for entry in rules.scored]
         counts.append(instance_ap.per_scene(truth, indptr, np.concatenate(masks), labels, scores, scored))
-    weights = np.concatenate([np.ones((1, 4), np.int64), np.eye(4, dtype=np.int64), resample_weights(4, 6)])
+    weights = np.concatenate(
+        [np.ones((1, 4), np.int64), np.eye(4, dtype=np.int64), rng.multinomial(4, [0.25] * 4, size=6)]
+    )
     metric = metric_of(rules)
     drawn = metric.resampled_headline(counts, [], weights)
     classes = metric.resampled_classes(counts, weights)
@@ -191,10 +198,87 @@ def test_differences_are_those_of_the_two_runs() -> None:
             singles = {s: after["per_scene"][s][name] - before["per_scene"][s][name] for s in one.scenes}
             assert value.per_scene == singles
             assert value.mean_of_scenes == pytest.approx(sum(singles.values()) / 3)
-            assert value.interval is not None
-            assert value.interval[0] - 1e-12 <= value.difference <= value.interval[1] + 1e-12
+            if value.interval is not None:  # the scenes' differences may be equal
+                middle = sum(value.interval) / 2
+                assert -1 in value.interval or 1 in value.interval or middle == pytest.approx(value.difference)
             assert value.test == sign_flip_test(np.array(list(singles.values())))
     assert found.protocols[1].metrics["AP"].difference < 0
+
+
+def test_an_interval_is_of_the_differences_without_each_scene_in_turn() -> None:
+    counts: list[dict[str, dict[str, SceneScore]]] = []
+    is_inside = []
+    for run, first in (("a", 0), ("b", 3)):  # the painted scenes are alike: these differ, and more in one run
+        shutil.copytree(run, f"noisy-{run}")
+        made = {
+            name: list(noisy_scores(name, first + 3).values())[first:] for name in ("rooms-semantic", "rooms-instance")
+        }
+        counts.append({name: dict(zip("abc", scores, strict=True)) for name, scores in made.items()})
+        for k, scene in enumerate("abc"):
+            packed = pack_scores({name: scores[k] for name, scores in made.items()})
+            RunFolder(Path(f"noisy-{run}")).job(f"painted/{scene}", "collector").counts.write_bytes(packed)
+    for one in compare("noisy-a", "noisy-b").protocols:
+        metric = metric_of(load_protocol(one.protocol))
+        for name, value in one.metrics.items():
+            pseudo = []
+            for left_out in "abc":
+                values = [
+                    metric.reported([score.counts for scene, score in side[one.protocol].items() if scene != left_out])
+                    for side in counts
+                ]
+                pseudo.append(3 * value.difference - 2 * (values[1][name] - values[0][name]))
+            half = 4.302652729911275 * np.std(pseudo, ddof=1) / np.sqrt(3)  # Student's t, 2 degrees of freedom
+            expected = (max(-1.0, value.difference - half), min(1.0, value.difference + half))
+            assert value.interval == pytest.approx(expected, abs=1e-9)
+            is_inside.append(-1 < expected[0] < expected[1] < 1)
+    assert any(is_inside)
+
+
+def test_p_of_all_is_corrected_for_every_metric_of_the_comparison_that_differs() -> None:
+    found = [value for one in compare("a", "b").protocols for value in one.metrics.values()]
+    differing = [value for value in found if any(value.per_scene.values())]
+    assert len(differing) > 1
+    assert {value.p_of_all for value in differing} == {min(1.0, 0.25 * len(differing))}  # p is 0.25 throughout
+    assert {value.p_of_all for value in found if value not in differing} <= {None}
+    classes = compare("a", "b", protocols=["rooms-instance"], per_class=True).protocols[0].classes
+    assert classes["chair"]["AP"].p_of_all == pytest.approx(0.75)  # three columns of one class differ
+    assert classes["sofa"]["AP"].p_of_all is None
+
+
+def difference_of(changes: list[float], interval: tuple[float, float] | None) -> Difference:
+    each: Float64Array = np.array(changes)
+    values = np.zeros(len(each) + 1)
+    found = form_difference((0.5, 0.6), [f"s/{k}" for k in range(len(each))], 0 * each, each, values)
+    return replace(found, interval=interval)
+
+
+DISAGREEMENTS: list[tuple[list[float], tuple[float, float] | None, str | None]] = [
+    ([0.1, 0.1, 0.12], (0.08, 0.13), "3 scenes can give no p below 0.25: no difference is shown"),
+    ([0.1] * 8, (0.05, 0.15), None),
+    ([0.1, -0.1] * 4, (-0.1, 0.1), None),
+    ([0.1, -0.1] * 4, (0.01, 0.1), "the test does not find a difference (p 1)"),
+    ([0.1, -0.1] * 4, (-0.1, -0.01), "the test does not find a difference (p 1)"),
+    ([0.1] * 8, (-0.05, 0.15), "the test finds a difference (p 0.0078)"),
+    ([0.1] * 8, None, None),
+]
+
+
+@pytest.mark.parametrize(("changes", "interval", "words"), DISAGREEMENTS)
+def test_an_interval_that_contradicts_the_test_is_never_without_a_word(
+    changes: list[float], interval: tuple[float, float] | None, words: str | None
+) -> None:
+    found = difference_of(changes, interval).disagreement
+    assert (found is None) == (words is None)
+    assert words is None or words in (found or "")
+
+
+def test_what_disagrees_stands_beneath_the_table() -> None:
+    comparison = compare("a", "b", per_class=True).to_json()
+    value = comparison["protocols"][1]["metrics"]["AP"]
+    comparison["protocols"][1]["metrics"]["AP"] = value | {"disagreement": "the interval leaves 0 out, but"}
+    text = markdown(comparison_tables(comparison))
+    assert "AP: the interval leaves 0 out, but" in text
+    assert "intervals over 3 scenes are rough" in text
 
 
 def test_the_two_sides_exchanged_change_signs_alone() -> None:
@@ -204,9 +288,10 @@ def test_the_two_sides_exchanged_change_signs_alone() -> None:
             left, right = one.metrics[name], other.metrics[name]
             assert left.difference == -right.difference
             assert left.test == right.test
-            assert left.interval is not None
-            assert right.interval is not None
-            np.testing.assert_allclose(left.interval, (-right.interval[1], -right.interval[0]), atol=1e-12)
+            assert (left.interval is None) == (right.interval is None)
+            turned = right.interval and (-right.interval[1], -right.interval[0])
+            np.testing.assert_allclose(left.interval or (0, 0), turned or (0, 0), atol=1e-12)
+            assert left.p_of_all == right.p_of_all
 
 
 def test_classes_are_compared_on_request() -> None:
@@ -314,8 +399,8 @@ def test_the_command_prints_tables_or_json(capsys: pytest.CaptureFixture[str]) -
     row = next(line for line in text.splitlines() if line.startswith("| AP "))
     cells = [cell.strip() for cell in row.strip("|").split("|")]
     assert cells[0] == "AP"
-    assert cells[1] == "100.0"
-    assert cells[5:] == ["0.25", "0.25", "0 / 0 / 3"]
+    assert cells[1:5] == ["0.25", "0.75", "0.25", "0 / 0 / 3"]
+    assert cells[5] == "100.0"
     assert "| chair | AP " in text
     assert "values of classes that no scene changes are left out" in text
     assert main(["compare", "a", "b", "--json"]) == 0
@@ -329,3 +414,4 @@ def test_the_command_refuses_in_one_line(capsys: pytest.CaptureFixture[str]) -> 
 
 def test_the_examples_in_the_docstrings_run() -> None:
     assert doctest.testmod(su3d_bench.reports.tables.model).failed == 0
+    assert doctest.testmod(su3d_bench.analysis.comparison).failed == 0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,8 @@ import pytest
 from painted import colour_perception
 from places import SCENES
 
-from su3d_bench.analysis.leaderboard import leaderboard
+import su3d_bench.analysis.leaderboard
+from su3d_bench.analysis.leaderboard import leaderboard, ranked
 from su3d_bench.cli.main import main
 from su3d_bench.runs import scene as scene_run
 
@@ -49,6 +51,25 @@ def test_runs_of_one_protocol_and_data_are_ranked_by_the_first_headline(runs: Pa
     assert found.refused == ()
     values = [one.values[0] or 0.0 for one in found.boards[0]]
     assert values == sorted(values, reverse=True)
+
+
+def test_ranks_that_two_scenes_cannot_tell_apart_stay_open(runs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert {one.ranks for board in leaderboard(runs).boards for one in board} == {None}
+    found = leaderboard(runs, with_ranks=True)
+    assert {one.ranks for board in found.boards for one in board} == {(1, 2)}
+    assert main(["report", "leaderboard", str(runs), "--intervals"]) == 0
+    text = capsys.readouterr().out
+    assert "| rank " in text and "| 1 to 2 " in text
+    assert "Intervals over 2 scenes are rough" in text
+
+
+def test_ranks_are_those_of_the_scenes_and_a_ceiling_has_none(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    board = leaderboard(runs).boards[0]
+    far = [replace(one, of_scenes=tuple((one.values[0] or 0) + k / 100 for k in range(8))) for one in board]
+    told = [replace(far[0], is_ceiling=True, method="oracle")]
+    assert [one.ranks for one in ranked((*far, *told))] == [(1, 1), (2, 2), None]
+    monkeypatch.setattr(su3d_bench.analysis.leaderboard, "MOST_RANKED", 1)
+    assert [one.ranks for one in ranked((*far, *told))] == [None] * 3
 
 
 REFUSED: dict[str, tuple[str, Callable[[Any], None], str]] = {

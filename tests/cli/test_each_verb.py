@@ -30,6 +30,7 @@ CASES: dict[str, tuple[list[str], int, str]] = {
     ),
     "check": (["--learn", "out", "--out", "reference.json"], 0, "reference.json"),
     "compare": (["out:opensu3d", "out:oracle"], 0, "rooms-instance"),
+    "plan": (["out"], 2, "1 scene is scored"),  # one tells nothing of how differences vary
     "attribute": (["out", "--method", "opensu3d"], 0, "rooms-instance"),
     "report tables": (["out", "--format", "latex", "--out", "tables.tex"], 0, "tables.tex"),
     "report timing": (["out"], 0, "opensu3d"),

@@ -74,6 +74,20 @@ def test_the_interval_surrounds_the_value_and_is_the_same_every_time(name: str) 
         assert interval[0] < interval[1]
 
 
+@pytest.mark.parametrize("aggregate", ["pooled", "scene-mean"])
+@pytest.mark.parametrize("name", [*SEMANTIC, *INSTANCE])
+def test_the_interval_is_student_s_on_the_values_without_each_scene(name: str, aggregate: str) -> None:
+    rules = load_protocol(name).model_copy(update={"aggregate": aggregate})
+    scores = noisy_scores(name, 6)
+    result = combine(rules, scores)
+    without = [combine(rules, {s: score for s, score in scores.items() if s != left_out}) for left_out in scores]
+    for key in rules.headline:
+        pseudo = [6 * result.metrics[key] - 5 * one.metrics[key] for one in without]
+        half = 2.5705818366147395 * np.std(pseudo, ddof=1) / np.sqrt(6)  # Student's t, 5 degrees of freedom
+        expected = (max(0.0, result.metrics[key] - half), min(1.0, result.metrics[key] + half))
+        assert result.intervals[key] == pytest.approx(expected, abs=1e-9)
+
+
 def test_a_single_scene_has_no_interval() -> None:
     assert combine(ROOM, noisy_scores("rooms-semantic", 1)).intervals == {"mAcc": None, "F-mIoU": None}
 

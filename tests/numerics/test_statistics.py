@@ -1,4 +1,4 @@
-"""Intervals over scenes: seeded, from additive counts, honest about a single scene."""
+"""Intervals over scenes and items, tests of many at once, ranks: by hand, by SciPy, and by simulation."""
 
 from __future__ import annotations
 
@@ -6,13 +6,26 @@ import doctest
 
 import numpy as np
 import pytest
+import scipy.stats
 
 import su3d_bench.numerics.statistics
-from su3d_bench.core.types import Float64Array, Int64Array
+from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import resampling
 from su3d_bench.metrics.semantic import confusion as semantic
-from su3d_bench.numerics.statistics import bootstrap_interval, percentile_interval, resample_weights
+from su3d_bench.numerics.statistics import (
+    DIFFERENCE,
+    MOST_GROUPS,
+    has_part,
+    holm,
+    jackknife_interval,
+    leave_one_out,
+    mean_interval,
+    pseudo_values,
+    rank_intervals,
+    share_interval,
+    t_quantile,
+)
 
 
 def test_the_examples_in_the_docstrings_run() -> None:
@@ -20,29 +33,121 @@ def test_the_examples_in_the_docstrings_run() -> None:
     assert doctest.testmod(resampling).failed == 0
 
 
-def test_the_same_seed_gives_the_same_interval_and_another_seed_another() -> None:
+def test_of_a_mean_the_interval_is_student_s() -> None:
     values: Float64Array = np.random.default_rng(5).random(8)
+    low, high = mean_interval(values) or (0, 0)
+    expected = scipy.stats.t.interval(0.95, 7, values.mean(), scipy.stats.sem(values))
+    np.testing.assert_allclose((low, high), expected, rtol=1e-12)
 
-    def mean(weights: Int64Array) -> Float64Array:
-        return np.array([float(row @ values) / 8 for row in weights])
 
-    assert bootstrap_interval(mean, 8) == bootstrap_interval(mean, 8)
-    assert bootstrap_interval(mean, 8, seed=0) != bootstrap_interval(mean, 8, seed=1)
+def test_pseudo_values_of_a_ratio_are_those_worked_out_by_hand() -> None:
+    # 1 of 2, 3 of 3 and 0 of 5: together 4 of 10, without each 3 of 8, 1 of 7 and 4 of 5
+    values = np.array([4 / 10, 3 / 8, 1 / 7, 4 / 5])
+    expected = [3 * 0.4 - 2 * 3 / 8, 3 * 0.4 - 2 / 7, 3 * 0.4 - 2 * 4 / 5]
+    np.testing.assert_allclose(pseudo_values(values), expected, rtol=1e-12)
+    error = np.std(expected, ddof=1) / np.sqrt(3)
+    half = 4.302652729911275 * error  # the quantile of a table of Student's t with 2 degrees of freedom
+    assert jackknife_interval(values, bounds=(-9, 9)) == pytest.approx((0.4 - half, 0.4 + half), rel=1e-9)
+
+
+def test_the_interval_ends_where_the_values_can() -> None:
+    assert mean_interval(np.array([0.0, 1.0, 1.0])) == (0.0, 1.0)
+    assert mean_interval(np.array([-1.0, 1.0, 1.0]), DIFFERENCE) == (-1.0, 1.0)
 
 
 def test_a_single_scene_has_no_interval() -> None:
-    assert bootstrap_interval(lambda weights: np.zeros(len(weights)), 1) is None
+    assert jackknife_interval(np.array([0.5, np.nan]), np.ones(1, bool)) is None
+    assert jackknife_interval(np.array([0.5])) is None
+    assert mean_interval(np.array([0.5])) is None
 
 
-def test_resamples_in_which_nothing_can_be_scored_are_left_out() -> None:
-    assert percentile_interval(np.array([np.nan, 0.5, 0.5])) == (0.5, 0.5)
-    assert percentile_interval(np.array([np.nan])) is None
+def test_scenes_that_do_not_differ_tell_nothing_of_others() -> None:
+    assert mean_interval(np.full(8, 0.3)) is None
+    assert jackknife_interval(np.array([1.0, 1.0, 1.0]), np.ones(2, bool)) is None
 
 
-def test_every_resample_draws_as_many_scenes_as_there_are() -> None:
-    weights = resample_weights(8)
-    assert weights.shape == (1000, 8)
-    assert (weights.sum(axis=1) == 8).all()
+def test_a_number_that_rests_on_one_scene_has_no_interval() -> None:
+    # without the first nothing can be scored
+    assert jackknife_interval(np.array([0.5, np.nan, 0.5, 0.5])) is None
+
+
+def test_scenes_without_a_part_in_a_number_do_not_narrow_its_interval() -> None:
+    values = np.array([0.4, 0.3, 0.5])
+    with_others = np.concatenate([values, [0.4, 0.4, 0.4]])  # without the others nothing changes
+    has_value = np.array([True, True, False, False, False])
+    assert jackknife_interval(with_others, has_value) == jackknife_interval(values, np.ones(2, bool))
+    assert jackknife_interval(with_others, np.ones(5, bool)) != jackknife_interval(values, np.ones(2, bool))
+
+
+def test_each_scene_is_left_out_once() -> None:
+    assert leave_one_out(3).tolist() == [[1, 1, 1], [0, 1, 1], [1, 0, 1], [1, 1, 0]]
+
+
+@pytest.mark.parametrize(
+    ("n_right", "n", "low", "high"), [(7, 10, 0.3968, 0.8922), (0, 10, 0.0, 0.2775), (1, 1, 0.2065, 1.0)]
+)
+def test_wilson_s_interval_is_that_of_scipy(n_right: int, n: int, low: float, high: float) -> None:
+    found = share_interval(n_right / n, n)
+    assert found == pytest.approx((low, high), abs=1e-4)
+    expected = scipy.stats.binomtest(n_right, n).proportion_ci(0.95, method="wilson")
+    np.testing.assert_allclose(found or (0, 0), (expected.low, expected.high), atol=1e-12)
+    assert share_interval(0.5, 0) is None
+
+
+def test_a_quantile_of_infinite_freedom_is_the_normal_one() -> None:
+    assert t_quantile(0.975, np.inf) == pytest.approx(scipy.stats.norm.ppf(0.975), rel=1e-12)
+    assert t_quantile(0.9, 5.5) == pytest.approx(scipy.stats.t.ppf(0.9, 5.5), rel=1e-9)
+
+
+def test_very_many_scenes_are_left_out_in_groups_and_give_nearly_the_same() -> None:
+    rng = np.random.default_rng(4)
+    values = rng.random(1700)
+    weights = leave_one_out(1700)
+    assert weights.shape == (1 + MOST_GROUPS, 1700)
+    assert ((weights == 0).sum(axis=0) == 1).all()  # each scene is left out once
+    found = jackknife_interval(weights @ values / weights.sum(axis=1), np.ones(1700, bool))
+    np.testing.assert_allclose(found or (0, 0), mean_interval(values) or (1, 1), atol=0.002)
+
+
+def test_a_group_has_a_part_where_one_of_its_scenes_has() -> None:
+    has_value = np.zeros(MOST_GROUPS + 2, bool)
+    has_value[[1, MOST_GROUPS]] = True  # the latter stands in the first group
+    values = np.full(1 + MOST_GROUPS, 0.5)
+    values[3] = 0.4
+    assert np.flatnonzero(has_part(values, has_value)).tolist() == [0, 1, 2]
+
+
+# ---- many at once
+
+
+def test_holm_s_values_are_those_of_its_paper() -> None:
+    # the steps of the paper: the least of n is held against alpha / n, the next against alpha / (n - 1)
+    assert holm([0.01, 0.02, 0.03, 0.04]) == pytest.approx([0.04, 0.06, 0.06, 0.06])
+    assert holm([0.5, None, 0.6]) == [1.0, None, 1.0]
+    assert holm([]) == []
+
+
+def test_holm_keeps_false_alarms_below_the_level() -> None:
+    rng = np.random.default_rng(0)
+    least = [min(p for p in holm(rng.random(20).tolist()) if p is not None) for _ in range(2000)]
+    assert np.mean(np.array(least) < 0.05) == pytest.approx(0.05, abs=0.015)  # 3 standard errors
+
+
+def test_ranks_stay_open_where_no_difference_is_shown() -> None:
+    level = np.array([0.9, 0.5, 0.5, 0.1])[:, None] + np.random.default_rng(1).normal(0, 0.01, (4, 12))
+    assert rank_intervals(list(level)) == [(1, 1), (2, 3), (2, 3), (4, 4)]
+    few = level[:, :5]  # 2 of 32 patterns of five signs: no p below 0.05
+    assert rank_intervals(list(few)) == [(1, 4)] * 4
+    assert rank_intervals([level[0]]) == [(1, 1)]
+
+
+def test_rank_intervals_of_equal_rows_hold_all_ranks_in_95_of_100() -> None:
+    rng = np.random.default_rng(3)
+    whole = [rank_intervals(list(rng.normal(0, 1, (4, 14)))) == [(1, 4)] * 4 for _ in range(200)]
+    assert np.mean(whole) >= 0.95 - 3 * np.sqrt(0.05 * 0.95 / 200)
+
+
+# ---- values over drawn scenes
 
 
 def random_scene(rng: np.random.Generator) -> instance_ap.InstanceCounts:
@@ -59,7 +164,7 @@ def random_scene(rng: np.random.Generator) -> instance_ap.InstanceCounts:
 def test_resampled_ap_equals_the_ap_of_the_scenes_drawn() -> None:
     rng = np.random.default_rng(11)
     counts = [random_scene(rng) for _ in range(5)]
-    weights = np.concatenate([np.ones((1, 5), np.int64), resample_weights(5, 20, seed=3), [[0, 0, 5, 0, 0]]])
+    weights = np.concatenate([np.ones((1, 5), np.int64), rng.multinomial(5, [0.2] * 5, size=20), [[0, 0, 5, 0, 0]]])
     resampled = resampling.resampled_ap(counts, weights)
     for row, weight in enumerate(weights):
         ap = instance_ap.combine([counts[s] for s in range(5) for _ in range(weight[s])])
@@ -75,7 +180,7 @@ def test_resampled_semantic_metrics_equal_those_of_the_scenes_drawn(metric: str)
         truth = rng.integers(0, 3, 200) + scene % 2
         truth[: 50 * (scene == 1)] = 4
         counts.append(semantic.per_scene(truth, rng.integers(-1, 6, 200), np.ones(6, bool)))
-    weights = resample_weights(4, 30, seed=1)
+    weights = rng.multinomial(4, [0.25] * 4, size=30)
     resampled = semantic.resampled_semantic(counts, weights, "scannet" if metric == "scannet" else "conceptgraphs")
     for row, weight in enumerate(weights):
         whole = semantic.concatenate([counts[s] for s in range(4) for _ in range(weight[s])]).confusion

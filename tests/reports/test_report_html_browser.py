@@ -209,9 +209,9 @@ def test_swapping_the_sides_turns_the_sign(browser: Chromium) -> None:
     sides = options(browser, "compare", "A")
     choose(browser, "compare", "A", next(one for one in sides if "noise" not in one and "one" in one))
     choose(browser, "compare", "B", next(one for one in sides if "noise" in one))
-    before = column(browser, "compare", 4)[0].split()[0]
+    before = column(browser, "compare", 6)[0].split()[0]
     browser.run("[...document.querySelectorAll('#compare button')].find((one) => one.textContent === 'Swap').click()")
-    after = column(browser, "compare", 4)[0].split()[0]
+    after = column(browser, "compare", 6)[0].split()[0]
     assert before[0] == "\N{MINUS SIGN}"
     assert after == "+" + before[1:]
     choose(browser, "compare", "A", sides[0])

@@ -2,9 +2,10 @@
 
 function compareSection() {
   if (!DATA.comparisons.length) return;
-  part('compare', 'Compare', 'B less A over the scenes that both have, in points of a per cent: with the 95 % interval '
-    + 'when both draw the same scenes, and the exact test that flips the signs of single scenes, with the least p that '
-    + 'so many scenes can give. Bold: p below 0.05.', (section) => {
+  part('compare', 'Compare', 'B less A over the scenes that both have, in points of a per cent: the exact test that flips '
+    + 'the signs of single scenes, with the least p that so many scenes can give; p of all, corrected by Holm for all '
+    + 'metrics of the comparison; and the 95 % t interval from the differences without each scene. Bold: p of all below '
+    + '0.05.', (section) => {
     const sides = [...new Set(DATA.comparisons.flatMap((one) => [one.left, one.right].map(String)))].map((text) => {
       const at = text.indexOf(',');
       return [text, sideName(Number(text.slice(0, at)), text.slice(at + 1))];
@@ -36,19 +37,24 @@ function compared(one, isTurned) {
     protocol: p.protocol, metric, n: p.scenes.length,
     left: isTurned ? d.right : d.left, right: isTurned ? d.left : d.right,
     difference: times(d.difference), interval: intervalOf(d), p: d.p, least: d.smallest_p, pairs: d.n_pairs,
+    ofAll: d.p_of_all, disagreement: d.disagreement,
     scenes: Object.entries(d.per_scene).map(([scene, value]) => [scene, times(value)]) })));
   const spread = (row) => (row.interval ? h('small', null, ` [${row.interval.map(signed).join(', ')}]`) : null);
   const least = (row) => h('small', null, ` (${plural(row.pairs, 'scene')}, at least ${row.least.toPrecision(2)})`);
   const table = dataTable({ caption: 'Differences, B less A', rows, columns: [
     { label: 'Protocol', value: (row) => row.protocol }, { label: 'Metric', value: (row) => row.metric },
+    { label: 'p', num: true, value: (row) => row.p,
+      show: (row) => (isNumber(row.p) ? [row.p.toPrecision(2), least(row)] : '–') },
+    { label: 'p of all', num: true, value: (row) => row.ofAll,
+      show: (row) => (isNumber(row.ofAll) ? row.ofAll.toPrecision(2) : '–') },
     { label: 'A', num: true, value: (row) => row.left, show: (row) => percent(row.left) },
     { label: 'B', num: true, value: (row) => row.right, show: (row) => percent(row.right) },
     { label: 'B − A', num: true, value: (row) => row.difference, show: (row) => [signed(row.difference), spread(row)],
-      best: (row) => isNumber(row.p) && row.p < 0.05 },
-    { label: 'p', num: true, value: (row) => row.p,
-      show: (row) => (isNumber(row.p) ? [row.p.toPrecision(2), least(row)] : '–') },
+      best: (row) => isNumber(row.ofAll) && row.ofAll < 0.05 },
     { label: 'Scene by scene', value: (row) => row.n, show: differenceStrip }] });
-  return [table, h('div', null, noteList([...new Set([...one.remarks, ...one.protocols.flatMap((p) => p.remarks)])]))];
+  const odd = rows.filter((row) => row.disagreement).map((row) => `${row.protocol}, ${row.metric}: ${row.disagreement}`);
+  const notes = [...odd, ...one.remarks, ...one.protocols.flatMap((p) => p.remarks)];
+  return [table, h('div', null, noteList([...new Set(notes)]))];
 }
 
 function differenceStrip(row) {

@@ -117,8 +117,8 @@ const isPooled = (one) =>
   !!one.result && one.headline.every((metric) => one.result.metrics[metric] === one.result.pooled[metric]);
 
 function summarySection() {
-  part('summary', 'Summary', 'Per cent with the 95 % interval over scenes. The tick on a line is what the truth itself '
-    + 'scores, no bound. The best is bold where all rows are of the same scenes and frames.', (section) => {
+  part('summary', 'Summary', 'Per cent with the 95 % interval over scenes, which is rough over fewer than ten. The tick on '
+    + 'a line is what the truth itself scores, no bound. The best is bold where all rows are of the same scenes and frames.', (section) => {
     const warn = (...content) => section.append(h('p', { class: 'note warn' }, content));
     for (const [index, run] of RUNS.entries()) {
       const where = RUNS.length > 1 ? `${runNames[index]}: ` : '';

@@ -25,7 +25,7 @@ def add_parser(actions: Any) -> None:
     )
     parser.add_argument("folder", type=Path, metavar="DIR", help="a folder with runs anywhere below it")
     parser.add_argument("--protocols", nargs="+", default=[], metavar="PROTOCOL", help="only these (default: all)")
-    parser.add_argument("--intervals", action="store_true", help="show the 95 %% interval over scenes")
+    parser.add_argument("--intervals", action="store_true", help="show 95 %% intervals: over scenes, and of ranks")
     add_table_format(parser)
     parser.add_argument("--out", type=Path, metavar="FILE", help="write there instead of printing")
 
@@ -35,7 +35,7 @@ def call(arguments: argparse.Namespace) -> int:
 
     from su3d_bench.analysis.leaderboard import leaderboard, tables
 
-    board = leaderboard(arguments.folder, arguments.protocols)
+    board = leaderboard(arguments.folder, arguments.protocols, with_ranks=arguments.intervals)
     if arguments.json:
         answer_json(asdict(board))
         return EXIT_DONE

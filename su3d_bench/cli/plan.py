@@ -1,0 +1,48 @@
+"""``su3d-bench plan``: how many scenes and seeds show a difference."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer_either, formatted
+from su3d_bench.core.errors import EXIT_DONE
+
+
+def add_parser(verbs: Any) -> None:
+    parser = add_verb(
+        verbs,
+        "plan",
+        "Tell how many scenes and seeds show a difference of so many points between two methods.",
+        (
+            "su3d-bench plan runs/my-run --methods opensu3d conceptgraphs --points 1 2 5",
+            "su3d-bench plan runs/seed-0 runs/seed-1 runs/seed-2 --protocol rooms-instance --json",
+        ),
+        call,
+    )
+    parser.add_argument(
+        "runs", nargs="+", type=Path, metavar="RUN", help="a finished run, and others that differ in --seed alone"
+    )
+    parser.add_argument("--methods", nargs=2, default=(), metavar=("A", "B"), help="whose (default: the only two)")
+    parser.add_argument(
+        "--points", nargs="+", type=float, default=[1.0, 2.0, 5.0], metavar="N", help="per cent (default: 1 2 5)"
+    )
+    parser.add_argument("--power", type=float, default=0.8, metavar="P", help="to find it (default: 0.8)")
+    add_protocols(parser, "under these protocols alone (default: all that scored both)")
+    add_table_format(parser)
+
+
+def call(arguments: argparse.Namespace) -> int:
+    from su3d_bench.analysis.planning import plan
+    from su3d_bench.reports.tables.planning import plan_tables
+
+    made = plan(
+        arguments.runs,
+        arguments.methods,
+        points=arguments.points,
+        protocols=arguments.protocol,
+        power=arguments.power,
+    ).to_json()
+    answer_either(arguments, made, formatted(plan_tables(made), arguments))
+    return EXIT_DONE

@@ -1,0 +1,146 @@
+"""What shows a difference, from runs of two methods under one seed and several; what does not belong together."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from painted import colour_perception
+from places import SCENES
+from scored_room import noisy_scores
+
+from su3d_bench.analysis.planning import plan
+from su3d_bench.cli.main import main
+from su3d_bench.core.errors import ConfigError
+from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.scoring import SceneScore, combine, pack_scores
+from su3d_bench.numerics.power import scenes_needed, variance_of
+from su3d_bench.runs import scene as scene_run
+from su3d_bench.store.run_folder import RunFolder
+
+COLLECTOR = f"{SCENES}/painted.py:Collector"
+PROTOCOLS = ("rooms-semantic", "rooms-instance")
+METHODS = ("collector", "collector@drop=1")
+N_SCENES = 3
+
+
+@cache
+def scores_of(name: str) -> list[SceneScore]:
+    """Of each scene, method and run, all different."""
+    return list(noisy_scores(name, 6 * N_SCENES).values())
+
+
+@pytest.fixture(scope="module")
+def runs(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """``seed-0`` to ``seed-2``: the same two methods, with other counts in every scene, method and run."""
+    folder = tmp_path_factory.mktemp("plans")
+    words = ["run", "--scenes", f"{SCENES}/painted.py:Painted/[abc]", "--methods", COLLECTOR, f"{COLLECTOR}@drop=1"]
+    words += ["--protocols", *PROTOCOLS, "--no-pictures", "--jobs", "1", "--quiet"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        patch.chdir(folder)
+        for seed in range(3):
+            assert main([*words, "--seed", str(seed), "--out", f"seed-{seed}"]) == 0
+        assert main([*words, "--set", "painted.n_frames=5", "--seed", "9", "--out", "other-data"]) == 0
+        assert main([*words, "--limit", "2", "--seed", "8", "--out", "partial"]) == 0
+    made = {name: scores_of(name) for name in PROTOCOLS}
+    for k in range(6):
+        for s, scene in enumerate("abc"):
+            packed = pack_scores({name: scores[N_SCENES * k + s] for name, scores in made.items()})
+            RunFolder(folder / f"seed-{k // 2}").job(f"painted/{scene}", METHODS[k % 2]).counts.write_bytes(packed)
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def _in_folder(runs: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(runs)
+
+
+def pseudo_values_of(name: str, metric: str, seed: int) -> list[float]:
+    """Of the difference between the two methods in a run, from the numbers without each scene."""
+    scores = scores_of(name)
+    rules = load_protocol(name)
+
+    def value(method: int, left_out: int | None) -> float:
+        first = N_SCENES * (2 * seed + method)
+        own = {str(s): scores[first + s] for s in range(N_SCENES) if s != left_out}
+        return combine(rules, own).metrics[metric]
+
+    whole = value(1, None) - value(0, None)
+    return [N_SCENES * whole - (N_SCENES - 1) * (value(1, s) - value(0, s)) for s in range(N_SCENES)]
+
+
+@pytest.mark.parametrize("n_seeds", [1, 3])
+def test_what_is_needed_follows_from_the_pseudo_values_of_the_runs(n_seeds: int) -> None:
+    found = plan([Path(f"seed-{seed}") for seed in range(n_seeds)], points=[5.0, 20.0])
+    assert (found.left, found.right, found.seeds) == (*METHODS, tuple(range(n_seeds)))
+    for protocol, metric in (("rooms-semantic", "mAcc"), ("rooms-instance", "AP50")):
+        one = found.protocols[protocol][metric]
+        variance = variance_of(np.array([pseudo_values_of(protocol, metric, seed) for seed in range(n_seeds)]))
+        assert one.variance is not None
+        assert one.variance.of_scenes == pytest.approx(variance.of_scenes, abs=1e-12)
+        assert one.variance.of_rest == pytest.approx(variance.of_rest, abs=1e-12)
+        assert (one.variance.of_seeds is None) == (n_seeds == 1)
+        for need in one.needs:
+            assert need.n_scenes == scenes_needed(variance, need.points / 100, need.n_seeds)
+            if None not in (need.low, need.n_scenes, need.high):
+                assert need.low <= need.n_scenes <= need.high  # type: ignore[operator]
+        assert {need.n_seeds for need in one.needs} == ({1} if n_seeds == 1 else {1, 2, 3, 5, 10})
+
+
+def test_the_command_prints_a_table_or_json(capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["plan", "seed-0", "seed-1", "--methods", *METHODS, "--points", "10", "--protocol", "rooms-instance"]
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    assert "| AP " in text and "10 points" in text and "seed 0, 1" in text
+    assert "intervals over 3 scenes are rough" in text
+    assert main([*words, "--json"]) == 0
+    assert list(json.loads(capsys.readouterr().out)["protocols"]) == ["rooms-instance"]
+    assert main(["plan", "seed-0"]) == 0
+    assert "how much seeds move the difference is not known" in capsys.readouterr().out
+
+
+def test_methods_that_do_not_differ_tell_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.copytree("seed-0", tmp_path / "run")
+    for scene in "abc":
+        jobs = [RunFolder(tmp_path / "run").job(f"painted/{scene}", method) for method in METHODS]
+        jobs[1].counts.write_bytes(jobs[0].counts.read_bytes())
+    found = plan([tmp_path / "run"], points=[1.0]).protocols["rooms-semantic"]["mAcc"]
+    assert (found.difference, found.interval, found.variance, found.needs) == (0.0, None, None, ())
+    assert main(["plan", str(tmp_path / "run")]) == 0
+    assert "no SD: the difference is the same in every scene and run" in capsys.readouterr().out
+
+
+REFUSED = {
+    "one method": (["seed-0", "--methods", "collector", "collector"], "a difference is of two methods"),
+    "an unknown method": (["seed-0", "--methods", "collector", "colector"], "did you mean 'collector'"),
+    "no points": (["seed-0", "--points", "0"], "--points 0: expected per cent above 0"),
+    "no power": (["seed-0", "--power", "1"], "--power 1: expected a probability"),
+    "other data": (["seed-0", "other-data"], "differs from seed-0 in dataset.painted.n_frames"),
+    "other frames": (["seed-0", "partial"], "has other frames than seed-0"),
+    "a repeat": (["seed-0", "copied"], "has the seed 0, as seed-0 has; a repeat tells nothing of other seeds"),
+    "an unknown protocol": (["seed-0", "--protocol", "rooms-instanse"], "did you mean 'rooms-instance'"),
+    "no run": (["nowhere"], "holds no run.json"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_tells_nothing_is_refused_in_one_line(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+    words, message = REFUSED[name]
+    if not Path("copied").exists():
+        shutil.copytree("seed-0", "copied")
+    assert main(["plan", *words]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_a_single_scene_is_refused(tmp_path: Path) -> None:
+    shutil.copytree("seed-0", tmp_path / "run")
+    for scene in "bc":
+        shutil.rmtree(RunFolder(tmp_path / "run").job(f"painted/{scene}", METHODS[0]).counts.parent)
+    with pytest.raises(ConfigError, match="1 scene is scored under rooms-semantic for both methods in every run"):
+        plan([tmp_path / "run"], points=[1.0])
