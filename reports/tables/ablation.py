@@ -152,7 +152,7 @@ def _compared(own: Measured, others: Sequence[Measured], metric: str) -> dict[st
     """Method -> its difference from ``own``, of the others that have a scene in common with it."""
     changes = {row.method: of_scenes(row, metric) - of_scenes(own, metric) for row in others}
     tests = {method: test for method, change in changes.items() if (test := sign_flip_test(change)) is not None}
-    adjusted = holm([test.p for test in tests.values()])
+    adjusted = [p for p in holm([test.p for test in tests.values()]) if p is not None]
     return {
         method: _Difference(float(np.nanmean(changes[method])), p, min(1.0, len(tests) * test.smallest_p))
         for (method, test), p in zip(tests.items(), adjusted, strict=True)
