@@ -82,15 +82,7 @@ class Relations:
 
     def of(self, relation: Relation) -> BoolArray:
         """Which pairs (K, K) stand in ``relation``."""
-        matrices = {
-            "on": "on",
-            "under": "under",
-            "in": "inside",
-            "above": "above",
-            "next to": "next_to",
-            "near": "near",
-        }
-        matrix: BoolArray = getattr(self, matrices[relation])
+        matrix: BoolArray = getattr(self, {"in": "inside", "next to": "next_to"}.get(relation, relation))
         return matrix
 
     def doubtful(self, relation: Relation) -> BoolArray:
@@ -108,11 +100,9 @@ class Relations:
     def _around(self) -> tuple[Relations, Relations]:
         return Relations(self._boxes, self._names, 1 / BAND), Relations(self._boxes, self._names, BAND)
 
-    def links(self, *, with_doubtful: bool = True) -> Iterator[Link]:
+    def links(self) -> Iterator[Link]:
         """Every relation but "near", by subject and object."""
         held = {name: self.of(name) for name in RELATIONS if name != "near"}
-        if not with_doubtful:
-            held = {name: matrix & ~self.doubtful(name) for name, matrix in held.items()}
         for a, b in np.argwhere(np.any(list(held.values()), axis=0)).tolist():
             for name, matrix in held.items():
                 if matrix[a, b]:

@@ -15,7 +15,7 @@ from su3d_bench.core.errors import ConfigError, printable, suggest
 from su3d_bench.numerics.relations import RELATIONS
 from su3d_bench.questions.model import MADE_KINDS, REASONING, Question
 from su3d_bench.questions.reasoning.answers import Answer
-from su3d_bench.questions.reasoning.generated import generate_questions
+from su3d_bench.questions.reasoning.generated import GeneratedQuestion, generate_questions
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
 from su3d_bench.questions.truths import MIN_VERTICES, fullest_truth, questions_of, scene_objects
 
@@ -58,14 +58,19 @@ def audited_questions(
     for question in generate_questions(objects, n_each=n_each, seed=seed):
         mentioned = _mentioned(question.text, objects)
         right = _of_ids(objects, question.answer.object_ids)
-        held = _of_ids(objects, question.answer.reference_ids)
-        if not held and question.answer.value is False and mentioned:
-            held = mentioned[-1]  # what is not the case was held against what the text ends with
-        held = _without(held, right)
+        held = held_against(question, objects)
         called = (*_called_as(right, objects), *(thing for things in mentioned for thing in things))
         others = _without(called, (*right, *held))
         words = _in_words(question.answer, objects)
         yield AuditedQuestion(address, question.kind, question.text, words, right, held, others, objects)
+
+
+def held_against(question: GeneratedQuestion, objects: SceneMap) -> Things:
+    """What an answer was held against; what is not the case, against what the text ends with."""
+    held = _of_ids(objects, question.answer.reference_ids)
+    if not held and question.answer.value is False and (mentioned := _mentioned(question.text, objects)):
+        held = mentioned[-1]
+    return _without(held, _of_ids(objects, question.answer.object_ids))
 
 
 def of_kinds(questions: Sequence[AuditedQuestion], kinds: Sequence[str]) -> list[AuditedQuestion]:

@@ -39,10 +39,6 @@ def known_objects(
         sight = None if seen is None else seen.get(known.id)
         is_asked = known.id in rows_of and (seen is None or (sight is not None and sight.is_plain))
         is_asked &= not any(name.endswith(f" {known.name}") for name in names)
-        colour = "" if sight is None or last_word(known.name) in WITHOUT_COLOUR else sight.colour
-        is_sure = sight is not None and (known.colour == sight.colour or (not known.colour and sight.is_sure_colour))
-        colour = colour if is_sure else ""  # in the light of the room it may look like another
-        words = [*([colour] if colour else []), *known.adjectives]
         is_cut = whole is None and sight is not None and sight.is_cut
         looks = None
         if whole is None and seen is not None:
@@ -51,7 +47,7 @@ def known_objects(
             MapObject(
                 known.id,
                 known.name,
-                " ".join(words),
+                " ".join((*_colour(known, sight), *known.adjectives)),
                 known.box.mean(axis=0),
                 known.box,
                 is_asked=is_asked,
@@ -61,6 +57,13 @@ def known_objects(
             )
         )
     return SceneMap(tuple(things))
+
+
+def _colour(known: WholeObject, sight: Sight | None) -> tuple[str, ...]:
+    """The word for what frames show, where it is what the thing was made in, or nobody knows and it is plain."""
+    if sight is None or not sight.colour or last_word(known.name) in WITHOUT_COLOUR:
+        return ()
+    return (sight.colour,) if known.colour == sight.colour or (not known.colour and sight.is_sure_colour) else ()
 
 
 def _of_vertices(truth: GroundTruth, instance: int, rows: Int64Array) -> WholeObject | None:

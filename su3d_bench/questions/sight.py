@@ -65,13 +65,10 @@ def sights(dataset: Any, scene: str, truth: GroundTruth, min_vertices: int) -> M
     """Instance id -> what the frames show of it, for the instances of the truth that some frame sees."""
     rows = _sampled_vertices(truth, min_vertices)
     points, owner = truth.points[rows].astype(np.float64), truth.instance[rows].astype(np.int64)
-    n_frames = int(dataset.info(scene, 1).n_frames)
-    frames = dataset.frames(scene, max(1, n_frames // N_FRAMES))
     pixels: dict[int, list[Float64Array]] = {}
     shares: dict[int, float] = {}
     is_inside = np.zeros(len(points), bool)
-    for k in range(min(len(frames), N_FRAMES)):
-        frame = frames[k]
+    for frame in looked_at(dataset, scene):
         seen, line, column = _seen(frame, points)
         is_inside[seen] |= _is_off_the_border(frame, line, column)
         side = max(frame.depth_m.shape) / CELLS_A_SIDE
@@ -110,6 +107,12 @@ def _is_cut(points: Float64Array, is_inside: BoolArray) -> bool:
     low, high = points.min(axis=0), points.max(axis=0)
     ends = np.concatenate([points - low <= END_M, high - points <= END_M], axis=1)
     return not (ends & is_inside[:, None]).any(axis=0).all()
+
+
+def looked_at(dataset: Any, scene: str) -> Iterator[Frame]:
+    """The frames of a scene, one at a time, in which it is looked up what people can be asked about."""
+    frames = dataset.frames(scene, max(1, int(dataset.info(scene, 1).n_frames) // N_FRAMES))
+    return (frames[k] for k in range(min(len(frames), N_FRAMES)))
 
 
 def instance_rows(truth: GroundTruth, min_vertices: int) -> Iterator[tuple[int, Int64Array]]:

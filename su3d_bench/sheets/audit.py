@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import StoreError, printable
-from su3d_bench.core.types import BoolArray, Float64Array, Frame, GroundTruth, Int64Array, UInt8Array
+from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Int64Array, UInt8Array
 from su3d_bench.questions.audit import AuditedQuestion, Things
 from su3d_bench.questions.reasoning.scene_map import MapObject
-from su3d_bench.questions.sight import N_FRAMES
+from su3d_bench.questions.sight import looked_at
 from su3d_bench.questions.truths import fullest_truth
 from su3d_bench.reports.pictures.items import owners_in_frame, png_bytes
 from su3d_bench.reports.pictures.tiles import Line, Mark, Photo, Plan, Shade, Tile, contact_sheet, picture_strip
@@ -146,12 +146,11 @@ class _Photographer:
         ids = np.unique(truth.instance[truth.instance > 0])
         owner = np.where(truth.instance > 0, np.searchsorted(ids, truth.instance) + 1, 0).astype(np.int64)
         self._place_of = {instance: place for place, instance in enumerate(ids.tolist(), 1)}
-        frames = dataset.frames(name, max(1, int(dataset.info(name, 1).n_frames) // N_FRAMES))
-        self.n_frames = min(len(frames), N_FRAMES)
-        self._seen = []
-        for k in range(self.n_frames):
-            frame: Frame = frames[k]
-            self._seen.append(_Seen(frame.rgb, frame.camera_to_world, owners_in_frame(frame, tree, owner)))
+        self._seen = [
+            _Seen(frame.rgb, frame.camera_to_world, owners_in_frame(frame, tree, owner))
+            for frame in looked_at(dataset, name)
+        ]
+        self.n_frames = len(self._seen)
         n = len(ids) + 1
         counts = [np.bincount(seen.owners.ravel(), minlength=n) / seen.owners.size for seen in self._seen]
         share: Float64Array = np.array(counts, np.float64).reshape(len(self._seen), n)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Sequence
 
 from su3d_bench.core.errors import printable
+from su3d_bench.questions.audit import held_against
 from su3d_bench.questions.generator import chosen
 from su3d_bench.questions.model import REASONING, question_id
 from su3d_bench.questions.reasoning.generated import generate_questions
@@ -32,8 +33,9 @@ def question_drafts(source: TruthSource, scene: str, per_kind: int, left_out: Co
     for made in generate_questions(objects, n_each=per_kind):
         made_id, answer = question_id(scene, REASONING, made.text), made.answer
         if made_id not in left_out:
-            ids = answer.object_ids, answer.reference_ids
-            drafts.append(shown.draft(made.text, answer.text, made_id, made.kind, *ids))
+            held = [thing.id for thing in held_against(made, objects)]
+            told = "no" if answer.value is False else answer.text
+            drafts.append(shown.draft(made.text, told, made_id, made.kind, answer.object_ids, held))
     return drafts
 
 

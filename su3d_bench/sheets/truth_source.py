@@ -11,7 +11,7 @@ import numpy as np
 
 from su3d_bench.core.config import read_assignments
 from su3d_bench.core.types import Frame, GroundTruth, Instances
-from su3d_bench.questions.sight import N_FRAMES, instance_rows
+from su3d_bench.questions.sight import instance_rows, looked_at
 from su3d_bench.questions.truths import fullest_truth
 from su3d_bench.runs.finished import read_run
 from su3d_bench.runs.job import build_dataset, part_of
@@ -56,8 +56,7 @@ class TruthSource:
 
     def _frames(self, scene: str) -> tuple[Frame, ...]:
         dataset, name = self.dataset(scene), scene.partition("/")[2]
-        frames = dataset.frames(name, max(1, int(dataset.info(name, 1).n_frames) // N_FRAMES))
-        return tuple(frames[k] for k in range(min(len(frames), N_FRAMES)))
+        return tuple(looked_at(dataset, name))
 
 
 def truth_of_run(folder: Path, scenes: Sequence[str] = ()) -> TruthSource:

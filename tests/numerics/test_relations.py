@@ -161,7 +161,7 @@ def test_what_a_little_more_or_less_decides_is_doubtful() -> None:
     assert bottom.doubtful("on")[0, 1] and bottom.doubtful("under")[0, 1]
     certain = Relations(np.array([TABLE, CUP, FLOOR]), ["table", "cup", "floor"])
     assert not certain.doubtful("on").any()
-    assert [(link.subject, link.relation, link.object) for link in certain.links(with_doubtful=False)] == [
+    assert [(link.subject, link.relation, link.object) for link in certain.links()] == [
         (0, "under", 1),
         (1, "on", 0),
     ]

@@ -24,11 +24,13 @@ from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.questions.files.files import read_questions
 from su3d_bench.questions.files.left_out import read_left_out
 from su3d_bench.questions.model import MADE_KINDS, REASONING, question_id
-from su3d_bench.questions.reasoning.generated import generate_questions
+from su3d_bench.questions.reasoning.answers import Answer
+from su3d_bench.questions.reasoning.generated import GeneratedQuestion, generate_questions
 from su3d_bench.questions.truths import fullest_truth, scene_objects
 from su3d_bench.reports.tables.judged import sheet_tables
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
+from su3d_bench.sheets import question_drafts as question_drafts_module
 from su3d_bench.sheets.answers import Judgement, check_key
 from su3d_bench.sheets.drawing import SceneDrafts, draw_all, draw_scene
 from su3d_bench.sheets.items import (
@@ -75,6 +77,14 @@ def painted_objects() -> Any:
 # Made
 
 
+def test_what_a_no_was_held_against_is_outlined(source: TruthSource, monkeypatch: pytest.MonkeyPatch) -> None:
+    denied = GeneratedQuestion("Is there a lamp on the sofa?", "is on", Answer("no: the map has none", value=False))
+    monkeypatch.setattr(question_drafts_module, "generate_questions", lambda objects, n_each: (denied,))
+    (draft,) = [one for one in question_drafts(source, "painted/a", 1) if one.question_kind == "is on"]
+    assert draft.text.endswith("Answer: no") and not draft.rows
+    assert [draft.names[row] for row in draft.others] == ["sofa #2"]
+
+
 def test_each_kind_and_template_is_asked_with_the_answer_of_the_truth(source: TruthSource) -> None:
     drafts = question_drafts(source, "painted/a", 2)
     made = [one for one in drafts if one.question_kind in MADE_KINDS]
@@ -83,7 +93,10 @@ def test_each_kind_and_template_is_asked_with_the_answer_of_the_truth(source: Tr
     assert max(Counter(one.question_kind for one in drafts).values()) == 2
     assert {one.question_kind for one in made} == {"instance", "property by name"}
     true = generate_questions(painted_objects(), n_each=2)
-    assert [one.text for one in reasoned] == [f"{one.text}\nAnswer: {one.answer.text}" for one in true]
+    told = ["no" if one.answer.value is False else one.answer.text for one in true]
+    assert [one.text for one in reasoned] == [
+        f"{one.text}\nAnswer: {words}" for one, words in zip(true, told, strict=True)
+    ]
     assert len({one.question_id for one in drafts}) == len(drafts)
     for text, one in asked.items():
         assert one.question_id == question_id("painted/a", one.question_kind, text)

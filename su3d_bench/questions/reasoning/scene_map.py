@@ -12,7 +12,16 @@ from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.types import BoolArray, Float64Array, Instances
 from su3d_bench.metrics.questions.score import labels_n
 from su3d_bench.metrics.questions.truths import RefinedNames
-from su3d_bench.numerics.relations import BUILT_IN, FIXTURES, SURFACES, Relation, Relations, is_between, may_be_between
+from su3d_bench.numerics.relations import (
+    BUILT_IN,
+    FIXTURES,
+    RELATIONS,
+    SURFACES,
+    Relation,
+    Relations,
+    is_between,
+    may_be_between,
+)
 from su3d_bench.questions.looks import Looks
 
 MOST_NAME, MOST_CAPTION = 80, 400  # characters; a hostile map may hold texts of any length
@@ -90,9 +99,13 @@ class SceneMap:
 
     def doubtful(self, relation: Relation) -> BoolArray:
         """The doubtful pairs (K, K) by their rows here."""
+        return self._doubtful[relation]
+
+    @cached_property
+    def _doubtful(self) -> dict[Relation, BoolArray]:
         is_cut = np.array([thing.is_cut for thing in self.objects], bool)
-        answer: BoolArray = self.relations.doubtful(relation) | ((is_cut[:, None] | is_cut[None]) & self.relations.near)
-        return answer
+        beside_cut = (is_cut[:, None] | is_cut[None]) & self.relations.near
+        return {relation: self.relations.doubtful(relation) | beside_cut for relation in RELATIONS}
 
     def is_between(self, thing: MapObject, first: MapObject, second: MapObject) -> bool:
         """Whether an object stands between two others; what one of them holds, or stands on, does not."""
