@@ -17,6 +17,7 @@ from su3d_bench.sheets.making import MadeSheets, write_sheets
 
 needs_browser = pytest.mark.skipif(find_chromium() is None, reason="no browser: install chromium")
 TEXTS = ("chair", "place to sit", "red cup", "lamp next to a bed")
+COUNT = "document.getElementById('count').textContent"
 
 
 def written(folder: Path, kind: SheetKind, texts: tuple[str, ...]) -> tuple[MadeSheets, Path]:
@@ -46,7 +47,7 @@ def answers(browser: Chromium, folder: Path) -> list[dict[str, str]]:
 
 
 def shown(browser: Chromium) -> str:
-    text: str = browser.run("document.getElementById('count').textContent")
+    text: str = browser.run(COUNT)
     return text
 
 
@@ -79,8 +80,7 @@ def test_a_sheet_is_answered_by_keyboard_kept_over_a_reload_and_exported(tmp_pat
     assert shown(browser) == "2 of 4 answered, item 3 of 4"
     browser.press("ArrowLeft", "ArrowLeft", "2", "n")
     assert shown(browser) == "2 of 4 answered, item 3 of 4"
-    browser.reload()
-    assert shown(browser) == "2 of 4 answered, item 3 of 4"
+    browser.reload(until=f"{COUNT} === '2 of 4 answered, item 3 of 4'")
     browser.press("u", "1", "n", "3", "1", "9", "x")
     assert shown(browser) == "4 of 4 answered, item 4 of 4"
     rows = answers(browser, tmp_path / "down")

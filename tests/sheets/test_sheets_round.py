@@ -132,7 +132,7 @@ def test_a_page_answered_by_keyboard_over_a_reload_is_scored(
     with Chromium(tmp_path / "profile") as browser:
         browser.open(tmp_path / "sheets" / "annotator-1" / PAGE)
         browser.press(*keys[:7])
-        browser.reload()
+        browser.reload(until="document.getElementById('count').textContent.startsWith('7 of ')")
         browser.press(*keys[7:])
         browser.downloads_to(down)
         browser.run("document.getElementById('export').click()")

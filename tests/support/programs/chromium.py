@@ -115,9 +115,18 @@ class Chromium:
         """Open a file, as a person does who double-clicks on it."""
         self._arrive("Page.navigate", {"url": path.resolve().as_uri()})
 
-    def reload(self) -> None:
-        """Load the page again; unlike ``open`` in the same process, which has what the page has just kept."""
-        self._arrive("Page.reload", {})
+    def reload(self, until: str) -> None:
+        """Load the page again until an expression is true of it.
+
+        Unlike ``open`` in the same process, which has what the page has just kept; and again, for what a page keeps
+        is on its way to the browser's store when the page goes on, and a reload may come before it.
+        """
+
+        def is_so() -> bool:
+            self._arrive("Page.reload", {})
+            return bool(self.run(until))
+
+        wait_until(is_so, f"it is not true of the page that is loaded again: {until}", WAIT_S)
 
     def _arrive(self, method: str, values: Mapping[str, Any]) -> None:
         self.run("window.isOfThePageBefore = true")
