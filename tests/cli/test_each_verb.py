@@ -41,7 +41,7 @@ CASES: dict[str, tuple[list[str], int, str]] = {
     "sheets score": (["--key", "sheets-key"], 0, ""),
     "sheets pictures": (["out", "--what", "labels", "--out", "labels.png"], 0, "labels.png"),
     "query": ([SCENE, "plant on shelf", "--run", "out"], 0, "opensu3d"),
-    "questions": (["show", "paper"], 0, "663 questions on 13 scenes"),
+    "questions": (["show", "paper"], 0, "904 questions on 13 scenes"),
     "ask": ([SCENE, "What is the largest object?", "--run", "out"], 0, "#"),
     "refine": (["out"], 0, "opensu3d"),
     "datasets list": ([], 0, "replica"),

@@ -89,7 +89,7 @@ def test_the_overlap_merge_needs_names_that_are_alike(cosine: float, n_left: int
 
 
 def test_class_agnostic_masks_merge_what_names_keep_apart() -> None:
-    shared = ALL_STAY.model_dump(exclude={"skip_bg", "background_names"})
+    shared = ALL_STAY.model_dump(exclude={"skip_bg", "background_names", "grounding"})
     assert len(mapped(ConceptGraphs(MappingConfig(**shared)), in_parts(0.0)).finish()) == 1
     assert len(mapped(ConceptGraphsDetector(ALL_STAY), in_parts(0.0)).finish()) == 2
 

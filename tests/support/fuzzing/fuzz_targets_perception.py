@@ -129,15 +129,17 @@ def _completion(folder: Path) -> Read:
 
 def _refined_names(folder: Path) -> Read:
     from su3d_bench.core.digests import digest_file
-    from su3d_bench.questions.refined_names import FILE_NAME, read_records
+    from su3d_bench.questions.refined_names import FILE_NAME, SCHEMA, read_records
+    from su3d_bench.questions.undesired import FilterConfig
     from su3d_bench.store.run_folder import RunFolder
 
     job = RunFolder(folder).job("rooms/living0", "opensu3d")
     job.prepare()
     job.prediction.write_bytes(b"a map")
     name = {"id": 3, "label": "chair", "refined": "armchair", "source": "vote", "reason": "", "candidates": []}
-    content = {"schema_version": 1, "prediction_sha256": digest_file(job.prediction), "refiner": "vote", "model": ""}
-    (job.path / FILE_NAME).write_text(json.dumps({**content, "top_m": 5, "names": [{**name, "request": ""}]}))
+    content = {"schema_version": SCHEMA, "prediction_sha256": digest_file(job.prediction), "refiner": "vote"}
+    content |= {"model": "", "top_m": 5, "filter": FilterConfig().model_dump()}
+    (job.path / FILE_NAME).write_text(json.dumps({**content, "names": [{**name, "request": "", "left_out": ""}]}))
     return lambda: read_records(job)
 
 
