@@ -285,7 +285,8 @@ def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int
     for name, p in zip(tests, holm([None if test is None else test.p for test in tests.values()]), strict=True):
         if name in marked and (len(marked[name]) > 1 or p is None or p >= LEVEL):
             marked[name] = set()
-    smallest = min((test.smallest_p for test in tests.values() if test is not None), default=1.0)
+    least = holm([None if test is None else test.smallest_p for test in tests.values()])
+    smallest = min((p for p in least if p is not None), default=1.0)
     corrected = f", corrected by Holm for {len(tests)} metrics" if len(tests) > 1 else ""
     over = "items" if rows[0].is_by_people and any(row.tests for row in rows) else "scenes"
     if smallest >= LEVEL:

@@ -173,7 +173,7 @@ def test_a_best_of_one_of_four_over_none_is_not_marked_and_a_clear_one_is() -> N
     def both(other: float) -> list[bool]:
         rows = [by_truth("opensu3d", "retrieval", "replica", **dict.fromkeys(KINDS, value)) for value in (0.25, other)]
         rows[0] = replace(rows[0], method="sam3d", per_scene={scene: {} for scene in SCENES[1:]})
-        one = {SCENES[0]: dict.fromkeys(KINDS, 1.0)} | {scene: dict.fromkeys(KINDS, 0.0) for scene in SCENES[1:]}
+        one = {SCENES[0]: dict.fromkeys(KINDS, 0.5)} | {scene: dict.fromkeys(KINDS, 0.0) for scene in SCENES[1:]}
         rows[0] = replace(rows[0], per_scene=one)
         table = judged_table("IV", rows, Shown(), with_published=False)
         return [row.cells[0].is_best for row in table.rows]
