@@ -66,7 +66,9 @@ _NO_OBJECT = frozenset({"object", "objects", "thing", "item", "image", "n/a"})
 _KEYS_OF_NAME = ("name", "object", "label", "title", "object_name")
 _KEYS_OF_CAPTION = ("description", "caption", "desc", "details")
 _KEYS_OF_ERRORS = frozenset({"error", "message", "refusal", "reason", "status"})
-_OBJECT_ID = re.compile(r"(?:#|\b(?:ids?|objects?)[\s_:#=\[(]*)(\d{1,9}(?:\s*(?:,|and|&)\s*#?\d{1,9})*)", re.IGNORECASE)
+# Ids are of 64 bits: a part of a segment has one of a dozen digits (opensu3d/postprocess.py).
+_ID = r"\d{1,18}(?!\d)"
+_OBJECT_ID = re.compile(rf"(?:#|\b(?:ids?|objects?)[\s_:#=\[(]*)({_ID}(?:\s*(?:,|and|&)\s*#?{_ID})*)", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -155,7 +157,7 @@ def answered(text: str, known_ids: Sequence[int]) -> Answered | None:
 def _ids(listed: Any, known: Collection[int]) -> tuple[int, ...]:
     """Those of ``listed`` that are ``known``, each once."""
     given = [str(value) for value in listed if isinstance(value, int | str)] if isinstance(listed, list) else []
-    numbers = dict.fromkeys(int(value.lstrip("#")) for value in given if re.fullmatch(r"#?\d{1,9}", value))
+    numbers = dict.fromkeys(int(value.lstrip("#")) for value in given if re.fullmatch(rf"#?{_ID}", value))
     return tuple(number for number in numbers if number in known)
 
 

@@ -116,6 +116,18 @@ def test_ids_of_an_answer_are_those_of_the_map() -> None:
     assert answered(" ", (1,)) is None
 
 
+def test_ids_of_parts_of_objects_are_understood_whole() -> None:
+    part = 123456000012  # of object 12; its first nine digits are another's
+    known = (123456000, part)
+    told = answered(f'{{"answer": "lamp", "object_ids": [{part}], "reference_ids": ["#{part}", 123456000]}}', known)
+    assert told is not None
+    assert (told.object_ids, told.reference_ids) == ((part,), (123456000,))
+    prose = answered(f"The lamp (id {part}) hangs above nothing.", known)
+    assert prose is not None and prose.object_ids == (part,)
+    digits = answered(f"The lamp (id 1{'0' * 18}) hangs above nothing.", (10**18,))
+    assert digits is not None and digits.object_ids == ()
+
+
 @settings(max_examples=150, deadline=None)
 @given(st.text(alphabet=st.sampled_from("ab:'\"`{}[]\n,.*# 1é\x00"), max_size=60))
 def test_no_answer_breaks_a_parser(text: str) -> None:
