@@ -24,6 +24,12 @@ def test_centre_and_size_become_corners_in_pixels() -> None:
     np.testing.assert_array_equal(corners_of(boxes_of((0.25, 0.5, 0.5, 0.2)), 10, 20), boxes_of((0, 4, 10, 6)))
 
 
+def test_boxes_become_pixels_before_corners_as_in_the_original() -> None:
+    """Boxes of 1200x680 by ``Model.post_process_result``; the other order has other last bits."""
+    told = corners_of(boxes_of((0.34, 0.43, 0.97, 0.56)), 680, 1200)
+    np.testing.assert_array_equal(told, boxes_of((-174.0, 102.0, 990.0, 482.79998779296875)))
+
+
 def test_overlap_is_intersection_over_union() -> None:
     others = boxes_of((0, 0, 10, 10), (5, 0, 15, 10), (0, 0, 5, 10), (10, 0, 20, 10), (3, 3, 3, 3))
     np.testing.assert_allclose(box_overlaps(boxes_of((0, 0, 10, 10))[0], others), [1, 50 / 150, 0.5, 0, 0])

@@ -13,11 +13,12 @@ from su3d_bench.core.types import Float32Array, Int64Array
 def corners_of(boxes: Float32Array, height: int, width: int) -> Float32Array:
     """Boxes (K, 4) x0 y0 x1 y1 in pixels from boxes centre x, centre y, width, height in shares of the image.
 
-    Each product and sum is float32, as the original's are.
+    Each product and sum is float32 and in the original's order: to pixels first, then from centres to corners
+    (``Model.post_process_result`` of GroundingDINO's inference.py, with torchvision's ``box_convert``).
     """
-    centre, half = boxes[:, :2], np.float32(0.5) * boxes[:, 2:]
-    size = np.array([width, height, width, height], np.float32)
-    return np.concatenate([centre - half, centre + half], axis=1).astype(np.float32) * size
+    pixels = boxes * np.array([width, height, width, height], np.float32)
+    centre, half = pixels[:, :2], np.float32(0.5) * pixels[:, 2:]
+    return np.concatenate([centre - half, centre + half], axis=1).astype(np.float32)
 
 
 def box_overlaps(box: Float32Array, others: Float32Array) -> Float32Array:
