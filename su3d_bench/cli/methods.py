@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import argparse
+import json
 import textwrap
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.common import add_verb, answer, answer_either, answer_json
@@ -68,17 +70,31 @@ def _show(arguments: argparse.Namespace) -> int:
     defaults = method.Config().model_dump(mode="json")
     row = _about(method.name, method)
     figures = figures_of(method=method.name)
+    presets = {name: dict(settings) for name, settings in _presets_of(method).items()}
     if arguments.json:
         published = [figure.model_dump(mode="json", exclude_none=True) for figure in figures]
-        answer_json({**row, "settings": defaults, "published": published})
+        answer_json({**row, "settings": defaults, "presets": presets, "published": published})
         return EXIT_DONE
     leaves = [(("method", method.name, *path), value, _remark(method, path)) for path, value in flatten(defaults)]
     answer("\n".join(f"# {line}" for line in _lines(row)))
     answer("\n" + write_toml(leaves) if leaves else f"# {method.name} has no settings")
+    if presets:
+        answer("\n# presets, each a method of its own name")
+        answer("\n".join(f"# {method.name}@{name}: {_assigned(settings)}" for name, settings in presets.items()))
     if figures:
         answer("\n# as reported, each in its own set-up; no two need be comparable")
         answer("\n".join(f"# {line}" for figure in figures for line in _figure_lines(figure)))
     return EXIT_DONE
+
+
+def _presets_of(method: Any) -> Mapping[str, Mapping[str, Any]]:
+    from su3d_bench.core.interfaces import HasPresets
+
+    return method.presets if isinstance(method, HasPresets) else {}
+
+
+def _assigned(settings: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key} = {json.dumps(value)}" for key, value in settings.items())
 
 
 def _figure_lines(figure: Figure) -> list[str]:

@@ -69,6 +69,18 @@ def test_the_settings_that_are_shown_can_be_used_as_they_stand(
     assert read_file(tmp_path / "mine.toml").under(("method", "opensu3d"))
 
 
+def test_a_method_shows_its_presets_and_one_without_any_says_nothing_of_them(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    presets = registry.load("method", "opensu3d").presets
+    text = told(capsys, "opensu3d")
+    assert [name for name in presets if f"# opensu3d@{name}: " not in text] == []
+    assert '# opensu3d@owner: border_pixels = "owner"' in text
+    assert json.loads(told(capsys, "opensu3d", "--json"))["presets"] == presets
+    assert "presets" not in told(capsys, "oracle")
+    assert json.loads(told(capsys, "oracle", "--json"))["presets"] == {}
+
+
 def test_a_method_that_no_paper_reports_says_nothing_of_papers(capsys: pytest.CaptureFixture[str]) -> None:
     assert "as reported" not in told(capsys, "oracle")
 
