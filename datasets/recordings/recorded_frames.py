@@ -11,6 +11,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
+from threading import Lock
 from typing import Any
 
 import numpy as np
@@ -63,16 +64,18 @@ class StoredDepth:
     """Metres of depth images as files hold them; 65535 is no depth where it stands apart from all others of the image.
 
     So 7-Scenes and many other recorders write "nothing"; in an image whose depths come near it, it is one of them.
-    ``metres`` (65536,) float32 are those of every value, 0 where it means none. What is taken out is said once.
+    ``metres`` (65536,) float32 are those of every value, 0 where it means none. Unless ``is_quiet``, what is taken out
+    is said once, in words that are the same whichever image is read first.
     """
 
-    def __init__(self, where: str, metres: Float32Array) -> None:
+    def __init__(self, where: str, metres: Float32Array, *, is_quiet: bool = False) -> None:
         self._where = where
         self._metres = metres
-        self._is_said = False
+        self._is_said = is_quiet
+        self._saying = Lock()  # frames are read by several threads
 
-    def depth_m(self, values: UInt16Array, name: str) -> Float32Array:
-        """Depth (H, W) m of the image ``name`` with these ``values``, 0 where it has none."""
+    def depth_m(self, values: UInt16Array) -> Float32Array:
+        """Depth (H, W) m of an image with these ``values``, 0 where it has none."""
         depth_m = self._metres.take(values)  # half the time of an index
         far_m = float(self._metres[LARGEST_DEPTH_VALUE])
         if far_m > 0 and values.max() == LARGEST_DEPTH_VALUE:
@@ -80,16 +83,15 @@ class StoredDepth:
             others_m = float(depth_m.max(initial=0.0, where=~is_largest))
             if others_m < (1 - STANDS_APART) * far_m:
                 depth_m[is_largest] = 0
-                self._say(name, float(is_largest.mean()), others_m, far_m)
+                self._say(far_m)
         return depth_m
 
-    def _say(self, name: str, share: float, others_m: float, far_m: float) -> None:
-        if self._is_said:
-            return
-        self._is_said = True
-        apart = f"depth {LARGEST_DEPTH_VALUE} ({far_m:.4g} m) stands apart from all others (to {others_m:.4g} m)"
-        counts = f"counts as no depth; first in {name}, {share:.1%} of its pixels"
-        logger.warning("%s: %s and %s", self._where, apart, counts)
+    def _say(self, far_m: float) -> None:
+        with self._saying:
+            was_said, self._is_said = self._is_said, True
+        if not was_said:
+            apart = f"depth {LARGEST_DEPTH_VALUE} ({far_m:.4g} m) counts as no depth"
+            logger.warning("%s: %s where it stands apart from all other depths of its image", self._where, apart)
 
 
 def numbers(words: Sequence[str], where: str) -> list[float]:
@@ -153,7 +155,7 @@ class RecordedFrame:
 
 @dataclass(frozen=True)
 class Recording:
-    """The usable frames of a scene; ``depth`` turns stored depth into metres.
+    """The usable frames of a scene; ``metres`` (65536,) are those of every value of a depth image, 0 for no depth.
 
     ``files`` are all that it is read from besides the images; ``image_size`` is what its camera file says, if it does;
     ``missing`` says, a line each, what was left out because something of it is not there.
@@ -163,7 +165,7 @@ class Recording:
     folder: Folder
     frames: tuple[RecordedFrame, ...]
     intrinsics: Float64Array
-    depth: StoredDepth
+    metres: Float32Array
     files: tuple[Path, ...]
     image_size: tuple[int, int] | None = None
     missing: tuple[str, ...] = ()
@@ -185,13 +187,17 @@ class Recording:
 
 
 class RecordedFrames(Sequence[Frame]):
-    """Every ``stride``-th usable frame, read when it is asked for; a file that cannot be used is a ``DataError``."""
+    """Every ``stride``-th usable frame, read when it is asked for; a file that cannot be used is a ``DataError``.
+
+    ``is_quiet``: nothing is said of depth that counts as none, for the frames are read for themselves too.
+    """
 
     advice = "copy the recording again"
 
-    def __init__(self, recording: Recording, stride: int = 1) -> None:
+    def __init__(self, recording: Recording, stride: int = 1, *, is_quiet: bool = False) -> None:
         self._recording = recording
         self._frames = recording.frames[::stride]
+        self._depth = StoredDepth(recording.where, recording.metres, is_quiet=is_quiet)
 
     def __len__(self) -> int:
         return len(self._frames)
@@ -201,7 +207,7 @@ class RecordedFrames(Sequence[Frame]):
         where, content = self._read(frame.colour)
         rgb = decode_colour(content, where)
         self.check_size(rgb.shape[1], rgb.shape[0], where)
-        depth_m = recording.depth.depth_m(self._depth_values(frame, rgb), frame.depth)
+        depth_m = self._depth.depth_m(self._depth_values(frame, rgb))
         return Frame(frame.index, frame.timestamp_s, rgb, depth_m, frame.pose, recording.intrinsics)
 
     def check_size(self, width: int, height: int, where: str) -> None:

@@ -21,7 +21,6 @@ from su3d_bench.datasets.recordings.recorded_frames import (
     RecordedFrame,
     RecordedFrames,
     Recording,
-    StoredDepth,
     depth_m_of_values,
     parsed_json,
 )
@@ -135,8 +134,8 @@ class ReplicaFrames(RecordedFrames):
             RecordedFrame(i, i / FRAMES_PER_SECOND, colour_name(i), depth_name(i), poses[i]) for i in indices
         )
         self._size = camera.width, camera.height
-        depth = StoredDepth(where, depth_m_of_values(camera.scale))
-        super().__init__(Recording(where, Folder(folder), frames, camera.intrinsics, depth, ()))
+        metres = depth_m_of_values(camera.scale)
+        super().__init__(Recording(where, Folder(folder), frames, camera.intrinsics, metres, ()))
 
     def check_size(self, width: int, height: int, where: str) -> None:
         if (width, height) != self._size:

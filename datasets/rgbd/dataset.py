@@ -27,7 +27,6 @@ from su3d_bench.datasets.recordings.recorded_frames import (
     RecordedFrame,
     RecordedFrames,
     Recording,
-    StoredDepth,
     left_out,
     pinhole,
 )
@@ -95,7 +94,7 @@ class Rgbd:
         description, recording = self._open(scene)
         if description.check_convention and scene not in self._checked:
             place = f"{recording.where}: {self._description(scene).name}"
-            _check_convention(RecordedFrames(recording), description, place)
+            _check_convention(RecordedFrames(recording, is_quiet=True), description, place)
             self._checked.add(scene)
         return RecordedFrames(recording, stride)
 
@@ -183,8 +182,7 @@ def open_recording(path: Path, description: RgbdDescription, where: str) -> Reco
     mesh = () if description.mesh is None else (folder.file(description.mesh, place),)
     files = (path, *camera_files, *poses.files, *mesh)
     lines = tuple(f"{where}: {line}" for line in missing)
-    stored = StoredDepth(where, depth_table(description))
-    return Recording(where, folder, tuple(frames), intrinsics, stored, files, size, lines)
+    return Recording(where, folder, tuple(frames), intrinsics, depth_table(description), files, size, lines)
 
 
 def _folder(path: Path, description: RgbdDescription, place: str) -> Folder:

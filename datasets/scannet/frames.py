@@ -90,7 +90,7 @@ class ScannetFrames(Sequence[Frame]):
     def __getitem__(self, position: int) -> Frame:  # type: ignore[override]
         i = int(self._records[position])
         pose = self._registration.camera_to_world(self._walk.poses[i])
-        depth_m = self._depth.depth_m(self._source.depth(i), f"frame {int(self._walk.numbers[i])}")
+        depth_m = self._depth.depth_m(self._source.depth(i))
         rgb, depth_m = self._registration.images(self._source.colour(i), depth_m)
         return Frame(
             index=int(self._walk.numbers[i]),

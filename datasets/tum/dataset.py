@@ -31,7 +31,6 @@ from su3d_bench.datasets.recordings.recorded_frames import (
     RecordedFrame,
     RecordedFrames,
     Recording,
-    StoredDepth,
     depth_m_of_values,
     left_out,
     numbers,
@@ -172,8 +171,7 @@ class Tum:
             *(f"{where}: {name} has no pose within {limit_s:g} s in groundtruth.txt" for name in unposed),
         )
         intrinsics = self._intrinsics(path, where)
-        stored = StoredDepth(where, DEPTH_M_OF_VALUE)
-        return Recording(where, folder, tuple(frames), intrinsics, stored, files, missing=lines)
+        return Recording(where, folder, tuple(frames), intrinsics, DEPTH_M_OF_VALUE, files, missing=lines)
 
     def _intrinsics(self, path: Path, where: str) -> Float64Array:
         if self.options.intrinsics is not None:

@@ -20,6 +20,7 @@ from su3d_bench.core.config import write_toml
 from su3d_bench.core.errors import DataError, GroundTruthMissing
 from su3d_bench.datasets.recordings.pose_convention import FLIP
 from su3d_bench.datasets.recordings.recorded_frames import read_text, square
+from su3d_bench.datasets.rgbd import dataset as rgbd
 from su3d_bench.datasets.rgbd.dataset import Rgbd, RgbdOptions
 from su3d_bench.datasets.rgbd.description import RgbdDescription
 from su3d_bench.datasets.rgbd.files import camera_to_world, read_intrinsics, read_trajectory_file
@@ -117,8 +118,27 @@ def test_the_largest_value_is_no_depth_where_it_stands_apart_and_that_is_said_on
     np.testing.assert_array_equal(among, (far * 0.001).astype(np.float32))
     assert (again[near > 2000] == 0).all() and again.max() < 2.01
     (said,) = (record.getMessage() for record in caplog.records)
-    assert said.startswith("rgbd/desk: depth 65535 (65.54 m) stands apart from all others (to 4 m)")
-    assert said.endswith("first in depth/frame-0.png, 12.5% of its pixels")
+    assert said == (
+        "rgbd/desk: depth 65535 (65.54 m) counts as no depth where it stands apart from all other depths of its image"
+    )
+
+
+def test_every_reading_of_a_scene_says_that_and_none_of_them_twice(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Each method of a run has a record of its own, and reads the frames that the check of poses read before."""
+    read: list[int] = []
+    monkeypatch.setattr(rgbd, "judge_convention", lambda frames: read.extend(frame.index for frame in frames))
+    folder = write_scene(tmp_path)
+    describe(folder, {**NUMBERED, "check_convention": True})
+    for index in range(3):
+        write_depth(folder, index, np.where(np.arange(WIDTH * HEIGHT).reshape(HEIGHT, WIDTH) < 9, 65535, 900 + index))
+    dataset = Rgbd(tmp_path)
+    for n_readings in (1, 2):
+        with caplog.at_level(logging.WARNING, "su3d_bench"):
+            assert all((frame.depth_m == 0).sum() == 9 for frame in dataset.frames("desk", 1))
+        assert [record.getMessage().count("65535") for record in caplog.records] == [1] * n_readings
+    assert read == [0, 1, 2]
 
 
 def test_what_check_and_show_say_of_depth_survives_a_lone_largest_value_and_any_other_is_a_warning(
@@ -132,7 +152,7 @@ def test_what_check_and_show_say_of_depth_survives_a_lone_largest_value_and_any_
     monkeypatch.setenv("SU3D_DATA", str(tmp_path))
     main(["datasets", "check", "rgbd/desk", "--quiet"])
     said = capsys.readouterr().out
-    assert "0.90 to 0.90 m" in said and "counts as no depth; first in depth/frame-" in said
+    assert "0.90 to 0.90 m" in said and said.count("depth 65535 (65.54 m) counts as no depth") == 1
     assert main(["datasets", "show", "rgbd/desk", "--quiet", "--json", "--out", str(tmp_path / "desk.png")]) == 0
     shown = json.loads(capsys.readouterr().out)
     assert shown["depth_m"] == pytest.approx([0.9, 0.902])

@@ -65,6 +65,18 @@ def test_frames_hold_what_the_files_hold(tmp_path: Path) -> None:
         frames[2]
 
 
+def test_the_largest_depth_is_none_where_it_stands_apart(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    write_render(tmp_path)
+    values = depth_values(1)
+    values[0] = 65535
+    cv2.imwrite(str(tmp_path / "Replica/room0/results/depth000001.png"), values)
+    first, second, _ = Replica(tmp_path).frames("room0", 1)
+    assert (second.depth_m[0] == 0).all() and (second.depth_m[1:] > 0).all() and first.depth_m[0, 1] > 0
+    assert [record.getMessage().partition(" counts")[0] for record in caplog.records] == [
+        f"replica/room0: depth 65535 ({65535 / SCALE:.4g} m)"
+    ]
+
+
 def test_info_counts_the_frames_of_the_stride(tmp_path: Path) -> None:
     write_render(tmp_path, n_frames=5)
     info = Replica(tmp_path).info("room0", 2)

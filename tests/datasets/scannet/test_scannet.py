@@ -8,6 +8,7 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -108,6 +109,24 @@ def test_frames_hold_what_the_recording_holds_on_the_depth_grid(tmp_path: Path) 
     assert frames[1].rgb[0, [15, 16]].tolist() == [list(LEFT), list(RIGHT)]
     with pytest.raises(IndexError):
         frames[3]
+
+
+@pytest.mark.parametrize("source", ["sens", "export"])
+def test_the_largest_depth_is_none_where_it_stands_apart(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, source: str
+) -> None:
+    if source == "sens":
+        values = np.full(DEPTH_SIZE[::-1], 2000, np.uint16)
+        values[0] = 65535
+        write_recording(tmp_path / SCAN / f"{SCAN}.sens", depth=values)
+    else:
+        export(tmp_path / SCAN)
+        values = np.full(DEPTH_SIZE[::-1], 1500, np.uint16)
+        values[0] = 65535
+        cv2.imwrite(str(tmp_path / SCAN / "depth/0.png"), values)
+    depth_m = ScanNet(tmp_path).frames(SCAN, 1)[0].depth_m
+    assert (depth_m[0] == 0).all() and (depth_m[1:] == values[1:] / 1000).all()
+    assert "depth 65535 (65.54 m) counts as no depth" in caplog.text
 
 
 def test_the_colour_grid_keeps_colour_and_thins_depth(tmp_path: Path) -> None:

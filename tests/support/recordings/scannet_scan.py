@@ -175,12 +175,19 @@ def depth_content(values: UInt16Array, compression: DepthCompression) -> bytes:
     return zlib.compress(raw) if compression == "zlib" else raw
 
 
-def write_recording(path: Path, n_frames: int = 5, lost: Sequence[int] = (), head: SensHeader | None = None) -> None:
-    """A walk along the floor; frames in ``lost`` have no pose."""
+def write_recording(
+    path: Path,
+    n_frames: int = 5,
+    lost: Sequence[int] = (),
+    head: SensHeader | None = None,
+    depth: UInt16Array | None = None,
+) -> None:
+    """A walk along the floor; frames in ``lost`` have no pose, ``depth`` (H, W) is that of every frame."""
     head = head or header()
     path.parent.mkdir(parents=True, exist_ok=True)
     colour_size, depth_size = (head.colour_width, head.colour_height), (head.depth_width, head.depth_height)
-    depth = np.full((depth_size[1], depth_size[0]), round(HEIGHT_M * 1000), np.uint16)
+    if depth is None:
+        depth = np.full((depth_size[1], depth_size[0]), round(HEIGHT_M * 1000), np.uint16)
     write_sens(
         path,
         head,
