@@ -119,13 +119,13 @@ def is_plural(name: str) -> bool:
 
 
 def with_article(noun: str) -> str:
-    """A noun after "a" or "an", as it is spoken; names that mean several, and stuff, stand alone.
+    """A noun after "a" or "an", as it is spoken; names that mean several, stuff, and what has an article stand alone.
 
     >>> with_article("indoor-plant"), with_article("utensil holder"), with_article("blinds"), with_article("LCD screen")
     ('an indoor-plant', 'a utensil holder', 'blinds', 'an LCD screen')
     """
     name = noun.strip().lower()
-    if is_plural(name) or not is_countable(name):
+    if is_plural(name) or not is_countable(name) or name.partition(" ")[0] in _ARTICLES:
         return noun
     return f"{'an' if _begins_with_vowel(noun.strip()) else 'a'} {noun}"
 

@@ -83,6 +83,7 @@ def test_what_is_always_several_or_stuff_is_spoken_of_so() -> None:
         ("LCD screen", "an LCD screen"), ("lcd screen", "an lcd screen"), ("USB hub", "a USB hub"), ("TV", "a TV"),
         ("tv-screen", "a tv-screen"), ("x-ray", "an x-ray"), ("L-shaped sofa", "an L-shaped sofa"),
         ("U-shaped desk", "a U-shaped desk"), ("blinds", "blinds"), ("kitchen curtains", "kitchen curtains"),
+        ("the bed", "the bed"), ("An old chair", "An old chair"), ("a-frame house", "an a-frame house"),
     ],
 )  # fmt: skip
 def test_the_article_is_the_one_that_is_spoken(noun: str, expected: str) -> None:
