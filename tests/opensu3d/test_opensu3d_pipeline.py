@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,6 +16,7 @@ from su3d_bench.core.timing import Timer
 from su3d_bench.core.types import Detections, Float32Array, Frame, Instances, SceneInfo
 from su3d_bench.opensu3d.config import Density, OpenSU3DConfig
 from su3d_bench.opensu3d.pipeline import OpenSU3D
+from su3d_bench.runs.feeding import Feeding, ReadAhead
 
 SCENE = SceneInfo("made", "wall", 4, 1, "rendered-rooms")
 WIDTH, HEIGHT, FOCAL = 160, 120, 120.0
@@ -278,6 +281,19 @@ def test_what_a_ring_swallows_and_what_lies_too_far_is_counted_and_said(caplog: 
     method = run([look(TWINS, 0)])
     method.close()
     assert method.losses == {} and len(caplog.records) == 2
+
+
+def test_a_row_of_an_update_has_what_it_left_out() -> None:
+    frame, detections = look(TWINS, 0)
+    method = OpenSU3D(CONFIG.model_copy(update={"depth_max": 2.5}))
+    method.start(SCENE)
+    perception = SimpleNamespace(detect=lambda frame, needs, timer: detections)
+    feeding = Feeding("made/wall", method, perception, lambda event: None)  # type: ignore[arg-type]
+    with ReadAhead([frame], 1) as frames:
+        feeding.up_to(1, frames, 1)
+    (row,) = csv.DictReader(feeding.updates_text().splitlines())
+    assert (row["n_swallowed"], row["n_too_far"]) == ("0", str(np.count_nonzero(frame.depth_m > 2.5)))
+    assert int(row["n_too_far"]) > 0
 
 
 def test_views_name_the_rows_that_detections_had_before_others_were_left_out() -> None:
