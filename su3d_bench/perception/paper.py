@@ -34,8 +34,8 @@ def stand_ins(config: PaperConfig, tagger: Tagger, encoder: Encoder, captioner: 
     said = [tagger.caveat] if tagger.caveat else []
     if config.segmenter != PAPER_SEGMENTER:
         said.append(f"masks: {config.segmenter} stands in for the paper's {PAPER_SEGMENTER}")
-    if config.grounded != GroundedConfig():
-        said.append("boxes: their thresholds are not the paper's")
+    if others := _settings_besides_the_papers(config.grounded):
+        said.append(f"named masks: {', '.join(others)} set otherwise than OpenSU3D's")
     if encoder.name != PAPER_ENCODER:
         said.append(f"features: {encoder.name} stands in for the paper's {PAPER_ENCODER}")
     if captioner is None:
@@ -43,6 +43,15 @@ def stand_ins(config: PaperConfig, tagger: Tagger, encoder: Encoder, captioner: 
     elif captioner.vision_model != PAPER_VISION_MODEL:
         said.append(f"names and captions: {captioner.vision_model} stands in for the paper's {PAPER_VISION_MODEL}")
     return said
+
+
+def _settings_besides_the_papers(config: GroundedConfig) -> list[str]:
+    """The settings of named masks, boxes among them, that are not the defaults."""
+    given, papers = (
+        {f"boxes.{name}": value for name, value in one.boxes} | {name: value for name, value in one if name != "boxes"}
+        for one in (config, GroundedConfig())
+    )
+    return [name for name, value in given.items() if value != papers[name]]
 
 
 class PaperPerception:

@@ -215,11 +215,13 @@ def test_the_profile_says_what_it_computes_otherwise_than_the_paper_and_nothing_
     assert profile_paper.stand_ins(PaperConfig(), ram, encoder, None) == [
         "names and captions: the tagger's names and a template stand in for the paper's vision model"
     ]
-    other = PaperConfig.model_validate({"segmenter": "sam-vit-b", "grounded": {"boxes": {"box_threshold": 0.3}}})
+    other = PaperConfig.model_validate(
+        {"segmenter": "sam-vit-b", "grounded": {"boxes": {"box_threshold": 0.3}, "stop_words": ["room"]}}
+    )
     encoder.name, captioner.vision_model = "clip-vit-l-14", "some-model"
     assert profile_paper.stand_ins(other, ram, encoder, captioner) == [  # type: ignore[arg-type]
         "masks: sam-vit-b stands in for the paper's sam-vit-h",
-        "boxes: their thresholds are not the paper's",
+        "named masks: boxes.box_threshold, stop_words set otherwise than OpenSU3D's",
         "features: clip-vit-l-14 stands in for the paper's clip-vit-h-14",
         "names and captions: some-model stands in for the paper's gpt-4-vision-preview",
     ]
