@@ -75,6 +75,13 @@ class Difference:
         if self.interval is None or self.test is None:
             return None
         leaves_out_zero = self.interval[0] > 0 or self.interval[1] < 0
+        if leaves_out_zero and self.test.p < ALPHA:
+            if (self.interval[0] > 0) == (self.mean_of_scenes > 0):
+                return None
+            return (
+                f"B - A and the mean over scenes have opposite signs, and neither is chance (p {self.test.p:.2g}): the "
+                "test is of the mean over scenes, the interval of B - A, in which scenes count by what they hold"
+            )
         if leaves_out_zero == (self.test.p < ALPHA):
             return None
         if not leaves_out_zero:
