@@ -101,6 +101,7 @@ def test_the_command_prints_a_table_or_json(capsys: pytest.CaptureFixture[str]) 
     assert main(words) == 0
     text = capsys.readouterr().out
     assert "| AP " in text and "10 points" in text and "seed 0, 1" in text
+    assert "two seeds: no interval" in text
     assert "intervals over 3 scenes are rough" in text
     assert main([*words, "--json"]) == 0
     assert list(json.loads(capsys.readouterr().out)["protocols"]) == ["rooms-instance"]
