@@ -71,8 +71,10 @@ def variance_of(differences: Float64Array) -> Variance:
 
 
 def crossed_interval(middle: float, variance: Variance) -> Interval | None:
-    """The t interval of a difference over the scenes and the seeds that were measured; None where nothing varied, and of two
-    seeds, which tell too little of seeds."""
+    """The t interval of a difference over the scenes and the seeds that were measured.
+
+    None where nothing varied, and of two seeds, which tell too little of seeds.
+    """
     if 1 < variance.n_seeds < LEAST_SEEDS:
         return None
     error, n_free = variance.error(variance.n_scenes, variance.n_seeds)
