@@ -11,7 +11,7 @@ from su3d_bench.numerics.statistics import ALPHA, DIFFERENCE, LEVEL, NO_SPREAD, 
 
 POWER = 0.8
 MOST_SCENES = 100_000  # more are not looked for
-LEAST_SEEDS = 3  # of two, where seeds matter, the interval over scenes and seeds holds the truth in 85 of 100 runs
+LEAST_SEEDS = 3  # of two, where seeds matter, the interval over scenes and seeds holds the truth in 85 of 100 sets
 LEAST_SCENES = 6  # of fewer, no pattern of signs has a p below 0.05: 2 of 2^5 are 0.0625
 
 
