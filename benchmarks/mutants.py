@@ -65,8 +65,9 @@ GUARDS: dict[str, tuple[str, ...]] = {
         "numerics/test_growth", "numerics/test_statistics", "test_metrics_undefined", "analysis/test_compare_pairs",
         "analysis/test_compare",
     ),
-    "analysis/comparison.py": ("analysis/test_compare_pairs", "analysis/test_compare"),
-    "analysis/sides.py": ("analysis/test_compare_pairs", "analysis/test_compare"),
+    "analysis/comparison.py": ("analysis/test_compare_pairs", "analysis/test_compare", "analysis/test_planning"),
+    "analysis/side_numbers.py": ("analysis/test_compare_pairs", "analysis/test_compare", "analysis/test_planning"),
+    "analysis/sides.py": ("analysis/test_compare_pairs", "analysis/test_compare", "analysis/test_planning"),
     "analysis/gate.py": ("analysis/test_gate",),
 }  # fmt: skip
 

@@ -162,13 +162,17 @@ def _compared(own: Measured, others: Sequence[Measured], metric: str) -> dict[st
 def _is_best(
     row: Measured, own: Measured, group: Sequence[Measured], metric: str, compared: Mapping[str, _Difference]
 ) -> bool:
-    """Whether a row has the highest value of its parameter and stands out."""
+    """Whether a row has the highest value of its parameter and stands out, in the mean over scenes too."""
     values = [member.metrics.get(metric) for member in group]
     known = [value for value in values if value is not None]
     if len(known) < 2 or row.metrics.get(metric) != max(known):
         return False
     rivals = [row] if row is not own else [member for member in group if member is not own]
-    return all(member.method in compared and compared[member.method].p < LEVEL for member in rivals)
+    ahead = 1 if row is not own else -1
+    return all(
+        (found := compared.get(member.method)) is not None and found.p < LEVEL and ahead * found.mean > 0
+        for member in rivals
+    )
 
 
 def _named_cells(row: Measured, shown: Shown, best: set[str]) -> list[tuple[Cell, str]]:

@@ -18,24 +18,26 @@ from su3d_bench.reports.tables.model import (
 )
 
 HEADER = ["p", "p of all", "smallest p", "better / equal / worse", "A", "B", "B - A", "mean over scenes"]
+SEEDS = "SD of seeds, A / B"
 
 
 def comparison_tables(comparison: Mapping[str, Any]) -> list[Table | Prose]:
     """One table a protocol and pair of methods, and one of its classes; numbers are percentages."""
     parts: list[Table | Prose] = [Prose((f"A: {comparison['left']}", f"B: {comparison['right']}"))]
     for compared in comparison["protocols"]:
-        parts += _protocol_parts(compared)
+        parts += _protocol_parts(compared, comparison["seeds"])
     return [*parts, *([Prose(tuple(comparison["remarks"]), is_list=True)] if comparison["remarks"] else [])]
 
 
-def _protocol_parts(compared: Mapping[str, Any]) -> list[Table | Prose]:
+def _protocol_parts(compared: Mapping[str, Any], seeds: Sequence[Sequence[int]]) -> list[Table | Prose]:
     left, right, name = compared["left"], compared["right"], compared["protocol"]
     pair = left if left == right else f"{left} (A), {right} (B)"
     title = f"{name} (version {compared['version']}): {pair}, {counted(len(compared['scenes']), 'scene')}"
-    header = ["metric", *HEADER]
-    rows = [[metric, *_cells(value)] for metric, value in compared["metrics"].items()]
+    has_seeds = max(map(len, seeds)) > 1
+    header = ["metric", *HEADER, *([SEEDS] if has_seeds else [])]
+    rows = [[metric, *_cells(value, has_seeds)] for metric, value in compared["metrics"].items()]
     class_rows = [
-        [class_name, column, *_cells(value)]
+        [class_name, column, *_cells(value, has_seeds)]
         for class_name, columns in compared["classes"].items()
         for column, value in columns.items()
         if any(value["per_scene"].values())
@@ -43,11 +45,20 @@ def _protocol_parts(compared: Mapping[str, Any]) -> list[Table | Prose]:
     parts: list[Table | Prose] = [text_table(f"{name}-{left}-{right}", [header, *rows], heading=title)]
     if class_rows:
         parts.append(text_table(f"{name}-{left}-{right}-classes", [["class", *header], *class_rows]))
-    notes = (*compared["remarks"], *_notes(compared))
+    notes = (*compared["remarks"], *_notes(compared), *([_of_seeds(seeds)] if has_seeds else []))
     return [*parts, *([Prose(notes, is_list=True)] if notes else [])]
 
 
-def _cells(value: Mapping[str, Any]) -> list[str]:
+def _of_seeds(seeds: Sequence[Sequence[int]]) -> str:
+    told = [f"{side} over {counted(len(of_side), 'seed')}" for side, of_side in zip("AB", seeds, strict=True)]
+    return (
+        f"each scene's value is the mean of {' and of '.join(told)}; {SEEDS}: the standard deviation of one run's "
+        "value, in points, from the seed alone. Test and interval are over scenes, and do not allow for what a seed "
+        "moves in all scenes alike; su3d-bench plan does"
+    )
+
+
+def _cells(value: Mapping[str, Any], has_seeds: bool) -> list[str]:
     difference = f"{signed(value['difference'])} {bracketed(value['interval'], signed)}".rstrip()
     changes = list(value["per_scene"].values())
     counts = (sum(d > 0 for d in changes), sum(d == 0 for d in changes), sum(d < 0 for d in changes))
@@ -60,6 +71,7 @@ def _cells(value: Mapping[str, Any]) -> list[str]:
         percent(value["right"]),
         difference,
         signed(value["mean_of_scenes"]),
+        *([" / ".join(map(percent, value["deviations_of_seeds"]))] if has_seeds else []),
     ]
 
 

@@ -8,7 +8,7 @@ from typing import Any
 
 from su3d_bench.core.errors import ConfigError, counted, printable
 from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, said_by
-from su3d_bench.numerics.statistics import holm
+from su3d_bench.numerics.statistics import ALPHA, holm
 from su3d_bench.reports.tables.model import (
     BY_PEOPLE,
     NOT_MEASURED,
@@ -294,6 +294,7 @@ def _tests(tests: Sequence[Mapping[str, Any]]) -> Table:
         )
         rows.append(TableRow(f"{test['right']} - {test['left']} ({test['dataset']})", cells))
     n_same, n_more = len(tests) - len(differing), len(differing) - len(rows)
+    odd = [f"{row.label}, {t['metric']}" for row, t in zip(rows, differing, strict=False) if _disagree(t)]
     return Table(
         name="differences",
         caption="Differences between methods, as people judged them.",
@@ -303,10 +304,19 @@ def _tests(tests: Sequence[Mapping[str, Any]]) -> Table:
         notes=(
             "p: two-sided sign-flip test over what differs (McNemar's exact test where each is judged once); p of all: "
             "corrected by Holm for all comparisons in which anything differs; smallest p: the least that so many give",
+            *([f"interval and test disagree, and the test decides, for {'; '.join(odd)}"] if odd else []),
             *([f"{n_same} of {len(tests)} comparisons are left out: nothing differs"] if n_same else []),
             *([f"{n_more} more differences are in scores.json"] if n_more else []),
         ),
     )
+
+
+def _disagree(test: Mapping[str, Any]) -> bool:
+    """Whether the interval of a change leaves 0 out where the test finds nothing, or the other way round."""
+    if test["interval"] is None:
+        return False
+    low, high = test["interval"]
+    return bool(low > 0 or high < 0) != bool(test["p"] < ALPHA)
 
 
 def _agreements(agreements: Sequence[Mapping[str, Any]]) -> Table:

@@ -270,6 +270,7 @@ def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int
         return {}, "The rows are of different scenes or frames, so that none is marked as the best."
     marked: dict[str, set[int]] = {}
     tests: dict[str, SignFlipTest | None] = {}
+    is_contradicted: dict[str, bool] = {}
     for name in shown.metrics:
         values = np.array([np.nan if row.metrics.get(name) is None else row.metrics[name] for row in rows], np.float64)
         order = sorted(competing, key=lambda k: -np.nan_to_num(values[k], nan=-1.0))
@@ -278,12 +279,13 @@ def best_rows(rows: Sequence[Measured], shown: Shown) -> tuple[dict[str, set[int
         best = {k for k in competing if percent(rows[k].metrics.get(name)) == percent(float(values[order[0]]))}
         if shown.only_significant:
             tests[name] = _paired_test(rows[order[0]], rows[order[1]], name)
+            is_contradicted[name] = _is_contradicted(rows[order[0]], rows[order[1]], name)
         if len(best) < len(competing):
             marked[name] = best
     if not shown.only_significant:
         return marked, "Bold: the highest measured value." if any(marked.values()) else None
     for name, p in zip(tests, holm([None if test is None else test.p for test in tests.values()]), strict=True):
-        if name in marked and (len(marked[name]) > 1 or p is None or p >= LEVEL):
+        if name in marked and (len(marked[name]) > 1 or p is None or p >= LEVEL or is_contradicted[name]):
             marked[name] = set()
     least = holm([None if test is None else test.smallest_p for test in tests.values()])
     smallest = min((p for p in least if p is not None), default=1.0)
@@ -307,6 +309,14 @@ def _paired_test(row: Measured, other: Measured, metric: str) -> SignFlipTest | 
     if row.is_by_people and (row.tests or other.tests):
         return row.tests.get((metric, other.method))
     return sign_flip_test(of_scenes(row, metric) - of_scenes(other, metric))
+
+
+def _is_contradicted(row: Measured, other: Measured, metric: str) -> bool:
+    """Whether ``row``, the higher over all scenes together, is the lower of the two in the mean over scenes, which is
+    what a test over scenes is of."""
+    if row.is_by_people and (row.tests or other.tests):
+        return False
+    return bool(np.nansum(of_scenes(row, metric) - of_scenes(other, metric)) < 0)
 
 
 def of_scenes(row: Measured, metric: str) -> np.ndarray:

@@ -34,6 +34,8 @@ def plan_tables(plan: Mapping[str, Any]) -> list[Table | Prose]:
         notes.append("no SD: the difference is the same in every scene and run, or rests on a single scene")
     if n_seeds < 2:
         notes.append("one seed: how much seeds move the difference is not known; name runs of other seeds too")
+    if n_seeds == 2:
+        notes.append("two seeds: no interval, for of so few it would hold the truth too seldom; name a run of a third")
     notes += [line for line in (few_scenes(len(plan["scenes"])),) if line]
     return [*tables, Prose(tuple(notes), is_list=True)]
 

@@ -1,18 +1,19 @@
 """Two runs side by side: what the second changes over the first, per metric, scene and class, and how sure that is.
 
 Numbers are formed over the scenes that both have. What decides is the exact test, which flips the signs of the
-differences of single scenes; the interval is of the differences without each scene in turn.
+differences of single scenes; the interval is of the differences without each scene in turn. A side of several runs
+stands for their mean, and what seeds alone move is said beside.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from su3d_bench.analysis.side_numbers import Numbers, OverScenes, SideNumbers, class_numbers, headline_numbers
 from su3d_bench.analysis.sides import (
     Side,
     check_shapes,
@@ -21,14 +22,14 @@ from su3d_bench.analysis.sides import (
     protocols_in_both,
     refuse_unlike,
     rules_of,
+    settings_that_differ,
 )
-from su3d_bench.core.config import MOVES_NO_NUMBER
 from su3d_bench.core.errors import ConfigError, counted, printable
 from su3d_bench.core.types import Float64Array
-from su3d_bench.metrics.metric import Counts, SceneScore
+from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, RELATIVE, said_by
-from su3d_bench.metrics.scoring import ProtocolResult, combine, metric_of, plain_json
+from su3d_bench.metrics.scoring import plain_json
 from su3d_bench.numerics.statistics import (
     ALPHA,
     DIFFERENCE,
@@ -36,14 +37,10 @@ from su3d_bench.numerics.statistics import (
     SignFlipTest,
     holm,
     jackknife_interval,
-    leave_one_out,
     sign_flip_test,
 )
-from su3d_bench.runs.finished import FinishedRun
 
 SCHEMA = 2
-# They move no number of a common scene.
-_SETTINGS_ASIDE = frozenset({"scenes", "methods", "protocols"}) | MOVES_NO_NUMBER
 
 
 @dataclass(frozen=True)
@@ -52,7 +49,8 @@ class Difference:
 
     ``per_scene`` holds the difference of each scene in which both have a value, ``mean_of_scenes`` their mean, on which
     ``test`` is. ``p_of_all``: its p corrected by Holm for all that are compared with it and in which any scene differs:
-    the headline metrics of a comparison, or the classes of a protocol.
+    the headline metrics of a comparison, or the classes of a protocol. ``deviations_of_seeds``: by how much, as a
+    standard deviation, the seed alone moves the value of one run of each side; None where a side is one run.
     """
 
     left: float
@@ -63,6 +61,7 @@ class Difference:
     mean_of_scenes: float
     test: SignFlipTest | None
     p_of_all: float | None = None
+    deviations_of_seeds: tuple[float | None, float | None] = (None, None)
 
     @property
     def disagreement(self) -> str | None:
@@ -75,6 +74,13 @@ class Difference:
         if self.interval is None or self.test is None:
             return None
         leaves_out_zero = self.interval[0] > 0 or self.interval[1] < 0
+        if leaves_out_zero and self.test.p < ALPHA:
+            if (self.interval[0] > 0) == (self.mean_of_scenes > 0):
+                return None
+            return (
+                f"B - A and the mean over scenes have opposite signs, and neither is chance (p {self.test.p:.2g}): the "
+                "test is of the mean over scenes, the interval of B - A, in which scenes count by what they hold"
+            )
         if leaves_out_zero == (self.test.p < ALPHA):
             return None
         if not leaves_out_zero:
@@ -110,10 +116,14 @@ class ProtocolComparison:
 
 @dataclass(frozen=True)
 class Comparison:
-    """``remarks`` are of the runs as such: partial or incomplete ones, and in which settings they differ."""
+    """``remarks`` are of the runs as such: partial or incomplete ones, and in which settings they differ.
+
+    ``seeds``: those of the runs of both sides.
+    """
 
     left: str
     right: str
+    seeds: tuple[tuple[int, ...], tuple[int, ...]]
     protocols: tuple[ProtocolComparison, ...]
     remarks: tuple[str, ...]
 
@@ -123,48 +133,10 @@ class Comparison:
             "schema": SCHEMA,
             "left": self.left,
             "right": self.right,
+            "seeds": [list(of_side) for of_side in self.seeds],
             "remarks": list(self.remarks),
             "protocols": [plain_json(_protocol_json(protocol)) for protocol in self.protocols],
         }
-
-
-class SideNumbers:
-    """What sides give, made once for all pairs that they are in."""
-
-    def __init__(self) -> None:
-        self._scores: dict[tuple[Path, str], dict[str, dict[str, SceneScore]]] = {}
-        self._over_scenes: dict[tuple[Path, str, str, tuple[str, ...]], OverScenes] = {}
-
-    def scores(self, side: Side) -> dict[str, dict[str, SceneScore]]:
-        """Protocol -> scene -> counts."""
-        key = side.run.folder.path, side.method
-        if key not in self._scores:
-            self._scores[key] = side.run.scores(side.method)
-        return self._scores[key]
-
-    def over_scenes(self, rules: ProtocolRules, side: Side, scores: Mapping[str, SceneScore]) -> OverScenes:
-        """The numbers over the scenes of ``scores``, and without each of them."""
-        key = side.run.folder.path, side.method, rules.name, tuple(scores)
-        if key not in self._over_scenes:
-            result = combine(rules, scores, with_intervals=False)
-            counts = [scores[scene].counts for scene in result.scenes]
-            rows = [result.per_scene[scene] for scene in result.scenes]
-            without_each = metric_of(rules).resampled_headline(counts, rows, leave_one_out(len(rows)))
-            self._over_scenes[key] = OverScenes(result, counts, without_each)
-        return self._over_scenes[key]
-
-
-@dataclass(frozen=True)
-class OverScenes:
-    """``without_each``: each headline metric (1 + G,) over all scenes, then without each in turn."""
-
-    result: ProtocolResult
-    counts: Sequence[Counts]
-    without_each: Mapping[str, Float64Array]
-
-    def of_scenes(self, metric: str) -> Float64Array:
-        """The metric (S,) of each scene alone, NaN where undefined."""
-        return np.array([self.result.per_scene[scene][metric] for scene in self.result.scenes], np.float64)
 
 
 def compare(
@@ -178,6 +150,7 @@ def compare(
 ) -> Comparison:
     """What ``right`` changes over ``left``, each the folder of a run or ``FOLDER:METHOD``.
 
+    Folders with commas between are one side: runs of one request under several seeds, over which values are averaged.
     Without methods those of one name are compared, or the only ones; ``numbers`` are shared by calls on the same runs.
     Raises ``ConfigError`` where the two cannot be compared, naming the first field that differs.
     """
@@ -189,91 +162,75 @@ def compare(
     of_all = _of_all([protocol.metrics for protocol in compared])
     compared = [replace(protocol, metrics=metrics) for protocol, metrics in zip(compared, of_all, strict=True)]
     sides = [side for pair in pairs for side in pair]
-    remarks = _remarks(first.run, second.run, {side.method for side in sides})
-    remarks += [line for side in sides for line in _caveats(side)]
-    return Comparison(first.run.name, second.run.name, tuple(compared), tuple(dict.fromkeys(remarks)))
+    remarks = _remarks(first, second, {side.method for side in sides})
+    remarks += [line for side in sides for of_run in side.each for line in _caveats(of_run)]
+    left_name, right_name = (", ".join(run.name for run in side.runs) for side in (first, second))
+    left_seeds, right_seeds = (tuple(run.record.seed or 0 for run in side.runs) for side in (first, second))
+    return Comparison(left_name, right_name, (left_seeds, right_seeds), tuple(compared), tuple(dict.fromkeys(remarks)))
 
 
 def _compare_methods(
     left: Side, right: Side, wanted: Sequence[str], per_class: bool, numbers: SideNumbers
 ) -> list[ProtocolComparison]:
-    counts, others = numbers.scores(left), numbers.scores(right)
-    names = protocols_in_both(left, right, wanted)
+    every = [*left.each, *right.each]
     compared = []
-    for name in names:
-        common = [scene for scene in counts.get(name, {}) if scene in others.get(name, {})]
-        refuse_unlike(left, right, name, common)
+    for name in protocols_in_both(left, right, wanted):
+        scores = {id(of_run): numbers.scores(of_run).get(name, {}) for of_run in every}
+        common = [scene for scene in scores[id(every[0])] if all(scene in of_run for of_run in scores.values())]
+        for of_run in every[1:]:
+            refuse_unlike(every[0], of_run, name, common)
         if not common:
             raise ConfigError(
                 f"{left.name} and {right.name}: no scene in common that is scored under {name}; compare runs of the "
                 "same scenes"
             )
         rules = rules_of(left, name)
-        sides = [{scene: scores[name][scene] for scene in common} for scores in (counts, others)]
-        check_shapes(rules, left, sides[0])
-        check_shapes(rules, right, sides[1])
-        remarks = [*_scene_remarks(left, right, counts[name], others[name]), *_own_remarks(left, right, name)]
-        each = [numbers.over_scenes(rules, *pair) for pair in zip((left, right), sides, strict=True)]
-        compared.append(_compare_protocol(rules, left, right, each[0], each[1], remarks, per_class))
+        over_scenes = []
+        for of_run in every:
+            own = {scene: scores[id(of_run)][scene] for scene in common}
+            check_shapes(rules, of_run, own)
+            over_scenes.append(numbers.over_scenes(rules, of_run, own))
+        remarks = [line for of_run in every for line in _scene_remarks(of_run, scores[id(of_run)], common)]
+        remarks += _own_remarks(every, name)
+        halves = over_scenes[: len(left.runs)], over_scenes[len(left.runs) :]
+        compared.append(_compare_protocol(rules, left.method, right.method, halves, remarks, per_class))
     return compared
 
 
 def _compare_protocol(
     rules: ProtocolRules,
-    left: Side,
-    right: Side,
-    own: OverScenes,
-    other: OverScenes,
+    left: str,
+    right: str,
+    sides: tuple[Sequence[OverScenes], Sequence[OverScenes]],
     remarks: Sequence[str],
     per_class: bool,
 ) -> ProtocolComparison:
-    results = own.result, other.result
-    scenes = results[0].scenes
+    scenes = sides[0][0].result.scenes
     metrics = {
-        name: form_difference(
-            (results[0].metrics[name], results[1].metrics[name]),
-            scenes,
-            own.of_scenes(name),
-            other.of_scenes(name),
-            other.without_each[name] - own.without_each[name],
-        )
+        name: difference_of(headline_numbers(sides[0], name), headline_numbers(sides[1], name), scenes)
         for name in rules.headline
     }
     return ProtocolComparison(
         protocol=rules.name,
         version=rules.version,
         aggregate=rules.aggregate,
-        left=left.method,
-        right=right.method,
+        left=left,
+        right=right,
         scenes=scenes,
         metrics=metrics,
-        classes=_compare_classes(rules, results, (own.counts, other.counts)) if per_class else {},
+        classes=_compare_classes(rules, sides, scenes) if per_class else {},
         remarks=tuple(remarks),
     )
 
 
 def _compare_classes(
-    rules: ProtocolRules, results: Sequence[ProtocolResult], counts: Sequence[Sequence[Counts]]
+    rules: ProtocolRules, sides: tuple[Sequence[OverScenes], Sequence[OverScenes]], scenes: Sequence[str]
 ) -> dict[str, dict[str, Difference]]:
-    scenes = results[0].scenes
-    alone = np.eye(len(scenes), dtype=np.int64)
-    metric = metric_of(rules)
-    without_each = [metric.resampled_classes(own, leave_one_out(len(scenes))) for own in counts]
-    single = [metric.resampled_classes(own, alone) for own in counts]
-    classes = {
-        name: {
-            column: form_difference(
-                (results[0].per_class[name][column], results[1].per_class[name][column]),
-                scenes,
-                single[0][name][column],
-                single[1][name][column],
-                without_each[1][name][column] - values,
-            )
-            for column, values in columns.items()
-        }
-        for name, columns in without_each[0].items()
-        if name in without_each[1]
-    }
+    left, right = (class_numbers(rules, side) for side in sides)
+    classes: dict[str, dict[str, Difference]] = {}
+    for (name, column), own in left.items():
+        if (name, column) in right:
+            classes.setdefault(name, {})[column] = difference_of(own, right[name, column], scenes)
     return dict(zip(classes, _of_all(list(classes.values())), strict=True))
 
 
@@ -310,28 +267,34 @@ def form_difference(
     )
 
 
-def _scene_remarks(
-    left: Side, right: Side, counts: Mapping[str, SceneScore], others: Mapping[str, SceneScore]
-) -> list[str]:
-    """Which scenes one of the two alone has."""
-    lines = []
-    for side, own, other in ((left, counts, others), (right, others, counts)):
-        alone = [scene for scene in own if scene not in other]
-        if alone:
-            lines.append(f"only the scenes in common are compared; {side.name} alone has {_some(alone)}")
-    return lines
+def difference_of(left: Numbers, right: Numbers, scenes: Sequence[str]) -> Difference:
+    """The difference of a value of two sides."""
+    found = form_difference(
+        (left.value, right.value),
+        scenes,
+        left.of_scenes,
+        right.of_scenes,
+        right.without_each - left.without_each,
+    )
+    return replace(found, deviations_of_seeds=(left.deviation_of_seeds, right.deviation_of_seeds))
 
 
-def _own_remarks(left: Side, right: Side, protocol: str) -> list[str]:
+def _scene_remarks(side: Side, own: Mapping[str, SceneScore], common: Sequence[str]) -> list[str]:
+    """Which scenes of one run not all have."""
+    alone = [scene for scene in own if scene not in common]
+    return [f"only the scenes in common are compared; {side.name} alone has {_some(alone)}"] if alone else []
+
+
+def _own_remarks(sides: Sequence[Side], protocol: str) -> list[str]:
     lines = []
-    for side in (left, right):
+    for side in sides:
         record = side.run.results.get((side.method, protocol))
         if record is not None and record.failed:
             lines.append(f"INCOMPLETE: {side.name} failed on {_some(record.failed)}")
         warnings = () if record is None or record.result is None else record.result.warnings
         for start in (RELATIVE, ANSWERED_BY, REFINED_BY):
             lines += [f"{side.name}: {start}{printable(said, 200)}" for said in said_by(warnings, start)]
-    if load_protocol(protocol).digest != left.run.protocols[protocol].digest:
+    if load_protocol(protocol).digest != sides[0].run.protocols[protocol].digest:
         lines.append(f"the rules of {protocol} here are not to the letter those that scored both runs (same version)")
     return lines
 
@@ -344,33 +307,20 @@ def _caveats(side: Side) -> list[str]:
     return [f"{side.name}: {printable(caveat)}" for caveat in caveats if caveat]
 
 
-def _remarks(left: FinishedRun, right: FinishedRun, methods: Set[str]) -> list[str]:
-    """What must be said of two runs of which ``methods`` are compared."""
+def _remarks(left: Side, right: Side, methods: Set[str]) -> list[str]:
+    """What must be said of the runs of which ``methods`` are compared."""
     lines = []
-    for run in dict.fromkeys((left.name, right.name)):
-        side = left if run == left.name else right
-        if side.record.is_partial:
-            lines.append(f"PARTIAL: {run} has only the first {side.limit} frames of each scene")
-        if side.is_incomplete:
-            lines.append(f"INCOMPLETE: {run} lacks scenes that failed")
-    if changed := settings_that_differ(left, right, methods):
+    for run in {run.name: run for side in (left, right) for run in side.runs}.values():
+        if run.record.is_partial:
+            lines.append(f"PARTIAL: {run.name} has only the first {run.limit} frames of each scene")
+        if run.is_incomplete:
+            lines.append(f"INCOMPLETE: {run.name} lacks scenes that failed")
+    aside = ("seed",) if left.others or right.others else ()
+    if changed := settings_that_differ(left.run, right.run, methods, aside):
         lines.append("settings that differ: " + "; ".join(changed[:6]) + _more(len(changed) - 6))
-    if left.record.code != right.record.code:
+    if len({run.record.code for side in (left, right) for run in side.runs}) > 1:
         lines.append("the runs were made by different versions of the code")
     return lines
-
-
-def settings_that_differ(
-    left: FinishedRun, right: FinishedRun, methods: Set[str], aside: Sequence[str] = ()
-) -> list[str]:
-    """What moves numbers and is set otherwise in the two runs, with both values, but for the keys ``aside``."""
-    changed = []
-    for path in dict.fromkeys([*left.settings, *right.settings]):
-        pair = (left.settings.get(path, "not set"), right.settings.get(path, "not set"))
-        is_aside = path[0] in _SETTINGS_ASIDE or (path[0] == "method" and methods.isdisjoint(path[1:2]))
-        if not is_aside and ".".join(path) not in aside and pair[0] != pair[1]:
-            changed.append(printable(f"{'.'.join(path)} {pair[0]} and {pair[1]}", 120))
-    return changed
 
 
 def _some(names: Sequence[str]) -> str:

@@ -30,7 +30,11 @@ COST_LIMIT = 1.3  # an update may cost so many times the reference's; benchmarks
 # Settings that name what was asked for or move no number; scenes, methods and protocols are compared one by one.
 NOT_COMPARED = frozenset({"scenes", "methods", "protocols", "perception.cache"}) | MOVES_NO_NUMBER
 _SHARES = ("recall", "precision", "IoU", "F1", "F1-conceptgraphs", "mPrecision", "mF1", "mF1-conceptgraphs", "pAcc")
-HIGHER_IS_BETTER = frozenset({"AP", "AP50", "AP25", "mAcc", "mIoU", "F-mIoU", "synonyms", "overall", *_SHARES})
+_OF_QUESTIONS = ("instance", "affordance", "property", "relative", "all", "answer", "objects")
+_OF_LABELS = ("label n", "label n'", "well-merged", "well-merged n'")
+HIGHER_IS_BETTER = frozenset(
+    {"AP", "AP50", "AP25", "mAcc", "mIoU", "F-mIoU", "synonyms", "overall", *_SHARES, *_OF_QUESTIONS, *_OF_LABELS}
+)
 
 
 class _Model(BaseModel):

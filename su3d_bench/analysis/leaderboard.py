@@ -252,7 +252,7 @@ def _table(board: Sequence[Entry], index: int, intervals: bool) -> Table:
     if has_ranks:
         notes.append(
             f"Rank: from which to which it may go by {first.headline[0]}, with 95 % for all rows together: sign-flip "
-            "tests of all pairs over scenes, corrected by Holm."
+            "tests of all pairs, of their means over scenes, corrected by Holm."
         )
     elif intervals and len(rivals) > MOST_RANKED:
         notes.append(f"No ranks: {len(rivals)} rows are more than the {MOST_RANKED} whose pairs are all tested.")

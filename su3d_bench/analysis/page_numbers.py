@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.analysis.attribution import attribute
-from su3d_bench.analysis.comparison import SideNumbers, compare
+from su3d_bench.analysis.comparison import compare
+from su3d_bench.analysis.side_numbers import SideNumbers
 from su3d_bench.analysis.sides import Side
 from su3d_bench.core.config import KeyPath
 from su3d_bench.core.errors import Su3dError, printable, printable_json

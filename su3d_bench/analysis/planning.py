@@ -9,8 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.analysis.comparison import OverScenes, SideNumbers, settings_that_differ
-from su3d_bench.analysis.sides import Side, check_shapes, protocols_in_both, refuse_unlike, rules_of
+from su3d_bench.analysis.side_numbers import OverScenes, SideNumbers
+from su3d_bench.analysis.sides import (
+    Side,
+    check_shapes,
+    protocols_in_both,
+    refuse_other_requests,
+    refuse_unlike,
+    rules_of,
+)
 from su3d_bench.core.errors import ConfigError, counted, printable
 from su3d_bench.core.types import BoolArray, Float64Array
 from su3d_bench.metrics.scoring import plain_json
@@ -89,7 +96,7 @@ def plan(
     read = [read_run(path) for path in dict.fromkeys(runs)]
     pair = _two_methods(read[0], methods)
     sides = [(Side(run, pair[0]), Side(run, pair[1])) for run in read]
-    _refuse_other_requests(sides)
+    refuse_other_requests(read, set(pair))
     numbers = SideNumbers()
     plans: dict[str, dict[str, MetricPlan]] = {}
     scenes: dict[str, None] = {}
@@ -147,28 +154,6 @@ def _two_methods(run: FinishedRun, methods: Sequence[str]) -> tuple[str, str]:
         known = ", ".join(printable(name, 80) for name in run.methods)
         raise ConfigError(f"{run.name}: a difference is of two methods; name them with --methods A B (it has {known})")
     return chosen[0], chosen[1]
-
-
-def _refuse_other_requests(sides: Sequence[tuple[Side, Side]]) -> None:
-    """A ``ConfigError`` where a run differs from the first in more than the seed, or has a seed that another has."""
-    seen: dict[int, FinishedRun] = {}
-    first = sides[0][0].run
-    for of_run in sides:
-        run = of_run[0].run
-        for side in of_run:
-            run.check_method(side.method)
-        if run.record.is_partial != first.record.is_partial or run.limit != first.limit:
-            raise ConfigError(f"{run.name}: has other frames than {first.name}; name runs that differ in --seed alone")
-        if changed := settings_that_differ(first, run, {side.method for side in of_run}, aside=("seed",)):
-            raise ConfigError(
-                f"{run.name}: differs from {first.name} in {changed[0]}; name runs that differ in --seed alone"
-            )
-        seed = run.record.seed or 0
-        if seed in seen:
-            raise ConfigError(
-                f"{run.name}: has the seed {seed}, as {seen[seed].name} has; a repeat tells nothing of other seeds"
-            )
-        seen[seed] = run
 
 
 def _plan_metric(

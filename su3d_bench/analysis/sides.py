@@ -2,46 +2,81 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from pathlib import Path
 
+from su3d_bench.core.config import MOVES_NO_NUMBER
 from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import SceneScore, metric_of
 from su3d_bench.runs.finished import FinishedRun, read_run
 
+# They move no number of a common scene.
+_SETTINGS_ASIDE = frozenset({"scenes", "methods", "protocols"}) | MOVES_NO_NUMBER
+
 
 @dataclass(frozen=True)
 class Side:
-    """A run and one of its methods."""
+    """A run and one of its methods, and with ``others`` the same method of runs that differ in their seed alone."""
 
     run: FinishedRun
     method: str
+    others: tuple[FinishedRun, ...] = ()
 
     @property
     def name(self) -> str:
-        return f"{self.run.name}:{self.method}"
+        return f"{', '.join(run.name for run in self.runs)}:{self.method}"
+
+    @property
+    def runs(self) -> tuple[FinishedRun, ...]:
+        return self.run, *self.others
+
+    @property
+    def each(self) -> tuple[Side, ...]:
+        """A side for each of the runs."""
+        return tuple(Side(run, self.method) for run in self.runs)
 
 
-def parse_side(text: str, method: str | None) -> tuple[FinishedRun, str | None]:
-    """The run of ``FOLDER`` or ``FOLDER:METHOD``, and the method if one is named there or by ``method``."""
-    if Path(text).is_dir():
-        return read_run(Path(text)), method
-    folder, colon, name = text.rpartition(":")
-    if colon and Path(folder).is_dir():
+def parse_side(text: str, method: str | None) -> tuple[tuple[FinishedRun, ...], str | None]:
+    """The runs of ``FOLDER`` or ``FOLDER,FOLDER``, and the method if one is named behind a colon or by ``method``."""
+    if folders := _folders(text):
+        return tuple(map(read_run, folders)), method
+    before, colon, name = text.rpartition(":")
+    if colon and (folders := _folders(before)):
         if method is not None and method != name:
             raise ConfigError(f"{printable(text, 200)}: names the method '{name}', --method names '{method}'")
-        return read_run(Path(folder)), name
+        return tuple(map(read_run, folders)), name
     raise ConfigError(f"{printable(text, 200)}: there is no such folder; name that of a run, such as runs/my-run")
 
 
+def _folders(text: str) -> list[Path]:
+    """The folder or folders that ``text`` names; none where one of them is missing."""
+    folders = [Path(text)] if Path(text).is_dir() else [Path(part) for part in text.split(",") if part]
+    return folders if all(folder.is_dir() for folder in folders) else []
+
+
 def pair_methods(
-    left: tuple[FinishedRun, str | None], right: tuple[FinishedRun, str | None]
+    left: tuple[Sequence[FinishedRun], str | None], right: tuple[Sequence[FinishedRun], str | None]
 ) -> list[tuple[Side, Side]]:
-    """The methods that are compared with each other: those named, else those of one name, else the only ones."""
-    (run, name), (other, other_name) = left, right
-    is_one_run = run.folder.path.resolve() == other.folder.path.resolve()
+    """The methods that are compared with each other: those named, else those of one name, else the only ones.
+
+    A ``ConfigError`` where the runs of a side differ in more than their seed.
+    """
+    pairs = _pairs(left, right)
+    for runs, methods in zip(
+        (left[0], right[0]), zip(*((a.method, b.method) for a, b in pairs), strict=True), strict=True
+    ):
+        refuse_other_requests(runs, set(methods))
+    return pairs
+
+
+def _pairs(
+    left: tuple[Sequence[FinishedRun], str | None], right: tuple[Sequence[FinishedRun], str | None]
+) -> list[tuple[Side, Side]]:
+    ((run, *more), name), ((other, *more_others), other_name) = left, right
+    folders = [{each.folder.path.resolve() for each in runs} for runs, _ in (left, right)]
+    is_one_run = not folders[0].isdisjoint(folders[1])
     if is_one_run and name == other_name:
         shown = run.name if name is None else f"{run.name}:{name}"
         raise ConfigError(
@@ -57,26 +92,61 @@ def pair_methods(
                 f"common; name one of each, such as {run.name}:{run.methods[0]}"
             )
         else:
-            return [(Side(run, each), Side(other, each)) for each in common]
+            return [(Side(run, each, tuple(more)), Side(other, each, tuple(more_others))) for each in common]
     name = name or _same_or_only(run, str(other_name))
     other_name = other_name or _same_or_only(other, name)
     run.check_method(name)
     other.check_method(other_name)
     if is_one_run and name == other_name:
         raise ConfigError(f"{run.name}:{name}: both sides are the same; name two methods of the run")
-    return [(Side(run, name), Side(other, other_name))]
+    return [(Side(run, name, tuple(more)), Side(other, other_name, tuple(more_others)))]
 
 
 def _same_or_only(run: FinishedRun, name: str) -> str:
     return run.methods[0] if name not in run.methods and len(run.methods) == 1 else name
 
 
+def refuse_other_requests(runs: Sequence[FinishedRun], methods: Set[str]) -> None:
+    """A ``ConfigError`` where a run differs from the first in more than the seed, or has a seed that another has."""
+    seen: dict[int, FinishedRun] = {}
+    first = runs[0]
+    for run in runs:
+        for method in methods:
+            run.check_method(method)
+        if run.record.is_partial != first.record.is_partial or run.limit != first.limit:
+            raise ConfigError(f"{run.name}: has other frames than {first.name}; name runs that differ in --seed alone")
+        if changed := settings_that_differ(first, run, methods, aside=("seed",)):
+            raise ConfigError(
+                f"{run.name}: differs from {first.name} in {changed[0]}; name runs that differ in --seed alone"
+            )
+        seed = run.record.seed or 0
+        if seed in seen:
+            raise ConfigError(
+                f"{run.name}: has the seed {seed}, as {seen[seed].name} has; a repeat tells nothing of other seeds"
+            )
+        seen[seed] = run
+
+
+def settings_that_differ(
+    left: FinishedRun, right: FinishedRun, methods: Set[str], aside: Sequence[str] = ()
+) -> list[str]:
+    """What moves numbers and is set otherwise in the two runs, with both values, but for the keys ``aside``."""
+    changed = []
+    for path in dict.fromkeys([*left.settings, *right.settings]):
+        pair = (left.settings.get(path, "not set"), right.settings.get(path, "not set"))
+        is_aside = path[0] in _SETTINGS_ASIDE or (path[0] == "method" and methods.isdisjoint(path[1:2]))
+        if not is_aside and ".".join(path) not in aside and pair[0] != pair[1]:
+            changed.append(printable(f"{'.'.join(path)} {pair[0]} and {pair[1]}", 120))
+    return changed
+
+
 def protocols_in_both(left: Side, right: Side, wanted: Sequence[str]) -> list[str]:
-    """The protocols ``wanted``, or else all, that scored both sides."""
-    common = [name for name in left.run.protocols if name in right.run.protocols]
+    """The protocols ``wanted``, or else all, that scored every run of both sides."""
+    runs = [*left.runs, *right.runs]
+    common = [name for name in left.run.protocols if all(name in run.protocols for run in runs)]
     for name in wanted:
-        for side in (left, right):
-            side.run.check_protocol(name)
+        for run in runs:
+            run.check_protocol(name)
     if not common:
         raise ConfigError(
             f"{left.run.name} was scored under {', '.join(left.run.protocols) or 'nothing'}, {right.run.name} under "

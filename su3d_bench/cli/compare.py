@@ -16,11 +16,11 @@ def add_parser(verbs: Any) -> None:
         "Compare two runs over their common scenes: exact test, and differences with interval.",
         (
             "su3d-bench compare runs/before runs/after --per-class",
-            "su3d-bench compare runs/my-run:opensu3d runs/my-run:oracle --protocol rooms-instance --json",
+            "su3d-bench compare runs/old-0,runs/old-1 runs/new-0,runs/new-1 --protocol rooms-instance --json",
         ),
         call,
     )
-    parser.add_argument("left", metavar="A", help="the folder of a run, or FOLDER:METHOD")
+    parser.add_argument("left", metavar="A", help="the folder of a run, or FOLDER:METHOD; FOLDER,FOLDER: several seeds")
     parser.add_argument("right", metavar="B", help="the run that is held against it; differences are B - A")
     parser.add_argument("--method", help="compare this method alone (default: all of the same name)")
     add_protocols(parser, "under these protocols alone (default: all that scored both)")

@@ -259,6 +259,9 @@ DISAGREEMENTS: list[tuple[list[float], tuple[float, float] | None, str | None]] 
     ([0.1, -0.1] * 4, (0.01, 0.1), "the test does not find a difference (p 1)"),
     ([0.1, -0.1] * 4, (-0.1, -0.01), "the test does not find a difference (p 1)"),
     ([0.1] * 8, (-0.05, 0.15), "the test finds a difference (p 0.0078)"),
+    ([0.1] * 8, (-0.15, -0.05), "have opposite signs, and neither is chance (p 0.0078)"),
+    ([-0.1] * 8, (0.05, 0.15), "have opposite signs"),
+    ([-0.1] * 8, (-0.15, -0.05), None),
     ([0.1] * 8, None, None),
 ]
 

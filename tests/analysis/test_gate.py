@@ -17,6 +17,7 @@ from places import SCENES
 
 from su3d_bench.analysis.gate import HIGHER_IS_BETTER, Reference, Value, check, learn, read_reference
 from su3d_bench.cli.main import main
+from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.reports.gate import Finding, Verdict, github_lines, junit_xml, markdown, plain_lines
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run
@@ -254,6 +255,15 @@ def test_a_value_without_a_better_direction_may_move_in_neither(value: float, ru
     taught = one_metric(reference, "mAcc", Value(value=0.5))
     verdict = check(read_run(measured(run, "mAcc", value)), taught)
     assert [one.kind for one in verdict.findings] == ["better" if value > 0.5 else "regression"]
+
+
+@pytest.mark.parametrize("protocol", ["rooms-retrieval", "rooms-reasoning", "rooms-annotation", "rooms-instance"])
+def test_a_headline_value_that_rises_passes_unless_it_is_a_share_of_what_is_wrong(
+    protocol: str, run: Path, reference: Reference
+) -> None:
+    for name in load_protocol(protocol).headline:
+        verdict = check(read_run(measured(run, name, 0.75)), one_metric(reference, name, Value(value=0.5)))
+        assert verdict.is_passed == (name not in {"under-merged", "over-merged"}), name
 
 
 def busier(costs: Any, factor: float) -> None:

@@ -1,7 +1,8 @@
-"""What shows a difference, from runs of two methods under one seed and several; what does not belong together."""
+"""Runs of two methods under one seed and several: what shows a difference, and what it is over all seeds."""
 
 from __future__ import annotations
 
+import doctest
 import json
 import shutil
 from functools import cache
@@ -13,12 +14,15 @@ from painted import colour_perception
 from places import SCENES
 from scored_room import noisy_scores
 
+import su3d_bench.analysis.side_numbers
+from su3d_bench.analysis.comparison import compare
 from su3d_bench.analysis.planning import plan
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import SceneScore, combine, pack_scores
 from su3d_bench.numerics.power import scenes_needed, variance_of
+from su3d_bench.numerics.statistics import sign_flip_test, t_quantile
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.store.run_folder import RunFolder
 
@@ -97,6 +101,7 @@ def test_the_command_prints_a_table_or_json(capsys: pytest.CaptureFixture[str]) 
     assert main(words) == 0
     text = capsys.readouterr().out
     assert "| AP " in text and "10 points" in text and "seed 0, 1" in text
+    assert "two seeds: no interval" in text
     assert "intervals over 3 scenes are rough" in text
     assert main([*words, "--json"]) == 0
     assert list(json.loads(capsys.readouterr().out)["protocols"]) == ["rooms-instance"]
@@ -144,3 +149,88 @@ def test_a_single_scene_is_refused(tmp_path: Path) -> None:
         shutil.rmtree(RunFolder(tmp_path / "run").job(f"painted/{scene}", METHODS[0]).counts.parent)
     with pytest.raises(ConfigError, match="1 scene is scored under rooms-semantic for both methods in every run"):
         plan([tmp_path / "run"], points=[1.0])
+
+
+# comparisons of several seeds
+
+
+def values_of(name: str, metric: str, seed: int, method: int) -> tuple[float, list[float]]:
+    """Over all scenes, and of each alone."""
+    first = N_SCENES * (2 * seed + method)
+    own = {scene: scores_of(name)[first + s] for s, scene in enumerate("abc")}
+    result = combine(load_protocol(name), own)
+    return result.metrics[metric], [result.per_scene[scene][metric] for scene in "abc"]
+
+
+@pytest.mark.parametrize(("protocol", "metric"), [("rooms-semantic", "mAcc"), ("rooms-instance", "AP50")])
+def test_a_side_of_several_seeds_stands_for_their_mean_and_says_how_far_seeds_alone_go(
+    protocol: str, metric: str
+) -> None:
+    comparison = compare("seed-0,seed-1,seed-2:collector", "seed-0,seed-2:collector@drop=1")
+    found = next(one for one in comparison.protocols if one.protocol == protocol).metrics[metric]
+    sides = [[values_of(protocol, metric, seed, k) for seed in seeds] for k, seeds in enumerate([(0, 1, 2), (0, 2)])]
+    whole = [[value for value, _ in side] for side in sides]
+    alone = [np.mean([scenes for _, scenes in side], axis=0) for side in sides]
+    assert comparison.seeds == ((0, 1, 2), (0, 2))
+    assert (found.left, found.right) == pytest.approx([np.mean(side) for side in whole])
+    assert found.deviations_of_seeds == pytest.approx([np.std(side, ddof=1) for side in whole])
+    assert list(found.per_scene.values()) == pytest.approx(list(alone[1] - alone[0]))
+    assert found.test == sign_flip_test(alone[1] - alone[0])
+
+
+def test_the_interval_of_means_over_seeds_is_over_scenes() -> None:
+    n_inside = 0
+    for one in compare("seed-0,seed-1:collector", "seed-0,seed-1:collector@drop=1").protocols:
+        for metric, found in one.metrics.items():
+            pseudo = np.mean([pseudo_values_of(one.protocol, metric, seed) for seed in (0, 1)], axis=0)
+            half = t_quantile(0.975, N_SCENES - 1) * pseudo.std(ddof=1) / np.sqrt(N_SCENES)
+            assert found.interval is not None
+            expected = found.difference - half, found.difference + half
+            assert found.interval == pytest.approx((max(-1.0, expected[0]), min(1.0, expected[1])))
+            n_inside += -1 < expected[0] < expected[1] < 1
+    assert n_inside
+
+
+def test_the_table_of_several_seeds_has_their_spread_and_that_of_one_has_not(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    sides = ["seed-0:collector", "seed-1,seed-2:collector@drop=1"]
+    assert main(["compare", *sides, "--protocol", "rooms-instance", "--per-class"]) == 0
+    text = capsys.readouterr().out
+    ap = [values_of("rooms-instance", "AP", seed, 1)[0] for seed in (1, 2)]
+    row = next(line for line in text.splitlines() if line.startswith("| AP "))
+    assert row.rstrip("| ").endswith(f"- / {100 * np.std(ap, ddof=1):.1f}")
+    assert "the mean of A over 1 seed and of B over 2 seeds" in text
+    assert "settings that differ" not in text
+    assert main(["compare", "seed-0:collector", "seed-0:collector@drop=1"]) == 0
+    assert "SD of seeds" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("sides", "message"),
+    [
+        (["seed-0,copied", "seed-1"], "copied: has the seed 0, as seed-0 has; a repeat tells nothing of other seeds"),
+        (["seed-0", "seed-1,partial"], "partial: has other frames than seed-1; name runs that differ in --seed alone"),
+        (["seed-0,other-data", "seed-1"], "other-data: differs from seed-0 in dataset.painted.n_frames"),
+        (["seed-0,seed-1", "seed-1,seed-2"], "both sides are the same"),
+        (["seed-0,nowhere:collector", "seed-1"], "seed-0,nowhere:collector: there is no such folder"),
+    ],
+)
+def test_runs_that_are_no_seeds_of_one_request_are_no_side(
+    sides: list[str], message: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    if not Path("copied").exists():
+        shutil.copytree("seed-0", "copied")
+    assert main(["compare", *sides]) == 2
+    error = capsys.readouterr().err
+    assert message in error and error.count("\n") == 1
+
+
+def test_a_folder_with_a_comma_in_its_name_is_one_run() -> None:
+    if not Path("one,two").exists():
+        shutil.copytree("seed-0", "one,two")
+    assert compare("one,two:collector", "seed-1:collector").left == "one,two"
+
+
+def test_the_examples_in_the_docstrings_run() -> None:
+    assert doctest.testmod(su3d_bench.analysis.side_numbers).failed == 0

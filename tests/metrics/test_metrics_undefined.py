@@ -179,6 +179,33 @@ def test_what_is_called_a_class_without_points_is_sliced_away_from_the_pooled_ro
     assert result.per_scene["b"]["mAcc"] == pytest.approx((1.0 + 0.25) / 2)
 
 
+def test_values_over_drawn_scenes_slice_away_what_the_pooled_rows_do() -> None:
+    one = confusion({A: {A: 4, C: 6, N: 1}, B: {B: 3, A: 1}}, present=[C])
+    counts = [one, confusion({A: {A: 2, B: 1}, B: {C: 2}}), confusion({C: {C: 5, A: 5}})]
+    for drawn in (np.ones((1, 3), np.int64), WEIGHTS):
+        found = metric_of(ROOM).resampled(counts, drawn)
+        assert_as_drawn(dict(found), of_drawn(ROOM, counts, drawn), ("mAcc", "mIoU", "F-mIoU"))
+    metric = metric_of(ROOM)
+    classes = metric.resampled_classes(counts, WEIGHTS)
+    for row, drawn in enumerate(WEIGHTS):
+        pooled = metric.pooled([counts[s] for s in range(3) for _ in range(drawn[s])]).classes
+        for name, columns in pooled.items():
+            assert {column: float(classes[name][column][row]) for column in classes[name]} == pytest.approx(
+                {column: columns[column] for column in classes[name]}
+            )
+
+
+def test_a_value_lies_in_its_own_interval_where_points_are_sliced_away() -> None:
+    rng = np.random.default_rng(3)
+    scored = {
+        f"s{k}": score(ROOM, confusion({A: {A: 20, C: 20}, B: {B: int(rng.integers(15, 20)), N: 2}}, present=[C]))
+        for k in range(6)
+    }
+    result = combine(ROOM, scored)
+    low, high = result.intervals["mAcc"] or (NAN, NAN)
+    assert low < result.metrics["mAcc"] < high
+
+
 def test_what_is_called_a_class_that_no_scene_has_stays_wrong() -> None:
     result = combine(ROOM, {"a": score(ROOM, confusion({A: {A: 4, C: 6}}))})
     assert result.pooled["mAcc"] == result.per_scene["a"]["mAcc"] == 0.4

@@ -114,7 +114,7 @@ def test_only_a_significant_best_is_marked_on_request() -> None:
     clear = [measured(), measured("sam3d", 0.5)]
     table = protocol_table(clear, Shown(only_significant=True), [])
     assert best(table) == [[False, False], [True, True]]
-    assert any("p cannot be below 0.0078" in note for note in table.notes)
+    assert any("p cannot be below 0.016" in note for note in table.notes)
     mixed = {
         scene: {"mAcc": 0.4 + (0.3 if k % 2 else -0.2), "F-mIoU": 0.3} for k, scene in enumerate(SCENES)
     }  # higher on the whole, but not in every scene
@@ -123,13 +123,19 @@ def test_only_a_significant_best_is_marked_on_request() -> None:
     assert best(protocol_table(unclear, Shown(), [])) == [[False, False], [True, True]]
 
 
+def test_a_value_that_is_lower_in_every_scene_is_no_significant_best() -> None:
+    lower = {scene: {"mAcc": 0.1, "F-mIoU": 0.1} for scene in SCENES}  # the highest of all scenes together
+    rows = [measured(), measured("sam3d", 0.5, per_scene=lower)]
+    assert best(protocol_table(rows, Shown(only_significant=True), [])) == [[False, False], [False, False]]
+
+
 def test_three_scenes_can_make_nothing_significant_and_the_note_says_so() -> None:
     three = {scene: measured().per_scene[scene] for scene in SCENES[:3]}
     more = {scene: {"mAcc": 0.9, "F-mIoU": 0.9} for scene in SCENES[:3]}
     rows = [measured(per_scene=three, n_planned=3), measured("sam3d", 0.9, per_scene=more, n_planned=3)]
     table = protocol_table(rows, Shown(only_significant=True), [])
     assert not any(map(any, best(table)))
-    assert any("with so few scenes no difference can have p < 0.05 (the least is 0.25)" in note for note in table.notes)
+    assert any("with so few scenes no difference can have p < 0.05 (the least is 0.5)" in note for note in table.notes)
 
 
 def test_one_method_of_two_runs_is_told_apart_by_the_run() -> None:
@@ -228,6 +234,19 @@ def test_table_i_marks_no_best_that_does_not_differ() -> None:
     table = ablation_table(rows, SWEEP, Shown(), with_published=False)
     assert [row.cells[0].is_best for row in table.rows] == [False, False, False, True]
     assert [row.cells[2].is_best for row in table.rows] == [True, False, False, True]  # 0.0001 in every scene alike
+
+
+def test_table_i_marks_no_best_whose_scenes_say_the_opposite() -> None:
+    turned = {"opensu3d@top_m=1": 0.5, "opensu3d@crop_ratios=[1.0]": 0.1}  # lower and higher over all scenes together
+    rows = [
+        replace(row, per_scene={scene: {"mAcc": turned[row.method], "F-mIoU": 0.2} for scene in SCENES})
+        if row.kind == "semantic" and row.method in turned
+        else row
+        for row in swept(SCENES, own=0.4, m1=0.3, k1=0.45)
+    ]
+    table = ablation_table(rows, SWEEP, Shown(), with_published=False)
+    assert [row.cells[0].is_best for row in table.rows] == [False, False, False, False]
+    assert [row.cells[2].is_best for row in table.rows] == [False, True, False, True]
 
 
 def test_table_i_marks_nothing_where_no_difference_could_be_told_and_says_so_once() -> None:

@@ -258,6 +258,21 @@ def test_the_tables_say_what_was_counted(small: tuple[Sheet, Key]) -> None:
     assert f"{n} of {n} items judged; judgements by ann {n}, bob {n}" in main_table.notes[1]
 
 
+def test_an_interval_of_a_change_that_contradicts_its_test_is_named() -> None:
+    sheet, key = retrieval_set(8)
+    content = asdict(scored(sheet, key, answered(sheet, key, {"ann": 0.0})))
+    # five of thirty answers changed, all one way: Student's interval leaves 0 out, 2 x 2^-5 is no p below 0.05
+    for test, interval in zip(content["tests"], [(0.02, 0.31), (-0.02, 0.31), None], strict=False):
+        test |= {"n_differ": 5, "p": 0.0625, "interval": interval}
+    content["tests"] = content["tests"][:3]
+    first = content["tests"][0]
+    (table,) = (one for one in sheet_tables(content) if one.name == "differences")
+    line = f"for {first['right']} - {first['left']} ({first['dataset']}), {first['metric']}"
+    assert [note for note in table.notes if "disagree" in note] == [
+        f"interval and test disagree, and the test decides, {line}"
+    ]
+
+
 def test_one_annotator_agrees_with_nobody() -> None:
     sheet, key = retrieval_set(8)
     tables = sheet_tables(asdict(scored(sheet, key, answered(sheet, key, {"ann": 0.0}))))

@@ -234,6 +234,8 @@ def resampled_semantic(
     if is_scored is not None:
         hit, n_true, n_predicted = hit[:, is_scored], n_true[:, is_scored], n_predicted[:, is_scored]
     counted = n_true > 0
+    if metric == "conceptgraphs":
+        n_true = n_true - resampled_points_sliced_away(counts, weights, n_true)
     recall = np.where(counted, hit / np.maximum(n_true, 1), np.nan)
     union = n_true + n_predicted - hit
     has_iou = union > 0 if metric == "scannet" else counted
@@ -243,7 +245,7 @@ def resampled_semantic(
     return {
         "mAcc": row_means(recall),
         "mIoU": row_means(iou),
-        "F-mIoU": np.where(n_points > 0, weighted, np.nan),
+        "F-mIoU": np.where(counted.any(axis=1), weighted, np.nan),
     }
 
 
@@ -257,3 +259,19 @@ def resampled_points(
     n_true = drawn @ np.stack([c.confusion.sum(axis=1) for c in counts]).astype(np.float64)
     n_predicted = drawn @ np.stack([c.confusion[:, :n_classes].sum(axis=0) for c in counts]).astype(np.float64)
     return hit, n_true, n_predicted
+
+
+def resampled_points_sliced_away(
+    counts: Sequence[SemanticCounts], weights: Int64Array, n_true: Float64Array
+) -> Float64Array:
+    """Points (R, C) of each true class that ConceptGraphs leaves out of the pooled rows, in the scenes that were drawn.
+
+    They are called a class that a drawn scene has, of which ``n_true`` (R, C) counts no point in any.
+    """
+    is_sliced = (weights @ np.stack([c.is_present for c in counts]).astype(np.int64) > 0) & (n_true == 0)
+    sliced_away = np.zeros_like(n_true)
+    for row in np.flatnonzero(is_sliced.any(axis=1)):  # of most runs none
+        columns = np.flatnonzero(is_sliced[row])
+        of_scenes = np.stack([c.confusion[:, columns].sum(axis=1) for c in counts])
+        sliced_away[row] = weights[row] @ of_scenes
+    return sliced_away

@@ -82,8 +82,11 @@ class SemanticMetric(Metric[SemanticCounts]):
         self, counts: Sequence[SemanticCounts], weights: Int64Array
     ) -> dict[str, dict[str, Float64Array]]:
         hit, n_true, n_predicted = semantic.resampled_points(counts, weights)
-        recall = np.where(n_true > 0, hit / np.maximum(n_true, 1), np.nan)
-        iou = np.where(n_true > 0, hit / np.maximum(n_true + n_predicted - hit, 1), np.nan)
+        counted = n_true > 0
+        if self.rules.metric == "conceptgraphs":
+            n_true = n_true - semantic.resampled_points_sliced_away(counts, weights, n_true)
+        recall = np.where(counted, hit / np.maximum(n_true, 1), np.nan)
+        iou = np.where(counted, hit / np.maximum(n_true + n_predicted - hit, 1), np.nan)
         return {
             self.rules.classes[index].name: {"recall": recall[:, index], "IoU": iou[:, index]}
             for index in np.flatnonzero(scored_classes(self.rules))
