@@ -113,12 +113,18 @@ def other_setup(
     differs = [
         *([] if is_its_protocol else ["protocol"]),
         *([] if all(row.scenes == _papers_scenes(row, datasets) for row in scored) else ["scenes"]),
-        *(["frames"] if any(row.limit for row in scored) else []),
+        *(["frames"] if any(row.limit or _of_stride(row) for row in scored) else []),
+        *(["settings"] if any(set(row.changed) - _of_stride(row) for row in scored) else []),
         *(["perception"] if profiles - {PAPER_PROFILE} else []),
         *(["encoder"] if profiles <= {PAPER_PROFILE} and not all(map(_has_its_encoder, scored)) else []),
         *more,
     ]
     return f"; not the paper's set-up: other {', '.join(differs)}" if differs else ""
+
+
+def _of_stride(row: Measured) -> set[str]:
+    """What of the changed settings says which frames are taken."""
+    return {setting for setting in row.changed if setting.startswith("stride = ")}
 
 
 def _papers_scenes(row: Measured, datasets: Sequence[str]) -> set[str]:
@@ -321,6 +327,8 @@ def run_notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
     for row, label in zip(rows, labels, strict=True):
         if row.limit:
             notes.setdefault(f"PARTIAL: only the first {row.limit} frames of each scene", []).append(label)
+        if row.changed:
+            notes.setdefault(f"with {some(row.changed, 8)}", []).append(label)
         if row.failed:
             notes.setdefault(f"INCOMPLETE: failed on {some(row.failed, 4)}", []).append(label)
         if row.unscored:

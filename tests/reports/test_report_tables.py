@@ -164,6 +164,8 @@ def test_the_papers_protocol_is_taken_where_it_is_there_and_others_say_that_they
     others = [
         (measured(profile="paper", encoder="ViT-L-14-336/openai"), "encoder"),
         (measured(profile="paper", limit=20, encoder=whole.encoder), "frames"),
+        (measured(profile="paper", changed=("stride = 10",), encoder=whole.encoder), "frames"),
+        (measured(profile="paper", changed=("eps = 0.05",), encoder=whole.encoder), "settings"),
         (measured(profile="paper", encoder=whole.encoder, per_scene={"replica/kitchen0": {}}), "scenes"),
     ]
     for row, other_thing in others:
