@@ -72,7 +72,7 @@ class Shown:
 def paper_table(number: PaperTable, measured: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
     """Table II or III of the paper: under the protocol of its set-up, or one each for the others that have its metrics.
 
-    ``found`` under several protocols of which one is the paper's gives that one alone.
+    What was scored under several protocols of which one is the paper's gives that one alone.
     """
     layout = LAYOUTS[number]
     metrics = shown.metrics or layout.metrics
@@ -83,7 +83,8 @@ def paper_table(number: PaperTable, measured: Sequence[Measured], shown: Shown, 
             f"Table {number}: needs {', '.join(metrics)}, which none of the runs' protocols has ({have}); score them "
             f"with --protocols {layout.protocol} too"
         )
-    names = list(dict.fromkeys(row.protocol for row in fitting))
+    scored = [row for row in fitting if row.per_scene] or fitting
+    names = list(dict.fromkeys(row.protocol for row in scored))
     names = [layout.protocol] if layout.protocol in names else names
     figures = figures_of(is_wanted=with_published, table=number)
     tables = []

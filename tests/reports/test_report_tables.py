@@ -172,7 +172,11 @@ def test_the_papers_protocol_is_taken_where_it_is_there_and_others_say_that_they
     ]
     for row, other_thing in others:
         assert paper_table("II", [row], Shown(), with_published=False)[0].caption.endswith(f": other {other_thing}.")
-    (other,) = paper_table("II", [own], Shown(), with_published=False)
+    lacking = measured(
+        per_scene={}, metrics=dict.fromkeys(whole.metrics)
+    )  # its protocol wants files that are not there
+    (other,) = paper_table("II", [lacking, own], Shown(), with_published=False)
+    assert [row.cells[0].text for row in other.rows] == ["40.0"]
     assert other.caption.endswith("rooms-semantic; not the paper's set-up: other protocol, perception.")
     with pytest.raises(ConfigError, match="Table III: needs AP, AP50, AP25"):
         paper_table("III", [own], Shown(), with_published=False)
