@@ -25,6 +25,7 @@ from su3d_bench.reports.tables.paper import PAPER_SCENES, Shown, other_setup, pr
 from su3d_bench.reports.tables.published import Figure, PaperTable, figures_of
 
 REFINED = "refined label (n')"
+PAPER_MODEL = "gpt-4-1106-preview"  # that of labels n' and of reasoning
 WHO_DID = {"reasoning": ANSWERED_BY, "annotation": REFINED_BY}  # what a sheet's key says beside who judged
 
 
@@ -78,7 +79,9 @@ def judged_table(number: PaperTable, results: Sequence[Measured], shown: Shown, 
     reported, sources = _reported(figures_of(is_wanted=with_published, table=number), names, shown, parts)
     # people judge the retrieval and labels of the paper, and its reasoning
     judges = [] if all(row.is_by_people for row in rows) else ["judges"]
-    setup = other_setup(rows, is_its_protocol=True, datasets=tuple(PAPER_SCENES), more=judges)
+    made_by = [who for row in rows for start in WHO_DID.values() for who in said_by(row.warnings, start)]
+    models = [] if all(PAPER_MODEL in who for who in made_by) else ["language model"]
+    setup = other_setup(rows, is_its_protocol=True, datasets=tuple(PAPER_SCENES), more=(*models, *judges))
     return Table(
         name=f"{number}-{'-'.join(names)}",
         caption=f"{layout.subject} on {', '.join(names)}{setup}.",
@@ -265,6 +268,7 @@ def _accuracies(scores: Mapping[str, Any], dataset: str) -> Table:
             "several people judged counts once, with the share of them that said so. "
             + (ABOUT_QUESTIONS if scores["kind"] == "questions" else ABOUT_TRUTH),
             f"set {scores['sheet_id']}{origin}; {judged}",
+            *(printable(remark, 300) for remark in scores["remarks"]),
             *([f"{WHO_DID[scores['kind']]}{printable(scores['answered_by'], 200)}"] if scores["answered_by"] else []),
             *([f"'cannot tell' is left out: at most {unclear} judgements of a number"] if unclear else []),
             *([f"no answers from {', '.join(scores['silent'])}"] if scores["silent"] else []),

@@ -185,8 +185,8 @@ class Measured:
 
     What people judged is of this form too, from ``scores.json`` instead. ``run`` is the folder as it was named;
     ``limit``: how many frames of a scene, 0 for all; ``ceilings`` are empty where there is none. ``per_scene`` is
-    scene -> metric -> value; ``warnings`` are what was said of the numbers when they were made, ``tests`` what people's
-    judgements of the same items say, by metric and other method.
+    scene -> metric -> value; ``changed``: settings other than the method's own; ``warnings`` are what was said of the
+    numbers when they were made, ``tests`` what people's judgements of the same items say, by metric and other method.
     """
 
     run: str
@@ -208,6 +208,7 @@ class Measured:
     confidences: str | None = None
     caveat: str | None
     warnings: tuple[str, ...] = ()
+    changed: tuple[str, ...] = ()
     tests: Mapping[tuple[str, str], SignFlipTest] = field(default_factory=dict)
 
     @property

@@ -72,7 +72,7 @@ class Shown:
 def paper_table(number: PaperTable, measured: Sequence[Measured], shown: Shown, *, with_published: bool) -> list[Table]:
     """Table II or III of the paper: under the protocol of its set-up, or one each for the others that have its metrics.
 
-    ``found`` under several protocols of which one is the paper's gives that one alone.
+    What was scored under several protocols of which one is the paper's gives that one alone.
     """
     layout = LAYOUTS[number]
     metrics = shown.metrics or layout.metrics
@@ -83,7 +83,8 @@ def paper_table(number: PaperTable, measured: Sequence[Measured], shown: Shown, 
             f"Table {number}: needs {', '.join(metrics)}, which none of the runs' protocols has ({have}); score them "
             f"with --protocols {layout.protocol} too"
         )
-    names = list(dict.fromkeys(row.protocol for row in fitting))
+    scored = [row for row in fitting if row.per_scene] or fitting
+    names = list(dict.fromkeys(row.protocol for row in scored))
     names = [layout.protocol] if layout.protocol in names else names
     figures = figures_of(is_wanted=with_published, table=number)
     tables = []
@@ -113,12 +114,18 @@ def other_setup(
     differs = [
         *([] if is_its_protocol else ["protocol"]),
         *([] if all(row.scenes == _papers_scenes(row, datasets) for row in scored) else ["scenes"]),
-        *(["frames"] if any(row.limit for row in scored) else []),
+        *(["frames"] if any(row.limit or _of_stride(row) for row in scored) else []),
+        *(["settings"] if any(set(row.changed) - _of_stride(row) for row in scored) else []),
         *(["perception"] if profiles - {PAPER_PROFILE} else []),
         *(["encoder"] if profiles <= {PAPER_PROFILE} and not all(map(_has_its_encoder, scored)) else []),
         *more,
     ]
     return f"; not the paper's set-up: other {', '.join(differs)}" if differs else ""
+
+
+def _of_stride(row: Measured) -> set[str]:
+    """What of the changed settings says which frames are taken."""
+    return {setting for setting in row.changed if setting.startswith("stride = ")}
 
 
 def _papers_scenes(row: Measured, datasets: Sequence[str]) -> set[str]:
@@ -331,6 +338,8 @@ def run_notes(rows: Sequence[Measured], labels: Sequence[str]) -> list[str]:
     for row, label in zip(rows, labels, strict=True):
         if row.limit:
             notes.setdefault(f"PARTIAL: only the first {row.limit} frames of each scene", []).append(label)
+        if row.changed:
+            notes.setdefault(f"with {some(row.changed, 8)}", []).append(label)
         if row.failed:
             notes.setdefault(f"INCOMPLETE: failed on {some(row.failed, 4)}", []).append(label)
         if row.unscored:

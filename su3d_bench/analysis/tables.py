@@ -82,7 +82,14 @@ def _judged_by_people(path: Path) -> list[Measured]:
                 per_scene={scene: {cell.metric: cell.per_scene.get(scene) for cell in cells} for scene in scenes},
                 n_planned=len(scenes),
                 caveat=_who_judged(scores, cells),
-                warnings=(f"{WHO_DID[scores.kind]}{scores.answered_by}",) if scores.answered_by else (),
+                limit=scores.limit,
+                profile=scores.profile or None,
+                encoder=scores.encoder or None,
+                changed=tuple(scores.changed.get(method, ())),
+                warnings=(
+                    *scores.remarks,
+                    *([f"{WHO_DID[scores.kind]}{scores.answered_by}"] if scores.answered_by else []),
+                ),
                 tests=_tests_of(scores, dataset, method),
             )
         )
@@ -114,16 +121,16 @@ def _results_of(name: str, run: FinishedRun) -> list[Measured]:
         if result.result is not None:
             names.setdefault(result.protocol, list(result.result.metrics))
     return [
-        _measured(name, run.limit, result, dict.fromkeys(names.get(result.protocol, result.headline)))
+        _measured(name, run, result, dict.fromkeys(names.get(result.protocol, result.headline)))
         for result in run.results.values()
     ]
 
 
-def _measured(run: str, limit: int, record: ResultRecord, nothing: Mapping[str, None]) -> Measured:
+def _measured(name: str, run: FinishedRun, record: ResultRecord, nothing: Mapping[str, None]) -> Measured:
     """``nothing``: the protocol's metrics without a value, for a method that has none."""
     numbers = record.result or NumbersRecord(scenes=(), metrics=nothing, intervals={}, per_scene={}, per_class={})
     return Measured(
-        run=run,
+        run=name,
         method=record.method,
         protocol=record.protocol,
         version=record.version,
@@ -136,11 +143,12 @@ def _measured(run: str, limit: int, record: ResultRecord, nothing: Mapping[str, 
         n_planned=record.n_planned,
         failed=record.failed,
         unscored=record.unscored,
-        limit=limit,
+        limit=run.limit,
         profile=record.profile,
         encoder=record.encoder,
         confidences=record.confidences,
         caveat=record.caveat,
+        changed=run.changed(record.method),
         warnings=numbers.warnings,
     )
 

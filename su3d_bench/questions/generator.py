@@ -21,7 +21,7 @@ import numpy as np
 from su3d_bench.core.english import last_word, with_article, words
 from su3d_bench.numerics.relations import RELATIONS
 from su3d_bench.questions.known_objects import is_called
-from su3d_bench.questions.looks import SIZES, Looks, measure_of
+from su3d_bench.questions.looks import LEAD, SIZES, Looks, measure_of
 from su3d_bench.questions.model import BY_NAME, KINDS, MADE_KINDS, Question, new_question
 from su3d_bench.questions.reasoning.named_objects import meant_by
 from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
@@ -179,7 +179,7 @@ def _looks(objects: SceneMap) -> Iterator[_Asked]:
             continue
         for word in sorted({word for _, looks in known for word in looks.words}):
             answers = tuple(thing.id for thing, looks in known if word in looks.words)
-            if len(answers) == sum(word in looks.maybe for _, looks in known):
+            if len(answers) == sum(word in looks.maybe for _, looks in known) and _none_is_more(word, known):
                 others = [other for other in _table("names").get(name, ()) if set(_ids(objects, other)) == set(ids)]
                 for called in (name, *others):
                     yield _Asked("property", f"{word} {called}", answers, name)
@@ -187,21 +187,33 @@ def _looks(objects: SceneMap) -> Iterator[_Asked]:
             yield from _measured(name, known)
 
 
+def _none_is_more(word: str, known: Sequence[tuple[MapObject, Looks]]) -> bool:
+    """Whether nothing that is not long (tall) by itself is as long (high) as what is; true of any other word."""
+    axis = {"long": 0, "tall": 2}.get(word)
+    if axis is None:
+        return True
+    least = min(float(looks.sides[axis]) for _, looks in known if word in looks.words)
+    return all(LEAD * float(looks.sides[axis]) <= least for _, looks in known if word not in looks.words)
+
+
 def _measured(name: str, known: Sequence[tuple[MapObject, Looks]]) -> Iterator[_Asked]:
     """The one that is large, small, long or tall beside every other of its name."""
     if len(known) < 2 or len({looks.is_flat for _, looks in known}) > 1:
         return
     for more, less, factor in SIZES:
-        values = [
-            (thing.id, value) for thing, looks in known if (value := measure_of(thing.name, looks, more)) is not None
-        ]
-        if len(values) < len(known):
+        measures = [(thing.id, measure_of(thing.name, looks, more), looks.sides.max()) for thing, looks in known]
+        ranked = sorted(
+            (value, float(side) if more == "large" else value, object_id)
+            for object_id, value, side in measures
+            if value is not None
+        )
+        if len(ranked) < len(known):
             continue
-        ranked = sorted(values, key=lambda pair: pair[1])
-        if ranked[-1][1] >= factor * ranked[-2][1]:
-            yield _Asked("property", f"{more} {name}", (ranked[-1][0],), name)
-        if less and factor * ranked[0][1] <= ranked[1][1]:
-            yield _Asked("property", f"{less} {name}", (ranked[0][0],), name)
+        values, sides, ids = zip(*ranked, strict=True)
+        if values[-1] >= factor * values[-2] and sides[-1] >= LEAD * max(sides[:-1]):
+            yield _Asked("property", f"{more} {name}", (ids[-1],), name)
+        if less and factor * values[0] <= values[1] and LEAD * sides[0] <= min(sides[1:]):
+            yield _Asked("property", f"{less} {name}", (ids[0],), name)
 
 
 def _relations(objects: SceneMap) -> Iterator[_Asked]:

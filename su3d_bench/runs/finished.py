@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from pydantic import ValidationError
 
-from su3d_bench.core.config import KeyPath, Settings, read_file, resolve
+from su3d_bench.core.config import KeyPath, Settings, flatten, read_file, resolve, toml_value
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, StoreError, printable, suggest
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.types import Prediction
@@ -97,6 +98,17 @@ class FinishedRun:
     @cached_property
     def settings(self) -> Mapping[KeyPath, Any]:
         return {entry.path: entry.value for entry in self.data.settings.entries}
+
+    def changed(self, method: str) -> tuple[str, ...]:
+        """The settings of ``method`` that are not its own, such as ``top_m = 3``; none of a method not known here."""
+        with suppress(ConfigError):
+            own = dict(flatten(json.loads(part_of("method", method, Settings()).options)))
+            given = {path[2:]: value for path, value in self.settings.items() if path[:2] == ("method", method)}
+            stride = self.settings.get(("stride",), 0)
+            given |= {("stride",): stride} if stride and ("stride",) in own else {}
+            differ = [path for path, value in given.items() if path in own and own[path] != value]
+            return tuple(printable(f"{'.'.join(path)} = {toml_value(given[path])}", 80) for path in differ)
+        return ()
 
     def dataset(self, scene: str) -> Any:
         """The dataset of ``scene``, whose data are those of the run; a ``DataError`` where they are others."""

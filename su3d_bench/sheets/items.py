@@ -7,7 +7,7 @@ for a number.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar
 
@@ -186,7 +186,9 @@ class KeyItem(_Strict):
 @dataclass(frozen=True)
 class Key(_Strict):
     """What the maintainer keeps: ``sheet_id`` ties it to its sheet, ``run`` names the run folder, ``run_digest`` its
-    code; ``answered_by``: who gave the answers of reasoning sheets, or labels n'."""
+    code; ``answered_by``: who gave the answers of reasoning sheets, or labels n'; ``profile``, ``encoder``, ``limit``
+    and ``changed`` (method -> settings other than its own) are those of the run; ``remarks``: what must stand beside
+    its numbers."""
 
     sheet_id: str
     kind: SheetKind
@@ -196,6 +198,11 @@ class Key(_Strict):
     automatic_rule: str
     items: tuple[KeyItem, ...]
     answered_by: str = ""
+    profile: str = ""
+    encoder: str = ""
+    limit: int = 0
+    changed: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
     schema_version: int = SCHEMA
 
 

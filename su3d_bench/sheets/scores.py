@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -152,6 +152,11 @@ class Scores:
     confusions: tuple[Confusion, ...]
     second_looks: tuple[SecondLook, ...]
     answered_by: str = ""
+    profile: str = ""
+    encoder: str = ""
+    limit: int = 0
+    changed: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
     schema_version: int = SCHEMA
 
 
@@ -186,6 +191,11 @@ def score(sheet: Sheet, key: Key, judgements: Sequence[Judgement], silent: Seque
         confusions=tuple(confusion for what in ratings if (confusion := _confusion(sheet, what, given)) is not None),
         second_looks=tuple(_second_looks(sheet, keys, judgements)),
         answered_by=key.answered_by,
+        profile=key.profile,
+        encoder=key.encoder,
+        limit=key.limit,
+        changed=key.changed,
+        remarks=key.remarks,
     )
 
 

@@ -68,6 +68,20 @@ def test_of_what_is_cut_or_small_or_not_said_of_such_things_no_shape_is_told() -
     assert words_of("table", polygon(40), is_cut=True) == (frozenset(), SHAPES)
     assert words_of("table", slab(0.15, 0.15, 0.1)) == (frozenset(), SHAPES)
     assert words_of("chair", slab(0.5, 0.5, 0.9)) == (frozenset(), SHAPES)
+    assert words_of("cushion", slab(0.5, 0.2, 0.5)) == (frozenset(), SHAPES)  # a square one that leans
+
+
+def test_a_round_seat_on_legs_that_stand_apart_in_a_square_is_round() -> None:
+    seat = polygon(40, height=0.04) * (0.3, 0.3, 1) + (0, 0, 0.46)
+    feet = np.array([(x, y, 0.0) for x in (-0.2, 0.2) for y in (-0.2, 0.2)])
+    rises = np.linspace(0, 1, 200)[:, None, None]
+    legs = (feet * (1 - rises) + (feet * 0.4 + (0, 0, 0.46)) * rises).reshape(-1, 3)
+    assert words_of("stool", np.concatenate([seat, legs])) == ({"round"}, {"round"})
+
+
+def test_a_box_that_is_higher_than_long_is_not_square_for_sure() -> None:
+    assert words_of("box", slab(0.4, 0.4, 0.3))[0] == {"square"}
+    assert words_of("box", slab(0.4, 0.4, 0.7)) == (frozenset(), {"square", "rectangular"})
 
 
 def test_a_rug_may_go_on_under_the_furniture_so_that_it_is_round_or_nothing_for_sure() -> None:
@@ -107,6 +121,14 @@ def test_a_thing_is_long_or_tall_by_itself_where_it_plainly_is() -> None:
     assert build("box", 0.4, 0.4, 0.4) == (frozenset(), frozenset())
     assert build("blanket", 0.2, 0.2, 0.9) == build("door", 0.9, 0.1, 2.0) == (frozenset(), frozenset())
     assert build("shelf", 0.8, 0.3, 1.6, is_cut=True) == (frozenset(), BUILDS)
+    assert build("lamp", 0.2, 0.2, 0.5) == (frozenset(), {"tall"})  # such a one may be short for a lamp
+    assert build("keyboard", 0.5, 0.15, 0.03) == (frozenset(), {"long"})
+
+
+def test_what_is_tall_by_itself_is_not_asked_for_where_a_wide_thing_is_as_high() -> None:
+    slim, wide = thing(1, "shelf", (0.5, 0.3, 1.2), "tall"), thing(2, "shelf", (1.4, 0.3, 1.3))
+    assert "tall shelf" not in asked(slim, wide)
+    assert asked(slim, thing(2, "shelf", (1.4, 0.3, 0.9)))["tall shelf"] == ("property", (1,))
 
 
 def test_other_names_of_a_thing_are_asked_with_its_looks_too() -> None:
@@ -152,6 +174,12 @@ def test_sizes_in_a_scan_are_of_what_the_images_do_not_cut() -> None:
     assert asked(small, large) == {"large box": ("property", (2,)), "small box": ("property", (1,))}
     assert asked(small, replace(large, is_cut=True)) == {}
     assert asked(small, thing(2, "box", (0.37, 0.37, 0.37))) == {}  # 1.9 times the volume
+    assert (
+        asked(thing(1, "lamp", (0.25, 0.25, 0.48)), thing(2, "lamp", (0.44, 0.44, 0.33))) == {}
+    )  # the other is longer
+    assert (
+        asked(thing(1, "bottle", (0.06, 0.06, 0.23)), thing(2, "bottle", (0.08, 0.08, 0.27))) == {}
+    )  # a finger longer
     assert asked(thing(1, "shelf", (0.8, 0.3, 0.9)), thing(2, "shelf", (0.8, 0.3, 1.6)))["tall shelf"][1] == (2,)
     assert asked(thing(1, "bench", (1.0, 0.4, 0.4)), thing(2, "bench", (1.6, 0.4, 0.4)))["long bench"][1] == (2,)
     doors = asked(thing(1, "door", (0.8, 0.1, 2.0)), thing(2, "door", (1.3, 0.1, 2.0)))
@@ -165,5 +193,7 @@ def test_large_is_the_face_of_what_is_flat_and_soft_things_are_neither_long_nor_
     block = looks_of("box", slab(0.8, 0.5, 0.5), None, is_cut=False)
     assert measure_of("box", block, "large") == pytest.approx(0.2, abs=0.01)
     assert measure_of("box", block, "tall") is not None and measure_of("blanket", block, "tall") is None
+    leaning = looks_of("cushion", slab(0.5, 0.2, 0.5), None, is_cut=False)
+    assert measure_of("cushion", leaning, "large") == pytest.approx(0.25, abs=0.02)
     rug = looks_of("rug", slab(2, 1, 0.02), None, is_cut=False)
     assert measure_of("rug", rug, "tall") is None and measure_of("rug", rug, "long") == pytest.approx(2, abs=0.03)

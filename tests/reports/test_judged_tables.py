@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +14,7 @@ from simulated_annotators import RATES, SCHEMES, annotation_set, answered, reaso
 from su3d_bench.analysis.tables import check_paper, measured_results
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.reports.tables.judged import KINDS, judged_table
+from su3d_bench.reports.tables.judged import KINDS, judged_table, sheet_tables
 from su3d_bench.reports.tables.latex import latex
 from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.paper import Shown
@@ -204,6 +204,38 @@ def test_reasoning_has_its_scores_above_the_papers(tmp_path: Path, capsys: pytes
     paper.write_text(latex([judged_table("reasoning", rows[:1], Shown(), with_published=True)]))
     checks = check_paper(paper)
     assert len(checks) == 2 and [check.fault for check in checks if check.fault] == []
+
+
+def test_what_people_judged_says_how_the_maps_were_made_and_what_the_encoder_was_trained_on(tmp_path: Path) -> None:
+    sheet, key = retrieval_set(40)
+    remark = "relative: the pattern is that of training captions"
+    made = replace(
+        key,
+        profile="embedded",
+        encoder="rooms-encoder",
+        limit=9,
+        changed={SCHEMES[0]: ("eps = 0.05",)},
+        remarks=(remark,),
+    )
+    scores = score(sheet, made, check_answers(sheet, answered(sheet, made, {"ann": 0.0})).judgements)
+    write_scores(tmp_path, scores)
+    table = judged_table("IV", measured_results([tmp_path]), Shown(), with_published=False)
+    assert table.caption.endswith("other scenes, frames, settings, perception.")
+    assert any(note.endswith(remark) for note in table.notes)
+    assert any("perception embedded, encoder rooms-encoder" in note for note in table.notes)
+    assert any(note.endswith(f"{SCHEMES[0]}: with eps = 0.05") for note in table.notes)
+    assert remark in sheet_tables(asdict(scores))[0].notes
+
+
+@pytest.mark.parametrize(
+    ("who", "differs"),
+    [("the vote of 5 views", True), ("the model gpt-4-1106-preview of su3d-bench refine", False)],
+)
+def test_a_caption_says_that_labels_are_of_another_language_model(who: str, differs: bool) -> None:
+    values = {"label n": 0.7, "label n'": 0.8, "well-merged": 0.5, "well-merged n'": 0.6}
+    row = replace(by_truth("opensu3d", "annotation", "replica", **values), warnings=(f"every scene: n': {who}",))
+    caption = judged_table("V", [replace(row, profile="paper")], Shown(), with_published=False).caption
+    assert ("language model" in caption) is differs
 
 
 def test_without_judged_rows_the_message_says_what_makes_them() -> None:

@@ -334,6 +334,9 @@ def test_sheets_are_made_from_the_command_line(
     sheet: Sheet = read_sheet(folder / "out" / "sheet.json")
     key = read_key(folder / "out-key" / "key.json")
     assert told["sheet_id"] == sheet.id == key.sheet_id
+    made_as = read_run(folder / "run")
+    assert (key.profile, key.encoder, key.limit) == (made_as.record.profile, made_as.record.encoder, made_as.limit)
+    assert key.profile and set(key.changed) == {one for one in key.methods if made_as.changed(one)} and not key.remarks
     assert told["n_items"] == len(sheet.items) == len(key.items) >= 4
     assert {kind for one in key.items for kind in [one.question_kind]} == {
         "instance", "property", "relative", "affordance"}  # fmt: skip

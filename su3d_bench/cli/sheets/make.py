@@ -123,7 +123,7 @@ def call(arguments: argparse.Namespace) -> int:
         if arguments.dry_run:
             return _estimate(sources["reasoning"], left_out, arguments)
         drafts, made_by = _drafts(sources, left_out, arguments)
-        origins = {kind: _origin(kind, mine, made_by.get(kind, "")) for kind, mine in sources.items()}
+        origins = {kind: _origin(kind, mine, made_by[kind]) for kind, mine in sources.items()}
         drawn = _drawn(source, source.run.name, drafts, arguments)
     if QUESTIONS in kinds:
         truth = _truth(arguments)
@@ -214,9 +214,13 @@ def _questions(
 def _drafts(
     sources: Mapping[SheetKind, RunSource], left_out: Collection[str], arguments: argparse.Namespace
 ) -> tuple[dict[SheetKind, list[Draft]], dict[SheetKind, str]]:
-    """What is judged, and who answered the questions of reasoning sheets or made labels n'."""
+    """What is judged, and who answered the questions of reasoning sheets or made labels n'.
+
+    Of retrieval sheets: what must be said of the encoder that compared the texts.
+    """
     import numpy as np
 
+    from su3d_bench.metrics.questions.score import relative_remark
     from su3d_bench.sheets.drafts import annotation_drafts, questions_of, reasoning_drafts, retrieval_drafts
     from su3d_bench.sheets.making import check_split
 
@@ -245,7 +249,8 @@ def _drafts(
                 drafts_of[kind] += retrieval_drafts(mine, scene, questions, encoder)
     for drafts in drafts_of.values():
         check_split(len(drafts), arguments.annotators, arguments.overlap)
-    return drafts_of, {"reasoning": answered_by, "annotation": " and ".join(labelled_by)}
+    said = (relative_remark(encoder) or "") if "retrieval" in sources else ""
+    return drafts_of, {"retrieval": said, "reasoning": answered_by, "annotation": " and ".join(labelled_by)}
 
 
 def _ask_map(source: RunSource, encoder: Encoder | None, arguments: argparse.Namespace) -> tuple[AskMap, str]:
@@ -312,7 +317,19 @@ def _origin(kind: SheetKind, source: RunSource, made_by: str) -> Origin:
     from su3d_bench.sheets.making import Origin
 
     rules = {rules.name for scene in source.scenes if (rules := source.rules(scene, kind)) is not None}
-    return Origin(source.run.name, source.run.record.code, source.methods, ", ".join(sorted(rules)), made_by)
+    run = source.run
+    return Origin(
+        run=run.name,
+        run_digest=run.record.code,
+        methods=source.methods,
+        automatic_rule=", ".join(sorted(rules)),
+        answered_by=made_by if kind != "retrieval" else "",
+        profile=run.record.profile or "",
+        encoder=run.record.encoder or "",
+        limit=run.limit,
+        changed={method: changed for method in source.methods if (changed := run.changed(method))},
+        remarks=(made_by,) if kind == "retrieval" and made_by else (),
+    )
 
 
 def _write(

@@ -100,7 +100,7 @@ class RetrievalMetric(ShareMetric):
         is_plain = ~np.isin(kinds, BY_NAME)
         rows["all"], rows["by name"] = is_right[is_plain], is_right[~is_plain]
         rows["reachable"] = np.array([not in_map.isdisjoint(question.answers) for question in truth.asked], bool)
-        warnings = [encoder_warning(self.rules, prediction, encoder), _relative_remark(encoder)]
+        warnings = [encoder_warning(self.rules, prediction, encoder), relative_remark(encoder)]
         asked_for = [answer for question in truth.asked for answer in question.answers]
         each = np.array([(question.by_chance, question.by_name) for question in truth.asked]).reshape(-1, 2).T
         cheap = {kind: each[:, kinds == kind] for kind in self.rules.value_names[:4]}
@@ -108,7 +108,7 @@ class RetrievalMetric(ShareMetric):
         return self._score(truth.scene, asked_for, prediction, rows, warnings, cheap)
 
 
-def _relative_remark(encoder: object) -> str | None:
+def relative_remark(encoder: object) -> str | None:
     """What must stand beside figures of relative queries; None where the encoder was not trained on such texts."""
     return f"{RELATIVE}{encoder.relative_remark}" if isinstance(encoder, KnowsRelativeTexts) else None
 
