@@ -95,7 +95,7 @@ class Difference:
             )
         return (
             f"the interval leaves 0 out, but the test does not find a difference (p {self.test.p:.2g}): the interval "
-            "takes the scenes' differences for normal, the test does not; none is shown"
+            "takes the scenes' differences for normal, the test does not: no difference is shown"
         )
 
 
