@@ -363,7 +363,9 @@ def test_truth_that_the_encoding_cannot_hold_is_refused() -> None:
     with pytest.raises(DataError, match="instance id 1000 would spill into the next class"):
         encode_ground_truth(np.array([5]), np.array([1000]))
     with pytest.raises(DataError, match="holds the id -1"):
-        encode_ground_truth(np.array([5]), np.array([-1]))
+        encode_ground_truth(np.array([5, 5]), np.array([3, -1]))
+    with pytest.raises(DataError, match="holds the id -2"):
+        encode_ground_truth(np.array([-2, 5]), np.array([1, 3]))
     with pytest.raises(DataError, match="holds the value -5"):
         one_scene(np.array([-5] * 200), [FIRST], [5], [1.0])
     with pytest.raises(DataError, match="class ids start at 1"):

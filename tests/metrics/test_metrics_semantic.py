@@ -20,6 +20,7 @@ from su3d_bench.metrics.semantic.confusion import (
     per_scene,
     scannet_metrics,
 )
+from su3d_bench.metrics.semantic.score import _one_a_voxel
 
 GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())
 POOLING = GOLDEN["cg_pooling"]
@@ -137,6 +138,14 @@ def test_counts_of_parts_add_up_to_the_whole(points: list[tuple[int, int]], cut:
     parts = [per_scene(truth[:cut], predicted[:cut], present), per_scene(truth[cut:], predicted[cut:], present)]
     assert np.array_equal(concatenate(parts).confusion, per_scene(truth, predicted, present).confusion)
     assert per_scene(truth, predicted, present).confusion.sum() == (truth >= 0).sum()
+
+
+def test_each_object_keeps_its_first_point_of_every_voxel() -> None:
+    x = np.array([0.31, 0.01, 0.02, 0.03, 0.32, 0.04, 0.33])  # voxels of 0.1: 3 0 0 0 3 0 3
+    owner = np.array([1, 0, 0, 1, 1, -1, 0])
+    kept = _one_a_voxel(np.stack([x, x, x], axis=1), owner, owner, 0.1)
+    assert kept.tolist() == [1, 0, -1, 1, -1, -1, 0]
+    assert _one_a_voxel(np.zeros((2, 3)), np.full(2, -1), np.full(2, -1), 0.1).tolist() == [-1, -1]
 
 
 def test_points_of_a_class_that_the_scene_does_not_score_are_left_out() -> None:

@@ -109,26 +109,35 @@ def are_same_points(left: Points, right: Points) -> bool:
 
 def reduce_to_voxels(points: Points, masks: Masks, voxel_m: float) -> Int64Array:
     """Indices, ascending, of the points that stay when each mask, and the background, keeps its first point a voxel."""
-    voxel = row_ids(voxel_coordinates(points, voxel_m))
-    n_voxels = int(voxel.max()) + 1 if len(voxel) else 0
+    voxel = voxel_coordinates(points, voxel_m)
     background = np.ones(len(points), bool)
     background[masks.indices] = False
     outside = np.flatnonzero(background)
     members = np.concatenate([masks.indices.astype(np.int64), outside])
     owner = np.concatenate([masks.owners, np.full(len(outside), len(masks), np.int64)])
-    _, first = np.unique(owner * n_voxels + voxel[members], return_index=True)
-    return np.unique(members[first])
+    return np.unique(members[first_rows(np.column_stack([owner, voxel[members]]))])
 
 
 def row_ids(rows: Int64Array | Float64Array) -> Int64Array:
-    """A number from 0 for each distinct row, without the slow comparison of whole rows in numpy's unique."""
-    if not len(rows):
-        return np.zeros(0, np.int64)
+    """A number from 0 for each distinct row, without the slow comparison of whole rows in numpy's unique.
+
+    >>> row_ids(np.array([[1, 5], [0, 5], [1, 5], [0, 6]])).tolist()
+    [1, 0, 1, 2]
+    """
     order = np.lexsort(rows.T)
     is_new = np.any(np.diff(rows[order], axis=0) != 0, axis=1)
-    ids = np.empty(len(rows), np.int64)
-    ids[order] = np.concatenate([[0], np.cumsum(is_new)])
+    ids = np.zeros(len(rows), np.int64)
+    ids[order[1:]] = np.cumsum(is_new)
     return ids
+
+
+def first_rows(rows: Int64Array) -> Int64Array:
+    """The first of each distinct row, in the order of ``row_ids``.
+
+    >>> first_rows(np.array([[1, 5], [0, 5], [1, 5], [0, 6]])).tolist()
+    [1, 0, 3]
+    """
+    return np.unique(row_ids(rows), return_index=True)[1]
 
 
 def transfer_masks(
@@ -155,8 +164,7 @@ def transfer_masks(
     of_point = csr_array(
         (np.ones(len(masks.indices), np.int8), masks.indices, masks.indptr), shape=(len(masks), len(points))
     ).tocsc()
-    moved = of_point[:, kept[nearest_index[reached]]].tocsr()
-    moved.sort_indices()
+    moved = of_point[:, kept[nearest_index[reached]]].tocsr()  # column after column, so each row is ascending
     return Masks(moved.indptr.astype(np.int64), reached[moved.indices].astype(np.int32))
 
 
