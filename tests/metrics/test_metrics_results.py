@@ -145,6 +145,12 @@ def test_duplicates_are_told() -> None:
     assert told == (
         "rooms/a: 1 pair of predictions overlaps with IoU above 0.9 (first 0 and 1); duplicates can raise or lower AP"
     )
+    small = [chairs[:99], chairs[50:], chairs[50:], chairs[:99]]  # of 100 points two, and two that do not count
+    told = warnings_of("rooms-instance", instances(truth.points, small, ["chair"] * 4))
+    assert told.startswith("rooms/a: 1 pair of predictions overlaps with IoU above 0.9 (first 1 and 2); ")
+    assert "3 pairs of predictions overlap with" in warnings_of(
+        "rooms-instance", instances(truth.points, [chairs] * 3, ["chair"] * 3)
+    )
 
 
 def test_another_encoder_than_the_protocols_is_told() -> None:

@@ -64,6 +64,14 @@ def test_the_lowest_index_wins_among_more_equals_than_are_asked_for_at_once() ->
     assert nearest(candidates, np.zeros((3, 3), np.float32))[1].tolist() == [4000] * 3
 
 
+@pytest.mark.parametrize("first", [-1.0, 1.0])
+def test_the_lowest_index_wins_whichever_of_two_equally_near_places_is_searched_first(first: float) -> None:
+    candidates = np.zeros((40, 3))
+    candidates[:20, 0], candidates[20:, 0] = first, -first  # more of each than are asked for at once
+    distance, index = nearest(candidates, np.zeros((2, 3)))
+    assert (index.tolist(), distance.tolist()) == ([0, 0], [1.0, 1.0])
+
+
 def test_large_clouds_are_walked_along_a_z_curve_of_32_cells_a_side(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(transfer, "WORTH_ORDERING", 13)
     # the key of a cell has a bit of x, of y and of z in turn: 1 2 4 for cells at 1, 8 16 32 at 2, 4096 for x at 16

@@ -36,8 +36,7 @@ def nearest(candidates: Points, queries: Points, cap_m: float = np.inf) -> tuple
     >>> distance.tolist(), index.tolist()
     ([1.0, 1.0], [0, 1])
     """
-    n = len(candidates)
-    if not n or not len(queries):
+    if not len(candidates) or not len(queries):
         return np.full(len(queries), np.inf), np.full(len(queries), -1, np.int64)
     from scipy.spatial import cKDTree
 
@@ -46,12 +45,10 @@ def nearest(candidates: Points, queries: Points, cap_m: float = np.inf) -> tuple
     tree = cKDTree(held, balanced_tree=False, compact_nodes=False)
     # the tree takes only neighbours nearer than its bound; the cap itself still counts
     bound = np.nextafter(cap_m, np.inf)
-    distances, indices = tree.query(ordered_queries, k=min(2, n), distance_upper_bound=bound, workers=1)
-    distances, indices = distances.reshape(len(ordered_queries), -1), indices.reshape(len(ordered_queries), -1)
-    nearest_index = np.append(order, -1)[indices[:, 0]]  # the tree says n where it found none
-    if n > 1:
-        tied = np.flatnonzero((distances[:, 0] == distances[:, 1]) & np.isfinite(distances[:, 0]))
-        nearest_index[tied] = _lowest_of_equals(tree, held, ordered_queries[tied], order)
+    distances, indices = tree.query(ordered_queries, k=2, distance_upper_bound=bound, workers=1)
+    nearest_index = order.take(indices[:, 0], mode="clip")  # the tree says n, and infinity, where it found none
+    tied = np.flatnonzero((distances[:, 0] == distances[:, 1]) & np.isfinite(distances[:, 0]))
+    nearest_index[tied] = _lowest_of_equals(tree, held, ordered_queries[tied], order)
     distance, index = np.empty(len(ordered_queries)), np.empty(len(ordered_queries), np.int64)
     distance[asking_order], index[asking_order] = distances[:, 0], nearest_index
     too_far = ~np.isfinite(distance) | (distance > cap_m)
