@@ -357,6 +357,10 @@ def test_a_point_that_stands_twice_in_a_mask_is_refused() -> None:
 def test_masks_that_do_not_pair_up_with_labels_are_refused() -> None:
     with pytest.raises(PredictionError, match="2 labels, 1 masks, 1 scores"):
         one_scene(TWO, [FIRST], [5, 5], [0.5])
+    with pytest.raises(PredictionError, match="2 labels, 1 masks, 2 scores"):
+        one_scene(TWO, [FIRST], [5, 5], [0.5, 0.5])
+    with pytest.raises(PredictionError, match="2 labels, 2 masks, 1 scores"):
+        one_scene(TWO, [FIRST, SECOND], [5, 5], [0.5])
 
 
 def test_truth_that_the_encoding_cannot_hold_is_refused() -> None:

@@ -150,6 +150,13 @@ def test_scannet_values_are_those_worked_out_by_hand() -> None:
     assert metrics.n_classes_above == (1, 1, 0, 0)
 
 
+def test_classes_are_counted_above_a_level_and_not_at_it() -> None:
+    n_hit = np.array([4, 5, 6, 8, 10, 12, 15, 18])  # of 20 points each, the others called nothing
+    metrics = scannet_metrics(np.column_stack([np.diag(n_hit), 20 - n_hit]))
+    assert metrics.iou.tolist() == [0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.75, 0.9]
+    assert metrics.n_classes_above == (8, 6, 3, 1)
+
+
 @given(st.lists(st.tuples(st.integers(-1, 4), st.integers(-1, 4)), max_size=60), st.integers(0, 60))
 def test_counts_of_parts_add_up_to_the_whole(points: list[tuple[int, int]], cut: int) -> None:
     truth, predicted = np.array(points, np.int64).reshape(-1, 2).T
@@ -173,6 +180,8 @@ def test_a_point_belongs_to_the_first_instance_that_takes_part_and_else_to_none(
     partition = Partition(points, np.array([0, 2, -1, 1, 1], np.int32), features)
     owner, rank = _point_owners(partition, np.array([True, False, True]))
     assert owner.tolist() == rank.tolist() == [0, 2, -1, -1, -1]
+    owner, rank = _point_owners(partition, np.array([False, True, True]))
+    assert owner.tolist() == rank.tolist() == [-1, 2, -1, 1, 1]
     dense = DenseFeatures(points[:4], np.array([[1, 0], [0, 0], [0, 2], [1, 1]], np.float16))
     owner, rank = _point_owners(dense, np.array([True, True, True, False]))
     assert (owner.tolist(), rank.tolist()) == ([0, 1, 2, 3], [0, -1, 0, -1])
