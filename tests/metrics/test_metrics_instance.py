@@ -370,7 +370,9 @@ def test_truth_that_the_encoding_cannot_hold_is_refused() -> None:
         encode_ground_truth(np.array([5, 5]), np.array([3, -1]))
     with pytest.raises(DataError, match="holds the id -2"):
         encode_ground_truth(np.array([-2, 5]), np.array([1, 3]))
-    with pytest.raises(DataError, match="holds the value -5"):
-        one_scene(np.array([-5] * 200), [FIRST], [5], [1.0])
+    with pytest.raises(DataError, match="holds the value -5;"):
+        one_scene(np.repeat([-5, 5001], 100), [FIRST], [5], [1.0])
+    with pytest.raises(DataError, match="holds the value 10000001;"):
+        one_scene(np.repeat([10_000_001, 0], 100), [FIRST], [5], [1.0])
     with pytest.raises(DataError, match="class ids start at 1"):
         one_scene(TWO, [FIRST], [5], [1.0], class_ids=(0, 5))

@@ -333,6 +333,17 @@ def test_scores_of_another_version_are_refused() -> None:
         combine(ROOM, {})
 
 
+@pytest.mark.parametrize("name", ["rooms-semantic", "rooms-instance"])
+def test_scores_of_other_classes_under_the_same_version_are_refused(name: str) -> None:
+    rules = load_protocol(name)
+    fewer = rules.model_copy(update={"classes": rules.classes[:5]})
+    n_before, n_after = (len(one.curve_names) if one.kind == "instance" else len(one.classes) for one in (rules, fewer))
+    with pytest.raises(
+        DataError, match=f"rooms/0: was scored with {n_before} classes, {name} has {n_after} here; score it again"
+    ):
+        combine(fewer, noisy_scores(name, 1))
+
+
 def test_an_instance_id_that_spills_into_the_next_class_is_refused() -> None:
     truth = replace(room(), instance=np.where(room().instance == 2, 1000, room().instance).astype(np.int32))
     with pytest.raises(DataError, match="instance id 1000 would spill into the next class"):

@@ -252,7 +252,7 @@ class Covered:
     def main_object(self) -> Int64Array:
         """The object (K,) that each instance covers most vertices of, the lowest id of equals, 0 where it covers none.
 
-        >>> Covered(np.array([3, 7]), np.array([[2, 5], [4, 4], [0, 0]])).main_object.tolist()
+        >>> Covered(np.array([3, 7]), np.array([[0, 1], [4, 4], [0, 0]])).main_object.tolist()
         [7, 3, 0]
         """
         if not len(self.object_ids):

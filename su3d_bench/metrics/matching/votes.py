@@ -65,7 +65,8 @@ def _most_votes(votes: Int64Array) -> Int64Array:
     n = np.stack([(votes == column[:, None]).sum(axis=1) for column in votes.T], axis=1)
     n[votes < 0] = 0
     has_most = n == n.max(axis=1, keepdims=True)
-    return np.where(has_most, votes, votes.max()).min(axis=1)
+    smallest: Int64Array = np.where(has_most, votes, votes.max()).min(axis=1)
+    return smallest
 
 
 class _Search:
