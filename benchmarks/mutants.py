@@ -51,6 +51,8 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "metrics/instance/": (*_CURVES, *_SCORES),
     "metrics/semantic/": ("test_metrics_semantic", "test_metrics_undefined", "test_metrics_hovsg", *_SCORES),
     "metrics/matching/checks.py": (*_SCORES, "evaluation/test_evaluate_checks", "evaluation/test_evaluate"),
+    "metrics/matching/kernels.py": ("opensu3d/test_device_results",),
+    "metrics/matching/labelling.py": (*_TRANSFER, "test_metrics_hovsg"),
     "metrics/matching/": _TRANSFER,
     "metrics/open_vocabulary/": _TEXTS,
     "metrics/questions/": _QUESTIONS,

@@ -17,6 +17,7 @@ from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.types import Masks
 from su3d_bench.evaluation.texts import read_text_features
 from su3d_bench.evaluation.truth import read_values
+from su3d_bench.metrics.matching import checks
 from su3d_bench.metrics.matching.checks import check_cloud, mask_facts
 
 # ---- checks
@@ -60,6 +61,10 @@ def test_facts_of_masks_are_exact() -> None:
     assert (facts.near, facts.identical) == (((0, 1),), ((0, 1),))
     assert (facts.n_covered, facts.n_contested) == (4, 3)
     assert (facts.lowest_score, facts.highest_score) == (0.25, 1.0)
+    assert (facts.n_masks, facts.n_empty) == (3, 0)
+    none = mask_facts(Masks(np.zeros(2, np.int64), np.zeros(0, np.int32)), np.zeros(0), 0)
+    assert (none.n_masks, none.n_empty, none.n_covered, none.n_contested) == (1, 1, 0, 0)
+    assert (none.near, none.lowest_score, none.highest_score) == ((), None, None)
 
 
 BOX = np.array([[0.0, 0, 0], [6.4, 5, 2.5], [1, 1, 1]], np.float32)
@@ -72,7 +77,7 @@ BOX = np.array([[0.0, 0, 0], [6.4, 5, 2.5], [1, 1, 1]], np.float32)
         (BOX * 100, "a: the cloud spans 640, the scene 6.4 m: centimetres\\?"),
         (BOX * 1e-3, "a: the cloud spans 0.0064, the scene 6.4 m: kilometres\\?"),
         (BOX + 50, "a: no point of the cloud lies in the box of the scene"),
-        (BOX * np.nan, "a: point 0 is at"),
+        (np.array([[0, 0, 0], [1, np.nan, 1]]), "a: point 1 is at \\[1.0, nan, 1.0\\]; coordinates are finite metres"),
     ],
 )
 def test_a_cloud_in_other_units_or_elsewhere_is_refused(points: Any, line: str) -> None:
@@ -80,11 +85,69 @@ def test_a_cloud_in_other_units_or_elsewhere_is_refused(points: Any, line: str) 
         check_cloud("a", points.astype(np.float32), BOX)
 
 
+METRE = np.array([[2.0, 2, 2], [3, 2.5, 2.5]], np.float32)
+NO_UNIT = "; is it of this scene\\?"
+
+
+@pytest.mark.parametrize(
+    ("ratio", "guess"),
+    [
+        (4000, NO_UNIT),
+        (3999, ": millimetres\\?"),
+        (251, ": millimetres\\?"),
+        (250, ": centimetres\\?"),
+        (26, ": centimetres\\?"),
+        (25, NO_UNIT),
+        (20.5, NO_UNIT),
+        (1 / 20.5, NO_UNIT),
+        (0.0041, NO_UNIT),
+        (0.0039, ": kilometres\\?"),
+        (0.000251, ": kilometres\\?"),
+        (0.000249, NO_UNIT),
+    ],
+)
+def test_a_unit_is_guessed_within_a_factor_of_four(ratio: float, guess: str) -> None:
+    with pytest.raises(PredictionError, match=f"spans .* m{guess} coordinates must be metres"):
+        check_cloud("a", (METRE * ratio).astype(np.float32), METRE)
+
+
+def test_a_cloud_of_a_twentieth_of_the_scene_or_of_twenty_is_looked_at_further() -> None:
+    assert check_cloud("a", METRE[1:], METRE) == []
+    assert check_cloud("a", METRE, METRE * 20 - 38) == []
+    far = METRE[:1] + np.array([20, 0, 0], np.float32)
+    assert check_cloud("a", np.concatenate([METRE, far]), METRE) == []
+    assert check_cloud("a", np.concatenate([METRE[:1], far]), METRE[:1]) == []  # a scene without extent is no measure
+
+
 def test_a_cloud_half_outside_is_doubted_and_one_that_fits_is_not() -> None:
     assert check_cloud("a", BOX, BOX) == []
     assert check_cloud("a", BOX[:0], BOX) == []
+    assert check_cloud("a", BOX, BOX[:0]) == []
     moved = BOX + np.array([6, 4.5, 0], np.float32)
-    assert check_cloud("a", moved, BOX)[0].startswith("a: only 33 % of the cloud lies in the box of the scene")
+    assert check_cloud("a", moved, BOX) == [
+        "a: only 33 % of the cloud lies in the box of the scene (the first outside is point 1); is the frame of "
+        "reference right?"
+    ]
+    assert check_cloud("a", np.concatenate([moved, moved[:1]]), BOX) == []  # half inside is enough
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_a_point_at_the_margin_of_the_box_is_inside_and_one_beyond_it_is_not(
+    axis: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cube, point = np.array([[0.0, 0, 0], [1, 1, 1]], np.float32), np.full((1, 3), 0.5, np.float32)
+
+    def assert_ends_between(inside: float, outside: float) -> None:
+        point[0, axis] = inside
+        assert check_cloud("a", point, cube) == []
+        point[0, axis] = outside
+        with pytest.raises(PredictionError, match="no point of the cloud lies in the box of the scene"):
+            check_cloud("a", point, cube)
+
+    assert_ends_between(-0.09, -0.11)
+    monkeypatch.setattr(checks, "NEAR_M", 0.125)  # which float32 can hold
+    assert_ends_between(-0.125, -0.126)
+    assert_ends_between(1.125, 1.126)
 
 
 # ---- hostile files

@@ -66,6 +66,8 @@ def test_random_points_agree_with_the_formulas_word_by_word(seed: int) -> None:
     assert ours.mean_iou == pytest.approx(sum(iou[c] for c in scored if n_predicted[c]) / len(scored))
     assert ours.frequency_weighted_iou == pytest.approx(sum(n_true[c] * iou[c] for c in scored) / (40 - n_ignored))
     assert ours.mean_accuracy == pytest.approx(sum(hit[c] / n_true[c] for c in scored) / len(scored))
+    assert ours.precision.tolist() == [hit[c] / max(1, n_predicted[c]) for c in scored]
+    assert ours.f1.tolist() == [2 * hit[c] / (n_true[c] + n_predicted[c]) for c in scored]
 
 
 # ---- the label set
@@ -180,6 +182,15 @@ def test_objects_that_overlap_vote_each_and_one_without_a_class_does_not() -> No
         alone = replace(truth, semantic=np.where(truth.instance == 2, truth.semantic, 0).astype(np.int32))
         score = score_scene(OVO, fitting(OVO, alone), prediction, None)
         assert combine(OVO, {"a": score}).per_class["chair"]["recall"] == recall
+
+
+def test_objects_of_the_first_class_vote_as_all_others() -> None:
+    truth, first = room(), OVO.classes[0]
+    own = np.flatnonzero(truth.instance == 2)
+    semantic = np.where(truth.instance == 2, first.id, 0).astype(np.int32)
+    scene = replace(fitting(OVO, truth), semantic=semantic)
+    score = score_scene(OVO, scene, instances(truth.points, [own], [first.name]), None)
+    assert combine(OVO, {"a": score}).per_class[first.name]["recall"] == 1.0
 
 
 def test_a_partition_and_dense_features_score_as_the_same_instances() -> None:

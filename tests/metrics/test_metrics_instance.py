@@ -357,14 +357,22 @@ def test_a_point_that_stands_twice_in_a_mask_is_refused() -> None:
 def test_masks_that_do_not_pair_up_with_labels_are_refused() -> None:
     with pytest.raises(PredictionError, match="2 labels, 1 masks, 1 scores"):
         one_scene(TWO, [FIRST], [5, 5], [0.5])
+    with pytest.raises(PredictionError, match="2 labels, 1 masks, 2 scores"):
+        one_scene(TWO, [FIRST], [5, 5], [0.5, 0.5])
+    with pytest.raises(PredictionError, match="2 labels, 2 masks, 1 scores"):
+        one_scene(TWO, [FIRST, SECOND], [5, 5], [0.5])
 
 
 def test_truth_that_the_encoding_cannot_hold_is_refused() -> None:
     with pytest.raises(DataError, match="instance id 1000 would spill into the next class"):
         encode_ground_truth(np.array([5]), np.array([1000]))
     with pytest.raises(DataError, match="holds the id -1"):
-        encode_ground_truth(np.array([5]), np.array([-1]))
-    with pytest.raises(DataError, match="holds the value -5"):
-        one_scene(np.array([-5] * 200), [FIRST], [5], [1.0])
+        encode_ground_truth(np.array([5, 5]), np.array([3, -1]))
+    with pytest.raises(DataError, match="holds the id -2"):
+        encode_ground_truth(np.array([-2, 5]), np.array([1, 3]))
+    with pytest.raises(DataError, match="holds the value -5;"):
+        one_scene(np.repeat([-5, 5001], 100), [FIRST], [5], [1.0])
+    with pytest.raises(DataError, match="holds the value 10000001;"):
+        one_scene(np.repeat([10_000_001, 0], 100), [FIRST], [5], [1.0])
     with pytest.raises(DataError, match="class ids start at 1"):
         one_scene(TWO, [FIRST], [5], [1.0], class_ids=(0, 5))

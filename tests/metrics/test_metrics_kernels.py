@@ -80,9 +80,10 @@ def test_compiled_products_add_up_in_the_order_of_the_others(n: int) -> None:
     assert kernels._dot(left, right, n) == dot(left[:n], right[:n])
 
 
-def test_resampled_curves_above_the_limit_are_those_of_the_scenes_drawn() -> None:
+@pytest.mark.parametrize("levels", [1, 6])
+def test_resampled_curves_above_the_limit_are_those_of_the_scenes_drawn(levels: int) -> None:
     rng = np.random.default_rng(8)
-    scenes = [many(rng, n, 6) for n in (MANY_ROWS, 700, 50)]
+    scenes = [many(rng, n, levels) for n in (MANY_ROWS, 700, 50)]
     drawn = np.array([[1, 1, 1], [0, 1, 1], [1, 0, 1], [1, 1, 0], [2, 0, 1], [0, 0, 3], [0, 3, 0]])
     weights = np.tile(drawn, (2 * resampling.AT_ONCE // len(drawn), 1))[: 2 * resampling.AT_ONCE - 3]
     found = resampling.resampled_ap(scenes, weights)

@@ -66,6 +66,18 @@ def test_the_lowest_indices_vote_among_more_equals_than_are_asked_for_at_once() 
     assert value.tolist() == [9, 9]
 
 
+@pytest.mark.parametrize("first", [-1.0, 1.0])
+def test_the_lowest_indices_vote_whichever_of_two_equally_near_places_is_searched_first(first: float) -> None:
+    points = np.zeros((82, 3))
+    points[:40, 0], points[40:80, 0] = first, -first  # more of each than are asked for at once
+    values = np.repeat([5, 4, 3], [3, 37, 42])
+    value, _ = transfer_votes(points[:80], values[:80], np.zeros((2, 3)), np.ones(2, bool), 3)
+    assert value.tolist() == [5, 5]
+    values[80:] = 4, 5  # the last two are nearer, and the third vote decides
+    value, _ = transfer_votes(points, values, np.zeros((2, 3)), np.ones(2, bool), 3)
+    assert value.tolist() == [5, 5]
+
+
 def test_the_smallest_value_of_as_many_votes_wins() -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0], [4, 0, 0]])
     value, _ = transfer_votes(points, np.array([7, 3, 7, 3, 5]), points[:1], np.ones(1, bool), 5)

@@ -6,6 +6,7 @@ import io
 import json
 import time
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -28,6 +29,8 @@ from scored_room import (
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import LabelSet, Prediction
+from su3d_bench.metrics.instance.average_precision import InstanceCounts
+from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import combine, pack_scores, score_scene, unpack_scores
 
@@ -88,8 +91,10 @@ def test_the_interval_is_student_s_on_the_values_without_each_scene(name: str, a
         assert result.intervals[key] == pytest.approx(expected, abs=1e-9)
 
 
-def test_a_single_scene_has_no_interval() -> None:
+def test_a_single_scene_has_no_interval_and_two_have_one() -> None:
     assert combine(ROOM, noisy_scores("rooms-semantic", 1)).intervals == {"mAcc": None, "F-mIoU": None}
+    assert all(combine(ROOM, noisy_scores("rooms-semantic", 2)).intervals.values())
+    assert not any(combine(ROOM, noisy_scores("rooms-semantic", 2), with_intervals=False).intervals.values())
 
 
 def test_a_protocol_may_report_the_mean_of_the_scenes() -> None:
@@ -125,6 +130,12 @@ def test_constant_confidences_are_told() -> None:
     prediction = replace(truth_as_prediction(room(), with_labels=True), scores=np.full(8, 0.5))
     told = warnings_of("rooms-instance", prediction)
     assert told == "rooms/a: every confidence is 0.5: AP of a class is then recall (1 + precision) / 2"
+    chairs = [np.flatnonzero(room().instance == k) for k in (2, 3)]
+    two = instances(room().points, chairs, ["chair", "chair"], scores=[0.25, 0.25])
+    assert warnings_of("rooms-instance", two).startswith("rooms/a: every confidence is 0.25: ")
+    assert warnings_of("rooms-instance", replace(two, scores=np.array([0.25, 0.5]))) == ""
+    assert warnings_of("rooms-instance", instances(room().points, chairs[:1], ["chair"])) == ""  # one has no order
+    assert warnings_of("replica-openmask3d", two) == ""  # where none counts
 
 
 def test_duplicates_are_told() -> None:
@@ -133,6 +144,12 @@ def test_duplicates_are_told() -> None:
     told = warnings_of("rooms-instance", instances(truth.points, [chairs, chairs[5:]], ["chair", "table"]))
     assert told == (
         "rooms/a: 1 pair of predictions overlaps with IoU above 0.9 (first 0 and 1); duplicates can raise or lower AP"
+    )
+    small = [chairs[:99], chairs[50:], chairs[50:], chairs[:99]]  # of 100 points two, and two that do not count
+    told = warnings_of("rooms-instance", instances(truth.points, small, ["chair"] * 4))
+    assert told.startswith("rooms/a: 1 pair of predictions overlaps with IoU above 0.9 (first 1 and 2); ")
+    assert "3 pairs of predictions overlap with" in warnings_of(
+        "rooms-instance", instances(truth.points, [chairs] * 3, ["chair"] * 3)
     )
 
 
@@ -214,6 +231,46 @@ def test_damaged_counts_are_a_data_error(cut: int) -> None:
         unpack_scores(data[:cut])
 
 
+def of_one_class(**changed: Any) -> dict[str, Any]:
+    """Arrays of counts with two predictions, of one class at two thresholds."""
+    arrays = {
+        "class_index": np.zeros(2, np.int32),
+        "threshold_index": np.array([0, 1], np.int32),
+        "score": np.array([0.5, 0.25]),
+        "is_true": np.array([True, False]),
+        "n_missed": np.array([[0, 1]]),
+        **{name: np.ones(1, np.int64) for name in ("n_truth", "n_small_truth", "n_predictions")},
+    }
+    return arrays | {name: np.array(value) for name, value in changed.items()}
+
+
+@pytest.mark.parametrize(
+    ("changed", "line"),
+    [
+        ({"class_index": [-1, 0]}, "'class_index' counts beyond the 1 classes"),
+        ({"class_index": [0, 1]}, "'class_index' counts beyond the 1 classes"),
+        ({"threshold_index": [-1, 0]}, "'threshold_index' counts beyond the 2 thresholds"),
+        ({"threshold_index": [0, 2]}, "'threshold_index' counts beyond the 2 thresholds"),
+        ({"score": [0.5, np.nan]}, "'score' has values that are NaN or infinite"),
+        ({"score": [-np.inf, 0.5]}, "'score' has values that are NaN or infinite"),
+        ({"score": [1, 0]}, r"'score' is int64 \(2,\)"),
+        ({"is_true": [True]}, r"'is_true' is bool \(1,\)"),
+        ({"n_missed": [0, 1]}, r"'n_missed' is int64 \(2,\)"),
+        ({"n_missed": [[0, 1], [0, 1]], "n_truth": [1]}, r"'n_truth' is int64 \(1,\)"),
+    ],
+)
+def test_counts_that_do_not_fit_together_are_refused(changed: dict[str, Any], line: str) -> None:
+    assert InstanceCounts.checked(of_one_class()).sizes == {"rows": 2, "classes": 1, "thresholds": 2}
+    with pytest.raises(DataError, match=f"counts: {line}; score the scene again"):
+        InstanceCounts.checked(of_one_class(**changed))
+
+
+def test_totals_of_other_objects_than_the_points_are_refused() -> None:
+    objects = {"n_points": np.ones(2, np.int64), "totals": np.zeros((3, 4))}
+    with pytest.raises(DataError, match=r"counts: 'totals' is float64 \(3, 4\); score the scene again"):
+        ObjectCounts.checked(objects)
+
+
 def test_a_result_has_no_nan_in_its_json() -> None:
     result = combine(load_protocol("rooms-instance"), noisy_scores("rooms-instance", 2))
     text = json.dumps(result.to_json(), allow_nan=False)
@@ -274,6 +331,17 @@ def test_scores_of_another_version_are_refused() -> None:
         combine(newer, {"rooms/a": score})
     with pytest.raises(DataError, match="no scene was scored"):
         combine(ROOM, {})
+
+
+@pytest.mark.parametrize("name", ["rooms-semantic", "rooms-instance"])
+def test_scores_of_other_classes_under_the_same_version_are_refused(name: str) -> None:
+    rules = load_protocol(name)
+    fewer = rules.model_copy(update={"classes": rules.classes[:5]})
+    n_before, n_after = (len(one.curve_names) if one.kind == "instance" else len(one.classes) for one in (rules, fewer))
+    with pytest.raises(
+        DataError, match=f"rooms/0: was scored with {n_before} classes, {name} has {n_after} here; score it again"
+    ):
+        combine(fewer, noisy_scores(name, 1))
 
 
 def test_an_instance_id_that_spills_into_the_next_class_is_refused() -> None:

@@ -202,6 +202,21 @@ def test_points_of_another_cloud_are_labelled_by_their_nearest_truth_point() -> 
     assert combine(rules, {"room": score}).metrics == {**combine(rules, {"room": score}).metrics, "mAcc": 1.0}
 
 
+def test_points_of_another_cloud_may_take_their_class_from_the_first_point_of_the_truth() -> None:
+    rules = load_protocol("replica-conceptgraphs-ex6")
+    chairs = np.flatnonzero(room().semantic == ID["chair"])
+    first = replace(
+        room(),
+        points=room().points[chairs],
+        semantic=room().semantic[chairs],
+        instance=room().instance[chairs],
+        variant="conceptgraphs",
+        evaluation_points=room().points[chairs[:1]] + np.float32(0.001),
+    )
+    score = score_scene(rules, first, instances(first.points, [np.arange(5)], ["chair"]), None)
+    assert combine(rules, {"room": score}).per_class["chair"]["recall"] == 1.0
+
+
 def test_a_class_that_no_truth_has_takes_points_away_from_the_true_one() -> None:
     truth = room()
     table = np.flatnonzero(truth.semantic == ID["table"])

@@ -10,7 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from places import CASES
+from scored_room import instances
 
+from su3d_bench.core.types import DenseFeatures, Partition
 from su3d_bench.metrics.semantic.confusion import (
     SemanticCounts,
     SemanticMetrics,
@@ -20,6 +22,7 @@ from su3d_bench.metrics.semantic.confusion import (
     per_scene,
     scannet_metrics,
 )
+from su3d_bench.metrics.semantic.score import _one_a_voxel, _point_owners
 
 GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())
 POOLING = GOLDEN["cg_pooling"]
@@ -130,6 +133,31 @@ def test_scannet_counts_a_predicted_only_class_as_zero_and_leaves_out_one_that_n
     assert np.isnan(metrics.iou[2])
 
 
+def test_scannet_values_are_those_worked_out_by_hand() -> None:
+    # of 9 points of the first class 3 are called so, 1 the second and 5 the third, which is never true; 2 of the second
+    # are called nothing
+    with np.errstate(all="raise"):  # nothing is divided by zero
+        metrics = scannet_metrics(np.array([[3, 1, 5, 0], [0, 0, 0, 2], [0, 0, 0, 0]]))
+    assert metrics.class_index.tolist() == [0, 1, 2]
+    np.testing.assert_array_equal(metrics.recall, [3 / 9, 0.0, np.nan])
+    np.testing.assert_array_equal(metrics.precision, [1.0, 0.0, 0.0])
+    np.testing.assert_array_equal(metrics.iou, [3 / 9, 0.0, 0.0])
+    np.testing.assert_array_equal(metrics.f1, [6 / 12, 0.0, 0.0])
+    np.testing.assert_array_equal(metrics.f1_conceptgraphs, [2 * (3 / 9) / (1 + 3 / 9), 0.0, np.nan])
+    assert (metrics.mean_accuracy, metrics.mean_precision) == ((3 / 9) / 2, 1 / 3)
+    assert (metrics.mean_iou, metrics.mean_f1) == ((3 / 9) / 3, (6 / 12) / 3)
+    assert metrics.frequency_weighted_iou == pytest.approx(9 * (3 / 9) / 11)
+    assert metrics.point_accuracy == pytest.approx(3 / 11)
+    assert metrics.n_classes_above == (1, 1, 0, 0)
+
+
+def test_classes_are_counted_above_a_level_and_not_at_it() -> None:
+    n_hit = np.array([4, 5, 6, 8, 10, 12, 15, 18])  # of 20 points each, the others called nothing
+    metrics = scannet_metrics(np.column_stack([np.diag(n_hit), 20 - n_hit]))
+    assert metrics.iou.tolist() == [0.2, 0.25, 0.3, 0.4, 0.5, 0.6, 0.75, 0.9]
+    assert metrics.n_classes_above == (8, 6, 3, 1)
+
+
 @given(st.lists(st.tuples(st.integers(-1, 4), st.integers(-1, 4)), max_size=60), st.integers(0, 60))
 def test_counts_of_parts_add_up_to_the_whole(points: list[tuple[int, int]], cut: int) -> None:
     truth, predicted = np.array(points, np.int64).reshape(-1, 2).T
@@ -137,6 +165,35 @@ def test_counts_of_parts_add_up_to_the_whole(points: list[tuple[int, int]], cut:
     parts = [per_scene(truth[:cut], predicted[:cut], present), per_scene(truth[cut:], predicted[cut:], present)]
     assert np.array_equal(concatenate(parts).confusion, per_scene(truth, predicted, present).confusion)
     assert per_scene(truth, predicted, present).confusion.sum() == (truth >= 0).sum()
+
+
+def test_a_point_belongs_to_the_first_instance_that_takes_part_and_else_to_none() -> None:
+    points = np.zeros((5, 3), np.float32)
+    features = np.ones((3, 2), np.float32)
+    overlapping = instances(points, [np.array([0, 1]), np.array([1, 2]), np.array([2, 3])], None)
+    for takes_part, expected in (
+        ([True, True, True], [0, 0, 1, 2, -1]),
+        ([False, True, True], [-1, 1, 1, 2, -1]),
+        ([False, False, False], [-1] * 5),
+    ):
+        owner, rank = _point_owners(overlapping, np.array(takes_part))
+        assert owner.tolist() == rank.tolist() == expected
+    partition = Partition(points, np.array([0, 2, -1, 1, 1], np.int32), features)
+    owner, rank = _point_owners(partition, np.array([True, False, True]))
+    assert owner.tolist() == rank.tolist() == [0, 2, -1, -1, -1]
+    owner, rank = _point_owners(partition, np.array([False, True, True]))
+    assert owner.tolist() == rank.tolist() == [-1, 2, -1, 1, 1]
+    dense = DenseFeatures(points[:4], np.array([[1, 0], [0, 0], [0, 2], [1, 1]], np.float16))
+    owner, rank = _point_owners(dense, np.array([True, True, True, False]))
+    assert (owner.tolist(), rank.tolist()) == ([0, 1, 2, 3], [0, -1, 0, -1])
+
+
+def test_each_object_keeps_its_first_point_of_every_voxel() -> None:
+    x = np.array([0.31, 0.01, 0.02, 0.03, 0.32, 0.04, 0.33])  # voxels of 0.1: 3 0 0 0 3 0 3
+    owner = np.array([1, 0, 0, 1, 1, -1, 0])
+    kept = _one_a_voxel(np.stack([x, x, x], axis=1), owner, owner, 0.1)
+    assert kept.tolist() == [1, 0, -1, 1, -1, -1, 0]
+    assert _one_a_voxel(np.zeros((2, 3)), np.full(2, -1), np.full(2, -1), 0.1).tolist() == [-1, -1]
 
 
 def test_points_of_a_class_that_the_scene_does_not_score_are_left_out() -> None:

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scored_room import ROOM, OneHotEncoder
 
-from su3d_bench.core.types import Masks
+from su3d_bench.core.types import Masks, Partition
 from su3d_bench.metrics import scoring
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import precision_recall, resampling
@@ -63,6 +64,28 @@ def test_the_lowest_index_wins_among_more_equals_than_are_asked_for_at_once() ->
     assert nearest(candidates, np.zeros((3, 3), np.float32))[1].tolist() == [4000] * 3
 
 
+@pytest.mark.parametrize("first", [-1.0, 1.0])
+def test_the_lowest_index_wins_whichever_of_two_equally_near_places_is_searched_first(first: float) -> None:
+    candidates = np.zeros((40, 3))
+    candidates[:20, 0], candidates[20:, 0] = first, -first  # more of each than are asked for at once
+    distance, index = nearest(candidates, np.zeros((2, 3)))
+    assert (index.tolist(), distance.tolist()) == ([0, 0], [1.0, 1.0])
+
+
+def test_large_clouds_are_walked_along_a_z_curve_of_32_cells_a_side(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(transfer, "WORTH_ORDERING", 13)
+    # the key of a cell has a bit of x, of y and of z in turn: 1 2 4 for cells at 1, 8 16 32 at 2, 4096 for x at 16
+    cells = np.array([[32, 8, 4], [2, 0, 0], [0, 0, 1], [16, 0, 0], [0, 2, 0], [1, 0, 0], [0, 0, 0], [0, 1.5, 0]])
+    asking = np.array([[99, 0, 0], [0, 0, 99], [-9, -9, -9], [0, 99, 0], [0.5, 0.5, 1.5]])  # outside: at the ends
+    low_m, cell_m = np.array([-20.0, -30.0, -40.0]), 0.5
+    candidates, queries = low_m + cell_m * cells, low_m + cell_m * asking
+    order, asking_order = transfer._along_curve(candidates, queries)
+    assert order.tolist() == [6, 5, 7, 2, 1, 4, 3, 0]
+    assert asking_order.tolist() == [2, 4, 0, 3, 1]
+    order, asking_order = transfer._along_curve(candidates, queries[:-1])
+    assert (order.tolist(), asking_order.tolist()) == ([0, 1, 2, 3, 4, 5, 6, 7], [0, 1, 2, 3])
+
+
 def test_a_neighbour_at_the_cap_counts_and_one_beyond_it_does_not() -> None:
     candidates = np.array([[0.0, 0, 0], [0.5, 0, 0]])
     queries = np.array([[1.0, 0, 0], [1.0 + 1e-9, 0, 0]])
@@ -108,6 +131,14 @@ def test_duplicates_are_pairs_strictly_above_the_iou() -> None:
     masks = Masks(np.array([0, 10, 19, 28]), np.concatenate([tens, tens[:9], tens[1:]]))
     assert duplicate_pairs(masks, 10, 0.9) == []
     assert duplicate_pairs(masks, 10, 0.89) == [(0, 1), (0, 2)]
+
+
+def test_features_that_no_class_may_name_are_none_of_the_classes() -> None:
+    features = np.ones((2, OneHotEncoder().dim), np.float32)
+    partition = Partition(np.zeros((3, 3), np.float32), np.array([0, 1, -1], np.int32), features)
+    nothing = labelling.classes_of_prediction(ROOM, partition, OneHotEncoder(), np.zeros(0, np.int64))
+    assert nothing.tolist() == [-1, -1]
+    assert labelling.class_index_of_ids(ROOM, []).tolist() == []
 
 
 def test_the_first_class_wins_ties_and_features_without_direction() -> None:

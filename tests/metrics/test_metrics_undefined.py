@@ -121,6 +121,12 @@ def test_a_class_of_a_single_point_has_values_in_the_scenes_that_have_it() -> No
     np.testing.assert_array_equal(found[ROOM.classes[A].name]["IoU"], [1.0, 1.0, NAN])
     np.testing.assert_array_equal(found[ROOM.classes[B].name]["recall"], [0.8, 0.75, 1.0])
     assert set(found) == {ROOM.classes[A].name, ROOM.classes[B].name}
+    single = [confusion({A: {A: 1}}), confusion({B: {B: 3, N: 1}})]
+    weights = np.array([[1, 1], [1, 0], [0, 1]])
+    of_all = metric_of(ROOM).resampled(single, weights)
+    assert_as_drawn(dict(of_all), of_drawn(ROOM, single, weights), ("mAcc", "mIoU", "F-mIoU"))
+    assert of_all["mAcc"].tolist() == of_all["mIoU"].tolist() == [0.875, 1.0, 0.75]
+    assert of_all["F-mIoU"].tolist() == [0.8, 1.0, 0.75]
 
 
 # ---- results

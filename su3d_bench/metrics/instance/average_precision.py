@@ -174,23 +174,21 @@ def per_scene(
     ([2, 2], [True, False, True, False, True, False, True, False])
     """
     _check_predictions(ground_truth, indptr, indices, len(scores) if labels is None else len(labels), scores)
-    class_of = {class_id: index for index, class_id in enumerate(class_ids)}
-    if any(class_id < 1 for class_id in class_of):
-        raise DataError(f"class ids: {min(class_of)} cannot be scored; class ids start at 1")
+    if any(class_id < 1 for class_id in class_ids):
+        raise DataError(f"class ids: {min(class_ids)} cannot be scored; class ids start at 1")
     segment_of_point, segment_value, segment_size = _segments(ground_truth)
-    segment_class = np.array([class_of.get(int(v) // INSTANCES_PER_CLASS, -1) for v in segment_value], np.int64)
+    segment_label = segment_value // INSTANCES_PER_CLASS
     size = np.diff(indptr)
-    is_listed = np.ones((len(class_of), len(size)), bool)
+    is_listed = np.ones((len(class_ids), len(size)), bool)
     if labels is not None:
-        prediction_class = np.array([class_of.get(int(label), -1) for label in labels], np.int64)
-        is_listed = prediction_class == np.arange(len(class_of))[:, None]
+        is_listed = labels == np.array(class_ids, np.int64)[:, None]
     kept = np.flatnonzero(is_listed.any(axis=0) & (size >= min_region_size))
     intersection = intersections(segment_of_point, len(segment_value), indptr, indices, kept)
-    n_void = intersection[:, segment_class < 0].sum(axis=1)
+    n_void = intersection[:, ~np.isin(segment_label, class_ids)].sum(axis=1)
 
     parts = []
-    for c in range(len(class_of)):
-        columns = np.flatnonzero(segment_class == c)  # ascending value, as the original walks them
+    for c, class_id in enumerate(class_ids):
+        columns = np.flatnonzero(segment_label == class_id)  # ascending value, as the original walks them
         rows = np.flatnonzero(is_listed[c, kept])
         n_points = size[kept[rows]]
         shared = intersection[np.ix_(rows, columns)]

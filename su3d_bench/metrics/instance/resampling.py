@@ -83,7 +83,7 @@ def _compiled_areas(rows: _Rows, bounds: Int64Array, n_truth: Int64Array, weight
     def fill(start: int) -> None:
         own = slice(start, start + AT_ONCE)
         drawn = np.ascontiguousarray(weights[own].T, np.int32)
-        instances = np.ascontiguousarray(np.maximum(n_truth[own], 1).T, np.int32)
+        instances = np.ascontiguousarray(n_truth[own].T, np.int32)
         areas_of_block = np.empty((len(areas), drawn.shape[1]))
         resampled_areas(scene, rows.is_true, is_last, bounds, class_of_cell, instances, drawn, areas_of_block)
         areas[:, own] = areas_of_block

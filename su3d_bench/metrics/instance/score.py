@@ -225,7 +225,7 @@ def score_of_masks(
 def _mask_warnings(rules: ProtocolRules, truth: GroundTruth, scored: ScoredMasks) -> list[str]:
     assert rules.min_region_size is not None
     warnings, scores = list[str](), scored.scores
-    if rules.confidence == "prediction" and len(scores) > 1 and (scores == scores[0]).all():
+    if rules.confidence == "prediction" and len(scores) > 1 and scores.min() == scores.max():
         warnings.append(f"{CONSTANT_CONFIDENCE} {scores[0]:g}: AP of a class is then recall (1 + precision) / 2")
     large = np.flatnonzero(scored.masks.sizes >= rules.min_region_size)
     pairs = transfer.duplicate_pairs(transfer.select(scored.masks, large), len(truth.points), DUPLICATE_IOU)
@@ -252,7 +252,7 @@ class Covered:
     def main_object(self) -> Int64Array:
         """The object (K,) that each instance covers most vertices of, the lowest id of equals, 0 where it covers none.
 
-        >>> Covered(np.array([3, 7]), np.array([[2, 5], [4, 4], [0, 0]])).main_object.tolist()
+        >>> Covered(np.array([3, 7]), np.array([[0, 1], [4, 4], [0, 0]])).main_object.tolist()
         [7, 3, 0]
         """
         if not len(self.object_ids):

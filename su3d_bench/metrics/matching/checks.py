@@ -40,7 +40,7 @@ class MaskFacts:
 
 def mask_facts(masks: Masks, scores: Float64Array, n_points: int) -> MaskFacts:
     """Facts of K masks over ``n_points`` points."""
-    n_owners = np.bincount(masks.indices, minlength=n_points) if n_points else np.zeros(0, np.int64)
+    n_owners = np.bincount(masks.indices, minlength=n_points)
     near = None
     if float((n_owners.astype(np.float64) ** 2).sum()) <= MOST_SHARED:
         near = tuple(duplicate_pairs(masks, n_points, NEAR_IOU))

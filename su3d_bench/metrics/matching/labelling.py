@@ -174,4 +174,4 @@ def class_index_of_ids(rules: ProtocolRules, ids: Sequence[int] | np.ndarray) ->
     index_of = {entry.id: index for index, entry in enumerate(rules.classes)}
     distinct, inverse = np.unique(values, return_inverse=True)
     table = np.array([index_of.get(int(value), -1) for value in distinct], np.int64)
-    return table[inverse] if len(values) else np.zeros(0, np.int64)
+    return table[inverse]

@@ -36,8 +36,7 @@ def nearest(candidates: Points, queries: Points, cap_m: float = np.inf) -> tuple
     >>> distance.tolist(), index.tolist()
     ([1.0, 1.0], [0, 1])
     """
-    n = len(candidates)
-    if not n or not len(queries):
+    if not len(candidates) or not len(queries):
         return np.full(len(queries), np.inf), np.full(len(queries), -1, np.int64)
     from scipy.spatial import cKDTree
 
@@ -46,12 +45,10 @@ def nearest(candidates: Points, queries: Points, cap_m: float = np.inf) -> tuple
     tree = cKDTree(held, balanced_tree=False, compact_nodes=False)
     # the tree takes only neighbours nearer than its bound; the cap itself still counts
     bound = np.nextafter(cap_m, np.inf)
-    distances, indices = tree.query(ordered_queries, k=min(2, n), distance_upper_bound=bound, workers=1)
-    distances, indices = distances.reshape(len(ordered_queries), -1), indices.reshape(len(ordered_queries), -1)
-    nearest_index = np.append(order, -1)[indices[:, 0]]  # the tree says n where it found none
-    if n > 1:
-        tied = np.flatnonzero((distances[:, 0] == distances[:, 1]) & np.isfinite(distances[:, 0]))
-        nearest_index[tied] = _lowest_of_equals(tree, held, ordered_queries[tied], order)
+    distances, indices = tree.query(ordered_queries, k=2, distance_upper_bound=bound, workers=1)
+    nearest_index = order.take(indices[:, 0], mode="clip")  # the tree says n, and infinity, where it found none
+    tied = np.flatnonzero((distances[:, 0] == distances[:, 1]) & np.isfinite(distances[:, 0]))
+    nearest_index[tied] = _lowest_of_equals(tree, held, ordered_queries[tied], order)
     distance, index = np.empty(len(ordered_queries)), np.empty(len(ordered_queries), np.int64)
     distance[asking_order], index[asking_order] = distances[:, 0], nearest_index
     too_far = ~np.isfinite(distance) | (distance > cap_m)
@@ -109,26 +106,35 @@ def are_same_points(left: Points, right: Points) -> bool:
 
 def reduce_to_voxels(points: Points, masks: Masks, voxel_m: float) -> Int64Array:
     """Indices, ascending, of the points that stay when each mask, and the background, keeps its first point a voxel."""
-    voxel = row_ids(voxel_coordinates(points, voxel_m))
-    n_voxels = int(voxel.max()) + 1 if len(voxel) else 0
+    voxel = voxel_coordinates(points, voxel_m)
     background = np.ones(len(points), bool)
     background[masks.indices] = False
     outside = np.flatnonzero(background)
     members = np.concatenate([masks.indices.astype(np.int64), outside])
     owner = np.concatenate([masks.owners, np.full(len(outside), len(masks), np.int64)])
-    _, first = np.unique(owner * n_voxels + voxel[members], return_index=True)
-    return np.unique(members[first])
+    return np.unique(members[first_rows(np.column_stack([owner, voxel[members]]))])
 
 
 def row_ids(rows: Int64Array | Float64Array) -> Int64Array:
-    """A number from 0 for each distinct row, without the slow comparison of whole rows in numpy's unique."""
-    if not len(rows):
-        return np.zeros(0, np.int64)
+    """A number from 0 for each distinct row, without the slow comparison of whole rows in numpy's unique.
+
+    >>> row_ids(np.array([[1, 5], [0, 5], [1, 5], [0, 6]])).tolist()
+    [1, 0, 1, 2]
+    """
     order = np.lexsort(rows.T)
     is_new = np.any(np.diff(rows[order], axis=0) != 0, axis=1)
-    ids = np.empty(len(rows), np.int64)
-    ids[order] = np.concatenate([[0], np.cumsum(is_new)])
+    ids = np.zeros(len(rows), np.int64)
+    ids[order[1:]] = np.cumsum(is_new)
     return ids
+
+
+def first_rows(rows: Int64Array) -> Int64Array:
+    """The first of each distinct row, in the order of ``row_ids``.
+
+    >>> first_rows(np.array([[1, 5], [0, 5], [1, 5], [0, 6]])).tolist()
+    [1, 0, 3]
+    """
+    return np.unique(row_ids(rows), return_index=True)[1]
 
 
 def transfer_masks(
@@ -155,8 +161,7 @@ def transfer_masks(
     of_point = csr_array(
         (np.ones(len(masks.indices), np.int8), masks.indices, masks.indptr), shape=(len(masks), len(points))
     ).tocsc()
-    moved = of_point[:, kept[nearest_index[reached]]].tocsr()
-    moved.sort_indices()
+    moved = of_point[:, kept[nearest_index[reached]]].tocsr()  # column after column, so each row is ascending
     return Masks(moved.indptr.astype(np.int64), reached[moved.indices].astype(np.int32))
 
 

@@ -52,23 +52,21 @@ def _distinct_places(points: Points) -> tuple[Float64Array, Int64Array]:
     """Each place once, and the row of every point's place: the corners of faces share theirs with several others."""
     rows = np.asarray(points, np.float64)
     ids = row_ids(rows)
-    places = np.empty((int(ids.max()) + 1 if len(ids) else 0, 3))
-    places[ids] = rows
-    return places, ids
+    _, first = np.unique(ids, return_index=True)
+    return rows[first], ids
 
 
 def _most_votes(votes: Int64Array) -> Int64Array:
-    """The value of most votes in each row (R, K), the smallest of equals; negative votes are none.
+    """The value of most votes in each row (R, K), the smallest of equals; votes of -1 are none.
 
     >>> _most_votes(np.array([[3, 1, 3, 1], [2, -1, -1, -1], [-1, -1, -1, -1]])).tolist()
     [1, 2, -1]
     """
-    best, n_best = np.full(len(votes), -1, np.int64), np.zeros(len(votes), np.int64)
-    for column in votes.T:
-        n = (votes == column[:, None]).sum(axis=1)
-        wins = (column >= 0) & ((n > n_best) | ((n == n_best) & (column < best)))
-        best, n_best = np.where(wins, column, best), np.where(wins, n, n_best)
-    return best
+    n = np.stack([(votes == column[:, None]).sum(axis=1) for column in votes.T], axis=1)
+    n[votes < 0] = 0
+    has_most = n == n.max(axis=1, keepdims=True)
+    smallest: Int64Array = np.where(has_most, votes, votes.max()).min(axis=1)
+    return smallest
 
 
 class _Search:
@@ -106,7 +104,7 @@ class _Search:
                 _, indices = self.tree.query(queries[rows], k=n_asked, workers=1)
                 offset = self.points[indices] - queries[rows][:, None, :]
                 squared = offset[..., 0] ** 2 + offset[..., 1] ** 2 + offset[..., 2] ** 2
-                order = np.lexsort((indices, squared), axis=-1)
+                order = np.lexsort((indices, squared))
                 answer[rows] = np.take_along_axis(indices, order, axis=1)[:, : self.k]
                 if n_asked < len(self.points):
                     ranked = np.take_along_axis(squared, order, axis=1)
@@ -136,8 +134,7 @@ def transfer_each_mask(points: Points, masks: Masks, targets: Points, cap_m: flo
     indptr = np.concatenate([[0], np.cumsum([len(rows) for rows in reached])])
     indices = np.concatenate([along_x[:0], *reached])
     of_place = csr_array((np.ones(len(indices), np.int8), indices, indptr), shape=(len(masks), len(places)))
-    moved = of_place.tocsc()[:, place_of_target].tocsr()
-    moved.sort_indices()
+    moved = of_place.tocsc()[:, place_of_target].tocsr()  # column after column, so each row is ascending
     return Masks(moved.indptr.astype(np.int64), moved.indices.astype(np.int32))
 
 

@@ -287,9 +287,8 @@ def _point_owners(prediction: Prediction, takes_part: BoolArray) -> tuple[Int64A
 def _one_a_voxel(points: transfer.Points, owner: Int64Array, rank: Int64Array, voxel_m: float) -> Int64Array:
     """``rank`` (N,) where each object keeps its first point a voxel, -1 for all others."""
     taking = np.flatnonzero(rank >= 0)
-    voxel = transfer.row_ids(voxel_coordinates(points[taking], voxel_m))
-    n_voxels = int(voxel.max(initial=0)) + 1
-    _, first = np.unique(owner[taking] * n_voxels + voxel, return_index=True)
+    voxel = voxel_coordinates(points[taking], voxel_m)
+    first = transfer.first_rows(np.column_stack([owner[taking], voxel]))
     kept = np.full(len(rank), -1, np.int64)
     kept[taking[first]] = rank[taking[first]]
     return kept
