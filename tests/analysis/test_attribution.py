@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from su3d_bench.core.types import Int32Array, Int64Array, Masks
 from su3d_bench.metrics.attribution import masks as attribution
-from su3d_bench.metrics.attribution.masks import KINDS, LabelledMasks, ScoringRules, mend_scene
+from su3d_bench.metrics.attribution.masks import KINDS, LabelledMasks, ScoringRules, mend_scene, with_true_labels
+from su3d_bench.metrics.attribution.overlaps import measure_overlaps
 from su3d_bench.metrics.instance import average_precision as instance_ap
 
 SIZE = 200  # points an instance
@@ -160,6 +161,41 @@ def test_what_the_evaluator_ignores_is_no_background() -> None:
     gain, n = gains(masks, classes, scores)
     assert n["background"] == 0
     assert set(gain.values()) == {0.0}
+
+
+def test_a_mask_with_just_half_of_itself_and_of_an_instance_in_it_belongs_to_none() -> None:
+    masks, classes, scores = perfect()
+    blob = np.concatenate([points(0, 0.5), np.arange(1200, 1300, dtype=np.int32)])  # 100 of 200, and 100 void points
+    _, n = gains([*masks, blob], [*classes, 3], [*scores, 0.95])
+    assert n == dict.fromkeys(KINDS, 0) | {"background": 1}
+
+
+def test_what_is_left_of_two_equal_merged_masks_is_found_once() -> None:
+    masks, classes, scores = perfect()
+    both = np.concatenate([points(2), points(3, 0.8)])  # most of it is instance 2 of class 3, its label that of 3
+    masks[2:4], classes[2:4], scores[2:4] = [both, both], [4, 4], [0.99, 0.98]
+    mended = mend_scene(truth(), labelled(masks, classes, scores), RULES)
+    assert mended.n["merged"] == 2
+    assert instance_ap.combine([mended.as_is]).ap50 < 1
+    assert instance_ap.combine([mended.alone["merged"]]).ap50 == 1
+
+
+def test_a_mask_of_just_half_an_instance_matches_nothing_and_counts_by_its_points() -> None:
+    half, more = points(0, 0.5), np.concatenate([points(0, 0.6, 0.4), np.arange(1200, 1260, dtype=np.int32)])
+    overlaps = measure_overlaps(truth(), labelled([half, more], [3, 3], [0.9, 0.9]), RULES)
+    assert overlaps.iou[:, 0].tolist() == [0.5, 120 / 260]
+    assert overlaps.parts[0].parts == (1, 0)
+
+
+def test_true_labels_are_those_of_the_instances_that_masks_share_most_points_with() -> None:
+    void = np.arange(1200, 1300, dtype=np.int32)
+    masks = [np.concatenate([points(0, 0.3), points(3, 0.4)]), points(5, 0.1), void]
+    predicted = labelled(masks, [3, 3, 3], [0.9, 0.8, 0.7])
+    named = with_true_labels(measure_overlaps(truth(), predicted, RULES))
+    assert named.class_ids.tolist() == [4, 5, 3]
+    assert named.scores.tolist() == [0.9, 0.8, 0.7]
+    of_none = with_true_labels(measure_overlaps(np.zeros_like(truth()), predicted, RULES))
+    assert of_none.class_ids.tolist() == [3, 3, 3]
 
 
 def test_of_duplicates_the_best_fit_stays_and_takes_the_best_confidence() -> None:

@@ -275,6 +275,21 @@ def test_on_a_busy_machine_costs_are_not_judged_and_it_says_so(
     assert main(["check", str(run), "--against", str(learnt)]) == 1
 
 
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("jobs = 1", "jobs = 2"), ("cache = true", "cache = false"), ("/b", "/[b]"), (":Collector", ":Collectors"),
+        ('"rooms-semantic", ', ""),
+    ],
+)  # fmt: skip
+def test_how_a_run_was_asked_for_and_what_moves_no_number_may_differ(
+    old: str, new: str, run: Path, reference: Reference
+) -> None:
+    setting(old, new)(run)
+    assert check(read_run(run), reference).findings == ()
+    assert learn([read_run(run)]).settings == reference.settings
+
+
 def test_on_another_processor_headline_values_have_a_stated_tolerance(run: Path, reference: Reference) -> None:
     edit(run / "run.json", lambda r: r.update(processor="other"))
     lowered("metrics", "mAcc", by=0.019)(run)

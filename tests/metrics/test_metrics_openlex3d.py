@@ -11,6 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from open_scene import (
     ENCODER,
+    OBJECTS,
     PROMPTS,
     WordEncoder,
     instances_with,
@@ -120,6 +121,12 @@ def test_an_object_counts_the_same_however_many_points_it_has() -> None:
     assert combine([counts]).tolist() == [0.5, 0, 0, 0, 0, 0.5]
 
 
+def test_an_object_without_points_has_no_part_in_any_mean() -> None:
+    counts = count_categories(np.array([0, 0, 2]), np.array([0, 4, 5]), 3)
+    assert counts.n_points.tolist() == [2, 1]
+    assert counts.totals.tolist() == [[1, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]]
+
+
 def test_a_box_that_ends_at_the_last_rank_has_nothing_to_its_right() -> None:
     score, _, _ = rank_scores(np.array([0, 1, 2]), 0, 2, 2)
     assert score.tolist() == [1.0, 1.0, 1.0]
@@ -151,6 +158,10 @@ def test_an_empty_prediction_is_all_missing_and_ranks_nothing() -> None:
     truth = lex_truth()
     assert values_of(TOPN, truth, nothing_at(truth)) == {name: float(name == "missing") for name in CATEGORIES}
     assert values_of(RANKING, truth, nothing_at(truth)) == {"overall": 0.0, "synonyms": 0.0, "secondary": 0.0}
+    ranked, nothing = (score_scene(RANKING, truth, one, ENCODER).counts for one in (perfect(truth), nothing_at(truth)))
+    assert isinstance(ranked, ObjectCounts) and isinstance(nothing, ObjectCounts)
+    assert nothing.n_points.tolist() == ranked.n_points.tolist()  # every object counts, the first one too
+    assert np.isnan(nothing.totals).tolist() == np.isnan(ranked.totals).tolist()
 
 
 def test_a_point_is_missing_beyond_five_centimetres_and_ranked_however_far_it_is() -> None:
@@ -315,6 +326,18 @@ def test_a_cloud_is_reduced_as_open3d_reduces_it() -> None:
     distance, index = transfer.nearest(theirs, ours)
     assert distance.max() < 1e-6  # theirs are added up in single precision
     assert len(set(index.tolist())) == len(ours)
+
+
+def test_without_voxels_every_point_speaks_for_itself() -> None:
+    """A chair and a table one centimetre apart, and a map of both; in voxels of 5 cm they are one thing."""
+    points = np.array([[0.01, 0, 0], [0.02, 0, 0]], np.float32)
+    truth = OpenLexTruth(points, np.array([7, 12]), OBJECTS, PROMPTS, "openlex3d-visible", "made for a test")
+    features = np.stack([WordEncoder().feature({word: 1.0}) for word in ("chair", "table")])
+    both = instances_with(points, [np.array([0]), np.array([1])], features)
+    one_label = TOPN.model_copy(update={"top_k": 1})
+    without = one_label.model_copy(update={"transfer": TOPN.transfer.model_copy(update={"evaluation_voxel_m": 0.0})})
+    assert [values_of(rules, truth, both)["synonyms"] for rules in (one_label, without)] == [0.5, 1.0]
+    assert values_of(without, truth, nothing_at(truth))["missing"] == 1.0
 
 
 # ---- scenes together

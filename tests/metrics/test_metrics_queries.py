@@ -20,7 +20,7 @@ from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.precision_recall import average_precision
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery, confidences, per_scene
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.metrics.scoring import combine, pack_scores, score_scene, unpack_scores
+from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores
 
 GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())
 OPENLEX, PLAIN = load_protocol("openlex3d-queries"), load_protocol("query-ap")
@@ -125,6 +125,12 @@ def test_the_truth_does_not_reach_one_under_openlex3d_where_a_query_has_two_obje
     truth = asking(query_truth(), ("seat", (7, 12)), ("light", (30,)))
     assert all(0.5 < value < 1 for value in metrics(OPENLEX, truth, with_words(truth, words)))
     assert metrics(PLAIN, ruled(PLAIN, truth), with_words(truth, words)) == pytest.approx([1.0, 1.0, 1.0])
+
+
+def test_of_queries_it_is_said_why_the_truth_has_no_score() -> None:
+    said = {name: metric_of(rules).ceiling_remark for name, rules in PROTOCOLS.items()}
+    assert "masks grow by the threshold" in str(said["openlex3d-queries"])
+    assert "how well perfect masks are ranked is up to the encoder" in str(said["query-ap"])
 
 
 def test_a_mask_meets_only_the_objects_of_its_own_query() -> None:

@@ -19,7 +19,7 @@ from su3d_bench.metrics.fitness import why_not_content, why_not_scorable
 from su3d_bench.metrics.instance.score import covered_objects
 from su3d_bench.metrics.protocol_files import rules_file
 from su3d_bench.metrics.protocols import load_protocol, protocols_for, read_protocol
-from su3d_bench.metrics.questions.score import are_objects_right, is_answer_right
+from su3d_bench.metrics.questions.score import are_objects_right, first_instances, is_answer_right
 from su3d_bench.metrics.questions.shares import ShareCounts
 from su3d_bench.metrics.questions.truths import AskedText, GivenAnswer, ReasoningTruth, RetrievalTruth, TrueAnswer
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
@@ -85,6 +85,14 @@ def test_what_is_farther_than_5_cm_covers_nothing() -> None:
 
 def test_an_empty_map_answers_nothing() -> None:
     assert values(nothing(TRUTH))["all"] == 0.0
+
+
+def test_where_there_is_nothing_to_rank_no_instance_comes_first() -> None:
+    assert first_instances(RULES, ["chair", "lamp"], nothing(room()), ENCODER).tolist() == [-1, -1]
+    assert first_instances(RULES, [], PERFECT, ENCODER).tolist() == []
+    for unnamed, encoder in ((replace(PERFECT, features=None), ENCODER), (PERFECT, None)):
+        with pytest.raises(PredictionError, match="needs features and an encoder"):
+            first_instances(RULES, ["chair"], unnamed, encoder)
 
 
 def test_a_kind_that_is_not_asked_has_no_value() -> None:

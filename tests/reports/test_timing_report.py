@@ -16,7 +16,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.timing import peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Float64Array
-from su3d_bench.metrics.costs import UpdateTimes, summarise
+from su3d_bench.metrics.costs import UpdateTimes, pooled, summarise
 from su3d_bench.numerics.statistics import growth_exponent
 from su3d_bench.reports.pictures.timing import _memory
 from su3d_bench.runs import scene as scene_run
@@ -74,6 +74,12 @@ def test_percentiles_leave_the_first_updates_out_and_the_share_counts_them() -> 
     assert stages_of(summary)["match"].share == 0.5
     assert summary.updates_per_s == pytest.approx(6 / 0.22)
     assert summary.frames_per_s == pytest.approx(60 / 0.22)
+
+
+def test_updates_of_several_scenes_are_pooled_without_the_first_of_each() -> None:
+    first, second = times(np.array([9.0, 1.0, 2.0])), times(np.array([8.0, 3.0]))
+    assert pooled([first, second], "total", 1).tolist() == [1.0, 2.0, 3.0]
+    assert pooled([], "total", 1).tolist() == []
 
 
 def test_the_share_of_the_map_is_what_is_neither_reading_nor_perception() -> None:
