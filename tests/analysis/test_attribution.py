@@ -187,6 +187,17 @@ def test_a_mask_of_just_half_an_instance_matches_nothing_and_counts_by_its_point
     assert overlaps.parts[0].parts == (1, 0)
 
 
+def test_a_mask_is_a_part_where_it_raises_the_iou_and_a_duplicate_where_half_of_it_is_known() -> None:
+    void = np.arange(1200, 1300, dtype=np.int32)
+    first = points(0, 0.6)  # 120 of 200 points, IoU 0.6
+    with_new = np.concatenate([points(0, 0.3, 0.375), void[:40]])  # 45 of its 100 points known, 15 new: 135 / 240
+    half_known = np.concatenate([points(0, 0.4, 0.4)])  # 40 of its 80 points known
+    better = points(0, 0.2, 0.6)  # 40 new points: 160 / 200
+    overlaps = measure_overlaps(truth(), labelled([first, with_new, half_known, better], [3] * 4, [0.9] * 4), RULES)
+    assert overlaps.parts[0].parts == (0, 3)
+    assert overlaps.parts[0].duplicates == (2,)
+
+
 def test_true_labels_are_those_of_the_instances_that_masks_share_most_points_with() -> None:
     void = np.arange(1200, 1300, dtype=np.int32)
     masks = [np.concatenate([points(0, 0.3), points(3, 0.4)]), points(5, 0.1), void]

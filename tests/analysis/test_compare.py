@@ -336,6 +336,15 @@ def test_two_methods_of_one_run_are_compared() -> None:
     assert "b:oracle is the truth itself, no system" in found.remarks
 
 
+def test_what_must_be_known_of_a_method_is_said_where_it_is_compared_alone() -> None:
+    shutil.copytree("variants", "caveats")
+    written = json.loads(Path("caveats/metrics.json").read_text())
+    for one in written["results"]:
+        one["caveat"] = f"{one['method']} saw the truth"
+    Path("caveats/metrics.json").write_text(json.dumps(written))
+    assert compare("a", "caveats").remarks == ("caveats:collector: collector saw the truth",)
+
+
 def test_the_only_methods_of_two_runs_are_compared_whatever_their_names() -> None:
     found = compare("b", "truth")
     assert [(one.left, one.right) for one in found.protocols] == [("collector", "oracle")] * 2
