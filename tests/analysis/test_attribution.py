@@ -170,6 +170,13 @@ def test_a_mask_with_just_half_of_itself_and_of_an_instance_in_it_belongs_to_non
     assert n == dict.fromkeys(KINDS, 0) | {"background": 1}
 
 
+def test_half_of_an_instance_is_not_most_of_it() -> None:
+    masks, classes, scores = perfect()
+    both = np.concatenate([points(0, 0.5), points(1, 0.5)])
+    _, n = gains([both, *masks[2:]], [3, *classes[2:]], [0.9, *scores[2:]])
+    assert n == dict.fromkeys(KINDS, 0) | {"background": 1, "missed": 2}
+
+
 def test_what_is_left_of_two_equal_merged_masks_is_found_once() -> None:
     masks, classes, scores = perfect()
     both = np.concatenate([points(2), points(3, 0.8)])  # most of it is instance 2 of class 3, its label that of 3

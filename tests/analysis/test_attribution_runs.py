@@ -183,11 +183,26 @@ def test_a_mask_is_that_of_the_scored_points_near_it_alone() -> None:
     assert [CAUSES[cause] if cause >= 0 else cause for cause in causes_of(found).tolist()] == [
         "label",
         *["background"] * 2,
-        *[attribution_semantic.NOT_SCORED] * 2,
+        *[-2] * 2,
     ]
     mended = mend_points(found, np.ones(4, bool)).with_true_labels
     assert mended is not None
     assert mended.confusion[:3, :3].tolist() == [[0, 0, 0], [0, 1, 0], [0, 2, 0]]  # the mask is called 1 everywhere
+
+
+def test_of_objects_with_equally_many_points_a_mask_belongs_to_the_one_with_the_lowest_number() -> None:
+    found = row_of_points(*((1, one, 0, 0.0, True) for one in (9, 4, 4, 9, 6)))
+    assert object_of_mask(found).tolist() == [4]
+    nothing = LabelledPoints(*(np.zeros(0, np.int64),) * 2, np.zeros(0, bool), *(np.zeros(0, np.int64),) * 4)
+    assert object_of_mask(nothing).tolist() == []
+    assert mend_points(nothing, np.ones(2, bool)).n == dict.fromkeys(CAUSES, 0)
+
+
+def test_geometry_is_missing_beyond_five_centimetres_and_goes_before_all_else() -> None:
+    wrong = row_of_points(*[(1, 7, 0, 0.0, True)] * 2, (1, 7, -1, np.inf, True), (1, 7, -1, np.inf, True))
+    found = replace(wrong, map_distance_m=np.array([0.05, 0.051, 0.05, 0.051]))
+    names = [CAUSES[cause] for cause in causes_of(found).tolist()]
+    assert names == ["label", "geometry", "background", "geometry"]
 
 
 def test_the_first_mask_counts_as_any_other() -> None:

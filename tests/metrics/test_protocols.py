@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -12,9 +13,10 @@ from places import CASES
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.datasets.rooms.classes import CLASSES
+from su3d_bench.metrics.fitness import ContentFacts, Form, n_feature_dimensions
 from su3d_bench.metrics.instance.average_precision import MIN_REGION_SIZE, THRESHOLDS
 from su3d_bench.metrics.protocol_files import RULES, protocol_names, read_remarks
-from su3d_bench.metrics.protocols import load_protocol, not_comparable_with, protocols_for
+from su3d_bench.metrics.protocols import RULES_OF_KIND, load_protocol, not_comparable_with, protocols_for
 
 NAMES = {
     "class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d", "openlex3d-queries",
@@ -137,6 +139,45 @@ def test_the_digest_moves_with_every_rule() -> None:
     changed = rules.model_copy(update={"prompt": "a picture of {}"})
     assert rules.digest == load_protocol("rooms-semantic").digest
     assert changed.digest != rules.digest
+
+
+def test_a_rule_that_a_file_leaves_out_asks_for_nothing() -> None:
+    said = {
+        "name": "mine", "version": 1, "summary": "made for a test", "kind": "semantic", "metric": "scannet",
+        "datasets": ("rooms",), "label_space": "rooms", "ground_truth": "mesh-vertices",
+        "classes": ({"id": 0, "name": "chair"},), "vocabulary": "all", "prompt": "{}",
+        "transfer": {"candidates": "object-points"}, "headline": ("mIoU",),
+    }  # fmt: skip
+    rules = RULES_OF_KIND["semantic"].model_validate(said).model_dump()
+    assert rules["transfer"] == {
+        "candidates": "object-points", "neighbours": 1, "cap_m": None, "evaluation_voxel_m": 0.0,
+    }  # fmt: skip
+    assert {key: value for key, value in rules.items() if key not in said} == {
+        "by_default": True, "class_agnostic": None, "ignore": (), "ignore_rule": "exact", "prompts": (),
+        "prompt_names": {}, "encoder": None, "min_region_size": None, "thresholds": (), "confidence": None,
+        "top_k": None, "questions": None, "per_kind": None, "synonyms": None, "merging": None, "answers": None,
+        "aggregate": "pooled", "not_comparable_with": (),
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("form", "labels", "needs_encoder"),
+    [
+        ("instances", "all", False), ("instances", "some", True), ("instances", "none", True),
+        ("vertex-masks", "all", False), ("vertex-masks", "some", False), ("vertex-masks", "none", True),
+    ],
+)  # fmt: skip
+def test_an_encoder_is_asked_for_where_features_must_stand_for_names(
+    form: Form, labels: str, needs_encoder: bool
+) -> None:
+    facts = ContentFacts(form, 3, 512, has_labels=labels != "none", has_every_label=labels == "all")
+    rules = load_protocol("rooms-semantic")
+    assert n_feature_dimensions(rules, facts) == (512 if needs_encoder else None)
+    assert n_feature_dimensions(rules, replace(facts, n=0)) is None
+    assert n_feature_dimensions(load_protocol("class-agnostic-open3dis"), facts) is None
+    assert n_feature_dimensions(load_protocol("rooms-annotation"), facts) is None
+    compares_texts = n_feature_dimensions(load_protocol("query-ap"), facts)
+    assert compares_texts == (512 if needs_encoder or form == "instances" else None)
 
 
 def test_a_misspelt_name_is_told_with_the_likely_one() -> None:

@@ -82,6 +82,13 @@ def test_updates_of_several_scenes_are_pooled_without_the_first_of_each() -> Non
     assert pooled([], "total", 1).tolist() == []
 
 
+def test_a_single_update_stands_for_one_frame() -> None:
+    summary = summarise([times(np.array([250.0]), frame=np.array([7.0]))], warm_up=0)
+    assert (summary.updates_per_s, summary.frames_per_s) == (4.0, 4.0)
+    without_indices = summarise([times(np.array([100.0, 100.0, 50.0]))], warm_up=0)
+    assert without_indices.frames_per_s == without_indices.updates_per_s == 12.0
+
+
 def test_the_share_of_the_map_is_what_is_neither_reading_nor_perception() -> None:
     one = times(np.full(4, 10.0), decode_ms=np.full(4, 3.0), encode_ms=np.full(4, 4.0), match_ms=np.full(4, 2.0))
     np.testing.assert_array_equal(one.ms("map"), 2.0)
