@@ -178,16 +178,22 @@ def row_of_points(*rows: tuple[int, int, int, float, bool]) -> LabelledPoints:
 
 def test_a_mask_is_that_of_the_scored_points_near_it_alone() -> None:
     near, far, void = (1, 7, 0, 0.05, True), (2, 8, 0, 0.051, True), (3, 9, 0, 0.0, False)
-    found = row_of_points(near, far, far, void, void)
-    assert object_of_mask(found).tolist() == [7]
+    far_of_another = (2, 8, 1, 0.051, True)
+    found = row_of_points(near, far, far, void, void, far_of_another)
+    assert object_of_mask(found).tolist() == [7, -1]
     assert [CAUSES[cause] if cause >= 0 else cause for cause in causes_of(found).tolist()] == [
         "label",
         *["background"] * 2,
         *[-2] * 2,
+        "background",
     ]
     mended = mend_points(found, np.ones(4, bool)).with_true_labels
     assert mended is not None
-    assert mended.confusion[:3, :3].tolist() == [[0, 0, 0], [0, 1, 0], [0, 2, 0]]  # the mask is called 1 everywhere
+    assert mended.confusion[:3, :3].tolist() == [
+        [0, 0, 0],
+        [0, 1, 0],
+        [1, 2, 0],
+    ]  # the first mask is called 1 everywhere
 
 
 def test_of_objects_with_equally_many_points_a_mask_belongs_to_the_one_with_the_lowest_number() -> None:

@@ -259,6 +259,9 @@ DISAGREEMENTS: list[tuple[list[float], tuple[float, float] | None, str | None]] 
     ([0.1, -0.1] * 4, (0.01, 0.1), "the test does not find a difference (p 1)"),
     ([0.1, -0.1] * 4, (-0.1, -0.01), "the test does not find a difference (p 1)"),
     ([0.1] * 8, (-0.05, 0.15), "the test finds a difference (p 0.0078)"),
+    ([0.1] * 8, (0.0, 0.2), "the test finds a difference (p 0.0078)"),
+    ([-0.1] * 8, (-0.2, 0.0), "the test finds a difference (p 0.0078)"),
+    ([-0.1] * 8, (-0.2, -0.01), None),
     ([0.1] * 8, None, None),
 ]
 
@@ -272,8 +275,17 @@ def test_an_interval_that_contradicts_the_test_is_never_without_a_word(
     assert words is None or words in (found or "")
 
 
+def test_a_p_of_just_five_in_a_hundred_shows_no_difference() -> None:
+    found = difference_of([0.1] * 8, (0.05, 0.15))
+    just = replace(found, test=SignFlipTest(0.05, 0.01, 8, True)).disagreement
+    assert "the test does not find a difference (p 0.05)" in str(just)
+    least = replace(found, test=SignFlipTest(0.05, 0.05, 8, True)).disagreement
+    assert "8 scenes can give no p below 0.05" in str(least)
+
+
 def test_what_disagrees_stands_beneath_the_table() -> None:
     comparison = compare("a", "b", per_class=True).to_json()
+    assert comparison["schema"] == 2
     value = comparison["protocols"][1]["metrics"]["AP"]
     comparison["protocols"][1]["metrics"]["AP"] = value | {"disagreement": "the interval leaves 0 out, but"}
     text = markdown(comparison_tables(comparison))

@@ -96,6 +96,16 @@ def test_what_scenes_share_does_not_widen_the_interval(folder: Path) -> None:
     assert wide.interval == pytest.approx((-swapped.interval[1], -swapped.interval[0]))
 
 
+def test_a_metric_counts_among_all_where_any_scene_differs(folder: Path) -> None:
+    two_differ = scored(LEFT | {"painted/a": 150, "painted/c": 970})
+    found = compared(folder, scored(LEFT), two_differ).protocols[0].metrics
+    # the signs of two scenes decide: half of their four patterns are as far from 0, and there are two metrics
+    assert {value.test.p for value in found.values() if value.test is not None} == {0.5}
+    assert {value.p_of_all for value in found.values()} == {1.0}
+    alike = compared(folder, scored(LEFT), scored(LEFT)).protocols[0].metrics
+    assert {value.p_of_all for value in alike.values()} == {None}
+
+
 def test_scenes_that_one_side_lacks_take_no_part(folder: Path) -> None:
     right = scored({scene: LEFT[scene] + GAIN[scene] for scene in ("painted/c", "painted/a")})
     found = compared(folder, scored(LEFT), right).protocols[0]

@@ -302,6 +302,13 @@ def test_on_another_processor_headline_values_have_a_stated_tolerance(run: Path,
     assert not check(read_run(run), reference).is_passed
 
 
+def test_a_run_that_timed_nothing_teaches_no_cost(run: Path, made: Path, reference: Reference) -> None:
+    without_calibration(run)
+    taught = learn([read_run(made), read_run(run)])
+    assert taught.costs == reference.costs != {}
+    assert taught.calibration_ms == reference.calibration_ms
+
+
 def test_runs_of_different_requests_teach_nothing(run: Path, made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     setting("seed = 0", "seed = 1")(run)
     assert main(["check", "--learn", str(made), str(run), "--out", str(run / "r.json")]) == 2

@@ -13,7 +13,7 @@ from places import CASES
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.datasets.rooms.classes import CLASSES
-from su3d_bench.metrics.fitness import ContentFacts, Form, n_feature_dimensions
+from su3d_bench.metrics.fitness import ContentFacts, Form, TruthFacts, n_feature_dimensions, why_not_truth
 from su3d_bench.metrics.instance.average_precision import MIN_REGION_SIZE, THRESHOLDS
 from su3d_bench.metrics.protocol_files import RULES, protocol_names, read_remarks
 from su3d_bench.metrics.protocols import RULES_OF_KIND, load_protocol, not_comparable_with, protocols_for
@@ -158,6 +158,32 @@ def test_a_rule_that_a_file_leaves_out_asks_for_nothing() -> None:
         "top_k": None, "questions": None, "per_kind": None, "synonyms": None, "merging": None, "answers": None,
         "aggregate": "pooled", "not_comparable_with": (),
     }  # fmt: skip
+
+
+MESH = TruthFacts("truth", "replica", ("mesh-vertices",))
+TRUTHS = [
+    ("rooms-semantic", MESH, None),
+    ("rooms-instance", MESH, None),
+    ("rooms-instance", replace(MESH, has_instances=False), "needs instances, the ground truth holds class ids alone"),
+    ("rooms-semantic", replace(MESH, has_instances=False, has_points=False), None),
+    ("rooms-annotation", replace(MESH, has_points=False), "needs the objects of a dataset"),
+    ("rooms-semantic", replace(MESH, label_space="nyu40"), "it scores the labels of 'replica', truth has those of"),
+    ("rooms-semantic", replace(MESH, label_space=None, variants=()), None),
+    ("rooms-semantic", replace(MESH, variants=("other", "more")), "it needs ground truth 'mesh-vertices', truth has o"),
+    ("replica-retrieval", MESH, None),
+]
+
+
+@pytest.mark.parametrize(("name", "truth", "reason"), TRUTHS)
+def test_a_truth_that_lacks_what_a_protocol_scores_is_told(name: str, truth: TruthFacts, reason: str | None) -> None:
+    said = why_not_truth(load_protocol(name), truth)
+    assert said == reason if reason is None else str(said).startswith(reason)
+
+
+def test_questions_of_a_dataset_itself_need_one_that_knows_them() -> None:
+    rules = load_protocol("rooms-retrieval").model_copy(update={"questions": "dataset"})
+    assert "knows questions and answers itself, which truth does not" in str(why_not_truth(rules, MESH))
+    assert why_not_truth(rules, replace(MESH, knows_questions=True)) is None
 
 
 @pytest.mark.parametrize(

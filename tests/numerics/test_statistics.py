@@ -141,6 +141,12 @@ def test_ranks_stay_open_where_no_difference_is_shown() -> None:
     assert rank_intervals([level[0]]) == [(1, 1)]
 
 
+def test_a_small_difference_that_every_scene_has_ranks_as_a_large_one_does() -> None:
+    level: Float64Array = np.linspace(0.1, 0.9, 10)
+    assert rank_intervals([level, level + 0.01]) == [(2, 2), (1, 1)]
+    assert rank_intervals([level + 0.01, level]) == [(1, 1), (2, 2)]
+
+
 def test_rank_intervals_of_equal_rows_hold_all_ranks_in_95_of_100() -> None:
     rng = np.random.default_rng(3)
     whole = [rank_intervals(list(rng.normal(0, 1, (4, 14)))) == [(1, 4)] * 4 for _ in range(200)]
