@@ -193,7 +193,7 @@ def test_a_mask_is_that_of_the_scored_points_near_it_alone() -> None:
         [0, 0, 0],
         [0, 1, 0],
         [1, 2, 0],
-    ]  # the first mask is called 1 everywhere
+    ]  # mask 0 is called 1 throughout
 
 
 def test_of_objects_with_equally_many_points_a_mask_belongs_to_the_one_with_the_lowest_number() -> None:
