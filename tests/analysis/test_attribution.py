@@ -205,6 +205,43 @@ def test_a_mask_is_a_part_where_it_raises_the_iou_and_a_duplicate_where_half_of_
     assert overlaps.parts[0].duplicates == (2,)
 
 
+SPLITS = {
+    "two halves": ([(0.5, 0.0, 3), (0.5, 0.5, 3)], True),
+    "one mask": ([(0.6, 0.0, 3)], False),
+    "two halves of another class": ([(0.5, 0.0, 4), (0.5, 0.5, 4)], False),
+    "together just half of it": ([(0.25, 0.0, 3), (0.25, 0.25, 3)], False),
+    # 110 points of the match, 130 of the others
+    "a match of the right class and others": ([(0.55, 0.0, 3), (0.35, 0.4, 4), (0.3, 0.7, 4)], True),
+    "a match of the wrong class and others": ([(0.55, 0.0, 4), (0.35, 0.4, 3), (0.3, 0.7, 3)], False),
+    # none matches: 100 points of the one class, 110 of the other
+    "most points of the right class": ([(0.5, 0.0, 4), (0.3, 0.45, 3), (0.25, 0.75, 3)], True),
+    "most points of the wrong class": ([(0.5, 0.0, 3), (0.3, 0.45, 4), (0.25, 0.75, 4)], False),
+}
+
+
+@pytest.mark.parametrize("name", SPLITS)
+def test_an_instance_is_split_where_its_parts_match_it_together_under_its_class(name: str) -> None:
+    parts, is_split = SPLITS[name]
+    masks = [points(0, share, start) for share, start, _ in parts]
+    predicted = labelled(masks, [class_id for *_, class_id in parts], [0.9] * len(parts))
+    assert measure_overlaps(truth(), predicted, RULES).is_split(0) == is_split
+
+
+def test_an_instance_that_a_merged_mask_finds_is_not_split() -> None:
+    halves, merged = [points(0, 0.5), points(0, 0.5, 0.5)], np.concatenate([points(0), points(1, 0.6)])
+    for masks, is_split in ((halves, True), ([*halves, merged], False)):
+        n = len(masks)
+        assert measure_overlaps(truth(), labelled(masks, [3] * n, [0.9] * n), RULES).is_split(0) == is_split
+
+
+def test_what_leaves_the_iou_as_it_is_is_no_part() -> None:
+    first = points(0, 0.6)  # 120 of 200
+    # 40 points of the first, 30 new ones and 50 void: together 150 of 250
+    second = np.concatenate([points(0, 0.35, 0.4), np.arange(1200, 1250, dtype=np.int32)])
+    overlaps = measure_overlaps(truth(), labelled([first, second], [3, 3], [0.9, 0.9]), RULES)
+    assert (overlaps.parts[0].parts, overlaps.parts[0].duplicates) == ((0,), ())
+
+
 def test_true_labels_are_those_of_the_instances_that_masks_share_most_points_with() -> None:
     void = np.arange(1200, 1300, dtype=np.int32)
     masks = [np.concatenate([points(0, 0.3), points(3, 0.4)]), points(5, 0.1), void]

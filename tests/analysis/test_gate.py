@@ -17,6 +17,7 @@ from places import SCENES
 
 from su3d_bench.analysis.gate import HIGHER_IS_BETTER, Reference, Value, check, learn, read_reference
 from su3d_bench.cli.main import main
+from su3d_bench.core.errors import ConfigError
 from su3d_bench.reports.gate import Finding, Verdict, github_lines, junit_xml, markdown, plain_lines
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run
@@ -300,6 +301,12 @@ def test_on_another_processor_headline_values_have_a_stated_tolerance(run: Path,
     assert "another processor" in verdict.remarks[0] and "within 2 points" in verdict.remarks[0]
     lowered("metrics", "mAcc", by=0.002)(run)
     assert not check(read_run(run), reference).is_passed
+
+
+def test_a_run_without_numbers_teaches_nothing(run: Path, made: Path) -> None:
+    in_metrics(lambda m: m["results"][1].update(result=None))(run)
+    with pytest.raises(ConfigError, match="collector under rooms-instance: was not scored; learn from runs with num"):
+        learn([read_run(made), read_run(run)])
 
 
 def test_a_run_that_timed_nothing_teaches_no_cost(run: Path, made: Path, reference: Reference) -> None:

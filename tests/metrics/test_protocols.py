@@ -7,13 +7,22 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 from places import CASES
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.datasets.rooms.classes import CLASSES
-from su3d_bench.metrics.fitness import ContentFacts, Form, TruthFacts, n_feature_dimensions, why_not_truth
+from su3d_bench.metrics.fitness import (
+    ContentFacts,
+    Form,
+    TruthFacts,
+    list_of_ids,
+    n_feature_dimensions,
+    why_not_numbers,
+    why_not_truth,
+)
 from su3d_bench.metrics.instance.average_precision import MIN_REGION_SIZE, THRESHOLDS
 from su3d_bench.metrics.protocol_files import RULES, protocol_names, read_remarks
 from su3d_bench.metrics.protocols import RULES_OF_KIND, load_protocol, not_comparable_with, protocols_for
@@ -184,6 +193,19 @@ def test_questions_of_a_dataset_itself_need_one_that_knows_them() -> None:
     rules = load_protocol("rooms-retrieval").model_copy(update={"questions": "dataset"})
     assert "knows questions and answers itself, which truth does not" in str(why_not_truth(rules, MESH))
     assert why_not_truth(rules, replace(MESH, knows_questions=True)) is None
+
+
+def test_class_ids_up_to_forty_are_of_nyu_and_larger_ones_of_scannet200() -> None:
+    assert [list_of_ids(one) for one in (1, 40, 41)] == ["nyu40-vertices"] * 2 + ["scannet200-vertices"]
+    facts = {one: ContentFacts("vertex-masks", 2, has_labels=True, class_ids=np.array([3, one])) for one in (40, 41)}
+    twenty, two_hundred = load_protocol("scannet-instance"), load_protocol("scannet200-instance")
+    assert [why_not_numbers(twenty, facts[one]) is None for one in (40, 41)] == [True, False]
+    assert [why_not_numbers(two_hundred, facts[one]) is None for one in (40, 41)] == [False, True]
+    assert "go up to 41, as ids of ScanNet200 do" in str(why_not_numbers(twenty, facts[41]))
+    assert why_not_numbers(load_protocol("rooms-instance"), facts[41]) is None
+    assert why_not_numbers(load_protocol("class-agnostic-segment3d"), facts[41]) is None
+    for without in (None, np.zeros(0, np.int64)):
+        assert why_not_numbers(two_hundred, replace(facts[40], class_ids=without)) is None
 
 
 @pytest.mark.parametrize(

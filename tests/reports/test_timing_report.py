@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +88,28 @@ def test_a_single_update_stands_for_one_frame() -> None:
     assert (summary.updates_per_s, summary.frames_per_s) == (4.0, 4.0)
     without_indices = summarise([times(np.array([100.0, 100.0, 50.0]))], warm_up=0)
     assert without_indices.frames_per_s == without_indices.updates_per_s == 12.0
+
+
+def test_a_scene_whose_map_has_no_size_says_nothing_of_growth_with_it() -> None:
+    grows = times(np.linspace(1.0, 10.0, 12), n_points=np.linspace(10.0, 100.0, 12))
+    alone = stages_of(summarise([grows], warm_up=0))["total"].against_points
+    both = stages_of(summarise([times(np.full(12, 500.0)), grows], warm_up=0))["total"].against_points
+    assert both == alone
+    assert alone.exponent == pytest.approx(1.0)
+
+
+def test_sizes_are_the_largest_over_scenes_and_the_finish_that_of_the_last_maps() -> None:
+    first = times(np.ones(2), n_points=np.array([7.0, 5.0]), map_bytes=np.array([10.0, 90.0]))
+    second = times(np.ones(3))
+    maps = tuple(MapCost(n_updates=n, finish_ms=ms) for n, ms in ((1, 50.0), (2, 4.0)))
+    first = replace(first, maps=maps, peak_rss_bytes=400)
+    second = replace(second, maps=maps[:1], peak_rss_bytes=300, device_bytes=20)
+    found = summarise([first, second])
+    assert (found.n_points, found.map_bytes, found.peak_rss_bytes, found.device_bytes) == (7, 90, 400, 20)
+    assert (found.finish_ms, summarise([first]).finish_ms) == (50.0, 4.0)
+    assert summarise([first, replace(second, peak_rss_bytes=500)]).peak_rss_bytes == 500
+    none = summarise([times(np.ones(3))])
+    assert (none.n_points, none.map_bytes, none.peak_rss_bytes, none.device_bytes, none.finish_ms) == (None,) * 5
 
 
 def test_the_share_of_the_map_is_what_is_neither_reading_nor_perception() -> None:
