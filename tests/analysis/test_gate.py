@@ -367,6 +367,37 @@ def test_a_reference_survives_its_file(reference: Reference, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(
+    ("key", "value", "is_read"),
+    [
+        ("n_runs", 1, True), ("n_runs", 0, False), ("across_machines", 0.0, True), ("across_machines", 1.0, True),
+        ("across_machines", -0.01, False), ("across_machines", 1.01, False), ("cost_limit", 1.01, True),
+        ("cost_limit", 1.0, False), ("calibration_ms", 0.01, True), ("calibration_ms", 0.0, False),
+        ("calibration_ms", None, True), ("results", [], False), ("costs", {}, True), ("schema_version", 2, False),
+    ],
+)  # fmt: skip
+def test_a_reference_outside_its_limits_is_none(
+    key: str, value: object, is_read: bool, reference: Reference, tmp_path: Path
+) -> None:
+    made = reference.model_dump(mode="json")
+    made["results"] = made["results"][:1]
+    (tmp_path / "r.json").write_text(json.dumps(made | {key: value}))
+    if is_read:
+        assert getattr(read_reference(tmp_path / "r.json"), key) == value
+    else:
+        with pytest.raises(ConfigError, match="is no reference of this version"):
+            read_reference(tmp_path / "r.json")
+
+
+@pytest.mark.parametrize(("value", "is_read"), [({"value": 0.5}, True), ({"value": 0.5, "tolerance": -0.1}, False)])
+def test_a_value_without_a_tolerance_has_none(value: dict[str, float], is_read: bool) -> None:
+    if is_read:
+        assert Value.model_validate(value).tolerance == 0.0
+    else:
+        with pytest.raises(ValueError, match="greater than or equal to 0"):
+            Value.model_validate(value)
+
+
+@pytest.mark.parametrize(
     "words", [[], ["a"], ["a", "b", "--against", "r"], ["--learn", "a"], ["a", "--against", "r", "--cost-limit", "2"]]
 )
 def test_a_request_that_is_neither_check_nor_learn_is_one_line(

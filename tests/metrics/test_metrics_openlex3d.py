@@ -121,6 +121,19 @@ def test_an_object_counts_the_same_however_many_points_it_has() -> None:
     assert combine([counts]).tolist() == [0.5, 0, 0, 0, 0, 0.5]
 
 
+def test_of_the_labels_of_a_point_the_one_that_is_nearest_for_its_own_object_counts() -> None:
+    table = np.array([[0, 5, 3], [5, 1, 5], [2, 5, 5]])  # of three objects, for three words
+    top = np.array([[0, 2], [1, 2], [2, 2]])  # of three units
+    rows, units = np.repeat([-1, 0, 1, 2], 4), np.tile([-1, 0, 1, 2], 4)
+    expected = [-1, -1, -1, -1, 4, 0, 3, 3, 4, 5, 1, 5, 4, 2, 5, 5]
+    assert point_categories(rows, units, top, table).tolist() == expected
+
+
+def test_a_point_without_an_object_or_a_category_is_not_counted() -> None:
+    counts = count_categories(np.array([0, -1, 1, 1]), np.array([0, 2, -1, 3]), 2)
+    assert counts.totals.tolist() == [[1, 0, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0]]
+
+
 def test_an_object_without_points_has_no_part_in_any_mean() -> None:
     counts = count_categories(np.array([0, 0, 2]), np.array([0, 4, 5]), 3)
     assert counts.n_points.tolist() == [2, 1]
