@@ -170,6 +170,16 @@ def test_a_mask_with_just_half_of_itself_and_of_an_instance_in_it_belongs_to_non
     assert n == dict.fromkeys(KINDS, 0) | {"background": 1}
 
 
+def test_what_a_merged_mask_has_outside_goes_with_the_instance_of_most_of_its_points() -> None:
+    masks, classes, scores = perfect()
+    both = np.concatenate([points(0), points(1), np.arange(1200, 1260, dtype=np.int32)])
+    mended = mend_scene(truth(), labelled([both, *masks[2:]], [3, *classes[2:]], [0.9, *scores[2:]]), RULES)
+    after = instance_ap.combine([mended.alone["merged"]])
+    assert mended.n["merged"] == 1
+    assert after.ap50 == 1
+    assert after.ap < 1  # 200 of 260 points: no match above an IoU of 0.77
+
+
 def test_half_of_an_instance_is_not_most_of_it() -> None:
     masks, classes, scores = perfect()
     both = np.concatenate([points(0, 0.5), points(1, 0.5)])
@@ -192,6 +202,8 @@ def test_a_mask_of_just_half_an_instance_matches_nothing_and_counts_by_its_point
     overlaps = measure_overlaps(truth(), labelled([half, more], [3, 3], [0.9, 0.9]), RULES)
     assert overlaps.iou[:, 0].tolist() == [0.5, 120 / 260]
     assert overlaps.parts[0].parts == (1, 0)
+    assert not overlaps.finds(0, 0)
+    assert not overlaps.is_found(0)
 
 
 def test_a_mask_is_a_part_where_it_raises_the_iou_and_a_duplicate_where_half_of_it_is_known() -> None:

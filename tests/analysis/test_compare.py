@@ -357,6 +357,18 @@ def test_what_must_be_known_of_a_method_is_said_where_it_is_compared_alone() -> 
     assert compare("a", "caveats").remarks == ("caveats:collector: collector saw the truth",)
 
 
+def test_who_answered_or_named_on_either_side_is_said() -> None:
+    shutil.copytree("a", "said")
+    written = json.loads(Path("said/metrics.json").read_text())
+    written["results"][0]["result"]["warnings"] += ["painted/a: n': the vote", "every scene: answers by a solver"]
+    Path("said/metrics.json").write_text(json.dumps(written))
+    expected = ("said:collector: answers by a solver", "said:collector: n': the vote")
+    for sides in (("b", "said"), ("said", "b")):
+        first, second = compare(*sides).protocols
+        assert set(expected) <= set(first.remarks)
+        assert not set(expected) & set(second.remarks)
+
+
 def test_the_only_methods_of_two_runs_are_compared_whatever_their_names() -> None:
     found = compare("b", "truth")
     assert [(one.left, one.right) for one in found.protocols] == [("collector", "oracle")] * 2

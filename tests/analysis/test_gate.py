@@ -388,12 +388,18 @@ def test_a_reference_outside_its_limits_is_none(
             read_reference(tmp_path / "r.json")
 
 
-@pytest.mark.parametrize(("value", "is_read"), [({"value": 0.5}, True), ({"value": 0.5, "tolerance": -0.1}, False)])
+@pytest.mark.parametrize(
+    ("value", "is_read"),
+    [
+        ({"value": 0.5}, True), ({"value": 0.5, "tolerance": -0.1}, False), ({"value": float("nan")}, False),
+        ({"value": 0.5, "tolerance": float("inf")}, False),
+    ],
+)  # fmt: skip
 def test_a_value_without_a_tolerance_has_none(value: dict[str, float], is_read: bool) -> None:
     if is_read:
         assert Value.model_validate(value).tolerance == 0.0
     else:
-        with pytest.raises(ValueError, match="greater than or equal to 0"):
+        with pytest.raises(ValueError, match=r"greater than or equal to 0|finite number"):
             Value.model_validate(value)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -33,6 +34,7 @@ from su3d_bench.metrics.open_vocabulary.openlex3d import (
     OpenLexTruth,
     category_table,
     count_categories,
+    count_ranks,
     point_categories,
     rank_scores,
     ranked_labels,
@@ -116,6 +118,13 @@ def test_an_object_without_synonyms_or_with_an_excluded_one_is_not_scored() -> N
 A = ObjectLabels(("a",))
 
 
+def test_ranks_are_counted_by_points_of_objects_that_have_any() -> None:
+    scores = np.array([[1.0, 0.5, np.nan], [0.0, 0.25, np.nan], [0.5, np.nan, 1.0]])
+    counts = count_ranks(np.array([0, 0, 0, -1, 2]), np.array([0, 4, 0, 4, 0]), scores, 3)
+    assert counts.n_points.tolist() == [3, 1]
+    np.testing.assert_array_equal(counts.totals, [[2.0, 1.25, np.nan], [0.5, np.nan, 1.0]])
+
+
 def test_an_object_counts_the_same_however_many_points_it_has() -> None:
     counts = count_categories(np.array([0] * 99 + [1]), np.array([0] * 99 + [5]), 2)
     assert combine([counts]).tolist() == [0.5, 0, 0, 0, 0, 0.5]
@@ -175,6 +184,10 @@ def test_an_empty_prediction_is_all_missing_and_ranks_nothing() -> None:
     assert isinstance(ranked, ObjectCounts) and isinstance(nothing, ObjectCounts)
     assert nothing.n_points.tolist() == ranked.n_points.tolist()  # every object counts, the first one too
     assert np.isnan(nothing.totals).tolist() == np.isnan(ranked.totals).tolist()
+    unseen = replace(truth, objects=truth.objects | {99: ObjectLabels(("pot",))})  # an object without points
+    without = score_scene(RANKING, unseen, nothing_at(truth), ENCODER).counts
+    assert isinstance(without, ObjectCounts)
+    assert without.n_points.tolist() == ranked.n_points.tolist()
 
 
 def test_a_point_is_missing_beyond_five_centimetres_and_ranked_however_far_it_is() -> None:
@@ -351,6 +364,17 @@ def test_without_voxels_every_point_speaks_for_itself() -> None:
     without = one_label.model_copy(update={"transfer": TOPN.transfer.model_copy(update={"evaluation_voxel_m": 0.0})})
     assert [values_of(rules, truth, both)["synonyms"] for rules in (one_label, without)] == [0.5, 1.0]
     assert values_of(without, truth, nothing_at(truth))["missing"] == 1.0
+
+
+@pytest.mark.parametrize(("far_m", "is_missing"), [(0.0625, False), (0.063, True)])
+def test_a_point_just_as_far_as_the_cap_has_the_label_of_its_nearest(far_m: float, is_missing: bool) -> None:
+    at_cap = TOPN.model_copy(update={"transfer": TOPN.transfer.model_copy(update={"cap_m": 0.0625})})
+    truth = OpenLexTruth(
+        np.zeros((1, 3), np.float32), np.array([7]), OBJECTS, PROMPTS, "openlex3d-visible", "made for a test"
+    )
+    feature = WordEncoder().feature({"chair": 1.0})[None]
+    found = instances_with(np.array([[far_m, 0, 0]], np.float32), [np.array([0])], feature)
+    assert values_of(at_cap, truth, found)["missing"] == float(is_missing)
 
 
 # ---- scenes together

@@ -13,6 +13,7 @@ from places import CASES
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
+from su3d_bench.core.types import DenseFeatures, Partition
 from su3d_bench.datasets.rooms.classes import CLASSES
 from su3d_bench.metrics.fitness import (
     ContentFacts,
@@ -20,12 +21,13 @@ from su3d_bench.metrics.fitness import (
     TruthFacts,
     list_of_ids,
     n_feature_dimensions,
+    why_not_content,
     why_not_numbers,
     why_not_truth,
 )
 from su3d_bench.metrics.instance.average_precision import MIN_REGION_SIZE, THRESHOLDS
 from su3d_bench.metrics.protocol_files import RULES, protocol_names, read_remarks
-from su3d_bench.metrics.protocols import RULES_OF_KIND, load_protocol, not_comparable_with, protocols_for
+from su3d_bench.metrics.protocols import RULES_OF_KIND, ProtocolRules, load_protocol, not_comparable_with, protocols_for
 
 NAMES = {
     "class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d", "openlex3d-queries",
@@ -143,6 +145,16 @@ def test_a_field_that_a_later_version_adds_leaves_digests_alone() -> None:
     assert explicit.digest == rules.digest
 
 
+def test_the_digest_says_nothing_of_rules_with_their_defaults() -> None:
+    class Later(ProtocolRules):
+        is_new: bool = False
+
+    rules = load_protocol("rooms-semantic")
+    later = Later.model_construct(**dict(rules))
+    assert later.digest == rules.digest
+    assert later.model_copy(update={"is_new": True}).digest != rules.digest
+
+
 def test_the_digest_moves_with_every_rule() -> None:
     rules = load_protocol("rooms-semantic")
     changed = rules.model_copy(update={"prompt": "a picture of {}"})
@@ -167,6 +179,34 @@ def test_a_rule_that_a_file_leaves_out_asks_for_nothing() -> None:
         "top_k": None, "questions": None, "per_kind": None, "synonyms": None, "merging": None, "answers": None,
         "aggregate": "pooled", "not_comparable_with": (),
     }  # fmt: skip
+
+
+KINDS = {
+    "semantic": {"takes_dense", "names_points", "takes_votes", "ignores_classes"},
+    "instance": {"needs_instances", "ignores_classes"},
+    "queries": {"needs_own_points", "ignores_classes"},
+    "categories": {"takes_dense", "needs_own_points"},
+    "retrieval": {"is_judged", "needs_own_points", "ignores_classes"},
+    "annotation": {"is_judged", "needs_own_points", "goes_by_names", "ignores_classes"},
+    "reasoning": {"is_judged", "needs_own_points", "goes_by_names", "ignores_classes"},
+}
+
+
+def test_kinds_differ_in_what_they_take() -> None:
+    facts = set.union(*KINDS.values())
+    assert {kind: {fact for fact in facts if getattr(rules, fact)} for kind, rules in RULES_OF_KIND.items()} == KINDS
+
+
+def test_what_a_prediction_holds_is_told_by_its_kind() -> None:
+    points, features = np.zeros((4, 3), np.float32), np.zeros((2, 512), np.float16)
+    partition = ContentFacts.of(Partition(points, np.array([0, 0, 1, -1], np.int32), features.astype(np.float32)))
+    dense = ContentFacts.of(DenseFeatures(points, np.zeros((4, 7), np.float16)))
+    assert (partition.form, partition.n, partition.n_dimensions) == ("partition", 2, 512)
+    assert (dense.form, dense.n, dense.n_dimensions) == ("dense", 4, 7)
+    assert why_not_content(load_protocol("rooms-instance"), partition) is None
+    assert "needs instances" in str(why_not_content(load_protocol("rooms-instance"), dense))
+    without_points = why_not_content(load_protocol("rooms-instance"), partition, has_points=False)
+    assert "the ground truth has no coordinates" in str(without_points)
 
 
 MESH = TruthFacts("truth", "replica", ("mesh-vertices",))
@@ -279,6 +319,18 @@ FAULTS = (
     ("instance", "version = 1", 'version = 1\nclass_agnostic = "scored"', "class_agnostic: takes no prompt"),
     ("instance", 'confidence = "prediction"', 'confidence = "similarity"', "takes ones or prediction"),
     ("instance", "[transfer]", "[transfer]\nneighbours = 5", "transfer.neighbours: belongs to kind 'semantic'"),
+    (
+        "annotation",
+        "version = 1",
+        'version = 1\nprompt = "{}"',
+        "compares no features; it takes no prompt and no encoder",
+    ),
+    (
+        "annotation",
+        "version = 1",
+        'version = 1\nencoder = "x"',
+        "compares no features; it takes no prompt and no encode",
+    ),
     ("instance", 'name = "mine"', 'name = "rooms-instance"', "the protocol name 'rooms-instance' is built in"),
 )
 

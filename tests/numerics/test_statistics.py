@@ -55,6 +55,11 @@ def test_the_interval_ends_where_the_values_can() -> None:
     assert mean_interval(np.array([-1.0, 1.0, 1.0]), DIFFERENCE) == (-1.0, 1.0)
 
 
+def test_two_values_have_an_interval() -> None:
+    half = 12.706204736432095 * 0.01  # the quantile of Student's t with 1 degree of freedom, and the standard error
+    assert mean_interval(np.array([0.49, 0.51])) == pytest.approx((0.5 - half, 0.5 + half))
+
+
 def test_a_single_scene_has_no_interval() -> None:
     assert jackknife_interval(np.array([0.5, np.nan]), np.ones(1, bool)) is None
     assert jackknife_interval(np.array([0.5])) is None

@@ -72,6 +72,7 @@ def test_percentiles_leave_the_first_updates_out_and_the_share_counts_them() -> 
     summary = summarise([times(total, match_ms=total / 2, frame=np.arange(0, 60, 10.0))], warm_up=2)
     stage = stages_of(summary)["total"]
     assert (stage.n, stage.p50, stage.worst, stage.first) == (4, 15.0, 30.0, 75.0)
+    assert stage.p95 == pytest.approx(28.5)  # 0.85 of the way from 20 to 30
     assert stages_of(summary)["match"].share == 0.5
     assert summary.updates_per_s == pytest.approx(6 / 0.22)
     assert summary.frames_per_s == pytest.approx(60 / 0.22)
