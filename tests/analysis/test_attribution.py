@@ -217,6 +217,33 @@ def test_a_mask_is_a_part_where_it_raises_the_iou_and_a_duplicate_where_half_of_
     assert overlaps.parts[0].duplicates == (2,)
 
 
+def test_the_best_part_is_the_match_of_the_right_class_then_any_match() -> None:
+    void = np.arange(1200, 1315, dtype=np.int32)
+    of_right_class, larger = points(0, 0.51), points(0, 0.6, 0.4)  # IoU 0.51 and 0.6
+    overlaps = measure_overlaps(truth(), labelled([larger, of_right_class], [4, 3], [0.9, 0.9]), RULES)
+    assert overlaps.parts[0].parts == (1, 0)
+    match, no_match = points(0, 0.55), np.concatenate([points(0, 0.6, 0.4), void])  # 110 and 120 points, IoU 0.55, 0.38
+    overlaps = measure_overlaps(truth(), labelled([no_match, match], [3, 4], [0.9, 0.9]), RULES)
+    assert overlaps.parts[0].parts == (1, 0)
+
+
+def test_instances_and_masks_count_from_the_minimum_size_on() -> None:
+    values = np.repeat([3001, 3002, 4001], [100, 99, 100])
+    masks = [np.arange(100), np.arange(99), np.arange(1)]
+    overlaps = measure_overlaps(values, labelled([m.astype(np.int32) for m in masks], [3] * 3, [0.9] * 3), RULES)
+    assert [members.tolist() for members in overlaps.members] == [list(range(100)), list(range(199, 299))]
+    assert overlaps.is_large.tolist() == [True, False, False]
+    assert overlaps.inside[:, 0].tolist() == [1.0, 1.0, 1.0]
+    point = LabelledMasks(Masks.of_sets([np.zeros(1, np.int32)]), np.array([3]), np.ones(1))
+    assert measure_overlaps(np.array([3001, 3002]), point, ScoringRules((3,), 1)).iou.tolist() == [[1.0, 0.0]]
+
+
+@pytest.mark.parametrize(("share", "is_merged"), [(0.5, False), (0.505, True)])
+def test_a_mask_is_merged_where_it_has_more_than_half_of_several_instances(share: float, is_merged: bool) -> None:
+    mask = np.concatenate([points(0), points(1, share)])
+    assert measure_overlaps(truth(), labelled([mask], [3], [0.9]), RULES).is_merged.tolist() == [is_merged]
+
+
 SPLITS = {
     "two halves": ([(0.5, 0.0, 3), (0.5, 0.5, 3)], True),
     "one mask": ([(0.6, 0.0, 3)], False),

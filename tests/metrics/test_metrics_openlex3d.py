@@ -167,6 +167,14 @@ def test_the_overall_score_weighs_every_label_alike() -> None:
     assert scores.tolist() == pytest.approx([2 / 3, 1.0, 0.0])
 
 
+def test_ranks_outside_their_box_count_by_how_far_they_lie_from_it() -> None:
+    labels = ranked_labels(ObjectLabels(("a", "b"), ("c",)), ["a", "b", "c", "d", "e"])
+    scores = labels.scores(np.array([[0, 2, 1, 3, 4], [4, 0, 3, 1, 2]]))
+    # the boxes are 0..1 and 2..2 of 0..4: 1 and 1 - 1 / 3, 1 - 1 / 2; then 1 - 3 / 3 and 1, 1 - 1 / 2
+    expected = [[(1 + 2 / 3 + 1 / 2) / 3, 5 / 6, 1 / 2], [(0 + 1 + 1 / 2) / 3, 1 / 2, 1 / 2]]
+    np.testing.assert_allclose(scores, expected, atol=1e-8)
+
+
 # ---- a whole scene
 
 

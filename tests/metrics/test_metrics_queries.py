@@ -68,6 +68,20 @@ def test_stretched_confidences_give_the_best_mask_of_every_query_one_and_the_wor
     assert confidences(np.full((4, 1), 0.3), "similarity-min-max").tolist() == [[0.0]] * 4
 
 
+def test_confidences_of_masks_that_hardly_differ_are_not_stretched_to_the_full_range() -> None:
+    stretched = confidences(np.array([[0.0], [1e-8], [4e-9]]), "similarity-min-max")  # (s + 1) / 2 over at least 1e-8
+    assert stretched[:, 0].tolist() == pytest.approx([0.0, 0.5, 0.2], abs=1e-6)
+
+
+def test_a_mask_of_a_single_point_counts_and_points_of_no_object_answer_nothing() -> None:
+    objects, masks = np.array([-1, 7]), Masks(np.array([0, 1, 2]), np.arange(2, dtype=np.int32))
+    found = per_scene(objects, [TextQuery("seat", (7,))], masks, np.array([[0.1], [0.9]]))
+    assert instance_ap.combine([found]).ap == 1.0
+    assert found.n_predictions.tolist() == [2]
+    nothing = per_scene(objects, [TextQuery("air", (-1,))], masks, np.array([[0.9], [0.1]]))
+    assert nothing.n_truth.tolist() == [0]
+
+
 def test_the_top_masks_of_each_query_count_and_of_equals_the_first() -> None:
     objects = np.repeat([1, 2, 3], 4)
     masks = Masks(np.array([0, 4, 8, 12]), np.arange(12, dtype=np.int32))

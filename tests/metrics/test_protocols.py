@@ -299,6 +299,8 @@ FAULTS = (
     ("semantic", "version = 1", "", "mine.toml: the key 'version' is missing"),
     ("semantic", '"rooms"  #', '"room"  #', "unknown class table 'room'; did you mean 'rooms'?"),
     ("semantic", '"rooms"  #', "[1]  #", "classes must be a table's name or rows of [id, name]"),
+    ("semantic", '"rooms"  #', '[[1, "a"], [2]]  #', "classes must be a table's name or rows of [id"),
+    ("semantic", '"rooms"  #', '[[1, "a", "b", "c"]]  #', "classes must be a table's name or rows of"),
     ("semantic", '"rooms"  #', '[[1, "a"], [1, "b"]]  #', "each id and each name may stand there once"),
     ("semantic", '"an image of {}"', '"an image"', "prompt: 'an image' has no {} for the class name"),
     ("semantic", '["floor", "wall"', '["flor", "wall"', "'flor' is no class; did you mean 'floor'?"),
