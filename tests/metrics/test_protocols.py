@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from places import CASES
+from pydantic import ValidationError
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
@@ -26,7 +27,7 @@ from su3d_bench.metrics.fitness import (
     why_not_truth,
 )
 from su3d_bench.metrics.instance.average_precision import MIN_REGION_SIZE, THRESHOLDS
-from su3d_bench.metrics.protocol_files import RULES, protocol_names, read_remarks
+from su3d_bench.metrics.protocol_files import HEADING, RULES, protocol_names, read_remarks, remarks_of
 from su3d_bench.metrics.protocols import RULES_OF_KIND, ProtocolRules, load_protocol, not_comparable_with, protocols_for
 
 NAMES = {
@@ -153,6 +154,11 @@ def test_the_digest_says_nothing_of_rules_with_their_defaults() -> None:
     later = Later.model_construct(**dict(rules))
     assert later.digest == rules.digest
     assert later.model_copy(update={"is_new": True}).digest != rules.digest
+
+
+def test_rules_that_are_read_stay_as_they_are() -> None:
+    with pytest.raises(ValidationError, match="frozen"):
+        load_protocol("rooms-semantic").version = 9  # type: ignore[misc]
 
 
 def test_the_digest_moves_with_every_rule() -> None:
@@ -299,8 +305,8 @@ FAULTS = (
     ("semantic", "version = 1", "", "mine.toml: the key 'version' is missing"),
     ("semantic", '"rooms"  #', '"room"  #', "unknown class table 'room'; did you mean 'rooms'?"),
     ("semantic", '"rooms"  #', "[1]  #", "classes must be a table's name or rows of [id, name]"),
-    ("semantic", '"rooms"  #', '[[1, "a"], [2]]  #', "classes must be a table's name or rows of [id"),
-    ("semantic", '"rooms"  #', '[[1, "a", "b", "c"]]  #', "classes must be a table's name or rows of"),
+    ("semantic", '"rooms"  #', '[[1, "a"], [2]]  #', "classes must be a table's name or rows of [id, name]"),
+    ("semantic", '"rooms"  #', '[[1, "a", "b", "c"]]  #', "classes must be a table's name or rows"),
     ("semantic", '"rooms"  #', '[[1, "a"], [1, "b"]]  #', "each id and each name may stand there once"),
     ("semantic", '"an image of {}"', '"an image"', "prompt: 'an image' has no {} for the class name"),
     ("semantic", '["floor", "wall"', '["flor", "wall"', "'flor' is no class; did you mean 'floor'?"),
@@ -321,18 +327,15 @@ FAULTS = (
     ("instance", "version = 1", 'version = 1\nclass_agnostic = "scored"', "class_agnostic: takes no prompt"),
     ("instance", 'confidence = "prediction"', 'confidence = "similarity"', "takes ones or prediction"),
     ("instance", "[transfer]", "[transfer]\nneighbours = 5", "transfer.neighbours: belongs to kind 'semantic'"),
+    ("annotation", "version = 1", 'version = 1\nprompt = "{}"', "it takes no prompt and no encoder"),
+    ("annotation", "version = 1", 'version = 1\nencoder = "x"', "it takes no prompt and no encoder"),
     (
-        "annotation",
-        "version = 1",
-        'version = 1\nprompt = "{}"',
-        "compares no features; it takes no prompt and no encoder",
+        "retrieval",
+        "min_region_size = 100",
+        "",
+        "questions: kinds 'retrieval' and 'reasoning' need them, and min_region",
     ),
-    (
-        "annotation",
-        "version = 1",
-        'version = 1\nencoder = "x"',
-        "compares no features; it takes no prompt and no encode",
-    ),
+    ("retrieval", "version = 1", 'version = 1\nconfidence = "ones"', "confidence belong to kind 'instance'"),
     ("instance", 'name = "mine"', 'name = "rooms-instance"', "the protocol name 'rooms-instance' is built in"),
 )
 
@@ -455,6 +458,15 @@ def test_an_extension_that_cannot_be_used_is_told_in_one_line(
         load_protocol(extending(tmp_path, "mine", parent, rest))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_file_without_a_heading_takes_none_from_what_it_extends(tmp_path: Path) -> None:
+    (tmp_path / "base.toml").write_text('# Of the base.\nname = "base"\nversion = 1  # the first\n')
+    (tmp_path / "mine.toml").write_text('extends = "base.toml"\nname = "mine"\n# no colour of its own\nversion = 2\n')
+    remarks = remarks_of([tmp_path / "mine.toml", tmp_path / "base.toml"])
+    assert remarks[HEADING] == ["extends base:", "Of the base."]
+    assert remarks["version"] == ["no colour of its own"]  # there is no rule called colour
+    assert "colour" not in remarks
 
 
 def test_what_a_file_extends_is_a_name_or_a_path(tmp_path: Path) -> None:
