@@ -15,9 +15,9 @@ from __future__ import annotations
 import argparse
 import ast
 import builtins
+import hashlib
 import os
 import queue
-import random
 import shutil
 import signal
 import subprocess
@@ -38,6 +38,7 @@ PACKAGE = "su3d_bench"
 MOST_SURVIVE = 0.05
 LONGEST = 10.0  # times what the tests of the module take as they are: beyond it a mutant runs for ever, and is noticed
 LEAST_S = 60.0
+ROUNDING = 1e-6  # a constant below it is a guard against rounding, whose size nobody sees
 
 _CURVES = ("test_metrics_instance", "test_metrics_kernels", "test_metrics_class_agnostic", "test_metrics_undefined")
 _SCORES = ("test_metrics_scoring", "test_metrics_results", "numerics/test_statistics")
@@ -84,7 +85,9 @@ _PAIRS = (
     ("zeros_like", "ones_like"), ("floor", "ceil"), ("left", "right"), ("start", "end"), ("ascending", "descending"),
 )  # fmt: skip
 # Keywords that say how a thing is done, not what comes out.
-_NO_NUMBER = frozenset({"strict", "copy", "workers", "maxsize", "balanced_tree", "compact_nodes", "cache", "nogil"})
+_NO_NUMBER = frozenset(
+    {"strict", "copy", "workers", "maxsize", "balanced_tree", "compact_nodes", "cache", "nogil", "assume_unique"}
+)
 # Sizes that say in what portions, or in which of two equal ways, a thing is computed: assignments with them stay.
 _PORTIONS = frozenset({
     "AT_ONCE", "MANY_ROWS", "MOST_REMEMBERED_ROWS", "MOST_SHARED", "_BLOCK_ROWS", "_BLOCK_UNITS", "_MAX_CELLS",
@@ -253,7 +256,11 @@ class _Faults(ast.NodeVisitor):
             self._add(function, ast.unparse(swapped))
         elif name in _SWAPPED_NAMES:
             self._add(function, _SWAPPED_NAMES[name])
-        self.generic_visit(node)
+        self.visit(function)
+        for argument in (*node.args, *node.keywords):
+            # any negative size of a new shape is "what is left"
+            if not (name == "reshape" and isinstance(argument, ast.UnaryOp)):
+                self.visit(argument)
 
     def visit_Constant(self, node: ast.Constant) -> None:
         value = node.value
@@ -261,7 +268,7 @@ class _Faults(ast.NodeVisitor):
             self._add(node, repr(not value))
         elif isinstance(value, int):
             self._add(node, repr(value + 1))
-        elif isinstance(value, float):
+        elif isinstance(value, float) and not 0.0 < value < ROUNDING:
             self._add(node, repr(value * 1.5 if value else 1.0))
         elif isinstance(value, str) and value in _SWAPPED_NAMES:
             self._add(node, repr(_SWAPPED_NAMES[value]))
@@ -274,6 +281,11 @@ def _is_text(node: ast.expr) -> bool:
 def mutants_of(module: str, source: str) -> list[Mutant]:
     """All faults that can be planted in ``source``, each once, as they stand there."""
     return list(dict.fromkeys(_Faults(module, source).found))
+
+
+def _turn(mutant: Mutant, seed: int) -> str:
+    """Its place in the draw: a number of its own, so that other code may change and the draw is the same."""
+    return hashlib.sha256(repr((seed, *mutant.key)).encode()).hexdigest()
 
 
 def planted(source: str, mutant: Mutant) -> str:
@@ -416,7 +428,7 @@ def main() -> int:
         for module in modules_of(arguments.modules)
         for mutant in mutants_of(module, (ROOT / module).read_text(encoding="utf-8"))
     ]
-    drawn = random.Random(arguments.seed).sample(every, min(arguments.mutants, len(every)))
+    drawn = sorted(every, key=lambda mutant: _turn(mutant, arguments.seed))[: arguments.mutants]
     print(
         f"{len(drawn)} of {len(every)} mutants of {len(modules_of(arguments.modules))} modules, seed {arguments.seed}"
     )

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 
 from su3d_bench.core.types import Int32Array, Int64Array, Masks
 from su3d_bench.metrics.attribution import masks as attribution
-from su3d_bench.metrics.attribution.masks import KINDS, LabelledMasks, ScoringRules, mend_scene
+from su3d_bench.metrics.attribution.masks import KINDS, LabelledMasks, ScoringRules, mend_scene, with_true_labels
+from su3d_bench.metrics.attribution.overlaps import measure_overlaps
 from su3d_bench.metrics.instance import average_precision as instance_ap
 
 SIZE = 200  # points an instance
@@ -160,6 +161,135 @@ def test_what_the_evaluator_ignores_is_no_background() -> None:
     gain, n = gains(masks, classes, scores)
     assert n["background"] == 0
     assert set(gain.values()) == {0.0}
+
+
+def test_a_mask_with_just_half_of_itself_and_of_an_instance_in_it_belongs_to_none() -> None:
+    masks, classes, scores = perfect()
+    blob = np.concatenate([points(0, 0.5), np.arange(1200, 1300, dtype=np.int32)])  # 100 of 200, and 100 void points
+    _, n = gains([*masks, blob], [*classes, 3], [*scores, 0.95])
+    assert n == dict.fromkeys(KINDS, 0) | {"background": 1}
+
+
+def test_what_a_merged_mask_has_outside_goes_with_the_instance_of_most_of_its_points() -> None:
+    masks, classes, scores = perfect()
+    both = np.concatenate([points(0), points(1), np.arange(1200, 1260, dtype=np.int32)])
+    mended = mend_scene(truth(), labelled([both, *masks[2:]], [3, *classes[2:]], [0.9, *scores[2:]]), RULES)
+    after = instance_ap.combine([mended.alone["merged"]])
+    assert mended.n["merged"] == 1
+    assert after.ap50 == 1
+    assert after.ap < 1  # 200 of 260 points: no match above an IoU of 0.77
+
+
+def test_half_of_an_instance_is_not_most_of_it() -> None:
+    masks, classes, scores = perfect()
+    both = np.concatenate([points(0, 0.5), points(1, 0.5)])
+    _, n = gains([both, *masks[2:]], [3, *classes[2:]], [0.9, *scores[2:]])
+    assert n == dict.fromkeys(KINDS, 0) | {"background": 1, "missed": 2}
+
+
+def test_what_is_left_of_two_equal_merged_masks_is_found_once() -> None:
+    masks, classes, scores = perfect()
+    both = np.concatenate([points(2), points(3, 0.8)])  # most of it is instance 2 of class 3, its label that of 3
+    masks[2:4], classes[2:4], scores[2:4] = [both, both], [4, 4], [0.99, 0.98]
+    mended = mend_scene(truth(), labelled(masks, classes, scores), RULES)
+    assert mended.n["merged"] == 2
+    assert instance_ap.combine([mended.as_is]).ap50 < 1
+    assert instance_ap.combine([mended.alone["merged"]]).ap50 == 1
+
+
+def test_a_mask_of_just_half_an_instance_matches_nothing_and_counts_by_its_points() -> None:
+    half, more = points(0, 0.5), np.concatenate([points(0, 0.6, 0.4), np.arange(1200, 1260, dtype=np.int32)])
+    overlaps = measure_overlaps(truth(), labelled([half, more], [3, 3], [0.9, 0.9]), RULES)
+    assert overlaps.iou[:, 0].tolist() == [0.5, 120 / 260]
+    assert overlaps.parts[0].parts == (1, 0)
+    assert not overlaps.finds(0, 0)
+    assert not overlaps.is_found(0)
+
+
+def test_a_mask_is_a_part_where_it_raises_the_iou_and_a_duplicate_where_half_of_it_is_known() -> None:
+    void = np.arange(1200, 1300, dtype=np.int32)
+    first = points(0, 0.6)  # 120 of 200 points, IoU 0.6
+    with_new = np.concatenate([points(0, 0.3, 0.375), void[:40]])  # 45 of its 100 points known, 15 new: 135 / 240
+    half_known = np.concatenate([points(0, 0.4, 0.4)])  # 40 of its 80 points known
+    better = points(0, 0.2, 0.6)  # 40 new points: 160 / 200
+    overlaps = measure_overlaps(truth(), labelled([first, with_new, half_known, better], [3] * 4, [0.9] * 4), RULES)
+    assert overlaps.parts[0].parts == (0, 3)
+    assert overlaps.parts[0].duplicates == (2,)
+
+
+def test_the_best_part_is_the_match_of_the_right_class_then_any_match() -> None:
+    void = np.arange(1200, 1315, dtype=np.int32)
+    of_right_class, larger = points(0, 0.51), points(0, 0.6, 0.4)  # IoU 0.51 and 0.6
+    overlaps = measure_overlaps(truth(), labelled([larger, of_right_class], [4, 3], [0.9, 0.9]), RULES)
+    assert overlaps.parts[0].parts == (1, 0)
+    match, no_match = points(0, 0.55), np.concatenate([points(0, 0.6, 0.4), void])  # 110 and 120 points, IoU 0.55, 0.38
+    overlaps = measure_overlaps(truth(), labelled([no_match, match], [3, 4], [0.9, 0.9]), RULES)
+    assert overlaps.parts[0].parts == (1, 0)
+
+
+def test_instances_and_masks_count_from_the_minimum_size_on() -> None:
+    values = np.repeat([3001, 3002, 4001], [100, 99, 100])
+    masks = [np.arange(100), np.arange(99), np.arange(1)]
+    overlaps = measure_overlaps(values, labelled([m.astype(np.int32) for m in masks], [3] * 3, [0.9] * 3), RULES)
+    assert [members.tolist() for members in overlaps.members] == [list(range(100)), list(range(199, 299))]
+    assert overlaps.is_large.tolist() == [True, False, False]
+    assert overlaps.inside[:, 0].tolist() == [1.0, 1.0, 1.0]
+    point = LabelledMasks(Masks.of_sets([np.zeros(1, np.int32)]), np.array([3]), np.ones(1))
+    assert measure_overlaps(np.array([3001, 3002]), point, ScoringRules((3,), 1)).iou.tolist() == [[1.0, 0.0]]
+
+
+@pytest.mark.parametrize(("share", "is_merged"), [(0.5, False), (0.505, True)])
+def test_a_mask_is_merged_where_it_has_more_than_half_of_several_instances(share: float, is_merged: bool) -> None:
+    mask = np.concatenate([points(0), points(1, share)])
+    assert measure_overlaps(truth(), labelled([mask], [3], [0.9]), RULES).is_merged.tolist() == [is_merged]
+
+
+SPLITS = {
+    "two halves": ([(0.5, 0.0, 3), (0.5, 0.5, 3)], True),
+    "one mask": ([(0.6, 0.0, 3)], False),
+    "two halves of another class": ([(0.5, 0.0, 4), (0.5, 0.5, 4)], False),
+    "together just half of it": ([(0.25, 0.0, 3), (0.25, 0.25, 3)], False),
+    # 110 points of the match, 130 of the others
+    "a match of the right class and others": ([(0.55, 0.0, 3), (0.35, 0.4, 4), (0.3, 0.7, 4)], True),
+    "a match of the wrong class and others": ([(0.55, 0.0, 4), (0.35, 0.4, 3), (0.3, 0.7, 3)], False),
+    # none matches: 100 points of the one class, 110 of the other
+    "most points of the right class": ([(0.5, 0.0, 4), (0.3, 0.45, 3), (0.25, 0.75, 3)], True),
+    "most points of the wrong class": ([(0.5, 0.0, 3), (0.3, 0.45, 4), (0.25, 0.75, 4)], False),
+}
+
+
+@pytest.mark.parametrize("name", SPLITS)
+def test_an_instance_is_split_where_its_parts_match_it_together_under_its_class(name: str) -> None:
+    parts, is_split = SPLITS[name]
+    masks = [points(0, share, start) for share, start, _ in parts]
+    predicted = labelled(masks, [class_id for *_, class_id in parts], [0.9] * len(parts))
+    assert measure_overlaps(truth(), predicted, RULES).is_split(0) == is_split
+
+
+def test_an_instance_that_a_merged_mask_finds_is_not_split() -> None:
+    halves, merged = [points(0, 0.5), points(0, 0.5, 0.5)], np.concatenate([points(0), points(1, 0.6)])
+    for masks, is_split in ((halves, True), ([*halves, merged], False)):
+        n = len(masks)
+        assert measure_overlaps(truth(), labelled(masks, [3] * n, [0.9] * n), RULES).is_split(0) == is_split
+
+
+def test_what_leaves_the_iou_as_it_is_is_no_part() -> None:
+    first = points(0, 0.6)  # 120 of 200
+    # 40 points of the first, 30 new ones and 50 void: together 150 of 250
+    second = np.concatenate([points(0, 0.35, 0.4), np.arange(1200, 1250, dtype=np.int32)])
+    overlaps = measure_overlaps(truth(), labelled([first, second], [3, 3], [0.9, 0.9]), RULES)
+    assert (overlaps.parts[0].parts, overlaps.parts[0].duplicates) == ((0,), ())
+
+
+def test_true_labels_are_those_of_the_instances_that_masks_share_most_points_with() -> None:
+    void = np.arange(1200, 1300, dtype=np.int32)
+    masks = [np.concatenate([points(0, 0.3), points(3, 0.4)]), points(5, 0.1), void]
+    predicted = labelled(masks, [3, 3, 3], [0.9, 0.8, 0.7])
+    named = with_true_labels(measure_overlaps(truth(), predicted, RULES))
+    assert named.class_ids.tolist() == [4, 5, 3]
+    assert named.scores.tolist() == [0.9, 0.8, 0.7]
+    of_none = with_true_labels(measure_overlaps(np.zeros_like(truth()), predicted, RULES))
+    assert of_none.class_ids.tolist() == [3, 3, 3]
 
 
 def test_of_duplicates_the_best_fit_stays_and_takes_the_best_confidence() -> None:

@@ -24,7 +24,7 @@ from su3d_bench.metrics.attribution import points as attribution_semantic
 from su3d_bench.metrics.attribution.arrays import EXPLAINED as EXPLAINED_KINDS
 from su3d_bench.metrics.attribution.arrays import scored_masks, scored_points
 from su3d_bench.metrics.attribution.masks import count_masks
-from su3d_bench.metrics.attribution.points import CAUSES, causes_of, mend_points
+from su3d_bench.metrics.attribution.points import CAUSES, LabelledPoints, causes_of, mend_points, object_of_mask
 from su3d_bench.metrics.protocol_files import protocol_names
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import score_scene
@@ -167,6 +167,70 @@ def test_true_labels_name_every_mask_by_its_own_points() -> None:
     assert mended.with_true_labels is not None
     confusion = mended.with_true_labels.confusion
     assert confusion.sum() - np.trace(confusion) == 40
+
+
+def row_of_points(*rows: tuple[int, int, int, float, bool]) -> LabelledPoints:
+    """Points by true class, object, mask, distance to the mask and whether they are scored; all are called 0."""
+    true_class, objects, mask, distance_m, is_scored = (np.array(column) for column in zip(*rows, strict=True))
+    near = np.zeros(len(rows))
+    return LabelledPoints(true_class, np.zeros(len(rows), np.int64), is_scored, objects, mask, near, distance_m)
+
+
+def test_a_mask_is_that_of_the_scored_points_near_it_alone() -> None:
+    near, far, void = (1, 7, 0, 0.05, True), (2, 8, 0, 0.051, True), (3, 9, 0, 0.0, False)
+    far_of_another = (2, 8, 1, 0.051, True)
+    found = row_of_points(near, far, far, void, void, far_of_another)
+    assert object_of_mask(found).tolist() == [7, -1]
+    assert [CAUSES[cause] if cause >= 0 else cause for cause in causes_of(found).tolist()] == [
+        "label",
+        *["background"] * 2,
+        *[-2] * 2,
+        "background",
+    ]
+    mended = mend_points(found, np.ones(4, bool)).with_true_labels
+    assert mended is not None
+    assert mended.confusion[:3, :3].tolist() == [
+        [0, 0, 0],
+        [0, 1, 0],
+        [1, 2, 0],
+    ]  # mask 0 is called 1 throughout
+
+
+def test_of_objects_with_equally_many_points_a_mask_belongs_to_the_one_with_the_lowest_number() -> None:
+    found = row_of_points(*((1, one, 0, 0.0, True) for one in (9, 4, 4, 9, 6)))
+    assert object_of_mask(found).tolist() == [4]
+    nothing = LabelledPoints(*(np.zeros(0, np.int64),) * 2, np.zeros(0, bool), *(np.zeros(0, np.int64),) * 4)
+    assert object_of_mask(nothing).tolist() == []
+    assert mend_points(nothing, np.ones(2, bool)).n == dict.fromkeys(CAUSES, 0)
+
+
+def test_geometry_is_missing_beyond_five_centimetres_and_goes_before_all_else() -> None:
+    wrong = row_of_points(*[(1, 7, 0, 0.0, True)] * 2, (1, 7, -1, np.inf, True), (1, 7, -1, np.inf, True))
+    found = replace(wrong, map_distance_m=np.array([0.05, 0.051, 0.05, 0.051]))
+    names = [CAUSES[cause] for cause in causes_of(found).tolist()]
+    assert names == ["label", "geometry", "background", "geometry"]
+
+
+def test_the_first_mask_counts_as_any_other() -> None:
+    own, other = (0, 7, 0, 0.0, True), (1, 8, 0, 0.0, True)
+    assert causes_of(row_of_points(own, own, other)).tolist() == [-1, -1, CAUSES.index("association")]
+    mended = mend_points(row_of_points(own, other, other), np.ones(2, bool)).with_true_labels
+    assert mended is not None
+    assert mended.confusion[:2, :2].tolist() == [[0, 1], [0, 2]]
+
+
+def test_what_has_no_instance_is_one_object_a_class_and_none_of_the_others() -> None:
+    truth = room()
+    without = np.isin(truth.instance, [1, 4, 8])  # the wall, the table, here of the fifth class, and the backpack
+    classes = np.where(truth.instance == 4, truth.labels.ids[4], truth.semantic).astype(np.int32)
+    truth = replace(truth, instance=np.where(without, 0, truth.instance).astype(np.int32), semantic=classes)
+    found = scored_points(ROOM_RULES, truth, truth_as_prediction(truth, with_labels=True), ENCODER).points
+    of_object = found.object_id[: 150 * len(NAMES)].reshape(len(NAMES), 150)  # the room's objects one after another
+    assert (of_object == of_object[:, :1]).all()
+    assert len(np.unique(of_object)) == len(NAMES)
+
+
+# the run
 
 
 # the run

@@ -261,7 +261,9 @@ DISAGREEMENTS: list[tuple[list[float], tuple[float, float] | None, str | None]] 
     ([0.1] * 8, (-0.05, 0.15), "the test finds a difference (p 0.0078)"),
     ([0.1] * 8, (-0.15, -0.05), "have opposite signs, and neither is chance (p 0.0078)"),
     ([-0.1] * 8, (0.05, 0.15), "have opposite signs"),
-    ([-0.1] * 8, (-0.15, -0.05), None),
+    ([0.1] * 8, (0.0, 0.2), "the test finds a difference (p 0.0078)"),
+    ([-0.1] * 8, (-0.2, 0.0), "the test finds a difference (p 0.0078)"),
+    ([-0.1] * 8, (-0.2, -0.01), None),
     ([0.1] * 8, None, None),
 ]
 
@@ -275,8 +277,17 @@ def test_an_interval_that_contradicts_the_test_is_never_without_a_word(
     assert words is None or words in (found or "")
 
 
+def test_a_p_of_just_five_in_a_hundred_shows_no_difference() -> None:
+    found = difference_of([0.1] * 8, (0.05, 0.15))
+    just = replace(found, test=SignFlipTest(0.05, 0.01, 8, True)).disagreement
+    assert "the test does not find a difference (p 0.05)" in str(just)
+    least = replace(found, test=SignFlipTest(0.05, 0.05, 8, True)).disagreement
+    assert "8 scenes can give no p below 0.05" in str(least)
+
+
 def test_what_disagrees_stands_beneath_the_table() -> None:
     comparison = compare("a", "b", per_class=True).to_json()
+    assert comparison["schema"] == 2
     value = comparison["protocols"][1]["metrics"]["AP"]
     comparison["protocols"][1]["metrics"]["AP"] = value | {"disagreement": "the interval leaves 0 out, but"}
     text = markdown(comparison_tables(comparison))
@@ -337,6 +348,27 @@ def test_two_methods_of_one_run_are_compared() -> None:
     assert (found.protocols[0].left, found.protocols[0].right) == ("collector", "oracle")
     assert found.protocols[1].metrics["AP"].right == 1.0
     assert "b:oracle is the truth itself, no system" in found.remarks
+
+
+def test_what_must_be_known_of_a_method_is_said_where_it_is_compared_alone() -> None:
+    shutil.copytree("variants", "caveats")
+    written = json.loads(Path("caveats/metrics.json").read_text())
+    for one in written["results"]:
+        one["caveat"] = f"{one['method']} saw the truth"
+    Path("caveats/metrics.json").write_text(json.dumps(written))
+    assert compare("a", "caveats").remarks == ("caveats:collector: collector saw the truth",)
+
+
+def test_who_answered_or_named_on_either_side_is_said() -> None:
+    shutil.copytree("a", "said")
+    written = json.loads(Path("said/metrics.json").read_text())
+    written["results"][0]["result"]["warnings"] += ["painted/a: n': the vote", "every scene: answers by a solver"]
+    Path("said/metrics.json").write_text(json.dumps(written))
+    expected = ("said:collector: answers by a solver", "said:collector: n': the vote")
+    for sides in (("b", "said"), ("said", "b")):
+        first, second = compare(*sides).protocols
+        assert set(expected) <= set(first.remarks)
+        assert not set(expected) & set(second.remarks)
 
 
 def test_the_only_methods_of_two_runs_are_compared_whatever_their_names() -> None:

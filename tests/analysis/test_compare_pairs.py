@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -14,6 +15,7 @@ from su3d_bench.analysis.comparison import Comparison, compare
 from su3d_bench.analysis.side_numbers import SideNumbers
 from su3d_bench.analysis.sides import Side
 from su3d_bench.cli.main import main
+from su3d_bench.core.errors import DataError
 from su3d_bench.metrics.metric import SceneScore
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
@@ -95,6 +97,25 @@ def test_what_scenes_share_does_not_widen_the_interval(folder: Path) -> None:
     swapped = compared(folder, scored({s: LEFT[s] + GAIN[s] for s in LEFT}), scored(LEFT)).protocols[0].metrics["mAcc"]
     assert swapped.interval is not None
     assert wide.interval == pytest.approx((-swapped.interval[1], -swapped.interval[0]))
+
+
+@pytest.mark.parametrize("side", [0, 1])
+def test_counts_of_other_classes_than_the_rules_have_are_refused_on_either_side(folder: Path, side: int) -> None:
+    both = [scored(LEFT), scored(LEFT)]
+    fewer = SemanticCounts(np.zeros((2, 3), np.int64), np.zeros(2, bool))
+    both[side]["painted/b"] = replace(both[side]["painted/b"], counts=fewer)
+    with pytest.raises(DataError, match=("collector", "collector@drop=2")[side] + ": painted/b"):
+        compared(folder, *both)
+
+
+def test_a_metric_counts_among_all_where_any_scene_differs(folder: Path) -> None:
+    two_differ = scored(LEFT | {"painted/a": 150, "painted/c": 970})
+    found = compared(folder, scored(LEFT), two_differ).protocols[0].metrics
+    # the signs of two scenes decide: half of their four patterns are as far from 0, and there are two metrics
+    assert {value.test.p for value in found.values() if value.test is not None} == {0.5}
+    assert {value.p_of_all for value in found.values()} == {1.0}
+    alike = compared(folder, scored(LEFT), scored(LEFT)).protocols[0].metrics
+    assert {value.p_of_all for value in alike.values()} == {None}
 
 
 def test_scenes_that_one_side_lacks_take_no_part(folder: Path) -> None:

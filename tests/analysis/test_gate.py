@@ -17,6 +17,7 @@ from places import SCENES
 
 from su3d_bench.analysis.gate import HIGHER_IS_BETTER, Reference, Value, check, learn, read_reference
 from su3d_bench.cli.main import main
+from su3d_bench.core.errors import ConfigError
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.reports.gate import Finding, Verdict, github_lines, junit_xml, markdown, plain_lines
 from su3d_bench.runs import scene as scene_run
@@ -285,6 +286,21 @@ def test_on_a_busy_machine_costs_are_not_judged_and_it_says_so(
     assert main(["check", str(run), "--against", str(learnt)]) == 1
 
 
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("jobs = 1", "jobs = 2"), ("cache = true", "cache = false"), ("/b", "/[b]"), (":Collector", ":Collectors"),
+        ('"rooms-semantic", ', ""),
+    ],
+)  # fmt: skip
+def test_how_a_run_was_asked_for_and_what_moves_no_number_may_differ(
+    old: str, new: str, run: Path, reference: Reference
+) -> None:
+    setting(old, new)(run)
+    assert check(read_run(run), reference).findings == ()
+    assert learn([read_run(run)]).settings == reference.settings
+
+
 def test_on_another_processor_headline_values_have_a_stated_tolerance(run: Path, reference: Reference) -> None:
     edit(run / "run.json", lambda r: r.update(processor="other"))
     lowered("metrics", "mAcc", by=0.019)(run)
@@ -295,6 +311,19 @@ def test_on_another_processor_headline_values_have_a_stated_tolerance(run: Path,
     assert "another processor" in verdict.remarks[0] and "within 2 points" in verdict.remarks[0]
     lowered("metrics", "mAcc", by=0.002)(run)
     assert not check(read_run(run), reference).is_passed
+
+
+def test_a_run_without_numbers_teaches_nothing(run: Path, made: Path) -> None:
+    in_metrics(lambda m: m["results"][1].update(result=None))(run)
+    with pytest.raises(ConfigError, match="collector under rooms-instance: was not scored; learn from runs with num"):
+        learn([read_run(made), read_run(run)])
+
+
+def test_a_run_that_timed_nothing_teaches_no_cost(run: Path, made: Path, reference: Reference) -> None:
+    without_calibration(run)
+    taught = learn([read_run(made), read_run(run)])
+    assert taught.costs == reference.costs != {}
+    assert taught.calibration_ms == reference.calibration_ms
 
 
 def test_runs_of_different_requests_teach_nothing(run: Path, made: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -345,6 +374,43 @@ def test_a_damaged_reference_is_one_line(
 def test_a_reference_survives_its_file(reference: Reference, tmp_path: Path) -> None:
     (tmp_path / "r.json").write_text(json.dumps(reference.model_dump(mode="json", exclude_defaults=True)))
     assert read_reference(tmp_path / "r.json") == reference
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "is_read"),
+    [
+        ("n_runs", 1, True), ("n_runs", 0, False), ("across_machines", 0.0, True), ("across_machines", 1.0, True),
+        ("across_machines", -0.01, False), ("across_machines", 1.01, False), ("cost_limit", 1.01, True),
+        ("cost_limit", 1.0, False), ("calibration_ms", 0.01, True), ("calibration_ms", 0.0, False),
+        ("calibration_ms", None, True), ("results", [], False), ("costs", {}, True), ("schema_version", 2, False),
+    ],
+)  # fmt: skip
+def test_a_reference_outside_its_limits_is_none(
+    key: str, value: object, is_read: bool, reference: Reference, tmp_path: Path
+) -> None:
+    made = reference.model_dump(mode="json")
+    made["results"] = made["results"][:1]
+    (tmp_path / "r.json").write_text(json.dumps(made | {key: value}))
+    if is_read:
+        assert getattr(read_reference(tmp_path / "r.json"), key) == value
+    else:
+        with pytest.raises(ConfigError, match="is no reference of this version"):
+            read_reference(tmp_path / "r.json")
+
+
+@pytest.mark.parametrize(
+    ("value", "is_read"),
+    [
+        ({"value": 0.5}, True), ({"value": 0.5, "tolerance": -0.1}, False), ({"value": float("nan")}, False),
+        ({"value": 0.5, "tolerance": float("inf")}, False),
+    ],
+)  # fmt: skip
+def test_a_value_without_a_tolerance_has_none(value: dict[str, float], is_read: bool) -> None:
+    if is_read:
+        assert Value.model_validate(value).tolerance == 0.0
+    else:
+        with pytest.raises(ValueError, match=r"greater than or equal to 0|finite number"):
+            Value.model_validate(value)
 
 
 @pytest.mark.parametrize(

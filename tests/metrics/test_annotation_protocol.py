@@ -139,6 +139,14 @@ def test_masks_of_half_and_of_two_objects_are_faulty() -> None:
     assert [found[key] for key in ("well-merged", "under-merged", "over-merged")] == [0.25, 0.5, 0.25]
 
 
+def test_instances_that_stand_for_nothing_that_is_judged_are_told() -> None:
+    whole = truth_as_prediction(TRUTH, with_labels=True)
+    masks, labels = [whole.mask(k) for k in range(len(whole))], list(whole.labels or ())
+    without_wall = instances(TRUTH.points, masks[1:], labels[1:])
+    told = [score_scene(RULES, truth(), one, None).warnings for one in (whole, without_wall)]
+    assert [sum("not judged" in line for line in lines) for lines in told] == [1, 0]
+
+
 def test_shuffled_instances_change_nothing() -> None:
     prediction = named(("wall", "office chair", "table", "coffee table", "lamp", "pillow", "", "rucksack"))
     order = np.random.default_rng(1).permutation(8)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from open_scene import (
     ENCODER,
+    OBJECTS,
     PROMPTS,
     WordEncoder,
     instances_with,
@@ -32,6 +34,7 @@ from su3d_bench.metrics.open_vocabulary.openlex3d import (
     OpenLexTruth,
     category_table,
     count_categories,
+    count_ranks,
     point_categories,
     rank_scores,
     ranked_labels,
@@ -115,9 +118,35 @@ def test_an_object_without_synonyms_or_with_an_excluded_one_is_not_scored() -> N
 A = ObjectLabels(("a",))
 
 
+def test_ranks_are_counted_by_points_of_objects_that_have_any() -> None:
+    scores = np.array([[1.0, 0.5, np.nan], [0.0, 0.25, np.nan], [0.5, np.nan, 1.0]])
+    counts = count_ranks(np.array([0, 0, 0, -1, 2]), np.array([0, 4, 0, 4, 0]), scores, 3)
+    assert counts.n_points.tolist() == [3, 1]
+    np.testing.assert_array_equal(counts.totals, [[2.0, 1.25, np.nan], [0.5, np.nan, 1.0]])
+
+
 def test_an_object_counts_the_same_however_many_points_it_has() -> None:
     counts = count_categories(np.array([0] * 99 + [1]), np.array([0] * 99 + [5]), 2)
     assert combine([counts]).tolist() == [0.5, 0, 0, 0, 0, 0.5]
+
+
+def test_of_the_labels_of_a_point_the_one_that_is_nearest_for_its_own_object_counts() -> None:
+    table = np.array([[0, 5, 3], [5, 1, 5], [2, 5, 5]])  # of three objects, for three words
+    top = np.array([[0, 2], [1, 2], [2, 2]])  # of three units
+    rows, units = np.repeat([-1, 0, 1, 2], 4), np.tile([-1, 0, 1, 2], 4)
+    expected = [-1, -1, -1, -1, 4, 0, 3, 3, 4, 5, 1, 5, 4, 2, 5, 5]
+    assert point_categories(rows, units, top, table).tolist() == expected
+
+
+def test_a_point_without_an_object_or_a_category_is_not_counted() -> None:
+    counts = count_categories(np.array([0, -1, 1, 1]), np.array([0, 2, -1, 3]), 2)
+    assert counts.totals.tolist() == [[1, 0, 0, 0, 0, 0], [0, 0, 0, 1, 0, 0]]
+
+
+def test_an_object_without_points_has_no_part_in_any_mean() -> None:
+    counts = count_categories(np.array([0, 0, 2]), np.array([0, 4, 5]), 3)
+    assert counts.n_points.tolist() == [2, 1]
+    assert counts.totals.tolist() == [[1, 0, 0, 0, 1, 0], [0, 0, 0, 0, 0, 1]]
 
 
 def test_a_box_that_ends_at_the_last_rank_has_nothing_to_its_right() -> None:
@@ -138,6 +167,14 @@ def test_the_overall_score_weighs_every_label_alike() -> None:
     assert scores.tolist() == pytest.approx([2 / 3, 1.0, 0.0])
 
 
+def test_ranks_outside_their_box_count_by_how_far_they_lie_from_it() -> None:
+    labels = ranked_labels(ObjectLabels(("a", "b"), ("c",)), ["a", "b", "c", "d", "e"])
+    scores = labels.scores(np.array([[0, 2, 1, 3, 4], [4, 0, 3, 1, 2]]))
+    # the boxes are 0..1 and 2..2 of 0..4: 1 and 1 - 1 / 3, 1 - 1 / 2; then 1 - 3 / 3 and 1, 1 - 1 / 2
+    expected = [[(1 + 2 / 3 + 1 / 2) / 3, 5 / 6, 1 / 2], [(0 + 1 + 1 / 2) / 3, 1 / 2, 1 / 2]]
+    np.testing.assert_allclose(scores, expected, atol=1e-8)
+
+
 # ---- a whole scene
 
 
@@ -151,6 +188,14 @@ def test_an_empty_prediction_is_all_missing_and_ranks_nothing() -> None:
     truth = lex_truth()
     assert values_of(TOPN, truth, nothing_at(truth)) == {name: float(name == "missing") for name in CATEGORIES}
     assert values_of(RANKING, truth, nothing_at(truth)) == {"overall": 0.0, "synonyms": 0.0, "secondary": 0.0}
+    ranked, nothing = (score_scene(RANKING, truth, one, ENCODER).counts for one in (perfect(truth), nothing_at(truth)))
+    assert isinstance(ranked, ObjectCounts) and isinstance(nothing, ObjectCounts)
+    assert nothing.n_points.tolist() == ranked.n_points.tolist()  # every object counts, the first one too
+    assert np.isnan(nothing.totals).tolist() == np.isnan(ranked.totals).tolist()
+    unseen = replace(truth, objects=truth.objects | {99: ObjectLabels(("pot",))})  # an object without points
+    without = score_scene(RANKING, unseen, nothing_at(truth), ENCODER).counts
+    assert isinstance(without, ObjectCounts)
+    assert without.n_points.tolist() == ranked.n_points.tolist()
 
 
 def test_a_point_is_missing_beyond_five_centimetres_and_ranked_however_far_it_is() -> None:
@@ -315,6 +360,29 @@ def test_a_cloud_is_reduced_as_open3d_reduces_it() -> None:
     distance, index = transfer.nearest(theirs, ours)
     assert distance.max() < 1e-6  # theirs are added up in single precision
     assert len(set(index.tolist())) == len(ours)
+
+
+def test_without_voxels_every_point_speaks_for_itself() -> None:
+    """A chair and a table one centimetre apart, and a map of both; in voxels of 5 cm they are one thing."""
+    points = np.array([[0.01, 0, 0], [0.02, 0, 0]], np.float32)
+    truth = OpenLexTruth(points, np.array([7, 12]), OBJECTS, PROMPTS, "openlex3d-visible", "made for a test")
+    features = np.stack([WordEncoder().feature({word: 1.0}) for word in ("chair", "table")])
+    both = instances_with(points, [np.array([0]), np.array([1])], features)
+    one_label = TOPN.model_copy(update={"top_k": 1})
+    without = one_label.model_copy(update={"transfer": TOPN.transfer.model_copy(update={"evaluation_voxel_m": 0.0})})
+    assert [values_of(rules, truth, both)["synonyms"] for rules in (one_label, without)] == [0.5, 1.0]
+    assert values_of(without, truth, nothing_at(truth))["missing"] == 1.0
+
+
+@pytest.mark.parametrize(("far_m", "is_missing"), [(0.0625, False), (0.063, True)])
+def test_a_point_just_as_far_as_the_cap_has_the_label_of_its_nearest(far_m: float, is_missing: bool) -> None:
+    at_cap = TOPN.model_copy(update={"transfer": TOPN.transfer.model_copy(update={"cap_m": 0.0625})})
+    truth = OpenLexTruth(
+        np.zeros((1, 3), np.float32), np.array([7]), OBJECTS, PROMPTS, "openlex3d-visible", "made for a test"
+    )
+    feature = WordEncoder().feature({"chair": 1.0})[None]
+    found = instances_with(np.array([[far_m, 0, 0]], np.float32), [np.array([0])], feature)
+    assert values_of(at_cap, truth, found)["missing"] == float(is_missing)
 
 
 # ---- scenes together

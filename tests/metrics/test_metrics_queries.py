@@ -20,7 +20,7 @@ from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.precision_recall import average_precision
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery, confidences, per_scene
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.metrics.scoring import combine, pack_scores, score_scene, unpack_scores
+from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores
 
 GOLDEN = json.loads((CASES / "conceptgraphs_golden.json").read_text())
 OPENLEX, PLAIN = load_protocol("openlex3d-queries"), load_protocol("query-ap")
@@ -66,6 +66,20 @@ def test_stretched_confidences_give_the_best_mask_of_every_query_one_and_the_wor
     stretched = confidences(rng.uniform(-1, 1, (9, 5)), "similarity-min-max")
     assert (stretched.max(axis=0) == 1).all() and (stretched.min(axis=0) == 0).all()
     assert confidences(np.full((4, 1), 0.3), "similarity-min-max").tolist() == [[0.0]] * 4
+
+
+def test_confidences_of_masks_that_hardly_differ_are_not_stretched_to_the_full_range() -> None:
+    stretched = confidences(np.array([[0.0], [1e-8], [4e-9]]), "similarity-min-max")  # (s + 1) / 2 over at least 1e-8
+    assert stretched[:, 0].tolist() == pytest.approx([0.0, 0.5, 0.2], abs=1e-6)
+
+
+def test_a_mask_of_a_single_point_counts_and_points_of_no_object_answer_nothing() -> None:
+    objects, masks = np.array([-1, 7]), Masks(np.array([0, 1, 2]), np.arange(2, dtype=np.int32))
+    found = per_scene(objects, [TextQuery("seat", (7,))], masks, np.array([[0.1], [0.9]]))
+    assert instance_ap.combine([found]).ap == 1.0
+    assert found.n_predictions.tolist() == [2]
+    nothing = per_scene(objects, [TextQuery("air", (-1,))], masks, np.array([[0.9], [0.1]]))
+    assert nothing.n_truth.tolist() == [0]
 
 
 def test_the_top_masks_of_each_query_count_and_of_equals_the_first() -> None:
@@ -125,6 +139,12 @@ def test_the_truth_does_not_reach_one_under_openlex3d_where_a_query_has_two_obje
     truth = asking(query_truth(), ("seat", (7, 12)), ("light", (30,)))
     assert all(0.5 < value < 1 for value in metrics(OPENLEX, truth, with_words(truth, words)))
     assert metrics(PLAIN, ruled(PLAIN, truth), with_words(truth, words)) == pytest.approx([1.0, 1.0, 1.0])
+
+
+def test_of_queries_it_is_said_why_the_truth_has_no_score() -> None:
+    said = {name: metric_of(rules).ceiling_remark for name, rules in PROTOCOLS.items()}
+    assert "masks grow by the threshold" in str(said["openlex3d-queries"])
+    assert "how well perfect masks are ranked is up to the encoder" in str(said["query-ap"])
 
 
 def test_a_mask_meets_only_the_objects_of_its_own_query() -> None:

@@ -4,17 +4,32 @@ from __future__ import annotations
 
 import json
 import re
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 from places import CASES
+from pydantic import ValidationError
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
+from su3d_bench.core.types import DenseFeatures, Partition
 from su3d_bench.datasets.rooms.classes import CLASSES
+from su3d_bench.metrics.fitness import (
+    ContentFacts,
+    Form,
+    TruthFacts,
+    list_of_ids,
+    n_feature_dimensions,
+    why_not_content,
+    why_not_numbers,
+    why_not_truth,
+)
 from su3d_bench.metrics.instance.average_precision import MIN_REGION_SIZE, THRESHOLDS
-from su3d_bench.metrics.protocol_files import RULES, protocol_names, read_remarks
-from su3d_bench.metrics.protocols import load_protocol, not_comparable_with, protocols_for
+from su3d_bench.metrics.protocol_files import HEADING, RULES, protocol_names, read_remarks, remarks_of
+from su3d_bench.metrics.protocols import RULES_OF_KIND, ProtocolRules, load_protocol, not_comparable_with, protocols_for
 
 NAMES = {
     "class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d", "openlex3d-queries",
@@ -132,11 +147,133 @@ def test_a_field_that_a_later_version_adds_leaves_digests_alone() -> None:
     assert explicit.digest == rules.digest
 
 
+def test_the_digest_says_nothing_of_rules_with_their_defaults() -> None:
+    class Later(ProtocolRules):
+        is_new: bool = False
+
+    rules = load_protocol("rooms-semantic")
+    later = Later.model_construct(**dict(rules))
+    assert later.digest == rules.digest
+    assert later.model_copy(update={"is_new": True}).digest != rules.digest
+
+
+def test_rules_that_are_read_stay_as_they_are() -> None:
+    rules: Any = load_protocol("rooms-semantic")
+    with pytest.raises(ValidationError, match="frozen"):
+        rules.version = 9
+
+
 def test_the_digest_moves_with_every_rule() -> None:
     rules = load_protocol("rooms-semantic")
     changed = rules.model_copy(update={"prompt": "a picture of {}"})
     assert rules.digest == load_protocol("rooms-semantic").digest
     assert changed.digest != rules.digest
+
+
+def test_a_rule_that_a_file_leaves_out_asks_for_nothing() -> None:
+    said = {
+        "name": "mine", "version": 1, "summary": "made for a test", "kind": "semantic", "metric": "scannet",
+        "datasets": ("rooms",), "label_space": "rooms", "ground_truth": "mesh-vertices",
+        "classes": ({"id": 0, "name": "chair"},), "vocabulary": "all", "prompt": "{}",
+        "transfer": {"candidates": "object-points"}, "headline": ("mIoU",),
+    }  # fmt: skip
+    rules = RULES_OF_KIND["semantic"].model_validate(said).model_dump()
+    assert rules["transfer"] == {
+        "candidates": "object-points", "neighbours": 1, "cap_m": None, "evaluation_voxel_m": 0.0,
+    }  # fmt: skip
+    assert {key: value for key, value in rules.items() if key not in said} == {
+        "by_default": True, "class_agnostic": None, "ignore": (), "ignore_rule": "exact", "prompts": (),
+        "prompt_names": {}, "encoder": None, "min_region_size": None, "thresholds": (), "confidence": None,
+        "top_k": None, "questions": None, "per_kind": None, "synonyms": None, "merging": None, "answers": None,
+        "aggregate": "pooled", "not_comparable_with": (),
+    }  # fmt: skip
+
+
+KINDS = {
+    "semantic": {"takes_dense", "names_points", "takes_votes", "ignores_classes"},
+    "instance": {"needs_instances", "ignores_classes"},
+    "queries": {"needs_own_points", "ignores_classes"},
+    "categories": {"takes_dense", "needs_own_points"},
+    "retrieval": {"is_judged", "needs_own_points", "ignores_classes"},
+    "annotation": {"is_judged", "needs_own_points", "goes_by_names", "ignores_classes"},
+    "reasoning": {"is_judged", "needs_own_points", "goes_by_names", "ignores_classes"},
+}
+
+
+def test_kinds_differ_in_what_they_take() -> None:
+    facts = set.union(*KINDS.values())
+    assert {kind: {fact for fact in facts if getattr(rules, fact)} for kind, rules in RULES_OF_KIND.items()} == KINDS
+
+
+def test_what_a_prediction_holds_is_told_by_its_kind() -> None:
+    points, features = np.zeros((4, 3), np.float32), np.zeros((2, 512), np.float16)
+    partition = ContentFacts.of(Partition(points, np.array([0, 0, 1, -1], np.int32), features.astype(np.float32)))
+    dense = ContentFacts.of(DenseFeatures(points, np.zeros((4, 7), np.float16)))
+    assert (partition.form, partition.n, partition.n_dimensions) == ("partition", 2, 512)
+    assert (dense.form, dense.n, dense.n_dimensions) == ("dense", 4, 7)
+    assert why_not_content(load_protocol("rooms-instance"), partition) is None
+    assert "needs instances" in str(why_not_content(load_protocol("rooms-instance"), dense))
+    without_points = why_not_content(load_protocol("rooms-instance"), partition, has_points=False)
+    assert "the ground truth has no coordinates" in str(without_points)
+
+
+MESH = TruthFacts("truth", "replica", ("mesh-vertices",))
+TRUTHS = [
+    ("rooms-semantic", MESH, None),
+    ("rooms-instance", MESH, None),
+    ("rooms-instance", replace(MESH, has_instances=False), "needs instances, the ground truth holds class ids alone"),
+    ("rooms-semantic", replace(MESH, has_instances=False, has_points=False), None),
+    ("rooms-annotation", replace(MESH, has_points=False), "needs the objects of a dataset"),
+    ("rooms-semantic", replace(MESH, label_space="nyu40"), "it scores the labels of 'replica', truth has those of"),
+    ("rooms-semantic", replace(MESH, label_space=None, variants=()), None),
+    ("rooms-semantic", replace(MESH, variants=("other", "more")), "it needs ground truth 'mesh-vertices', truth has o"),
+    ("replica-retrieval", MESH, None),
+]
+
+
+@pytest.mark.parametrize(("name", "truth", "reason"), TRUTHS)
+def test_a_truth_that_lacks_what_a_protocol_scores_is_told(name: str, truth: TruthFacts, reason: str | None) -> None:
+    said = why_not_truth(load_protocol(name), truth)
+    assert said == reason if reason is None else str(said).startswith(reason)
+
+
+def test_questions_of_a_dataset_itself_need_one_that_knows_them() -> None:
+    rules = load_protocol("rooms-retrieval").model_copy(update={"questions": "dataset"})
+    assert "knows questions and answers itself, which truth does not" in str(why_not_truth(rules, MESH))
+    assert why_not_truth(rules, replace(MESH, knows_questions=True)) is None
+
+
+def test_class_ids_up_to_forty_are_of_nyu_and_larger_ones_of_scannet200() -> None:
+    assert [list_of_ids(one) for one in (1, 40, 41)] == ["nyu40-vertices"] * 2 + ["scannet200-vertices"]
+    facts = {one: ContentFacts("vertex-masks", 2, has_labels=True, class_ids=np.array([3, one])) for one in (40, 41)}
+    twenty, two_hundred = load_protocol("scannet-instance"), load_protocol("scannet200-instance")
+    assert [why_not_numbers(twenty, facts[one]) is None for one in (40, 41)] == [True, False]
+    assert [why_not_numbers(two_hundred, facts[one]) is None for one in (40, 41)] == [False, True]
+    assert "go up to 41, as ids of ScanNet200 do" in str(why_not_numbers(twenty, facts[41]))
+    assert why_not_numbers(load_protocol("rooms-instance"), facts[41]) is None
+    assert why_not_numbers(load_protocol("class-agnostic-segment3d"), facts[41]) is None
+    for without in (None, np.zeros(0, np.int64)):
+        assert why_not_numbers(two_hundred, replace(facts[40], class_ids=without)) is None
+
+
+@pytest.mark.parametrize(
+    ("form", "labels", "needs_encoder"),
+    [
+        ("instances", "all", False), ("instances", "some", True), ("instances", "none", True),
+        ("vertex-masks", "all", False), ("vertex-masks", "some", False), ("vertex-masks", "none", True),
+    ],
+)  # fmt: skip
+def test_an_encoder_is_asked_for_where_features_must_stand_for_names(
+    form: Form, labels: str, needs_encoder: bool
+) -> None:
+    facts = ContentFacts(form, 3, 512, has_labels=labels != "none", has_every_label=labels == "all")
+    rules = load_protocol("rooms-semantic")
+    assert n_feature_dimensions(rules, facts) == (512 if needs_encoder else None)
+    assert n_feature_dimensions(rules, replace(facts, n=0)) is None
+    assert n_feature_dimensions(load_protocol("class-agnostic-open3dis"), facts) is None
+    assert n_feature_dimensions(load_protocol("rooms-annotation"), facts) is None
+    compares_texts = n_feature_dimensions(load_protocol("query-ap"), facts)
+    assert compares_texts == (512 if needs_encoder or form == "instances" else None)
 
 
 def test_a_misspelt_name_is_told_with_the_likely_one() -> None:
@@ -170,6 +307,8 @@ FAULTS = (
     ("semantic", "version = 1", "", "mine.toml: the key 'version' is missing"),
     ("semantic", '"rooms"  #', '"room"  #', "unknown class table 'room'; did you mean 'rooms'?"),
     ("semantic", '"rooms"  #', "[1]  #", "classes must be a table's name or rows of [id, name]"),
+    ("semantic", '"rooms"  #', '[[1, "a"], [2]]  #', "classes must be a table's name or rows of [id, name]"),
+    ("semantic", '"rooms"  #', '[[1, "a", "b", "c"]]  #', "classes must be a table's name or rows"),
     ("semantic", '"rooms"  #', '[[1, "a"], [1, "b"]]  #', "each id and each name may stand there once"),
     ("semantic", '"an image of {}"', '"an image"', "prompt: 'an image' has no {} for the class name"),
     ("semantic", '["floor", "wall"', '["flor", "wall"', "'flor' is no class; did you mean 'floor'?"),
@@ -180,7 +319,7 @@ FAULTS = (
     ("instance", '"map-points"', '"object-points"', "kind 'instance' takes 'map-points'"),
     ("instance", "version = 1", "version = ", "mine.toml: is no valid TOML"),
     ("semantic", '"object-points"', '"map-points"', "kind 'semantic' takes 'object-points'"),
-    ("semantic", "voxel_m = 0.0", "voxel_m = 0.02\nneighbours = 5", "of neighbours that vote nothing is left out"),
+    ("semantic", "voxel_m = 0.0", "voxel_m = 0.02\nneighbours = 2", "of neighbours that vote nothing is left out"),
     ("semantic", 'vocabulary = "scored"', "# none", "vocabulary: belongs to protocols that choose among classes"),
     ("semantic", "version = 1", 'version = 1\nprompts = ["{}"]', "prompt: give either prompt or prompts"),
     ("semantic", 'metric = "conceptgraphs"', 'metric = "query-ap"', "kind 'semantic' needs metric 'conceptgraphs' or"),
@@ -189,7 +328,11 @@ FAULTS = (
     ("semantic", "version = 1", 'version = 1\nclass_agnostic = "scored"', "class_agnostic: belongs to kind 'instance'"),
     ("instance", "version = 1", 'version = 1\nclass_agnostic = "scored"', "class_agnostic: takes no prompt"),
     ("instance", 'confidence = "prediction"', 'confidence = "similarity"', "takes ones or prediction"),
-    ("instance", "[transfer]", "[transfer]\nneighbours = 5", "transfer.neighbours: belongs to kind 'semantic'"),
+    ("instance", "[transfer]", "[transfer]\nneighbours = 2", "transfer.neighbours: belongs to kind 'semantic'"),
+    ("annotation", "version = 1", 'version = 1\nprompt = "{}"', "it takes no prompt and no encoder"),
+    ("annotation", "version = 1", 'version = 1\nencoder = "x"', "it takes no prompt and no encoder"),
+    ("retrieval", "min_region_size = 100", "", "questions: kinds 'retrieval' and 'reasoning' need them"),
+    ("retrieval", "version = 1", 'version = 1\nconfidence = "ones"', "confidence belong to kind 'instance'"),
     ("instance", 'name = "mine"', 'name = "rooms-instance"', "the protocol name 'rooms-instance' is built in"),
 )
 
@@ -215,6 +358,7 @@ OPEN_FAULTS = (
         "a protocol of kind 'categories' has overall, synonyms, secondary",
     ),
     ("openlex3d-queries", "cap_m = 0.03162277660168379", "", "transfer.cap_m: 'each-mask' needs one"),
+    ("openlex3d-queries", "voxel_m = 0.0", "voxel_m = 0.02", "needs one, and no evaluation_voxel_m"),
     ("openlex3d-queries", '"each-mask"', '"object-points"', "kind 'queries' takes 'each-mask' or 'map-points'"),
     ("openlex3d-queries", '"similarity-min-max"', '"ones"', "kind 'queries' takes similarity or similarity-min-max"),
     ("query-ap", "min_region_size = 1", "", "kind 'queries' needs metric 'query-ap', min_region_size"),
@@ -312,6 +456,15 @@ def test_an_extension_that_cannot_be_used_is_told_in_one_line(
         load_protocol(extending(tmp_path, "mine", parent, rest))
     assert message in str(caught.value)
     assert "\n" not in str(caught.value)
+
+
+def test_a_file_without_a_heading_takes_none_from_what_it_extends(tmp_path: Path) -> None:
+    (tmp_path / "base.toml").write_text('# Of the base.\nname = "base"\nversion = 1  # the first\n')
+    (tmp_path / "mine.toml").write_text('extends = "base.toml"\nname = "mine"\n# no colour of its own\nversion = 2\n')
+    remarks = remarks_of([tmp_path / "mine.toml", tmp_path / "base.toml"])
+    assert remarks[HEADING] == ["extends base:", "Of the base."]
+    assert remarks["version"] == ["no colour of its own"]  # there is no rule called colour
+    assert "colour" not in remarks
 
 
 def test_what_a_file_extends_is_a_name_or_a_path(tmp_path: Path) -> None:

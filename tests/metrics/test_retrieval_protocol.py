@@ -19,7 +19,8 @@ from su3d_bench.metrics.fitness import why_not_content, why_not_scorable
 from su3d_bench.metrics.instance.score import covered_objects
 from su3d_bench.metrics.protocol_files import rules_file
 from su3d_bench.metrics.protocols import load_protocol, protocols_for, read_protocol
-from su3d_bench.metrics.questions.score import are_objects_right, is_answer_right
+from su3d_bench.metrics.questions import shares
+from su3d_bench.metrics.questions.score import are_objects_right, first_instances, is_answer_right
 from su3d_bench.metrics.questions.shares import ShareCounts
 from su3d_bench.metrics.questions.truths import AskedText, GivenAnswer, ReasoningTruth, RetrievalTruth, TrueAnswer
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, plain_json, score_scene, unpack_scores
@@ -87,6 +88,14 @@ def test_an_empty_map_answers_nothing() -> None:
     assert values(nothing(TRUTH))["all"] == 0.0
 
 
+def test_where_there_is_nothing_to_rank_no_instance_comes_first() -> None:
+    assert first_instances(RULES, ["chair", "lamp"], nothing(room()), ENCODER).tolist() == [-1, -1]
+    assert first_instances(RULES, [], PERFECT, ENCODER).tolist() == []
+    for unnamed, encoder in ((replace(PERFECT, features=None), ENCODER), (PERFECT, None)):
+        with pytest.raises(PredictionError, match="needs features and an encoder"):
+            first_instances(RULES, ["chair"], unnamed, encoder)
+
+
 def test_a_kind_that_is_not_asked_has_no_value() -> None:
     found = values(PERFECT, RetrievalTruth(TRUTH, ASKED[:1]))
     assert found["instance"] == found["all"] == 1.0
@@ -97,6 +106,18 @@ def test_a_partition_is_scored_as_its_instances_are() -> None:
     owner = TRUTH.instance.astype(np.int32) - 1
     assert PERFECT.features is not None
     assert values(Partition(TRUTH.points, owner, PERFECT.features)) == values(PERFECT)
+
+
+def test_what_a_guess_and_names_alone_get_right_is_a_share_of_what_was_asked() -> None:
+    asked = (AskedText("instance", "chair", (2, 3), 0.25, 0.5), AskedText("instance", "lamp", (5,), 0.125, 1.0))
+    found = values(PERFECT, RetrievalTruth(TRUTH, (*asked, AskedText("property", "red table", (4,), 0.5, 0.25))))
+    assert (found["chance_instance"], found["names-alone_instance"]) == (0.1875, 0.75)
+    assert (found["chance_property"], found["names-alone_property"]) == (0.5, 0.25)
+    assert (found["chance_all"], found["chance_relative"]) == (0.875 / 3, None)
+    by_chance, by_name = shares.baselines(shares.share_counts([4, 0], [3, 0], by_name=[1.0, 0.0]))
+    assert np.isnan(by_chance).all()
+    assert by_name[0] == 0.25
+    assert np.isnan(by_name[1])
 
 
 def test_order_of_instances_and_questions_changes_nothing() -> None:

@@ -44,6 +44,15 @@ def test_the_verdict_is_by_the_interval_and_not_by_the_slope(low: float, high: f
         assert Growth(exponent, low, high).words == words
 
 
+def test_the_first_and_the_last_update_are_drawn_as_all_others_are() -> None:
+    sizes = 2.0 ** np.arange(MIN_FIT)
+    costly = np.ones(MIN_FIT)
+    costly[-1] = 8.0
+    last, first = growth_exponent(sizes, costly), growth_exponent(sizes, costly[::-1])
+    assert last is not None and abs(last.low) < 1e-9 < last.exponent < last.high
+    assert first is not None and first.low < first.exponent < -1e-9 < first.high < 1e-9
+
+
 def test_nothing_is_said_of_too_few_points_or_of_sizes_that_hardly_differ() -> None:
     sizes = np.linspace(1.0, 2.0, MIN_FIT)
     assert growth_exponent(sizes, sizes) is not None

@@ -55,6 +55,11 @@ def test_the_interval_ends_where_the_values_can() -> None:
     assert mean_interval(np.array([-1.0, 1.0, 1.0]), DIFFERENCE) == (-1.0, 1.0)
 
 
+def test_two_values_have_an_interval() -> None:
+    half = 12.706204736432095 * 0.01  # the quantile of Student's t with 1 degree of freedom, and the standard error
+    assert mean_interval(np.array([0.49, 0.51])) == pytest.approx((0.5 - half, 0.5 + half))
+
+
 def test_a_single_scene_has_no_interval() -> None:
     assert jackknife_interval(np.array([0.5, np.nan]), np.ones(1, bool)) is None
     assert jackknife_interval(np.array([0.5])) is None
@@ -139,6 +144,12 @@ def test_ranks_stay_open_where_no_difference_is_shown() -> None:
     few = level[:, :5]  # 2 of 32 patterns of five signs: no p below 0.05
     assert rank_intervals(list(few)) == [(1, 4)] * 4
     assert rank_intervals([level[0]]) == [(1, 1)]
+
+
+def test_a_small_difference_that_every_scene_has_ranks_as_a_large_one_does() -> None:
+    level: Float64Array = np.linspace(0.1, 0.9, 10)
+    assert rank_intervals([level, level + 0.01]) == [(2, 2), (1, 1)]
+    assert rank_intervals([level + 0.01, level]) == [(1, 1), (2, 2)]
 
 
 def test_rank_intervals_of_equal_rows_hold_all_ranks_in_95_of_100() -> None:

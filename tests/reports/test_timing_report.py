@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +17,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.core.timing import peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Float64Array
-from su3d_bench.metrics.costs import UpdateTimes, summarise
+from su3d_bench.metrics.costs import UpdateTimes, pooled, summarise
 from su3d_bench.numerics.statistics import growth_exponent
 from su3d_bench.reports.pictures.timing import _memory
 from su3d_bench.runs import scene as scene_run
@@ -71,9 +72,45 @@ def test_percentiles_leave_the_first_updates_out_and_the_share_counts_them() -> 
     summary = summarise([times(total, match_ms=total / 2, frame=np.arange(0, 60, 10.0))], warm_up=2)
     stage = stages_of(summary)["total"]
     assert (stage.n, stage.p50, stage.worst, stage.first) == (4, 15.0, 30.0, 75.0)
+    assert stage.p95 == pytest.approx(28.5)  # 0.85 of the way from 20 to 30
     assert stages_of(summary)["match"].share == 0.5
     assert summary.updates_per_s == pytest.approx(6 / 0.22)
     assert summary.frames_per_s == pytest.approx(60 / 0.22)
+
+
+def test_updates_of_several_scenes_are_pooled_without_the_first_of_each() -> None:
+    first, second = times(np.array([9.0, 1.0, 2.0])), times(np.array([8.0, 3.0]))
+    assert pooled([first, second], "total", 1).tolist() == [1.0, 2.0, 3.0]
+    assert pooled([], "total", 1).tolist() == []
+
+
+def test_a_single_update_stands_for_one_frame() -> None:
+    summary = summarise([times(np.array([250.0]), frame=np.array([7.0]))], warm_up=0)
+    assert (summary.updates_per_s, summary.frames_per_s) == (4.0, 4.0)
+    without_indices = summarise([times(np.array([100.0, 100.0, 50.0]))], warm_up=0)
+    assert without_indices.frames_per_s == without_indices.updates_per_s == 12.0
+
+
+def test_a_scene_whose_map_has_no_size_says_nothing_of_growth_with_it() -> None:
+    grows = times(np.linspace(1.0, 10.0, 12), n_points=np.linspace(10.0, 100.0, 12))
+    alone = stages_of(summarise([grows], warm_up=0))["total"].against_points
+    both = stages_of(summarise([times(np.full(12, 500.0)), grows], warm_up=0))["total"].against_points
+    assert both == alone
+    assert alone.exponent == pytest.approx(1.0)
+
+
+def test_sizes_are_the_largest_over_scenes_and_the_finish_that_of_the_last_maps() -> None:
+    first = times(np.ones(2), n_points=np.array([7.0, 5.0]), map_bytes=np.array([10.0, 90.0]))
+    second = times(np.ones(3))
+    maps = tuple(MapCost(n_updates=n, finish_ms=ms) for n, ms in ((1, 50.0), (2, 4.0)))
+    first = replace(first, maps=maps, peak_rss_bytes=400)
+    second = replace(second, maps=maps[:1], peak_rss_bytes=300, device_bytes=20)
+    found = summarise([first, second])
+    assert (found.n_points, found.map_bytes, found.peak_rss_bytes, found.device_bytes) == (7, 90, 400, 20)
+    assert (found.finish_ms, summarise([first]).finish_ms) == (50.0, 4.0)
+    assert summarise([first, replace(second, peak_rss_bytes=500)]).peak_rss_bytes == 500
+    none = summarise([times(np.ones(3))])
+    assert (none.n_points, none.map_bytes, none.peak_rss_bytes, none.device_bytes, none.finish_ms) == (None,) * 5
 
 
 def test_the_share_of_the_map_is_what_is_neither_reading_nor_perception() -> None:

@@ -98,10 +98,11 @@ class Overlaps:
     def _parts_of(self, g: int) -> Parts:
         inside = np.flatnonzero((self.inside[:, g] > HALF) & ~self.is_merged).tolist()
         order = sorted(inside, key=lambda k: self._rank(k, g))
+        if not order:
+            return Parts((), ())
         parts, duplicates = order[:1], []
         size = len(self.members[g])
-        union = self.predicted.masks.mask(order[0]) if order else np.zeros(0, np.int32)
-        n_common = int(self.shared[order[0], g]) if order else 0
+        union, n_common = self.predicted.masks.mask(order[0]), int(self.shared[order[0], g])
         for k in order[1:]:
             mask = self.predicted.masks.mask(k)
             joined = np.union1d(union, mask)

@@ -145,9 +145,7 @@ def _count_categories(
         vocabulary = list(truth.prompts)
         n_top = min(rules.top_k, len(vocabulary))
         blocks = _similarity_blocks(rules, truth, prediction, encoder, used)
-        top = np.concatenate(
-            [np.zeros((0, n_top), np.int64), *(openlex3d.top_labels(block, n_top) for block in blocks)]
-        )
+        top = np.concatenate([openlex3d.top_labels(block, n_top) for block in blocks])
     table = openlex3d.category_table(truth.objects, ids, vocabulary)
     category = openlex3d.point_categories(object_row, of_point, top, table)
     return openlex3d.count_categories(object_row, category, len(ids))
