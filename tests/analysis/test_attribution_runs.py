@@ -333,6 +333,7 @@ def test_other_data_than_the_run_s_are_refused() -> None:
 
 ERRORS = [
     ({"method": "colector"}, "whole: holds no scores of the method 'colector'; did you mean 'collector'?"),
+    ({"method": "x"}, "whole: holds no scores of the method 'x'; it has collector, oracle"),
     ({"protocols": ["rooms-instanse"]}, "whole: was not scored under 'rooms-instanse'; did you mean 'rooms-instance'?"),
 ]
 
