@@ -187,6 +187,12 @@ def test_a_small_instance_is_neither_found_nor_missed() -> None:
     assert one_scene(truth, [FIRST, np.arange(199, 299)], [5, 5], [0.5, 1.0]).ap50 == 1.0
 
 
+def test_what_lies_on_void_and_on_small_instances_is_ignored_together() -> None:
+    truth = np.repeat([5001, 5002, 0], [200, 60, 30])
+    mask = np.concatenate([FIRST[160:], np.arange(200, 230), np.arange(260, 290)])  # of 100 points 30 on each
+    assert one_scene(truth, [FIRST, mask], [5, 5], [0.5, 0.9]).ap50 == 1.0
+
+
 def test_overlap_with_another_class_is_a_false_positive() -> None:
     truth = np.repeat([5001, 7001], [200, 200])
     ours = one_scene(truth, [FIRST, SECOND], [5, 5], [0.5, 0.9])
