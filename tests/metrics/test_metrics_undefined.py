@@ -198,6 +198,13 @@ def test_an_undefined_scene_takes_no_part_in_an_interval() -> None:
     assert interval[0] < combine(ROOM, scored).metrics["mAcc"] < interval[1]
 
 
+def test_a_scene_that_moves_no_mean_takes_part_in_the_interval() -> None:
+    rules = ROOM.model_copy(update={"aggregate": "scene-mean"})
+    scored = {str(n): score(ROOM, confusion({A: {A: n, N: 10 - n}})) for n in (4, 5, 6)}
+    # 4.303, of Student's t with 2 degrees of freedom, times 0.1 / sqrt(3)
+    assert combine(rules, scored).intervals["mAcc"] == pytest.approx((0.5 - 0.24841, 0.5 + 0.24841), abs=1e-5)
+
+
 # ---- the column that ConceptGraphs slices away
 
 
