@@ -12,6 +12,7 @@ from evaluated_text import CHAIR, TABLE, document, numbers, said, scene, write_t
 from prediction_files import (
     write_scannet_text,
 )
+from scored_room import ROOM
 
 from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.types import Masks
@@ -53,6 +54,21 @@ def test_two_lines_that_name_one_mask_file_are_told(tmp_path: Path) -> None:
     listed.write_text(listed.read_text() + "masks/m.txt 7 0.5\n")
     remarks = document(tmp_path)["remarks"]
     assert any(line.startswith("scene0001_00: 1 lines name a mask file again") for line in remarks)
+
+
+@pytest.mark.parametrize(
+    ("numbers", "line"),
+    [
+        ([901, 902, 902, 903], "1 of class 901, 1 of class 903; the first"),
+        ([901, 902, 902, 903, 904, 905], "1 of class 901, 1 of class 903 and 2 classes more; the first"),
+    ],
+)
+def test_of_classes_that_are_not_scored_the_three_most_frequent_are_named(numbers: list[int], line: str) -> None:
+    found = checks.class_warnings("a", ROOM, np.array(numbers, np.int32), np.zeros(len(numbers), np.int64))
+    n = len(numbers)
+    assert found == [
+        f"a: {n} of {n} masks have a class that is not scored and count for nothing: 2 of class 902, {line} is mask 0"
+    ]
 
 
 def test_facts_of_masks_are_exact() -> None:

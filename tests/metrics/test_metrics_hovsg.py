@@ -70,6 +70,12 @@ def test_random_points_agree_with_the_formulas_word_by_word(seed: int) -> None:
     assert ours.f1.tolist() == [2 * hit[c] / (n_true[c] + n_predicted[c]) for c in scored]
 
 
+def test_a_class_of_a_single_point_counts() -> None:
+    metrics = hovsg_metrics(np.array([[1, 0, 0], [0, 3, 1]]), np.array([True, True]))
+    assert metrics.class_index.tolist() == [0, 1]
+    assert metrics.mean_accuracy == (1 + 0.75) / 2
+
+
 # ---- the label set
 
 

@@ -11,8 +11,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from places import CASES
+from scored_room import LABELS, instances
 
 from su3d_bench.core.errors import DataError, PredictionError
+from su3d_bench.core.types import GroundTruth
 from su3d_bench.metrics.instance.average_precision import (
     THRESHOLDS,
     InstanceAP,
@@ -24,6 +26,7 @@ from su3d_bench.metrics.instance.average_precision import (
     per_scene,
 )
 from su3d_bench.metrics.instance.precision_recall import dot
+from su3d_bench.metrics.instance.score import NO_OBJECT, covered_objects
 from su3d_bench.metrics.protocols import load_protocol
 
 INSTANCE_CASES = sorted(p.stem for p in CASES.glob("inst*.json")) + sorted(p.stem for p in CASES.glob("replica*.json"))
@@ -184,6 +187,12 @@ def test_a_small_instance_is_neither_found_nor_missed() -> None:
     assert one_scene(truth, [FIRST, np.arange(199, 299)], [5, 5], [0.5, 1.0]).ap50 == 1.0
 
 
+def test_what_lies_on_void_and_on_small_instances_is_ignored_together() -> None:
+    truth = np.repeat([5001, 5002, 0], [200, 60, 30])
+    mask = np.concatenate([FIRST[160:], np.arange(200, 230), np.arange(260, 290)])  # of 100 points 30 on each
+    assert one_scene(truth, [FIRST, mask], [5, 5], [0.5, 0.9]).ap50 == 1.0
+
+
 def test_overlap_with_another_class_is_a_false_positive() -> None:
     truth = np.repeat([5001, 7001], [200, 200])
     ours = one_scene(truth, [FIRST, SECOND], [5, 5], [0.5, 0.9])
@@ -214,6 +223,17 @@ def test_no_truth_at_all_is_nan_and_warns_of_nothing(recwarn: pytest.WarningsRec
     ours = one_scene(np.zeros(300, np.int64), [FIRST], [5], [1.0])
     assert np.isnan([ours.ap, ours.ap50, ours.ap25]).all()
     assert not recwarn.list
+
+
+def test_an_instance_covers_the_vertices_whose_nearest_map_point_is_its_own() -> None:
+    points = np.arange(6)[:, None] * np.array([1, 0, 0], np.float32)
+    objects = np.array([0, 1, 1, 2, 2, -1], np.int32)
+    truth = GroundTruth(points, objects, objects, LABELS, "mesh-vertices", "made for a test")
+    moved = instances(points + np.float32(0.01), [np.arange(3), np.arange(2, 5), np.array([0, 5])], None)
+    covered = covered_objects(load_protocol("rooms-instance").transfer, truth, moved)
+    assert covered.object_ids.tolist() == [1, 2]
+    assert covered.n_shared.tolist() == [[2, 0], [1, 2], [0, 0]]
+    assert covered.main_object.tolist() == [1, 2, NO_OBJECT]
 
 
 # ---- properties

@@ -73,6 +73,15 @@ def test_a_wanted_cell_without_rows_is_zero_and_an_unwanted_one_no_number() -> N
     assert np.isnan(areas[2])
 
 
+@pytest.mark.parametrize("n", [1, 5, 40])
+def test_the_loops_stay_within_their_arrays(n: int) -> None:
+    score, is_true = np.linspace(0, 1, n), np.arange(n) % 3 > 0
+    of_cell = np.full(1, np.nan)
+    # as Python runs them, which looks where the compiled loops write
+    kernels.areas.py_func(score, is_true, np.array([0, n]), np.array([2]), np.array([True]), of_cell)
+    assert of_cell.tolist() == [average_precision(score, is_true, 2)]
+
+
 @pytest.mark.parametrize("n", [0, 1, 15, 16, 17, 31, 32, 33, 47, 48, 63, 64, 65, 97, 1000])
 def test_compiled_products_add_up_in_the_order_of_the_others(n: int) -> None:
     rng = np.random.default_rng(n)

@@ -32,7 +32,7 @@ from su3d_bench.core.types import LabelSet, Prediction
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.metrics.scoring import combine, pack_scores, score_scene, unpack_scores
+from su3d_bench.metrics.scoring import combine, combined_metrics, pack_scores, score_scene, unpack_scores
 
 # ---- several scenes
 
@@ -104,6 +104,12 @@ def test_a_protocol_may_report_the_mean_of_the_scenes() -> None:
     assert result.metrics == result.scene_mean
     assert interval is not None
     assert interval[0] < result.metrics["mAcc"] < interval[1]
+
+
+@pytest.mark.parametrize("aggregate", ["pooled", "scene-mean"])
+def test_the_reported_values_alone_are_those_of_the_whole_result(aggregate: str) -> None:
+    rules, scores = ROOM.model_copy(update={"aggregate": aggregate}), noisy_scores("rooms-semantic", 2)
+    assert combined_metrics(rules, scores) == combine(rules, scores).metrics
 
 
 def test_groups_are_averaged_over_the_classes_that_have_ground_truth() -> None:

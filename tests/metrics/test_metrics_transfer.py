@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scored_room import ROOM, OneHotEncoder
+from threadpoolctl import threadpool_info
 
-from su3d_bench.core.types import Masks, Partition
+from su3d_bench.core.types import Float64Array, Masks, Partition
 from su3d_bench.metrics import scoring
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance import precision_recall, resampling
@@ -18,7 +19,13 @@ from su3d_bench.metrics.instance import precision_recall as dot_product
 from su3d_bench.metrics.matching import labelling
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import most_similar
-from su3d_bench.metrics.matching.nearest import duplicate_pairs, nearest, reduce_to_voxels, transfer_masks
+from su3d_bench.metrics.matching.nearest import (
+    duplicate_pairs,
+    nearest,
+    reduce_to_voxels,
+    transfer_masks,
+    transfer_values,
+)
 from su3d_bench.metrics.semantic import confusion as semantic
 
 
@@ -99,6 +106,21 @@ def test_no_candidates_means_no_neighbours() -> None:
     assert (index.tolist(), distance.tolist()) == ([-1, -1], [np.inf, np.inf])
 
 
+def test_what_shares_a_place_keeps_its_own_value_on_a_copy_of_its_points_too() -> None:
+    points, rank, wanted = np.zeros((3, 3)), np.array([0, 1, -1]), np.array([True, True, True])
+    values, distance = transfer_values(points, np.array([7, 8, 9]), rank, points.copy(), wanted)
+    assert (values.tolist(), distance.tolist()) == ([7, 8, 7], [0.0, 0.0, 0.0])
+    masks = Masks(np.array([0, 1, 2]), np.array([0, 1], np.int32))
+    assert transfer_masks(points, masks, points.copy()).indices.tolist() == [0, 1]
+
+
+def test_what_is_not_wanted_or_beyond_the_cap_has_no_value() -> None:
+    points, targets = np.array([[1.0, 0, 0]]), np.array([[1.0, 0, 0], [1, 0, 0], [9, 0, 0]])
+    wanted = np.array([True, False, True])
+    values, distance = transfer_values(points, np.array([7]), np.array([0]), targets, wanted, 0.5)
+    assert (values.tolist(), distance.tolist()) == ([7, -1, -1], [0.0, np.inf, np.inf])
+
+
 def test_overlapping_masks_stay_overlapping_and_background_competes() -> None:
     points = np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0], [3, 0, 0]])
     masks = Masks(np.array([0, 2, 4]), np.array([0, 1, 1, 2], np.int32))
@@ -145,6 +167,25 @@ def test_the_first_class_wins_ties_and_features_without_direction() -> None:
     text = np.array([[1.0, 0], [0, 1], [0, 1]])
     features = np.array([[0.0, 5], [1, 1], [0, 0], [np.nan, 1]])
     assert most_similar(features, text).tolist() == [1, 0, 0, 0]
+
+
+def test_a_feature_that_holds_what_is_no_number_is_near_to_nothing() -> None:
+    features = np.array([[np.nan, 1], [1, np.inf], [np.nan, np.nan], [0, 2]])
+    assert labelling.cosines(features, np.array([[1.0, 0], [0, 1]])).tolist() == [[0, 0], [0, 0], [0, 0], [0, 1]]
+
+
+def test_cosines_are_added_up_by_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    n_threads: list[int] = []
+
+    def normalised(rows: Float64Array) -> Float64Array:
+        n_threads.append(max(pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"))
+        return rows
+
+    monkeypatch.setattr(labelling, "_normalised", normalised)
+    labelling.cosines(np.eye(3), np.eye(3))
+    assert n_threads == [1, 1]
+    most_similar(np.eye(3), np.eye(3))
+    assert n_threads[3:] == [1]  # after the directions of the texts, which are found before
 
 
 def test_labels_do_not_depend_on_the_number_of_rows_named_at_once() -> None:

@@ -5,18 +5,25 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Sequence
+from typing import ClassVar
 
 import numpy as np
 import pytest
 
+from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.resampling import resampled_ap
-from su3d_bench.metrics.metric import SceneScore, Values, scene_mean
+from su3d_bench.metrics.metric import Arrays, Counts, SceneScore, Values, present, scene_mean
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import combine, metric_of, plain_json
-from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate, conceptgraphs_metrics
+from su3d_bench.metrics.semantic.confusion import (
+    SemanticCounts,
+    concatenate,
+    conceptgraphs_metrics,
+    resampled_semantic,
+)
 from su3d_bench.numerics.statistics import nan_mean, row_means
 
 NAN = float("nan")
@@ -129,7 +136,33 @@ def test_a_class_of_a_single_point_has_values_in_the_scenes_that_have_it() -> No
     assert of_all["F-mIoU"].tolist() == [0.8, 1.0, 0.75]
 
 
+def test_under_scannet_a_class_that_is_neither_true_nor_called_leaves_the_mean_of_drawn_scenes() -> None:
+    found = resampled_semantic([confusion({A: {A: 3, B: 1}})], np.array([[1], [2]]), "scannet")
+    assert found["mIoU"].tolist() == [0.375, 0.375]  # 3/4 and 0 for the one that is only called
+    assert found["mAcc"].tolist() == [0.75, 0.75]
+
+
 # ---- results
+
+
+def test_a_class_is_present_with_a_single_point() -> None:
+    assert present(np.array([2, -1, 0, 0]), 4).tolist() == [True, False, True, False]
+
+
+class Nothing(Counts):
+    arrays: ClassVar[Arrays] = {}
+
+
+def test_counts_without_the_axis_of_a_single_class_are_refused() -> None:
+    with pytest.raises(DataError, match="a: was scored with 0 classes, class-agnostic-segment3d has 1 here"):
+        metric_of(load_protocol("class-agnostic-segment3d")).check("a", Nothing())
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_classes_that_should_have_points_and_have_none_score_zero(dtype: type[np.float32] | type[np.float64]) -> None:
+    with np.errstate(all="raise"):
+        metrics = conceptgraphs_metrics(np.zeros((2, 3), np.int64), np.arange(2), dtype)
+    assert (metrics.mean_accuracy, metrics.mean_iou, metrics.frequency_weighted_iou) == (0.0, 0.0, 0.0)
 
 
 def test_a_scene_without_truth_has_no_value_and_moves_none() -> None:
@@ -163,6 +196,13 @@ def test_an_undefined_scene_takes_no_part_in_an_interval() -> None:
     assert interval is not None
     assert np.isfinite(interval).all()
     assert interval[0] < combine(ROOM, scored).metrics["mAcc"] < interval[1]
+
+
+def test_a_scene_that_moves_no_mean_takes_part_in_the_interval() -> None:
+    rules = ROOM.model_copy(update={"aggregate": "scene-mean"})
+    scored = {str(n): score(ROOM, confusion({A: {A: n, N: 10 - n}})) for n in (4, 5, 6)}
+    # 4.303, of Student's t with 2 degrees of freedom, times 0.1 / sqrt(3)
+    assert combine(rules, scored).intervals["mAcc"] == pytest.approx((0.5 - 0.24841, 0.5 + 0.24841), abs=1e-5)
 
 
 # ---- the column that ConceptGraphs slices away

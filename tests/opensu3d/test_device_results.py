@@ -65,6 +65,19 @@ def test_a_block_in_which_every_choice_is_clear_is_not_computed_again(monkeypatc
         most_similar(np.ones((3, 4)), text, TORCH_ON_CPU)
 
 
+@needs_torch
+def test_a_choice_as_clear_as_the_gap_is_sure_and_one_less_clear_is_not(monkeypatch: pytest.MonkeyPatch) -> None:
+    from su3d_bench.metrics.matching import kernels
+
+    directions = kernels.directions_on(TORCH_ON_CPU, np.eye(3))  # cosines of 1 and 0
+    monkeypatch.setattr(kernels, "SURE_GAP", 1.0)
+    chosen = kernels.sure_most_similar(directions, directions)
+    assert chosen is not None
+    assert chosen.tolist() == [0, 1, 2]
+    monkeypatch.setattr(kernels, "SURE_GAP", np.nextafter(1.0, 2.0))
+    assert kernels.sure_most_similar(directions, directions) is None
+
+
 @on_each_device
 def test_cosines_of_a_device_are_those_of_the_cpu(device: str) -> None:
     rng = np.random.default_rng(1)

@@ -29,10 +29,8 @@ def _dot(left, right, n):  # type: ignore[no-untyped-def]
         wide = np.zeros(32)
         for i in range(n_wide):
             wide[i % 32] = _fused(left[i], right[i], wide[i % 32])  # type: ignore[call-arg]
-        lanes = np.empty(16)
-        for register in range(4):
-            for i in range(4):
-                lanes[4 * register + i] = wide[8 * register + i] + wide[8 * register + i + 4]
+        halves = wide.reshape(4, 2, 4)  # of four registers
+        lanes = (halves[:, 0] + halves[:, 1]).ravel()
         for i in range(n_wide, n_blocked):
             lanes[i - n_wide] = _fused(left[i], right[i], lanes[i - n_wide])  # type: ignore[call-arg]
         four = ((lanes[0:4] + lanes[4:8]) + lanes[8:12]) + lanes[12:16]
@@ -45,10 +43,8 @@ def _dot(left, right, n):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True, error_model="numpy")
 def areas(score, is_true, bounds, n_missed, is_wanted, area_of_cell):  # type: ignore[no-untyped-def]
     """Writes ``average_precision`` of each wanted cell, whose rows come with rising score between its ``bounds``."""
-    most = 0
-    for cell in range(len(area_of_cell)):
-        most = max(most, bounds[cell + 1] - bounds[cell])
-    precision, recall, width = np.empty(most + 1), np.empty(most + 3), np.empty(most + 1)
+    n_rows = len(score)  # no cell has more vertices
+    precision, recall, width = np.empty(n_rows + 1), np.empty(n_rows + 3), np.empty(n_rows + 1)
     for cell in range(len(area_of_cell)):
         start, end = bounds[cell], bounds[cell + 1]
         if not is_wanted[cell]:

@@ -76,7 +76,7 @@ def _compiled_areas(rows: _Rows, bounds: Int64Array, n_truth: Int64Array, weight
 
     areas = np.zeros((len(bounds) - 1, len(weights)))
     class_of_cell = np.repeat(np.arange(n_truth.shape[1]), len(areas) // n_truth.shape[1])
-    is_last = np.append(np.diff(rows.score) != 0, True)
+    is_last = np.diff(rows.score, append=np.nan) != 0
     is_last[bounds[1:][bounds[1:] > 0] - 1] = True
     scene = rows.scene.astype(np.int32)
 

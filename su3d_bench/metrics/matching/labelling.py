@@ -11,7 +11,7 @@ from threadpoolctl import threadpool_limits
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, Prediction
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Instances, Int64Array, Prediction
 from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.store.scratch import row_blocks
 
@@ -61,7 +61,7 @@ def _classes_of_features(
 ) -> Int64Array:
     features = prediction.features
     if features is None:
-        if getattr(prediction, "scores", np.zeros(1)).size == 0:
+        if isinstance(prediction, Instances) and not len(prediction):
             return np.zeros(0, np.int64)
         raise PredictionError(
             f"{rules.name}: the prediction has neither labels nor features; give each instance one of them"

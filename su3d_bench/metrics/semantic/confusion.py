@@ -63,8 +63,8 @@ def per_scene(truth: IntArray, predicted: IntArray, is_present: BoolArray) -> Se
     >>> counts.confusion.tolist()
     [[1, 1, 0], [0, 0, 1]]
     """
-    scored = np.where(truth >= 0, is_present[truth], False)
-    return SemanticCounts(confusion_matrix(np.where(scored, truth, -1), predicted, len(is_present)), is_present.copy())
+    counts = is_present[truth]  # whatever it says of a negative truth, which the matrix skips
+    return SemanticCounts(confusion_matrix(truth[counts], predicted[counts], len(is_present)), is_present.copy())
 
 
 def confusion_matrix(truth: IntArray, predicted: IntArray, n_classes: int) -> Int64Array:
