@@ -32,8 +32,18 @@ from su3d_bench.metrics.semantic.score import SemanticMetric
 from su3d_bench.numerics.statistics import jackknife_interval, leave_one_out
 from su3d_bench.store.atomic import read_arrays
 
-__all__ = ["SceneScore", "Truth", "combine", "metric_of", "pack_scores", "score_scene", "unpack_scores"]
+__all__ = [
+    "EVERY_SCENE",
+    "SceneScore",
+    "Truth",
+    "combine",
+    "metric_of",
+    "pack_scores",
+    "score_scene",
+    "unpack_scores",
+]
 
+EVERY_SCENE = "every scene"  # stands before a warning that all scenes share, where else the name of one stands
 QuestionTruth = RetrievalTruth | AnnotationTruth | ReasoningTruth
 Truth = GroundTruth | OpenLexTruth | QueryTruth | QuestionTruth
 METRICS: dict[str, type[Metric[Any]]] = {
@@ -209,7 +219,7 @@ def _gathered(warnings: Mapping[str, tuple[str, ...]]) -> list[str]:
     sentences = dict.fromkeys(sentence for of_scene in warnings.values() for sentence in of_scene)
     shared = [s for s in sentences if len(warnings) > 1 and all(s in of_scene for of_scene in warnings.values())]
     single = [f"{scene}: {s}" for scene, of_scene in warnings.items() for s in of_scene if s not in shared]
-    return [f"every scene: {sentence}" for sentence in shared] + single
+    return [f"{EVERY_SCENE}: {sentence}" for sentence in shared] + single
 
 
 def pack_scores(scores: Mapping[str, SceneScore]) -> bytes:

@@ -23,7 +23,7 @@ from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.timing import hardware_line, processor_digest
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
-from su3d_bench.metrics.scoring import SceneScore, combine, combined_metrics, plain_json, unpack_scores
+from su3d_bench.metrics.scoring import EVERY_SCENE, SceneScore, combine, combined_metrics, plain_json, unpack_scores
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.runs.executors.choose import ELSEWHERE, run_units
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
@@ -269,7 +269,7 @@ def confidences_of(rules: ProtocolRules, numbers: NumbersRecord) -> str | None:
         what = "1 for every instance" if rules.confidence == "ones" else "similarity to the query"
         return f"{what}, by the protocol"
     said = {warning.partition(": ")[0] for warning in numbers.warnings if CONSTANT_CONFIDENCE in warning}
-    are_equal = said >= {scene for scene, n in numbers.n_predictions.items() if n > 1}
+    are_equal = EVERY_SCENE in said or said >= {scene for scene, n in numbers.n_predictions.items() if n > 1}
     return "the same for all instances of a scene" if are_equal else "computed by the method"
 
 

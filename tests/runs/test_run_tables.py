@@ -118,6 +118,7 @@ def test_where_confidences_come_from_is_told_by_the_protocol_or_seen_in_the_pred
     assert confidences_of(ones, numbers()) == "1 for every instance, by the protocol"
     assert confidences_of(load_protocol("query-ap"), numbers()) == "similarity to the query, by the protocol"
     assert confidences_of(own, numbers("d/a", "d/b")) == "the same for all instances of a scene"
+    assert confidences_of(own, numbers("every scene")) == "the same for all instances of a scene"
     assert confidences_of(own, numbers("d/a")) == "computed by the method"
 
 
