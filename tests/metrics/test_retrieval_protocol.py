@@ -120,6 +120,13 @@ def test_what_a_guess_and_names_alone_get_right_is_a_share_of_what_was_asked() -
     assert np.isnan(by_name[1])
 
 
+def test_texts_to_which_the_name_alone_is_the_answer_stand_apart() -> None:
+    kinds = (("property by name", 4), ("relative by name", 4), ("relative by name", 8))  # "red table" finds the table
+    found = values(PERFECT, RetrievalTruth(TRUTH, (*ASKED, *(AskedText(kind, "red table", (i,)) for kind, i in kinds))))
+    assert (found["by name"], found["n_by name"]) == (2 / 3, 3)
+    assert (found["all"], found["n_all"]) == (4 / 6, 6)
+
+
 def test_order_of_instances_and_questions_changes_nothing() -> None:
     order = np.random.default_rng(0).permutation(len(PERFECT))
     assert PERFECT.features is not None
