@@ -236,6 +236,15 @@ def test_objects_are_right_where_the_instances_stand_for_exactly_them() -> None:
         assert are_objects_right(true, GivenAnswer(None, np.array(rows, np.int64), True), main_object) is is_right
 
 
+@pytest.mark.parametrize("is_settled", [True, False])
+def test_it_is_told_where_questions_could_not_be_settled(is_settled: bool) -> None:
+    given = GivenAnswer(2, np.zeros(0, np.int64), is_settled)
+    asked = (TrueAnswer("how many chairs?", "count", 2, ()),)
+    truth = ReasoningTruth(TRUTH, asked, lambda prediction, encoder: [given], "a solver")
+    told = score_scene(REASONING, truth, truth_as_prediction(TRUTH, with_labels=True), None).warnings
+    assert ("questions that the solver could not settle count as wrong" in told) == (not is_settled)
+
+
 def test_the_truth_answers_its_own_questions(all_is_seen: None) -> None:
     truth = question_truth(REASONING, SimpleNamespace(name="rooms"), "made", TRUTH)
     assert isinstance(truth, ReasoningTruth)
