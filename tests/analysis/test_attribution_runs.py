@@ -217,6 +217,10 @@ def test_the_first_mask_counts_as_any_other() -> None:
     mended = mend_points(row_of_points(own, other, other), np.ones(2, bool)).with_true_labels
     assert mended is not None
     assert mended.confusion[:2, :2].tolist() == [[0, 1], [0, 2]]
+    called_other = replace(row_of_points(own, own, other), predicted=np.ones(3, np.int64))
+    renamed = mend_points(called_other, np.ones(2, bool)).with_true_labels  # the first mask is of the first class
+    assert renamed is not None
+    assert renamed.confusion[:2, :2].tolist() == [[2, 0], [1, 0]]
 
 
 def test_where_neighbours_vote_the_mask_is_that_of_most_of_them() -> None:
