@@ -125,7 +125,8 @@ class FinishedRun:
     def check_method(self, method: str) -> None:
         """A ``ConfigError`` where the run holds no scores of ``method``."""
         if method not in self.methods and not self.has_scores(method):
-            known = [*self.methods, *([CEILING_METHOD] if self.has_scores(CEILING_METHOD) else [])]
+            has_truth = CEILING_METHOD not in self.methods and self.has_scores(CEILING_METHOD)
+            known = [*self.methods, *([CEILING_METHOD] if has_truth else [])]
             hint = suggest(method, known) or f"; it has {', '.join(known)}"
             raise ConfigError(f"{self.name}: holds no scores of the method '{printable(method, 80)}'{hint}")
 

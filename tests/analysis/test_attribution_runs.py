@@ -199,7 +199,8 @@ def test_a_mask_is_that_of_the_scored_points_near_it_alone() -> None:
 def test_of_objects_with_equally_many_points_a_mask_belongs_to_the_one_with_the_lowest_number() -> None:
     found = row_of_points(*((1, one, 0, 0.0, True) for one in (9, 4, 4, 9, 6)))
     assert object_of_mask(found).tolist() == [4]
-    nothing = LabelledPoints(*(np.zeros(0, np.int64),) * 2, np.zeros(0, bool), *(np.zeros(0, np.int64),) * 4)
+    none, no_metres = np.zeros(0, np.int64), np.zeros(0)
+    nothing = LabelledPoints(none, none, np.zeros(0, bool), none, none, no_metres, no_metres)
     assert object_of_mask(nothing).tolist() == []
     assert mend_points(nothing, np.ones(2, bool)).n == dict.fromkeys(CAUSES, 0)
 
@@ -346,6 +347,7 @@ def test_other_data_than_the_run_s_are_refused() -> None:
 
 ERRORS = [
     ({"method": "colector"}, "whole: holds no scores of the method 'colector'; did you mean 'collector'?"),
+    ({"method": "x"}, "whole: holds no scores of the method 'x'; it has collector, oracle"),
     ({"protocols": ["rooms-instanse"]}, "whole: was not scored under 'rooms-instanse'; did you mean 'rooms-instance'?"),
 ]
 

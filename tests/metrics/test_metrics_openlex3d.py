@@ -192,7 +192,7 @@ def test_an_empty_prediction_is_all_missing_and_ranks_nothing() -> None:
     assert isinstance(ranked, ObjectCounts) and isinstance(nothing, ObjectCounts)
     assert nothing.n_points.tolist() == ranked.n_points.tolist()  # every object counts, the first one too
     assert np.isnan(nothing.totals).tolist() == np.isnan(ranked.totals).tolist()
-    unseen = replace(truth, objects=truth.objects | {99: ObjectLabels(("pot",))})  # an object without points
+    unseen = replace(truth, objects={**truth.objects, 99: ObjectLabels(("pot",))})  # an object without points
     without = score_scene(RANKING, unseen, nothing_at(truth), ENCODER).counts
     assert isinstance(without, ObjectCounts)
     assert without.n_points.tolist() == ranked.n_points.tolist()

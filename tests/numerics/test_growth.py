@@ -45,7 +45,7 @@ def test_the_verdict_is_by_the_interval_and_not_by_the_slope(low: float, high: f
 
 
 def test_the_first_and_the_last_update_are_drawn_as_all_others_are() -> None:
-    sizes = 2.0 ** np.arange(MIN_FIT)
+    sizes = np.array([2.0**k for k in range(MIN_FIT)])
     costly = np.ones(MIN_FIT)
     costly[-1] = 8.0
     last, first = growth_exponent(sizes, costly), growth_exponent(sizes, costly[::-1])

@@ -141,5 +141,5 @@ def test_a_page_answered_by_keyboard_over_a_reload_is_scored(
     assert main(["sheets", "score", str(files[0]), "--key", str(tmp_path / "sheets-key"), "--json"]) == 0
     found = json.loads(capsys.readouterr().out)
     values = {(one["judge"], one["metric"]): (one["value"], one["n_items"]) for one in found["cells"]}
-    assert len(values) == 10 and found["second_looks"] == []
+    assert len(values) == 16 and found["second_looks"] == []
     assert all(values["people", metric] == values["automatic", metric] for _, metric in values)

@@ -225,7 +225,7 @@ def resampled_semantic(
     Classes that are true somewhere in the drawn scenes count; under ``scannet`` those that are only predicted join the
     mean IoU with 0. Where the confusion matrices hold ignored classes too, ``is_scored`` (C,) marks the others.
 
-    >>> a = SemanticCounts(np.array([[4, 0, 0], [0, 0, 0]]), np.array([True, False]))
+    >>> a = SemanticCounts(np.array([[4, 0, 0], [0, 0, 0]]), np.array([True, True]))
     >>> b = SemanticCounts(np.array([[0, 0, 0], [1, 1, 0]]), np.array([False, True]))
     >>> resampled_semantic([a, b], np.array([[2, 0], [1, 1], [0, 2]]), "conceptgraphs")["mAcc"].tolist()
     [1.0, 0.75, 0.5]
