@@ -196,7 +196,7 @@ def sign_flip_test(differences: Float64Array) -> SignFlipTest | None:
     observed = abs(float(pairs.sum())) - 1e-12 * float(np.abs(pairs).sum())
     if n <= MAX_EXACT_PAIRS:
         p = 1.0 if observed <= 0 else _n_sums_from(pairs, observed) * 2 / 2**n
-        return SignFlipTest(p, min(1.0, 2.0 ** (1 - n)), n, True)
+        return SignFlipTest(p, 2.0 ** (1 - n), n, True)
     generator = np.random.default_rng(SEED)
     n_as_far = 0
     for _ in range(N_FLIPS // 1000):

@@ -303,6 +303,33 @@ def test_of_duplicates_the_best_fit_stays_and_takes_the_best_confidence() -> Non
     assert instance_ap.combine([after]).ap == 1
 
 
+def confidences(counts: instance_ap.InstanceCounts) -> list[float]:
+    """Those of the first class at the first threshold, ascending."""
+    at_first: list[float] = counts.score[(counts.class_index == 0) & (counts.threshold_index == 0)].tolist()
+    return sorted(at_first)
+
+
+def test_of_merged_masks_the_surest_is_cut_and_the_others_are_dropped() -> None:
+    both = np.concatenate([points(0), points(1)])
+    mended = mend_scene(truth(), labelled([both, both], [3, 3], [0.5, 0.9]), RULES)
+    assert mended.n["merged"] == 2
+    assert confidences(mended.alone["merged"]) == [0.9, 0.9]
+
+
+def test_what_the_evaluator_does_not_count_is_no_duplicate() -> None:
+    masks, classes, scores = perfect()
+    _, n = gains([*masks, points(0, 0.45), points(0)], [*classes, 3, 0], [*scores, 0.9, 0.9])  # 90 points; no class
+    assert n["duplicate"] == 0
+
+
+def test_a_missed_instance_is_added_with_the_highest_confidence_of_the_scene() -> None:
+    masks, classes, _ = with_error("missed")
+    mended = mend_scene(truth(), labelled(masks, classes, [0.1, 0.2, 0.3, 0.4, 0.5]), RULES)
+    assert confidences(mended.alone["missed"]) == [0.1, 0.2, 0.5]
+    of_nothing = mend_scene(truth(), labelled([], [], []), RULES)
+    assert confidences(of_nothing.alone["missed"]) == [1.0, 1.0, 1.0]
+
+
 def test_an_empty_prediction_misses_everything() -> None:
     gain, n = gains([], [], [])
     assert n == dict.fromkeys(KINDS, 0) | {"missed": len(CLASSES)}

@@ -218,6 +218,20 @@ def test_the_first_mask_counts_as_any_other() -> None:
     mended = mend_points(row_of_points(own, other, other), np.ones(2, bool)).with_true_labels
     assert mended is not None
     assert mended.confusion[:2, :2].tolist() == [[0, 1], [0, 2]]
+    called_other = replace(row_of_points(own, own, other), predicted=np.ones(3, np.int64))
+    renamed = mend_points(called_other, np.ones(2, bool)).with_true_labels  # the first mask is of the first class
+    assert renamed is not None
+    assert renamed.confusion[:2, :2].tolist() == [[2, 0], [1, 0]]
+
+
+def test_where_neighbours_vote_the_mask_is_that_of_most_of_them() -> None:
+    rules = load_protocol("replica-hovsg")
+    assert rules.transfer.neighbours > 1
+    truth = replace(room(), variant=rules.ground_truth)
+    found = scored_points(rules, truth, truth_as_prediction(truth, with_labels=True), ENCODER).points
+    scored = found.is_scored & (truth.instance > 0)
+    assert scored.any()
+    assert (found.mask[scored] == truth.instance[scored] - 1).all()
 
 
 def test_what_has_no_instance_is_one_object_a_class_and_none_of_the_others() -> None:

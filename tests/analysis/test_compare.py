@@ -21,7 +21,7 @@ from scored_room import noisy_scores
 
 import su3d_bench.analysis.comparison
 import su3d_bench.reports.tables.model
-from su3d_bench.analysis.comparison import Difference, compare, form_difference
+from su3d_bench.analysis.comparison import Difference, _some, compare, form_difference
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, StoreError
 from su3d_bench.core.types import Float64Array
@@ -341,6 +341,35 @@ def test_settings_that_differ_are_named() -> None:
     assert compare("a", "variants").remarks == ()  # of the variant, which is not compared, nothing is said
     copy_as("a", "odd", "run.toml", lambda text: "method = 3\n" + text.replace("[method.collector]", "[other]"))
     assert "method.collector.drop 0 and not set" in compare("a", "odd").remarks[0]
+
+
+def test_of_many_settings_six_are_named_and_the_others_counted() -> None:
+    copy_as("a", "seven", "run.toml", lambda text: "".join(f"x{k} = {k}\n" for k in range(7)) + text)
+    (said,) = compare("a", "seven").remarks
+    assert said.count("not set and") == 6
+    assert said.endswith("x5 not set and 5 and 1 more")
+
+
+@pytest.mark.parametrize(
+    ("n", "said"), [(1, "s0"), (3, "s0, s1, s2"), (4, "s0, s1, s2 and 1 more"), (6, "s0, s1, s2 and 3 more")]
+)
+def test_of_many_scenes_three_are_named_and_the_others_counted(n: int, said: str) -> None:
+    assert _some([f"s{k}" for k in range(n)]) == said
+
+
+def test_protocols_that_only_one_run_was_scored_under_are_left_aside() -> None:
+    shutil.copytree("b", "one-protocol")
+    written = json.loads(Path("one-protocol/run.json").read_text())
+    written["protocols"] = [one for one in written["protocols"] if one["name"] == "rooms-semantic"]
+    Path("one-protocol/run.json").write_text(json.dumps(written))
+    (found,) = compare("a", "one-protocol").protocols
+    assert (found.protocol, found.remarks) == ("rooms-semantic", ())
+
+
+def test_partial_runs_of_other_limits_are_no_repeats_of_each_other() -> None:
+    copy_as("partial", "three-frames", "metrics.json", lambda text: text.replace('"limit": 2', '"limit": 3'))
+    with pytest.raises(ConfigError, match="three-frames: has other frames than partial"):
+        compare("partial,three-frames", "a")
 
 
 def test_two_methods_of_one_run_are_compared() -> None:

@@ -326,6 +326,26 @@ def test_a_run_that_timed_nothing_teaches_no_cost(run: Path, made: Path, referen
     assert taught.calibration_ms == reference.calibration_ms
 
 
+def test_the_headline_values_that_were_compared_are_counted(run: Path, reference: Reference) -> None:
+    n = sum(len(load_protocol(name).headline) for name in ("rooms-semantic", "rooms-instance"))
+    assert check(read_run(run), reference).n_compared == n
+
+
+def test_runs_that_hold_other_results_teach_nothing(run: Path, made: Path) -> None:
+    in_metrics(lambda m: m["results"].pop())(run)
+    with pytest.raises(ConfigError, match="the runs hold different methods or protocols"):
+        learn([read_run(made), read_run(run)])
+
+
+@pytest.mark.parametrize(("long", "shown"), [("x" * 40, "x" * 40), ("x" * 41, "x" * 12 + "...")])
+def test_what_has_more_than_forty_characters_is_shown_by_its_first(
+    long: str, shown: str, run: Path, reference: Reference
+) -> None:
+    in_metrics(lambda m: m["results"][0].update(profile=long))(run)
+    (finding,) = check(read_run(run), reference).findings
+    assert finding.text.endswith(f", now {shown}")
+
+
 def test_runs_of_different_requests_teach_nothing(run: Path, made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     setting("seed = 0", "seed = 1")(run)
     assert main(["check", "--learn", str(made), str(run), "--out", str(run / "r.json")]) == 2

@@ -14,7 +14,7 @@ from su3d_bench.core.types import Instances, Partition
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance.score import Covered
 from su3d_bench.metrics.protocols import load_protocol
-from su3d_bench.metrics.questions.score import judge_merging, labels_n
+from su3d_bench.metrics.questions.score import REFINED_BY, judge_merging, labels_n, said_by
 from su3d_bench.metrics.questions.truths import AnnotationTruth, RefinedNames
 from su3d_bench.metrics.scoring import metric_of, score_scene
 from su3d_bench.questions.refined_names import FILE_NAME, records_of, refined_digest, refined_names, write_records
@@ -106,6 +106,11 @@ def test_the_vote_takes_the_name_of_most_weight() -> None:
     assert voted is not None
     assert set(voted.names) == {"couch"}
     assert voted_names(truth_as_prediction(TRUTH, with_labels=True)) is None
+
+
+def test_who_named_is_what_stands_behind_the_name_of_a_scene_alone() -> None:
+    told = ["a/b: n': the vote", "n': a model", "c/d: seen beside n': nobody", "e/f: n': ", "n' leaves out 1 of 4"]
+    assert said_by(told, REFINED_BY) == ("the vote", "a model")
 
 
 def test_a_label_that_the_method_decided_goes_before_the_name() -> None:

@@ -27,7 +27,7 @@ from su3d_bench.core.errors import DataError, PredictionError
 from su3d_bench.core.types import DenseFeatures, Partition, Prediction
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.open_vocabulary import openlex3d
+from su3d_bench.metrics.open_vocabulary import openlex3d, score
 from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts, combine, concatenate, resampled
 from su3d_bench.metrics.open_vocabulary.openlex3d import (
     ObjectLabels,
@@ -198,6 +198,23 @@ def test_an_empty_prediction_is_all_missing_and_ranks_nothing() -> None:
     assert without.n_points.tolist() == ranked.n_points.tolist()
 
 
+def test_in_an_empty_map_a_single_object_of_one_point_counts_as_others_do() -> None:
+    truth = OpenLexTruth(
+        np.zeros((1, 3), np.float32), np.array([7]), {7: OBJECTS[7]}, PROMPTS, "openlex3d-visible", "made for a test"
+    )
+    counts = score_scene(RANKING, truth, nothing_at(truth), ENCODER).counts
+    assert isinstance(counts, ObjectCounts)
+    assert (counts.n_points.tolist(), counts.totals.tolist()) == ([1], [[0.0, 0.0, 0.0]])
+
+
+@pytest.mark.parametrize("rules", [TOPN, RANKING], ids=lambda rules: rules.name)
+def test_units_that_are_compared_in_many_blocks_score_as_in_one(rules: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    truth, prediction = lex_truth(), noisy(0)
+    in_one = values_of(rules, truth, prediction)
+    monkeypatch.setattr(score, "_BLOCK_UNITS", 2)  # of five
+    assert values_of(rules, truth, prediction) == pytest.approx(in_one, abs=1e-12)
+
+
 def test_a_point_is_missing_beyond_five_centimetres_and_ranked_however_far_it_is() -> None:
     truth = lex_truth()
     whole = perfect(truth)
@@ -213,8 +230,8 @@ def masks_of(prediction: Any) -> list[np.ndarray]:
 def test_the_ranking_scores_walls_and_the_categories_do_not() -> None:
     truth = lex_truth()
     n_walls = int((truth.object_of_point == 40).sum())
-    score, ranked = (score_scene(rules, truth, perfect(truth), ENCODER) for rules in (TOPN, RANKING))
-    assert ranked.n_scored - score.n_scored == n_walls > 0
+    named, ranked = (score_scene(rules, truth, perfect(truth), ENCODER) for rules in (TOPN, RANKING))
+    assert ranked.n_scored - named.n_scored == n_walls > 0
 
 
 def test_one_of_five_labels_is_enough_for_a_category() -> None:

@@ -189,6 +189,13 @@ def test_a_mask_reaches_a_point_nearer_than_the_root_of_a_thousandth(offset_m: f
     assert metrics(OPENLEX, truth, mask) == [float(is_reached)] * 3
 
 
+def test_an_object_of_number_zero_may_be_asked_for_and_points_of_none_may_not() -> None:
+    queries = (TextQuery("seat", (0,)), TextQuery("air", (-1,)))
+    truth = QueryTruth(np.zeros((5, 3), np.float32), np.array([0, 0, 1, -1, -1]), queries, OPENLEX.ground_truth, "test")
+    mask = instances_with(truth.points, [np.arange(5)], WordEncoder().feature({"seat": 1.0})[None])
+    assert score_scene(OPENLEX, truth, mask, ENCODER).n_scored == 2
+
+
 def test_overlapping_masks_are_all_ranked() -> None:
     truth = asking(query_truth(), ("seat", (7,)))
     seats = np.flatnonzero(truth.object_of_point == 7)

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 from places import CASES
 from pydantic import ValidationError
+from scored_room import instances
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
@@ -24,6 +25,7 @@ from su3d_bench.metrics.fitness import (
     list_of_ids,
     n_feature_dimensions,
     why_not_content,
+    why_not_map,
     why_not_numbers,
     why_not_truth,
 )
@@ -215,6 +217,29 @@ def test_what_a_prediction_holds_is_told_by_its_kind() -> None:
     assert "needs instances" in str(why_not_content(load_protocol("rooms-instance"), dense))
     without_points = why_not_content(load_protocol("rooms-instance"), partition, has_points=False)
     assert "the ground truth has no coordinates" in str(without_points)
+
+
+@pytest.mark.parametrize(
+    ("content", "reason"),
+    [
+        (ContentFacts("instances", 2, has_names=True), None),
+        (ContentFacts("instances", 2, 512), "needs names, and the method gives its instances none"),
+        (ContentFacts("instances", 0), None),
+        (ContentFacts("partition", 2, 512), "needs instances with names, and the method gives a partition"),
+    ],
+)
+def test_where_names_are_judged_instances_must_have_them(content: ContentFacts, reason: str | None) -> None:
+    assert why_not_map(load_protocol("rooms-annotation"), content) == reason
+
+
+def test_a_single_name_or_class_is_enough_to_be_judged_by() -> None:
+    mask, points = np.arange(2, dtype=np.int32), np.zeros((2, 3), np.float32)
+    for labels, has_names in ((["chair", ""], True), (["", ""], False)):
+        assert ContentFacts.of(instances(points, [mask, mask], labels)).has_names == has_names
+    rules = load_protocol("scannet-instance")
+    for class_ids, reason in (([0, 3], None), ([0, 0], "needs classes, every mask has class 0")):
+        content = ContentFacts("vertex-masks", 2, has_labels=True, class_ids=np.array(class_ids))
+        assert why_not_content(rules, content) == reason
 
 
 MESH = TruthFacts("truth", "replica", ("mesh-vertices",))

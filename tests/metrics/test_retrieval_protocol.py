@@ -120,6 +120,13 @@ def test_what_a_guess_and_names_alone_get_right_is_a_share_of_what_was_asked() -
     assert np.isnan(by_name[1])
 
 
+def test_texts_to_which_the_name_alone_is_the_answer_stand_apart() -> None:
+    kinds = (("property by name", 4), ("relative by name", 4), ("relative by name", 8))  # "red table" finds the table
+    found = values(PERFECT, RetrievalTruth(TRUTH, (*ASKED, *(AskedText(kind, "red table", (i,)) for kind, i in kinds))))
+    assert (found["by name"], found["n_by name"]) == (2 / 3, 3)
+    assert (found["all"], found["n_all"]) == (4 / 6, 6)
+
+
 def test_order_of_instances_and_questions_changes_nothing() -> None:
     order = np.random.default_rng(0).permutation(len(PERFECT))
     assert PERFECT.features is not None
@@ -227,6 +234,15 @@ def test_objects_are_right_where_the_instances_stand_for_exactly_them() -> None:
     true = TrueAnswer("which?", "nearest", None, (4,))
     for rows, is_right in (([0], True), ([0, 1], True), ([0, 2], False), ([], False)):
         assert are_objects_right(true, GivenAnswer(None, np.array(rows, np.int64), True), main_object) is is_right
+
+
+@pytest.mark.parametrize("is_settled", [True, False])
+def test_it_is_told_where_questions_could_not_be_settled(is_settled: bool) -> None:
+    given = GivenAnswer(2, np.zeros(0, np.int64), is_settled)
+    asked = (TrueAnswer("how many chairs?", "count", 2, ()),)
+    truth = ReasoningTruth(TRUTH, asked, lambda prediction, encoder: [given], "a solver")
+    told = score_scene(REASONING, truth, truth_as_prediction(TRUTH, with_labels=True), None).warnings
+    assert ("questions that the solver could not settle count as wrong" in told) == (not is_settled)
 
 
 def test_the_truth_answers_its_own_questions(all_is_seen: None) -> None:

@@ -233,7 +233,7 @@ class QueryMetric(CurveMetric):
         assert rules.min_region_size is not None
         assert rules.confidence in ("similarity", "similarity-min-max")
         masks = transfer.masks_of(prediction)
-        similarity = np.zeros((len(masks), len(truth.queries)))
+        similarity = np.empty((len(masks), len(truth.queries)))
         if len(masks) and truth.queries:
             features, known = _features(rules, prediction, encoder)
             text = text_features(rules, [query.text for query in truth.queries], features, known)
