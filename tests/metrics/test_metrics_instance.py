@@ -226,7 +226,7 @@ def test_no_truth_at_all_is_nan_and_warns_of_nothing(recwarn: pytest.WarningsRec
 
 
 def test_an_instance_covers_the_vertices_whose_nearest_map_point_is_its_own() -> None:
-    points = np.arange(6)[:, None] * np.array([1, 0, 0], np.float32)
+    points = np.array([[k, 0, 0] for k in range(6)], np.float32)
     objects = np.array([0, 1, 1, 2, 2, -1], np.int32)
     truth = GroundTruth(points, objects, objects, LABELS, "mesh-vertices", "made for a test")
     moved = instances(points + np.float32(0.01), [np.arange(3), np.arange(2, 5), np.array([0, 5])], None)
