@@ -65,7 +65,7 @@ def test_nothing_is_said_of_too_few_points_or_of_sizes_that_hardly_differ() -> N
 
 @pytest.mark.parametrize(("size_unit", "cost_unit"), [(1e12, 1.0), (1.0, 1e300), (1.0, 1e-300)])
 def test_a_growth_is_the_same_in_whatever_unit_sizes_and_costs_are(size_unit: float, cost_unit: float) -> None:
-    sizes = np.array([1.0 + 2e-5 * k for k in range(30)])  # grows by a little at a time, and costs by three times as much
+    sizes = np.array([1.0 + 2e-5 * k for k in range(30)])  # by a little, and costs by three times as much
     sizes[-1] = 2.0
     costs = np.append(sizes[:-1] ** 3, 2.0)
     known, found = growth_exponent(sizes, costs), growth_exponent(size_unit * sizes, cost_unit * costs)
