@@ -172,6 +172,13 @@ def random_scene(rng: np.random.Generator) -> instance_ap.InstanceCounts:
     return instance_ap.per_scene(truth, indptr, np.concatenate(masks), labels, scores, [1, 2, 3])
 
 
+def test_the_counts_of_a_class_alone_are_its_rows_as_the_first_class() -> None:
+    counts = random_scene(np.random.default_rng(3))
+    alone = instance_ap.only(counts, 1)
+    n_rows = int(np.count_nonzero(counts.class_index == 1))
+    assert n_rows > 0 and alone.class_index.tolist() == [0] * n_rows
+
+
 def test_resampled_ap_equals_the_ap_of_the_scenes_drawn() -> None:
     rng = np.random.default_rng(11)
     counts = [random_scene(rng) for _ in range(5)]
