@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -16,6 +17,8 @@ MOST_KEPT_BYTES = 4 << 30
 
 # The table of readers to damage takes its samples from the tests of those readers.
 sys.path += sorted({str(file.parent) for file in TESTS.rglob("*.py")} - {*sys.path})
+
+from chat_server import ChatServer, chat_server  # noqa: E402 (it is found by the line above)
 
 # Every file of a run is brought to the disk before it counts; thousands of small runs would wait for nothing else.
 if MEMORY.is_dir() and os.access(MEMORY, os.W_OK) and shutil.disk_usage(MEMORY).free > MOST_KEPT_BYTES:
@@ -37,6 +40,21 @@ def rooms_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "rooms-data"
     folder.mkdir(exist_ok=True)
     return folder
+
+
+@pytest.fixture(scope="module")
+def chat_of_module() -> Iterator[ChatServer]:
+    with chat_server() as server:
+        yield server
+
+
+@pytest.fixture
+def chat(chat_of_module: ChatServer, monkeypatch: pytest.MonkeyPatch) -> ChatServer:
+    """A language model's server as it was before any question; the test says what it answers."""
+    pytest.importorskip("openai", reason="the models extra is not installed")
+    monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
+    chat_of_module.forget()
+    return chat_of_module
 
 
 @pytest.hookimpl(tryfirst=True)

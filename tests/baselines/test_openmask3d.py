@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from prediction_files import write_openyolo3d
+from proposals_by_hand import made_proposals
 from pydantic import ValidationError
 
 from su3d_bench.baselines.openmask3d.features import FeatureMeans, crop_boxes, prompted_mask
@@ -51,16 +52,6 @@ def frame(index: int = 0, depth_m: float = 1.0, x_m: float = 0.0) -> Frame:
 def seen(points: Sequence[Sequence[float]], view: Frame, tolerance_m: float = 0.2) -> list[int]:
     pixels = visible_pixels(np.array(points, np.float32), view, view.intrinsics, tolerance_m)
     return [int(pixel) for pixel in pixels]
-
-
-def made(points: np.ndarray, *masks: Sequence[int], scores: Sequence[float] | None = None) -> Proposals:
-    return Proposals(
-        points=points.astype(np.float32),
-        indptr=np.cumsum([0, *(len(mask) for mask in masks)]).astype(np.int64),
-        indices=np.array([k for mask in masks for k in mask], np.int32),
-        scores=np.ones(len(masks)) if scores is None else np.array(scores, np.float64),
-        source="made",
-    )
 
 
 class TestProjection:
@@ -107,7 +98,7 @@ class TestProjection:
 class TestViews:
     def test_pixels_count_once_however_many_points_hit_them(self) -> None:
         points = np.array([(0, 0, 1), (0.01, 0, 1), (0.3, 0, 1), (9, 9, 9)])
-        proposals = made(points, [0, 1, 2, 3], [1, 2], [3], [])
+        proposals = made_proposals(points, [0, 1, 2, 3], [1, 2], [3], [])
         pixels = visible_pixels(proposals.points, frame(), INTRINSICS, 0.2)
         assert count_pixels(pixels, proposals, WIDTH * HEIGHT).tolist() == [2, 2, 0, 0]
         assert pixels_of_mask(pixels, proposals.mask(0), WIDTH).tolist() == [[0, 0], [3, 0]]
@@ -259,25 +250,25 @@ def ran(
 
 class TestMethod:
     def test_each_proposal_gets_the_feature_of_what_its_views_show(self) -> None:
-        _, found, _, _ = ran(made(WALL, LEFT, MIDDLE, RIGHT), [frame()])
+        _, found, _, _ = ran(made_proposals(WALL, LEFT, MIDDLE, RIGHT), [frame()])
         assert found.features is not None and found.features.tolist() == np.eye(3).tolist()
         assert found.scores.tolist() == [1, 1, 1] and found.labels is None
         assert np.array_equal(found.points, WALL) and found.mask(1).tolist() == MIDDLE
         assert found.boxes[0].tolist() == [WALL[LEFT].min(axis=0).tolist(), WALL[LEFT].max(axis=0).tolist()]
 
     def test_two_objects_that_a_proposal_merges_stay_merged(self) -> None:
-        _, found, _, _ = ran(made(WALL, LEFT + MIDDLE, RIGHT), [frame()])
+        _, found, _, _ = ran(made_proposals(WALL, LEFT + MIDDLE, RIGHT), [frame()])
         assert len(found) == 2 and found.mask(0).tolist() == LEFT + MIDDLE
         assert found.features is not None and found.features[0].max() == 1  # the surest prompt saw one of the two
 
     def test_an_object_without_a_proposal_is_never_found(self) -> None:
-        _, found, _, regions = ran(made(WALL, LEFT), [frame(0), frame(1), frame(2)])
+        _, found, _, regions = ran(made_proposals(WALL, LEFT), [frame(0), frame(1), frame(2)])
         assert not set(found.indices.tolist()) & set(MIDDLE + RIGHT) and regions.masks.any(axis=0).all()
 
     def test_a_mask_without_a_usable_view_has_a_zero_feature_and_so_the_first_class(self) -> None:
         """As NaN becomes 0 and argmax 0 in the original; the protocols' rule is the same."""
         hidden = np.concatenate([WALL, [(0.5, 0.5, 3)]]).astype(np.float32)
-        _, found, _, _ = ran(made(hidden, LEFT, [len(WALL)], []), [frame()])
+        _, found, _, _ = ran(made_proposals(hidden, LEFT, [len(WALL)], []), [frame()])
         assert found.features is not None and found.features[1:].tolist() == [[0, 0, 0]] * 2
         assert most_similar(found.features, np.eye(3)[[1, 0, 2]]).tolist() == [1, 0, 0]
         assert found.boxes[2].tolist() == [[0, 0, 0], [0, 0, 0]] and np.diff(found.view_indptr).tolist() == [1, 0, 0]
@@ -286,7 +277,7 @@ class TestMethod:
         """Seen from further right fewer columns show; frames 0 and 3 show all, so two views are these."""
         frames = [frame(10 * k, x_m=x) for k, x in enumerate((0.0, 0.6, 0.3, 0.0))]
         method, found, counted, regions = ran(
-            made(WALL, list(range(len(WALL))), LEFT), frames, OpenMask3DConfig(proposals="oracle", top_k=2)
+            made_proposals(WALL, list(range(len(WALL))), LEFT), frames, OpenMask3DConfig(proposals="oracle", top_k=2)
         )
         assert counted.read == [0, 3] and regions.frames == [0, 0, 30, 30]
         assert found.views.tolist() == [[0, 0], [30, 0], [0, 1], [30, 1]]
@@ -295,7 +286,7 @@ class TestMethod:
         assert method.map_bytes > 12 * len(WALL)
 
     def test_finish_midway_changes_nothing_and_the_same_run_gives_the_same(self) -> None:
-        proposals, frames = made(WALL, LEFT + MIDDLE, RIGHT), [frame(0), frame(10, x_m=0.1)]
+        proposals, frames = made_proposals(WALL, LEFT + MIDDLE, RIGHT), [frame(0), frame(10, x_m=0.1)]
         method, first, _, _ = ran(proposals, frames)
         again, (_, other, _, _) = method.finish(), ran(proposals, frames)
         assert first.features is not None and again.features is not None and other.features is not None
@@ -303,35 +294,38 @@ class TestMethod:
         assert np.array_equal(first.views, other.views)
 
     def test_a_masks_prompts_do_not_depend_on_the_other_masks(self) -> None:
-        alone = ran(made(WALL, LEFT + MIDDLE), [frame()])[1].features
-        beside = ran(made(WALL, LEFT + MIDDLE, RIGHT), [frame()])[1].features
+        alone = ran(made_proposals(WALL, LEFT + MIDDLE), [frame()])[1].features
+        beside = ran(made_proposals(WALL, LEFT + MIDDLE, RIGHT), [frame()])[1].features
         assert alone is not None and beside is not None and alone[0].tolist() == beside[0].tolist()
 
     def test_a_score_of_a_proposal_is_a_confidence_where_asked_for(self) -> None:
         config = OpenMask3DConfig(proposals="oracle", confidence="proposal")
-        _, found, _, _ = ran(made(WALL, LEFT, RIGHT, scores=[0.3, 0.8]), [frame()], config)
+        _, found, _, _ = ran(made_proposals(WALL, LEFT, RIGHT, scores=[0.3, 0.8]), [frame()], config)
         assert found.scores.tolist() == [0.3, 0.8]
 
     def test_other_intrinsics_move_the_views(self) -> None:
         config = OpenMask3DConfig(proposals="oracle", intrinsics="openmask3d", intrinsic_resolution=(16, 12))
-        as_is, moved = ran(made(WALL, LEFT), [frame()])[0], ran(made(WALL, LEFT), [frame()], config)[0]
+        as_is, moved = (
+            ran(made_proposals(WALL, LEFT), [frame()])[0],
+            ran(made_proposals(WALL, LEFT), [frame()], config)[0],
+        )
         assert as_is._views.n_pixels[0, 0] == 32 != moved._views.n_pixels[0, 0]
 
     def test_a_frame_that_is_another_when_read_again_is_an_error(self) -> None:
-        method, _, counted, _ = ran(made(WALL, LEFT), [frame()])
+        method, _, counted, _ = ran(made_proposals(WALL, LEFT), [frame()])
         counted.frames = [frame(5)]
         with pytest.raises(DataError, match="update 0 was frame 0, read again it is frame 5"):
             method.finish()
 
     def test_without_frames_or_proposals_there_are_empty_answers(self) -> None:
-        assert ran(made(WALL, LEFT), [])[1].features is not None
-        assert len(ran(made(WALL), [frame()])[1]) == 0
+        assert ran(made_proposals(WALL, LEFT), [])[1].features is not None
+        assert len(ran(made_proposals(WALL), [frame()])[1]) == 0
 
     def test_proposals_from_files_are_described(self, tmp_path: Path) -> None:
         masks = np.zeros((1, len(WALL)), bool)
         masks[0, RIGHT] = True
         write_openyolo3d(tmp_path, {"name": "room0", "masks": masks, "scores": np.array([0.5])})
-        _, found, _, _ = ran(made(WALL, LEFT), [frame()], OpenMask3DConfig(proposals_folder=tmp_path))
+        _, found, _, _ = ran(made_proposals(WALL, LEFT), [frame()], OpenMask3DConfig(proposals_folder=tmp_path))
         assert (
             found.mask(0).tolist() == RIGHT and found.features is not None and found.features[0].tolist() == [0, 0, 1]
         )

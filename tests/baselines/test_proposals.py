@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,6 +9,7 @@ import numpy as np
 import pytest
 from damage import damages, outcomes, truncations
 from prediction_files import TorchFile, write_openmask3d, write_openyolo3d, write_scannet_text
+from proposals_by_hand import made_proposals
 from pydantic import ValidationError
 from test_mesh_segments import sheet
 
@@ -50,16 +50,6 @@ def flat(n: int = 6) -> Surface:
 
 def masks_of(proposals: Proposals) -> list[list[int]]:
     return [proposals.mask(k).tolist() for k in range(len(proposals))]
-
-
-def made(points: np.ndarray, *masks: Sequence[int], scores: Sequence[float] | None = None) -> Proposals:
-    return Proposals(
-        points=points.astype(np.float32),
-        indptr=np.cumsum([0, *(len(mask) for mask in masks)]).astype(np.int64),
-        indices=np.array([k for mask in masks for k in mask], np.int32),
-        scores=np.ones(len(masks)) if scores is None else np.array(scores, np.float64),
-        source="made",
-    )
 
 
 class TestFiles:
@@ -152,21 +142,21 @@ class TestParts:
         assert density_clusters(np.zeros((0, 3), np.float32), 0.95, 3).tolist() == []
 
     def test_each_part_is_a_mask_with_its_masks_score_the_best_first(self) -> None:
-        proposals = made(self.ROW, [0, 1, 3, 4], [5], [1, 2], scores=[0.2, 0.9, 0.2])
+        proposals = made_proposals(self.ROW, [0, 1, 3, 4], [5], [1, 2], scores=[0.2, 0.9, 0.2])
         parts = split_into_parts(proposals, 0.95, 1, 0, 1.0)
         assert masks_of(parts) == [[5], [0, 1], [3, 4], [1, 2]] and parts.scores.tolist() == [0.9, 0.2, 0.2, 0.2]
 
     def test_small_parts_go_and_of_five_the_best_four_fifths_stay(self) -> None:
         points = np.array([(x, 0, 0) for x in range(12)])
         masks = [[0, 1], [2, 3], [4, 5], [6, 7], [8, 9], [10]]
-        proposals = made(points, *masks, scores=[0.1, 0.6, 0.5, 0.4, 0.3, 0.9])
+        proposals = made_proposals(points, *masks, scores=[0.1, 0.6, 0.5, 0.4, 0.3, 0.9])
         parts = split_into_parts(proposals, 1.0, 1, 1, 0.8)  # [10] has no more than one point
         assert masks_of(parts) == [[2, 3], [4, 5], [6, 7], [8, 9]]
-        assert len(split_into_parts(made(points, [0]), 1.0, 1, 0, 0.8)) == 0  # floor(0.8)
+        assert len(split_into_parts(made_proposals(points, [0]), 1.0, 1, 0, 0.8)) == 0  # floor(0.8)
 
     def test_a_mask_takes_segments_of_which_it_holds_more_than_half(self) -> None:
         segments = np.array([0, 0, 1, 1, 1, 2])
-        voted = voted_by_segments(made(self.ROW, [0, 2, 3], [5], [0]), segments)
+        voted = voted_by_segments(made_proposals(self.ROW, [0, 2, 3], [5], [0]), segments)
         assert masks_of(voted) == [[2, 3, 4], [5], []]  # half of segment 0 is not more than half
 
 
@@ -314,7 +304,7 @@ class TestConfig:
         )
 
     def test_true_proposals_are_carried_to_the_nearest_vertices_overlaps_included(self) -> None:
-        truth = made(np.array([(0.1, 0, 0), (2.1, 0, 0), (4.9, 0, 0)]), [0, 1], [1, 2])
+        truth = made_proposals(np.array([(0.1, 0, 0), (2.1, 0, 0), (4.9, 0, 0)]), [0, 1], [1, 2])
         found = make_proposals(ProposalConfig(proposals="oracle"), tools(flat(), truth), "rooms", "room0")
         assert masks_of(found) == [[0, 1, 2, 3], [2, 3, 4, 5]] and found.source == "made"  # 3 is 0.9 from 2.1
         assert ProposalConfig(proposals="oracle").caveat is None

@@ -7,13 +7,12 @@ import json
 import shlex
 import subprocess
 import sys
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from chat_server import KEY, Answered, ChatServer, chat_server, error
+from chat_server import KEY, Answered, ChatServer, error
 from scored_room import instances
 
 from su3d_bench.cli.main import build_parser, main
@@ -74,19 +73,10 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(reasoning_picture, "draw_reasoning", lambda *words: None)
 
 
-@pytest.fixture(scope="module")
-def shared() -> Iterator[ChatServer]:
-    with chat_server() as server:
-        yield server
-
-
 @pytest.fixture
-def server(shared: ChatServer) -> ChatServer:
-    pytest.importorskip("openai", reason="the models extra is not installed")
-    shared.bodies.clear()
-    shared.script.clear()
-    shared.answer = lambda body: Answered('{"answer": "the grey sink", "object_ids": [30, 10]}')
-    return shared
+def server(chat: ChatServer) -> ChatServer:
+    chat.answer = lambda body: Answered('{"answer": "the grey sink", "object_ids": [30, 10]}')
+    return chat
 
 
 def llm(server: ChatServer, *more: str) -> list[str]:

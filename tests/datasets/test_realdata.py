@@ -8,7 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from places import REAL_RECORDINGS
+from places import REAL_RECORDINGS, needs_recordings
 from scipy.spatial import cKDTree
 
 from su3d_bench.cli.main import main
@@ -20,7 +20,7 @@ from su3d_bench.datasets.tum.dataset import Tum
 from su3d_bench.numerics.geometry import back_project
 from su3d_bench.store.predictions import read_prediction
 
-pytestmark = pytest.mark.skipif(not REAL_RECORDINGS.is_dir(), reason="needs the real recordings in ../shared/realdata")
+pytestmark = needs_recordings
 FRAME_FILES = {
     "colour": "frame-{index}.color.png",
     "depth": "frame-{index}.depth.png",

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from places import REAL_RECORDINGS
+from places import REAL_RECORDINGS, needs_recordings
 from tiny_models import blocks, frame_of, paper_words, tiny_dino, tiny_sam, write_models
 
 from su3d_bench.cli.main import main
@@ -320,7 +320,7 @@ def test_a_room_runs_end_to_end(
     assert "RAM++ is not here" in str(read_json(tmp_path / "out" / "metrics.json"))
 
 
-@pytest.mark.skipif(not REAL_RECORDINGS.is_dir(), reason="needs the real recordings in ../shared/realdata")
+@needs_recordings
 def test_real_frames_run_end_to_end(models: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder = tmp_path / "data" / "rgbd" / "chair"
     folder.mkdir(parents=True)

@@ -19,6 +19,7 @@ import pytest
 from damage import damages, outcomes, truncations
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from same_values import assert_same
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.formats import torch_zip
@@ -56,22 +57,6 @@ def objects(n: int = 3) -> dict[str, Any]:
         "is_background": False,
     }
     return {"objects": [one], "bg_objects": None, "class_names": ["chair"], "class_colors": {"0": [0.1, 0.2, 0.3]}}
-
-
-def assert_same(ours: Any, theirs: Any) -> None:
-    if isinstance(theirs, np.ndarray):
-        assert isinstance(ours, np.ndarray) and ours.dtype == theirs.dtype
-        np.testing.assert_array_equal(ours, theirs)
-    elif isinstance(theirs, dict):
-        assert list(ours) == list(theirs)
-        for key, value in theirs.items():
-            assert_same(ours[key], value)
-    elif isinstance(theirs, list | tuple):
-        assert type(ours) is type(theirs) and len(ours) == len(theirs)
-        for one, other in zip(ours, theirs, strict=True):
-            assert_same(one, other)
-    else:
-        assert type(ours) is type(theirs) and ours == theirs
 
 
 # ---- what is read

@@ -16,6 +16,7 @@ import numpy as np
 import pytest
 from damage import damages, outcomes, truncations
 from places import CASES
+from same_values import assert_same
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.formats import numpy_files as zip_files
@@ -48,22 +49,6 @@ KINDS = {
     "open3dis.pth": "dict",
     "sam3d.pth": "array",
 }
-
-
-def assert_same(ours: Any, theirs: Any) -> None:
-    if isinstance(theirs, np.ndarray):
-        assert isinstance(ours, np.ndarray) and ours.dtype == theirs.dtype
-        np.testing.assert_array_equal(ours, theirs)
-    elif isinstance(theirs, dict):
-        assert list(ours) == list(theirs)
-        for key, value in theirs.items():
-            assert_same(ours[key], value)
-    elif isinstance(theirs, list | tuple):
-        assert type(ours) is type(theirs) and len(ours) == len(theirs)
-        for one, other in zip(ours, theirs, strict=True):
-            assert_same(one, other)
-    else:
-        assert ours == theirs
 
 
 def read_any(path: Path) -> Any:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from chat_server import KEY, Answered, Body, ChatServer, chat_server
+from chat_server import KEY, Answered, Body, ChatServer
 from made_sheets import COLLECTOR, PAINTED
 from painted import colour_perception
 
@@ -36,19 +35,10 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.fixture(scope="module")
-def shared() -> Iterator[ChatServer]:
-    with chat_server() as server:
-        yield server
-
-
 @pytest.fixture
-def server(shared: ChatServer) -> ChatServer:
-    pytest.importorskip("openai", reason="the models extra is not installed")
-    shared.bodies.clear()
-    shared.script.clear()
-    shared.answer = geometry
-    return shared
+def server(chat: ChatServer) -> ChatServer:
+    chat.answer = geometry
+    return chat
 
 
 def geometry(body: Body) -> Answered:

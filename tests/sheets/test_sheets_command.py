@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
-from chat_server import KEY, Answered, ChatServer, chat_server, error
+from chat_server import KEY, Answered, ChatServer, error
 from made_sheets import METHODS, RUN
 from painted import colour_perception
 
@@ -53,19 +52,10 @@ def folder(made: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-@pytest.fixture(scope="module")
-def shared() -> Iterator[ChatServer]:
-    with chat_server() as server:
-        yield server
-
-
 @pytest.fixture
-def server(shared: ChatServer) -> ChatServer:
-    pytest.importorskip("openai", reason="the models extra is not installed")
-    shared.bodies.clear()
-    shared.script.clear()
-    shared.answer = lambda body: Answered(ANSWER)
-    return shared
+def server(chat: ChatServer) -> ChatServer:
+    chat.answer = lambda body: Answered(ANSWER)
+    return chat
 
 
 def told(capsys: pytest.CaptureFixture[str], *words: str) -> list[dict[str, Any]]:

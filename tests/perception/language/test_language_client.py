@@ -6,7 +6,6 @@ import builtins
 import json
 import sys
 import threading
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -24,21 +23,10 @@ from su3d_bench.perception.language.transport import HOSTED
 pytest.importorskip("openai", reason="the models extra is not installed")
 
 
-@pytest.fixture(scope="module")
-def shared() -> Iterator[ChatServer]:
-    with chat_server() as server:
-        yield server
-
-
 @pytest.fixture
-def server(shared: ChatServer, monkeypatch: pytest.MonkeyPatch) -> ChatServer:
+def server(chat: ChatServer, monkeypatch: pytest.MonkeyPatch) -> ChatServer:
     monkeypatch.setenv("SU3D_TEST_KEY", KEY)
-    monkeypatch.delenv("OPENAI_BASE_URL", raising=False)
-    shared.script.clear()
-    shared.bodies.clear()
-    shared.headers.clear()
-    shared.answer = lambda body: Answered()
-    return shared
+    return chat
 
 
 def ask(text: str, **changes: Any) -> ChatRequest:

@@ -53,10 +53,7 @@ class ChatServer:
     """``script`` is worked off first, one answer a request; after it ``answer`` says what to do with a body."""
 
     def __init__(self) -> None:
-        self.script: list[Answered] = []
-        self.answer: Callable[[Body], Answered] = lambda body: Answered()
-        self.bodies: list[Body] = []
-        self.headers: list[dict[str, str]] = []
+        self.forget()
         self.stop = threading.Event()
         self._lock = threading.Lock()
         server = self
@@ -80,6 +77,13 @@ class ChatServer:
         self._http.daemon_threads = True
         self.url = f"http://127.0.0.1:{self._http.server_address[1]}/v1"
         threading.Thread(target=self._http.serve_forever, kwargs={"poll_interval": 0.01}, daemon=True).start()
+
+    def forget(self) -> None:
+        """As nothing had been asked: no script, "ok" to every body, nothing counted."""
+        self.script: list[Answered] = []
+        self.answer: Callable[[Body], Answered] = lambda body: Answered()
+        self.bodies: list[Body] = []
+        self.headers: list[dict[str, str]] = []
 
     @property
     def n_asked(self) -> int:
