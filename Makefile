@@ -23,31 +23,31 @@ proofs: $(VENV)/test
 	@mkdir -p build/measured
 	$(BIN)/python -m pytest -q -n auto -m proof
 	SU3D_FUZZ_EXAMPLES=60 $(BIN)/python -m pytest -q -n auto tests/fuzz
-	$(BIN)/python benchmarks/fuzz.py --inputs 100000 --seed 1 --json build/measured/fuzz.json
-	$(BIN)/python benchmarks/coverage_of_intervals.py
-	$(BIN)/python benchmarks/kill_at_random.py --kills 200 --json build/measured/kills.json
-	if [ "$$(id -u)" = 0 ]; then $(BIN)/python benchmarks/full_disk.py --disks 20; fi
+	$(BIN)/python benchmarks fuzz --inputs 100000 --seed 1 --json build/measured/fuzz.json
+	$(BIN)/python benchmarks coverage_of_intervals
+	$(BIN)/python benchmarks kill_at_random --kills 200 --json build/measured/kills.json
+	if [ "$$(id -u)" = 0 ]; then $(BIN)/python benchmarks full_disk --disks 20; fi
 
 # Faults planted in metrics, statistics, comparison and gate, one at a time: which do the tests not notice? Hours.
 mutants: $(VENV)/test
 	@mkdir -p build/measured
-	$(BIN)/python benchmarks/mutants.py --mutants 600 --json build/measured/mutants.json
+	$(BIN)/python benchmarks mutants --mutants 600 --json build/measured/mutants.json
 
 bench: $(VENV)/test
 	@mkdir -p build
 	$(BIN)/python -m pytest benchmarks --benchmark-only --benchmark-group-by=group --benchmark-columns=min,median,rounds --benchmark-json=build/bench.json
-	$(BIN)/python benchmarks/write_performance.py build/bench.json docs/performance.md
+	$(BIN)/python benchmarks write_performance build/bench.json docs/performance.md
 
 # All methods on the demo rooms, and along corridors so long that every map reaches 5 million points: on two cores three
 # quarters of an hour for the rooms and half an hour for the corridors.
 CORRIDOR_RUN := $(BIN)/su3d-bench run --profile oracle --stride 1 --no-pictures --set perception.cache=false --jobs 1
-CORRIDOR := benchmarks/corridor.py:Corridor
+CORRIDOR := benchmarks/scale/corridor.py:Corridor
 bench-methods: $(VENV)/test
 	$(BIN)/su3d-bench run --scenes $(DEMO_SCENES) --methods all --protocols rooms-semantic rooms-instance --no-pictures --out runs/bench-rooms
 	$(CORRIDOR_RUN) --scenes $(CORRIDOR)/930m --methods opensu3d conceptfusion conceptfusion-sam sam3d@incremental conceptgraphs --out runs/bench-corridor
 	$(CORRIDOR_RUN) --scenes $(CORRIDOR)/310m --methods conceptgraphs-detector --out runs/bench-corridor-detector
 	$(CORRIDOR_RUN) --scenes $(CORRIDOR)/10m $(CORRIDOR)/30m $(CORRIDOR)/100m $(CORRIDOR)/300m $(CORRIDOR)/1000m --limit 20 --set corridor.step_m=0.5 --methods openmask3d openmask3d-segment3d --out runs/bench-corridor-scans
-	$(BIN)/python benchmarks/write_performance.py build/bench.json docs/performance.md --rooms runs/bench-rooms --corridors runs/bench-corridor runs/bench-corridor-detector runs/bench-corridor-scans
+	$(BIN)/python benchmarks write_performance build/bench.json docs/performance.md --rooms runs/bench-rooms --corridors runs/bench-corridor runs/bench-corridor-detector runs/bench-corridor-scans
 
 # Learns the reference that .ci/run holds the demo run against; commit it with the change that moves the numbers. Wide
 # limits where machines differ: CI runs on whatever there is, beside whatever else runs there.

@@ -1,5 +1,8 @@
-"""Benchmarks use what tests share: the made scenes and the devices of torch."""
+"""Benchmarks use each other and what tests share."""
 
 from __future__ import annotations
 
-import shared_with_tests  # noqa: F401
+import runpy
+from pathlib import Path
+
+runpy.run_path(str(Path(__file__).parent / "measuring" / "folders.py"))

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import ast
-import importlib.util
 import random
 import subprocess
-import sys
 from pathlib import Path
 from types import ModuleType
 
 import pytest
+from benchmark_programs import benchmark_program
 from places import ROOT
 
 SOURCE = '''"""Text 1."""
@@ -29,15 +28,7 @@ def kept(values: list[int], low: int = 3) -> list[int]:
 
 @pytest.fixture(scope="module")
 def mutants() -> ModuleType:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.syspath_prepend(str(ROOT / "benchmarks"))
-        spec = importlib.util.spec_from_file_location("mutants", ROOT / "benchmarks" / "mutants.py")
-        assert spec is not None
-        assert spec.loader is not None
-        module = importlib.util.module_from_spec(spec)
-        patch.setitem(sys.modules, "mutants", module)
-        spec.loader.exec_module(module)
-        return module
+    return benchmark_program("mutants")
 
 
 def test_operators_constants_conditions_and_statements_are_mutated_and_texts_and_types_are_not(

@@ -26,7 +26,7 @@ SPREADS = 2.0  # a value may leave the taught ones by this many times their rang
 ACROSS_MACHINES = 0.02  # 2 points: what ONNX Runtime's and BLAS's kernels of other processors may move a headline value
 # Where the calibrating work itself takes so many times the reference's on the same kind of processor, others used it.
 BUSY = 1.5
-COST_LIMIT = 1.3  # an update may cost so many times the reference's; benchmarks/gate_repeats.py has the scatter of runs
+COST_LIMIT = 1.3  # an update may cost so many times the reference's; `python benchmarks gate_repeats` has the scatter
 # Settings that name what was asked for or move no number; scenes, methods and protocols are compared one by one.
 NOT_COMPARED = frozenset({"scenes", "methods", "protocols", "perception.cache"}) | MOVES_NO_NUMBER
 _SHARES = ("recall", "precision", "IoU", "F1", "F1-conceptgraphs", "mPrecision", "mF1", "mF1-conceptgraphs", "pAcc")

@@ -86,8 +86,8 @@ def jackknife_interval(
 
     With ``has_value`` (S,) scenes that have no part in the number are left aside. It is around the value itself rather
     than the mean of the pseudo-values, which covers the truth less often at few scenes
-    (benchmarks/coverage_of_intervals.py has both), and ends at ``bounds``. None for a single scene, where a scene left
-    out leaves nothing to score, and where the scenes do not differ, which tells nothing of others.
+    (``python benchmarks coverage_of_intervals`` has both), and ends at ``bounds``. None for a single scene, where a
+    scene left out leaves nothing to score, and where the scenes do not differ, which tells nothing of others.
     Source: Efron and Tibshirani, An Introduction to the Bootstrap (1993), chapter 11; the t quantile after Tukey.
 
     >>> means = np.array([0.5, 0.55, 0.5, 0.45])  # of 0.4, 0.5 and 0.6, and without each of them

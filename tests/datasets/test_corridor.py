@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from benchmark_programs import benchmark_program
 from places import ROOT
 
 from su3d_bench.core.registry import load
@@ -16,21 +16,15 @@ from su3d_bench.core.types import Float64Array, Int32Array
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.reports.pictures.timing import medians_by_size
 
-BENCHMARKS = ROOT / "benchmarks"
-
 
 def corridor(**options: float) -> Any:
-    dataset = load("dataset", f"{BENCHMARKS / 'corridor.py'}:Corridor")
+    dataset = load("dataset", f"{ROOT / 'benchmarks/scale/corridor.py'}:Corridor")
     return dataset(Path(), dataset.Options(**options))
 
 
 @pytest.fixture(scope="module")
 def write_performance() -> Any:
-    spec = importlib.util.spec_from_file_location("write_performance", BENCHMARKS / "write_performance.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    return module
+    return benchmark_program("write_performance")
 
 
 def corners_of(vertices: Any, triangles: Int32Array) -> Float64Array:

@@ -1,4 +1,4 @@
-"""Damage for every reader in the inventory; ``benchmarks/fuzz.py`` is the long mode of the same table."""
+"""Damage for every reader in the inventory; ``benchmarks/reliability/fuzz.py`` is the long mode of the same table."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def test_a_reader_meets_damage_with_nothing_but_typed_errors_soon_and_in_little_
     monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
     n = math.ceil(N_INPUTS * TARGETS[name].weight / WEIGHT)
     faults = [(index, fault) for index, fault in enumerate(faults_of(TARGETS[name], tmp_path / "sample", n)) if fault]
-    assert not faults, f"python benchmarks/fuzz.py --only '{name}' --first {faults[0][0]} --inputs 1: {faults[0][1]}"
+    assert not faults, f"python benchmarks fuzz --only '{name}' --first {faults[0][0]} --inputs 1: {faults[0][1]}"
 
 
 # What the harness itself finds

@@ -2,20 +2,15 @@
 
 from __future__ import annotations
 
-import importlib.util
 import re
-import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from benchmark_programs import benchmark_program
 from places import ROOT
 
-_spec = importlib.util.spec_from_file_location("coverage_of_intervals", ROOT / "benchmarks/coverage_of_intervals.py")
-assert _spec is not None and _spec.loader is not None
-coverage = importlib.util.module_from_spec(_spec)
-sys.modules[_spec.name] = coverage  # its dataclasses look for it there
-_spec.loader.exec_module(coverage)
+coverage = benchmark_program("coverage_of_intervals")
 
 PAGE = (ROOT / "docs" / "statistics.md").read_text(encoding="utf-8")
 

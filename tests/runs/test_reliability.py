@@ -33,7 +33,6 @@ from su3d_bench.store.atomic import filling, npz_bytes, read_npz
 from su3d_bench.store.run_folder import RunFolder
 from su3d_bench.store.scratch import TemporaryFolder
 
-KILLS = ROOT / "benchmarks" / "kill_at_random.py"
 SUBJECT = f"{SCENES}/kill_subject.py"
 SETTINGS = ("--set", "painted.n_frames=3", "--protocols", "rooms-semantic", "--no-pictures", "--jobs", "1", "--quiet")
 
@@ -62,7 +61,19 @@ def results(out: str = "out") -> dict[str, bytes]:
 
 @pytest.mark.proof
 def test_runs_killed_at_random_and_after_power_cuts_end_in_the_bytes_of_an_undisturbed_one() -> None:
-    words = [sys.executable, str(KILLS), "--kills", "5", "--seed", "3", "--executors", "inline", "--json", "found.json"]
+    words = [
+        sys.executable,
+        str(ROOT / "benchmarks"),
+        "kill_at_random",
+        "--kills",
+        "5",
+        "--seed",
+        "3",
+        "--executors",
+        "inline",
+        "--json",
+        "found.json",
+    ]
     done = subprocess.run(words, capture_output=True, text=True, timeout=300)
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads(Path("found.json").read_text())

@@ -1,4 +1,4 @@
-"""The inventory of what reads files and texts of others: tests and ``benchmarks/fuzz.py`` damage every row."""
+"""The inventory of what reads files and texts of others: tests and ``python benchmarks fuzz`` damage every row."""
 
 from __future__ import annotations
 

@@ -1,0 +1,206 @@
+"""``docs/performance.md``: a table a group of ``make bench``, what scripts measured, then whole runs.
+
+``python benchmarks write_performance build/bench.json docs/performance.md [--rooms RUN] [--corridors RUN ...]``: the
+runs are those of ``make bench-methods``; without them their sections stay as the page has them, and so does the list of
+marks, which is written by hand.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from su3d_bench.core.timing import hardware_line
+from su3d_bench.metrics.costs import (
+    MAP,
+    NOT_MAP,
+    TOTAL,
+    WARM_UP,
+    MethodSummary,
+    StageSummary,
+    UpdateTimes,
+    pooled,
+    summarise,
+)
+from su3d_bench.numerics.statistics import Growth
+from su3d_bench.reports.pictures.timing import draw_update_cost
+from su3d_bench.reports.tables.formats import aligned
+from su3d_bench.runs.finished import read_run, read_update_times
+
+HEAD = """# Performance
+
+Written by `make bench` on one machine: {hardware}.
+Times are medians; only the ratios within a table travel to another machine. No check fails because a machine was slow.
+"""
+MARKS_TITLE = "## Marks"
+ROOMS_TITLE = "## Every method on rooms"
+CORRIDORS_TITLE = "## An update against the map"
+CORRIDORS_TEXT = """
+`make bench-methods`: walks along corridors of the lengths given, perfect masks, every frame an update. The map of
+OpenMask3D is the scan, whole from the first frame on: it walks the first metres of several corridors. Milliseconds
+are medians without reading and perception, of the tenth of the updates with the smallest maps and of that with the
+largest. The exponent is that of a log-log fit against the points of the method's own map, with its 95 % interval; so
+are those of the stages that grow and take at least a twentieth of that time.
+"""
+LEAST_SHARE = 0.05  # of the time without reading and perception, for a stage to be named
+
+
+def benchmark_sections(benchmarks: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    """One a group of the ``benchmarks`` of a JSON file of pytest-benchmark, with ratios within it."""
+    groups: dict[str, list[Mapping[str, Any]]] = {}
+    for one in benchmarks:
+        groups.setdefault(str(one["group"] or one["name"]), []).append(one)
+    for name, rows in groups.items():
+        yield "\n".join([*_benchmark_table(name, rows), ""])
+
+
+def _benchmark_table(group: str, rows: Sequence[Mapping[str, Any]]) -> Iterator[str]:
+    yield f"## {group[:1].upper()}{group[1:]}\n"
+    extras = list(dict.fromkeys(key for row in rows for key in row["extra_info"]))
+    columns = ["benchmark", "median", "times the fastest", "rounds", *(key.replace("_", " ") for key in extras)]
+    yield f"| {' | '.join(columns)} |"
+    yield f"|{'---|' * len(columns)}"
+    fastest = min(row["stats"]["median"] for row in rows)
+    for row in rows:
+        median = row["stats"]["median"]
+        cells = [_words(row["name"]), _time(median), f"{median / fastest:.3g}", str(row["stats"]["rounds"])]
+        yield f"| {' | '.join([*cells, *(str(row['extra_info'].get(key, '')) for key in extras)])} |"
+
+
+def _words(name: str) -> str:
+    """``test_a_b[c]`` as ``a b, c``."""
+    base, _, parameter = name.removeprefix("test_").removesuffix("]").partition("[")
+    words = base.replace("_", " ")
+    return f"{words}, {parameter}" if parameter else words
+
+
+def _time(seconds: float) -> str:
+    """Three digits in the unit that fits: 12.3 ms."""
+    for unit, scale in (("s", 1.0), ("ms", 1e3), ("µs", 1e6)):
+        if seconds * scale >= 1:
+            return f"{seconds * scale:.3g} {unit}"
+    return f"{seconds * 1e9:.3g} ns"
+
+
+def measured_sections(folder: Path) -> Iterator[str]:
+    """One a JSON file that ``write_measured`` left in ``folder``, in the order of their names."""
+    for path in sorted(folder.glob("*.json")):
+        told = json.loads(path.read_text(encoding="utf-8"))
+        notes = [" ".join(told["notes"]), ""] if told["notes"] else []
+        lines = [f"## {told['title']}", "", f"`{told['command']}`", "", *aligned([told["columns"], *told["rows"]]), ""]
+        yield "\n".join([*lines, *notes])
+
+
+def rooms_section(run: Path) -> str:
+    """Run time and memory of every method on the scenes of a run."""
+    rows = [["method", "updates", "ms an update", "of it the map", "finish, s", "whole scene, s", "peak memory, MiB"]]
+    for times in _times(run):
+        summary = summarise(times)
+        total_s = [one.ms(TOTAL).sum() / 1e3 + one.maps[-1].finish_ms / 1e3 for one in times]
+        rows.append(
+            [
+                summary.method,
+                str(summary.n_updates),
+                *(f"{_stage(summary, name).p50:.0f}" for name in (TOTAL, MAP)),
+                f"{(summary.finish_ms or 0) / 1e3:.1f}",
+                f"{sum(total_s) / len(total_s):.0f}",
+                f"{(summary.peak_rss_bytes or 0) / 2**20:.0f}",
+            ]
+        )
+    scenes = ", ".join(read_run(run).scenes)
+    text = f"`make bench-methods`: {scenes}, embedded profile, each method's own stride, two scenes side by side. "
+    text += "Medians over updates; the slowest `finish`; memory is that of the process."
+    return "\n".join([ROOMS_TITLE, "", text, "", *aligned(rows), ""])
+
+
+def corridors_section(runs: Sequence[Path], picture: Path) -> str:
+    """How the cost of an update grows with each method's map, and its plot."""
+    every = [times for run in runs for times in _times(run)]
+    picture.write_bytes(draw_update_cost(every, WARM_UP, "png"))
+    plot = f"![Cost of an update against the points of the map]({picture.parent.name}/{picture.name})"
+    return "\n".join([CORRIDORS_TITLE, CORRIDORS_TEXT, *aligned(growth_table(every)), "", plot, ""])
+
+
+def growth_table(every: Sequence[Sequence[UpdateTimes]]) -> list[list[str]]:
+    """A row a method: how large its map became, and what an update of the smallest and the largest maps cost."""
+    head = ["method", "m", "updates", "points, from", "to", "ms, smallest tenth", "largest", "worst", "exponent", ""]
+    rows = [[*head, "stages that grow"]]
+    for times in every:
+        summary = summarise(times)
+        cost = pooled(times, MAP, WARM_UP)
+        points = np.concatenate([one.columns["n_points"][WARM_UP:] for one in times])
+        by_size = np.argsort(points, kind="stable")
+        tenth = max(1, len(cost) // 10)
+        rows.append(
+            [
+                *(summary.method, ", ".join(_length(one.scene) for one in times), str(summary.n_updates)),
+                *(f"{points.min():,.0f}", f"{points.max():,.0f}"),
+                *(f"{np.median(cost[part]):.1f}" for part in (by_size[:tenth], by_size[-tenth:])),
+                f"{cost.max():.0f}",
+                *_growth(_stage(summary, MAP).against_points),
+                _growing_stages(summary),
+            ]
+        )
+    return rows
+
+
+def _length(scene: str) -> str:
+    return scene.rpartition("/")[2].removesuffix("m")
+
+
+def _growth(growth: Growth | None) -> tuple[str, str]:
+    if growth is None:
+        return "-", ""
+    return f"{growth.exponent:.2f} [{growth.low:.2f}, {growth.high:.2f}]", growth.words
+
+
+def _growing_stages(summary: MethodSummary) -> str:
+    least = LEAST_SHARE * _stage(summary, MAP).share
+    mine = [one for one in summary.stages if one.name not in (*NOT_MAP, MAP, TOTAL) and one.share >= least]
+    grown = [(one.name, one.against_points) for one in mine if one.against_points is not None]
+    return ", ".join(f"{name} {growth.exponent:.2f}" for name, growth in grown if growth.words == "grows")
+
+
+def _times(run: Path) -> list[list[UpdateTimes]]:
+    finished = read_run(run)
+    return [found for method in finished.methods if (found := read_update_times(finished, method))]
+
+
+def _stage(summary: MethodSummary, name: str) -> StageSummary:
+    return next(one for one in summary.stages if one.name == name)
+
+
+def section_of(page: str, title: str) -> str:
+    """The section of ``page`` below the line ``title``, with it; empty where there is none."""
+    _, found, rest = f"\n{page}".partition(f"\n{title}\n")
+    section, _, _ = f"{found[1:]}{rest}".partition("\n## ")
+    return f"{section.rstrip()}\n" if found else ""
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("benchmarks", type=Path, help="JSON file of pytest-benchmark")
+    parser.add_argument("page", type=Path)
+    parser.add_argument("--measured", type=Path, default=Path("build/measured"), help="folder of scripts' JSON files")
+    parser.add_argument("--rooms", type=Path, metavar="RUN")
+    parser.add_argument("--corridors", type=Path, nargs="+", metavar="RUN")
+    asked = parser.parse_args()
+    before = asked.page.read_text(encoding="utf-8") if asked.page.exists() else ""
+    sections = [HEAD.format(hardware=hardware_line()), section_of(before, MARKS_TITLE)]
+    sections += benchmark_sections(json.loads(asked.benchmarks.read_text(encoding="utf-8"))["benchmarks"])
+    sections += measured_sections(asked.measured)
+    sections.append(rooms_section(asked.rooms) if asked.rooms else section_of(before, ROOMS_TITLE))
+    picture = asked.page.parent / "pictures" / "update-cost.png"
+    sections.append(
+        corridors_section(asked.corridors, picture) if asked.corridors else section_of(before, CORRIDORS_TITLE)
+    )
+    asked.page.write_text("\n".join(filter(None, sections)), encoding="utf-8")
+
+
+if __name__ == "__main__":
+    main()

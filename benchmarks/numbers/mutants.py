@@ -1,0 +1,258 @@
+"""Small faults planted in metrics, statistics, comparison and gate, one at a time: do the tests of the module notice?
+
+    python benchmarks mutants --mutants 600
+    python benchmarks mutants --mutants 40 --seed 3 --modules analysis/gate
+
+Every place of a module where one operator, constant, condition or statement can be another is a mutant; a sample of all
+of them is drawn by ``--seed``. Each is written into a copy of what git tracks here, and the tests of the module are run
+there until one fails. A mutant that passes them all survives. ``mutants.toml`` beside this file has the reasons of
+survivors that no test can or need kill; the exit status is 1 where a survivor has none there, or where more than
+``MOST_SURVIVE`` survive. Uncommitted changes of tracked files count.
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import os
+import queue
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import tomllib
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from folders import ROOT
+from measured import write_measured
+from planted_faults import Mutant, mutants_of, planted
+
+REASONS = Path(__file__).with_suffix(".toml")
+PACKAGE = "su3d_bench"
+MOST_SURVIVE = 0.05
+LONGEST = 10.0  # times what the tests of the module take as they are: beyond it a mutant runs for ever, and is noticed
+LEAST_S = 60.0
+
+_CURVES = ("test_metrics_instance", "test_metrics_kernels", "test_metrics_class_agnostic", "test_metrics_undefined")
+_SCORES = ("test_metrics_scoring", "test_metrics_results", "numerics/test_statistics")
+_TRANSFER = ("test_metrics_transfer", "test_metrics_neighbours", *_SCORES)
+_TEXTS = ("test_metrics_queries", "test_metrics_openlex3d")
+_QUESTIONS = ("test_annotation_protocol", "test_retrieval_protocol", "questions/test_reasoning_solver")
+_PROTOCOLS = ("test_protocols", "test_metrics_scoring", "evaluation/test_evaluate")
+# Of each module, or of all in a folder, the tests that must notice: the quick ones first. Names without a folder stand
+# in tests/metrics.
+GUARDS: dict[str, tuple[str, ...]] = {
+    "metrics/instance/": (*_CURVES, *_SCORES),
+    "metrics/semantic/": ("test_metrics_semantic", "test_metrics_undefined", "test_metrics_hovsg", *_SCORES),
+    "metrics/matching/checks.py": (*_SCORES, "evaluation/test_evaluate_checks", "evaluation/test_evaluate"),
+    "metrics/matching/kernels.py": ("opensu3d/test_device_results",),
+    "metrics/matching/labelling.py": (*_TRANSFER, "test_metrics_hovsg"),
+    "metrics/matching/": _TRANSFER,
+    "metrics/open_vocabulary/": _TEXTS,
+    "metrics/questions/": _QUESTIONS,
+    "metrics/attribution/": ("analysis/test_attribution", "analysis/test_attribution_runs"),
+    "metrics/costs.py": ("reports/test_timing_report",),
+    "metrics/fitness.py": _PROTOCOLS,
+    "metrics/protocols.py": _PROTOCOLS,
+    "metrics/protocol_files.py": _PROTOCOLS,
+    "metrics/metric.py": ("test_metrics_undefined", *_SCORES, "analysis/test_compare_pairs"),
+    "metrics/scoring.py": ("test_metrics_undefined", *_SCORES),
+    "numerics/statistics.py": (
+        "numerics/test_growth", "numerics/test_statistics", "test_metrics_undefined", "analysis/test_compare_pairs",
+        "analysis/test_compare",
+    ),
+    "analysis/comparison.py": ("analysis/test_compare_pairs", "analysis/test_compare", "analysis/test_planning"),
+    "analysis/side_numbers.py": ("analysis/test_compare_pairs", "analysis/test_compare", "analysis/test_planning"),
+    "analysis/sides.py": ("analysis/test_compare_pairs", "analysis/test_compare", "analysis/test_planning"),
+    "analysis/gate.py": ("analysis/test_gate",),
+}  # fmt: skip
+
+
+def _turn(mutant: Mutant, seed: int) -> str:
+    """Its place in the draw: a number of its own, so that other code may change and the draw is the same."""
+    return hashlib.sha256(repr((seed, *mutant.key)).encode()).hexdigest()
+
+
+def guards_of(module: str) -> tuple[str, ...]:
+    """The test files that must notice a fault in a module of the package."""
+    inside = module.removeprefix(f"{PACKAGE}/")
+    row = max((one for one in GUARDS if inside == one or (one.endswith("/") and inside.startswith(one))), key=len)
+    return tuple(f"tests/{name if '/' in name else f'metrics/{name}'}.py" for name in dict.fromkeys(GUARDS[row]))
+
+
+def modules_of(wanted: Sequence[str]) -> list[str]:
+    """The guarded modules whose path holds one of ``wanted``, or all."""
+    found = []
+    for row in GUARDS:
+        path = ROOT / PACKAGE / row
+        files = sorted(path.rglob("*.py")) if row.endswith("/") else [path]
+        found += [str(file.relative_to(ROOT)) for file in files if file.stat().st_size]
+    chosen = [module for module in dict.fromkeys(found) if not wanted or any(word in module for word in wanted)]
+    return sorted(chosen)
+
+
+# ---- copies in which the tests run
+
+
+def copy_tree(target: Path) -> None:
+    """What git tracks here, as it is on the disk, links as links."""
+    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout.decode()
+    for name in filter(None, listed.split("\0")):
+        source = ROOT / name
+        if not source.is_symlink() and not source.is_file():
+            continue
+        (target / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy2(source, target / name, follow_symlinks=False)
+
+
+class Copy:
+    """A copy of the tree in which one fault at a time is planted."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self._stamp = int(time.time())
+        copy_tree(folder)
+
+    def write(self, module: str, text: str) -> None:
+        path = self.folder / module
+        path.write_text(text, encoding="utf-8")
+        # compiled modules are told apart by size and whole seconds of this time, and mutants follow fast
+        self._stamp += 2
+        os.utime(path, (self._stamp, self._stamp))
+
+    def passes(self, tests: Sequence[str], limit_s: float) -> bool | None:
+        """Whether all ``tests`` pass; None where they take longer than ``limit_s``."""
+        options = ["-x", "-q", "-p", "no:cacheprovider", f"--basetemp={self.folder / '.tests'}"]
+        environment = os.environ | {"PYTHONPATH": str(self.folder), "HYPOTHESIS_STORAGE_DIRECTORY": os.devnull}
+        process = subprocess.Popen(
+            [sys.executable, "-m", "pytest", *options, *tests],
+            cwd=self.folder,
+            env=environment,
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+            start_new_session=True,
+        )
+        try:
+            return process.wait(timeout=limit_s) == 0
+        except subprocess.TimeoutExpired:
+            return None
+        finally:
+            if process.poll() is None:
+                os.killpg(process.pid, signal.SIGKILL)
+                process.wait()
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What became of a mutant: ``killed``, ``timed out`` (and so noticed) or ``survived``."""
+
+    mutant: Mutant
+    outcome: str
+    seconds: float
+
+
+def run_mutants(mutants: Sequence[Mutant], n_copies: int, folder: Path) -> Iterator[Verdict]:
+    """A verdict a mutant, as they come; ``RuntimeError`` where the tests fail without any fault."""
+    copies: queue.Queue[Copy] = queue.Queue()
+    for index in range(n_copies):
+        copies.put(Copy(folder / f"copy{index}"))
+    limits: dict[tuple[str, ...], float] = {}
+    first = copies.get()
+    for tests in dict.fromkeys(guards_of(mutant.module) for mutant in mutants):
+        begin = time.monotonic()
+        if not first.passes(tests, 3600.0):
+            raise RuntimeError(f"without a fault these fail: {' '.join(tests)}")
+        limits[tests] = max(LEAST_S, LONGEST * (time.monotonic() - begin))
+    copies.put(first)
+
+    def judge(mutant: Mutant) -> Verdict:
+        copy, begin = copies.get(), time.monotonic()
+        source = (ROOT / mutant.module).read_text(encoding="utf-8")
+        tests = guards_of(mutant.module)
+        try:
+            copy.write(mutant.module, planted(source, mutant))
+            passed = copy.passes(tests, limits[tests])
+        finally:
+            copy.write(mutant.module, source)
+            copies.put(copy)
+        outcome = "timed out" if passed is None else "survived" if passed else "killed"
+        return Verdict(mutant, outcome, time.monotonic() - begin)
+
+    with ThreadPoolExecutor(n_copies) as threads:
+        yield from threads.map(judge, mutants)
+
+
+# ---- reasons and report
+
+
+def read_reasons(path: Path) -> dict[tuple[str, str, str, str], str]:
+    """Why a survivor may survive, by its key."""
+    if not path.is_file():
+        return {}
+    rows = tomllib.loads(path.read_text(encoding="utf-8")).get("survivor", [])
+    return {(row["module"], row["where"], row["before"], row["after"]): row["why"] for row in rows}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--mutants", type=int, default=600, help="how many are drawn from all")
+    parser.add_argument("--seed", type=int, default=0, help="of the drawing")
+    parser.add_argument("--modules", nargs="+", default=[], help="only modules whose path holds one of these")
+    parser.add_argument("--copies", type=int, default=os.cpu_count() or 1, help="how many are judged at a time")
+    parser.add_argument("--json", type=Path, help="where the table is written")
+    parser.add_argument("--list", action="store_true", help="print the drawn mutants and stop")
+    arguments = parser.parse_args()
+    every = [
+        mutant
+        for module in modules_of(arguments.modules)
+        for mutant in mutants_of(module, (ROOT / module).read_text(encoding="utf-8"))
+    ]
+    drawn = sorted(every, key=lambda mutant: _turn(mutant, arguments.seed))[: arguments.mutants]
+    print(
+        f"{len(drawn)} of {len(every)} mutants of {len(modules_of(arguments.modules))} modules, seed {arguments.seed}"
+    )
+    if arguments.list:
+        print(*drawn, sep="\n")
+        return 0
+    verdicts = []
+    with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
+        for verdict in run_mutants(drawn, arguments.copies, Path(folder)):
+            verdicts.append(verdict)
+            if verdict.outcome != "killed":
+                print(f"{verdict.outcome}: {verdict.mutant}", flush=True)
+    return report(verdicts, arguments)
+
+
+def report(verdicts: Sequence[Verdict], arguments: argparse.Namespace) -> int:
+    """Print what survived and why it may; 1 where it may not."""
+    reasons = read_reasons(REASONS)
+    survivors = [verdict.mutant for verdict in verdicts if verdict.outcome == "survived"]
+    unexplained = [mutant for mutant in survivors if mutant.key not in reasons]
+    share = len(survivors) / max(1, len(verdicts))
+    print(f"\n{len(survivors)} of {len(verdicts)} survived ({100 * share:.1f} %; {100 * MOST_SURVIVE:g} % may)")
+    for mutant in survivors:
+        print(f"  {mutant}\n      {reasons.get(mutant.key, 'NO REASON in benchmarks/numbers/mutants.toml')}")
+    if arguments.json:
+        rows: list[list[str]] = []
+        for module in dict.fromkeys(sorted(verdict.mutant.module for verdict in verdicts)):
+            own = [verdict.outcome for verdict in verdicts if verdict.mutant.module == module]
+            counts = [own.count(outcome) for outcome in ("killed", "timed out", "survived")]
+            rows.append([module, str(len(own)), *map(str, counts)])
+        command = f"python benchmarks mutants --mutants {arguments.mutants} --seed {arguments.seed}"
+        notes = [
+            f"`{mutant.module}`, `{mutant.where}`: `{mutant.before}` as `{mutant.after}`: "
+            f"{reasons.get(mutant.key, 'no reason given')}"
+            for mutant in survivors
+        ]
+        columns = ("module", "mutants", "killed", "timed out", "survived")
+        write_measured(arguments.json, "Planted faults", command, columns, rows, notes)
+    return int(bool(unexplained) or share > MOST_SURVIVE)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,146 @@
+"""Runs of the command as forked processes, for scripts that disturb them, and what their folders hold afterwards.
+
+Each run is a process forked from one that has its modules loaded, so that what strikes it strikes the work, not the
+start.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+import json
+import os
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from folders import ROOT
+
+SCENES = ROOT / "tests/support/scenes"
+METHODS = ("opensu3d", "sam3d", "conceptfusion")
+RUN = ("run", "--protocols", "rooms-semantic", "rooms-instance", "--anytime", "0.5", "--no-pictures", "--quiet")
+SUBJECTS = {
+    "light": (
+        *RUN, "--scenes", *(f"{SCENES}/kill_subject.py:Painted/{scene}" for scene in "abc"),
+        "--methods", f"{SCENES}/painted.py:Collector", f"{SCENES}/kill_subject.py:Dense",
+        "--set", "painted.n_frames=4", "painted.frame_ms=10.0", "collector.noise_m=0.01",
+    ),
+    "opensu3d": (
+        *RUN, "--scenes", *(f"{SCENES}/painted.py:Painted/{scene}" for scene in "ab"),
+        "--methods", *METHODS, "--profile", "oracle",
+        "--set", "painted.n_frames=4", *(f"{name}.stride=1" for name in METHODS),
+    ),
+}  # fmt: skip
+EXECUTORS = {
+    "inline": ("--jobs", "1"),
+    "processes": ("--jobs", "2"),
+    "ray": ("--executor", "ray", "--jobs", "2"),
+}
+TIMES = ("_ms", "rss_bytes")
+COMPLETE, INCOMPLETE = 0, 3  # exit codes of the command
+
+
+class Run:
+    """One run of the command in a process group of its own."""
+
+    def __init__(self, folder: Path, request: Sequence[str], log: Path | None = None) -> None:
+        self._log = log or folder.with_suffix(".log")
+        words = [*request, "--out", str(folder)]
+        self.started = time.monotonic()
+        self.pid = os.fork()
+        if self.pid == 0:
+            self._be_the_command(words)
+
+    def _be_the_command(self, words: list[str]) -> None:
+        code = 4
+        try:
+            os.setsid()
+            log = os.open(self._log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
+            os.dup2(log, 1)
+            os.dup2(log, 2)
+            from su3d_bench.cli.main import main
+
+            code = main(words)
+            sys.stdout.flush()
+            sys.stderr.flush()
+        finally:
+            os._exit(code)
+
+    def finish(self) -> int:
+        """The exit code; minus the signal where one ended it."""
+        _, status = os.waitpid(self.pid, 0)
+        return os.waitstatus_to_exitcode(status)
+
+    def has_ended(self) -> bool:
+        """Whether it is over; its exit code can still be had."""
+        return os.waitid(os.P_PID, self.pid, os.WEXITED | os.WNOHANG | os.WNOWAIT) is not None
+
+    def said(self) -> str:
+        return self._log.read_text(errors="replace")[-2000:]
+
+
+def outcome(folder: Path) -> dict[str, Any]:
+    """What every file of a run folder holds, without what a clock or a meter put there."""
+    return {
+        path.relative_to(folder).as_posix(): _timeless(path) for path in sorted(folder.rglob("*")) if path.is_file()
+    }
+
+
+def _timeless(path: Path) -> Any:
+    content = path.read_bytes()
+    if path.name == "updates.csv":
+        rows = list(csv.DictReader(io.StringIO(content.decode())))
+        return [{name: value for name, value in row.items() if not name.endswith(TIMES)} for row in rows]
+    if path.name == "done.json":
+        record = json.loads(content)
+        for step in record["steps"].values():
+            step["files"].pop("updates.csv", None)
+            step["remarks"].pop("costs", None)
+        return record
+    return content
+
+
+def false_seals(folder: Path, expected: dict[str, Any]) -> list[str]:
+    """Files that a seal vouches for, or a reader takes for a finished run, though they are not those of a whole run."""
+    from su3d_bench.core.digests import digest_file
+    from su3d_bench.core.errors import Su3dError
+    from su3d_bench.runs.finished import read_run
+    from su3d_bench.store.run_folder import JobFolder
+
+    wrong = []
+    for done in folder.rglob("done.json"):
+        for seal in JobFolder(done.parent).seals().values():
+            files = {done.parent / name: sha for name, sha in seal.files.items()}
+            if all(path.is_file() and digest_file(path) == sha for path, sha in files.items()):
+                names = [path.relative_to(folder).as_posix() for path in files]
+                wrong += [name for name in names if _timeless(folder / name) != expected.get(name)]
+    with contextlib.suppress(Su3dError):
+        run = read_run(folder)
+        if run.is_incomplete:
+            return wrong
+        for method in run.methods:
+            run.scores(method)
+        present = outcome(folder)
+        wrong += [f"{name} of a run that reads as finished" for name in expected if present.get(name) != expected[name]]
+    return wrong
+
+
+def load_modules(subject: str) -> None:
+    """What a run imports, in this one process, which must stay without threads of its own."""
+    from su3d_bench.runs.executors.local import limit_threads
+
+    limit_threads()
+    import su3d_bench.cli.main
+    import su3d_bench.reports.tables.run
+    import su3d_bench.runs.plan
+    import su3d_bench.runs.runner
+
+    if subject == "opensu3d":
+        import sklearn.cluster  # noqa: F401
+
+        import su3d_bench.baselines.conceptfusion.method
+        import su3d_bench.baselines.sam3d.method
+        import su3d_bench.opensu3d.pipeline  # noqa: F401

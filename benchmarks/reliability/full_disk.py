@@ -1,0 +1,133 @@
+"""Runs on disks that are full or read-only, real ones: small file systems in memory. Needs root, for mount.
+
+    python benchmarks full_disk --disks 20
+
+The light run of ``kill_at_random.py`` writes to a disk of a size drawn at random below what it needs, with its cache
+there or elsewhere, or to a disk that turns read-only at a random moment. It must end with one line that says so, no
+traceback and nothing half-written that is vouched for; once the disk is larger, or can be written, the same command
+must end in the bytes of the run that met no fault.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import random
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+from forked_runs import COMPLETE, EXECUTORS, SUBJECTS, Run, false_seals, load_modules, outcome
+from measured import write_measured
+
+REQUEST = (*SUBJECTS["light"], *EXECUTORS["inline"])
+ENOUGH = "size=64m"
+WRONG_INPUT = 2  # exit code of the command: nothing that it could do
+KINDS = {
+    "run folder on a full disk": "the disk is full; free some space",
+    "cache on a full disk": "the perception cache cannot be written (No space left on device)",
+    "disk that turns read-only": "the folder is read-only; choose another with --out",
+}
+
+
+@contextmanager
+def disk(at: Path, options: str) -> Iterator[None]:
+    """A file system in memory at ``at``."""
+    at.mkdir()
+    subprocess.run(["mount", "-t", "tmpfs", "-o", options, "su3d-full-disk", str(at)], check=True)
+    try:
+        yield
+    finally:
+        subprocess.run(["umount", str(at)], check=True)
+        at.rmdir()
+
+
+def remount(at: Path, options: str) -> None:
+    subprocess.run(["mount", "-o", f"remount,{options}", str(at)], check=True)
+
+
+def used_kib(folder: Path) -> int:
+    return sum(-(-path.stat().st_size // 4096) * 4 for path in folder.rglob("*"))
+
+
+class Trials:
+    """Runs of each kind, against the undisturbed one."""
+
+    def __init__(self, scratch: Path, moments: random.Random) -> None:
+        self._scratch, self._moments = scratch, moments
+        os.environ["SU3D_CACHE"] = str(scratch / "whole-cache")
+        whole = Run(scratch / "whole", REQUEST)
+        if whole.finish() != COMPLETE:
+            raise SystemExit(f"the undisturbed run failed: {whole.said()}")
+        self._whole_s = time.monotonic() - whole.started
+        self._expected = outcome(scratch / "whole")
+        self._needs_kib = {"run": used_kib(scratch / "whole"), "cache": used_kib(scratch / "whole-cache")}
+
+    def one(self, kind: str, number: int) -> tuple[bool, list[str]]:
+        """Whether the fault was met, and what was wrong with how it ended."""
+        at = self._scratch / f"disk{number}"
+        cache = at / "cache" if kind.startswith("cache") else self._scratch / f"cache{number}"
+        folder = self._scratch / f"run{number}" if kind.startswith("cache") else at / "run"
+        os.environ["SU3D_CACHE"] = str(cache)
+        # Half: a file system in memory counts no folders, and each entry has one.
+        needed = self._needs_kib["cache"] // 2 if kind.startswith("cache") else self._needs_kib["run"]
+        small = f"size={self._moments.randrange(4, needed, 4)}k" if "full" in kind else ENOUGH
+        with disk(at, small):
+            run = Run(folder, REQUEST, self._scratch / f"log{number}")
+            if "read-only" in kind:
+                time.sleep(self._moments.uniform(0, self._whole_s))
+                # An open file keeps a disk from turning read-only: between two writes it works.
+                while subprocess.run(["mount", "-o", "remount,ro", str(at)], capture_output=True).returncode:
+                    time.sleep(0.001)
+            code = run.finish()
+            remount(at, f"rw,{ENOUGH}")
+            if code == COMPLETE:
+                return False, []
+            wrong = self._wrong_end(kind, folder, code, run.said())
+            again = Run(folder, REQUEST, self._scratch / f"log{number}")
+            if again.finish() != COMPLETE:
+                return True, [*wrong, f"does not go on: {again.said()}"]
+            found = outcome(folder)
+            names = [
+                name for name in found.keys() | self._expected.keys() if found.get(name) != self._expected.get(name)
+            ]
+            return True, [*wrong, *(f"{name} differs" for name in names)]
+
+    def _wrong_end(self, kind: str, folder: Path, code: int, said: str) -> list[str]:
+        wrong = [f"{name} is vouched for" for name in false_seals(folder, self._expected)] if folder.is_dir() else []
+        lines = [line for line in said.splitlines() if line.startswith("su3d-bench: ")]
+        if code != WRONG_INPUT or len(lines) != 1 or KINDS[kind] not in lines[0] or "Traceback" in said:
+            wrong.append(f"ended with {code}: {said}")
+        return wrong
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--disks", type=int, default=20, help="of each kind (default: 20)")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write the table there too")
+    given = parser.parse_args(arguments)
+    load_modules("light")
+    rows = []
+    with tempfile.TemporaryDirectory(prefix="su3d-disks-") as scratch:
+        trials = Trials(Path(scratch), random.Random(given.seed))
+        for k, kind in enumerate(KINDS):
+            ends = [trials.one(kind, k * given.disks + number) for number in range(given.disks)]
+            faults = [line for _, wrong in ends for line in wrong]
+            for line in faults:
+                print(f"FAULT {kind}: {line}")
+            rows.append([kind, str(given.disks), str(sum(met for met, _ in ends)), str(len(faults))])
+            print("{}: {} runs, {} met it, {} faults".format(*rows[-1]), flush=True)
+    if given.json is not None:
+        command = f"python benchmarks full_disk --disks {given.disks}"
+        notes = ["The others were over before the disk was full or read-only."]
+        write_measured(given.json, "Disks that refuse", command, ["kind", "runs", "met it", "faults"], rows, notes)
+    return 1 if any(row[-1] != "0" for row in rows) else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

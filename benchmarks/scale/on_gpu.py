@@ -1,0 +1,277 @@
+"""Results on a GPU beside those of the CPU: matching, similarity, every kind of model, a run; differences and times.
+
+    python benchmarks on_gpu --json build/measured/on_gpu.json
+    python benchmarks on_gpu --device cpu --points 500000
+
+Some three minutes on a machine with a GPU; without one it ends at once, in one line, with code 2. ``--device cpu`` has
+torch compute on the CPU, so that all but the GPU itself is tried. Models have the tests' small configurations and
+random weights; ``paper_profile_speed.py --device cuda`` has the full sizes. The code is 1 where a difference is larger
+than its tolerance. Times are the best of five, arrays of the host to arrays of the host.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import copy
+import io
+import json
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from measured import write_measured
+from numpy.typing import NDArray
+from tiny_encoders import noise_images, write_tiny_clip
+from tiny_models import DINO_PX, SAM_PX, blocks, tiny_dino, tiny_sam, tiny_tokenizer
+from torch_devices import TORCH_ON_CPU
+
+from su3d_bench.cli.main import main as command_line
+from su3d_bench.core.devices import device_for, make_deterministic
+from su3d_bench.core.errors import ConfigError, ModelMissing
+from su3d_bench.core.timing import Timer, synchronise_device
+from su3d_bench.metrics.matching.labelling import cosines, most_similar
+from su3d_bench.opensu3d.config import OpenSU3DConfig
+from su3d_bench.opensu3d.pipeline import OpenSU3D
+from su3d_bench.perception.embedded.encoder import EmbeddedEncoder
+from su3d_bench.perception.models.config import ModelsConfig
+from su3d_bench.perception.models.encoders.towers_onnx import export_encoder
+from su3d_bench.perception.models.files import locate
+from su3d_bench.perception.models.loading import load_encoder
+from su3d_bench.perception.models.masks.grounding_dino import GroundingDino
+from su3d_bench.perception.models.masks.sam import Sam, TorchSam
+
+REPEATS = 5
+CLIP = "clip-vit-h-14"
+TEXTS = ("a chair in a scene", "the lamp", "tv screen", "a red cup on the table")
+Arrays = Iterable[NDArray[Any]]
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """``on(device)`` gives the work there; ``tolerance`` bounds the largest difference, or the share that differs."""
+
+    what: str
+    on: Callable[[str], Callable[[], Arrays]]
+    tolerance: float
+    is_share: bool = False
+    repeats: int = REPEATS
+
+
+def difference(one: Comparison, here: Arrays, there: Arrays) -> float:
+    """The largest difference of any entry, or the largest share of entries that differ."""
+    found = 0.0
+    for a, b in zip(here, there, strict=True):
+        if a.shape != b.shape:
+            return float("inf")
+        if one.is_share:
+            found = max(found, float((a != b).mean()) if a.size else 0.0)
+        else:
+            found = max(found, float(np.abs(a.astype(np.float64) - b.astype(np.float64)).max(initial=0.0)))
+    return found
+
+
+def measured(work: Callable[[], Arrays], repeats: int) -> tuple[Arrays, float]:
+    """What ``work`` gives, and its best time in milliseconds after one run that does not count."""
+    best = float("inf")
+    for k in range(repeats + 1):
+        synchronise_device()
+        start = time.perf_counter()
+        found = work()
+        synchronise_device()
+        if k or not repeats:
+            best = min(best, time.perf_counter() - start)
+    return found, best * 1e3
+
+
+def maps(n_points: int) -> Iterator[Comparison]:
+    """A view of 204,000 points against a map, and what that map is after it took the view in."""
+    from bench_association import EPS, case
+    from bench_update import every_second_pixel, filled
+    from wall import view
+
+    scene, frame = case(n_points).scene, case(n_points).frame
+
+    def match(device: str) -> Callable[[], Arrays]:
+        method = OpenSU3D(OpenSU3DConfig(eps=EPS, density="all"))
+        method.receive_device(device)
+        for part in np.array_split(scene, max(1, n_points // 1_000_000)):
+            method._map.insert(part, np.ones(len(part), np.int32))
+        return lambda: (method._map.nearest(frame),)
+
+    def update(device: str) -> Callable[[], Arrays]:
+        method = OpenSU3D(OpenSU3DConfig(frame_voxel=0.0))
+        method.receive_device(device)
+        filled(method, n_points)
+        seen, detections = every_second_pixel(*view())
+
+        def work() -> Arrays:
+            method.update(seen, detections, Timer())
+            return contents_of(method)
+
+        return work
+
+    yield Comparison(f"match 204,000 points against {n_points:,}", match, 0.0, is_share=True)
+    yield Comparison(f"update of a map of {n_points:,} points", update, 0.0, is_share=True)
+
+
+def contents_of(method: OpenSU3D) -> Iterator[NDArray[Any]]:
+    """The map, taken from the device when it is compared."""
+    yield np.array([method.n_instances])
+    yield method._map.points
+    yield method._map.ids
+
+
+def similarities() -> Iterator[Comparison]:
+    """Labels of points, and cosines of units and prompts."""
+    rng = np.random.default_rng(0)
+    features = rng.normal(size=(100_000, 512)).astype(np.float32)
+    text = rng.normal(size=(200, 512)).astype(np.float32)
+
+    yield Comparison(
+        "labels of 100,000 x 512 among 200", lambda device: lambda: (most_similar(features, text, device),), 0.0, True
+    )
+    yield Comparison(
+        "cosines of 8,192 x 512 with 200",
+        lambda device: lambda: (cosines(features[:8192], text, device),),
+        1e-12,
+    )
+
+
+def encoders(folder: Path) -> Iterator[Comparison]:
+    """The embedded encoder, and a small CLIP by torch in two precisions and by ONNX Runtime."""
+    images = noise_images(32)
+
+    def embedded(device: str) -> Callable[[], Arrays]:
+        encoder = EmbeddedEncoder(device=device)
+        return lambda: (encoder.encode_images(images), encoder.encode_texts(TEXTS))
+
+    write_tiny_clip(folder / CLIP)
+    export_encoder(locate(CLIP, ("transformers",), folder=folder), folder / f"{CLIP}-onnx")
+
+    def clip(**settings: Any) -> Callable[[str], Callable[[], Arrays]]:
+        def on(device: str) -> Callable[[], Arrays]:
+            place = {"device": "cpu" if device.startswith("cpu") else device}
+            if device == "cpu":  # what all are compared with
+                place["precision"] = "float32"
+            config = ModelsConfig(encoder=CLIP, folder=folder, **(settings | place))
+            return lambda: (load_encoder(config).encode_images(images), load_encoder(config).encode_texts(TEXTS))
+
+        return on
+
+    yield Comparison("embedded encoder, 32 images", embedded, 1e-4)
+    yield Comparison("CLIP by torch, float32, 32 images", clip(precision="float32"), 1e-4)
+    yield Comparison("CLIP by torch, float16 (the CPU: float32), 32 images", clip(precision="float16"), 2e-2)
+    yield Comparison("CLIP by ONNX Runtime, 32 images", clip(runtime="onnx"), 1e-4)
+
+
+def networks(folder: Path) -> Iterator[Comparison]:
+    """SAM's masks of boxes and GroundingDINO's probabilities and boxes."""
+    rgb = blocks(60, 100)
+    boxes = np.array([[5, 5, 60, 50], [0, 0, 100, 60], [40, 10, 90, 40]], np.float32)
+    tokenizer = tiny_tokenizer(folder)
+
+    def sam(device: str) -> Callable[[], Arrays]:
+        segmenter = Sam(TorchSam(copy.deepcopy(tiny_sam()).to(device)))
+        return lambda: (segmenter.from_boxes(segmenter.look(rgb), boxes, is_single=False)[0],)
+
+    def dino(device: str) -> Callable[[], Arrays]:
+        detector = GroundingDino(copy.deepcopy(tiny_dino()).to(device), tokenizer, *DINO_PX)
+        pixels = detector.pixels(rgb)
+        return lambda: detector.answer(pixels, "cat. coffee table. lamp.")[:2]
+
+    yield Comparison(f"SAM ({SAM_PX} px) by torch, masks of 3 boxes", sam, 0.01, is_share=True)
+    yield Comparison("GroundingDINO by torch, probabilities and boxes", dino, 1e-3)
+
+
+def runs(folder: Path) -> Iterator[Comparison]:
+    """Metrics of a whole run of five updates, by the command line."""
+
+    def run(device: str) -> Callable[[], Arrays]:
+        name = "cpu" if device.startswith("cpu") else device
+        words = ["run", "--scenes", "rooms/living0", "--limit", "5", "--no-pictures", "--jobs", "1", "--json"]
+        words += ["--device", name, "--set", "perception.cache=false", "--quiet"]
+
+        def work() -> Arrays:
+            said = io.StringIO()
+            with contextlib.redirect_stdout(said), tempfile.TemporaryDirectory(dir=folder) as out:
+                if command_line([*words, "--out", f"{out}/run"]) != 0:
+                    raise SystemExit(f"su3d-bench {' '.join(words)}: failed")
+            return (np.array(list(numbers(json.loads(said.getvalue())))),)
+
+        return work
+
+    yield Comparison("run: rooms/living0, 5 updates, all metrics", run, 1e-3, repeats=0)
+
+
+def numbers(content: Any) -> Iterator[float]:
+    """Every number in JSON, in its order, but times."""
+    if isinstance(content, dict):
+        for key, value in content.items():
+            if not key.endswith(("_ms", "_s", "_bytes")):
+                yield from numbers(value)
+    elif isinstance(content, list):
+        for value in content:
+            yield from numbers(value)
+    elif isinstance(content, int | float):
+        yield float(content)
+
+
+def compare(one: Comparison, device: str) -> tuple[list[str], bool]:
+    """A row of the table, and whether the difference is within its tolerance."""
+    here, here_ms = measured(one.on("cpu"), one.repeats)
+    try:
+        there, there_ms = measured(one.on(device), one.repeats)
+    except ModelMissing as error:
+        return [one.what, f"{here_ms:.1f} ms", "not run", "-", str(error)], True
+    found = difference(one, here, there)
+    kind = " of entries" if one.is_share else ""
+    row = [one.what, f"{here_ms:.1f} ms", f"{there_ms:.1f} ms", f"{found:.1e}{kind}", f"{one.tolerance:g}{kind}"]
+    return row, found <= one.tolerance
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--device", default="cuda:0", help="cuda:0, another GPU, or cpu: torch on the CPU")
+    parser.add_argument("--points", type=int, nargs="+", default=[500_000, 5_000_000, 10_000_000], help="of the maps")
+    parser.add_argument("--json", type=Path, help="write the table for docs/performance.md")
+    arguments = parser.parse_args()
+    try:
+        device = device_for(arguments.device, 0)
+    except (ConfigError, ModelMissing) as error:
+        print(f"on_gpu.py: {error}", file=sys.stderr)
+        return 2
+    import torch
+
+    where = f"torch on the CPU, {torch.get_num_threads()} threads" if device == "cpu" else torch.cuda.get_device_name()
+    make_deterministic(device)
+    rows: list[list[str]] = []
+    is_within = True
+    with tempfile.TemporaryDirectory(prefix="on-gpu-") as name:
+        folder = Path(name)
+        parts: Sequence[Iterator[Comparison]] = (
+            *map(maps, arguments.points), similarities(), encoders(folder), networks(folder), runs(folder)
+        )  # fmt: skip
+        for one in (each for part in parts for each in part):
+            row, is_good = compare(one, TORCH_ON_CPU if device == "cpu" else device)
+            is_within &= is_good
+            rows.append(row)
+            print("  ".join(row), "" if is_good else "  TOO LARGE", flush=True)
+    if arguments.json:
+        columns = ["what", "CPU", where, "largest difference", "tolerance"]
+        notes = [f"torch {torch.__version__}. RAM++ is not among the models: its architecture is in its own package."]
+        title, words = "On a GPU, beside the CPU", "python benchmarks on_gpu"
+        if device == "cpu":
+            title, words = "Torch beside the CPU's own path, without a GPU", f"{words} --device cpu"
+            notes.append("No GPU was at hand: this shows that the results are the same, and no speed of a device.")
+        write_measured(arguments.json, title, words, columns, rows, notes)
+    return 0 if is_within else 1
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,151 @@
+"""How large the page of 20 scenes under 8 methods is, and how long a browser takes to open it.
+
+``python benchmarks page_opening [RUN] [--opens 5] [--json build/measured/page_opening.json]``: the maps, tables and
+times of a finished run (default: ``runs/demo``) stand for those of other scenes and methods, thinned as such a page
+thins them, so that the page has the size and the tables of a real one. Chromium opens it as a file, each time with an
+empty profile, without a graphics card. Milliseconds from the start of the navigation: first paint; usable: the summary
+stands and every control answers; whole: all sections are made; loaded: the last map is parsed; first map: it is drawn,
+after the view was scrolled to. Exit code 1 where the page has 30 MB or more, or is not loaded and whole within 3 s.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import sys
+import tempfile
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from measured import write_measured
+
+from su3d_bench.analysis.page_maps import QUERIES, page_scenes, points_of_each
+from su3d_bench.analysis.page_numbers import page_numbers, scored_maps
+from su3d_bench.reports.page.page import page_html
+from su3d_bench.runs.executors.local import limit_threads
+
+N_SCENES, N_METHODS = 20, 8
+MOST_BYTES, MOST_MS = 30_000_000, 3000.0
+METHODS = [f"method{k}" for k in range(N_METHODS)]
+SCENES = [f"rooms/room{k}" for k in range(N_SCENES)]
+NOTE = (
+    "Processor time: what the page's process took until it was whole, whatever else the machine did. "
+    "Usable: the summary stands and every control answers. Whole: all sections are made. Loaded: the last map is "
+    "parsed. First map: it is drawn, from the moment at which the view is scrolled to."
+)
+TIMES = """(() => {
+  const page = performance.getEntriesByType('navigation')[0], marks = performance.getEntriesByType('mark');
+  const paint = performance.getEntriesByName('first-contentful-paint')[0];
+  const mark = (name) => marks.find((one) => one.name === name)?.startTime;
+  return { 'first paint': paint?.startTime, usable: mark('su3d-usable'), whole: mark('su3d-whole'),
+    loaded: page.loadEventEnd };
+})()"""
+FIRST_MAP = "document.querySelector('#maps .say').hidden && document.querySelectorAll('#maps .side tbody tr').length"
+
+
+def simulated_page(run: Path) -> str:
+    """The page of a run as if it had ``N_SCENES`` scenes and ``N_METHODS`` methods."""
+    most_points = points_of_each(N_SCENES * N_METHODS, MOST_BYTES)
+    made = [one for one in page_scenes(scored_maps([run]), QUERIES, most_points) if one.maps]
+    numbers = page_numbers([run])
+    numbers["runs"][0] |= {"scenes": SCENES, "methods": METHODS}
+    for key in ("results", "confusions", "errors", "timing"):
+        numbers[key] = list(_of_all_methods(numbers[key]))
+    numbers["comparisons"] = _comparisons(numbers["comparisons"])
+    drawn = [(scene, made[k % len(made)]) for k, scene in enumerate(SCENES)]
+    contents = [scene.maps[j % len(scene.maps)].content for _, scene in drawn for j in range(N_METHODS)]
+    listed = [{"run": 0, "scene": name, "method": method, "reason": None} for name in SCENES for method in METHODS]
+    scenes = [{**scene.listed(), "scene": name} for name, scene in drawn]
+    return page_html(f"{N_SCENES} scenes x {N_METHODS} methods", {**numbers, "maps": listed}, scenes, contents)
+
+
+def _of_all_methods(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The rows of the first method under the names of all, their scenes under those of all."""
+    first = rows[0]["method"] if rows else None
+    return [_renamed(row, method) for row in rows if row["method"] == first for method in METHODS]
+
+
+def _renamed(row: Mapping[str, Any], method: str) -> dict[str, Any]:
+    made = copy.deepcopy({**row, "method": method})
+    if made.get("result"):
+        made["n_planned"] = N_SCENES
+        made["result"] |= {"scenes": SCENES, "per_scene": _spread(made["result"]["per_scene"])}
+    if "series" in made:
+        made |= {"scenes": SCENES, "series": _spread(made["series"])}
+    return made
+
+
+def _spread(values: Mapping[str, Any]) -> dict[str, Any]:
+    known = list(values.values())
+    return {scene: known[k % len(known)] for k, scene in enumerate(SCENES)}
+
+
+def _comparisons(known: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """All pairs of methods, each with the differences of the first pair that is known."""
+    whole = next((one for one in known if one["protocols"]), None)
+    if whole is None:
+        return []
+    pairs = [(a, b) for k, a in enumerate(METHODS) for b in METHODS[k + 1 :]]
+    made = [copy.deepcopy({**whole, "left": [0, a], "right": [0, b]}) for a, b in pairs]
+    for one in made:
+        for protocol in one["protocols"]:
+            protocol["scenes"] = SCENES
+            for difference in protocol["metrics"].values():
+                difference["per_scene"] = _spread(difference["per_scene"])
+    return made
+
+
+def opened(page: Path) -> dict[str, float]:
+    """Milliseconds of one opening."""
+    import chromium
+
+    chromium.FLAGS = (*chromium.FLAGS, "--use-angle=swiftshader", "--enable-unsafe-swiftshader")
+    with tempfile.TemporaryDirectory() as folder, chromium.Chromium(Path(folder), width=1440, height=900) as browser:
+        browser.call("Performance.enable")
+        browser.open(page)
+        browser.until("!document.querySelector('#main[aria-busy]')")
+        found: dict[str, float] = browser.run(TIMES)
+        counters = {one["name"]: one["value"] for one in browser.call("Performance.getMetrics")["metrics"]}
+        found["processor time"] = 1000 * counters["ProcessTime"]
+        start = time.perf_counter()
+        browser.run("document.getElementById('maps').scrollIntoView()")
+        browser.until(FIRST_MAP)
+        return {**found, "first map": 1000 * (time.perf_counter() - start)}
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("run", nargs="?", type=Path, default=Path("runs/demo"), help="(default: runs/demo)")
+    parser.add_argument("--opens", type=int, default=5, help="how often it is opened (default: 5)")
+    parser.add_argument("--out", type=Path, help="keep the page there")
+    parser.add_argument("--json", type=Path, help="write what was measured there")
+    arguments = parser.parse_args()
+    limit_threads()
+    with tempfile.TemporaryDirectory() as folder:
+        page = arguments.out or Path(folder) / "page.html"
+        page.write_text(simulated_page(arguments.run), encoding="utf-8")
+        n_bytes = page.stat().st_size
+        print(f"{N_SCENES} scenes x {N_METHODS} methods: {n_bytes / 1e6:.1f} MB")
+        rows = [opened(page) for _ in range(arguments.opens)]
+    table = []
+    for name in rows[0]:
+        values = np.array([row[name] for row in rows])
+        table.append([name, f"{np.median(values):.0f} ms", f"{values.max():.0f} ms"])
+        print(f"{name}: median {table[-1][1]}, worst {table[-1][2]}")
+    if arguments.json is not None:
+        title = f"The page of {N_SCENES} scenes under {N_METHODS} methods, {n_bytes / 1e6:.1f} MB, opened in Chromium"
+        notes = [
+            f"{arguments.opens} openings as a file, each with an empty profile, drawn without a graphics card.",
+            NOTE,
+        ]
+        command = "python benchmarks page_opening runs/demo"
+        write_measured(arguments.json, title, command, ["from the start", "median", "worst"], table, notes)
+    worst = max(max(row["loaded"], row["whole"]) for row in rows)
+    return int(n_bytes >= MOST_BYTES or worst >= MOST_MS)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
