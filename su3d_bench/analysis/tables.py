@@ -19,8 +19,8 @@ from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.model import BY_PEOPLE, Measured, Origin, is_count
 from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.runs.finished import FinishedRun, read_run
-from su3d_bench.sheets.scores import FILE as SCORES_FILE
-from su3d_bench.sheets.scores import LABEL_METRICS, ScoreCell, Scores, read_scores
+from su3d_bench.sheets.judging.scores import FILE as SCORES_FILE
+from su3d_bench.sheets.judging.scores import LABEL_METRICS, ScoreCell, Scores, read_scores
 from su3d_bench.store.atomic import is_file
 from su3d_bench.store.records import NumbersRecord, ResultRecord
 

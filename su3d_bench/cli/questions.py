@@ -195,7 +195,7 @@ def _audit(arguments: argparse.Namespace) -> int:
 
 
 def _score(arguments: argparse.Namespace) -> int:
-    from su3d_bench.sheets.audit_scores import audit_json, audit_table, read_verdicts
+    from su3d_bench.sheets.judging.audit_scores import audit_json, audit_table, read_verdicts
 
     verdicts = read_verdicts(arguments.score)
     table = audit_table(verdicts)

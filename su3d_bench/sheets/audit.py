@@ -19,9 +19,9 @@ from su3d_bench.reports.pictures.items import owners_in_frame, png_bytes
 from su3d_bench.reports.pictures.tiles import Line, Mark, Photo, Plan, Shade, Tile, contact_sheet, picture_strip
 from su3d_bench.reports.sheet.audit_page import audit_page
 from su3d_bench.reports.tables.formats import csv_lines, harmless
-from su3d_bench.sheets.answers import MOST_CHARACTERS
-from su3d_bench.sheets.audit_scores import COLUMNS, FILE, read_verdicts
-from su3d_bench.sheets.drawing import at_full_size
+from su3d_bench.sheets.judging.answers import MOST_CHARACTERS
+from su3d_bench.sheets.judging.audit_scores import COLUMNS, FILE, read_verdicts
+from su3d_bench.sheets.making.drawing import at_full_size
 from su3d_bench.store.atomic import make_folder, remove_file, write_bytes, write_text
 
 PER_SHEET = 12

@@ -26,7 +26,7 @@ from su3d_bench.questions.reasoning.scene_map import MapObject, SceneMap
 from su3d_bench.reports.pictures.items import png_bytes
 from su3d_bench.reports.pictures.tiles import Line, Mark, Photo, Tile, contact_sheet, picture_strip
 from su3d_bench.sheets.audit import BLUE, GREEN, ORANGE, make_audit
-from su3d_bench.sheets.audit_scores import COLUMNS, audit_table, read_verdicts
+from su3d_bench.sheets.judging.audit_scores import COLUMNS, audit_table, read_verdicts
 
 PAINTED = f"{SCENES}/painted.py:Painted"
 HOSTILE = '<script>alert("x")</script>\x1b[2J'

@@ -18,8 +18,8 @@ from su3d_bench.reports.tables.judged import KINDS, judged_table, sheet_tables
 from su3d_bench.reports.tables.latex import latex
 from su3d_bench.reports.tables.model import Measured
 from su3d_bench.reports.tables.paper import Shown
-from su3d_bench.sheets.answers import check_answers
-from su3d_bench.sheets.scores import score, write_scores
+from su3d_bench.sheets.judging.answers import check_answers
+from su3d_bench.sheets.judging.scores import score, write_scores
 
 LABELS = [
     ("right", "right", "well-merged"),

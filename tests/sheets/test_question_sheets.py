@@ -30,9 +30,6 @@ from su3d_bench.questions.truths import fullest_truth, scene_objects
 from su3d_bench.reports.tables.judged import sheet_tables
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
-from su3d_bench.sheets import question_drafts as question_drafts_module
-from su3d_bench.sheets.answers import Judgement, check_key
-from su3d_bench.sheets.drawing import SceneDrafts, draw_all, draw_scene
 from su3d_bench.sheets.items import (
     ARGUABLE,
     ASKS,
@@ -48,10 +45,13 @@ from su3d_bench.sheets.items import (
     write_key,
     write_sheet,
 )
-from su3d_bench.sheets.question_drafts import question_drafts
-from su3d_bench.sheets.scores import OF_ALL_KINDS, Scores, read_scores, score
-from su3d_bench.sheets.truth_source import TruthSource, truth_of_addresses, truth_of_run
-from su3d_bench.sheets.verdicts import WHOLE, whole_verdicts
+from su3d_bench.sheets.judging.answers import Judgement, check_key
+from su3d_bench.sheets.judging.scores import OF_ALL_KINDS, Scores, read_scores, score
+from su3d_bench.sheets.judging.verdicts import WHOLE, whole_verdicts
+from su3d_bench.sheets.making import question_drafts as question_drafts_module
+from su3d_bench.sheets.making.drawing import SceneDrafts, draw_all, draw_scene
+from su3d_bench.sheets.making.question_drafts import question_drafts
+from su3d_bench.sheets.making.truth_source import TruthSource, truth_of_addresses, truth_of_run
 
 SCENE = f"{PAINTED}/a"
 PARTS = tuple(ask.name for ask in ASKS["questions"])

@@ -13,9 +13,9 @@ from damage import damages, outcomes, truncations
 from simulated_annotators import annotation_set, answered, as_csv, retrieval_set
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.sheets.answers import check_answers, check_key, parse_csv, parse_workbook, read_answers
 from su3d_bench.sheets.items import ANSWER_COLUMNS, Key, Sheet, read_key, write_key
-from su3d_bench.sheets.scores import Scores, read_scores, score, write_scores
+from su3d_bench.sheets.judging.answers import check_answers, check_key, parse_csv, parse_workbook, read_answers
+from su3d_bench.sheets.judging.scores import Scores, read_scores, score, write_scores
 
 
 @pytest.fixture(scope="module")

@@ -20,7 +20,7 @@ from su3d_bench.questions.model import question_id
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.sheets.items import read_key, read_sheet
-from su3d_bench.sheets.run_source import RunSource
+from su3d_bench.sheets.making.run_source import RunSource
 from su3d_bench.store.predictions import read_prediction, write_prediction
 from su3d_bench.store.run_folder import RunFolder
 

@@ -38,9 +38,6 @@ from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.executors.local import run_processes
 from su3d_bench.runs.finished import read_run
-from su3d_bench.sheets import run_source
-from su3d_bench.sheets.drafts import annotation_drafts, reasoning_drafts, retrieval_drafts
-from su3d_bench.sheets.drawing import Artist, SceneDrafts, _lost, draw_all, draw_scene
 from su3d_bench.sheets.items import (
     ANSWER_COLUMNS,
     Sheet,
@@ -50,8 +47,11 @@ from su3d_bench.sheets.items import (
     write_key,
     write_sheet,
 )
-from su3d_bench.sheets.making import table_csv, write_sheets
-from su3d_bench.sheets.run_source import RunSource
+from su3d_bench.sheets.making import run_source
+from su3d_bench.sheets.making.drafts import annotation_drafts, reasoning_drafts, retrieval_drafts
+from su3d_bench.sheets.making.drawing import Artist, SceneDrafts, _lost, draw_all, draw_scene
+from su3d_bench.sheets.making.run_source import RunSource
+from su3d_bench.sheets.making.sets import table_csv, write_sheets
 
 TEXTS = tuple(f"thing {k}" for k in range(12))
 

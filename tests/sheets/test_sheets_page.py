@@ -13,7 +13,7 @@ from waiting import wait_until
 
 from su3d_bench.reports.sheet.page import json_in_html
 from su3d_bench.sheets.items import ANSWER_COLUMNS, SheetKind
-from su3d_bench.sheets.making import MadeSheets, write_sheets
+from su3d_bench.sheets.making.sets import MadeSheets, write_sheets
 
 needs_browser = pytest.mark.skipif(find_chromium() is None, reason="no browser: install chromium")
 TEXTS = ("chair", "place to sit", "red cup", "lamp next to a bed")

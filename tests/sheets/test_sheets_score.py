@@ -19,7 +19,7 @@ from su3d_bench.reports.sheet.second_looks import second_looks_csv, second_looks
 from su3d_bench.reports.tables.formats import csv_text, html_page, markdown
 from su3d_bench.reports.tables.judged import sheet_tables
 from su3d_bench.sheets.items import Key, Sheet, write_key, write_sheet
-from su3d_bench.sheets.scores import ScoreCell, Scores, paired_p, read_scores
+from su3d_bench.sheets.judging.scores import ScoreCell, Scores, paired_p, read_scores
 
 
 def cells_of(scores: Scores, judge: str = "people") -> dict[tuple[str, str], ScoreCell]:

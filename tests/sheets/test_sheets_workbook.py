@@ -11,10 +11,10 @@ import pytest
 from made_sheets import HOSTILE, made
 from places import SUPPORT
 
-from su3d_bench.sheets.answers import read_answers
 from su3d_bench.sheets.items import ANSWER_COLUMNS
-from su3d_bench.sheets.making import MadeSheets
-from su3d_bench.sheets.workbook import COLUMNS, HEADER_ROW, HIDDEN, workbook_bytes
+from su3d_bench.sheets.judging.answers import read_answers
+from su3d_bench.sheets.making.sets import MadeSheets
+from su3d_bench.sheets.making.workbook import COLUMNS, HEADER_ROW, HIDDEN, workbook_bytes
 
 openpyxl = pytest.importorskip("openpyxl", reason="needs the sheets extra")
 OFFICE = shutil.which("soffice") or shutil.which("libreoffice")

@@ -252,7 +252,7 @@ def test_labels_of_a_mapped_table_are_those_of_the_same_rows_in_memory(tmp_path:
 def test_a_map_larger_than_what_it_takes_is_fused_written_read_and_scored() -> None:
     """256 MB of features: no step may hold them all; the program itself measures 2 M points x 1024 so."""
     words = ["--points", "250000", "--dimensions", "512", "--features-in", "disk"]
-    program = [sys.executable, ROOT / "benchmarks", "dense_memory"]
+    program = [sys.executable, str(ROOT / "benchmarks"), "dense_memory"]
     done = subprocess.run([*program, *words], capture_output=True, text=True, check=True)
     steps = {line["step"]: line for line in map(json.loads, done.stdout.splitlines())}
     scored = steps["read and score"]

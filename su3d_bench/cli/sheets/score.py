@@ -11,7 +11,7 @@ from su3d_bench.cli.common import add_table_format, add_verb, answer, answer_jso
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError
 
 if TYPE_CHECKING:
-    from su3d_bench.sheets.scores import Scores
+    from su3d_bench.sheets.judging.scores import Scores
 
 NAME = "score"
 SHOWN_FAULTS = 200  # lines; the number of all is told
@@ -59,10 +59,10 @@ def call(arguments: argparse.Namespace) -> int:
 
     from su3d_bench.reports.tables.judged import sheet_tables
     from su3d_bench.reports.tables.model import Prose
-    from su3d_bench.sheets.answers import check_answers, check_key, read_answers
     from su3d_bench.sheets.items import KEY_FILE, read_key, read_sheet
-    from su3d_bench.sheets.scores import score
-    from su3d_bench.sheets.verdicts import disputed_csv
+    from su3d_bench.sheets.judging.answers import check_answers, check_key, read_answers
+    from su3d_bench.sheets.judging.scores import score
+    from su3d_bench.sheets.judging.verdicts import disputed_csv
     from su3d_bench.store.atomic import write_text
 
     key_file = arguments.key / KEY_FILE if arguments.key.is_dir() else arguments.key
@@ -142,7 +142,7 @@ def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:
     from su3d_bench.reports.tables.formats import FORMATS
     from su3d_bench.reports.tables.judged import sheet_tables
     from su3d_bench.sheets.items import PICTURES
-    from su3d_bench.sheets.scores import write_scores
+    from su3d_bench.sheets.judging.scores import write_scores
     from su3d_bench.store.atomic import make_folder, write_text
 
     make_folder(folder)

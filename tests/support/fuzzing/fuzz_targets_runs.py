@@ -153,7 +153,7 @@ def _answers(name: str) -> Make:
         from counted_sheets import workbook
         from simulated_annotators import answered, as_csv, retrieval_set
 
-        from su3d_bench.sheets.answers import check_answers, read_answers
+        from su3d_bench.sheets.judging.answers import check_answers, read_answers
 
         sheet, key = retrieval_set(4)
         rows = answered(sheet, key, {"ann": 0.0})
@@ -181,7 +181,7 @@ def _sheet_files(folder: Path) -> Read:
 
     def asked() -> Iterator[Read]:
         from su3d_bench.sheets.items import KEY_FILE, SHEET_FILE, read_key, read_sheet
-        from su3d_bench.sheets.scores import read_scores
+        from su3d_bench.sheets.judging.scores import read_scores
 
         yield lambda: called(words)
         yield lambda: read_sheet(folder / "sheet" / SHEET_FILE)

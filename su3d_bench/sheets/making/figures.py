@@ -18,8 +18,8 @@ from su3d_bench.reports.pictures.figures import Cell, GridRow
 from su3d_bench.reports.pictures.items import Tag, seen_in
 from su3d_bench.reports.pictures.map_views import DrawnMap, MapView, drawn_map, pale
 from su3d_bench.reports.pictures.maps import ROOM_SURFACES, Scale, class_colours, similarity_colours
-from su3d_bench.sheets.drawing import ANSWER_COLOUR, OTHER_COLOUR, tags_of
-from su3d_bench.sheets.run_source import RunSource
+from su3d_bench.sheets.making.drawing import ANSWER_COLOUR, OTHER_COLOUR, tags_of
+from su3d_bench.sheets.making.run_source import RunSource
 
 CELL_WIDTH, CELL_HEIGHT = 720, 500  # pixels of one picture
 SMALLER = 4  # times, of the views in which the corner is chosen

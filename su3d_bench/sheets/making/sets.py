@@ -14,7 +14,6 @@ from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.reports.sheet.page import page_html
 from su3d_bench.reports.tables.formats import FORMULA_STARTS, csv_lines
-from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import (
     ANSWER_COLUMNS,
     ASKS,
@@ -29,7 +28,8 @@ from su3d_bench.sheets.items import (
     write_key,
     write_sheet,
 )
-from su3d_bench.sheets.workbook import workbook_bytes
+from su3d_bench.sheets.making.drafts import Draft
+from su3d_bench.sheets.making.workbook import workbook_bytes
 from su3d_bench.store.atomic import make_folder, remove_file, write_bytes, write_text
 
 MOST_ANNOTATORS = 100

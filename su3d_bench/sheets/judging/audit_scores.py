@@ -10,8 +10,8 @@ from typing import Any
 from su3d_bench.core.errors import DataError, printable, reading, suggest
 from su3d_bench.numerics.statistics import share_interval
 from su3d_bench.reports.tables.model import Cell, Table, TableRow, bracketed, percent
-from su3d_bench.sheets.answers import MOST_TEXT_BYTES, cell_text, csv_rows
 from su3d_bench.sheets.items import ARGUABLE, RIGHT, VERDICTS, WRONG
+from su3d_bench.sheets.judging.answers import MOST_TEXT_BYTES, cell_text, csv_rows
 
 FILE = "audit.csv"
 COLUMNS = ("number", "scene", "kind", "text", "answer", "verdict", "remark")

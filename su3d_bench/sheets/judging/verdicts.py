@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING
 
 from su3d_bench.questions.files.left_out import COLUMN
 from su3d_bench.reports.tables.formats import csv_lines, harmless
-from su3d_bench.sheets.answers import Judgement
 from su3d_bench.sheets.items import VERDICTS, Key
+from su3d_bench.sheets.judging.answers import Judgement
 
 if TYPE_CHECKING:
-    from su3d_bench.sheets.scores import SecondLook
+    from su3d_bench.sheets.judging.scores import SecondLook
 
 WHOLE = "all three"
 COLUMNS = (COLUMN, "scene", "kind", "why", "text")

@@ -26,10 +26,10 @@ from su3d_bench.numerics.statistics import (
     sign_flip_test,
 )
 from su3d_bench.questions.model import ALL_KINDS
-from su3d_bench.sheets.agreement import Agreement, agreement, cohen_kappa
-from su3d_bench.sheets.answers import LABELS, Judgement
 from su3d_bench.sheets.items import ARGUABLE, CANNOT_TELL, MERGES, RIGHT, Key, KeyItem, Sheet, SheetKind, read_record
-from su3d_bench.sheets.verdicts import WHOLE, whole_verdicts
+from su3d_bench.sheets.judging.agreement import Agreement, agreement, cohen_kappa
+from su3d_bench.sheets.judging.answers import LABELS, Judgement
+from su3d_bench.sheets.judging.verdicts import WHOLE, whole_verdicts
 from su3d_bench.store.atomic import write_json
 
 if TYPE_CHECKING:

@@ -33,7 +33,7 @@ from su3d_bench.questions.reasoning.scene_map import SceneMap
 from su3d_bench.questions.retrieval import rank_all
 from su3d_bench.questions.truths import own_questions, question_truth, scene_objects
 from su3d_bench.sheets.items import RIGHT, WRONG, SheetKind
-from su3d_bench.sheets.run_source import RunSource, mask_digest
+from su3d_bench.sheets.making.run_source import RunSource, mask_digest
 
 MOST_TEXT = 1000  # characters of a query, a label or an answer that a sheet shows
 NO_LABEL = "(no label)"

@@ -25,9 +25,9 @@ from su3d_bench.reports.pictures.items import (
 from su3d_bench.reports.pictures.map_views import DrawnMap, MapView, drawn_map, pale
 from su3d_bench.reports.pictures.maps import Scale, instance_colours, scale_stops, similarity_colours
 from su3d_bench.runs.executors.local import Event, Report, run_inline, run_processes
-from su3d_bench.sheets.drafts import Draft
 from su3d_bench.sheets.items import SheetKind
-from su3d_bench.sheets.run_source import mask_digest
+from su3d_bench.sheets.making.drafts import Draft
+from su3d_bench.sheets.making.run_source import mask_digest
 
 ANSWER_COLOUR, OTHER_COLOUR = (222, 74, 22), (32, 98, 196)  # those of reasoning_picture
 PALE_SHARE = 0.3

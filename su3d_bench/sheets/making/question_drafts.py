@@ -11,10 +11,10 @@ from su3d_bench.questions.model import REASONING, question_id
 from su3d_bench.questions.reasoning.generated import generate_questions
 from su3d_bench.questions.reasoning.scene_map import SceneMap
 from su3d_bench.questions.truths import MIN_VERTICES, questions_of, scene_objects
-from su3d_bench.sheets.drafts import MOST_TEXT, Draft
 from su3d_bench.sheets.items import ASKS
-from su3d_bench.sheets.scores import OF_ALL_KINDS
-from su3d_bench.sheets.truth_source import TruthSource
+from su3d_bench.sheets.judging.scores import OF_ALL_KINDS
+from su3d_bench.sheets.making.drafts import MOST_TEXT, Draft
+from su3d_bench.sheets.making.truth_source import TruthSource
 
 
 def question_drafts(source: TruthSource, scene: str, per_kind: int, left_out: Collection[str] = ()) -> list[Draft]:
