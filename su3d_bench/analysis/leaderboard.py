@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
+from su3d_bench.analysis.recomputed import rules_of_run, why_not_counted
 from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.protocol_files import protocol_names
-from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.scoring import combine
 from su3d_bench.numerics.statistics import Interval, rank_intervals
 from su3d_bench.reports.tables.model import (
@@ -134,18 +134,16 @@ def _entries(name: str, run: FinishedRun, protocols: Sequence[str]) -> Iterator[
             yield Refused(name, what, reason)
             continue
         try:
+            rules = rules_of_run(run, protocol)
             scores = run.scores(method).get(protocol, {})
-            result = combine(load_protocol(protocol), scores) if scores else None
+            if reason := why_not_counted(run, method, protocol, scores):
+                yield Refused(name, what, printable(reason, 300))
+                continue
+            result = combine(rules, scores)
         except Su3dError as error:
             yield Refused(name, what, printable(str(error), 300))
             continue
-        if result is None or record.result is None:
-            yield Refused(name, what, "was not scored")
-            continue
         recomputed = result.to_json()
-        if any(recomputed["metrics"].get(key) != record.result.metrics.get(key) for key in record.headline):
-            yield Refused(name, what, "metrics.json does not follow from the counts; run its command again")
-            continue
         unknown = [scene for scene in result.scenes if scene not in run.record.data_digests]
         if unknown:
             yield Refused(name, what, f"the data of {printable(unknown[0], 80)} have no digest")
@@ -171,14 +169,8 @@ def _why_not(run: FinishedRun, protocol: str, failed: Sequence[str]) -> str | No
         return f"is partial: the first {run.limit} frames of each scene"
     if failed:
         return f"is incomplete: {len(failed)} scenes failed"
-    if protocol not in protocol_names():
-        return "its protocol is none of those installed here"
-    if protocol not in run.protocols:
-        return "its protocol is none of those that run.json names"
-    here, rules = load_protocol(protocol), run.protocols[protocol]
-    if rules.version != here.version:
-        return f"was scored under version {rules.version} of the protocol, here it is {here.version}"
-    return None if rules.digest == here.digest else "its protocol has the version of the one here and other rules"
+    # A file of rules that somebody else's run names is not looked for.
+    return None if protocol in protocol_names() else "its protocol is none of those installed here"
 
 
 def _of_same_data(entries: Sequence[Entry]) -> tuple[list[Entry], list[Refused]]:

@@ -17,6 +17,7 @@ from su3d_bench.metrics.matching.nearest import n_farther
 from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.numerics.statistics import nan_mean
 
+MOST_COUNTED = 1 << 53  # numbers beyond it are not whole any more where ratios are formed
 Values = dict[str, float]
 Arrays = Mapping[str, tuple[str, tuple[str, ...]]]
 C = TypeVar("C", bound="Counts")
@@ -35,14 +36,24 @@ class Counts:
 
     @classmethod
     def checked(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
-        """The counts in ``arrays``; a ``DataError`` names one that is of another kind or shape than it must be."""
+        """The counts in ``arrays``; a ``DataError`` names one that no scene gives: of another kind or shape than it
+        must be, below 0, or that another one contradicts."""
         sizes: dict[str, int] = {}
         for name, (number_kind, axes) in cls.arrays.items():
             array = arrays[name]
             fits = array.dtype.kind == number_kind and array.ndim == len(axes)
             if not fits or any(sizes.setdefault(axis, n) != n for axis, n in zip(axes, array.shape, strict=True)):
                 raise DataError(f"counts: '{name}' is {array.dtype.name} {array.shape}; score the scene again")
-        return cls(**{name: arrays[name] for name in cls.arrays})
+            if number_kind == "i" and array.size and not 0 <= array.min() <= array.max() < MOST_COUNTED:
+                raise DataError(f"counts: '{name}' counts from {array.min()} to {array.max()}; score the scene again")
+        counts = cls(**{name: arrays[name] for name in cls.arrays})
+        if (fault := counts.contradiction()) is not None:
+            raise DataError(f"counts: {fault}; score the scene again")
+        return counts
+
+    def contradiction(self) -> str | None:
+        """A clause on what cannot be true of these counts; None where all can."""
+        return None
 
     @property
     def sizes(self) -> dict[str, int]:

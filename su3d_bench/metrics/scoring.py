@@ -21,7 +21,7 @@ from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partiti
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.instance.score import InstanceMetric
 from su3d_bench.metrics.matching import nearest as transfer
-from su3d_bench.metrics.metric import Counts, Metric, SceneScore, scene_mean
+from su3d_bench.metrics.metric import MOST_COUNTED, Counts, Metric, SceneScore, scene_mean
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
 from su3d_bench.metrics.open_vocabulary.score import CategoriesMetric, QueryMetric
@@ -266,6 +266,15 @@ def _unpack_one(name: str, arrays: Mapping[str, NDArray[Any]]) -> SceneScore:
     n_farther = np.array(about["n_farther"], np.int64)
     if n_farther.shape != (len(transfer.COVERAGE_RADII_M),):
         raise DataError(f"counts: 'n_farther' has the shape {n_farther.shape}; score the scene again")
+    if about["protocol"] != name:
+        raise DataError(f"counts: '{name}' holds those of '{about['protocol']}'; score the scene again")
+    for key in ("version", "n_predictions", "n_scored"):
+        if type(about[key]) is not int or not 0 <= about[key] < MOST_COUNTED:
+            raise DataError(f"counts: '{key}' is {about[key]}; score the scene again")
+    if not (np.diff([about["n_scored"], *n_farther, 0]) <= 0).all():
+        raise DataError(
+            f"counts: 'n_farther' is {n_farther.tolist()} of {about['n_scored']} scored points; score the scene again"
+        )
     kind = _COUNTS[about["kind"]]
     return SceneScore(
         protocol=about["protocol"],

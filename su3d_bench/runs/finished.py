@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
@@ -195,6 +196,10 @@ def read_run(path: Path) -> FinishedRun:
         raise StoreError(f"{shown}: holds no metrics.json, so the run is not finished; run its command again")
     record = read_record(RunRecord, path / "run.json", shown)
     metrics = read_record(MetricsRecord, path / "metrics.json", shown)
+    _named_once(f"{shown}: run.json", "protocol", [rules.name for rules in record.protocols])
+    _named_once(f"{shown}: run.json", "scene", record.scenes)
+    _named_once(f"{shown}: run.json", "method", record.methods)
+    _named_once(f"{shown}: metrics.json", "result", [f"{one.method} / {one.protocol}" for one in metrics.results])
     return FinishedRun(
         folder=RunFolder(path),
         record=record,
@@ -203,6 +208,13 @@ def read_run(path: Path) -> FinishedRun:
         limit=metrics.limit,
         data=RunData(read_file(path / "run.toml"), record.data_digests),
     )
+
+
+def _named_once(where: str, what: str, names: Sequence[str]) -> None:
+    """A ``StoreError`` where a name stands twice: of two that differ, one would be read and the other passed over."""
+    twice = next((name for name, n in Counter(names).items() if n > 1), None)
+    if twice is not None:
+        raise StoreError(f"{where}: names the {what} '{printable(twice, 100)}' twice; run its command again")
 
 
 def map_of_scene(scene: str, method: str, run: Path | None) -> tuple[RunFolder, JobFolder, Prediction]:

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import numpy as np
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
 from su3d_bench.core.errors import DataError, StoreError, printable
 from su3d_bench.core.types import Float64Array
@@ -23,8 +23,34 @@ from su3d_bench.store.atomic import read_json
 SCHEMA = 1
 MOST_UPDATES = 10_000_000
 Kind = TypeVar("Kind")
+ROUNDING = 1e-9  # by how much a mean of shares may pass 1
+MOST = 1e18  # milliseconds, bytes or things: more than there are
 Number = Annotated[float, Field(allow_inf_nan=False)]  # NaN would differ from nothing, and so pass every comparison
-Values = Mapping[str, Number | None]
+Amount = Annotated[float, Field(ge=0, le=MOST, allow_inf_nan=False)]
+Count = Annotated[int, Field(ge=0, le=int(MOST))]
+Share = Annotated[float, Field(ge=0, le=1 + ROUNDING, allow_inf_nan=False)]
+
+
+def impossible_value(name: str, value: float) -> str | None:
+    """A clause where the value ``name`` of a result cannot be ``value``: ``n_...`` are numbers of things, all others
+    fractions.
+
+    >>> impossible_value("mAcc", 7e300), impossible_value("n_classes", 7)
+    ("'mAcc' is 7e+300, a fraction lies from 0 to 1", None)
+    """
+    if name.startswith("n_"):
+        return None if 0 <= value <= MOST else f"'{name}' is {value:g}, of which there are none or more"
+    return None if 0 <= value <= 1 + ROUNDING else f"'{name}' is {value:g}, a fraction lies from 0 to 1"
+
+
+def _possible(values: Mapping[str, float | None]) -> Mapping[str, float | None]:
+    for name, value in values.items():
+        if value is not None and (fault := impossible_value(name, value)) is not None:
+            raise ValueError(fault)
+    return values
+
+
+Values = Annotated[Mapping[str, Number | None], AfterValidator(_possible)]
 
 
 @dataclass(frozen=True)
@@ -110,17 +136,17 @@ class NumbersRecord:
     protocol: str = ""
     version: int = 0
     headline: tuple[str, ...] = ()
-    n_scenes: int = 0
+    n_scenes: Count = 0
     scenes: tuple[str, ...]
     metrics: Values
-    intervals: Mapping[str, tuple[Number, Number] | None]
+    intervals: Mapping[str, tuple[Share, Share] | None]
     pooled: Values = field(default_factory=dict)
     scene_mean: Values = field(default_factory=dict)
     per_scene: Mapping[str, Values]
     per_class: Mapping[str, Values]
     groups: Mapping[str, Values] = field(default_factory=dict)
     coverage: Values = field(default_factory=dict)
-    n_predictions: Mapping[str, int] = field(default_factory=dict)
+    n_predictions: Mapping[str, Count] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
 
 
@@ -128,7 +154,7 @@ class NumbersRecord:
 class MidwayRecord:
     """The metrics of the maps after ``share`` of the updates."""
 
-    share: Number
+    share: Share
     metrics: Values
 
 
@@ -149,7 +175,7 @@ class ResultRecord:
     caveat: str | None
     encoder: str | None
     encoder_digest: str | None
-    n_planned: int
+    n_planned: Count
     failed: tuple[str, ...]
     unscored: tuple[str, ...]
     ceiling: Values | None
@@ -164,7 +190,7 @@ class MetricsRecord:
 
     schema: int = SCHEMA
     is_partial: bool = False
-    limit: int
+    limit: Count
     seed: int = 0
     scenes: tuple[str, ...] = ()
     results: tuple[ResultRecord, ...]
@@ -172,24 +198,28 @@ class MetricsRecord:
 
 @dataclass(frozen=True)
 class MapCost:
-    """What one map took: the updates before it and the milliseconds of ``finish``."""
+    """What one map took: the updates before it, the milliseconds of ``finish``, those of them that were perception's."""
 
-    n_updates: int
-    finish_ms: Number
+    n_updates: Count
+    finish_ms: Amount
+    perception_ms: Amount = 0.0
 
 
 @dataclass(frozen=True)
 class CostsRecord:
     """``costs`` beside the seal of ``predict``: maps midway and the last one, null for what was not measured.
 
-    ``calibration_ms``: the time of a fixed piece of work, measured between the updates. What a method measures itself
-    stands beside the two numbers of a map.
+    ``calibration_ms``: the time of a fixed piece of work, measured between the updates; ``start_ms`` and ``close_ms``:
+    what the method took before the first frame and after the last map. What a method measures itself stands beside the
+    numbers of a map.
     """
 
     maps: tuple[MapCost, ...]
-    calibration_ms: Number | None
-    peak_rss_bytes: int | None
-    device_bytes: int | None
+    calibration_ms: Amount | None
+    peak_rss_bytes: Count | None
+    device_bytes: Count | None
+    start_ms: Amount | None = None
+    close_ms: Amount | None = None
 
 
 @dataclass(frozen=True)
@@ -200,6 +230,8 @@ class SealRecord:
     files: Annotated[Mapping[str, str], Field(min_length=1)]
     remarks: Mapping[str, Any]
 
+
+OUT_OF_RANGE = ("value_error", "greater_than_equal", "less_than_equal")
 
 _ADAPTERS: dict[Any, TypeAdapter[Any]] = {
     kind: TypeAdapter(kind) for kind in (RunRecord, RequestRecord, MetricsRecord, CostsRecord, SealRecord)
@@ -232,6 +264,9 @@ def read_record(kind: type[Kind], file: Path, shown: str) -> Kind:
         key = printable(".".join(map(str, first["loc"])), 120)
         if first["type"] == "finite_number":
             what = f"{file.name} is not as a run writes it: {key} is no finite number"
+        elif first["type"] in OUT_OF_RANGE:
+            fault = str(first.get("ctx", {}).get("error", f"it is {first['input']}"))
+            what = f"{file.name} is not as a run writes it: {key}: {printable(fault, 160)}"
         else:
             what = f"{file.name}: {key or 'it'} is not as a run writes it"
         raise StoreError(f"{shown}: {what}; run it again") from error
@@ -261,4 +296,8 @@ def read_updates(file: Path, where: str) -> dict[str, Float64Array]:
         raise DataError(f"{where}: is not a table of numbers; run the same command again to mend it") from error
     if not np.isfinite(table).all():
         raise DataError(f"{where}: holds a number that is not finite; run the same command again to mend it")
+    if table.size and not 0 <= table.min() <= table.max() <= MOST:
+        raise DataError(f"{where}: holds {table.min():g} and {table.max():g}; times and sizes lie from 0 to {MOST:g}")
+    if len(set(header)) != len(header):
+        raise DataError(f"{where}: has two columns of one name; run the same command again to mend it")
     return {name: table[:, column] for column, name in enumerate(header)}

@@ -32,7 +32,9 @@ from su3d_bench.core.types import LabelSet, Prediction
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.questions.shares import ShareCounts
 from su3d_bench.metrics.scoring import combine, combined_metrics, pack_scores, score_scene, unpack_scores
+from su3d_bench.metrics.semantic.confusion import SemanticCounts
 
 # ---- several scenes
 
@@ -253,9 +255,9 @@ def of_one_class(**changed: Any) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("changed", "line"),
     [
-        ({"class_index": [-1, 0]}, "'class_index' counts beyond the 1 classes"),
+        ({"class_index": [-1, 0]}, "'class_index' counts from -1 to 0"),
         ({"class_index": [0, 1]}, "'class_index' counts beyond the 1 classes"),
-        ({"threshold_index": [-1, 0]}, "'threshold_index' counts beyond the 2 thresholds"),
+        ({"threshold_index": [-1, 0]}, "'threshold_index' counts from -1 to 0"),
         ({"threshold_index": [0, 2]}, "'threshold_index' counts beyond the 2 thresholds"),
         ({"score": [0.5, np.nan]}, "'score' has values that are NaN or infinite"),
         ({"score": [-np.inf, 0.5]}, "'score' has values that are NaN or infinite"),
@@ -263,6 +265,11 @@ def of_one_class(**changed: Any) -> dict[str, Any]:
         ({"is_true": [True]}, r"'is_true' is bool \(1,\)"),
         ({"n_missed": [0, 1]}, r"'n_missed' is int64 \(2,\)"),
         ({"n_missed": [[0, 1], [0, 1]], "n_truth": [1]}, r"'n_truth' is int64 \(1,\)"),
+        ({"n_predictions": [-1]}, "'n_predictions' counts from -1 to -1"),
+        ({"n_small_truth": [1 << 60]}, f"'n_small_truth' counts from {1 << 60} to {1 << 60}"),
+        ({"n_truth": [2]}, "'n_truth' of class 0 is 2, met and missed are 1"),
+        ({"n_missed": [[1, 1]]}, "'n_truth' of class 0 is 1, met and missed are 2"),
+        ({"is_true": [False, False]}, "'n_truth' of class 0 is 1, met and missed are 0"),
     ],
 )
 def test_counts_that_do_not_fit_together_are_refused(changed: dict[str, Any], line: str) -> None:
@@ -275,6 +282,76 @@ def test_totals_of_other_objects_than_the_points_are_refused() -> None:
     objects = {"n_points": np.ones(2, np.int64), "totals": np.zeros((3, 4))}
     with pytest.raises(DataError, match=r"counts: 'totals' is float64 \(3, 4\); score the scene again"):
         ObjectCounts.checked(objects)
+
+
+@pytest.mark.parametrize(
+    ("n_points", "total", "line"),
+    [
+        ([0], 0.0, "'n_points' has an object without points"),
+        ([4], 4.5, "'totals' has 4.5 over 4 points"),
+        ([4], -1.0, "'totals' has -1 over 4 points"),
+        ([4], np.inf, "'totals' has inf over 4 points"),
+        ([4], 7e300, r"'totals' has 7e\+300 over 4 points"),
+    ],
+)
+def test_totals_that_no_points_come_to_are_refused(n_points: list[int], total: float, line: str) -> None:
+    whole = {"n_points": np.array([4]), "totals": np.array([[4.0, np.nan]])}
+    assert len(ObjectCounts.checked(whole).totals) == 1
+    with pytest.raises(DataError, match=f"counts: {line}; score the scene again"):
+        ObjectCounts.checked({"n_points": np.array(n_points), "totals": np.array([[total, np.nan]])})
+
+
+@pytest.mark.parametrize(
+    ("changed", "line"),
+    [
+        ({"n_right": [5, 0]}, "'n_right' has 5 of 4 judged"),
+        ({"n_right": [-1, 0]}, "'n_right' counts from -1 to 0"),
+        ({"by_chance": [1.5, 0.5]}, "'by_chance' has 0.5 of 0 judged"),
+        ({"by_name": [-0.5, np.nan]}, "'by_name' has -0.5 of 4 judged"),
+    ],
+)
+def test_more_that_is_right_than_was_judged_is_refused(changed: dict[str, Any], line: str) -> None:
+    whole = {
+        "n_judged": np.array([4, 0]),
+        "n_right": np.array([4, 0]),
+        **{name: np.array([1.5, np.nan]) for name in ("by_chance", "by_name")},
+    }
+    assert ShareCounts.checked(whole).n_right.tolist() == [4, 0]
+    with pytest.raises(DataError, match=f"counts: {line}; score the scene again"):
+        ShareCounts.checked(whole | {name: np.array(value) for name, value in changed.items()})
+
+
+@pytest.mark.parametrize(
+    ("confusion", "line"),
+    [
+        ([[5, -1, 0], [0, 0, 0]], "'confusion' counts from -1 to 5"),
+        ([[5, 0, 0], [0, 1, 0]], "'confusion' has points of class 1, which the scene does not have"),
+    ],
+)
+def test_a_confusion_that_no_scene_gives_is_refused(confusion: list[list[int]], line: str) -> None:
+    is_present = np.array([True, False])
+    assert SemanticCounts.checked({"confusion": np.array([[5, 1, 0], [0, 0, 0]]), "is_present": is_present}) is not None
+    with pytest.raises(DataError, match=f"counts: {line}; score the scene again"):
+        SemanticCounts.checked({"confusion": np.array(confusion), "is_present": is_present})
+
+
+@pytest.mark.parametrize(
+    ("changed", "line"),
+    [
+        ({"n_predictions": -1}, "'n_predictions' is -1"),
+        ({"n_scored": 7e300}, r"'n_scored' is 7e\+300"),
+        ({"n_farther": [2, 1, 9]}, r"'n_farther' is \[2, 1, 9\] of 3 scored points"),
+        ({"n_farther": [1, 2, 0]}, r"'n_farther' is \[1, 2, 0\] of 3 scored points"),
+        ({"protocol": "other"}, "'rooms-semantic' holds those of 'other'"),
+    ],
+)
+def test_what_stands_beside_the_counts_is_checked_too(changed: dict[str, Any], line: str) -> None:
+    score = replace(score_scene(ROOM, *noisy(0), None), n_scored=3, n_farther=np.array([2, 1, 0]))
+    assert unpack_scores(pack_scores({ROOM.name: score}))[ROOM.name].n_scored == 3
+    if "n_farther" in changed:
+        changed = {"n_farther": np.array(changed["n_farther"])}
+    with pytest.raises(DataError, match=f"counts: {line}; score the scene again"):
+        unpack_scores(pack_scores({ROOM.name: replace(score, **changed)}))
 
 
 def test_a_result_has_no_nan_in_its_json() -> None:

@@ -7,9 +7,9 @@ A scene gives a table of counted predictions, tables of scenes are concatenated,
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -59,17 +59,20 @@ class InstanceCounts(Counts):
     n_small_truth: Int64Array
     n_predictions: Int64Array
 
-    @classmethod
-    def checked(cls, arrays: Mapping[str, NDArray[Any]]) -> Self:
-        """Those in ``arrays``; rows beyond the classes or thresholds, or without a finite score, are errors too."""
-        counts = super().checked(arrays)
+    def contradiction(self) -> str | None:
+        """Rows beyond the classes or thresholds, scores without an order, other instances than met and missed ones."""
         for name, axis in (("class_index", "classes"), ("threshold_index", "thresholds")):
-            index, n = arrays[name], counts.sizes[axis]
-            if len(index) and not 0 <= index.min() <= index.max() < n:
-                raise DataError(f"counts: '{name}' counts beyond the {n} {axis}; score the scene again")
-        if not np.isfinite(counts.score).all():
-            raise DataError("counts: 'score' has values that are NaN or infinite; score the scene again")
-        return counts
+            if getattr(self, name).max(initial=-1) >= self.sizes[axis]:
+                return f"'{name}' counts beyond the {self.sizes[axis]} {axis}"
+        if not np.isfinite(self.score).all():
+            return "'score' has values that are NaN or infinite"
+        known = self.n_missed.copy()
+        np.add.at(known, (self.class_index[self.is_true], self.threshold_index[self.is_true]), 1)
+        wrong = np.argwhere(known != self.n_truth[:, None])
+        if not len(wrong):
+            return None
+        row, column = wrong[0]
+        return f"'n_truth' of class {row} is {self.n_truth[row]}, met and missed are {known[row, column]}"
 
 
 _ROWS = [name for name, (_, axes) in InstanceCounts.arrays.items() if axes == ("rows",)]

@@ -11,6 +11,8 @@ import numpy as np
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.metrics.metric import Arrays, Counts
 
+ROUNDING = 1e-6  # by how much a sum of shares may leave what it is a sum over
+
 
 @dataclass(frozen=True)
 class ObjectCounts(Counts):
@@ -24,6 +26,17 @@ class ObjectCounts(Counts):
 
     n_points: Int64Array
     totals: Float64Array
+
+    def contradiction(self) -> str | None:
+        """An object without points, or a total of shares that is more than its points."""
+        if not (self.n_points > 0).all():
+            return "'n_points' has an object without points"
+        most = self.n_points[:, None] * (1 + ROUNDING)
+        beyond = np.argwhere(~np.isnan(self.totals) & ~((self.totals >= -ROUNDING) & (self.totals <= most)))
+        if not len(beyond):
+            return None
+        row, column = beyond[0]
+        return f"'totals' has {self.totals[row, column]:g} over {self.n_points[row]} points"
 
 
 def concatenate(counts: Sequence[ObjectCounts]) -> ObjectCounts:

@@ -11,6 +11,8 @@ import numpy as np
 from su3d_bench.core.types import Float64Array, Int64Array
 from su3d_bench.metrics.metric import Arrays, Counts
 
+ROUNDING = 1e-6  # by how much a sum of shares may pass what it is a sum over
+
 
 @dataclass(frozen=True)
 class ShareCounts(Counts):
@@ -32,6 +34,15 @@ class ShareCounts(Counts):
     n_right: Int64Array
     by_chance: Float64Array
     by_name: Float64Array
+
+    def contradiction(self) -> str | None:
+        """More that is right, or that a guess gets right, than was judged."""
+        for name in ("n_right", "by_chance", "by_name"):
+            right = getattr(self, name)
+            beyond = np.flatnonzero(~np.isnan(right) & ~((right >= 0) & (right <= self.n_judged + ROUNDING)))
+            if len(beyond):
+                return f"'{name}' has {right[beyond[0]]:g} of {self.n_judged[beyond[0]]} judged"
+        return None
 
 
 def combine(counts: Sequence[ShareCounts]) -> ShareCounts:

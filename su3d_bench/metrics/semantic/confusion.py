@@ -32,6 +32,11 @@ class SemanticCounts(Counts):
     confusion: Int64Array
     is_present: BoolArray
 
+    def contradiction(self) -> str | None:
+        """Points of a class that the scenes do not contain."""
+        absent = np.flatnonzero(self.confusion.any(axis=1) & ~self.is_present)
+        return f"'confusion' has points of class {absent[0]}, which the scene does not have" if len(absent) else None
+
 
 @dataclass(frozen=True)
 class SemanticMetrics:
