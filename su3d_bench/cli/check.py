@@ -30,7 +30,7 @@ def add_parser(verbs: Any) -> None:
     parser.add_argument("--learn", nargs="+", type=Path, metavar="RUN", help="repeats of one run to learn from")
     parser.add_argument("--out", type=Path, metavar="FILE", help="where --learn writes the reference")
     parser.add_argument(
-        "--cost-limit", type=float, metavar="TIMES", help="how many times slower an update may be (with --learn)"
+        "--cost-limit", type=float, metavar="TIMES", help="how many times as long a method may take (with --learn)"
     )
     parser.add_argument(
         "--across-machines",
@@ -56,7 +56,9 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _learn(arguments: argparse.Namespace) -> int:
-    from su3d_bench.analysis.gate import ACROSS_MACHINES, COST_LIMIT, learn
+    from su3d_bench.analysis.gate.costs import why_no_cost
+    from su3d_bench.analysis.gate.reference import ACROSS_MACHINES, COST_LIMIT, MOST_COST_LIMIT, learn
+    from su3d_bench.core.errors import printable
     from su3d_bench.runs.finished import read_run
     from su3d_bench.store.atomic import json_text
 
@@ -64,22 +66,30 @@ def _learn(arguments: argparse.Namespace) -> int:
         raise ConfigError("check: --learn takes the runs and needs --out FILE; it checks nothing")
     cost_limit = COST_LIMIT if arguments.cost_limit is None else arguments.cost_limit
     across = ACROSS_MACHINES if arguments.across_machines is None else arguments.across_machines / 100
-    if not cost_limit > 1 or not 0 <= across <= 1:
-        raise ConfigError("check: --cost-limit is a factor above 1, --across-machines from 0 to 100 points")
-    reference = learn([read_run(path) for path in arguments.learn], across, cost_limit)
+    if not 1 < cost_limit <= MOST_COST_LIMIT or not 0 <= across <= 1:
+        raise ConfigError(
+            f"check: --cost-limit is a factor above 1 and up to {MOST_COST_LIMIT:g}, --across-machines from 0 to 100 "
+            "points"
+        )
+    runs = [read_run(path) for path in arguments.learn]
+    reference = learn(runs, across, cost_limit)
     written(arguments.out, json_text(reference.model_dump(mode="json", exclude_defaults=True)))
     n_exact = sum(metric.tolerance == 0 for each in reference.results for metric in each.metrics.values())
     n_values = sum(len(each.metrics) for each in reference.results)
     answer(f"{arguments.out}: {n_values} headline values from {reference.n_runs} runs, {n_exact} of them exact")
     if reference.n_runs == 1:
         remark("one run shows no spread: every value must be met exactly; learn from several where runs vary")
+    for method in runs[0].methods:
+        if method not in reference.costs:
+            remark(f"{printable(method, 80)}: no cost is learnt: it {why_no_cost(runs[0], method)}")
     return EXIT_DONE
 
 
 def _check(arguments: argparse.Namespace) -> int:
     from dataclasses import asdict
 
-    from su3d_bench.analysis.gate import check, read_reference
+    from su3d_bench.analysis.gate.check import check
+    from su3d_bench.analysis.gate.reference import read_reference
     from su3d_bench.reports.gate import github_lines, plain_lines
     from su3d_bench.runs.finished import read_run
 

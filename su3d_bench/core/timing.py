@@ -6,9 +6,11 @@ import hashlib
 import os
 import platform
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 
@@ -40,6 +42,64 @@ class Timer:
     def take(self) -> dict[str, float]:
         taken, self._elapsed_ms = self._elapsed_ms, {}
         return taken
+
+
+@dataclass
+class Spent:
+    """Wall time of calls of a method, ``perception_ms`` of it in perception that the method asked for."""
+
+    total_ms: float = 0.0
+    perception_ms: float = 0.0
+
+    @property
+    def method_ms(self) -> float:
+        """What the method itself took."""
+        return max(0.0, self.total_ms - self.perception_ms)
+
+
+class MethodClock:
+    """The wall time of a method, part by part, measured around its calls: no stage that it names itself counts.
+
+    Perception that it asks for is told apart where it is asked for by the thread that runs the method: what others do
+    meanwhile takes no time away from it.
+    """
+
+    def __init__(self) -> None:
+        self._spent: dict[str, Spent] = {}
+        self._running: tuple[Spent, int] | None = None
+
+    @contextmanager
+    def running(self, part: str) -> Iterator[None]:
+        """The method runs inside; its time adds to ``part``."""
+        spent = self._spent.setdefault(part, Spent())
+        synchronise_device()
+        self._running = spent, threading.get_ident()
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            synchronise_device()
+            spent.total_ms += (time.perf_counter() - start) * 1e3
+            self._running = None
+
+    @contextmanager
+    def perception(self) -> Iterator[None]:
+        """Perception runs inside, asked for by the method or not."""
+        running = self._running
+        if running is None or running[1] != threading.get_ident():
+            yield
+            return
+        synchronise_device()
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            synchronise_device()
+            running[0].perception_ms += (time.perf_counter() - start) * 1e3
+
+    def take(self, part: str) -> Spent:
+        """What ``part`` took since it was taken last."""
+        return self._spent.pop(part, Spent())
 
 
 def calibration_ms() -> float:

@@ -11,8 +11,10 @@ from su3d_bench.core.types import Float64Array
 from su3d_bench.numerics.statistics import Growth, growth_exponent
 from su3d_bench.store.records import MapCost
 
-# Stages that are no part of keeping the map: reading the frame, and perception.
+# Stages that are no part of keeping the map: reading the frame, and perception. They tell the map's part of runs whose
+# updates have no ``method_ms``, as earlier versions wrote them.
 NOT_MAP = ("decode", "cache", "segment", "encode", "caption")
+MEASURED_AROUND = ("total_ms", "method_ms")  # by who runs the method; all other times are of stages
 MAP = "map"
 TOTAL = "total"
 WARM_UP = 3  # first updates: caches and memory are cold, and the map is small
@@ -22,9 +24,10 @@ WARM_UP = 3  # first updates: caches and memory are cold, and the map is small
 class UpdateTimes:
     """The updates of one scene under one method, in their order.
 
-    ``columns`` holds (N,) float64 of every column of ``updates.csv``: ``total_ms``, a ``<stage>_ms`` a stage, sizes.
-    ``maps`` are those midway and the last one; bytes are None where they were not measured. ``calibration_ms``:
-    the time of a fixed piece of work, measured between the updates.
+    ``columns`` holds (N,) float64 of every column of ``updates.csv``: ``total_ms``, ``method_ms``, a ``<stage>_ms`` a
+    stage, sizes. ``maps`` are those midway and the last one; what was not measured is None. ``calibration_ms``: the
+    time of a fixed piece of work, measured between the updates; ``start_ms`` and ``close_ms``: of the method before
+    the first frame and after the last map.
     """
 
     run: str
@@ -35,6 +38,8 @@ class UpdateTimes:
     peak_rss_bytes: int | None
     device_bytes: int | None
     calibration_ms: float | None = None
+    start_ms: float | None = None
+    close_ms: float | None = None
 
     def __len__(self) -> int:
         return len(next(iter(self.columns.values()), ()))
@@ -42,11 +47,15 @@ class UpdateTimes:
     @property
     def stages(self) -> tuple[str, ...]:
         """Names of the stages, in the order in which they first took time."""
-        return tuple(name.removesuffix("_ms") for name in self.columns if name.endswith("_ms") and name != "total_ms")
+        return tuple(
+            name.removesuffix("_ms") for name in self.columns if name.endswith("_ms") and name not in MEASURED_AROUND
+        )
 
     def ms(self, stage: str) -> Float64Array:
         """Milliseconds (N,) of a stage, of ``total`` or of ``map``; zeros for a stage that it does not have."""
         if stage == MAP:
+            if "method_ms" in self.columns:
+                return self.columns["method_ms"]
             mine = [self.ms(name) for name in self.stages if name not in NOT_MAP]
             return np.sum(mine, axis=0) if mine else np.zeros(len(self))
         return self.columns.get(f"{stage}_ms", np.zeros(len(self)))
@@ -80,7 +89,7 @@ class StageSummary:
 class MethodSummary:
     """What a method cost over the scenes of a run; rows of ``stages`` end with ``map`` and ``total``.
 
-    ``map`` is everything but reading the frame and perception. ``frames_per_s`` counts frames at full rate, of which
+    ``map`` is the whole time of the method without perception. ``frames_per_s`` counts frames at full rate, of which
     every stride-th is an update. Bytes are the largest over the scenes, None where none was measured.
     """
 

@@ -15,12 +15,23 @@ from typing import Any, Generic, Self, TypeVar, overload
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.interfaces import Closes, CountsLosses, Dataset, HasFinishCosts, HasSurface, Method
-from su3d_bench.core.timing import Timer, calibration_ms, memory_bytes
+from su3d_bench.core.interfaces import (
+    Closes,
+    CountsLosses,
+    Dataset,
+    HasFinishCosts,
+    HasSurface,
+    Method,
+    RegionPerception,
+)
+from su3d_bench.core.timing import MethodClock, Timer, calibration_ms, memory_bytes
 from su3d_bench.core.types import (
+    BoolArray,
     Detections,
+    Float32Array,
     Frame,
     GroundTruth,
+    Int64Array,
     PerceptionNeeds,
     Proposals,
     SceneInfo,
@@ -53,6 +64,26 @@ class FirstFrames(Sequence[Frame]):
         if isinstance(index, slice):
             return [self.frames[i] for i in range(self.n)[index]]
         return self.frames[range(self.n)[index]]
+
+
+@dataclass(frozen=True)
+class TimedRegions:
+    """Perception on demand, its time told apart from that of the method that asks for it."""
+
+    regions: RegionPerception
+    clock: MethodClock
+
+    @property
+    def dim(self) -> int:
+        return self.regions.dim
+
+    def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
+        with self.clock.perception():
+            return self.regions.mask_at(frame, points)
+
+    def encode_regions(self, frame: Frame, mask: BoolArray, boxes: Int64Array) -> Float32Array:
+        with self.clock.perception():
+            return self.regions.encode_regions(frame, mask, boxes)
 
 
 def no_detections(frame: Frame, needs: PerceptionNeeds) -> Detections:
@@ -165,8 +196,11 @@ SIZES = ("n_points", "n_instances", "map_bytes")
 class Feeding:
     """One method on one scene: ``maps`` holds, for each map written, the updates before it and what it took."""
 
-    def __init__(self, scene: str, method: Method, perception: Perception, report: Report) -> None:
+    def __init__(
+        self, scene: str, method: Method, perception: Perception, report: Report, clock: MethodClock | None = None
+    ) -> None:
         self.maps: list[dict[str, float | int]] = []
+        self._clock = clock or MethodClock()
         self._scene = scene
         self._method = method
         self._perception = perception
@@ -205,14 +239,17 @@ class Feeding:
         if not (frame.depth_m > 0).any():
             raise DataError(f"{self._scene} frame {frame.index}: depth is empty, no pixel is above 0 m")
         detections = self._detect(frame)
-        method.update(frame, detections, timer)
+        with self._clock.running("update"):
+            method.update(frame, detections, timer)
         total_ms = (time.perf_counter() - start) * 1e3
-        row: Row = {"update": update, "frame": frame.index, "n_detections": len(detections)}
-        row |= {name: int(getattr(method, name)) for name in SIZES if hasattr(method, name)}
-        row |= dict(method.losses) if isinstance(method, CountsLosses) else {}
-        row |= {"rss_bytes": memory_bytes()}
-        row |= {f"{name}_ms": round(ms, 3) for name, ms in timer.take().items()}
-        return row | {"total_ms": round(total_ms, 3)}
+        own: Row = {"update": update, "frame": frame.index, "n_detections": len(detections)}
+        of_method: Row = {name: int(getattr(method, name)) for name in SIZES if hasattr(method, name)}
+        of_method |= dict(method.losses) if isinstance(method, CountsLosses) else {}
+        of_method |= {"rss_bytes": memory_bytes()}
+        of_method |= {f"{name}_ms": round(ms, 3) for name, ms in timer.take().items()}
+        # What is measured here goes before what a method calls by the same name.
+        own |= {key: value for key, value in of_method.items() if key not in own}
+        return own | {"method_ms": round(self._clock.take("update").method_ms, 3), "total_ms": round(total_ms, 3)}
 
     def _detect(self, frame: Frame) -> Detections:
         needs = self._method.needs
@@ -222,12 +259,13 @@ class Feeding:
 
     def write_map(self, path: Path) -> None:
         """Write the method's map so far."""
-        start = time.perf_counter()
-        prediction = self._method.finish()
-        elapsed_ms = (time.perf_counter() - start) * 1e3
+        with self._clock.running("finish"):
+            prediction = self._method.finish()
+        spent = self._clock.take("finish")
         write_prediction(path, prediction)
         costs = dict(self._method.finish_costs) if isinstance(self._method, HasFinishCosts) else {}
-        self.maps.append({"n_updates": len(self._rows), "finish_ms": round(elapsed_ms, 3)} | costs)
+        own = {"n_updates": len(self._rows), "finish_ms": spent.total_ms, "perception_ms": spent.perception_ms}
+        self.maps.append({**own, **costs, **{name: round(value, 3) for name, value in own.items()}})
 
     def updates_text(self) -> str:
         """The table of the updates."""

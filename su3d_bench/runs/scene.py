@@ -26,7 +26,7 @@ from su3d_bench.core.interfaces import (
     TakesTruth,
     WarmsUp,
 )
-from su3d_bench.core.timing import device_memory_bytes, peak_memory_bytes, start_memory_watch
+from su3d_bench.core.timing import MethodClock, device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Prediction, Proposals, SceneInfo
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
@@ -45,6 +45,7 @@ from su3d_bench.runs.feeding import (
     FirstFrames,
     ReadAhead,
     SceneLog,
+    TimedRegions,
     surface_of,
     true_proposals,
     warm_up,
@@ -195,7 +196,7 @@ class _Scene:
         if was_resumed:
             log.recall(folder.remarks("predict"))
         else:
-            self._predict(part, method, info, perception, folder, key, log)
+            self._predict(part, info, perception, folder, key, log)
         score_key = inputs.score_key(key, folder)
         if not folder.is_done("score", score_key):
             self._score(part, perception, folder, score_key, log)
@@ -205,13 +206,16 @@ class _Scene:
     def _predict(
         self,
         part: Part,
-        method: Method,
         info: SceneInfo,
         perception: Perception,
         folder: JobFolder,
         key: Mapping[str, str],
         log: SceneLog,
     ) -> None:
+        """Feed a method that is made anew, so that what it does when it is made is timed too, and seal its map."""
+        clock = MethodClock()
+        with clock.running("start"):
+            method: Method = build_method(part)
         frames: Sequence[Frame] = ()
         n = 0
         if method.needs.frames:
@@ -219,27 +223,34 @@ class _Scene:
             n = min(len(frames), self.job.limit or len(frames))
         device = device_for(self.perception_config.models.device, self.job.index)
         if isinstance(method, TakesDevice):
-            method.receive_device(device)
+            with clock.running("start"):
+                method.receive_device(device)
         if isinstance(method, TakesTools):
-            method.receive_tools(self._tools(method, perception, frames, n))
+            tools = self._tools(method, perception, frames, n, clock)
+            with clock.running("start"):
+                method.receive_tools(tools)
         if isinstance(method, TakesTruth):
             if not self.dataset.variants:
                 raise GroundTruthMissing(f"{self.job.scene}: {method.name} needs ground truth, the dataset has none")
-            method.receive_truth(self.truth(self.dataset.variants[0]))
+            truth = self.truth(self.dataset.variants[0])
+            with clock.running("start"):
+                method.receive_truth(truth)
         _warm_up(part, device)
         start_memory_watch()
-        feeding = Feeding(self.job.scene, method, perception, self.report)
+        feeding = Feeding(self.job.scene, method, perception, self.report, clock)
         shares = self.job.anytime if method.needs.frames else ()
         is_rendered = isinstance(self.dataset, RendersFrames) and self.dataset.renders_frames
-        with ReadAhead(frames, n, n_ahead=0 if is_rendered else N_AHEAD) as ahead:
+        with clock.running("start"):
             method.start(info)
+        with ReadAhead(frames, n, n_ahead=0 if is_rendered else N_AHEAD) as ahead:
             for share in shares:
                 feeding.up_to(math.ceil(share * n), ahead, n)
                 feeding.write_map(folder.anytime(share))
             feeding.up_to(n, ahead, n)
         feeding.write_map(folder.prediction)
         if isinstance(method, Closes):
-            method.close()
+            with clock.running("close"):
+                method.close()
         write_text(folder.updates, feeding.updates_text())
         files = [folder.prediction, folder.updates, *map(folder.anytime, shares)]
         costs = {
@@ -247,13 +258,17 @@ class _Scene:
             "calibration_ms": feeding.calibration_ms,
             "peak_rss_bytes": peak_memory_bytes(),
             "device_bytes": device_memory_bytes(),
+            "start_ms": round(clock.take("start").method_ms, 3),
+            "close_ms": round(clock.take("close").method_ms, 3),
         }
         folder.seal("predict", key, files, {"costs": costs} | log.remarks())
 
-    def _tools(self, method: Method, perception: Perception, frames: Sequence[Frame], n: int) -> SceneTools:
+    def _tools(
+        self, method: Method, perception: Perception, frames: Sequence[Frame], n: int, clock: MethodClock
+    ) -> SceneTools:
         return SceneTools(
             frames=FirstFrames(frames, n),
-            regions=perception.regions(),
+            regions=TimedRegions(perception.regions(), clock),
             surface=partial(surface_of, self.dataset, self.job.scene_name),
             true_proposals=self._true_proposals if method.needs.true_proposals else None,
         )

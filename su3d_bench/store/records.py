@@ -198,7 +198,7 @@ class MetricsRecord:
 
 @dataclass(frozen=True)
 class MapCost:
-    """What one map took: the updates before it, the milliseconds of ``finish``, those of them that were perception's."""
+    """What one map took: the updates before it, milliseconds of ``finish``, and what of them was perception's."""
 
     n_updates: Count
     finish_ms: Amount

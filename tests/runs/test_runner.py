@@ -103,7 +103,7 @@ def test_updates_hold_a_row_a_frame_with_its_stages() -> None:
     rows = list(csv.DictReader((job() / "updates.csv").open()))
     assert [row["frame"] for row in rows] == ["0", "2", "4"]
     assert list(rows[0])[:5] == ["update", "frame", "n_detections", "n_points", "n_instances"]
-    assert list(rows[0])[5:] == ["rss_bytes", "decode_ms", "segment_ms", "collect_ms", "total_ms"]
+    assert list(rows[0])[5:] == ["rss_bytes", "decode_ms", "segment_ms", "collect_ms", "method_ms", "total_ms"]
     assert [int(row["n_points"]) for row in rows] == [768, 1536, 2304]
 
 

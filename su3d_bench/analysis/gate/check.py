@@ -1,0 +1,170 @@
+"""Everything in which a run differs from a reference."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping
+from typing import Literal
+
+from su3d_bench.analysis.gate.costs import busy_remark, cost_findings, why_no_cost
+from su3d_bench.analysis.gate.reference import (
+    SCHEMA,
+    MethodResult,
+    Reference,
+    Values,
+    differing_keys,
+    settings_of,
+    wrong_files,
+)
+from su3d_bench.core.errors import printable
+from su3d_bench.reports.gate import Finding, Verdict
+from su3d_bench.runs.finished import FinishedRun
+from su3d_bench.store.records import NumbersRecord
+
+_SHARES = ("recall", "precision", "IoU", "F1", "F1-conceptgraphs", "mPrecision", "mF1", "mF1-conceptgraphs", "pAcc")
+_OF_QUESTIONS = ("instance", "affordance", "property", "relative", "all", "answer", "objects")
+_OF_LABELS = ("label n", "label n'", "well-merged", "well-merged n'")
+HIGHER_IS_BETTER = frozenset(
+    {"AP", "AP50", "AP25", "mAcc", "mIoU", "F-mIoU", "synonyms", "overall", *_SHARES, *_OF_QUESTIONS, *_OF_LABELS}
+)
+
+
+def check(run: FinishedRun, reference: Reference) -> Verdict:
+    """Everything in which ``run`` differs from ``reference``, failures and improvements."""
+    is_same_machine = run.record.processor == reference.processor
+    findings = [*_identity(run, reference)]
+    findings += [Finding("changed", where, fault) for where, fault in wrong_files(run)]
+    table = run.results
+    n_compared = 0
+    for expected in reference.results:
+        where = f"{printable(expected.method, 80)} / {printable(expected.protocol, 80)}"
+        measured = table.get((expected.method, expected.protocol))
+        if measured is None or measured.result is None:
+            findings.append(Finding("missing", where, "the run has no score of it"))
+            continue
+        if measured.profile != expected.profile:
+            findings.append(_changed(where, "profile", expected.profile, measured.profile))
+        if measured.encoder_digest != expected.encoder_digest:
+            findings.append(_changed(where, "encoder digest", expected.encoder_digest, measured.encoder_digest))
+        findings += _unknown(where, "value", expected.metrics, measured.headline)
+        findings += _numbers(where, expected, measured.result, None if is_same_machine else reference.across_machines)
+        n_compared += len(expected.metrics)
+    costs, limit = reference.costs, reference.cost_limit
+    findings += cost_findings(run, costs, reference.calibration_ms, limit, is_judged=is_same_machine)
+    findings += _costs_not_learnt(run, reference)
+    return Verdict(run.name, tuple(findings), n_compared, tuple(_remarks(run, reference)))
+
+
+def _remarks(run: FinishedRun, reference: Reference) -> Iterator[str]:
+    """What was not judged, and why."""
+    if run.record.processor != reference.processor:
+        yield _other_machine(run, reference)
+    elif (busy := busy_remark(run, reference.calibration_ms)) is not None:
+        yield busy
+    known = {result.method for result in reference.results}
+    others = [*(method for method in run.methods if method not in known)]
+    others += [name for name in run.protocols if name not in reference.protocols]
+    if others:
+        yield f"the reference does not know, so that nothing holds: {', '.join(printable(name, 80) for name in others)}"
+    if reference.schema_version != SCHEMA:
+        yield (
+            "the reference is of an older version, whose costs are not those that are judged now: no cost is judged, "
+            "learn it again"
+        )
+        return
+    for method in run.methods:
+        if method in known and method not in reference.costs and (reason := why_no_cost(run, method)):
+            yield f"{printable(method, 80)}: no cost is judged: it {reason}"
+
+
+def _costs_not_learnt(run: FinishedRun, reference: Reference) -> Iterator[Finding]:
+    known = {result.method for result in reference.results}
+    for method in run.methods if reference.schema_version == SCHEMA else ():
+        if method in known and method not in reference.costs and why_no_cost(run, method) is None:
+            text = "the reference holds none and the run measured it; learn a new reference"
+            yield Finding("missing", f"{printable(method, 80)} / cost", text)
+
+
+def _unknown(where: str, kind: str, known: Collection[str], measured: Collection[str]) -> Iterator[Finding]:
+    """A finding for whatever the run has and the reference has not."""
+    for name in measured:
+        if name not in known:
+            text = f"the reference does not have this {kind}; learn a new one"
+            yield Finding("changed", f"{where} / {kind} {printable(name, 80)}", text)
+
+
+def _other_machine(run: FinishedRun, reference: Reference) -> str:
+    return (
+        f"another processor ({run.record.hardware}) than the reference's ({reference.hardware}): headline values are "
+        f"compared within {100 * reference.across_machines:g} points, scenes and classes by presence, costs are not "
+        "judged"
+    )
+
+
+def _identity(run: FinishedRun, reference: Reference) -> Iterator[Finding]:
+    if run.is_incomplete:
+        yield Finding("missing", "run", "is incomplete: some scenes failed")
+    if run.limit != reference.limit:
+        yield _changed("run", "limit", reference.limit, run.limit)
+    for key, before, now in differing_keys(reference.settings, settings_of(run)):
+        yield _changed("settings", key, before, now)
+    for scene, digest in reference.data_digests.items():
+        if scene not in run.scenes:
+            yield Finding("missing", scene, "the run does not have this scene")
+        elif run.record.data_digests.get(scene) != digest:
+            yield _changed(scene, "data digest", digest, run.record.data_digests.get(scene))
+    yield from _unknown("run", "scene", reference.data_digests, run.scenes)
+    for name, expected in reference.protocols.items():
+        if name not in run.protocols:
+            yield Finding("missing", name, "the run does not have this protocol")
+            continue
+        rules = run.protocols[name]
+        if rules.version != expected.version:
+            yield _changed(name, "protocol version", expected.version, rules.version)
+        elif rules.digest != expected.digest:
+            yield _changed(name, "protocol digest", expected.digest, rules.digest)
+
+
+def _changed(where: str, what: str, before: object, now: object) -> Finding:
+    return Finding("changed", where, f"{what} was {_short(before)}, now {_short(now)}")
+
+
+def _short(value: object) -> str:
+    text = printable(str(value), 200)
+    return f"{text[:12]}..." if len(text) > 40 and " " not in text else text
+
+
+def _numbers(where: str, expected: MethodResult, measured: NumbersRecord, across: float | None) -> Iterator[Finding]:
+    """``across``: the tolerance of headline values of another machine; None on the same one."""
+    yield from _compare(where, expected.metrics, measured.metrics, across)
+    yield from _unknown(where, "scene", expected.scenes, measured.per_scene)
+    if across is None:
+        yield from _unknown(where, "class", expected.classes, measured.per_class)
+    for kind, tables, rows in (
+        ("scene", expected.scenes, measured.per_scene),
+        ("class", expected.classes, measured.per_class),
+    ):
+        for name, values in tables.items():
+            row = rows.get(name)
+            if row is None:
+                yield Finding(
+                    "missing", f"{where} / {kind} {printable(name, 80)}", f"the run does not have this {kind}"
+                )
+            elif across is None:
+                yield from _compare(f"{where} / {kind} {printable(name, 80)}", values, row, None)
+
+
+def _compare(where: str, expected: Values, row: Mapping[str, float | None], across: float | None) -> Iterator[Finding]:
+    for name, value in expected.items():
+        tolerance = value.tolerance if across is None else max(across, value.tolerance)
+        measured = row.get(name)
+        if measured == value.value:
+            continue
+        if measured is None or value.value is None:
+            yield Finding("regression", f"{where} / {name}", "is undefined in one of the two", value.value, measured)
+        elif abs(measured - value.value) > tolerance:
+            is_better = name in HIGHER_IS_BETTER and measured > value.value
+            text = "is better than the reference" if is_better else "is worse than the reference"
+            if name not in HIGHER_IS_BETTER:
+                text = "differs from the reference"
+            kind: Literal["better", "regression"] = "better" if is_better else "regression"
+            yield Finding(kind, f"{where} / {name}", text, value.value, measured, tolerance)

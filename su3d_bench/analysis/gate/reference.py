@@ -1,0 +1,252 @@
+"""What a run is held against: every number with its tolerance, learnt from earlier runs of the same request.
+
+A tolerance is what the spread of the taught runs gives: none where they agree to the last bit. What moves a number
+without being one (protocol, data, weights, settings) must not change at all.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from su3d_bench.analysis.gate.costs import Cost, calibration_of, method_cost
+from su3d_bench.analysis.recomputed import damaged_files, why_not_counted
+from su3d_bench.core.config import MOVES_NO_NUMBER
+from su3d_bench.core.errors import ConfigError, StoreError, Su3dError, printable
+from su3d_bench.runs.finished import FinishedRun
+from su3d_bench.store.atomic import read_json
+from su3d_bench.store.records import ROUNDING, ResultRecord, impossible_value
+
+SCHEMA = 2  # 1 had the cost of an update alone, from the stages that a method named itself
+SPREADS = 2.0  # a value may leave the taught ones by this many times their range: 2 of 50 unchanged repeats would at 1
+ACROSS_MACHINES = 0.02  # 2 points: what ONNX Runtime's and BLAS's kernels of other processors may move a headline value
+COST_LIMIT = 1.3  # a method may cost so many times the reference's; `python benchmarks gate_repeats` has the scatter
+MOST_COST_LIMIT = 1000.0
+# Settings that name what was asked for or move no number; scenes, methods and protocols are compared one by one.
+NOT_COMPARED = frozenset({"scenes", "methods", "protocols", "perception.cache"}) | MOVES_NO_NUMBER
+
+
+class _Model(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Value(_Model):
+    """A fraction, None where it is undefined, and by how much another run may differ from it."""
+
+    value: float | None = Field(allow_inf_nan=False)
+    tolerance: float = Field(default=0.0, ge=0, le=SPREADS * (1 + ROUNDING), allow_inf_nan=False)
+
+
+Values = Mapping[str, Value]
+
+
+class ProtocolKey(_Model):
+    version: int
+    digest: str
+
+
+class MethodResult(_Model):
+    """One method under one protocol: its headline values, those of each scene, and all values of each class."""
+
+    method: str
+    protocol: str
+    profile: str | None
+    encoder_digest: str | None
+    metrics: dict[str, Value] = Field(min_length=1)
+    scenes: dict[str, dict[str, Value]] = Field(min_length=1)
+    classes: dict[str, dict[str, Value]]
+
+    @model_validator(mode="after")
+    def _holds_possible_values(self) -> Self:
+        for row in (self.metrics, *self.scenes.values(), *self.classes.values()):
+            for name, value in row.items():
+                if value.value is not None and (fault := impossible_value(name, value.value)) is not None:
+                    raise ValueError(fault)
+        if all(value.value is None for value in self.metrics.values()):
+            raise ValueError(f"{self.method} under {self.protocol} has no value")
+        if any(row.keys() != self.metrics.keys() for row in self.scenes.values()):
+            raise ValueError(
+                f"a scene of {self.method} under {self.protocol} has other values than all scenes together"
+            )
+        return self
+
+
+class Reference(_Model):
+    """What a run is held against; ``costs``: of each method, over the calibrating piece of work.
+
+    ``processor``: a digest of the processor's kind; byte-equality is promised on one kind alone. ``calibration_ms``:
+    of that piece of work. Of a file of schema 1 the costs are passed over: they were of a part of the updates alone.
+    """
+
+    schema_version: Literal[1, 2] = 1
+    hardware: str
+    processor: str
+    n_runs: int = Field(ge=1)
+    across_machines: float = Field(ge=0, le=1)
+    cost_limit: float = Field(gt=1, le=MOST_COST_LIMIT)
+    limit: int = Field(ge=0)
+    settings: dict[str, str]
+    data_digests: dict[str, str] = Field(min_length=1)
+    protocols: dict[str, ProtocolKey] = Field(min_length=1)
+    results: tuple[MethodResult, ...] = Field(min_length=1)
+    costs: dict[str, Cost]
+    calibration_ms: float | None = Field(default=None, gt=0, allow_inf_nan=False)
+
+    @model_validator(mode="before")
+    @classmethod
+    def _without_costs_of_schema_1(cls, value: Any) -> Any:
+        if isinstance(value, dict) and value.get("schema_version", 1) == 1:
+            return {**value, "costs": {}, "calibration_ms": None}
+        return value
+
+    @model_validator(mode="after")
+    def _agrees_with_itself(self) -> Self:
+        keys = [(result.method, result.protocol) for result in self.results]
+        if len(set(keys)) < len(keys):
+            raise ValueError("a method stands twice under one protocol")
+        for result in self.results:
+            if result.protocol not in self.protocols:
+                raise ValueError(f"protocols lacks {result.protocol}")
+            if unknown := next((scene for scene in result.scenes if scene not in self.data_digests), None):
+                raise ValueError(f"data_digests lacks {unknown}")
+        if self.costs and self.calibration_ms is None:
+            raise ValueError("costs without calibration_ms")
+        return self
+
+
+def read_reference(path: Path) -> Reference:
+    """The reference in ``path``; ``ConfigError`` where it is none."""
+    try:
+        return Reference.model_validate(read_json(path))
+    except StoreError as error:
+        raise ConfigError(
+            f"{error.args[0].partition(';')[0]}; make a reference with su3d-bench check --learn RUN"
+        ) from error
+    except (ValidationError, RecursionError) as error:
+        what = _fault(error) if isinstance(error, ValidationError) else "is nested too deep"
+        raise ConfigError(
+            f"{printable(str(path), 200)}: is no reference of this version: {what}; make one with su3d-bench check "
+            "--learn RUN"
+        ) from error
+
+
+def _fault(error: ValidationError) -> str:
+    first = error.errors()[0]
+    key = printable(".".join(map(str, first["loc"])), 120)
+    what = str(first.get("ctx", {}).get("error", first["msg"]))
+    return printable(f"{key}: {what}" if key else what, 240)
+
+
+def learn(
+    runs: Sequence[FinishedRun], across_machines: float = ACROSS_MACHINES, cost_limit: float = COST_LIMIT
+) -> Reference:
+    """A reference from complete ``runs`` of one request, which must agree in everything that is not a measurement."""
+    first = runs[0]
+    for run in runs:
+        if run.is_incomplete:
+            raise ConfigError(f"{run.name}: is incomplete; a reference is learnt from complete runs")
+        if differing := next(differing_keys(settings_of(first), settings_of(run)), None):
+            raise ConfigError(f"{run.name}: differs from {first.name} in {differing[0]}; learn from repeats of one run")
+        if (run.record.data_digests, run.protocols) != (first.record.data_digests, first.protocols):
+            raise ConfigError(f"{run.name}: has other data or protocols than {first.name}; learn from repeats")
+        for where, fault in wrong_files(run):
+            raise ConfigError(f"{run.name}: {where}: {fault}; run its command again")
+    tables = [run.results for run in runs]
+    if any(set(table) != set(tables[0]) for table in tables):
+        raise ConfigError(f"{first.name}: the runs hold different methods or protocols; learn from repeats of one run")
+    return Reference(
+        schema_version=SCHEMA,
+        hardware=first.record.hardware,
+        processor=first.record.processor,
+        n_runs=len(runs),
+        across_machines=across_machines,
+        cost_limit=cost_limit,
+        limit=first.limit,
+        settings=settings_of(first),
+        data_digests=dict(first.record.data_digests),
+        protocols={name: ProtocolKey(version=key.version, digest=key.digest) for name, key in first.protocols.items()},
+        results=tuple(_learn_result([table[key] for table in tables]) for key in tables[0]),
+        **_learn_costs(runs),
+    )
+
+
+def wrong_files(run: FinishedRun) -> Iterator[tuple[str, str]]:
+    """Where and what: files that are not those of the run, numbers that do not follow from its counts."""
+    yield from damaged_files(run)
+    for method in dict.fromkeys(method for method, _ in run.results):
+        try:
+            scores = run.scores(method)
+        except Su3dError as error:
+            yield printable(method, 80), printable(str(error), 300)
+            continue
+        for (name, protocol), record in run.results.items():
+            if name == method and record.result is not None:
+                fault = why_not_counted(run, method, protocol, scores.get(protocol, {}))
+                if fault is not None:
+                    yield f"{printable(method, 80)} / {printable(protocol, 80)}", printable(fault, 300)
+
+
+def _learn_costs(runs: Sequence[FinishedRun]) -> dict[str, Any]:
+    known = {method: [cost for run in runs if (cost := method_cost(run, method))] for method in runs[0].methods}
+    calibrations = [milliseconds for run in runs if (milliseconds := calibration_of(run)) is not None]
+    return {
+        "costs": {method: Cost.middle(costs) for method, costs in known.items() if costs},
+        "calibration_ms": float(np.median(calibrations)) if calibrations else None,
+    }
+
+
+def _learn_result(repeats: Sequence[ResultRecord]) -> MethodResult:
+    first = repeats[0]
+    numbers = [repeat.result for repeat in repeats if repeat.result is not None]
+    if len(numbers) < len(repeats):
+        raise ConfigError(f"{first.method} under {first.protocol}: was not scored; learn from runs with numbers")
+    if all(result.metrics.get(name) is None for result in numbers for name in first.headline):
+        raise ConfigError(
+            f"{first.method} under {first.protocol}: has no value to hold a run against; learn without this protocol"
+        )
+    scenes = [{scene: _only(row, first.headline) for scene, row in result.per_scene.items()} for result in numbers]
+    return MethodResult(
+        method=first.method,
+        protocol=first.protocol,
+        profile=first.profile,
+        encoder_digest=first.encoder_digest,
+        metrics=_learn_values([_only(result.metrics, first.headline) for result in numbers]),
+        scenes={scene: _learn_values([rows.get(scene, {}) for rows in scenes]) for scene in scenes[0]},
+        classes={
+            name: _learn_values([result.per_class.get(name, {}) for result in numbers]) for name in numbers[0].per_class
+        },
+    )
+
+
+def _only(row: Mapping[str, float | None], names: Sequence[str]) -> dict[str, float | None]:
+    return {name: row.get(name) for name in names}
+
+
+def _learn_values(repeats: Sequence[Mapping[str, float | None]]) -> dict[str, Value]:
+    return {name: _learn_value([repeat.get(name) for repeat in repeats]) for name in repeats[0]}
+
+
+def _learn_value(repeats: Sequence[float | None]) -> Value:
+    known = [value for value in repeats if value is not None]
+    if not known:
+        return Value(value=None, tolerance=0.0)
+    spread = max(known) - min(known)
+    return Value(value=known[0] if spread == 0 else math.fsum(known) / len(known), tolerance=SPREADS * spread)
+
+
+def settings_of(run: FinishedRun) -> dict[str, str]:
+    """The settings that must be those of the reference."""
+    keys = {".".join(path): str(value) for path, value in run.settings.items()}
+    return {key: value for key, value in sorted(keys.items()) if key not in NOT_COMPARED}
+
+
+def differing_keys(before: Mapping[str, str], now: Mapping[str, str]) -> Iterator[tuple[str, str, str]]:
+    """Each key that differs, with what it was and is."""
+    for key in [*before, *(key for key in now if key not in before)]:
+        if before.get(key) != now.get(key):
+            yield key, before.get(key, "not set"), now.get(key, "not set")
