@@ -69,7 +69,8 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "analysis/comparison.py": ("analysis/test_compare_pairs", "analysis/test_compare", "analysis/test_planning"),
     "analysis/side_numbers.py": ("analysis/test_compare_pairs", "analysis/test_compare", "analysis/test_planning"),
     "analysis/sides.py": ("analysis/test_compare_pairs", "analysis/test_compare", "analysis/test_planning"),
-    "analysis/gate.py": ("analysis/test_gate",),
+    "analysis/gate/": ("analysis/test_gate", "analysis/test_gate_costs"),
+    "analysis/recomputed.py": ("analysis/test_gate", "analysis/test_leaderboard"),
 }  # fmt: skip
 
 

@@ -58,7 +58,8 @@ def _checked_counts(side: Any, protocol: str) -> None:
 
 def _run(folder: Path) -> Read:
     """Everything that is read of a finished run."""
-    from su3d_bench.analysis.gate import check, learn, read_reference
+    from su3d_bench.analysis.gate.check import check
+    from su3d_bench.analysis.gate.reference import learn, read_reference
     from su3d_bench.analysis.leaderboard import leaderboard
     from su3d_bench.analysis.sides import Side
     from su3d_bench.analysis.tables import measured_results
