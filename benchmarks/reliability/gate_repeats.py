@@ -2,7 +2,8 @@
 
 ``python benchmarks gate_repeats [--repeats 50] [--json build/measured/gate_repeats.json]``: the same small run again
 and again, OpenSU3D with perfect masks on the forty updates of a room; the first five teach the reference, the
-others are checked against it, and each once more with a method slower by half, which must fail. Some seconds a run. Exit code 1 where a repeat fails or a slower one passes.
+others are checked against it, and each once more with a method slower by half, which must fail. Some seconds a run.
+Exit code 1 where a repeat fails or a slower one passes.
 """
 
 from __future__ import annotations

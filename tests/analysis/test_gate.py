@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import json
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -15,10 +16,14 @@ import pytest
 from painted import colour_perception
 from places import SCENES
 
-from su3d_bench.analysis.gate import HIGHER_IS_BETTER, Reference, Value, check, learn, read_reference
+from su3d_bench.analysis.gate.check import HIGHER_IS_BETTER, check, compared
+from su3d_bench.analysis.gate.reference import Reference, Value, learn, read_reference
 from su3d_bench.cli.main import main
+from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.scoring import combine, pack_scores, unpack_scores
+from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.reports.gate import Finding, Verdict, github_lines, junit_xml, markdown, plain_lines
 from su3d_bench.runs import scene as scene_run
 from su3d_bench.runs.finished import read_run
@@ -34,21 +39,64 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(scene_run, "build_perception", colour_perception)
         assert main([*WORDS, "--out", str(folder)]) == 0
-    for updates in folder.rglob("updates.csv"):
-        _steady(updates)
+    timed(folder)
     return folder
 
 
-def _steady(updates: Path) -> None:
-    """Put times of 4 ms in place of the measured ones, so that the tests do not depend on the machine's mood."""
-    rows = list(csv.reader(updates.open()))
-    if len(rows) < 2:
-        return
-    header = rows[0]
-    with updates.open("w", newline="") as stream:
-        writer = csv.writer(stream, lineterminator="\n")
-        writer.writerow([*header[:-1], "match_ms", "total_ms"])
-        writer.writerows([*row[:-1], "4.0", "9.0"] for row in rows[1:])
+COSTS = {"calibration_ms": 5.0, "start_ms": 10.0, "close_ms": 0.0}
+
+
+def timed(run: Path, method_ms: Sequence[float] = (40.0,) * 6, finish_ms: float = 60.0, **costs: float) -> Path:
+    """Put such times in place of the measured ones, so that the tests do not depend on the machine's mood."""
+    for updates in run.rglob("collector/updates.csv"):
+        rows = list(csv.DictReader(updates.open()))
+        for row, ms in zip(rows, method_ms, strict=True):
+            row |= {"method_ms": str(ms), "total_ms": str(ms + 50)}
+        with updates.open("w", newline="") as stream:
+            writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
+            writer.writeheader()
+            writer.writerows(rows)
+    for done in run.rglob("collector/done.json"):
+        edit(done, lambda value: of_costs(value).update(COSTS | costs))
+        edit(done, lambda value: of_costs(value)["maps"][0].update(finish_ms=finish_ms, perception_ms=0.0))
+    return sealed(run)
+
+
+def of_costs(done: Any) -> Any:
+    return done["steps"]["predict"]["remarks"]["costs"]
+
+
+def sealed(run: Path) -> Path:
+    """The run with seals that fit its files, as one has that was written so."""
+    for done in run.rglob("done.json"):
+
+        def seal(value: Any, folder: Path = done.parent) -> None:
+            for step in value["steps"].values():
+                step["files"] = {name: digest_file(folder / name) for name in step["files"] if (folder / name).exists()}
+
+        edit(done, seal)
+    return run
+
+
+def counted_otherwise(run: Path, n_points: int = 5) -> Path:
+    """The run with ``n_points`` of the chairs called sofas, in counts and metrics alike."""
+    scores: dict[str, dict[str, Any]] = {}
+    for file in run.rglob("collector/counts.npz"):
+        of_scene = unpack_scores(file.read_bytes())
+        counts = of_scene["rooms-semantic"].counts
+        assert isinstance(counts, SemanticCounts)
+        chair, other = np.flatnonzero(counts.confusion.any(axis=1))[:2]
+        counts.confusion[chair, [chair, other]] += (-n_points, n_points)
+        file.write_bytes(pack_scores(of_scene))
+        scene = file.parent.parent.name.replace(".", "/")
+        scores |= {name: {**scores.get(name, {}), scene: score} for name, score in of_scene.items()}
+
+    def change(metrics: Any) -> None:
+        for result in metrics["results"]:
+            result["result"] = combine(load_protocol(result["protocol"]), scores[result["protocol"]]).to_json()
+
+    edit(run / "metrics.json", change)
+    return sealed(run)
 
 
 @pytest.fixture(scope="module")
@@ -95,9 +143,12 @@ def lowered(table: str, *keys: str, by: float = 0.001) -> Callable[[Path], None]
 
 
 def slower(factor: float) -> Callable[[Path], None]:
+    return with_times([40.0 * factor] * 6)
+
+
+def with_times(method_ms: Sequence[float] = (40.0,) * 6, **costs: float) -> Callable[[Path], None]:
     def change(run: Path) -> None:
-        for updates in run.rglob("updates.csv"):
-            updates.write_text(updates.read_text().replace("4.0,9.0", f"{4 * factor},{5 + 4 * factor}"))
+        timed(run, method_ms, **costs)
 
     return change
 
@@ -113,7 +164,41 @@ def setting(old: str, new: str) -> Callable[[Path], None]:
 
 def without_calibration(run: Path) -> None:
     for done in run.rglob("collector/done.json"):
-        edit(done, lambda value: value["steps"]["predict"]["remarks"]["costs"].update(calibration_ms=None))
+        edit(done, lambda value: of_costs(value).update(calibration_ms=None))
+
+
+def file_of(run: Path, name: str) -> Path:
+    return run / "scenes/painted.a/collector" / name
+
+
+def cut(name: str) -> Callable[[Path], None]:
+    """What a disk that was full leaves of a file."""
+
+    def change(run: Path) -> None:
+        file_of(run, name).write_bytes(file_of(run, name).read_bytes()[:-20])
+
+    return change
+
+
+def garbage(name: str) -> Callable[[Path], None]:
+    """A file that is none, and a seal that says that it is."""
+
+    def change(run: Path) -> None:
+        file_of(run, name).write_bytes(b"no archive")
+        sealed(run)
+
+    return change
+
+
+def counts_alone(run: Path) -> None:
+    """Other counts than those from which the metrics were formed."""
+    text = (run / "metrics.json").read_text()
+    counted_otherwise(run)
+    (run / "metrics.json").write_text(text)
+
+
+def without(name: str) -> Callable[[Path], None]:
+    return lambda run: file_of(run, name).unlink()
 
 
 def results_of(metrics: Any) -> Any:
@@ -147,9 +232,57 @@ PLANTED: dict[str, tuple[Callable[[Path], None], str]] = {
     "another option of the dataset": (setting("n_frames = 6", "n_frames = 5"), "dataset.painted.n_frames was 6, now 5"),
     "an incomplete run": (in_record(lambda r: r.update(status="incomplete")), "run: is incomplete"),
     "a partial run": (in_metrics(lambda m: m.update(limit=3)), "run: limit was 0, now 3"),
-    "an update slower by half": (slower(1.5), "cost of an update: costs 1.4"),
-    "an update that nobody timed": (without_calibration, "cost of an update: the run did not measure it"),
+    "an update slower by half": (slower(1.5), "cost of the updates after 3: costs 1.50 times"),
+    "an update that nobody timed": (without_calibration, "collector / cost: the run did not measure it"),
+    "a map that is gone": (without("prediction.npz"), "collector / scene painted/a: prediction.npz is missing"),
+    "a map cut off": (cut("prediction.npz"), "prediction.npz is not the file that the run wrote"),
+    "a map that is none": (garbage("prediction.npz"), "collector / scene painted/a: holds no map"),
+    "counts that are gone": (without("counts.npz"), "counts.npz is missing"),
+    "counts cut off": (cut("counts.npz"), "counts.npz is not the file that the run wrote"),
+    "counts that are none": (garbage("counts.npz"), "collector: painted/a: collector: counts: are damaged"),
+    "other counts": (counts_alone, "metrics.json does not follow from the counts: metrics.mAcc is 1, the counts give"),
+    "no seal": (without("done.json"), "done.json does not vouch for prediction.npz"),
+    "a scene more": (
+        in_record(lambda r: r["scenes"].append("painted/c")),
+        "run / scene painted/c: the reference does not have this scene",
+    ),
+    "a scene more in a result": (
+        in_metrics(lambda m: results_of(m)["per_scene"].update(x=results_of(m)["per_scene"]["painted/a"])),
+        "rooms-semantic / scene x: the reference does not have this scene",
+    ),
+    "a class more": (
+        in_metrics(lambda m: results_of(m)["per_class"].update(x=results_of(m)["per_class"]["chair"])),
+        "rooms-semantic / class x: the reference does not have this class",
+    ),
 }
+
+NONE_WHATEVER: dict[str, tuple[Callable[[Path], None], str]] = {
+    f"a metric of {value}": (
+        in_metrics(lambda m, value=value: results_of(m)["metrics"].update(mAcc=value)),  # type: ignore[misc]
+        f"metrics.json is not as a run writes it: results.0.result.metrics: 'mAcc' is {value:g}, a fraction lies",
+    )
+    for value in (7e300, -0.25, 1.01, 100.0)
+} | {
+    "a negative number of classes": (
+        in_metrics(lambda m: results_of(m)["metrics"].update(n_classes=-1)), "'n_classes' is -1"
+    ),
+    "a class beyond 1": (
+        in_metrics(lambda m: results_of(m)["per_class"]["chair"].update(IoU=2.0)), "'IoU' is 2, a fraction"
+    ),
+    "a protocol named twice": (
+        in_record(lambda r: r["protocols"].append(r["protocols"][0] | {"digest": "f" * 64})),
+        "run.json: names the protocol 'rooms-semantic' twice",
+    ),
+    "a scene named twice": (in_record(lambda r: r["scenes"].append("painted/a")), "names the scene 'painted/a' twice"),
+    "a method named twice": (in_record(lambda r: r["methods"].append("collector")), "the method 'collector' twice"),
+    "a result twice": (in_metrics(lambda m: m["results"].append(m["results"][0])), "collector / rooms-semantic' twice"),
+    "a time below 0": (with_times([-1.0] * 6), "updates.csv: holds -1 and"),
+    "an endless time": (with_times([7e300] * 6), "times and sizes lie from 0 to 1e+18"),
+    "a finish below 0": (with_times(finish_ms=-1.0), "the costs in done.json are not as"),
+    "no time at all for the calibrating work": (
+        with_times(calibration_ms=-1.0), "the costs in done.json are not as a run"
+    ),
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("name", PLANTED)
@@ -160,6 +293,18 @@ def test_a_planted_regression_is_caught(name: str, run: Path, learnt: Path, caps
     assert said in capsys.readouterr().out
 
 
+@pytest.mark.parametrize("name", NONE_WHATEVER)
+def test_what_no_run_can_have_written_is_refused(
+    name: str, run: Path, learnt: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    plant, said = NONE_WHATEVER[name]
+    plant(run)
+    assert main(["check", str(run), "--against", str(learnt)]) == 2
+    error = capsys.readouterr().err
+    assert said in error and error.count("\n") == 1
+    assert main(["check", "--learn", str(run), "--out", str(run / "r.json")]) == 2
+
+
 def test_a_value_that_is_no_number_never_passes(run: Path, learnt: Path, capsys: pytest.CaptureFixture[str]) -> None:
     in_metrics(lambda m: results_of(m)["metrics"].update(mAcc=float("nan")))(run)
     assert main(["check", str(run), "--against", str(learnt)]) == 2
@@ -168,12 +313,10 @@ def test_a_value_that_is_no_number_never_passes(run: Path, learnt: Path, capsys:
 
 def test_fifty_unchanged_repeats_pass(run: Path, learnt: Path) -> None:
     generator = np.random.default_rng(0)
-    originals = {path: path.read_text() for path in run.rglob("updates.csv")}
     for _ in range(50):
         # Time is the one thing that unchanged repeats differ in: by a twentieth, now and then by a tenth.
-        factor = float(np.exp(generator.normal(0, 0.05)))
-        for path, text in originals.items():
-            path.write_text(text.replace("4.0,9.0", f"{4 * factor},{5 + 4 * factor}"))
+        noise = np.exp(generator.normal(0, 0.05, 8))
+        timed(run, 40 * noise[:6], 60 * noise[6], start_ms=10 * noise[7])
         assert main(["check", str(run), "--against", str(learnt)]) == 0
 
 
@@ -185,104 +328,87 @@ def test_real_repeats_with_real_times_pass(tmp_path: Path, monkeypatch: pytest.M
     assert check(read_run(tmp_path / "b"), taught).is_passed
 
 
-def test_what_is_better_is_said_and_passes(run: Path, reference: Reference) -> None:
-    edit(run / "metrics.json", lambda m: results_of(m)["metrics"].update(mAcc=results_of(m)["metrics"]["mAcc"] + 0.01))
-    verdict = check(read_run(run), reference)
+def test_what_is_better_is_said_and_passes(run: Path, made: Path) -> None:
+    verdict = check(read_run(made), learn([read_run(counted_otherwise(run))]))
     assert verdict.is_passed
-    assert [one.kind for one in verdict.findings] == ["better"]
-    assert "1 better" in plain_lines(verdict)[0]
+    assert {one.kind for one in verdict.findings} == {"better"}
+    assert f"{len(verdict.findings)} better" in plain_lines(verdict)[0]
 
 
 def test_the_tolerance_is_twice_the_spread_of_the_taught_runs(run: Path, made: Path, tmp_path: Path) -> None:
-    value = json.loads((made / "metrics.json").read_text())["results"][0]["result"]["metrics"]["mAcc"]
-    lowered("metrics", "mAcc", by=0.004)(run)
-    taught = learn([read_run(made), read_run(run)])
+    first, second = (read_run(path) for path in (made, counted_otherwise(run, 4)))
+    values = [results_in(one).metrics["mAcc"] for one in (first, second)]
+    taught = learn([first, second])
     learnt = taught.results[0].metrics["mAcc"]
-    assert learnt.value == pytest.approx(value - 0.002)
-    assert learnt.tolerance == pytest.approx(0.008)
-    assert taught.results[0].metrics["F-mIoU"].tolerance == 0
-    shutil.copytree(made, tmp_path / "third")
-    lowered("metrics", "mAcc", by=0.0099)(tmp_path / "third")
-    assert check(read_run(tmp_path / "third"), taught).is_passed
-    lowered("metrics", "mAcc", by=0.0002)(tmp_path / "third")
-    assert not check(read_run(tmp_path / "third"), taught).is_passed
+    assert learnt.value == pytest.approx(np.mean(values))
+    assert learnt.tolerance == pytest.approx(2 * (values[0] - values[1]))
+    for n_points, is_passed in ((9, True), (11, False)):  # 2 less than the mean of the two, and 8 more at most
+        shutil.copytree(made, tmp_path / str(n_points))
+        verdict = check(read_run(counted_otherwise(tmp_path / str(n_points), n_points)), taught)
+        assert verdict.is_passed == is_passed, verdict.findings
 
 
-def one_metric(reference: Reference, name: str, value: Value, across_machines: float = 0.0) -> Reference:
-    """A reference that knows a single headline value of the first result, and no scenes, classes and costs."""
-    first, *others = reference.results
-    first = first.model_copy(update={"metrics": {name: value}, "scenes": {}, "classes": {}})
-    update = {"results": (first, *others), "costs": {}, "across_machines": across_machines}
-    return reference.model_copy(update=update)
+def results_in(run: Any) -> Any:
+    return run.results["collector", "rooms-semantic"].result
 
 
-def measured(run: Path, name: str, value: float) -> Path:
-    edit(run / "metrics.json", lambda m: results_of(m)["metrics"].update({name: value}))
-    return run
+def findings_of(run: Path, name: str, measured: float, value: Value, across: float | None = None) -> list[Finding]:
+    """What is said where a run measured this of a headline value of which no scene and class is known."""
+    numbers = replace(results_in(read_run(run)), metrics={name: measured}, per_scene={}, per_class={})
+    first = learn([read_run(run)]).results[0]
+    expected = first.model_copy(update={"metrics": {name: value}, "scenes": {}, "classes": {}})
+    return list(compared("m / p", expected, numbers, across))
 
 
-def test_a_value_that_differs_by_just_the_tolerance_passes_and_by_a_bit_more_fails(
-    run: Path, reference: Reference
-) -> None:
-    taught = one_metric(reference, "mAcc", Value(value=0.75, tolerance=0.25))
-    for value, is_passed in ((0.5, True), (1.0, True), (np.nextafter(0.5, 0), False)):
-        verdict = check(read_run(measured(run, "mAcc", float(value))), taught)
-        assert verdict.is_passed == is_passed
-        assert len(verdict.findings) == (not is_passed)
+def test_a_value_that_differs_by_just_the_tolerance_passes_and_by_a_bit_more_fails(made: Path) -> None:
+    taught = Value(value=0.75, tolerance=0.25)
+    for value, n_findings in ((0.5, 0), (1.0, 0), (np.nextafter(0.5, 0), 1)):
+        assert len(findings_of(made, "mAcc", float(value), taught)) == n_findings
 
 
 @pytest.mark.parametrize(("own", "across"), [(0.25, 0.125), (0.125, 0.25)])
-def test_on_another_processor_the_larger_of_the_two_tolerances_counts(
-    own: float, across: float, run: Path, reference: Reference
-) -> None:
-    edit(run / "run.json", lambda r: r.update(processor="other"))
-    taught = one_metric(reference, "mAcc", Value(value=0.75, tolerance=own), across)
-    assert check(read_run(measured(run, "mAcc", 0.5)), taught).is_passed
-    assert not check(read_run(measured(run, "mAcc", 0.4375)), taught).is_passed
-
-
-def test_on_the_same_processor_the_tolerance_of_other_machines_does_not_count(run: Path, reference: Reference) -> None:
-    taught = one_metric(reference, "mAcc", Value(value=0.75, tolerance=0.125), 0.25)
-    assert not check(read_run(measured(run, "mAcc", 0.5)), taught).is_passed
+def test_on_another_processor_the_larger_of_the_two_tolerances_counts(own: float, across: float, made: Path) -> None:
+    taught = Value(value=0.75, tolerance=own)
+    assert findings_of(made, "mAcc", 0.5, taught, across) == []
+    assert len(findings_of(made, "mAcc", 0.4375, taught, across)) == 1
 
 
 @pytest.mark.parametrize("value", [0.25, 0.75])
-def test_a_value_without_a_better_direction_may_move_in_neither(value: float, run: Path, reference: Reference) -> None:
+def test_a_value_without_a_better_direction_may_move_in_neither(value: float, made: Path) -> None:
     assert "over-merged" not in HIGHER_IS_BETTER
-    taught = one_metric(reference, "over-merged", Value(value=0.5))
-    verdict = check(read_run(measured(run, "over-merged", value)), taught)
-    assert [(one.kind, one.text) for one in verdict.findings] == [("regression", "differs from the reference")]
-    assert not verdict.is_passed
-    taught = one_metric(reference, "mAcc", Value(value=0.5))
-    verdict = check(read_run(measured(run, "mAcc", value)), taught)
-    assert [one.kind for one in verdict.findings] == ["better" if value > 0.5 else "regression"]
+    found = findings_of(made, "over-merged", value, Value(value=0.5))
+    assert [(one.kind, one.text, one.is_failure) for one in found] == [
+        ("regression", "differs from the reference", True)
+    ]
+    found = findings_of(made, "mAcc", value, Value(value=0.5))
+    assert [one.kind for one in found] == ["better" if value > 0.5 else "regression"]
 
 
 @pytest.mark.parametrize("protocol", ["rooms-retrieval", "rooms-reasoning", "rooms-annotation", "rooms-instance"])
-def test_a_headline_value_that_rises_passes_unless_it_is_a_share_of_what_is_wrong(
-    protocol: str, run: Path, reference: Reference
-) -> None:
+def test_a_headline_value_that_rises_passes_unless_it_is_a_share_of_what_is_wrong(protocol: str, made: Path) -> None:
     for name in load_protocol(protocol).headline:
-        verdict = check(read_run(measured(run, name, 0.75)), one_metric(reference, name, Value(value=0.5)))
-        assert verdict.is_passed == (name not in {"under-merged", "over-merged"}), name
+        (found,) = findings_of(made, name, 0.75, Value(value=0.5))
+        assert found.is_failure == (name in {"under-merged", "over-merged"}), name
 
 
-def busier(costs: Any, factor: float) -> None:
-    if costs["calibration_ms"] is not None:
-        costs["calibration_ms"] *= factor
+@pytest.mark.parametrize("factor", [2.0, 10.0, 1e9])
+def test_a_slowed_calibration_hides_no_tenfold_cost(
+    factor: float, run: Path, learnt: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    timed(run, [400.0] * 6, calibration_ms=5.0 * factor)
+    assert main(["check", str(run), "--against", str(learnt)]) == 1
+    shown = capsys.readouterr()
+    assert "cost of the updates after 3: costs 5.00 times the reference" in shown.out
+    assert "other programs used the processor, or what is checked slows it" in shown.err
 
 
-def test_on_a_busy_machine_costs_are_not_judged_and_it_says_so(
+def test_a_busy_machine_excuses_a_cost_up_to_twice_and_it_is_said(
     run: Path, learnt: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    slower(3.0)(run)
-    assert main(["check", str(run), "--against", str(learnt)]) == 1
-    for done in run.rglob("collector/done.json"):
-        edit(done, lambda value: busier(value["steps"]["predict"]["remarks"]["costs"], 2.0))
-    capsys.readouterr()
+    timed(run, [100.0] * 6, 150.0, calibration_ms=15.0)
     assert main(["check", str(run), "--against", str(learnt)]) == 0
-    assert "the machine was busy: the calibrating work took" in capsys.readouterr().err
-    lowered("metrics", "mAcc")(run)
+    assert "the calibrating work took 15 ms, 3.0 times the reference's" in capsys.readouterr().err
+    timed(run, [106.0] * 6, 150.0, calibration_ms=15.0)
     assert main(["check", str(run), "--against", str(learnt)]) == 1
 
 
@@ -302,14 +428,13 @@ def test_how_a_run_was_asked_for_and_what_moves_no_number_may_differ(
 
 
 def test_on_another_processor_headline_values_have_a_stated_tolerance(run: Path, reference: Reference) -> None:
+    slower(3.0)(counted_otherwise(run, 4))
+    assert not check(read_run(run), reference).is_passed
     edit(run / "run.json", lambda r: r.update(processor="other"))
-    lowered("metrics", "mAcc", by=0.019)(run)
-    lowered("per_class", "chair", "IoU", by=0.2)(run)
-    slower(3.0)(run)
     verdict = check(read_run(run), reference)
-    assert verdict.is_passed
+    assert verdict.is_passed, verdict.findings
     assert "another processor" in verdict.remarks[0] and "within 2 points" in verdict.remarks[0]
-    lowered("metrics", "mAcc", by=0.002)(run)
+    counted_otherwise(run, 40)
     assert not check(read_run(run), reference).is_passed
 
 
@@ -362,10 +487,10 @@ def test_the_command_fails_with_one_and_writes_what_a_pull_request_needs(
     words = ["check", str(run), "--against", str(learnt), "--github"]
     assert main([*words, "--markdown", str(tmp_path / "c.md"), "--junit", str(tmp_path / "j.xml")]) == 1
     shown = capsys.readouterr().out
-    assert shown.startswith("failed: 1 difference from") and "::error title=su3d-bench::" in shown
+    assert shown.startswith("failed: 2 differences from") and "::error title=su3d-bench::" in shown
     assert "| FAIL | collector / rooms-semantic / mAcc |" in (tmp_path / "c.md").read_text()
     suite = ElementTree.parse(tmp_path / "j.xml").getroot()
-    assert suite.get("failures") == "1" and len(suite.findall("testcase/failure")) == 1
+    assert suite.get("failures") == "2" and len(suite.findall("testcase/failure")) == 2
     assert main([*words, "--json"]) == 1
     assert json.loads(capsys.readouterr().out)["passed"] is False
 
@@ -401,8 +526,10 @@ def test_a_reference_survives_its_file(reference: Reference, tmp_path: Path) -> 
     [
         ("n_runs", 1, True), ("n_runs", 0, False), ("across_machines", 0.0, True), ("across_machines", 1.0, True),
         ("across_machines", -0.01, False), ("across_machines", 1.01, False), ("cost_limit", 1.01, True),
-        ("cost_limit", 1.0, False), ("calibration_ms", 0.01, True), ("calibration_ms", 0.0, False),
-        ("calibration_ms", None, True), ("results", [], False), ("costs", {}, True), ("schema_version", 2, False),
+        ("cost_limit", 1.0, False), ("cost_limit", 1001.0, False), ("calibration_ms", 0.01, True),
+        ("calibration_ms", 0.0, False), ("calibration_ms", None, False), ("results", [], False), ("costs", {}, True),
+        ("schema_version", 3, False), ("limit", -1, False), ("data_digests", {}, False),
+        ("data_digests", {"painted/a": "x"}, False), ("protocols", {}, False),
     ],
 )  # fmt: skip
 def test_a_reference_outside_its_limits_is_none(

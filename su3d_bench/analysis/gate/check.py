@@ -46,7 +46,7 @@ def check(run: FinishedRun, reference: Reference) -> Verdict:
         if measured.encoder_digest != expected.encoder_digest:
             findings.append(_changed(where, "encoder digest", expected.encoder_digest, measured.encoder_digest))
         findings += _unknown(where, "value", expected.metrics, measured.headline)
-        findings += _numbers(where, expected, measured.result, None if is_same_machine else reference.across_machines)
+        findings += compared(where, expected, measured.result, None if is_same_machine else reference.across_machines)
         n_compared += len(expected.metrics)
     costs, limit = reference.costs, reference.cost_limit
     findings += cost_findings(run, costs, reference.calibration_ms, limit, is_judged=is_same_machine)
@@ -133,8 +133,11 @@ def _short(value: object) -> str:
     return f"{text[:12]}..." if len(text) > 40 and " " not in text else text
 
 
-def _numbers(where: str, expected: MethodResult, measured: NumbersRecord, across: float | None) -> Iterator[Finding]:
-    """``across``: the tolerance of headline values of another machine; None on the same one."""
+def compared(where: str, expected: MethodResult, measured: NumbersRecord, across: float | None) -> Iterator[Finding]:
+    """Every number that differs, or that one of the two lacks.
+
+    ``across``: the tolerance of headline values of another machine; None on the same one.
+    """
     yield from _compare(where, expected.metrics, measured.metrics, across)
     yield from _unknown(where, "scene", expected.scenes, measured.per_scene)
     if across is None:

@@ -138,6 +138,5 @@ def busy_remark(run: FinishedRun, calibration_ms: float | None) -> str | None:
         return None
     return (
         f"the calibrating work took {now:.3g} ms, {now / calibration_ms:.1f} times the reference's: other programs used "
-        f"the processor, or what is checked slows it; it excuses at most {MOST_EXCUSED:g} times the cost, run it again "
-        "alone"
+        f"the processor, or what is checked slows it; that excuses {MOST_EXCUSED:g} times the cost at most"
     )

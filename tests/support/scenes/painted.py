@@ -37,6 +37,7 @@ from su3d_bench.numerics.geometry import back_project
 HEIGHT, WIDTH = 24, 32
 INTRINSICS = np.array([[30.0, 0, 15.5], [0, 30.0, 11.5], [0, 0, 1]])
 LABELS = LabelSet("replica", (20, 76, 80, 93), ("chair", "sofa", "table", "wall"))
+DELAY_S = 0.15
 COLOURS = np.array([[200, 30, 30], [30, 200, 30], [30, 30, 200], [120, 120, 120]], np.uint8)
 FAULTS = ("missing-frame", "nan-pose", "depth-size", "empty-depth", "unknown-class", "no-truth", "crash", "kill")
 
@@ -216,6 +217,41 @@ class Collector:
             views=np.concatenate(views) if views else np.zeros((0, 2), np.int32),
             ids=np.arange(1, len(names) + 1, dtype=np.int32),
         )
+
+
+class Delayed(Collector):
+    """A collector that takes ``DELAY_S`` longer where the environment says; its name and numbers stay the same."""
+
+    name = "delayed"
+
+    def __init__(self, config: Collector.Config) -> None:
+        super().__init__(config)
+        self._n_updates = 0
+        self._delayed("made")
+
+    def _delayed(self, where: str) -> None:
+        if os.environ.get("PAINTED_DELAY") == where:
+            time.sleep(DELAY_S)
+
+    def start(self, scene: SceneInfo) -> None:
+        super().start(scene)
+        self._delayed("start")
+
+    def update(self, frame: Frame, detections: Detections, timer: StageTimer) -> None:
+        super().update(frame, detections, timer)
+        self._n_updates += 1
+        self._delayed("outside")
+        if self._n_updates <= 3:
+            self._delayed("first")
+        with timer.stage("segment"):
+            self._delayed("named")
+
+    def finish(self) -> Prediction:
+        self._delayed("finish")
+        return super().finish()
+
+    def close(self) -> None:
+        self._delayed("close")
 
 
 class WordEncoder:

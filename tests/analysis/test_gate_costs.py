@@ -1,0 +1,237 @@
+"""What the gate sees of a method's cost, wherever the method puts it; what a reference without it says."""
+
+from __future__ import annotations
+
+import json
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+from painted import DELAY_S, colour_perception
+from places import SCENES
+
+from su3d_bench.analysis.gate.check import check
+from su3d_bench.analysis.gate.costs import LEAST_SHARE, MOST, Cost, cost_findings, method_cost
+from su3d_bench.analysis.gate.reference import Reference, learn, read_reference
+from su3d_bench.cli.main import main
+from su3d_bench.core.errors import ConfigError
+from su3d_bench.core.timing import MethodClock
+from su3d_bench.reports.gate import Finding
+from su3d_bench.runs import scene as scene_run
+from su3d_bench.runs.finished import read_run, read_update_times
+
+PAINTED = f"{SCENES}/painted.py"
+WORDS = ["run", "--scenes", f"{PAINTED}:Painted/a", "--methods", f"{PAINTED}:Delayed"]
+WORDS += ["--protocols", "rooms-semantic", "--no-pictures", "--jobs", "1"]
+
+
+def made_in(folder: Path, *words: str, delay: str = "") -> Path:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(scene_run, "build_perception", colour_perception)
+        patch.setenv("PAINTED_DELAY", delay)
+        assert main([*WORDS, *words, "--out", str(folder)]) == 0
+    return folder
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return made_in(tmp_path_factory.mktemp("costs") / "run")
+
+
+@pytest.fixture(scope="module")
+def reference(made: Path) -> Reference:
+    return learn([read_run(made)], cost_limit=10.0)
+
+
+PLACES = {
+    "outside": "the updates after 3",
+    "named": "the updates after 3",
+    "first": "start and the first 3 updates",
+    "start": "start and the first 3 updates",
+    "made": "start and the first 3 updates",
+    "finish": "finish",
+    "close": "finish",
+}
+
+
+@pytest.mark.parametrize("where", PLACES)
+def test_a_cost_is_seen_wherever_the_method_puts_it(where: str, tmp_path: Path, reference: Reference) -> None:
+    run = read_run(made_in(tmp_path / "run", delay=where))
+    found = [one for one in check(run, reference).findings if one.kind == "cost"]
+    assert f"delayed / cost of {PLACES[where]}" in {one.where for one in found}
+    (times,) = read_update_times(run, "delayed")
+    of_maps = sum(one.finish_ms for one in times.maps)
+    whole_ms = (times.start_ms or 0) + times.ms("map").sum() + of_maps + (times.close_ms or 0)
+    assert whole_ms > 1e3 * DELAY_S
+
+
+def test_a_stage_named_as_one_of_perceptions_is_the_methods_all_the_same(tmp_path: Path) -> None:
+    (times,) = read_update_times(read_run(made_in(tmp_path / "run", delay="named")), "delayed")
+    assert (times.ms("segment") > 1e3 * DELAY_S).all()
+    assert (times.ms("map") > 1e3 * DELAY_S).all()
+    assert (times.ms("map") <= times.ms("total")).all()
+
+
+def test_perception_that_a_method_asks_for_is_not_its_own_unless_another_thread_asks() -> None:
+    ready = threading.Event()
+    clock = MethodClock()
+    with clock.running("update"):
+        with clock.perception():
+            ready.wait(0.05)
+        other = threading.Thread(target=lambda: _asked(clock, ready))
+        other.start()
+        other.join()
+    spent = clock.take("update")
+    assert spent.perception_ms >= 45
+    assert spent.method_ms >= 45
+    assert spent.total_ms == pytest.approx(spent.method_ms + spent.perception_ms)
+    with clock.perception():
+        pass
+    assert clock.take("update").total_ms == 0
+
+
+def _asked(clock: MethodClock, ready: threading.Event) -> None:
+    with clock.perception():
+        ready.wait(0.05)
+
+
+COST = Cost(start=10, updates=100, finish=40, whole=150)
+
+
+def dearer(limit: float = 1.5, **parts: float) -> list[str]:
+    """Which parts of a cost fail."""
+
+    class Run:
+        methods = ("m",)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("su3d_bench.analysis.gate.costs.why_no_cost", lambda run, method: None)
+        patch.setattr("su3d_bench.analysis.gate.costs.method_cost", lambda *_: COST.model_copy(update=parts))
+        found: list[Finding] = list(cost_findings(Run(), {"m": COST}, 1.0, limit, is_judged=True))  # type: ignore[arg-type]
+    return [one.where.partition("cost of ")[2] for one in found]
+
+
+def test_every_part_is_held_against_the_limit_by_itself() -> None:
+    assert dearer() == []
+    assert dearer(updates=150, whole=200) == []  # just the limit
+    assert dearer(updates=151, whole=201) == ["the updates after 3"]
+    assert dearer(finish=61, whole=171) == ["finish"]
+    assert dearer(whole=226) == ["all together"]
+    assert dearer(updates=1000, whole=1050) == ["the updates after 3", "all together"]
+
+
+def test_a_part_that_hardly_shows_in_the_whole_is_none() -> None:
+    least = LEAST_SHARE * COST.whole
+    assert dearer(start=10 + least, whole=157.5) == []
+    assert dearer(start=10 + least + 0.1, whole=157.6) == ["start and the first 3 updates"]
+    assert dearer(1.001, whole=151) == []
+    assert dearer(1.001, whole=151.1) == ["all together"]
+
+
+@pytest.mark.parametrize(("n", "what"), [("3", "has 3 updates a scene at most"), ("1", "has 1 update a scene at most")])
+def test_fewer_than_four_updates_are_told_to_learn_no_cost(
+    n: str, what: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run, reference = made_in(tmp_path / "run", "--limit", n), tmp_path / "r.json"
+    capsys.readouterr()
+    assert main(["check", "--learn", str(run), "--out", str(reference)]) == 0
+    assert f"delayed: no cost is learnt: it {what}, and a cost is learnt from 4 on" in capsys.readouterr().err
+    assert read_reference(reference).costs == {}
+    assert main(["check", str(run), "--against", str(reference)]) == 0
+    assert f"delayed: no cost is judged: it {what}" in capsys.readouterr().err
+
+
+def test_four_updates_teach_a_cost(tmp_path: Path) -> None:
+    run = read_run(made_in(tmp_path / "run", "--limit", "4"))
+    cost = method_cost(run, "delayed")
+    assert cost is not None and 0 < cost.whole < MOST
+    assert cost.updates <= cost.whole
+    assert learn([run]).costs == {"delayed": cost}
+
+
+def test_a_run_that_measured_a_cost_that_the_reference_lacks_fails(made: Path, reference: Reference) -> None:
+    verdict = check(read_run(made), reference.model_copy(update={"costs": {}}))
+    assert [one.where for one in verdict.failures] == ["delayed / cost"]
+    assert "learn a new reference" in verdict.failures[0].text
+
+
+def test_a_reference_of_the_first_schema_holds_the_values_and_says_that_it_holds_no_cost(
+    made: Path, tmp_path: Path, reference: Reference, capsys: pytest.CaptureFixture[str]
+) -> None:
+    value = reference.model_dump(mode="json")
+    del value["schema_version"]
+    path = tmp_path / "r.json"
+    path.write_text(json.dumps(value | {"costs": {"delayed": 2.84}, "calibration_ms": 6.29}))
+    assert main(["check", str(made), "--against", str(path)]) == 0
+    assert "no cost is judged, learn it again" in capsys.readouterr().err
+    value["results"][0]["metrics"]["mAcc"]["value"] -= 0.25
+    path.write_text(json.dumps(value | {"costs": {}}))
+    assert "better" in {one.kind for one in check(read_run(made), read_reference(path)).findings}
+
+
+def _result(change: Callable[[Any], None]) -> Callable[[Any], None]:
+    return lambda reference: change(reference["results"][0])
+
+
+HOLLOW: dict[str, tuple[Callable[[Any], None], str]] = {
+    "no value": (_result(lambda r: r.update(metrics={})), "results.0.metrics"),
+    "undefined values": (
+        _result(lambda r: r.update(metrics={"mAcc": {"value": None}}, scenes={"painted/a": {"mAcc": {"value": None}}})),
+        "results.0: delayed under rooms-semantic has no value",
+    ),
+    "no scene": (_result(lambda r: r.update(scenes={})), "results.0.scenes"),
+    "a scene without values": (_result(lambda r: r["scenes"].update({"painted/a": {}})), "a scene of delayed under"),
+    "a value beyond 1": (_result(lambda r: r["metrics"]["mAcc"].update(value=7e300)), "'mAcc' is 7e\\+300"),
+    "a value below 0": (_result(lambda r: r["metrics"]["mAcc"].update(value=-0.1)), "'mAcc' is -0.1"),
+    "a tolerance of everything": (_result(lambda r: r["metrics"]["mAcc"].update(tolerance=7e300)), "tolerance"),
+    "a result twice": (lambda r: r["results"].append(r["results"][0]), "a method stands twice under one protocol"),
+    "no protocol of its result": (lambda r: r["protocols"].update(x=r["protocols"].pop("rooms-semantic")), "lacks"),
+    "no data of its scene": (lambda r: r.update(data_digests={"painted/b": "x"}), "data_digests lacks painted/a"),
+    "a negative cost": (lambda r: r["costs"]["delayed"].update(updates=-1), "costs.delayed.updates"),
+    "an endless cost": (lambda r: r["costs"]["delayed"].update(whole=7e300), "costs.delayed.whole"),
+    "costs without their unit": (lambda r: r.update(calibration_ms=None), "costs without calibration_ms"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOLLOW)
+def test_a_reference_that_holds_nothing_or_the_impossible_is_none(
+    name: str, reference: Reference, tmp_path: Path
+) -> None:
+    change, said = HOLLOW[name]
+    value = reference.model_dump(mode="json")
+    change(value)
+    (tmp_path / "r.json").write_text(json.dumps(value))
+    with pytest.raises(ConfigError, match=rf"is no reference of this version: .*{said}"):
+        read_reference(tmp_path / "r.json")
+
+
+def test_values_and_classes_that_the_reference_lacks_fail(made: Path, reference: Reference) -> None:
+    (first,) = reference.results
+    fewer = {
+        "metrics": {"mAcc": first.metrics["mAcc"]},
+        "scenes": {scene: {"mAcc": row["mAcc"]} for scene, row in first.scenes.items()},
+        "classes": {},
+    }
+    verdict = check(read_run(made), reference.model_copy(update={"results": (first.model_copy(update=fewer),)}))
+    where = {one.where for one in verdict.failures}
+    assert {"delayed / rooms-semantic / value F-mIoU", "delayed / rooms-semantic / class chair"} <= where
+
+
+def test_a_method_and_a_protocol_that_the_reference_does_not_know_are_named(
+    tmp_path: Path, reference: Reference
+) -> None:
+    words = ["--methods", f"{PAINTED}:Delayed", f"{PAINTED}:Collector"]
+    words += ["--protocols", "rooms-semantic", "rooms-instance"]
+    verdict = check(read_run(made_in(tmp_path / "run", *words)), reference)
+    changed = [one for one in verdict.failures if one.kind != "cost" and one.where != "settings"]
+    assert changed == []
+    assert "the reference does not know, so that nothing holds: collector, rooms-instance" in verdict.remarks
+
+
+def test_a_run_whose_files_are_damaged_teaches_nothing(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    run = made_in(tmp_path / "run")
+    (run / "scenes/painted.a/delayed/prediction.npz").unlink()
+    assert main(["check", "--learn", str(run), "--out", str(tmp_path / "r.json")]) == 2
+    assert "delayed / scene painted/a: prediction.npz is missing; run its command again" in capsys.readouterr().err
