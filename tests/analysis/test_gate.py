@@ -399,7 +399,7 @@ def test_a_slowed_calibration_hides_no_tenfold_cost(
     assert main(["check", str(run), "--against", str(learnt)]) == 1
     shown = capsys.readouterr()
     assert "cost of the updates after 3: costs 5.00 times the reference" in shown.out
-    assert "other programs used the processor, or what is checked slows it" in shown.err
+    assert "others used the processor, or what is checked slows it" in shown.err
 
 
 def test_a_busy_machine_excuses_a_cost_up_to_twice_and_it_is_said(

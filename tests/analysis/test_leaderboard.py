@@ -16,6 +16,7 @@ from places import SCENES
 import su3d_bench.analysis.leaderboard
 from su3d_bench.analysis.leaderboard import leaderboard, ranked
 from su3d_bench.cli.main import main
+from su3d_bench.metrics.scoring import pack_scores, unpack_scores
 from su3d_bench.runs import scene as scene_run
 
 PAINTED = f"{SCENES}/painted.py"
@@ -80,6 +81,32 @@ REFUSED: dict[str, tuple[str, Callable[[Any], None], str]] = {
         lambda m: m["results"][0]["result"]["metrics"].update(mAcc=0.123),
         "does not follow from the counts",
     ),
+    "an edited scene": (
+        "metrics.json",
+        lambda m: m["results"][0]["result"]["per_scene"]["painted/a"].update(mAcc=0.123),
+        "the counts: per_scene.painted/a.mAcc is 0.123, the counts give 1",
+    ),
+    "a class that was never counted": (
+        "metrics.json",
+        lambda m: m["results"][0]["result"]["per_class"].update(gold={"IoU": 1.0}),
+        "per_class.gold.IoU is 1, the counts give nothing",
+    ),
+    "a scene without its value": (
+        "metrics.json",
+        lambda m: m["results"][0]["result"]["per_scene"]["painted/a"].pop("mAcc"),
+        "per_scene.painted/a has no mAcc",
+    ),
+    "scenes that were not counted": (
+        "metrics.json",
+        lambda m: m["results"][0]["result"]["scenes"].append("painted/c"),
+        "it has 3 scenes, the counts 2",
+    ),
+    "another version of a result": ("metrics.json", lambda m: m["results"][0].update(version=9), "version is 9"),
+    "a number beyond all": (
+        "metrics.json",
+        lambda m: m["results"][0]["result"]["metrics"].update(mAcc=7e300),
+        "'mAcc' is 7e+300, a fraction lies from 0 to 1",
+    ),
     "a partial run": ("run.json", lambda r: r.update(is_partial=True), "is partial"),
     "a failed scene": ("metrics.json", lambda m: m["results"][0].update(failed=["painted/b"]), "is incomplete"),
     "no record": ("run.json", lambda r: r.clear(), "is not as a run writes it"),
@@ -93,6 +120,33 @@ def test_what_does_not_agree_is_left_out_with_the_reason(name: str, runs: Path) 
     found = leaderboard(runs)
     assert any(one.run == "bob" and reason in one.reason for one in found.refused), found.refused
     assert any([one.run for one in board] == ["ann/first"] for board in found.boards)
+
+
+def worse_counts(runs: Path) -> None:
+    """Counts below 0 in one scene of a run, as no scene gives."""
+    file = runs / "bob/scenes/painted.a/collector/counts.npz"
+    scores = unpack_scores(file.read_bytes())
+    scores["rooms-semantic"].counts.confusion[0, 0] -= 10**6  # type: ignore[attr-defined]
+    file.write_bytes(pack_scores(scores))
+
+
+def test_counts_that_no_scene_gives_are_refused_by_every_reader(
+    runs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    paper = str(tmp_path / "paper.tex")
+    assert main(["report", "tables", str(runs / "bob"), "--format", "latex", "--out", paper]) == 0
+    assert main(["report", "verify", paper]) == 0
+    worse_counts(runs)
+    line = "counts: 'confusion' counts from -"
+    capsys.readouterr()
+    assert main(["compare", str(runs / "ann/first"), str(runs / "bob")]) == 2
+    assert line in capsys.readouterr().err
+    assert main(["attribute", str(runs / "bob")]) == 2
+    assert line in capsys.readouterr().err
+    assert main(["report", "verify", paper]) == 1
+    assert line in capsys.readouterr().out
+    refused = leaderboard(runs).refused
+    assert {one.run for one in refused} == {"bob"} and all(line in one.reason for one in refused)
 
 
 def test_of_two_sets_of_data_the_one_that_most_have_is_ranked(runs: Path) -> None:

@@ -137,6 +137,6 @@ def busy_remark(run: FinishedRun, calibration_ms: float | None) -> str | None:
     if now is None or calibration_ms is None or now <= BUSY * calibration_ms:
         return None
     return (
-        f"the calibrating work took {now:.3g} ms, {now / calibration_ms:.1f} times the reference's: other programs used "
+        f"the calibrating work took {now:.3g} ms, {now / calibration_ms:.1f} times the reference's: others used "
         f"the processor, or what is checked slows it; that excuses {MOST_EXCUSED:g} times the cost at most"
     )
