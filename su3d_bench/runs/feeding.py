@@ -66,24 +66,21 @@ class FirstFrames(Sequence[Frame]):
         return self.frames[range(self.n)[index]]
 
 
-@dataclass(frozen=True)
 class TimedRegions:
     """Perception on demand, its time told apart from that of the method that asks for it."""
 
-    regions: RegionPerception
-    clock: MethodClock
-
-    @property
-    def dim(self) -> int:
-        return self.regions.dim
+    def __init__(self, regions: RegionPerception, clock: MethodClock) -> None:
+        self.dim = regions.dim
+        self._regions = regions
+        self._clock = clock
 
     def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
-        with self.clock.perception():
-            return self.regions.mask_at(frame, points)
+        with self._clock.perception():
+            return self._regions.mask_at(frame, points)
 
     def encode_regions(self, frame: Frame, mask: BoolArray, boxes: Int64Array) -> Float32Array:
-        with self.clock.perception():
-            return self.regions.encode_regions(frame, mask, boxes)
+        with self._clock.perception():
+            return self._regions.encode_regions(frame, mask, boxes)
 
 
 def no_detections(frame: Frame, needs: PerceptionNeeds) -> Detections:

@@ -316,7 +316,7 @@ def test_fifty_unchanged_repeats_pass(run: Path, learnt: Path) -> None:
     for _ in range(50):
         # Time is the one thing that unchanged repeats differ in: by a twentieth, now and then by a tenth.
         noise = np.exp(generator.normal(0, 0.05, 8))
-        timed(run, 40 * noise[:6], 60 * noise[6], start_ms=10 * noise[7])
+        timed(run, (40 * noise[:6]).tolist(), 60 * noise[6], start_ms=10 * noise[7])
         assert main(["check", str(run), "--against", str(learnt)]) == 0
 
 

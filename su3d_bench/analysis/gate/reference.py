@@ -22,7 +22,7 @@ from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.atomic import read_json
 from su3d_bench.store.records import ROUNDING, ResultRecord, impossible_value
 
-SCHEMA = 2  # 1 had the cost of an update alone, from the stages that a method named itself
+SCHEMA: Literal[2] = 2  # 1 had the cost of an update alone, from the stages that a method named itself
 SPREADS = 2.0  # a value may leave the taught ones by this many times their range: 2 of 50 unchanged repeats would at 1
 ACROSS_MACHINES = 0.02  # 2 points: what ONNX Runtime's and BLAS's kernels of other processors may move a headline value
 COST_LIMIT = 1.3  # a method may cost so many times the reference's; `python benchmarks gate_repeats` has the scatter
