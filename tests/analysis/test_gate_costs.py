@@ -74,6 +74,15 @@ def test_a_stage_named_as_one_of_perceptions_is_the_methods_all_the_same(tmp_pat
     assert (times.ms("map") <= times.ms("total")).all()
 
 
+def test_what_a_method_says_of_its_costs_takes_the_place_of_nothing_that_was_measured(made: Path) -> None:
+    (times,) = read_update_times(read_run(made), "delayed")
+    assert times.columns["frame"].tolist() == [0, 1, 2, 3, 4, 5]
+    assert times.columns["n_lost"].tolist() == [3] * 6
+    assert times.ms("map").all() and times.maps[-1].finish_ms > 0
+    done = json.loads((made / "scenes/painted.a/delayed/done.json").read_text())
+    assert done["steps"]["predict"]["remarks"]["costs"]["maps"][0]["n_things"] == 7
+
+
 def test_perception_that_a_method_asks_for_is_not_its_own_unless_another_thread_asks() -> None:
     ready = threading.Event()
     clock = MethodClock()

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 from places import ROOT
 
-from su3d_bench.core.errors import StoreError
+from su3d_bench.core.errors import DataError, StoreError
 from su3d_bench.store import records
 from su3d_bench.store.atomic import write_json
 from su3d_bench.store.records import (
@@ -108,3 +108,36 @@ def test_a_number_that_is_none_is_named(tmp_path: Path) -> None:
     (tmp_path / "metrics.json").write_text(json.dumps(written))
     with pytest.raises(StoreError, match=r"^run: metrics\.json is not as a run writes it: results\.0\.result\.metrics"):
         read_record(MetricsRecord, tmp_path / "metrics.json", "run")
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"metrics": {"mAcc": 7e300}}, "result.metrics: 'mAcc' is 7e+300, a fraction lies from 0 to 1"),
+        ({"per_scene": {"d/a": {"mAcc": -0.5}}}, "'mAcc' is -0.5, a fraction lies from 0 to 1"),
+        ({"pooled": {"n_classes": -1}}, "result.pooled: 'n_classes' is -1, of which there are none or more"),
+        ({"intervals": {"mAcc": (0.5, 100.0)}}, "result.intervals.mAcc.1: it is 100.0"),
+        ({"n_predictions": {"d/a": -3}}, "result.n_predictions.d/a: it is -3"),
+    ],
+)
+def test_a_number_that_cannot_be_is_named(changed: dict[str, Any], said: str, tmp_path: Path) -> None:
+    result = replace(RESULT, result=replace(VALUES, **changed))
+    write_json(tmp_path / "metrics.json", plain(MetricsRecord(limit=0, results=(result,))))
+    with pytest.raises(StoreError) as caught:
+        read_record(MetricsRecord, tmp_path / "metrics.json", "run")
+    assert said in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("update,total_ms\n0,-1.0\n", "holds -1 and 0; times and sizes lie from 0 to 1e+18"),
+        ("update,total_ms\n0,7e300\n", "holds 0 and 7e+300; times"),
+        ("total_ms,total_ms\n1,2\n", "has two columns of one name"),
+    ],
+)
+def test_a_table_of_updates_that_no_run_wrote_is_refused(text: str, said: str, tmp_path: Path) -> None:
+    (tmp_path / "updates.csv").write_text(text)
+    with pytest.raises(DataError) as caught:
+        records.read_updates(tmp_path / "updates.csv", "run")
+    assert said in str(caught.value)

@@ -220,7 +220,10 @@ class Collector:
 
 
 class Delayed(Collector):
-    """A collector that takes ``DELAY_S`` longer where the environment says; its name and numbers stay the same."""
+    """A collector that takes ``DELAY_S`` longer where the environment says; its name and numbers stay the same.
+
+    What it says of its own costs is not true.
+    """
 
     name = "delayed"
 
@@ -249,6 +252,14 @@ class Delayed(Collector):
     def finish(self) -> Prediction:
         self._delayed("finish")
         return super().finish()
+
+    @property
+    def finish_costs(self) -> dict[str, float | int]:
+        return {"finish_ms": 0.0, "n_things": 7}
+
+    @property
+    def losses(self) -> dict[str, int]:
+        return {"frame": 0, "method_ms": 0, "n_lost": 3}
 
     def close(self) -> None:
         self._delayed("close")
