@@ -93,10 +93,10 @@ def _unknown(where: str, kind: str, known: Collection[str], measured: Collection
 
 
 def _other_machine(run: FinishedRun, reference: Reference) -> str:
+    here, there = (printable(hardware, 120) for hardware in (run.record.hardware, reference.hardware))
     return (
-        f"another processor ({run.record.hardware}) than the reference's ({reference.hardware}): headline values are "
-        f"compared within {100 * reference.across_machines:g} points, scenes and classes by presence, costs are not "
-        "judged"
+        f"another processor ({here}) than the reference's ({there}): headline values are compared within "
+        f"{100 * reference.across_machines:g} points, scenes and classes by presence, costs are not judged"
     )
 
 
@@ -109,13 +109,13 @@ def _identity(run: FinishedRun, reference: Reference) -> Iterator[Finding]:
         yield _changed("settings", key, before, now)
     for scene, digest in reference.data_digests.items():
         if scene not in run.scenes:
-            yield Finding("missing", scene, "the run does not have this scene")
+            yield Finding("missing", printable(scene, 80), "the run does not have this scene")
         elif run.record.data_digests.get(scene) != digest:
             yield _changed(scene, "data digest", digest, run.record.data_digests.get(scene))
     yield from _unknown("run", "scene", reference.data_digests, run.scenes)
     for name, expected in reference.protocols.items():
         if name not in run.protocols:
-            yield Finding("missing", name, "the run does not have this protocol")
+            yield Finding("missing", printable(name, 80), "the run does not have this protocol")
             continue
         rules = run.protocols[name]
         if rules.version != expected.version:
@@ -125,7 +125,8 @@ def _identity(run: FinishedRun, reference: Reference) -> Iterator[Finding]:
 
 
 def _changed(where: str, what: str, before: object, now: object) -> Finding:
-    return Finding("changed", where, f"{what} was {_short(before)}, now {_short(now)}")
+    text = f"{printable(what, 200)} was {_short(before)}, now {_short(now)}"
+    return Finding("changed", printable(where, 200), text)
 
 
 def _short(value: object) -> str:
@@ -163,11 +164,17 @@ def _compare(where: str, expected: Values, row: Mapping[str, float | None], acro
         if measured == value.value:
             continue
         if measured is None or value.value is None:
-            yield Finding("regression", f"{where} / {name}", "is undefined in one of the two", value.value, measured)
+            yield Finding(
+                "regression",
+                f"{where} / {printable(name, 80)}",
+                "is undefined in one of the two",
+                value.value,
+                measured,
+            )
         elif abs(measured - value.value) > tolerance:
             is_better = name in HIGHER_IS_BETTER and measured > value.value
             text = "is better than the reference" if is_better else "is worse than the reference"
             if name not in HIGHER_IS_BETTER:
                 text = "differs from the reference"
             kind: Literal["better", "regression"] = "better" if is_better else "regression"
-            yield Finding(kind, f"{where} / {name}", text, value.value, measured, tolerance)
+            yield Finding(kind, f"{where} / {printable(name, 80)}", text, value.value, measured, tolerance)
