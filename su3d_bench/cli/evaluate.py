@@ -39,6 +39,12 @@ def add_parser(verbs: Any) -> None:
         help="ground truth as text instead, <scene>.txt with label * 1000 + instance a vertex, or label ids; or "
         "OpenLex3D's release",
     )
+    parser.add_argument(
+        "--truth-values",
+        choices=("classes", "instances", "numbers"),
+        help="what that text holds, where its values do not tell: class ids, label * 1000 + instance, or numbers of "
+        "objects alone (0 for none), as in the OpenSUN3D challenge",
+    )
     add_protocols(parser, "evaluations (default: all that fit)", "PROTOCOL")
     parser.add_argument("--scenes", nargs="+", default=[], metavar="SCENE", help="names or patterns (default: all)")
     parser.add_argument("--format", metavar="FORMAT", help="of the predictions, where it cannot be recognised")
@@ -73,6 +79,7 @@ def call(arguments: argparse.Namespace) -> int:
             tuple(arguments.predictions),
             dataset=arguments.dataset,
             ground_truth=arguments.ground_truth,
+            truth_values=arguments.truth_values,
             protocols=tuple(arguments.protocol),
             scenes=tuple(arguments.scenes),
             format=arguments.format,

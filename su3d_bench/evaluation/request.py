@@ -7,22 +7,24 @@ from pathlib import Path
 from typing import Literal
 
 Confidences = Literal["protocol", "file"]
+ValuesForm = Literal["classes", "instances", "numbers"]
 
 
 @dataclass(frozen=True)
 class Request:
     """What to score: ``predictions`` are folders or files; everything else may be left out.
 
-    ``ground_truth``: a folder of <scene>.txt in ScanNet's layout, in place of the dataset's own. ``protocols``: all
-    that fit where none is named. ``scenes``: names or patterns. ``confidences``: where a protocol has 1 for every mask,
-    its own rule, or what the files say; None: what the files say in the official script's format, which that script
-    reads as it stands, and the protocol's rule in all others. ``queries``: a file of texts and the objects that they
-    speak of, for ``query-ap``.
+    ``ground_truth``: a folder of <scene>.txt in ScanNet's layout, in place of the dataset's own. ``truth_values``: what
+    their values are, where that is not plain from them. ``protocols``: all that fit where none is named. ``scenes``:
+    names or patterns. ``confidences``: where a protocol has 1 for every mask, its own rule, or what the files say;
+    None: what the files say in the official script's format, which that script reads as it stands, and the protocol's
+    rule in all others. ``queries``: a file of texts and the objects that they speak of, for ``query-ap``.
     """
 
     predictions: tuple[Path, ...]
     dataset: str | None = None
     ground_truth: Path | None = None
+    truth_values: ValuesForm | None = None
     protocols: tuple[str, ...] = ()
     scenes: tuple[str, ...] = ()
     format: str | None = None

@@ -167,10 +167,11 @@ def _is_empty(content: Content) -> bool:
 def skips_missing_scenes(rules: ProtocolRules) -> bool:
     """Whether the original leaves scenes without a prediction out, so that their objects never count as missed.
 
-    evaluate_semantic_instance.py, evaluate_semantic_label.py and those made after them walk the prediction files. A
-    protocol of a user, or of rooms that are made here, has no original.
+    evaluate_semantic_instance.py, evaluate_semantic_label.py and those made after them walk the prediction files, but
+    for OpenSUN3D's, which walks the truth's and stops at the first scene without a prediction. A protocol of a user, or
+    of rooms that are made here, has no original.
     """
-    if rules.metric != "scannet" or rules.name not in protocol_names():
+    if rules.metric != "scannet" or rules.name not in protocol_names() or rules.class_agnostic == "numbered":
         return False
     return not any(getattr(registry.load("dataset", name), "renders_frames", False) for name in rules.datasets)
 
@@ -262,8 +263,17 @@ def _instance_counts(
     """The counts of masks with class ids (K,), or without any of each mask under every class."""
     assert rules.min_region_size is not None
     used = np.ones(len(masks)) if rules.confidence == "ones" else scores
-    size, thresholds = rules.min_region_size, rules.thresholds
-    return instance_ap.per_scene(values, masks.indptr, masks.indices, ids, used, _class_ids(rules), size, thresholds)
+    return instance_ap.per_scene(
+        values,
+        masks.indptr,
+        masks.indices,
+        ids,
+        used,
+        _class_ids(rules),
+        rules.min_region_size,
+        rules.thresholds,
+        forgives_void=rules.void is None,
+    )
 
 
 def _score(

@@ -30,6 +30,7 @@ from su3d_bench.core.errors import (
 from su3d_bench.core.types import GroundTruth, Int64Array
 from su3d_bench.datasets.openlex3d import FACE_CORNERS, VISIBLE, OpenLexRelease
 from su3d_bench.evaluation.request import Request
+from su3d_bench.evaluation.truth_values import FLAG, TruthValues
 from su3d_bench.formats.arrays import MOST_POINTS
 from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.metrics.fitness import ID_LISTS, LARGEST_NYU40_ID, TruthFacts, list_of_ids, why_not_truth
@@ -45,7 +46,7 @@ from su3d_bench.questions.truths import question_truth
 from su3d_bench.runs.scenes import data_root
 
 NOT_MEANT = "is not meant for"
-LARGEST_LABEL = 1357  # of scannetv2-labels.combined.tsv; values above it are label * 1000 + instance
+NO_TEXTS = f"evaluate: {FLAG} says what the texts of --ground-truth hold; leave it out, there are none here"
 LARGEST_VALUE = 10_000 * INSTANCES_PER_CLASS  # as the instance metric has it
 
 
@@ -89,12 +90,16 @@ class SceneTruths(ABC):
 
 def kind_of_truth(request: Request) -> Callable[[Request, Sequence[Source]], SceneTruths]:
     """The kind of truth that is asked for, to be opened with the request and the predictions."""
+    if request.ground_truth is None and request.truth_values is not None:
+        raise ConfigError(NO_TEXTS)
     return DatasetTruths if request.ground_truth is None else _folder_truths
 
 
 def _folder_truths(request: Request, sources: Sequence[Source]) -> SceneTruths:
     assert request.ground_truth is not None
     kind = OpenLexTruths if OpenLexRelease.is_at(request.ground_truth) else TextTruths
+    if request.truth_values is not None and kind is not TextTruths:
+        raise ConfigError(NO_TEXTS)
     return kind(request, sources)
 
 
@@ -222,11 +227,7 @@ class OpenLexTruths(SceneTruths):
 
 
 class TextTruths(SceneTruths):
-    """Labels of points without coordinates; whether values hold instances is told from all scenes together.
-
-    They do above the largest class id. Where all lie between 1000 and that, they are instances of the class 1 for a
-    protocol that needs instances or has no class of such an id, and class ids for the others; both with a doubt.
-    """
+    """Labels of points without coordinates; what values mean is said, or told from all scenes together."""
 
     has_points = False
 
@@ -247,8 +248,8 @@ class TextTruths(SceneTruths):
         requested = chosen if request.scenes else ()
         self.matches, self.remarks = match_scenes(sources, chosen, self.dataset_name, self.where, requested)
         self._values = {match.scene: read_values(self._files[match.scene]) for match in self.matches}
-        self._lowest, self._highest = _range(self._values.values())
-        self._largest = self._highest
+        self._said = request.truth_values
+        self._range = self._all = TruthValues.of(self._values.values(), self._said)
         if self.matches and self.dataset_name is None and not request.protocols:
             raise ConfigError(
                 f"{self.where}: whose labels are these? name the protocol with --protocol or the dataset with --dataset"
@@ -259,69 +260,31 @@ class TextTruths(SceneTruths):
             return _why_no_queries(is_named=is_named)
         if rules.is_judged and not is_named:
             return f"{NOT_MEANT} texts"
-        has_instances = self._has_instances(rules)
-        facts = TruthFacts(self.where, None, (), has_points=False, has_instances=has_instances)
-        reason = why_not_truth(rules, facts)
-        if reason is not None and rules.needs_instances and not has_instances:
-            return self._why_no_instances()
-        if reason is not None or is_named:
-            return reason
-        if self.dataset_name not in rules.datasets:
+        if not is_named and (self.dataset_name not in rules.datasets or not rules.by_default):
             return f"{NOT_MEANT} {self.dataset_name}"
-        variant = list_of_ids(self._largest_label(rules))
-        fits = variant == rules.ground_truth or rules.ground_truth not in ID_LISTS
-        return None if fits else f"the labels of the ground truth are '{variant}'"
+        facts = TruthFacts(self.where, None, (), has_points=False)
+        reason = why_not_truth(rules, facts) or self._range.why_not(rules)
+        if reason is not None or is_named or rules.ground_truth not in ID_LISTS:
+            return reason
+        if self._range.form(rules) == "numbers":
+            return None
+        variant = list_of_ids(largest := self._range.largest_label(rules))
+        if variant == rules.ground_truth:
+            return None
+        other = "; name the protocol where they are of its own list" if largest <= LARGEST_NYU40_ID else ""
+        return f"the labels of the ground truth go up to {largest}, as {ID_LISTS[variant]}{other}"
 
     def of_scene(self, rules: ProtocolRules, scene: str) -> VertexTruth:
         if scene not in self._values:  # missed: the doubts speak of all that are scored
             self._values |= {name: read_values(file) for name, file in self._files.items() if name not in self._values}
-            _, self._largest = _range(self._values.values())
-        values = self._values[scene]
-        labels = values // INSTANCES_PER_CLASS if self._has_instances(rules) else values
-        return VertexTruth(values, labels, self._doubts(rules))
-
-    @property
-    def _may_be_either(self) -> bool:
-        return INSTANCES_PER_CLASS < self._lowest <= self._highest <= LARGEST_LABEL
-
-    def _has_instances(self, rules: ProtocolRules) -> bool:
-        if not self._may_be_either:
-            return self._highest > LARGEST_LABEL
-        is_id = any(self._lowest <= entry.id <= self._highest for entry in rules.classes)
-        return rules.needs_instances or not is_id
-
-    def _largest_label(self, rules: ProtocolRules) -> int:
-        return self._largest // INSTANCES_PER_CLASS if self._has_instances(rules) else self._largest
-
-    def _why_no_instances(self) -> str:
-        if not self._highest:
-            return "needs instances, and every value of the ground truth is 0: nothing is annotated"
-        return (
-            f"needs instances, and the values of the ground truth, {self._lowest} to {self._highest}, are taken for "
-            f"class ids alone: class id * 1000 + instance is never below 1000, and above {LARGEST_LABEL} somewhere "
-            "unless all objects are of class 1"
-        )
-
-    def _doubts(self, rules: ProtocolRules) -> tuple[str, ...]:
-        if self._may_be_either:
-            taken = "class 1 * 1000 + instance" if self._has_instances(rules) else "class ids"
-            return (f"every value of the ground truth is from {self._lowest} to {self._highest}: taken for {taken}",)
-        largest = self._largest_label(rules)
-        if rules.ground_truth == "nyu40-vertices" and largest > LARGEST_NYU40_ID:
-            return (
-                f"the ground truth holds the label {largest}, NYU40 ends at {LARGEST_NYU40_ID}: are these raw ids "
-                "of ScanNet200? points of other classes are void",
+            self._all = TruthValues.of(self._values.values(), self._said)
+        if self._all.form(rules) != self._range.form(rules):
+            raise DataError(
+                f"{self.where}: the values of scenes without a prediction go up to {self._all.highest}, those of the "
+                f"others to {self._range.highest}; say what they are with {FLAG} classes, instances or numbers"
             )
-        if rules.ground_truth == "scannet200-vertices" and largest <= LARGEST_NYU40_ID:
-            return (f"the largest label of the ground truth is {largest}: are these NYU40 ids?",)
-        return ()
-
-
-def _range(scenes: Iterable[Int64Array]) -> tuple[int, int]:
-    """The lowest value that is no 0, and the highest; both 0 where nothing is annotated."""
-    annotated = [values[values > 0] for values in scenes if values.any()]
-    lowest = min((int(values.min()) for values in annotated), default=0)
-    return lowest, max((int(values.max()) for values in annotated), default=0)
+        values, labels = self._range.read(self._values[scene], rules)
+        return VertexTruth(values, labels, self._all.doubts(rules))
 
 
 def text_scenes(folder: Path) -> dict[str, Path]:

@@ -34,6 +34,7 @@ from su3d_bench.formats.ply_parts import (
 from su3d_bench.store.atomic import write_bytes
 
 AnyArray = NDArray[Any]
+FIRST_BYTES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -96,6 +97,26 @@ def read_ply(path: Path, where: str | None = None) -> PlyFile:
             f"{where}: {left} {body.unit} stand after the last element that the header names; it is damaged"
         )
     return PlyFile(header.format, header.comments, tuple(elements))
+
+
+def first_rows(path: Path, name: str) -> dict[str, AnyArray]:
+    """The columns of the first rows of the element ``name``, as many as the first megabyte of the file holds.
+
+    Empty where the element is not the first of a binary file or has lists. Raises as ``read_ply`` does.
+    """
+    where = str(path)
+    with reading(where, DataError), path.open("rb") as file:
+        content = file.read(FIRST_BYTES)
+    header = read_header(content, where)
+    promise = header.elements[0] if header.elements else None
+    is_plain = promise is not None and all(column.count_type is None for column in promise.properties)
+    if promise is None or promise.name != name or not promise.properties or not is_plain or header.format == "ascii":
+        return {}
+    body = BinaryBody(content, header)
+    stride = sum(body.size(column.type) for column in promise.properties)
+    n_rows = min(promise.n_rows, (body.n_units - body.start) // stride)
+    columns, _ = _equal_columns(Promise(name, n_rows, promise.properties), body, body.start) or ({}, 0)
+    return {key: column for key, column in columns.items() if isinstance(column, np.ndarray)}
 
 
 def _read_element(promise: Promise, body: Body, at: int, where: str) -> tuple[PlyElement, int]:

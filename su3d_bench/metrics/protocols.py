@@ -27,6 +27,7 @@ _ONLY_CURVES = "min_region_size, thresholds and confidence belong to kind 'insta
 _OWN_FIELDS = {
     "classes": "classes: needed where labels count, that is under kinds 'semantic' and 'instance'",
     "class_agnostic": "class_agnostic: belongs to kind 'instance'",
+    "void": "void: belongs to kind 'instance'",
     "vocabulary": "vocabulary: belongs to protocols that choose among classes, and these need it",
     "min_region_size": _ONLY_CURVES,
     "thresholds": _ONLY_CURVES,
@@ -109,7 +110,9 @@ class ProtocolRules(_Strict):
     mask, the ``prediction``'s own, or for queries the ``similarity`` of mask and text (cosine), or that stretched to
     0..1 over the scene's masks for each query. ``top_k``: how many labels of a point, or masks of a query, count; all
     where absent. ``class_agnostic`` drops the labels: the truth's instances are those of the ``scored`` classes (the
-    rest is void), all ``annotated`` ones, or ``everything``, with the points that nobody annotated as one more.
+    rest is void), all ``annotated`` ones, ``numbered``, where a number alone tells an object, whatever its class, or
+    ``everything``, with the points that nobody annotated as one more. ``void``: masks on it are ``false-positives``;
+    where absent, they are dropped at every threshold that their share of void is above, as in ScanNet's script.
     """
 
     name: str
@@ -132,7 +135,8 @@ class ProtocolRules(_Strict):
     label_space: str
     ground_truth: str
     classes: tuple[ClassEntry, ...] = ()
-    class_agnostic: Literal["scored", "annotated", "everything"] | None = None
+    class_agnostic: Literal["scored", "annotated", "numbered", "everything"] | None = None
+    void: Literal["false-positives"] | None = None
     ignore: tuple[str, ...] = ()
     ignore_rule: Literal["exact", "substring"] = "exact"
     vocabulary: Literal["all", "scored", "scene"] | None = None
@@ -296,7 +300,7 @@ class InstanceRules(ProtocolRules):
     values_of_metric: ClassVar[ValuesOfMetric] = {"scannet": AP_NAMES}
     needs_instances = True
     confidences = ("ones", "prediction")
-    takes = ("class_agnostic", *_CURVE_FIELDS)
+    takes = ("class_agnostic", "void", *_CURVE_FIELDS)
 
     def _needed(self) -> tuple[str, ...]:
         if self.class_agnostic is None:

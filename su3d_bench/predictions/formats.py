@@ -13,19 +13,21 @@ from su3d_bench.predictions.mask_archives import MaskClustering, Open3dis, OpenI
 from su3d_bench.predictions.openlex3d import OpenLex3d
 from su3d_bench.predictions.openmask3d import OpenMask3d
 from su3d_bench.predictions.own_runs import OwnRuns
-from su3d_bench.predictions.sam3d import Sam3d
-from su3d_bench.predictions.scannet_text import ScannetSemanticText, ScannetText
+from su3d_bench.predictions.sam3d import Sam3d, Sam3dColours
+from su3d_bench.predictions.scannet_text import OpenSun3dText, ScannetSemanticText, ScannetText
 
 _ALL: tuple[Reader, ...] = (
     OwnRuns(),
     ScannetText(),
     ScannetSemanticText(),
+    OpenSun3dText(),
     OpenMask3d(),
     MaskClustering(),
     Open3dis(),
     OpenYolo3d(),
     OpenIns3d(),
     Sam3d(),
+    Sam3dColours(),
     ConceptGraphs(),
     Gradslam(),
     HovSg(),

@@ -1,10 +1,12 @@
-"""Text predictions of ScanNet's benchmark: lists of masks, as Mask3D and Segment3D export them too, and labels."""
+"""Text predictions of ScanNet's benchmark: lists of masks, as Mask3D and Segment3D export them too, and labels; and the
+lists of the OpenSUN3D challenge, which have no class."""
 
 from __future__ import annotations
 
 import json
 import math
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -78,16 +80,7 @@ class ScannetText(TextFiles):
     def read_scene(self, place: Path, scene: str) -> ScenePrediction:
         where, lines = shown(place), read_list(place)
         pairs = last_line_of_each_mask_file([line.file for line in lines])
-        members, n_points = [], None
-        for first, _ in pairs:
-            n, indices = _read_mask(place.parent, lines[first], where)
-            if n_points not in {None, n}:
-                raise PredictionError(
-                    f"{where}:{lines[first].number}: mask '{printable(lines[first].file, 120)}' is of {n} points "
-                    f"and '{printable(lines[0].file, 120)}' of {n_points}; all must have the points of the scene"
-                )
-            n_points = n
-            members.append(indices)
+        members, n_points = _read_masks(place.parent, [lines[first] for first, _ in pairs], where)
         masks = vertex_masks(
             where,
             members,
@@ -97,6 +90,25 @@ class ScannetText(TextFiles):
             keys=[printable(lines[first].file, 200) for first, _ in pairs],
         )
         return ScenePrediction(scene, self.name, place, masks, _remarks(lines, len(pairs)))
+
+
+class OpenSun3dText(TextFiles):
+    name = "opensun3d-challenge"
+    summary = "The OpenSUN3D challenge's submission: <scene>.txt with lines 'mask file, confidence', without classes"
+
+    def recognise(self, path: Path) -> str | None:
+        words = next((line.split() for line in self.first_lines(path) if line), [])
+        is_list = len(words) == 2 and _number(words[0]) is None and _number(words[1]) is not None
+        return "its .txt files list a mask file and a confidence a line" if is_list else None
+
+    def read_scene(self, place: Path, scene: str) -> ScenePrediction:
+        """Every line is a mask, one that names a file again too: the original numbers them anew."""
+        where, lines = shown(place), read_list(place, has_classes=False)
+        members, n_points = _read_masks(place.parent, lines, where)
+        scores = np.array([line.score for line in lines], np.float64)
+        keys = [printable(line.file, 200) for line in lines]
+        masks = vertex_masks(where, members, n_points, scores=scores, keys=keys)
+        return ScenePrediction(scene, self.name, place, masks, ("masks without classes",))
 
 
 class ScannetSemanticText(TextFiles):
@@ -121,21 +133,28 @@ class ScannetSemanticText(TextFiles):
         return ScenePrediction(scene, self.name, place, VertexLabels(values.astype(np.int32)))
 
 
-def read_list(file: Path) -> list[Line]:
-    """The lines of a list of masks, each as the official script takes it: three fields with single spaces between."""
+def read_list(file: Path, *, has_classes: bool = True) -> list[Line]:
+    """The lines of a list of masks, each as the official script takes it: three fields with single spaces between.
+
+    Without classes, as OpenSUN3D's script takes them through numpy: two fields, blanks between, no empty lines and
+    nothing behind a #; the class is then 0.
+    """
     where, lines = shown(file), []
+    form = "mask file, class id, confidence' with single spaces between" if has_classes else "mask file, confidence'"
     for number, raw in enumerate(_content(file, where).splitlines(), 1):
-        words = raw.decode("utf-8", "replace").split(" ")
-        if len(words) != 3:
+        text = raw.decode("utf-8", "replace")
+        words = text.split(" ") if has_classes else text.partition("#")[0].split()
+        if not words:
+            continue
+        if len(words) != 2 + has_classes:
             raise PredictionError(
-                f"{where}:{number}: {len(words)} fields in '{printable(' '.join(words), 120)}'; expected 'mask file, "
-                "class id, confidence' with single spaces between"
+                f"{where}:{number}: {len(words)} fields in '{printable(text, 120)}'; expected '{form}"
             )
-        label, score = _number(words[1]), _number(words[2])
+        label, score = _number(words[1]) if has_classes else 0, _number(words[-1])
         if label is None or not -(1 << 31) < label < 1 << 31:
             raise PredictionError(f"{where}:{number}: '{printable(words[1], 60)}' is no class id")
         if score is None:
-            raise PredictionError(f"{where}:{number}: confidence '{printable(words[2], 60)}' is no finite number")
+            raise PredictionError(f"{where}:{number}: confidence '{printable(words[-1], 60)}' is no finite number")
         lines.append(Line(number, _plain_path(words[0], f"{where}:{number}"), int(label), score))
     return lines
 
@@ -148,6 +167,22 @@ def _plain_path(text: str, where: str) -> str:
             f"{where}: '{printable(text, 120)}' is no path inside the folder of the list; mask files must be in it"
         )
     return plain
+
+
+def _read_masks(folder: Path, lines: Sequence[Line], where: str) -> tuple[list[Int32Array], int | None]:
+    """The points in the mask of each line, and of how many points all are; None without any."""
+    members: list[Int32Array] = []
+    n_points = None
+    for line in lines:
+        n, indices = _read_mask(folder, line, where)
+        if n_points not in {None, n}:
+            raise PredictionError(
+                f"{where}:{line.number}: mask '{printable(line.file, 120)}' is of {n} points and "
+                f"'{printable(lines[0].file, 120)}' of {n_points}; all must have the points of the scene"
+            )
+        n_points = n
+        members.append(indices)
+    return members, n_points
 
 
 def _read_mask(folder: Path, line: Line, where: str) -> tuple[int, Int32Array]:

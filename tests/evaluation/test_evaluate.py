@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -28,6 +29,7 @@ from prediction_files import (
 
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError
 from su3d_bench.evaluation.evaluate import Request, evaluate
+from su3d_bench.evaluation.request import ValuesForm
 from su3d_bench.metrics.instance.average_precision import THRESHOLDS, combine, per_scene
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.predictions.formats import READERS
@@ -88,7 +90,7 @@ def test_all_protocols_that_fit_are_scored_at_once_and_the_others_have_a_reason(
         "class-agnostic-segment3d",
     }
     reasons = found["not_scored"]
-    assert reasons["scannet-instance"] == "the labels of the ground truth are 'scannet200-vertices'"
+    assert reasons["scannet-instance"] == "the labels of the ground truth go up to 1163, as ids of ScanNet200 do"
     assert reasons["scannet200-semantic"].startswith("needs a class for every point")
     assert reasons["replica-openmask3d"] == "is not meant for scannet"
     annotated = found["protocols"]["class-agnostic-segment3d"]
@@ -108,31 +110,40 @@ def test_instance_protocols_refuse_a_truth_of_labels_alone(tmp_path: Path) -> No
     write_truth(tmp_path / "gt", values=TRUTH // 1000)
     write_scannet_text(tmp_path / "pred", scene([CHAIR], [5]))
     with pytest.raises(
-        ConfigError, match=r"scannet-instance.*needs instances, .* 1 to 7, are taken for class ids alone"
+        ConfigError, match=r"scannet-instance.*needs instances, .* 1 to 7, are class ids alone: .* say --truth-values"
     ):
         numbers(tmp_path)
     write_truth(tmp_path / "gt", values=np.repeat([7, 1001, 0], 200))
-    with pytest.raises(ConfigError, match=r"7 to 1001, are taken for class ids alone: class id \* 1000 \+ instance is"):
+    with pytest.raises(ConfigError, match=r"7 to 1001, may be class ids alone, or class id \* 1000 \+ instance of"):
         numbers(tmp_path)
     write_truth(tmp_path / "gt", values=np.zeros(600, int))
     with pytest.raises(ConfigError, match=r"every value of the ground truth is 0: nothing is annotated"):
         numbers(tmp_path)
 
 
-def test_low_values_that_can_be_instances_of_class_1_are_these_where_instances_are_needed(tmp_path: Path) -> None:
+FORMS: tuple[tuple[ValuesForm, float], ...] = (("classes", 0.5), ("instances", 0.0))
+
+
+def test_low_values_are_what_they_are_said_to_be(tmp_path: Path) -> None:
     write_truth(tmp_path / "gt", values=np.repeat([1001, 1357, 0], 200))
     write_scannet_text(tmp_path / "pred", scene([CHAIR, TABLE], [1, 1]))
-    found = numbers(tmp_path, "class-agnostic-segment3d")
+    either = r"may be class ids alone, or class id \* 1000 \+ instance of class 1; say which with --truth-values"
+    with pytest.raises(ConfigError, match=rf"1001 to 1357, {either}"):
+        numbers(tmp_path, "class-agnostic-segment3d")
+    named = Request((tmp_path / "pred",), ground_truth=tmp_path / "gt", protocols=("class-agnostic-segment3d",))
+    found = evaluate(replace(named, truth_values="instances")).to_json()["protocols"]["class-agnostic-segment3d"]
     assert found["metrics"] == {"ap": 1.0, "ap50": 1.0, "ap25": 1.0}
-    said(found, "every value of the ground truth is from 1001 to 1357: taken for class 1 * 1000 + instance")
     write_truth(tmp_path / "labels", values=np.repeat([1163, 1170, 0], 200))  # object, bottle: ids of ScanNet200
     (tmp_path / "points").mkdir()
     (tmp_path / "points/scene0001_00.txt").write_text("1163\n" * 400 + "0\n" * 200)
-    for protocol, recall, taken in (("scannet200-semantic", 0.5, "class ids"), ("scannet-semantic", 0.0, "class 1 *")):
-        request = Request((tmp_path / "points",), ground_truth=tmp_path / "labels", protocols=(protocol,))
-        scored = evaluate(request).to_json()["protocols"][protocol]
+    request = Request((tmp_path / "points",), ground_truth=tmp_path / "labels", protocols=("scannet200-semantic",))
+    with pytest.raises(ConfigError, match=rf"1163 to 1170, {either}"):
+        evaluate(request)
+    for form, recall in FORMS:
+        scored = evaluate(replace(request, truth_values=form)).to_json()["protocols"]["scannet200-semantic"]
         assert scored["metrics"]["macc"] == recall
-        said(scored, f"every value of the ground truth is from 1163 to 1170: taken for {taken}")
+    write_truth(tmp_path / "labels", values=np.repeat([2, 1163, 0], 200))  # as instances, 2 would be of no class
+    assert evaluate(request).to_json()["protocols"]["scannet200-semantic"]["metrics"]["macc"] == 0.5
 
 
 def test_labels_of_points_may_be_held_against_a_truth_with_instances(tmp_path: Path) -> None:

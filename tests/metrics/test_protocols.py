@@ -35,6 +35,7 @@ from su3d_bench.metrics.protocols import RULES_OF_KIND, ProtocolRules, load_prot
 
 NAMES = {
     "class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d", "openlex3d-queries",
+    "opensun3d-challenge",
     "openlex3d-ranking", "openlex3d-topn", "query-ap", "replica-conceptgraphs-ex1", "replica-conceptgraphs-ex4",
     "replica-conceptgraphs-ex6", "replica-hovsg", "replica-hovsg-exact", "replica-mesh-ex6", "replica-openmask3d",
     "replica-openmask3d-released", "replica-openmask3d-semantic",
@@ -99,7 +100,7 @@ def test_class_ids_are_those_of_the_original(name: str, case: str, oracle: str) 
 def test_instance_protocols_use_the_original_thresholds_and_size(name: str) -> None:
     rules = load_protocol(name)
     if rules.kind in ("instance", "queries"):
-        n_points = MIN_REGION_SIZE if rules.kind == "instance" else 1
+        n_points = MIN_REGION_SIZE if rules.kind == "instance" and name != "opensun3d-challenge" else 1
         assert (rules.thresholds, rules.min_region_size) == (THRESHOLDS, n_points)
     else:
         n_vertices = MIN_REGION_SIZE if rules.is_judged else None
@@ -184,7 +185,7 @@ def test_a_rule_that_a_file_leaves_out_asks_for_nothing() -> None:
         "candidates": "object-points", "neighbours": 1, "cap_m": None, "evaluation_voxel_m": 0.0,
     }  # fmt: skip
     assert {key: value for key, value in rules.items() if key not in said} == {
-        "by_default": True, "class_agnostic": None, "ignore": (), "ignore_rule": "exact", "prompts": (),
+        "by_default": True, "class_agnostic": None, "void": None, "ignore": (), "ignore_rule": "exact", "prompts": (),
         "prompt_names": {}, "encoder": None, "min_region_size": None, "thresholds": (), "confidence": None,
         "top_k": None, "questions": None, "per_kind": None, "synonyms": None, "merging": None, "answers": None,
         "aggregate": "pooled", "not_comparable_with": (),
@@ -352,6 +353,7 @@ FAULTS = (
     ("semantic", "version = 1", "version = 1\ntop_k = 5", "top_k: belongs to kind 'queries'"),
     ("semantic", "version = 1", 'version = 1\nclass_agnostic = "scored"', "class_agnostic: belongs to kind 'instance'"),
     ("instance", "version = 1", 'version = 1\nclass_agnostic = "scored"', "class_agnostic: takes no prompt"),
+    ("semantic", "version = 1", 'version = 1\nvoid = "false-positives"', "void: belongs to kind 'instance'"),
     ("instance", 'confidence = "prediction"', 'confidence = "similarity"', "takes ones or prediction"),
     ("instance", "[transfer]", "[transfer]\nneighbours = 2", "transfer.neighbours: belongs to kind 'semantic'"),
     ("annotation", "version = 1", 'version = 1\nprompt = "{}"', "it takes no prompt and no encoder"),

@@ -27,6 +27,7 @@ from prediction_files import (
     write_openmask3d,
     write_openyolo3d,
     write_sam3d,
+    write_sam3d_colours,
     write_scannet_text,
     write_scannetpp_json,
     written_in,
@@ -256,6 +257,21 @@ def test_groups_of_sam3d_become_masks_without_classes(tmp_path: Path, suffix: st
     np.save(tmp_path / "none.npy", np.full(5, -1))
     none = masks_of(READERS["sam3d"].read(tmp_path, "none"))
     assert (len(none), none.n_points) == (0, 5)
+
+
+def test_colours_of_sam3d_are_groups_and_black_is_none(tmp_path: Path) -> None:
+    groups = np.repeat([1, -1, 0, 1, 2], [30, 25, 40, 15, 50])
+    write_sam3d_colours(tmp_path / "s.ply", groups)
+    prediction = read(tmp_path, "s")
+    sizes = sorted(masks_of(prediction).sizes.tolist())
+    assert (prediction.format, sizes, masks_of(prediction).n_points) == ("sam3d-colours", [40, 45, 50], len(groups))
+    members = {tuple(masks_of(prediction).mask(k).tolist()) for k in range(3)}
+    assert members == {tuple(np.flatnonzero(groups == group).tolist()) for group in range(3)}
+    write_sam3d_colours(tmp_path / "photograph.ply", np.arange(200))
+    assert READERS["sam3d-colours"].recognise(tmp_path / "photograph.ply") is None
+    (tmp_path / "plain.ply").write_text("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n0\n")
+    with pytest.raises(PredictionError, match=r"plain.ply: its points have no colours red, green, blue of one byte"):
+        read(tmp_path / "plain.ply", "plain", "sam3d-colours")
 
 
 def test_our_own_run_folders_and_files_are_read(tmp_path: Path) -> None:

@@ -39,7 +39,9 @@ def scored_masks(
     assert rules.min_region_size is not None
     scored = masks_on_truth(rules, truth, prediction, encoder)
     masks = LabelledMasks(scored.masks, scored.labels.astype(np.int64), scored.scores)
-    return scored.values, masks, ScoringRules(tuple(scored.class_ids), rules.min_region_size, rules.thresholds)
+    class_ids, forgives_void = tuple(scored.class_ids), rules.void is None
+    scoring = ScoringRules(class_ids, rules.min_region_size, rules.thresholds, forgives_void)
+    return scored.values, masks, scoring
 
 
 @dataclass(frozen=True)

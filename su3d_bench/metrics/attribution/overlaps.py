@@ -25,11 +25,13 @@ class LabelledMasks:
 
 @dataclass(frozen=True)
 class ScoringRules:
-    """What the evaluator needs: the scored class ids, the minimum size in points, the IoU thresholds."""
+    """What the evaluator needs: the scored class ids, the minimum size in points, the IoU thresholds, and whether it
+    drops masks for being void."""
 
     class_ids: tuple[int, ...]
     min_region_size: int = instance_ap.MIN_REGION_SIZE
     thresholds: tuple[float, ...] = instance_ap.THRESHOLDS
+    forgives_void: bool = True
 
 
 @dataclass(frozen=True)
@@ -151,5 +153,5 @@ def measure_overlaps(truth: Int64Array, predicted: LabelledMasks, rules: Scoring
         is_merged=((cover > HALF).sum(axis=1) > 1) & (has_own_class & (np.maximum(inside, cover) > HALF)).any(axis=1),
         is_large=is_large,
         is_counted=is_large & np.isin(predicted.class_ids, rules.class_ids),
-        is_ignored=n_ignored > max(rules.thresholds) * at_least_one[:, 0],
+        is_ignored=rules.forgives_void & (n_ignored > max(rules.thresholds) * at_least_one[:, 0]),
     )

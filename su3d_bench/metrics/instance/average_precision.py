@@ -157,13 +157,16 @@ def per_scene(
     class_ids: Sequence[int],
     min_region_size: int = MIN_REGION_SIZE,
     thresholds: Sequence[float] = THRESHOLDS,
+    *,
+    forgives_void: bool = True,
 ) -> InstanceCounts:
     """The additive counts of one scene.
 
     ``ground_truth`` (N,) holds label * 1000 + instance a point, 0 where unannotated; prediction k covers the points
     ``indices[indptr[k]:indptr[k + 1]]``, strictly ascending, and has ``labels[k]`` and ``scores[k]``. Their
     order counts for AP25 alone, as in the original under Python 3. Points whose label is not in ``class_ids`` are void.
-    Without ``labels`` every mask is listed once under each class.
+    Without ``labels`` every mask is listed once under each class. Unless it ``forgives_void``, a mask that meets no
+    instance is a false positive however much of it is void or in small instances.
 
     >>> truth = np.array([3001] * 200 + [0] * 50)
     >>> counts = per_scene(truth, np.array([0, 150]), np.arange(150), np.array([3]), np.array([0.9]), [3, 4])
@@ -202,7 +205,7 @@ def per_scene(
                 iou=shared / (segment_size[columns][None, :] + n_points[:, None] - shared),
                 takes_part=~is_small,
                 scores=scores[kept[rows]],
-                ignored_share=(n_void[rows] + shared[:, is_small].sum(axis=1)) / n_points,
+                ignored_share=forgives_void * (n_void[rows] + shared[:, is_small].sum(axis=1)) / n_points,
                 thresholds=thresholds,
             )
         )

@@ -112,6 +112,7 @@ class InstanceMetric(CurveMetric):
             scored.class_ids,
             rules.min_region_size,
             rules.thresholds,
+            forgives_void=rules.void is None,
         )
         wanted = np.isin(scored.values // instance_ap.INSTANCES_PER_CLASS, scored.class_ids)
         warnings = [None if rules.class_agnostic else encoder_warning(rules, prediction, encoder)]
@@ -178,8 +179,9 @@ def encode_without_classes(rules: ProtocolRules, semantic: IntArray, instance: I
 
     ``scored``: what has no scored class is void. ``annotated``: only points without an instance are. Both number the
     objects from 1, class after class and in each by instance number, in the order in which the originals match them;
-    equal instance numbers of two classes are two objects. ``everything``: nothing is void, points without an instance
-    are one more, of the value 1000, and equal instance numbers are one object, for the original takes them modulo 1000.
+    equal instance numbers of two classes are two objects. ``numbered``: equal instance numbers are one object, and
+    objects come by their number. ``everything``: the same, for the original takes values modulo 1000, and nothing is
+    void, for points without an instance are one more, of the value 1000.
 
     >>> from su3d_bench.metrics.protocols import load_protocol
     >>> semantic, instance = np.array([0, 1, 5, 2, 5]), np.array([0, 1, 1, 3, 2])  # 1 is the wall
@@ -191,6 +193,7 @@ def encode_without_classes(rules: ProtocolRules, semantic: IntArray, instance: I
     values = instance_ap.encode_ground_truth(np.full(len(instance), OBJECT), instance)
     if rules.class_agnostic == "everything":
         values[np.asarray(instance) == 0] = OBJECT * instance_ap.INSTANCES_PER_CLASS
+    if rules.class_agnostic in {"everything", "numbered"}:
         return values
     label = np.asarray(semantic, np.int64)
     if rules.class_agnostic == "scored":

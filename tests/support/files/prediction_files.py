@@ -15,6 +15,7 @@ from places import CASES
 
 from su3d_bench.core.errors import PredictionError
 from su3d_bench.core.types import Instances
+from su3d_bench.formats.ply import PlyElement, write_ply
 from su3d_bench.predictions.formats import READERS
 from su3d_bench.store.predictions import write_prediction
 
@@ -174,6 +175,26 @@ def write_open3dis(folder: Path, scene: dict[str, Any], *, as_tensor: bool = Fal
     file.write(folder / f"{scene['name']}.pth", pickled)
 
 
+def write_opensun3d(folder: Path, scene: dict[str, Any]) -> None:
+    """A submission to the OpenSUN3D challenge: mask file and confidence."""
+    lines = []
+    (folder / "predicted_masks").mkdir(parents=True, exist_ok=True)
+    for k, (mask, score) in enumerate(zip(scene["masks"], scene["scores"], strict=True)):
+        file = f"predicted_masks/{scene['name']}_{k}.txt"
+        np.savetxt(folder / file, mask, fmt="%d")
+        lines.append(f"{file} {float(score)!r}\n")
+    (folder / f"{scene['name']}.txt").write_text("".join(lines))
+
+
+def write_sam3d_colours(file: Path, groups: Any) -> None:
+    """The cloud that SAM3D draws: doubles, a random colour a group, black for -1, as Open3D writes it."""
+    rng = np.random.default_rng(1)
+    palette = np.vstack([rng.integers(1, 256, (int(np.max(groups)) + 1, 3)), np.zeros((1, 3), int)]).astype(np.uint8)
+    colours, points = palette[groups], rng.random((len(groups), 3))
+    columns = dict(zip("xyz", points.T, strict=True)) | dict(zip(("red", "green", "blue"), colours.T, strict=True))
+    write_ply(file, [PlyElement("vertex", len(groups), columns)])
+
+
 def write_sam3d(folder: Path, name: str, groups: Any) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     file = TorchFile()
@@ -191,7 +212,7 @@ TOY: dict[str, Any] = {
 FEATURES = RNG.normal(size=(3, 768))
 OURS = (
     "su3d-bench", "scannet-text", "scannet-semantic-text", "openmask3d", "maskclustering", "open3dis", "openyolo3d",
-    "openins3d", "sam3d",
+    "openins3d", "sam3d", "sam3d-colours", "opensun3d-challenge",
 )  # fmt: skip
 
 
@@ -215,6 +236,8 @@ def written_in(tmp_path: Path, format: str) -> Path:
         "openyolo3d": lambda: write_openyolo3d(folder, TOY),
         "openins3d": lambda: write_openins3d(folder, TOY),
         "sam3d": lambda: write_sam3d(folder, name, np.array([0, 0, -1, 1])),
+        "sam3d-colours": lambda: write_sam3d_colours(folder / f"{name}.ply", np.repeat([0, -1, 1], [30, 40, 50])),
+        "opensun3d-challenge": lambda: write_opensun3d(folder, TOY),
     }
     if format == "su3d-bench":
         (folder / f"scenes/replica.{name}/m").mkdir(parents=True)
