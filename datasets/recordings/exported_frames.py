@@ -12,7 +12,6 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -24,17 +23,8 @@ from su3d_bench.datasets.recordings.source import SensorPair
 from su3d_bench.formats.images import Size, UInt16Array, decode_colour, decode_depth, image_size, read_bytes, sized
 
 FRAMES_PER_SECOND = 30.0  # of ScanNet's recordings; the exports have no times
-MOST_MISSING = 1000  # named; a stray file with a huge number makes all those before it missing
 EXPORT_AGAIN = "export the recording again"
 NumberedNames = Mapping[int, str]  # the number of a frame to the name of its file
-
-
-class IncompleteExport(DataError):
-    """Frames that lack files: ``n_missing`` of them, of which the first are ``missing``."""
-
-    def __init__(self, where: str, missing: Sequence[str], n_missing: int) -> None:
-        super().__init__(f"{where}: {missing[0]} is missing{_more(n_missing)}; {EXPORT_AGAIN}")
-        self.missing, self.n_missing = missing, n_missing
 
 
 @dataclass(frozen=True)
@@ -148,8 +138,8 @@ def check_complete(kinds: Mapping[str, NumberedNames], expected: range, where: s
     there = {name: {number for number in files if number in expected} for name, files in kinds.items()}
     n_missing = sum(len(expected) - len(known) for known in there.values())
     if n_missing:
-        missing = (name.format(n) for name, known in there.items() for n in expected if n not in known)
-        raise IncompleteExport(where, tuple(islice(missing, MOST_MISSING)), n_missing)
+        first = next(name.format(n) for name, known in there.items() for n in expected if n not in known)
+        raise DataError(f"{where}: {first} is missing{_more(n_missing)}; {EXPORT_AGAIN}")
     extra = [name for files in kinds.values() for number, name in files.items() if number not in expected]
     if extra:
         raise DataError(

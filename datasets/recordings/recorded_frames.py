@@ -158,7 +158,7 @@ class Recording:
     """The usable frames of a scene; ``metres`` (65536,) are those of every value of a depth image, 0 for no depth.
 
     ``files`` are all that it is read from besides the images; ``image_size`` is what its camera file says, if it does;
-    ``missing`` says, a line each, what was left out because something of it is not there.
+    ``missing`` says, a line for each reason, what was left out because something of it is not there.
     """
 
     where: str

@@ -106,7 +106,7 @@ class Rgbd:
         return self._recording(scene).digest((self.name, READER_VERSION, scene))
 
     def problems(self, scene: str) -> Iterator[str]:
-        """Frames that lack an image or a usable pose, one line each; the others go on without them."""
+        """Frames that lack an image or a usable pose, one line for all; the others go on without them."""
         yield from self._recording(scene).missing
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
@@ -176,13 +176,13 @@ def open_recording(path: Path, description: RgbdDescription, where: str) -> Reco
             frames.append(RecordedFrame(number, time_s, colour, depth, pose))
     if not frames:
         raise DataError(f"{place}: no frame has colour, depth and a pose (the first: {missing[0]})")
-    if missing:
-        logger.warning("%s", left_out(where, missing, "frames lack an image or a usable pose", len(frames)))
+    remarks = [left_out(where, missing, "frames lack an image or a usable pose", len(frames))] if missing else []
+    for line in remarks:
+        logger.warning("%s", line)
     intrinsics, size, camera_files = _intrinsics(folder, description, where, place)
     mesh = () if description.mesh is None else (folder.file(description.mesh, place),)
     files = (path, *camera_files, *poses.files, *mesh)
-    lines = tuple(f"{where}: {line}" for line in missing)
-    return Recording(where, folder, tuple(frames), intrinsics, depth_table(description), files, size, lines)
+    return Recording(where, folder, tuple(frames), intrinsics, depth_table(description), files, size, tuple(remarks))
 
 
 def _folder(path: Path, description: RgbdDescription, place: str) -> Folder:

@@ -30,7 +30,8 @@ class RgbdDescription(BaseModel):
       with ``*`` or ``?`` in all of them, the k-th file of each in numeric order. JPEG, PNG, PPM; PNG, PGM of 16 bits
     - ``pose``: text files of a 4x4 matrix; or ``trajectory``: one file with a pose for every image or, where images are
       missing, for every number from the first to the last. ``trajectory_format``: ``open3d`` (blocks of five lines,
-      ``trajectory.log``), ``tum`` (time tx ty tz qx qy qz qw) or ``kitti`` (12 numbers a line)
+      ``trajectory.log``), ``tum`` (time tx ty tz qx qy qz qw) or ``kitti`` (12 numbers a line) or
+      ``matrix`` (16 numbers a line, row by row, as 7-Scenes, NICE-SLAM and many others keep them in one file)
     - ``pose_direction`` and ``camera_axes``: what the matrices map, and whether y points down and z into the scene
       (``opencv``) or y up and z back (``opengl``)
     - ``depth_unit_m``: metres of one unit. ``depth_rotated_bits``: by how many bits stored values are rotated to the
@@ -49,7 +50,7 @@ class RgbdDescription(BaseModel):
     depth: str
     pose: str | None = None
     trajectory: str | None = None
-    trajectory_format: Literal["open3d", "tum", "kitti"] = "open3d"
+    trajectory_format: Literal["open3d", "tum", "kitti", "matrix"] = "open3d"
     pose_direction: Literal["camera_to_world", "world_to_camera"] = "camera_to_world"
     camera_axes: Literal["opencv", "opengl"] = "opencv"
     depth_unit_m: float = Field(ge=1e-7, le=10, allow_inf_nan=False)

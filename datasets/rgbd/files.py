@@ -20,6 +20,8 @@ from su3d_bench.numerics.geometry import are_rigid
 MAX_NUMBER = 2**31 - 1  # maps keep the numbers of frames in 32 bits; time stamps in names do not fit
 MAX_DISTANCE_M = 1e6  # of a camera from the origin
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+MATRIX_ROWS = {"kitti": (3, "the upper rows of a 4x4 matrix"), "matrix": (4, "a 4x4 matrix row by row")}
+FORMS_OF_WORDS = {8: "tum", 12: "kitti", 16: "matrix"}  # numbers a line
 Pose = Float64Array | None  # None: tracking was lost, the matrix holds numbers that are not finite
 
 
@@ -76,10 +78,12 @@ def read_trajectory_file(path: Path, form: str, where: str) -> tuple[Float64Arra
     """The matrix of each pose (n, 4, 4), and the times in seconds where the file has them."""
     if form == "open3d":
         return np.array(_open3d_log(read_text(path, where).split("\n"), where)).reshape(-1, 4, 4), None
-    if form == "kitti":
-        rows = rows_of(path, where, 12, "12 numbers, the upper rows of a 4x4 matrix")
-        upper = np.array([numbers(words, f"{where} line {n}") for n, words in rows]).reshape(-1, 3, 4)
-        return np.concatenate([upper, np.tile([0.0, 0.0, 0.0, 1.0], (len(rows), 1, 1))], axis=1), None
+    if form in MATRIX_ROWS:
+        n_rows, whose = MATRIX_ROWS[form]
+        rows = rows_of(path, where, 4 * n_rows, f"{4 * n_rows} numbers, {whose}")
+        upper = np.array([numbers(words, f"{where} line {n}") for n, words in rows]).reshape(-1, n_rows, 4)
+        lower = np.tile([0.0, 0.0, 0.0, 1.0], (len(rows), 4 - n_rows, 1)).reshape(len(rows), 4 - n_rows, 4)
+        return np.concatenate([upper, lower], axis=1), None
     values, times_s = [], []
     for n, words in rows_of(path, where, 8, "'time tx ty tz qx qy qz qw'"):
         row = numbers(words[1:], f"{where} line {n}")
@@ -93,6 +97,9 @@ def _open3d_log(lines: list[str], where: str) -> list[list[float]]:
     """Blocks of a line of three integers and four lines of a matrix, as Open3D writes ``.log`` files."""
     while lines and not lines[-1].strip():
         lines.pop()
+    if lines and (form := FORMS_OF_WORDS.get(len(lines[0].split()))):
+        n = len(lines[0].split())
+        raise DataError(f'{where} line 1: has {n} values; expected three integers, or set trajectory_format = "{form}"')
     if not lines or len(lines) % 5:
         raise DataError(f"{where} has {len(lines)} lines; expected blocks of five, three integers and a 4x4 matrix")
     matrices = []

@@ -11,12 +11,11 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.datasets.recordings.exported_frames import EXPORT_AGAIN, IncompleteExport
 from su3d_bench.datasets.recordings.registration import Grid, make_registration
 from su3d_bench.datasets.recordings.source import RgbdSource
 from su3d_bench.datasets.scannet.annotations import aggregation_name, read_objects, read_segments, segments_name
 from su3d_bench.datasets.scannet.frames import classify_poses, faulty_pose, read_walk
-from su3d_bench.datasets.scannet.labels import TABLE_NAME, read_label_table
+from su3d_bench.datasets.scannet.labels import FIRST_TABLE_NAME, TABLE_NAME, read_label_table
 from su3d_bench.datasets.scannet.truth import (
     labels_name,
     mesh_name,
@@ -35,11 +34,6 @@ def recording_problems(open_source: Callable[[], RgbdSource], grid: Grid, where:
     try:
         source = open_source()
         walk, is_faulty = classify_poses(source)
-    except IncompleteExport as error:
-        yield from (f"{where}: {name} is missing; {EXPORT_AGAIN}" for name in error.missing)
-        if error.n_missing > len(error.missing):
-            yield f"{where}: {error.n_missing - len(error.missing)} more files are missing"
-        return
     except DataError as error:
         yield str(error)
         return
@@ -56,6 +50,7 @@ def annotation_problems(files: Mapping[str, Path], scan: str, where: str) -> Ite
     """Faults of the files that there are (by their names), each alone and, where all of the truth is, together."""
     readers: dict[str, Callable[[Path], object]] = {
         TABLE_NAME: lambda path: read_label_table(path, where),
+        FIRST_TABLE_NAME: lambda path: read_label_table(path, where),
         meta_name(scan): lambda path: read_axis_alignment(path, where),
         segments_name(scan): lambda path: read_segments(path, scan, where),
         aggregation_name(scan): lambda path: read_objects(path, scan, where),

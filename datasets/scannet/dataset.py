@@ -143,16 +143,17 @@ class ScanNet:
             raise GroundTruthMissing(f"{self._where(scene)}: no ground truth '{variant}'{hint}")
         scan = self._annotated_scan(scene)
         if variant == "nyu40-vertices":
-            return nyu40_truth(scan, self._label_table)
-        if self._label_table is None:
+            return nyu40_truth(scan, self._label_tables)
+        table = next((table for table in self._label_tables if table.name == TABLE_NAME), None)
+        if table is None:
             raise GroundTruthMissing(
                 f"{self._where(scene)}: no ground truth '{variant}'; {TABLE_NAME} of the release is missing, put it "
                 f"into {self.tree.table_folders()[0]}"
             )
-        return scannet200_truth(scan, self._label_table)
+        return scannet200_truth(scan, table)
 
     def instance_mesh(self, scene: str) -> InstanceMesh:
-        return instance_mesh(self._annotated_scan(scene), self._label_table)
+        return instance_mesh(self._annotated_scan(scene), self._label_tables)
 
     def surface(self, scene: str) -> Surface:
         """The decimated mesh, with the published segments where they are here; scans without truth have both."""
@@ -206,14 +207,13 @@ class ScanNet:
         return read_axis_alignment(path, self._where(scene))
 
     @cached_property
-    def _label_table(self) -> LabelTable | None:
-        path = self.tree.find_label_table()
-        return None if path is None else read_label_table(path, self.name)
+    def _label_tables(self) -> Sequence[LabelTable]:
+        return [read_label_table(path, self.name) for path in self.tree.label_tables()]
 
     def _small_files(self, scene: str) -> tuple[Path, ...]:
         """What is read of the scene beside its recording, as far as it is there."""
         paths = [self.tree.find_file(scene, name) for name in (meta_name(scene), *truth_names(scene))]
-        return tuple(path for path in (*paths, self.tree.find_label_table()) if path is not None)
+        return tuple(path for path in (*paths, *self.tree.label_tables()) if path is not None)
 
     def _truth_files(self, scene: str) -> dict[str, Path]:
         """The path of each file of the truth."""

@@ -14,7 +14,7 @@ from pathlib import Path
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.datasets.recordings.made_rooms import read_marker
-from su3d_bench.datasets.scannet.labels import TABLE_NAME
+from su3d_bench.datasets.scannet.labels import FIRST_TABLE_NAME, TABLE_NAME
 
 # The scenes of OpenSU3D's evaluation, in the order of its section IV-A.
 PAPER_SCENES = ("scene0000_00", "scene0034_00", "scene0164_03", "scene0525_01", "scene0549_00")
@@ -26,13 +26,14 @@ SUBFOLDERS = (
     "scans",
     "scans_test",
     "v2/scans",
+    "v1/scans",
     "public/v2/scans",
     *(f"scans/{split}" for split in SPLITS),
     *SPLITS,
     "validation",
 )
 PLACES = tuple(dict.fromkeys("/".join(part for part in (b, s) if part) or "." for b in BASES for s in SUBFOLDERS))
-TABLE_FOLDERS = ("tasks", "metadata", "v2/tasks")  # beside the scans, where some keep the label table
+TABLE_FOLDERS = ("tasks", "metadata", "v2/tasks", "v1/tasks")  # beside the scans, where some keep the label table
 SCAN_NAME = re.compile(r"scene\d{4}_\d{2}")
 EXPORTS = ("pose", "data/pose", "exported", "_info.txt")  # what tells a folder with exported frames
 SCANNET_URL = "http://www.scan-net.org"
@@ -57,9 +58,14 @@ class ScanFolders:
         """The file ``name`` of a scan, from the first of its folders that has it."""
         return next((path for folder in self.folders[scan] if (path := folder / name).is_file()), None)
 
-    def find_label_table(self) -> Path | None:
+    def find_label_table(self, name: str = TABLE_NAME) -> Path | None:
         """The label table: in a folder with scans, above one, or in the usual folders beside them."""
-        return next((path for folder in self.table_folders() if (path := folder / TABLE_NAME).is_file()), None)
+        return next((path for folder in self.table_folders() if (path := folder / name).is_file()), None)
+
+    def label_tables(self) -> list[Path]:
+        """That of the second release and that of the first, as far as they are here."""
+        found = [self.find_label_table(name) for name in (TABLE_NAME, FIRST_TABLE_NAME)]
+        return [path for path in found if path is not None]
 
     def table_folders(self) -> list[Path]:
         """Where the label table is looked for, the nearest to the scans first."""

@@ -4,9 +4,10 @@ As Mask3D and OpenMask3D prepare it: an instance id is the object's id + 1, 0 wh
 class is the NYU40 id in ``_vh_clean_2.labels.ply``, or for ScanNet200 the raw id of the object's category. Classes that
 a protocol does not have stay in the truth, they are void there.
 
-The first release differs: its ``labels.ply`` holds raw ids, which are line numbers of another table. Classes then come
-from the objects' categories. A file holds raw ids when one of its labels exceeds 40, or when more of its labels are the
-raw ids of the objects' categories than are their NYU40 ids.
+The first release differs: its ``labels.ply`` holds raw ids, which are numbers of rows in a table of its own. Classes then
+come from the objects' categories, by that table or, where it is not here, by that of the second release. A file holds
+raw ids when one of its labels exceeds 40, or when more of its labels are the raw ids of the objects' categories in a
+table than are their NYU40 ids.
 """
 
 from __future__ import annotations
@@ -31,7 +32,14 @@ from su3d_bench.datasets.scannet.annotations import (
     read_segments,
     segments_name,
 )
-from su3d_bench.datasets.scannet.labels import MAX_NYU40_ID, TABLE_NAME, LabelTable, nyu40_label_set, raw_label_set
+from su3d_bench.datasets.scannet.labels import (
+    FIRST_TABLE_NAME,
+    MAX_NYU40_ID,
+    TABLE_NAME,
+    LabelTable,
+    nyu40_label_set,
+    raw_label_set,
+)
 from su3d_bench.formats.ply import ListColumn, read_ply
 from su3d_bench.numerics.geometry import are_rigid
 
@@ -150,9 +158,9 @@ def _mesh(path: Path, where: str) -> tuple[Float32Array, Int32Array]:
     return vertices, corners.values.reshape(-1, 3).astype(np.int32)
 
 
-def nyu40_truth(scan: AnnotatedScan, table: LabelTable | None) -> GroundTruth:
-    """Classes of NYU40; ``table`` is needed for files of the first release alone."""
-    semantic, source = nyu40_of_vertex(scan, table)
+def nyu40_truth(scan: AnnotatedScan, tables: Sequence[LabelTable]) -> GroundTruth:
+    """Classes of NYU40; one of ``tables`` is needed for files of the first release alone."""
+    semantic, source = nyu40_of_vertex(scan, tables)
     return GroundTruth(
         scan.vertices,
         semantic,
@@ -176,30 +184,27 @@ def scannet200_truth(scan: AnnotatedScan, table: LabelTable) -> GroundTruth:
     )
 
 
-def nyu40_of_vertex(scan: AnnotatedScan, table: LabelTable | None) -> tuple[Int32Array, str]:
+def nyu40_of_vertex(scan: AnnotatedScan, tables: Sequence[LabelTable]) -> tuple[Int32Array, str]:
     """The NYU40 class of each vertex, 0 for none, and where it is from."""
-    if not _holds_raw_ids(scan, table):
+    is_annotated = scan.object_of_vertex >= 0
+    agrees = {
+        (table.name, kind): int((scan.labels == scan.of_category(value_of))[is_annotated].sum())
+        for table in tables
+        for kind, value_of in (("raw", table.raw_id_of), ("nyu40", table.nyu40_of))
+    }
+    table = max(tables, key=lambda table: agrees[table.name, "raw"], default=None)
+    holds_raw_ids = scan.labels.max() > MAX_NYU40_ID
+    if table is not None and not holds_raw_ids:
+        holds_raw_ids = agrees[table.name, "raw"] > max(agrees[each.name, "nyu40"] for each in tables)
+    if not holds_raw_ids:
         return scan.labels.astype(np.int32), "the labels of _vh_clean_2.labels.ply"
     if table is None:
         raise GroundTruthMissing(
             f"{scan.where}: the labels are raw ids of the first release (the largest: {scan.labels.max()}); their "
-            f"classes are in {TABLE_NAME}, which is not beside the scans"
+            f"classes are in its table {FIRST_TABLE_NAME}, or {TABLE_NAME}, and neither is beside the scans"
         )
     _say_what_is_unknown(scan, table)
-    return scan.of_category(table.nyu40_of), "the NYU40 classes of the objects' categories"
-
-
-def _holds_raw_ids(scan: AnnotatedScan, table: LabelTable | None) -> bool:
-    if scan.labels.max() > MAX_NYU40_ID:
-        return True
-    if table is None:
-        return False
-    is_annotated = scan.object_of_vertex >= 0
-    n_raw, n_nyu40 = (
-        int((scan.labels == scan.of_category(value_of))[is_annotated].sum())
-        for value_of in (table.raw_id_of, table.nyu40_of)
-    )
-    return n_raw > n_nyu40
+    return scan.of_category(table.nyu40_of), f"the NYU40 classes of the objects' categories in {table.name}"
 
 
 def _say_what_is_unknown(scan: AnnotatedScan, table: LabelTable) -> None:
@@ -209,12 +214,12 @@ def _say_what_is_unknown(scan: AnnotatedScan, table: LabelTable) -> None:
         categories = sorted({scan.objects[row].category for row in unknown})
         logger.warning(
             "%s: categories without a row in %s: %d (the first: %s); vertices made void: %d",
-            scan.where, TABLE_NAME, len(categories), ascii(categories[0][:40]),
+            scan.where, table.name, len(categories), ascii(categories[0][:40]),
             int(np.isin(scan.object_of_vertex, unknown).sum()),
         )  # fmt: skip
 
 
-def instance_mesh(scan: AnnotatedScan, table: LabelTable | None) -> InstanceMesh:
+def instance_mesh(scan: AnnotatedScan, tables: Sequence[LabelTable]) -> InstanceMesh:
     """The triangles, each with the instance of most of its vertices, 0 where all three differ; classes of NYU40.
 
     The class of an instance is that of most of its vertices, the lowest where several have as many.
@@ -224,7 +229,7 @@ def instance_mesh(scan: AnnotatedScan, table: LabelTable | None) -> InstanceMesh
     instance = scan.instance
     first, second, third = instance[scan.triangles].T
     of_triangle = np.where((first == second) | (first == third), first, np.where(second == third, second, 0))
-    semantic, _ = nyu40_of_vertex(scan, table)
+    semantic, _ = nyu40_of_vertex(scan, tables)
     n_classes = MAX_NYU40_ID + 1
     ids = np.unique(instance[instance > 0])
     counts = np.bincount(instance.astype(np.int64) * n_classes + semantic, minlength=(instance.max() + 1) * n_classes)

@@ -115,7 +115,7 @@ class Tum:
         return self._recording(scene).digest((self.name, READER_VERSION, scene, self.info(scene, 1).image_domain))
 
     def problems(self, scene: str) -> Iterator[str]:
-        """What the lists name and is not there, one line each; the frames go on without it."""
+        """What the lists name and is not there, a line in all; the frames go on without it."""
         yield from self._recording(scene).missing
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
@@ -166,12 +166,8 @@ class Tum:
             logger.warning("%s", line)
         camera = ("camera.txt",) if (path / "camera.txt").exists() else ()
         files = tuple(path / name for name in (*lists, *camera, "groundtruth.txt"))
-        lines = (
-            *(f"{named}: {name} is missing; copy it there" for name in missing),
-            *(f"{where}: {name} has no pose within {limit_s:g} s in groundtruth.txt" for name in unposed),
-        )
         intrinsics = self._intrinsics(path, where)
-        return Recording(where, folder, tuple(frames), intrinsics, DEPTH_M_OF_VALUE, files, missing=lines)
+        return Recording(where, folder, tuple(frames), intrinsics, DEPTH_M_OF_VALUE, files, missing=tuple(remarks))
 
     def _intrinsics(self, path: Path, where: str) -> Float64Array:
         if self.options.intrinsics is not None:

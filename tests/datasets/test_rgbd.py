@@ -189,6 +189,7 @@ def test_an_unscored_run_says_what_its_labels_are_worth_and_needs_no_truth(
         {"pose": None, "trajectory": "trajectory.log"},
         {"pose": None, "trajectory": "lines.tum", "trajectory_format": "tum"},
         {"pose": None, "trajectory": "lines.kitti", "trajectory_format": "kitti"},
+        {"pose": None, "trajectory": "lines.matrix", "trajectory_format": "matrix"},
         {"colour": "colour/*.png", "depth": "depth/frame-?.png", "pose": "*.pose.txt"},
         {"folder": "../desk/data"},
     ],
@@ -200,6 +201,8 @@ def test_every_way_to_name_the_same_files_gives_the_same_frames(tmp_path: Path, 
     folder = write_scene(tmp_path, **changes)
     kitti = [" ".join(map(repr, pose(k)[:3].reshape(-1).tolist())) for k in range(3)]
     (folder / "data/lines.kitti").write_text("\n".join(kitti))
+    rows = [" ".join(map(repr, pose(k).reshape(-1).tolist())) for k in range(3)]
+    (folder / "data/lines.matrix").write_text("\n".join(rows))
     half = [0.05 * k for k in range(3)]
     tum = [f"{k / 30} {k} {1 / 3} {-k} 0 0 {np.sin(a)} {np.cos(a)}" for k, a in enumerate(half)]
     (folder / "data/lines.tum").write_text("# time x y z\n" + "\n".join(tum))
@@ -257,6 +260,7 @@ def test_frames_that_lack_a_part_are_said_once_and_left_out(tmp_path: Path, capl
         "rgbd/desk: 3 frames lack an image or a usable pose (the first: frame 1, no colour and no pose); left out, "
         "2 frames are used"
     ]
+    assert list(rgbd.problems("desk")) == [record.getMessage() for record in caplog.records]
 
 
 def test_a_trajectory_counts_missing_images_or_leaves_them_out(tmp_path: Path) -> None:
@@ -371,6 +375,7 @@ def camera_with(**values: Any) -> Change:
         (file("frame-1.pose.txt", "x" + " 0" * 15), "frame-1.pose.txt: 'x' is no number"),
         (file("frame-1.pose.txt", text_of(2 * pose(1))), "frame-1.pose.txt: not a rigid motion in metres"),
         (file("frame-1.pose.txt", text_of(pose(1)).replace("-1.0", "-1e9", 1)), "frame-1.pose.txt: not a rigid motion"),
+        (log_with(1, " ".join("0" * 16)), 'has 16 values; expected three integers, or set trajectory_format = "matrix"'),
         (log_with(6, "1 1"), "trajectory.log line 6: '1 1'; expected three integers"),
         (log_with(7, "1 0 0"), "trajectory.log line 7 has 3 values; expected 4, a row of a 4x4 matrix"),
         (log_with(7, "1 0 0 x"), "trajectory.log line 7: 'x' is no number"),

@@ -117,6 +117,7 @@ def test_missing_images_are_counted_once_and_the_others_used(tmp_path: Path, cap
         f"tum/{SCENE}: rgb.txt and depth.txt: 2 images named there are missing (the first: rgb/100.100000.png); "
         "left out, 2 frames are used"
     ]
+    assert list(tum.problems(SCENE)) == [record.getMessage() for record in caplog.records]
 
 
 def test_frames_without_a_pose_in_time_are_counted_and_left_out(

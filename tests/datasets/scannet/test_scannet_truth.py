@@ -20,7 +20,14 @@ from su3d_bench.datasets.scannet.annotations import (
     read_segments,
     segments_name,
 )
-from su3d_bench.datasets.scannet.labels import TABLE_NAME, LabelTable, nyu40_label_set, raw_label_set, read_label_table
+from su3d_bench.datasets.scannet.labels import (
+    FIRST_TABLE_NAME,
+    TABLE_NAME,
+    LabelTable,
+    nyu40_label_set,
+    raw_label_set,
+    read_label_table,
+)
 from su3d_bench.datasets.scannet.truth import (
     AnnotatedScan,
     aligned,
@@ -59,7 +66,7 @@ def table(tmp_path: Path, text: str | None = None) -> LabelTable:
 
 def test_nyu40_truth_is_the_label_of_the_file_and_the_last_object_that_claims_the_segment(tmp_path: Path) -> None:
     write_truth(tmp_path, SEGMENTS, GROUPS, NYU40)
-    truth = nyu40_truth(read(tmp_path), None)
+    truth = nyu40_truth(read(tmp_path), [])
     assert truth.semantic.tolist() == NYU40
     assert truth.instance.tolist() == INSTANCE
     assert truth.variant == "nyu40-vertices"
@@ -133,7 +140,7 @@ def test_labels_of_the_first_release_are_raw_ids_and_become_nyu40(tmp_path: Path
     """The second scan has no id above 40: only its objects tell the releases apart."""
     raw = [6 if one == 90 else one for one in RAW] if groups is not GROUPS else RAW
     write_truth(tmp_path, SEGMENTS, groups, raw, prefix="")
-    truth = nyu40_truth(read(tmp_path), table(tmp_path))
+    truth = nyu40_truth(read(tmp_path), [table(tmp_path)])
     assert truth.semantic.tolist() == ([6 if one == 39 else one for one in NYU40] if groups is not GROUPS else NYU40)
     assert truth.instance.tolist() == INSTANCE
     assert "categories" in truth.source
@@ -141,13 +148,37 @@ def test_labels_of_the_first_release_are_raw_ids_and_become_nyu40(tmp_path: Path
 
 def test_labels_of_the_first_release_need_the_table(tmp_path: Path) -> None:
     write_truth(tmp_path, SEGMENTS, GROUPS, RAW, prefix="")
-    with pytest.raises(GroundTruthMissing, match=r"raw ids of the first release \(the largest: 90\); .*combined\.tsv"):
-        nyu40_truth(read(tmp_path), None)
+    with pytest.raises(GroundTruthMissing, match=r"raw ids of the first release \(the largest: 90\); .*scannet-labels"):
+        nyu40_truth(read(tmp_path), [])
+
+
+def first_table(tmp_path: Path) -> LabelTable:
+    """The table of the first release: no ids but the numbers of rows, and a class that is not there."""
+    categories = [("wall", "1"), ("stool", "40"), ("storage", ""), *[(f"thing {k}", "40") for k in range(4, 47)]]
+    categories += [("piano", "39"), ("chair", "5")]
+    rows = [f"{name}\t7\t21\t{nyu40}\t4\t{name}" for name, nyu40 in categories]
+    (tmp_path / FIRST_TABLE_NAME).write_text("\n".join(["category\tcount\tnyuId\tnyu40id\teigen13id\tnyuClass", *rows]))
+    return read_label_table(tmp_path / FIRST_TABLE_NAME, WHERE)
+
+
+@pytest.mark.parametrize("beside", [False, True])
+def test_labels_of_the_first_release_are_rows_of_its_own_table(tmp_path: Path, beside: bool) -> None:
+    rows = [48 if one == 5 else 47 if one == 39 else 2 if one == 40 else 0 for one in NYU40]
+    write_truth(tmp_path, SEGMENTS, GROUPS, rows, prefix="")
+    first = first_table(tmp_path)
+    assert (first.raw_id_of["storage"], first.nyu40_of.get("storage")) == (3, None)
+    other = table(tmp_path, table_text([("chair", 2, 6, "sofa")]))  # knows no piano, and the chair as a sofa
+    truth = nyu40_truth(read(tmp_path), [other, first] if beside else [first])
+    assert truth.semantic.tolist() == NYU40
+    assert truth.source.endswith(f"categories in {FIRST_TABLE_NAME} and the objects of .aggregation.json")
+    with pytest.raises(DataError, match=r"scannet-labels.combined.tsv: has no column 'category'"):
+        (tmp_path / FIRST_TABLE_NAME).write_text(table_text().replace("\tcategory", "\tother"))
+        read_label_table(tmp_path / FIRST_TABLE_NAME, WHERE)
 
 
 def test_a_triangle_belongs_to_the_instance_of_most_of_its_vertices(tmp_path: Path) -> None:
     write_truth(tmp_path, SEGMENTS, GROUPS, NYU40)
-    mesh = instance_mesh(read(tmp_path), None)
+    mesh = instance_mesh(read(tmp_path), [])
     # the first cell: vertices 0 (none), 1 and 6 (chair); the second: 1, 7 (chair) and 2, 8 (piano)
     assert mesh.triangles[:4].tolist() == [[0, 1, 6], [1, 7, 6], [1, 2, 7], [2, 8, 7]]
     assert mesh.instance_of_triangle[:4].tolist() == [1, 1, 1, 3]
@@ -158,7 +189,7 @@ def test_a_triangle_of_three_instances_belongs_to_none(tmp_path: Path) -> None:
     points, triangles = np.eye(3, dtype=np.float32), np.array([[0, 1, 2]], np.int32)
     write_truth(tmp_path, [1, 2, 3], [(0, "chair", [1]), (1, "couch", [2]), (2, "x", [3])], [5, 6, 0],
                 mesh=(points, triangles))  # fmt: skip
-    mesh = instance_mesh(read(tmp_path), None)
+    mesh = instance_mesh(read(tmp_path), [])
     assert mesh.instance_of_triangle.tolist() == [0]
     assert mesh.class_of_instance == {1: 5, 2: 6}
 
@@ -167,7 +198,7 @@ def test_the_class_of_an_instance_is_that_of_most_of_its_vertices(tmp_path: Path
     labels = list(NYU40)
     labels[1] = 8
     write_truth(tmp_path, SEGMENTS, GROUPS, labels)
-    assert instance_mesh(read(tmp_path), None).class_of_instance[1] == 5
+    assert instance_mesh(read(tmp_path), []).class_of_instance[1] == 5
 
 
 def test_alignment_moves_the_vertices(tmp_path: Path) -> None:
