@@ -144,7 +144,7 @@ def _inspect(
 
 
 class _Findings:
-    """Collects what is found of one scene, each fault once though several steps come upon it."""
+    """Collects what is found of one scene, each fault once though several steps come upon it, at its gravest."""
 
     def __init__(self, scene: str) -> None:
         self.scene = scene
@@ -158,8 +158,10 @@ class _Findings:
         for finding in findings:
             text = printable(finding.text.removeprefix(f"{self.scene}: ").removeprefix(f"{finding.where}: "))
             where = printable(finding.where)
-            if not any((place, text) in self._findings for place in (where, "")):
-                self._findings[where, text] = Finding(finding.severity, finding.check, where, text)
+            keys = [(place, text) for place in (where, "") if (place, text) in self._findings] or [(where, text)]
+            known = self._findings.get(keys[0])
+            if known is None or SEVERITIES.index(finding.severity) < SEVERITIES.index(known.severity):
+                self._findings[keys[0]] = Finding(finding.severity, finding.check, keys[0][0], text)
 
     def add_fault(self, check: str, where: str, error: Exception) -> None:
         """A finding of what was raised, unless it is about a file whose fault is known."""

@@ -2,7 +2,7 @@
 
 The table ``scannetv2-labels.combined.tsv`` comes with the data and is not shipped here. Two versions circulate, the
 older one and the one updated for ScanNet200; both are read the same way. The first release has a table of its own,
-``scannet-labels.combined.tsv``: its raw categories stand in ``category``, and a raw id is the number of the row, from 1.
+``scannet-labels.combined.tsv``: raw categories stand in ``category``, and a raw id is the number of the row, from 1.
 """
 
 from __future__ import annotations

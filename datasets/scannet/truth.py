@@ -4,10 +4,10 @@ As Mask3D and OpenMask3D prepare it: an instance id is the object's id + 1, 0 wh
 class is the NYU40 id in ``_vh_clean_2.labels.ply``, or for ScanNet200 the raw id of the object's category. Classes that
 a protocol does not have stay in the truth, they are void there.
 
-The first release differs: its ``labels.ply`` holds raw ids, which are numbers of rows in a table of its own. Classes then
-come from the objects' categories, by that table or, where it is not here, by that of the second release. A file holds
-raw ids when one of its labels exceeds 40, or when more of its labels are the raw ids of the objects' categories in a
-table than are their NYU40 ids.
+The first release differs: its ``labels.ply`` holds raw ids, which are numbers of rows in a table of its own. Classes
+then come from the objects' categories, by that table or, where it is not here, by that of the second release. A file
+holds raw ids when one of its labels exceeds 40, or when more of its labels are the raw ids of the objects' categories
+in a table than are their NYU40 ids.
 """
 
 from __future__ import annotations

@@ -375,7 +375,7 @@ def camera_with(**values: Any) -> Change:
         (file("frame-1.pose.txt", "x" + " 0" * 15), "frame-1.pose.txt: 'x' is no number"),
         (file("frame-1.pose.txt", text_of(2 * pose(1))), "frame-1.pose.txt: not a rigid motion in metres"),
         (file("frame-1.pose.txt", text_of(pose(1)).replace("-1.0", "-1e9", 1)), "frame-1.pose.txt: not a rigid motion"),
-        (log_with(1, " ".join("0" * 16)), 'has 16 values; expected three integers, or set trajectory_format = "matrix"'),
+        (log_with(1, " ".join("0" * 16)), 'expected three integers, or set trajectory_format = "matrix"'),
         (log_with(6, "1 1"), "trajectory.log line 6: '1 1'; expected three integers"),
         (log_with(7, "1 0 0"), "trajectory.log line 7 has 3 values; expected 4, a row of a 4x4 matrix"),
         (log_with(7, "1 0 0 x"), "trajectory.log line 7: 'x' is no number"),
