@@ -136,8 +136,10 @@ def _row(question: Question) -> dict[str, Any]:
 def _printable_row(question: Question) -> tuple[str, ...]:
     from su3d_bench.core.errors import printable
 
-    ids = "unknown" if question.answers is None else " ".join(map(str, question.answers))
-    return printable(question.scene, 60), question.kind, printable(question.text, MOST_CHARACTERS), f"-> {ids}"
+    ids = " ".join(map(str, question.answers or ()))
+    reply = f'"{printable(question.reply, MOST_CHARACTERS)}"' if question.reply else ""
+    known = " ".join(part for part in (ids, reply) if part) or "unknown"
+    return printable(question.scene, 60), question.kind, printable(question.text, MOST_CHARACTERS), f"-> {known}"
 
 
 def _answer_counts(questions: Sequence[Question], arguments: argparse.Namespace) -> None:
@@ -146,7 +148,10 @@ def _answer_counts(questions: Sequence[Question], arguments: argparse.Namespace)
     kinds = ", ".join(f"{n} {kind}" for kind, n in counts.items())
     n_scenes = len({question.scene for question in questions})
     text = f"{len(questions)} questions on {n_scenes} scenes ({kinds}); {n_known} with known answers"
-    answer_either(arguments, {"n": len(questions), "n_known": n_known, "kinds": dict(counts)}, text)
+    if n_replies := sum(bool(question.reply) for question in questions):
+        text += f", {n_replies} with one in words"
+    content = {"n": len(questions), "n_known": n_known, "n_replies": n_replies, "kinds": dict(counts)}
+    answer_either(arguments, content, text)
 
 
 def _audit(arguments: argparse.Namespace) -> int:

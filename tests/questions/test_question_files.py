@@ -118,6 +118,53 @@ def test_sqa3d_takes_its_answers_from_the_file_beside_it(tmp_path: Path) -> None
     assert read_questions(questions)[0].reply == "table"
 
 
+def test_one_question_of_sqa3d_with_two_answers_keeps_both_and_they_are_shown(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    questions = tmp_path / "v1_balanced_questions_val_scannetv2.json"
+    questions.write_text(json.dumps({"questions": [SQA_QUESTION, {**SQA_QUESTION, "question_id": 8}]}))
+    replies = [{"question_id": k, "answers": [{"answer": word}]} for k, word in ((7, "table"), (8, "desk"))]
+    (tmp_path / "v1_balanced_sqa_annotations_val_scannetv2.json").write_text(json.dumps({"annotations": replies}))
+    assert [one.reply for one in read_questions(questions)] == ["table or desk"]
+    assert main(["questions", "show", str(questions)]) == 0
+    shown = capsys.readouterr().out
+    assert "1 questions on 1 scenes (1 reasoning); 0 with known answers, 1 with one in words" in shown
+    assert 'What is in front?  -> "table or desk"' in shown
+
+
+OPENEQA = [{"question": "What is red?", "answer": "the box", "category": "x", "episode_history": "scannet-v0/002"}]
+SCANQA = [{"question": "What is red?", "answers": ["box"], "object_ids": [3], "scene_id": "scene0000_00"}]
+NR3D_ROW = {"item_id": "nr3d_0", "scan_id": "scene0000_00", "target_id": 9, "utterance": "the plant"}
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "line"),
+    [
+        ("open-eqa-v0.json", OPENEQA, "OpenEQA's questions, .*; write scene, text and objects"),
+        ("scannet_qa.json", SCANQA, r"ScanQA's form \(Beacon3D's \*_qa.json too\)"),
+        (
+            "metadata_scannet_grounding.json",
+            {"scene0000_00": {"box": {"3": []}}},
+            r"Beacon3D's .*; give its \*_grounding",
+        ),
+        ("nr3d.json", [NR3D_ROW], "Nr3D or Sr3D as JSON; give nr3d.csv"),
+        ("scanrefer.jsonl", NR3D_ROW, "one JSON object a line, .*; give ScanRefer_filtered_train.json or nr3d.csv"),
+        ("nr3d.json", f"{json.dumps(NR3D_ROW)}\n{json.dumps(NR3D_ROW)}\n", "one JSON object a line"),
+        ("nr3d.csv", "scan_id,utterance\nscene0000_00,plant\n", "row 2: has no 'target_id'"),
+        ("ScanRefer_filtered_train.txt", "scene0000_00\nscene0000_01\n", "a list of scenes, .*; give its .json"),
+        ("scenes.json", ["scene0000_00"], "a list of scenes; give the file of their descriptions"),
+        ("v1_sqa_annotations.json", json.loads(SQA3D_ANSWERS), "SQA3D's answers; give the file of questions beside it"),
+        ("predicted.json", [{"scene_id": "scene0000_00", "object_id": 1, "bbox": []}], "boxes predicted for ScanRefer"),
+    ],
+)
+def test_known_files_that_are_not_read_are_refused_with_what_to_do(
+    tmp_path: Path, name: str, content: object, line: str
+) -> None:
+    (tmp_path / name).write_text(content if isinstance(content, str) else json.dumps(content))
+    with pytest.raises(DataError, match=f"{name}: .*{line}"):
+        read_questions(tmp_path / name)
+
+
 @pytest.mark.parametrize(
     ("name", "content"),
     [("q.json", SCANREFER), ("q.csv", NR3D), ("s.json", SQA3D), ("q.toml", toml_text(SET[:2]))],

@@ -3,6 +3,9 @@
 ScanRefer: a JSON list of ``scene_id``, ``object_id``, ``description``. Nr3D: a CSV with ``scan_id``, ``target_id``,
 ``utterance``. SQA3D: a JSON with ``questions`` of ``scene_id``, ``situation``, ``question``, ``question_id``, whose
 answers stand in a file of annotations beside it. Object ids are ScanNet's own, one less than the truth's here.
+
+Other files of these and of OpenEQA, Beacon3D and ScanQA are known, and refused with what to give instead. Sources: the
+files' descriptions in facebookresearch/open-eqa at b5752aa, Beacon3D's data and daveredrum/ScanRefer.
 """
 
 from __future__ import annotations
@@ -10,6 +13,7 @@ from __future__ import annotations
 import csv
 import io
 import json
+import re
 from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -22,34 +26,87 @@ DATASET = "scannet"
 MOST_BYTES = 256 << 20  # ScanRefer's training set has some 40 MB
 MOST_QUESTIONS = 1_000_000
 NR3D_COLUMNS = ("scan_id", "target_id", "utterance")
+OWN_FORM = "write scene, text and objects of such questions as CSV or TOML"
+# What is no set of questions with objects: the keys of its entries, whose file it is, and what to do.
+REFUSED_ENTRIES = (
+    ({"question", "answer", "episode_history"}, "OpenEQA's questions, answered in words from a walk", OWN_FORM),
+    ({"question", "answers", "object_ids"}, "ScanQA's form (Beacon3D's *_qa.json too), answered in words", OWN_FORM),
+    ({"scan_id", "target_id", "utterance"}, "Nr3D or Sr3D as JSON", "give nr3d.csv or sr3d.csv as released"),
+    ({"scene_id", "object_id", "caption"}, "captions for ScanRefer", "give ScanRefer_filtered_train.json or _val.json"),
+    ({"scene_id", "object_id", "bbox"}, "boxes predicted for ScanRefer", "give ScanRefer_filtered_val.json itself"),
+)
+ONE_A_LINE = (
+    "one JSON object a line, as ScanRefer and Nr3D are handed on in SceneVerse and 3D-VisTA; give "
+    "ScanRefer_filtered_train.json or nr3d.csv as released"
+)
 _FIRST_BYTES = 65536
 
 
 def is_foreign(path: Path) -> bool:
-    """Whether a file is of one of these forms, by its ending or, for a CSV, its first line."""
-    if path.suffix.lower() == ".json":
+    """Whether a file is of one of these forms, by its ending or, for a CSV and a list of scenes, its first line."""
+    suffix = path.suffix.lower()
+    if suffix in (".json", ".jsonl"):
         return True
-    if path.suffix.lower() != ".csv" or not path.is_file():
+    if suffix not in (".csv", ".txt") or not path.is_file():
         return False
     with path.open("rb") as file:
         line = file.read(_FIRST_BYTES).partition(b"\n")[0].decode("utf-8", "replace")
-    return set(NR3D_COLUMNS) <= {word.strip().strip('"').lstrip("\ufeff") for word in line.split(",")}
+    if suffix == ".txt":
+        return _is_scene(line.strip())
+    return len(set(NR3D_COLUMNS) & {word.strip().strip('"').lstrip("\ufeff") for word in line.split(",")}) > 1
 
 
 def read_foreign(path: Path) -> tuple[Question, ...]:
     """The sentences of a file: descriptions and utterances as relative queries, SQA3D's as reasoning questions."""
-    where = printable(str(path), 200)
+    where, suffix = printable(str(path), 200), path.suffix.lower()
     text = _text_of(path, where)
-    if path.suffix.lower() == ".csv":
+    if suffix == ".txt":
+        raise DataError(f"{where}: a list of scenes, as beside ScanRefer's and Nr3D's files; give its .json or .csv")
+    if suffix == ".jsonl" or (text.lstrip().startswith("{") and _is_one_a_line(text)):
+        raise DataError(f"{where}: {ONE_A_LINE}")
+    if suffix == ".csv":
         rows = _placed(_csv_rows(text, where), where, "row", 2)
         return tuple(_sentences(rows, ("scan_id", "utterance", "target_id"), "Nr3D"))
     content = _json_of(text, where)
+    _refuse_others(content, where)
     if isinstance(content, list):
         rows = _placed(content, where, "entry")
         return tuple(_sentences(rows, ("scene_id", "description", "object_id"), "ScanRefer"))
     if isinstance(content, dict) and isinstance(content.get("questions"), list):
         return tuple(_situated(content["questions"], _replies(path), where))
     raise DataError(f"{where}: is neither a list of descriptions (ScanRefer) nor has it 'questions' (SQA3D)")
+
+
+def _refuse_others(content: Any, where: str) -> None:
+    """``DataError`` where the content of a JSON file is of a known form that is not read."""
+    if isinstance(content, list) and content and isinstance(content[0], Mapping) and "description" not in content[0]:
+        for keys, whose, advice in REFUSED_ENTRIES:
+            if keys <= set(content[0]):
+                raise DataError(f"{where}: {whose}; {advice}")
+    if isinstance(content, list) and content and isinstance(content[0], str) and _is_scene(content[0]):
+        raise DataError(f"{where}: a list of scenes; give the file of their descriptions")
+    if not isinstance(content, dict) or not content or "questions" in content:
+        return
+    if isinstance(content.get("annotations"), list):
+        raise DataError(f"{where}: SQA3D's answers; give the file of questions beside it, ..._questions_...")
+    first = next(iter(content.values()))
+    if _is_scene(next(iter(content))) and isinstance(first, Mapping):
+        raise DataError(
+            f"{where}: scenes with classes and objects below, as in Beacon3D's metadata_*.json; give its "
+            "*_grounding.json, which has ScanRefer's form"
+        )
+
+
+def _is_one_a_line(text: str) -> bool:
+    first, _, rest = text.lstrip().partition("\n")
+    try:
+        return isinstance(json.loads(first), dict) and bool(rest.strip())
+    except (ValueError, RecursionError):
+        return False
+
+
+def _is_scene(word: str) -> bool:
+    return re.fullmatch(r"scene_?\d{4,5}_\d\d", word) is not None
 
 
 def _text_of(path: Path, where: str) -> str:

@@ -51,12 +51,17 @@ def read_questions(path: Path, dataset: str | None = None) -> tuple[Question, ..
 
 
 def _each_once(questions: Sequence[Question]) -> tuple[Question, ...]:
-    """The first of each id: people wrote some sentences twice; where their objects differ, all are right."""
+    """The first of each id: people wrote some sentences twice; where objects or replies differ, all are right."""
     answers: dict[str, set[int]] = {}
+    replies: dict[str, dict[str, None]] = {}
     for question in questions:
         answers.setdefault(question.id, set()).update(question.answers or ())
+        replies.setdefault(question.id, {}).update({question.reply: None} if question.reply else {})
     first = {question.id: question for question in reversed(questions)}
-    return tuple(replace(first[key], answers=tuple(sorted(ids)) or None) for key, ids in answers.items())
+    return tuple(
+        replace(first[key], answers=tuple(sorted(ids)) or None, reply=" or ".join(replies[key]))
+        for key, ids in answers.items()
+    )
 
 
 def paper_queries() -> tuple[Question, ...]:
