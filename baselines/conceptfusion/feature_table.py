@@ -14,6 +14,7 @@ from su3d_bench.store.scratch import release_pages, scratch_folder
 
 Place = Literal["memory", "disk"]
 HalfArray = NDArray[np.float16]
+MOST_LENGTH = 1e30  # at its floor a confidence is rounded up by a fifth, at every image: kept from overflow
 BLOCK_ROWS = 4096  # 16 MB of float32 at 1024 dimensions
 
 
@@ -21,7 +22,8 @@ class FeatureTable:
     """Features (N, D) float16 and the confidence of each.
 
     On disk they lie in a file without a name, which is gone with the process, however that ends. Both places do the
-    same arithmetic: a block in float32, rounded to half precision once an update.
+    same arithmetic: a block in float32, rounded to half precision once an update. ``average_in_half`` leaves the length
+    of features apart, so that it does not leave half precision.
     """
 
     def __init__(self, n_dimensions: int, place: Place) -> None:
@@ -29,6 +31,7 @@ class FeatureTable:
         self._file: IO[bytes] | None = _nameless_file() if place == "disk" else None
         self._held = np.empty((0, n_dimensions), np.float16)
         self._confidences = np.empty(0)
+        self._lengths: Float64Array | None = None  # (N,) by what each row is to be multiplied
         self._n = 0
 
     def __len__(self) -> int:
@@ -49,6 +52,9 @@ class FeatureTable:
         end = self._n + len(row)
         self._confidences = with_room(self._confidences, self._n, end)
         self._confidences[self._n : end] = confidences
+        if self._lengths is not None:
+            self._lengths = with_room(self._lengths, self._n, end)
+            self._lengths[self._n : end] = 1.0
         if self._file is None:
             self._held = with_room(self._held, self._n, end)
         for start in range(0, len(row), BLOCK_ROWS):
@@ -87,6 +93,41 @@ class FeatureTable:
             table[of_point] = (np.float32(1) - share) * before + share * features[row[chosen]].astype(np.float32)
             self._confidences[of_point] = held + added
             release_pages(table)
+
+    def average_in_half(self, point: Int64Array, features: HalfArray, row: Int32Array, weights: Float64Array) -> None:
+        """As ``average``, to be called at every image that met a point, with gradslam's products of half precision.
+
+        Confidences are rounded to half precision before they are multiplied; that of the image times its feature stays
+        half precision, and so does, the first time, that of the map: what then falls below 3e-8 is gone. From then on
+        its features are of single precision, and a row that nothing is averaged into is multiplied by its rounded
+        confidence and divided by the one that is not. Source: fuse_with_map of gradslam at 59ca872.
+        """
+        table = self._mapped("r+") if self._file is not None else self._held[: self._n]
+        held = self._confidences[: self._n].copy()
+        rounded = held.astype(np.float16)
+        is_first = self._lengths is None
+        lengths = np.ones(self._n) if self._lengths is None else self._lengths[: self._n]
+        added = np.zeros(self._n)
+        added[point] = weights
+        source = np.full(self._n, -1, np.int64)
+        source[point] = row
+        if not is_first:
+            lengths = np.minimum(lengths * np.where(source < 0, rounded / held, 1.0), MOST_LENGTH)
+        changed = np.arange(self._n) if is_first else np.sort(point)
+        for start in range(0, len(changed), BLOCK_ROWS):
+            chosen = changed[start : start + BLOCK_ROWS]
+            seen = features[source[chosen]] * (added[chosen].astype(np.float16) * (source[chosen] >= 0))[:, None]
+            if is_first:
+                total = (table[chosen] * rounded[chosen, None] + seen).astype(np.float32)
+            else:
+                before = table[chosen] * lengths[chosen, None].astype(np.float32)
+                total = before * rounded[chosen, None].astype(np.float32) + seen
+            mean = total / (held + added)[chosen, None].astype(np.float32)
+            lengths[chosen] = np.maximum(np.abs(mean).max(axis=1), 1.0)
+            table[chosen] = mean / lengths[chosen, None].astype(np.float32)
+            release_pages(table)
+        self._confidences[: self._n] = held + added
+        self._lengths = lengths
 
     def _mapped(self, mode: Literal["r", "r+"]) -> HalfArray:
         # mapped anew at each use, for the file grows between them

@@ -33,8 +33,10 @@ class ConceptGraphs:
         source="https://github.com/concept-graphs/concept-graphs, commit 5c4da70",
         licence="MIT",
         needs=("class-agnostic masks", "an image encoder"),
-        status="every step is tested on hand-worked values, voxel averages and clusters against Open3D; never run "
-        "beside the original, and no figure of the paper has been reproduced",
+        status="every step is tested on hand-worked values, voxel averages and clusters against Open3D; run beside the "
+        "original program on one made room with the same detections: 62 of 62 and 56 of 56 objects, 450 of 450 and 511 "
+        "of 511 associations, points equal once poses are rounded to float32 as there; the original's unseeded noise "
+        "moves voxel IoU between two of its own runs to a median of 0.65; no figure of the paper has been reproduced",
     )
 
     def __init__(self, config: MappingConfig | None = None) -> None:

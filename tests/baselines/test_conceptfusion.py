@@ -11,6 +11,7 @@ import pytest
 from box_room import SIZE, write_box_room
 from scannet_scan import SCAN, write_recording
 
+from su3d_bench.baselines.conceptfusion.feature_table import FeatureTable
 from su3d_bench.baselines.conceptfusion.method import ConceptFusion, ConceptFusionConfig, ConceptFusionSam
 from su3d_bench.baselines.conceptfusion.pixel_features import mixed_features, mixing_weights, paint
 from su3d_bench.core.errors import DataError
@@ -205,6 +206,73 @@ def test_a_feature_with_a_zero_channel_is_never_averaged_in_unless_any_channel_w
 def test_the_first_seen_feature_with_a_zero_channel_keeps_its_weight_against_a_full_one() -> None:
     method = fused((wall(0), seen(0, (EVERYWHERE, E1))), (wall(1), seen(1, (EVERYWHERE, A))))
     np.testing.assert_allclose(method.finish().features[0], (E1 + A) / 2, atol=1e-3)
+
+
+# ---- products in half precision, as gradslam has them
+
+
+def table_of(features: np.ndarray, confidences: np.ndarray, place: Any = "memory") -> FeatureTable:
+    table = FeatureTable(features.shape[1], place)
+    table.append(features.astype(np.float16), np.arange(len(features), dtype=np.int32), confidences)
+    return table
+
+
+@pytest.mark.parametrize("place", ["memory", "disk"])
+def test_in_half_precision_a_confidence_at_its_floor_takes_the_feature_of_the_first_image_with_it(place: Any) -> None:
+    features = np.full((3, 4), 0.03)
+    table = table_of(features, np.array([1e-7, 0.5, 1e-7]), place)
+    none = np.zeros(0, np.int64)
+    table.average(none, features.astype(np.float16), none.astype(np.int32), np.zeros(0))
+    assert (table.features() != 0).all()
+    table.average_in_half(none, features.astype(np.float16), none.astype(np.int32), np.zeros(0))
+    assert (table.features() != 0).any(axis=1).tolist() == [False, True, False]
+    table.append(features.astype(np.float16), np.arange(3, dtype=np.int32), np.full(3, 1e-7))
+    for _ in range(1000):  # of single precision by now: not lost, and kept from overflow
+        table.average_in_half(none, features.astype(np.float16), none.astype(np.int32), np.zeros(0))
+    np.testing.assert_array_equal(table.features()[3:], features.astype(np.float16))
+
+
+def test_products_in_half_precision_are_those_of_whole_arrays() -> None:
+    """Against gradslam's formula for all points at once, half in the first step and single from then on."""
+    rng = np.random.default_rng(5)
+    n, d = 40, 16
+    confidences = np.where(rng.random(n) < 0.4, 1e-7, rng.random(n))
+    first = unit_rows(rng.normal(size=(n, d)))
+    table = table_of(first, confidences)
+    whole: np.ndarray = first.astype(np.float16)
+    for step in range(5):
+        point = np.sort(rng.choice(n, 12, replace=False))
+        seen = unit_rows(rng.normal(size=(12, d))).astype(np.float16)
+        weights = np.where(rng.random(12) < 0.4, 1e-7, rng.random(12))
+        table.average_in_half(point, seen, np.arange(12, dtype=np.int32), weights)
+        of_map, of_image = np.zeros((n, d), np.float16), np.zeros(n)
+        of_map[point], of_image[point] = seen, weights
+        product = confidences.astype(np.float16)[:, None] * whole + of_image.astype(np.float16)[:, None] * of_map
+        assert product.dtype == (np.float16 if step == 0 else np.float32)
+        confidences = confidences + of_image
+        whole = product.astype(np.float32) / confidences[:, None].astype(np.float32)
+        shown = table.features().astype(float)
+        lengths = np.maximum(np.linalg.norm(whole, axis=1), 1e-9)[:, None]
+        assert ((shown != 0).any(axis=1) == (whole != 0).any(axis=1)).all()
+        shown /= np.maximum(np.linalg.norm(shown, axis=1), 1e-9)[:, None]
+        np.testing.assert_allclose(shown, whole / lengths, atol=3e-3)
+    np.testing.assert_allclose(table.confidences, confidences)
+
+
+def unit_rows(values: np.ndarray) -> np.ndarray:
+    return np.asarray(values / np.linalg.norm(values, axis=1, keepdims=True))
+
+
+def test_a_wall_beyond_the_floor_of_confidence_loses_its_feature_in_half_precision_alone() -> None:
+    dim = unit(3, 4) / 100
+    updates = (wall(0, 4.0), seen(0, (EVERYWHERE, A))), (wall(1, 4.0), seen(1))
+    assert ConceptFusion.presets["half-products"] == {"products": "half"}
+    for products, alive in (("single", True), ("half", False)):
+        method = fused(updates[0], products=products, features_in="memory")
+        assert method._features is not None
+        method._features._held[:] = dim  # as small as those of a thousand dimensions
+        method.update(*updates[1], Timer())
+        assert (method.finish().features != 0).all() == alive
 
 
 def test_the_map_grows_by_what_no_point_was_seen_at() -> None:
