@@ -108,7 +108,7 @@ class SAM3D:
         status=(
             "the merging of clouds, the tree and the ensemble match the original's output on reference inputs to the "
             "last id, with a stable sort in place of its unstable one; run beside the original program on one made "
-            "room with the same masks: 503,520 of 503,520 vertices with the stable sort; its own unstable one changes 2 "
+            "room with the same masks: 503,520 of 503,520 vertices with the stable sort; its unstable one changes 2 "
             "of 39 groups; features of groups and scores are ours"
         ),
     )

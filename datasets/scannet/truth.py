@@ -6,8 +6,9 @@ a protocol does not have stay in the truth, they are void there.
 
 The first release differs: its ``labels.ply`` holds raw ids, which are numbers of rows in a table of its own. Classes
 then come from the objects' categories, by that table or, where it is not here, by that of the second release. A file
-holds raw ids when one of its labels exceeds 40, or when more of its labels are the raw ids of the objects' categories
-in a table than are their NYU40 ids.
+holds raw ids when more of its labels are the raw ids of the objects' categories in a table than are their NYU40 ids;
+where no table tells, when one exceeds 40. Three scans of the second release have single labels of 50 and 149 among
+those of NYU40 (ScanNet's issues 20 and 86), which are void.
 """
 
 from __future__ import annotations
@@ -193,11 +194,11 @@ def nyu40_of_vertex(scan: AnnotatedScan, tables: Sequence[LabelTable]) -> tuple[
         for kind, value_of in (("raw", table.raw_id_of), ("nyu40", table.nyu40_of))
     }
     table = max(tables, key=lambda table: agrees[table.name, "raw"], default=None)
-    holds_raw_ids = scan.labels.max() > MAX_NYU40_ID
-    if table is not None and not holds_raw_ids:
-        holds_raw_ids = agrees[table.name, "raw"] > max(agrees[each.name, "nyu40"] for each in tables)
-    if not holds_raw_ids:
-        return scan.labels.astype(np.int32), "the labels of _vh_clean_2.labels.ply"
+    n_raw = 0 if table is None else agrees[table.name, "raw"]
+    n_nyu40 = max((agrees[each.name, "nyu40"] for each in tables), default=0)
+    if n_raw < n_nyu40 or (n_raw == n_nyu40 and scan.labels.max() <= MAX_NYU40_ID):
+        semantic = np.where(scan.labels <= MAX_NYU40_ID, scan.labels, 0)
+        return semantic.astype(np.int32), "the labels of _vh_clean_2.labels.ply"
     if table is None:
         raise GroundTruthMissing(
             f"{scan.where}: the labels are raw ids of the first release (the largest: {scan.labels.max()}); their "

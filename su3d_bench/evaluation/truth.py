@@ -30,7 +30,7 @@ from su3d_bench.core.errors import (
 from su3d_bench.core.types import GroundTruth, Int64Array
 from su3d_bench.datasets.openlex3d import FACE_CORNERS, VISIBLE, OpenLexRelease
 from su3d_bench.evaluation.request import Request
-from su3d_bench.evaluation.truth_values import FLAG, TruthValues
+from su3d_bench.evaluation.truth_values import FLAG, TruthValues, check_said
 from su3d_bench.formats.arrays import MOST_POINTS
 from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.metrics.fitness import ID_LISTS, LARGEST_NYU40_ID, TruthFacts, list_of_ids, why_not_truth
@@ -46,7 +46,6 @@ from su3d_bench.questions.truths import question_truth
 from su3d_bench.runs.scenes import data_root
 
 NOT_MEANT = "is not meant for"
-NO_TEXTS = f"evaluate: {FLAG} says what the texts of --ground-truth hold; leave it out, there are none here"
 LARGEST_VALUE = 10_000 * INSTANCES_PER_CLASS  # as the instance metric has it
 
 
@@ -90,16 +89,14 @@ class SceneTruths(ABC):
 
 def kind_of_truth(request: Request) -> Callable[[Request, Sequence[Source]], SceneTruths]:
     """The kind of truth that is asked for, to be opened with the request and the predictions."""
-    if request.ground_truth is None and request.truth_values is not None:
-        raise ConfigError(NO_TEXTS)
+    check_said(request.truth_values, is_text=request.ground_truth is not None)
     return DatasetTruths if request.ground_truth is None else _folder_truths
 
 
 def _folder_truths(request: Request, sources: Sequence[Source]) -> SceneTruths:
     assert request.ground_truth is not None
     kind = OpenLexTruths if OpenLexRelease.is_at(request.ground_truth) else TextTruths
-    if request.truth_values is not None and kind is not TextTruths:
-        raise ConfigError(NO_TEXTS)
+    check_said(request.truth_values, is_text=kind is TextTruths)
     return kind(request, sources)
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.types import Int64Array
 from su3d_bench.evaluation.request import ValuesForm
 from su3d_bench.metrics.fitness import LARGEST_NYU40_ID
@@ -26,6 +27,14 @@ FORMS: dict[ValuesForm, str] = {
 }
 BEYOND = (OBJECT + 1) * INSTANCES_PER_CLASS  # values of the label 2: no object where values are numbers
 FLAG = "--truth-values"
+
+
+def check_said(said: ValuesForm | None, *, is_text: bool) -> None:
+    """``ConfigError`` where it is said what values of texts are, and the truth is none."""
+    if said is not None and not is_text:
+        raise ConfigError(
+            f"evaluate: {FLAG} says what the texts of --ground-truth hold; leave it out, there are none here"
+        )
 
 
 @dataclass(frozen=True)

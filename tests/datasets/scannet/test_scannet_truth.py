@@ -152,6 +152,15 @@ def test_labels_of_the_first_release_need_the_table(tmp_path: Path) -> None:
         nyu40_truth(read(tmp_path), [])
 
 
+def test_a_stray_label_above_40_does_not_make_a_file_one_of_the_first_release(tmp_path: Path) -> None:
+    """As in scene0270_00 and scene0384_00 of the second release."""
+    labels = [149 if k == 8 else one for k, one in enumerate(NYU40)]
+    write_truth(tmp_path, SEGMENTS, [*GROUPS[:2], (5, "stool with a name of its own", [19])], labels)
+    truth = nyu40_truth(read(tmp_path), [table(tmp_path)])
+    assert truth.semantic.tolist() == [0 if k == 8 else one for k, one in enumerate(NYU40)]
+    assert "labels.ply" in truth.source
+
+
 def first_table(tmp_path: Path) -> LabelTable:
     """The table of the first release: no ids but the numbers of rows, and a class that is not there."""
     categories = [("wall", "1"), ("stool", "40"), ("storage", ""), *[(f"thing {k}", "40") for k in range(4, 47)]]
