@@ -40,6 +40,15 @@ SCENES = {
         "intrinsics_file": "camera_primesense.json",
         "depth_unit_m": 1e-3,
     },
+    "walk": {
+        "folder": "hololens_94",
+        "colour": "images/{index}.png",
+        "depth": "depth/{index}.png",
+        "trajectory": "poses.txt",
+        "trajectory_format": "matrix",
+        "intrinsics_file": "K.txt",
+        "depth_unit_m": 1e-3,
+    },
 }
 
 
@@ -128,8 +137,10 @@ def test_the_poses_of_every_recording_agree_with_its_depth(root: Path) -> None:
 
 
 def test_tum_reports_the_images_that_are_not_there(caplog: pytest.LogCaptureFixture) -> None:
-    frames = Tum(REAL_RECORDINGS.resolve()).frames("tum_fr1desk_9", 1)
+    tum = Tum(REAL_RECORDINGS.resolve())
+    frames = tum.frames("tum_fr1desk_9", 1)
     assert [frame.index for frame in frames] == list(range(9))
+    assert len(list(tum.problems("tum_fr1desk_9"))) == 1
     assert "associate.txt: 1128 images named there are missing (the first: rgb/1305031453.659600.png)" in caplog.text
     assert frames[0].intrinsics[0, 0] == 517.3
 
