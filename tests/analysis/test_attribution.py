@@ -55,6 +55,17 @@ def test_the_example_runs() -> None:
     assert doctest.testmod(attribution).failed == 0
 
 
+def test_a_mask_on_void_is_background_where_void_is_not_forgiven() -> None:
+    masks, classes, scores = perfect()
+    on_void = labelled([*masks, np.arange(SIZE * 6, SIZE * 6 + 150)], [*classes, 3], [*scores, 0.95])
+    for forgives, n in ((True, 0), (False, 1)):
+        rules = ScoringRules((3, 4, 5), forgives_void=forgives)
+        mended = mend_scene(truth(), on_void, rules)
+        assert mended.n["background"] == n
+        assert (instance_ap.combine([mended.as_is]).ap50 < 1) == (not forgives)
+        assert instance_ap.combine([mended.all]).ap50 == 1
+
+
 def test_a_perfect_prediction_loses_nothing() -> None:
     gain, n = gains(*perfect())
     assert set(gain.values()) == {0.0}
