@@ -57,7 +57,7 @@ def test_the_example_runs() -> None:
 
 def test_a_mask_on_void_is_background_where_void_is_not_forgiven() -> None:
     masks, classes, scores = perfect()
-    on_void = labelled([*masks, np.arange(SIZE * 6, SIZE * 6 + 150)], [*classes, 3], [*scores, 0.95])
+    on_void = labelled([*masks, np.arange(SIZE * 6, SIZE * 6 + 150, dtype=np.int32)], [*classes, 3], [*scores, 0.95])
     for forgives, n in ((True, 0), (False, 1)):
         rules = ScoringRules((3, 4, 5), forgives_void=forgives)
         mended = mend_scene(truth(), on_void, rules)
