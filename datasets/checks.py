@@ -30,7 +30,7 @@ from su3d_bench.datasets.checks_of_frames import (
     check_truth,
     facts_of,
 )
-from su3d_bench.datasets.recordings.pose_convention import check_convention
+from su3d_bench.datasets.recordings.pose_convention import judge_scene
 from su3d_bench.formats.images import decode_colour, decode_depth, read_bytes
 
 SAMPLED_FRAMES = 20
@@ -121,7 +121,7 @@ def _inspect(
     _look_at_files(files, findings, decode=frames is None)
     findings.add(*check_frames(facts))
     if frames is not None and not is_made_on_demand:
-        _look_at_convention(_Readable(frames, broken), facts, findings)
+        _look_at_convention(dataset, scene, _Readable(frames, broken), facts, findings)
     truth, points = _look_at_truth(dataset, scene, findings)
     meeting = None
     if points is not None and facts:
@@ -279,13 +279,15 @@ class _Readable(Sequence[Frame]):
         return self._frames[self._positions[position]]
 
 
-def _look_at_convention(frames: Sequence[Frame], facts: Sequence[FrameFacts], findings: _Findings) -> None:
+def _look_at_convention(
+    dataset: Dataset, scene: str, frames: Sequence[Frame], facts: Sequence[FrameFacts], findings: _Findings
+) -> None:
     """Whether depth and poses agree between frames; asked only where each of them is usable by itself."""
     if not facts or findings.has_error(("pose", "intrinsics", "size")):
         return
-    line = findings.attempt("convention", lambda: check_convention(frames, findings.scene))
-    if line is not None:
-        findings.add(Finding("error", "convention", "", line))
+    verdict = findings.attempt("convention", lambda: judge_scene(dataset, scene, frames))
+    if verdict is not None:
+        findings.add(Finding("error" if verdict.is_wrong else "warning", "convention", "", verdict.line))
 
 
 def _look_at_files(files: Sequence[Path], findings: _Findings, *, decode: bool) -> None:

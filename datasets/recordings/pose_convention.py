@@ -2,7 +2,8 @@
 
 Wrong poses that are rigid motions look right to every other check, and a map made with them is only bad. The points of
 one frame are projected into another under the reading at hand and under the usual mistakes: the inverse motion, the
-other camera axes, both, and another unit of depth. Where a mistake agrees clearly better, the reading is wrong.
+other camera axes, both, and another unit of depth. Where a mistake agrees clearly better, the reading is wrong; where
+the reading at hand is not clearly better than the inverse, nobody can tell from the frames.
 """
 
 from __future__ import annotations
@@ -14,6 +15,7 @@ from typing import Literal
 
 import numpy as np
 
+from su3d_bench.core.interfaces import CorrectsReading, Dataset
 from su3d_bench.core.types import Float64Array, Frame
 
 N_ANCHORS = 4
@@ -29,6 +31,13 @@ FLIP = np.diag([1.0, -1.0, -1.0, 1.0])  # OpenCV's camera axes to OpenGL's, and 
 ROTATED = 0.125
 DEPTH_FACTORS = (0.001, 0.1, ROTATED, 0.2, 5.0, 8.0, 10.0, 1000.0)
 Motion = Literal["as read", "inverse", "other axes", "inverse and other axes"]
+READINGS: tuple[tuple[Motion, float], ...] = (
+    ("as read", 1.0),
+    ("inverse", 1.0),
+    ("other axes", 1.0),
+    ("inverse and other axes", 1.0),
+    *(("as read", factor) for factor in DEPTH_FACTORS),
+)
 
 
 @dataclass(frozen=True)
@@ -65,20 +74,59 @@ class Finding:
         return of_motion[self.motion]
 
 
-def check_convention(frames: Sequence[Frame], where: str) -> str | None:
-    """One line that says which other reading of the poses or the depth agrees clearly better; None where none does."""
-    finding = judge_convention(frames)
-    if finding is None:
+@dataclass(frozen=True)
+class Verdict:
+    """What is to be said of how poses and depth are read: ``is_wrong`` where another reading agrees clearly better,
+    else the reading is only not confirmed."""
+
+    is_wrong: bool
+    line: str
+
+
+def judge_scene(dataset: Dataset, scene: str, frames: Sequence[Frame] | None = None) -> Verdict | None:
+    """The verdict on a scene in the words of its dataset; None where the reading is right, or none is asked for.
+
+    ``frames`` are those at full rate where they are at hand; some twenty of them are read.
+    """
+    if isinstance(dataset, CorrectsReading) and not dataset.is_reading_checked(scene):
         return None
+    where = f"{dataset.name}/{scene}"
+    shares = _shares(dataset.frames(scene, 1) if frames is None else frames)
+    finding = _best_other(shares)
+    if finding is None:
+        doubt = _doubt(shares)
+        return None if doubt is None else Verdict(False, f"{where}: {doubt}")
+    if isinstance(dataset, CorrectsReading):
+        return Verdict(True, f"{where}: {finding.shares} {dataset.correction_of_reading(scene, finding)}")
+    return Verdict(True, f"{where}: {finding.shares} {_in_words(finding)}")
+
+
+def _in_words(finding: Finding) -> str:
     if finding.depth_factor != 1:
-        other = f"with depth times {finding.depth_factor:g}; check the unit of the depth"
-    elif finding.motion == "inverse":
-        other = "with the inverse poses; check whether they are camera-to-world or world-to-camera"
-    elif finding.motion == "other axes":
-        other = "with OpenGL's camera axes for OpenCV's, or the reverse; check the axes of the poses"
-    else:
-        other = "with the inverse poses and OpenGL's camera axes for OpenCV's, or the reverse; check both"
-    return f"{where}: {finding.shares} {other}"
+        return f"with depth times {finding.depth_factor:g}; check the unit of the depth"
+    if finding.motion == "inverse":
+        return "with the inverse poses; check whether they are camera-to-world or world-to-camera"
+    if finding.motion == "other axes":
+        return "with OpenGL's camera axes for OpenCV's, or the reverse; check the axes of the poses"
+    return "with the inverse poses and OpenGL's camera axes for OpenCV's, or the reverse; check both"
+
+
+def _doubt(shares: Float64Array) -> str | None:
+    """Why the frames do not confirm that the poses are no inverses, which is the usual mistake; None where they do."""
+    as_read, inverse = shares[:, 0], shares[:, READINGS.index(("inverse", 1.0))]
+    if not len(shares) or max(as_read.max(), inverse.max()) < MIN_SHARE:
+        best = f", at most {as_read.max():.0%} of what one sees" if len(shares) else ""
+        return f"poses and depth could not be checked: no two of the frames looked at see the same{best}"
+    tells = np.abs(as_read - inverse) >= MIN_GAIN
+    n_confirm = int((tells & (as_read > inverse) & (as_read >= MIN_SHARE)).sum())
+    if n_confirm and n_confirm >= MIN_WON * tells.sum():
+        return None
+    if not tells.any():
+        return "the frames do not tell the poses from their inverses: the camera hardly moves between those looked at"
+    return (
+        f"poses and depth may contradict each other: only {n_confirm} of {int(tells.sum())} pairs of frames agree "
+        f"better as the poses are read than with their inverses; look at su3d-bench datasets show"
+    )
 
 
 def judge_convention(frames: Sequence[Frame]) -> Finding | None:
@@ -86,8 +134,11 @@ def judge_convention(frames: Sequence[Frame]) -> Finding | None:
 
     Frames without motion between them tell nothing, nor does one frame.
     """
-    readings: list[tuple[Motion, float]] = [("as read", 1.0), ("inverse", 1.0), ("other axes", 1.0)]
-    readings += [("inverse and other axes", 1.0), *(("as read", factor) for factor in DEPTH_FACTORS)]
+    return _best_other(_shares(frames))
+
+
+def _shares(frames: Sequence[Frame]) -> Float64Array:
+    """For each pair of frames (rows) and reading (columns) the share of the points that agree."""
     cache: dict[int, Frame] = {}
     table = []
     for first, second in _pairs(len(frames)):
@@ -95,10 +146,13 @@ def judge_convention(frames: Sequence[Frame]) -> Finding | None:
             if position not in cache:
                 cache[position] = frames[position]
         points = _Points(cache[first])
-        table.append([points.share_in(cache[second], motion, factor) for motion, factor in readings])
-    shares = np.array(table).reshape(-1, len(readings))
+        table.append([points.share_in(cache[second], motion, factor) for motion, factor in READINGS])
+    return np.array(table, np.float64).reshape(-1, len(READINGS))
+
+
+def _best_other(shares: Float64Array) -> Finding | None:
     best: Finding | None = None
-    for column, (motion, factor) in enumerate(readings[1:], start=1):
+    for column, (motion, factor) in enumerate(READINGS[1:], start=1):
         gains = shares[:, column] - shares[:, 0]
         tells = np.abs(gains) >= MIN_GAIN
         wins = (gains >= MIN_GAIN) & (shares[:, column] >= MIN_SHARE)

@@ -20,7 +20,7 @@ from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, GroundTruth, InstanceMesh, SceneInfo, Surface
 from su3d_bench.datasets.recordings.exported_frames import read_matrix
 from su3d_bench.datasets.recordings.meshes import read_surface
-from su3d_bench.datasets.recordings.pose_convention import ROTATED, judge_convention
+from su3d_bench.datasets.recordings.pose_convention import ROTATED, Finding
 from su3d_bench.datasets.recordings.recorded_frames import (
     N_DEPTH_VALUES,
     Folder,
@@ -70,7 +70,6 @@ class Rgbd:
         self.root = root
         self.options = options or RgbdOptions()
         self._last: tuple[str, RgbdDescription, Recording] | None = None
-        self._checked: set[str] = set()
 
     def scenes(self) -> Sequence[str]:
         """The scenes of the option ``files`` in its order, then those below the data root."""
@@ -90,13 +89,24 @@ class Rgbd:
         return SceneInfo(self.name, scene, len(RecordedFrames(self._recording(scene), stride)), stride, "camera")
 
     def frames(self, scene: str, stride: int) -> Sequence[Frame]:
-        """The frames, once their depth images and poses were seen to agree, unless the description forgoes that."""
-        description, recording = self._open(scene)
-        if description.check_convention and scene not in self._checked:
-            place = f"{recording.where}: {self._description(scene).name}"
-            _check_convention(RecordedFrames(recording, is_quiet=True), description, place)
-            self._checked.add(scene)
-        return RecordedFrames(recording, stride)
+        return RecordedFrames(self._recording(scene), stride)
+
+    def is_reading_checked(self, scene: str) -> bool:
+        """Whether the description lets depth be held against the poses."""
+        return self._open(scene)[0].check_convention
+
+    def correction_of_reading(self, scene: str, finding: Finding) -> str:
+        """The keys of the description that make the files be read as ``finding`` says."""
+        description = self._open(scene)[0]
+        changes = [f'{key} = "{OTHER[getattr(description, key)]}"' for key in finding.changes(description.camera_axes)]
+        if finding.depth_factor == ROTATED and description.depth_rotated_bits == 0:
+            changes.append("depth_rotated_bits = 3")
+        elif finding.depth_factor != 1:
+            changes.append(f"depth_unit_m = {description.depth_unit_m * finding.depth_factor:g}")
+        return (
+            f"with {' and '.join(changes)}; set that in {self._description(scene).name}, or check_convention = false "
+            "to read the files as they are described"
+        )
 
     def files(self, scene: str) -> Sequence[Path]:
         recording = self._recording(scene)
@@ -250,19 +260,3 @@ def depth_table(description: RgbdDescription) -> Float32Array:
     depth_m[np.isin(values, description.depth_invalid)] = 0
     depth_m.setflags(write=False)
     return depth_m
-
-
-def _check_convention(frames: Sequence[Frame], description: RgbdDescription, place: str) -> None:
-    """Raise ``DataError`` where another reading of the poses agrees clearly better with the depth images."""
-    finding = judge_convention(frames)
-    if finding is None:
-        return
-    changes = [f'{key} = "{OTHER[getattr(description, key)]}"' for key in finding.changes(description.camera_axes)]
-    if finding.depth_factor == ROTATED and description.depth_rotated_bits == 0:
-        changes.append("depth_rotated_bits = 3")
-    elif finding.depth_factor != 1:
-        changes.append(f"depth_unit_m = {description.depth_unit_m * finding.depth_factor:g}")
-    raise DataError(
-        f"{place}: {finding.shares} with {' and '.join(changes)}; set that, or check_convention = false to read the "
-        "files as they are described"
-    )

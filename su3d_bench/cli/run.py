@@ -66,6 +66,11 @@ def add_run_flags(parser: argparse.ArgumentParser) -> None:
         "--offline", action=argparse.BooleanOptionalAction, help="use stored replies of language models, ask nobody"
     )
     parser.add_argument(
+        "--accept-poses",
+        action=argparse.BooleanOptionalAction,
+        help="run recordings whose depth contradicts their poses all the same, with a warning (default: refuse them)",
+    )
+    parser.add_argument(
         "--anytime", nargs="+", type=float, metavar="SHARE", help="score the map after these shares of the updates too"
     )
     add_settings(parser, "such as opensu3d.top_m=10")

@@ -84,7 +84,7 @@ DEFAULT_SOURCE = "default"
 
 # Where scenes run and what is drawn of them: neither moves a number.
 MOVES_NO_NUMBER = frozenset(
-    {"jobs", "pictures", "offline", "executor", "ray_address", "gpus_per_job", "retries", "slurm"}
+    {"jobs", "pictures", "offline", "accept_poses", "executor", "ray_address", "gpus_per_job", "retries", "slurm"}
 )
 
 
@@ -95,6 +95,7 @@ class RunConfig(BaseModel):
     CPU core; ``limit`` 0: all frames, otherwise the first ``limit`` frames of each scene, and the run is partial;
     ``solver``: who answers the questions of reasoning protocols, geometry alone or the text model of
     ``perception.language``; ``offline``: no language model is asked, replies that are stored with the run are used;
+    ``accept_poses``: recordings whose depth contradicts their poses are run all the same;
     ``anytime``: shares of the updates after which the map so far is scored too, such as 0.1 0.25 0.5;
     ``executor`` auto: this process for one job, else processes; ``ray_address`` empty: that of ``RAY_ADDRESS``, or the
     cluster on this machine; ``retries``: of a scene whose machine was lost; ``slurm``: KEY=VALUE of submitit.
@@ -113,6 +114,7 @@ class RunConfig(BaseModel):
     pictures: bool = True
     solver: Literal["built-in", "llm"] = "built-in"
     offline: bool = False
+    accept_poses: bool = False
     anytime: tuple[Annotated[float, Field(gt=0, lt=1)], ...] = ()
     executor: Literal["auto", "inline", "processes", "ray", "slurm"] = "auto"
     ray_address: str = ""

@@ -124,6 +124,16 @@ class HasProblems(Protocol):
 
 
 @runtime_checkable
+class CorrectsReading(Protocol):
+    """Its files are read as a description says: whether depth shall be held against poses, and what to change in the
+    description where another reading, a ``Finding`` of ``pose_convention``, agrees better."""
+
+    def is_reading_checked(self, scene: str) -> bool: ...
+
+    def correction_of_reading(self, scene: str, finding: Any) -> str: ...
+
+
+@runtime_checkable
 class HasSurface(Protocol):
     """The scan's mesh without labels."""
 
@@ -341,6 +351,7 @@ ABILITIES = {
         HasStatus,
         HasGroups,
         HasProblems,
+        CorrectsReading,
         HasSurface,
         HasQueries,
         KnowsObjects,

@@ -36,7 +36,10 @@ class Part:
 
 @dataclass(frozen=True)
 class SceneJob:
-    """Everything that a worker needs to know of one scene; ``index`` counts the scenes of the run."""
+    """Everything that a worker needs to know of one scene; ``index`` counts the scenes of the run.
+
+    ``doubts``: what must be said of its poses, None where whoever made the job could not look at its data.
+    """
 
     scene: str
     dataset: Part
@@ -56,6 +59,8 @@ class SceneJob:
     index: int = 0
     is_offline: bool = False
     solver: str = "built-in"
+    accepts_poses: bool = False
+    doubts: tuple[str, ...] | None = None
 
     @property
     def scene_name(self) -> str:
@@ -67,7 +72,7 @@ class SceneJob:
 class MethodOutcome:
     """What became of one scene under one method; ``error`` is a line, ``unscored`` pairs a protocol and a reason.
 
-    ``warnings`` are what the library said of the data on the way.
+    ``warnings`` are what the library said of the data on the way, ``doubts`` those that stand beside every number.
     """
 
     scene: str
@@ -81,6 +86,7 @@ class MethodOutcome:
     was_resumed: bool = False
     unscored: tuple[tuple[str, str], ...] = ()
     warnings: tuple[str, ...] = ()
+    doubts: tuple[str, ...] = ()
 
 
 def stride_of(job_stride: int, options: str) -> int:
@@ -190,6 +196,7 @@ class JobInputs:
             was_resumed=was_resumed,
             unscored=tuple(remarks["unscored"].items()),
             warnings=tuple(remarks["warnings"]),
+            doubts=tuple(remarks["doubts"]),
         )
 
 

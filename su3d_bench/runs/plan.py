@@ -282,6 +282,7 @@ def _scene_job(config: RunConfig, parts: _Parts, folder: Path, root: Path, targe
         data_root=root,
         cache_root=cache_root(),
         is_offline=config.offline,
+        accepts_poses=config.accept_poses,
         solver=config.solver,
     )
 

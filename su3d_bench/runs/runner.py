@@ -29,6 +29,7 @@ from su3d_bench.runs.executors.choose import ELSEWHERE, run_units
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
 from su3d_bench.runs.job import MethodOutcome, SceneJob
 from su3d_bench.runs.plan import Plan
+from su3d_bench.runs.poses import judged
 from su3d_bench.runs.remote.scene import DistantJob, failed_distant, fetch_results, run_distant_scene, send_records
 from su3d_bench.runs.resume import FinishedScenes
 from su3d_bench.runs.scene import failed_outcomes, run_scene
@@ -67,7 +68,12 @@ class RunResult:
 
 
 def run_plan(plan: Plan, report: Report) -> RunResult:
-    """Do every job of ``plan`` that is not done yet and write the run's records."""
+    """Do every job of ``plan`` that is not done yet and write the run's records.
+
+    ``PosesContradicted``, before anything is written, where the depth of a recording contradicts its poses.
+    """
+    if plan.data is None:  # else each worker looks at the data that it fetches
+        plan = replace(plan, jobs=judged(plan.jobs))
     with plan.folder.locked():
         metrics_file = plan.folder.path / "metrics.json"
         remove_file(metrics_file)  # what stands there may be of another plan
@@ -239,7 +245,10 @@ def _result(
     scored = {scene: scores[rules.name, scene] for scene in planned if (rules.name, scene) in scores}
     failed = {scene: mine[scene].error for scene in planned if mine[scene].error is not None}
     scenes = [scene for protocol, scene in scores if protocol == rules.name]
+    doubts = tuple(line for scene in scored for line in mine[scene].doubts)
     numbers = NumbersRecord(**combine(rules, scored).to_json()) if scored else None
+    if numbers is not None:
+        numbers = replace(numbers, warnings=(*numbers.warnings, *doubts))
     midway = [(share, _metrics_over(scenes, rules, counts)) for share, counts in early.items()]
     return ResultRecord(
         method=method,

@@ -61,13 +61,21 @@ from su3d_bench.runs.job import (
     refuse_other_run,
     stride_of,
 )
+from su3d_bench.runs.poses import REMARK, PosesContradicted, judged
 from su3d_bench.store.atomic import write_bytes, write_text
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.run_folder import JobFolder, RunFolder
 
+logger = logging.getLogger(__name__)
+
 
 def run_scene(job: SceneJob, report: Report) -> tuple[MethodOutcome, ...]:
     """Outcomes of all methods on one scene, that of the ceiling last; a method that fails leaves the others alone."""
+    if job.doubts is None:
+        try:
+            (job,) = judged([job])
+        except PosesContradicted as error:
+            return failed_outcomes(job, str(error).removeprefix(f"{job.scene}: "))
     scene = _Scene(job, report)
     parts = job.methods if job.ceiling is None else (*job.methods, job.ceiling)
     return tuple(_guarded(scene, part) for part in parts)
@@ -218,6 +226,9 @@ class _Scene:
             method: Method = build_method(part)
         frames: Sequence[Frame] = ()
         n = 0
+        doubts = self._doubts(method)
+        for line in doubts:
+            logger.warning("%s", line)
         if method.needs.frames:
             frames = self.dataset.frames(self.job.scene_name, info.stride)
             n = min(len(frames), self.job.limit or len(frames))
@@ -261,7 +272,10 @@ class _Scene:
             "start_ms": round(clock.take("start").method_ms, 3),
             "close_ms": round(clock.take("close").method_ms, 3),
         }
-        folder.seal("predict", key, files, {"costs": costs} | log.remarks())
+        folder.seal("predict", key, files, {"costs": costs, REMARK: doubts} | log.remarks())
+
+    def _doubts(self, method: Method) -> tuple[str, ...]:
+        return (self.job.doubts or ()) if method.needs.frames else ()
 
     def _tools(
         self, method: Method, perception: Perception, frames: Sequence[Frame], n: int, clock: MethodClock
@@ -294,7 +308,8 @@ class _Scene:
             truth_to_draw = next(iter(self._truths.values()), None)
             files += draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
         write_text(folder.log, log.text("done"))
-        remarks = {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings))}
+        doubts = folder.remarks("predict").get(REMARK, ())
+        remarks = {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings)), REMARK: doubts}
         folder.seal("score", key, [*files, folder.log], remarks)
 
     def _scores(

@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from su3d_bench.cli.main import main
 from su3d_bench.core.config import write_toml
 from su3d_bench.core.types import Instances
-from su3d_bench.datasets.recordings.pose_convention import check_convention
+from su3d_bench.datasets.recordings.pose_convention import judge_scene
 from su3d_bench.datasets.rgbd.dataset import Rgbd
 from su3d_bench.datasets.tum.dataset import Tum
 from su3d_bench.numerics.geometry import back_project
@@ -131,9 +131,9 @@ def test_recordings_run_unscored_with_the_embedded_segmenter(
 
 def test_the_poses_of_every_recording_agree_with_its_depth(root: Path) -> None:
     for scene in SCENES:
-        assert check_convention(Rgbd(root).frames(scene, 1), scene) is None
+        assert judge_scene(Rgbd(root), scene) is None
     tum = Tum(REAL_RECORDINGS.resolve())
-    assert check_convention(tum.frames("tum_fr1desk_9", 1), "tum") is None
+    assert judge_scene(tum, "tum_fr1desk_9") is None
 
 
 def test_tum_reports_the_images_that_are_not_there(caplog: pytest.LogCaptureFixture) -> None:

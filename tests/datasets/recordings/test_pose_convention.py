@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from su3d_bench.core.types import Float64Array, Frame
-from su3d_bench.datasets.recordings.pose_convention import FLIP, check_convention, judge_convention
+from su3d_bench.datasets.recordings.pose_convention import FLIP, judge_convention, judge_scene
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 
 Reading = Callable[[Float64Array], Float64Array]
@@ -43,7 +43,7 @@ def read_as(frames: Sequence[Frame], reading: Reading, depth_factor: float = 1.0
 def test_a_right_reading_is_never_refused(scene: str, noise: int) -> None:
     frames = walk(scene, noise)
     for stride in (1, 4, 15):
-        assert check_convention(frames[::stride], "rooms/x") is None
+        assert judge_convention(frames[::stride]) is None
 
 
 @pytest.mark.parametrize(("scene", "noise"), [("living0", 0), ("living0", 2), ("bathroom0", 2)])
@@ -74,26 +74,27 @@ def test_a_wrong_unit_of_depth_is_named(factor: float) -> None:
 
 
 def test_the_line_says_which_reading_agrees_and_both_shares() -> None:
-    line = check_convention(read_as(walk("living0", 0), inverse), "rgbd/desk")
-    assert line is not None and line.startswith("rgbd/desk: poses and depth contradict each other: ")
-    assert line.endswith("% with the inverse poses; check whether they are camera-to-world or world-to-camera")
-    assert check_convention(read_as(walk("living0", 0), lambda pose: pose, 0.1), "a/b").endswith(  # type: ignore[union-attr]
-        "with depth times 10; check the unit of the depth"
-    )
+    rooms = Rooms(Path("unused"))
+    verdict = judge_scene(rooms, "living0", read_as(walk("living0", 0), inverse))
+    assert verdict is not None and verdict.is_wrong
+    assert verdict.line.startswith("rooms/living0: poses and depth contradict each other: ")
+    assert verdict.line.endswith("% with the inverse poses; check whether they are camera-to-world or world-to-camera")
+    verdict = judge_scene(rooms, "living0", read_as(walk("living0", 0), lambda pose: pose, 0.1))
+    assert verdict is not None and verdict.line.endswith("with depth times 10; check the unit of the depth")
 
 
 @pytest.mark.parametrize("reading", [lambda pose: pose, inverse, lambda pose: pose @ FLIP])
 def test_a_camera_that_does_not_move_tells_nothing(reading: Reading) -> None:
     frame = walk("living0", 2)[0]
     still = [replace(frame, index=index) for index in range(10)]
-    assert check_convention(read_as(still, reading), "a/b") is None
+    assert judge_convention(read_as(still, reading)) is None
 
 
 def test_no_frame_one_frame_and_frames_without_depth_tell_nothing() -> None:
     frames = walk("living0", 0)
-    assert check_convention([], "a/b") is None
-    assert check_convention(frames[:1], "a/b") is None
-    assert check_convention(read_as(frames, inverse, 0.0), "a/b") is None
+    assert judge_convention([]) is None
+    assert judge_convention(frames[:1]) is None
+    assert judge_convention(read_as(frames, inverse, 0.0)) is None
 
 
 def test_frames_that_share_no_view_tell_nothing() -> None:

@@ -1,0 +1,125 @@
+"""What a run says of recordings whose poses and depth contradict each other, before it works on them."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from su3d_bench.cli.main import main
+from su3d_bench.core.config import Setting, Settings
+from su3d_bench.core.types import Float64Array
+from su3d_bench.datasets.recordings import pose_convention
+from su3d_bench.runs import poses
+from su3d_bench.runs.plan import make_plan
+from su3d_bench.runs.scene import run_scene
+
+MAKE = "datasets make rooms --layout replica --scenes bathroom0 office0 --workers 1 --quiet"
+SMALL = ["--set", "n_frames=40", "--set", "width=96", "--set", "height=72", "--set", "mesh_spacing_m=0.1"]
+RUN = "run --scenes replica/bathroom0 --stride 20 --jobs 1 --protocols rooms-semantic --no-pictures --quiet --out out"
+CONTRADICTED = "replica/bathroom0: poses and depth contradict each other: "
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two small rooms in Replica's layout."""
+    root = tmp_path_factory.mktemp("whole")
+    assert main([*MAKE.split(), *SMALL, "--out", str(root)]) == 0
+    return root
+
+
+@pytest.fixture
+def root(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A copy of the rooms that a test may spoil."""
+    shutil.copytree(whole, tmp_path / "data")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SU3D_DATA", "data")
+    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "data"
+
+
+def spoil(root: Path, change: Callable[[Float64Array], Float64Array], scene: str = "bathroom0") -> None:
+    path = root / "Replica" / scene / "traj.txt"
+    np.savetxt(path, change(np.loadtxt(path).reshape(-1, 4, 4)).reshape(-1, 16))
+
+
+def inverted(matrices: Float64Array) -> Float64Array:
+    return np.asarray(np.linalg.inv(matrices), np.float64)
+
+
+def test_inverse_poses_end_a_run_before_its_work_and_the_reading_that_agrees_is_named(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spoil(root, inverted)
+    assert main(RUN.split()) == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith(f"su3d-bench: {CONTRADICTED}") and "% with the inverse poses" in line
+    assert line.endswith("; --accept-poses runs it all the same")
+    assert not Path("out").exists()
+
+
+def test_accepted_poses_are_a_warning_in_table_log_and_record_and_a_resumed_run_says_it_again(
+    root: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spoil(root, inverted)
+    assert main([*RUN.split(), "--accept-poses"]) == 0
+    table = capsys.readouterr().out
+    assert f"- opensu3d: {CONTRADICTED.removeprefix('replica/bathroom0: ')}" in table and "(replica/bathroom0)" in table
+    assert CONTRADICTED in next(Path("out").glob("scenes/*/opensu3d/log.txt")).read_text()
+    assert any(line.startswith(CONTRADICTED) for line in json.loads(Path("out/run.json").read_text())["warnings"])
+    metrics = Path("out/metrics.json").read_bytes()
+    monkeypatch.setattr(poses, "judge_scene", lambda *words: pytest.fail("looked at the poses again"))
+    assert main(RUN.split()) == 0
+    assert capsys.readouterr().out == table and Path("out/metrics.json").read_bytes() == metrics
+
+
+def test_poses_that_depth_confirms_are_run_without_a_word(root: Path) -> None:
+    assert main(RUN.split()) == 0
+    assert json.loads(Path("out/run.json").read_text())["warnings"] == []
+
+
+def test_frames_that_tell_nothing_are_a_warning_beside_the_numbers(
+    root: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    spoil(root, lambda matrices: np.repeat(matrices[:1], len(matrices), axis=0))
+    assert main(RUN.split()) == 0
+    doubt = "poses and depth could not be checked: no two of the frames looked at see the same, at most "
+    assert doubt in capsys.readouterr().out
+    assert any(doubt in line for line in json.loads(Path("out/run.json").read_text())["warnings"])
+
+
+def test_a_still_camera_does_not_tell_a_pose_from_its_inverse() -> None:
+    shares = np.tile([1.0, 1.0, *[0.0] * (len(pose_convention.READINGS) - 2)], (4, 1))
+    doubt = pose_convention._doubt(shares)
+    assert doubt is not None and doubt.startswith("the frames do not tell the poses from their inverses: the camera ")
+    shares[0, :2], shares[1, :2] = (0.9, 0.1), (0.1, 0.4)
+    assert "only 1 of 2 pairs of frames agree better as the poses are read" in str(pose_convention._doubt(shares))
+    shares[:, :2] = 0.9, 0.1
+    assert pose_convention._doubt(shares) is None
+
+
+def test_one_of_several_scenes_names_how_many_there_are_and_made_rooms_are_not_looked_at(
+    root: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for scene in ("bathroom0", "office0"):
+        spoil(root, inverted, scene)
+    words = [word.replace("replica/bathroom0", "replica/*") for word in RUN.split()]
+    assert main(words) == 2
+    assert "(and 1 more of 2 scenes); --accept-poses" in capsys.readouterr().err
+    monkeypatch.setattr(poses, "judge_scene", lambda *words: pytest.fail("looked at a made room"))
+    plan = make_plan(Settings((Setting(("scenes",), ("rooms/living0",), ""),)))
+    assert poses.judged(plan.jobs)[0].doubts == ()
+
+
+def test_a_worker_with_data_of_its_own_looks_itself(root: Path) -> None:
+    spoil(root, inverted)
+    plan = make_plan(Settings((Setting(("scenes",), ("replica/bathroom0",), ""),)), out=Path("elsewhere"))
+    (outcome,) = run_scene(plan.jobs[0], lambda event: None)
+    assert outcome.error is not None and outcome.error.startswith(CONTRADICTED)
+    (job,) = poses.judged([replace(plan.jobs[0], accepts_poses=True)])
+    assert job.doubts is not None and job.doubts[0].startswith(CONTRADICTED)
