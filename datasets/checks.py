@@ -19,8 +19,8 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing, Su3dError, printable
-from su3d_bench.core.interfaces import Dataset, HasProblems
-from su3d_bench.core.types import Float32Array, Frame, InstanceMesh
+from su3d_bench.core.interfaces import Dataset, HasProblems, SaysUp
+from su3d_bench.core.types import Float32Array, Frame, InstanceMesh, WorldUp
 from su3d_bench.datasets.checks_of_frames import (
     Finding,
     FrameFacts,
@@ -31,6 +31,7 @@ from su3d_bench.datasets.checks_of_frames import (
     facts_of,
 )
 from su3d_bench.datasets.recordings.pose_convention import judge_scene
+from su3d_bench.datasets.recordings.world_up import guess_up
 from su3d_bench.formats.images import decode_colour, decode_depth, read_bytes
 
 SAMPLED_FRAMES = 20
@@ -66,7 +67,7 @@ class Inspection:
     """What is known of a scene after a check; ``digest`` is the data key that results of this scene carry.
 
     ``n_frames`` is None where the frames cannot be counted; ``n_read`` of them were read. ``meeting`` is None where
-    there is no truth or no frame.
+    there is no truth or no frame; ``up``, which axis of the files points up, where no frame was read.
     """
 
     scene: str
@@ -75,6 +76,7 @@ class Inspection:
     n_files: int
     size: tuple[int, int] | None
     depth: DepthStatistics | None
+    up: WorldUp | None
     truth: tuple[TruthVariant, ...]
     meeting: Meeting | None
     digest: str | None
@@ -122,6 +124,9 @@ def _inspect(
     findings.add(*check_frames(facts))
     if frames is not None and not is_made_on_demand:
         _look_at_convention(dataset, scene, _Readable(frames, broken), facts, findings)
+    up = None
+    if facts and frames is not None:
+        up = _look_at_up(dataset, scene, facts, _Readable(frames, broken), findings)
     truth, points = _look_at_truth(dataset, scene, findings)
     meeting = None
     if points is not None and facts:
@@ -135,6 +140,7 @@ def _inspect(
         n_files=len(files),
         size=(facts[0].width, facts[0].height) if facts else None,
         depth=_depth_statistics(facts),
+        up=up,
         truth=truth,
         meeting=meeting,
         digest=digest,
@@ -288,6 +294,19 @@ def _look_at_convention(
     verdict = findings.attempt("convention", lambda: judge_scene(dataset, scene, frames))
     if verdict is not None:
         findings.add(Finding("error" if verdict.is_wrong else "warning", "convention", "", verdict.line))
+
+
+def _look_at_up(
+    dataset: Dataset, scene: str, facts: Sequence[FrameFacts], frames: Sequence[Frame], findings: _Findings
+) -> WorldUp | None:
+    """Which axis points up; a warning where z is taken to, and the frames show another."""
+    poses = np.array([frame.camera_to_world for frame in facts])
+    up: WorldUp | None = findings.attempt(
+        "up", lambda: dataset.up(scene) if isinstance(dataset, SaysUp) else guess_up(poses, frames)
+    )
+    if up is not None and up.doubt is not None:
+        findings.add(Finding("warning", "up", "", up.doubt))
+    return up
 
 
 def _look_at_files(files: Sequence[Path], findings: _Findings, *, decode: bool) -> None:

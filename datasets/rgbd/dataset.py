@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,16 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, field_validator
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
-from su3d_bench.core.types import Float32Array, Float64Array, Frame, GroundTruth, InstanceMesh, SceneInfo, Surface
+from su3d_bench.core.types import (
+    Float32Array,
+    Float64Array,
+    Frame,
+    GroundTruth,
+    InstanceMesh,
+    SceneInfo,
+    Surface,
+    WorldUp,
+)
 from su3d_bench.datasets.recordings.exported_frames import read_matrix
 from su3d_bench.datasets.recordings.meshes import read_surface
 from su3d_bench.datasets.recordings.pose_convention import ROTATED, Finding
@@ -30,6 +39,7 @@ from su3d_bench.datasets.recordings.recorded_frames import (
     left_out,
     pinhole,
 )
+from su3d_bench.datasets.recordings.world_up import guess_up
 from su3d_bench.datasets.rgbd.description import FILE_NAME, INDEX, RgbdDescription, read_description
 from su3d_bench.datasets.rgbd.files import (
     Pose,
@@ -38,6 +48,7 @@ from su3d_bench.datasets.rgbd.files import (
     read_intrinsics,
     read_trajectory_file,
 )
+from su3d_bench.numerics.geometry import turn_to_z
 
 logger = logging.getLogger(__name__)
 OTHER = {"camera_to_world": "world_to_camera", "world_to_camera": "camera_to_world"}
@@ -131,7 +142,20 @@ class Rgbd:
         place = f"{recording.where}: {self._description(scene).name}"
         if description.mesh is None:
             raise DataError(f'{place} names no mesh; add one in the world of the poses: mesh = "mesh.ply"')
-        return read_surface(recording.folder.file(description.mesh, place), f"{recording.where}: {description.mesh}")
+        surface = read_surface(recording.folder.file(description.mesh, place), f"{recording.where}: {description.mesh}")
+        if description.up is None:
+            return surface
+        turned = (surface.vertices @ turn_to_z(description.up).T).astype(np.float32)
+        return replace(surface, vertices=turned)
+
+    def up(self, scene: str) -> WorldUp:
+        """What the description says of its world, or else what the frames show."""
+        description, recording = self._open(scene)
+        name = self._description(scene).name
+        if description.up is not None:
+            return WorldUp(description.up, True, f"{name} says so")
+        guess = guess_up(np.array([frame.pose for frame in recording.frames]), RecordedFrames(recording, is_quiet=True))
+        return replace(guess, remedy=f'set up = "{guess.axis}" in {name}, or up = "z"')
 
     def _descriptions(self) -> dict[str, Path]:
         """Scene -> description; a file is called by its own name, or by its folder's where it is an ``rgbd.toml``."""

@@ -11,6 +11,7 @@ from pydantic import BaseModel, ConfigDict, Field, field_validator, model_valida
 
 from su3d_bench.core.config import Setting, Settings, flatten, resolve
 from su3d_bench.core.errors import ConfigError, DataError, suggest
+from su3d_bench.core.types import UpAxis
 from su3d_bench.datasets.recordings.recorded_frames import read_text
 
 FILE_NAME = "rgbd.toml"
@@ -38,6 +39,8 @@ class RgbdDescription(BaseModel):
       left; with 3, a value p means ((p >> 3) | (p << 13)) & 0xffff units. ``depth_invalid``: how many units, besides 0,
       mean no depth; 65535 need not be named, it means none wherever it stands apart from all other depths of its image
     - ``intrinsics``: fx, fy, cx, cy in pixels; or ``intrinsics_file``: 3x3 (or 4x4) numbers, or Open3D's camera (JSON)
+    - ``up``: the axis of the poses' world that points up, such as ``-y``; poses and mesh are turned until it is z.
+      Without it the world stays as it is; where the frames show another axis to point up, that is said
     - ``mesh``: a mesh of the scene in the world of the poses (.ply), for methods that work on one
     - ``frames_per_second``: gives frames their times where the trajectory has none
     - ``check_convention``: off to read poses that the depth images contradict
@@ -58,6 +61,7 @@ class RgbdDescription(BaseModel):
     depth_invalid: tuple[DepthValue, ...] = ()
     intrinsics: tuple[Number, Number, Number, Number] | None = None
     intrinsics_file: str | None = None
+    up: UpAxis | None = None
     mesh: str | None = None
     frames_per_second: float = Field(default=30.0, gt=0, le=1e4, allow_inf_nan=False)
     check_convention: bool = True

@@ -15,7 +15,7 @@ from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.recordings.recorded_frames import Folder, numbers, parsed_json, pinhole, read_text, square
 from su3d_bench.datasets.rgbd.description import INDEX, RgbdDescription
 from su3d_bench.datasets.tum.timed_poses import quaternion_poses, rows_of, seconds, unit_quaternion
-from su3d_bench.numerics.geometry import are_rigid
+from su3d_bench.numerics.geometry import are_rigid, turn_to_z
 
 MAX_NUMBER = 2**31 - 1  # maps keep the numbers of frames in 32 bits; time stamps in names do not fit
 MAX_DISTANCE_M = 1e6  # of a camera from the origin
@@ -117,14 +117,20 @@ def _open3d_log(lines: list[str], where: str) -> list[list[float]]:
 
 
 def camera_to_world(matrix: Float64Array, description: RgbdDescription, where: str) -> Pose:
-    """The pose with OpenCV axes out of a matrix (4, 4) that is meant as the description says."""
+    """The pose with OpenCV axes, in a world with z up, out of a matrix (4, 4) that is meant as the description says."""
     if not np.isfinite(matrix).all():
         return None
     if np.abs(matrix[:3, 3]).max() > MAX_DISTANCE_M or not are_rigid(matrix[None])[0]:
         raise DataError(f"{where}: not a rigid motion in metres; expected a rotation, a translation and 0 0 0 1")
     if description.pose_direction == "world_to_camera":
         matrix = np.asarray(np.linalg.inv(matrix), np.float64)
-    return matrix @ OPENGL_TO_OPENCV if description.camera_axes == "opengl" else matrix
+    if description.camera_axes == "opengl":
+        matrix = matrix @ OPENGL_TO_OPENCV
+    if description.up is None:
+        return matrix
+    turned = matrix.copy()
+    turned[:3] = turn_to_z(description.up) @ matrix[:3]
+    return turned
 
 
 def read_intrinsics(path: Path, where: str) -> tuple[Float64Array, tuple[int, int] | None]:

@@ -83,6 +83,8 @@ def facts_line(look: SceneLook) -> str:
         words.append(f"{counts['n_points']:,} points of ground truth ({printable(look.truth.variant, 40)})")
     else:
         words.append("no ground truth")
+    if look.up is not None and look.up.axis is not None:
+        words.append(f"{look.up.axis} is up" + ("" if look.up.is_turned else " by guess"))
     return " \u00b7 ".join(words)
 
 

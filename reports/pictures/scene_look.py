@@ -8,9 +8,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from su3d_bench.core.errors import DataError, GroundTruthMissing
-from su3d_bench.core.interfaces import Dataset
-from su3d_bench.core.types import Float32Array, Float64Array, Frame, GroundTruth, UInt8Array
-from su3d_bench.numerics.geometry import back_project, valid_depth
+from su3d_bench.core.interfaces import Dataset, SaysUp
+from su3d_bench.core.types import Float32Array, Float64Array, Frame, GroundTruth, UInt8Array, WorldUp
+from su3d_bench.numerics.geometry import back_project, turn_to_z, valid_depth
 
 CAMERAS = 48  # enough for the shape of a walk
 SHOWN_FRAMES = 6
@@ -24,8 +24,9 @@ class SceneLook:
     """A scene as a picture needs it.
 
     ``poses`` (n, 4, 4) camera-to-world of the cameras that were read, of ``n_frames`` in the scene; ``seen`` (m, 3) m
-    in the world and ``seen_rgb`` (m, 3) what they see; ``shown`` are some of the frames; ``depth_m`` the least and
-    the greatest depth; ``truth`` or the reason why there is none.
+    in the world, z up, and ``seen_rgb`` (m, 3) what they see; ``shown`` are some of the frames; ``depth_m`` the least
+    and the greatest depth; ``truth`` or the reason why there is none; ``up`` where the dataset's files may have any
+    world: where it is only guessed, the world of the picture is turned and that of the frames is not.
     """
 
     scene: str
@@ -37,6 +38,7 @@ class SceneLook:
     depth_m: tuple[float, float]
     truth: GroundTruth | None
     no_truth: str
+    up: WorldUp | None = None
 
     @property
     def counts(self) -> dict[str, int]:
@@ -74,16 +76,21 @@ def look_at(
         ranges += list(np.percentile(depth, PERCENTILES)) if len(depth) else []
     progress(len(positions), len(positions))
     truth, reason = _truth(dataset, scene)
+    up = dataset.up(scene) if isinstance(dataset, SaysUp) else None
+    turn = np.eye(3) if up is None or up.axis is None or up.is_turned else turn_to_z(up.axis)
+    drawn = np.array(poses)
+    drawn[:, :3] = turn @ drawn[:, :3]
     return SceneLook(
         scene=f"{dataset.name}/{scene}",
         n_frames=n_frames,
-        poses=np.array(poses),
-        seen=np.concatenate(points),
+        poses=drawn,
+        seen=(np.concatenate(points) @ turn.T).astype(np.float32),
         seen_rgb=np.concatenate(colours),
         shown=tuple(shown),
         depth_m=(float(min(ranges, default=0.0)), float(max(ranges, default=0.0))),
         truth=truth,
         no_truth=reason,
+        up=up,
     )
 
 

@@ -27,6 +27,7 @@ from su3d_bench.core.types import (
     Surface,
     UInt8Array,
     WholeObject,
+    WorldUp,
 )
 
 
@@ -63,7 +64,8 @@ class Dataset(Protocol):
 
     The class also has ``Options``, a strict model of its settings, ``label_space``, whose class ids its truth uses, and
     ``variants``, the forms of ground truth it can give, the fullest first; it is made as ``Cls(data_root, options)``.
-    Frames are read from several threads at once.
+    Frames are read from several threads at once. Its world has z up: pictures from above, heights and spatial words go
+    by that.
     """
 
     name: str
@@ -131,6 +133,13 @@ class CorrectsReading(Protocol):
     def is_reading_checked(self, scene: str) -> bool: ...
 
     def correction_of_reading(self, scene: str, finding: Any) -> str: ...
+
+
+@runtime_checkable
+class SaysUp(Protocol):
+    """Its files may have any world: which axis of it points up."""
+
+    def up(self, scene: str) -> WorldUp: ...
 
 
 @runtime_checkable
@@ -352,6 +361,7 @@ ABILITIES = {
         HasGroups,
         HasProblems,
         CorrectsReading,
+        SaysUp,
         HasSurface,
         HasQueries,
         KnowsObjects,

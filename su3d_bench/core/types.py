@@ -1,6 +1,6 @@
 """What travels between the parts: frozen dataclasses, checked once at the border.
 
-Coordinates are metres in the world frame unless a name says otherwise; camera axes are OpenCV's
+Coordinates are metres in the world frame unless a name says otherwise, and z points up there; camera axes are OpenCV's
 (x right, y down, z forward).
 """
 
@@ -24,6 +24,7 @@ Float64Array = NDArray[np.float64]
 IntArray = NDArray[np.integer[Any]]
 
 ImageDomain = Literal["rendered-rooms", "camera"]
+UpAxis = Literal["x", "-x", "y", "-y", "z", "-z"]
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,27 @@ class SceneInfo:
     stride: int
     image_domain: ImageDomain
     seed: int = 0
+
+
+@dataclass(frozen=True)
+class WorldUp:
+    """Which axis of the world of a recording's files points up; ``axis`` None where nobody can tell.
+
+    ``is_turned``: its description says so, and its frames come out in a world that is turned until z points up. Else
+    frames are as the files have them, and the axis is a guess for ``reason``; ``remedy``: what to do where it is right.
+    """
+
+    axis: UpAxis | None
+    is_turned: bool
+    reason: str
+    remedy: str = "turn the poses"
+
+    @property
+    def doubt(self) -> str | None:
+        """What is to be said where the guess is another axis than z, which whatever goes by heights takes."""
+        if self.is_turned or self.axis in (None, "z"):
+            return None
+        return f"z is taken to be up, but {self.axis} seems to be ({self.reason}); {self.remedy}"
 
 
 @dataclass(frozen=True)

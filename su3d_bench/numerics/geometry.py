@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Int64Array, UpAxis
 
 RIGID_TOLERANCE = 1e-2  # catches scaled, mirrored and transposed matrices, not the digits that a text file left out
 
@@ -58,6 +58,23 @@ def are_rigid(matrices: Float64Array) -> BoolArray:
         is_affine = np.abs(last_rows - (0, 0, 0, 1)).max(axis=1) < RIGID_TOLERANCE
     result: BoolArray = is_orthogonal & is_proper & is_affine
     return result
+
+
+def turn_to_z(axis: UpAxis) -> Float64Array:
+    """The quarter or half turn (3, 3) about x, or for x about y, that brings ``axis`` to z; exact for every number.
+
+    >>> (turn_to_z("-y") @ [1, 2, 3]).tolist()
+    [1.0, 3.0, -2.0]
+    """
+    rows = {
+        "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
+        "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),
+        "y": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
+        "-y": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
+        "x": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
+        "-x": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
+    }
+    return np.array(rows[axis], np.float64)
 
 
 def rotations_of(quaternions: Float64Array) -> Float64Array:

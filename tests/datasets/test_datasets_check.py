@@ -342,7 +342,7 @@ def test_the_json_has_everything(at_root: Path, capsys: pytest.CaptureFixture[st
     assert (table["n_scenes"], table["n_with_errors"], table["data_root"]) == (1, 1, str(at_root))
     (one,) = table["scenes"]
     assert set(one) == {
-        "scene", "n_errors", "n_warnings", "n_frames", "n_read", "n_files", "size", "depth", "truth", "meeting",
+        "scene", "n_errors", "n_warnings", "n_frames", "n_read", "n_files", "size", "depth", "up", "truth", "meeting",
         "digest", "findings", "elapsed_s",
     }  # fmt: skip
     assert set(one["findings"][0]) == {"severity", "check", "where", "text"}

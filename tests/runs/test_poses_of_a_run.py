@@ -12,9 +12,10 @@ import numpy as np
 import pytest
 
 from su3d_bench.cli.main import main
-from su3d_bench.core.config import Setting, Settings
+from su3d_bench.core.config import Setting, Settings, write_toml
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.recordings import pose_convention
+from su3d_bench.numerics.geometry import turn_to_z
 from su3d_bench.runs import poses
 from su3d_bench.runs.plan import make_plan
 from su3d_bench.runs.scene import run_scene
@@ -123,3 +124,24 @@ def test_a_worker_with_data_of_its_own_looks_itself(root: Path) -> None:
     assert outcome.error is not None and outcome.error.startswith(CONTRADICTED)
     (job,) = poses.judged([replace(plan.jobs[0], accepts_poses=True)])
     assert job.doubts is not None and job.doubts[0].startswith(CONTRADICTED)
+
+
+def test_a_world_whose_up_is_not_z_is_a_warning_of_a_run(root: Path) -> None:
+    """Of a dataset whose files may have any world."""
+    folder = root / "rgbd" / "bath"
+    folder.mkdir(parents=True)
+    shutil.copytree(root / "Replica" / "bathroom0" / "results", folder / "results")
+    poses_in = np.loadtxt(root / "Replica" / "bathroom0" / "traj.txt").reshape(-1, 4, 4)
+    poses_in[:, :3] = turn_to_z("-y").T @ poses_in[:, :3]
+    np.savetxt(folder / "kitti.txt", poses_in[:, :3].reshape(-1, 12))
+    camera = json.loads((root / "Replica" / "cam_params.json").read_text())["camera"]
+    table = {"colour": "results/frame{index}.jpg", "depth": "results/depth{index}.png", "trajectory": "kitti.txt",
+             "trajectory_format": "kitti", "depth_unit_m": 1 / camera["scale"],
+             "intrinsics": [float(camera[key]) for key in ("fx", "fy", "cx", "cy")]}  # fmt: skip
+    (folder / "rgbd.toml").write_text(write_toml([((key,), value, "") for key, value in table.items()]))
+    words = "run --scenes rgbd/bath --stride 20 --jobs 1 --no-pictures --quiet --out up"
+    assert main(words.split()) == 0
+    (line,) = json.loads(Path("up/run.json").read_text())["warnings"]
+    assert (
+        line.startswith("rgbd/bath: z is taken to be up, but -y seems to be (") and 'set up = "-y" in rgbd.toml' in line
+    )

@@ -13,6 +13,7 @@ from su3d_bench.cli.common import answer, answer_json, progress, remark
 from su3d_bench.core import registry
 from su3d_bench.core.config import read_assignments
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError, counted, printable, printable_json
+from su3d_bench.core.types import WorldUp
 from su3d_bench.datasets.checks import Inspection, TruthVariant, inspect
 from su3d_bench.datasets.checks_of_frames import Finding
 from su3d_bench.runs.executors.local import Event
@@ -86,6 +87,8 @@ def lines_of(inspection: Inspection) -> list[str]:
         d = inspection.depth
         text = f"{d.near_m:.2f} to {d.far_m:.2f} m, median {d.median_m:.2f} m, {d.valid_share:.1%} of the pixels"
         rows.append(("depth", text))
+    if inspection.up is not None:
+        rows.append(("up", up_text(inspection.up)))
     rows += [("ground truth", _truth_text(variant)) for variant in inspection.truth]
     if inspection.meeting is not None:
         meeting = inspection.meeting
@@ -117,6 +120,15 @@ def _frames_text(inspection: Inspection) -> str:
     size = "" if inspection.size is None else f", {inspection.size[0]}x{inspection.size[1]}"
     files = f", {inspection.n_files} files" if inspection.n_files else ", made on demand"
     return f"{inspection.n_frames} ({read}){size}{files}"
+
+
+def up_text(up: WorldUp) -> str:
+    """Which axis points up, who says so, and what becomes of it."""
+    if up.axis is None:
+        return f"taken to be z; {up.reason}"
+    if up.is_turned or up.axis == "z":
+        return f"{up.axis}, {up.reason}" + ("" if up.axis == "z" else "; turned to z")
+    return f"taken to be z; {up.axis} seems to be, {up.reason}"
 
 
 def _truth_text(variant: TruthVariant) -> str:

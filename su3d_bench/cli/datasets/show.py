@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import argparse
 import re
+from dataclasses import asdict
 from pathlib import Path
 
 from su3d_bench.cli.common import answer, answer_json, progress
-from su3d_bench.cli.datasets.check import chosen_scenes
+from su3d_bench.cli.datasets.check import chosen_scenes, up_text
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, printable, printable_json
 from su3d_bench.reports.pictures.scene import draw_scene_picture, facts_line
 from su3d_bench.reports.pictures.scene_look import look_at
@@ -38,12 +39,15 @@ def show(arguments: argparse.Namespace) -> int:
             "n_frames": look.n_frames,
             "size": [width, height],
             "depth_m": list(look.depth_m),
+            "up": None if look.up is None else asdict(look.up),
             "ground_truth": None if look.truth is None else {"variant": look.truth.variant, **look.counts},
             "no_ground_truth": look.no_truth or None,
         }
         answer_json(printable_json(table))
         return EXIT_DONE
     answer(f"{printable(name)}: {facts_line(look)}")
+    if look.up is not None:
+        answer(f"up: {printable(up_text(look.up))}")
     if look.no_truth:
         answer(printable(look.no_truth))
     answer(f"picture: {printable(str(path))}")
