@@ -18,9 +18,9 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError, GroundTruthMissing, Su3dError, printable
+from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, Su3dError, printable
 from su3d_bench.core.interfaces import Dataset, HasProblems, SaysUp
-from su3d_bench.core.types import Float32Array, Frame, InstanceMesh, WorldUp
+from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, WorldUp
 from su3d_bench.datasets.checks_of_frames import (
     Finding,
     FrameFacts,
@@ -115,7 +115,7 @@ def _inspect(
     n_problems = _ask_for_problems(dataset, scene, findings)
     listed = findings.attempt("file", lambda: tuple(dataset.files(scene)))
     files, is_made_on_demand = listed or (), listed == () and not n_problems
-    frames = findings.attempt("frame", lambda: _counted_frames(dataset, scene))
+    frames = _counted_frames(dataset, scene, findings)
     facts: list[FrameFacts] = []
     if frames is not None:
         positions = _positions(len(frames), is_quick or is_made_on_demand)
@@ -127,10 +127,10 @@ def _inspect(
     up = None
     if facts and frames is not None:
         up = _look_at_up(dataset, scene, facts, _Readable(frames, broken), findings)
-    truth, points = _look_at_truth(dataset, scene, findings)
+    truth, known = _look_at_truth(dataset, scene, findings)
     meeting = None
-    if points is not None and facts:
-        meeting, meeting_findings = check_truth(facts, points)
+    if known is not None and facts:
+        meeting, meeting_findings = check_truth(facts, known.points, known.boxes)
         findings.add(*meeting_findings)
     digest = findings.attempt("digest", lambda: dataset.digest(scene))
     return Inspection(
@@ -216,14 +216,21 @@ def _warnings_as_findings(findings: _Findings) -> Iterator[None]:
         package.removeHandler(listener)
 
 
-def _counted_frames(dataset: Dataset, scene: str) -> Sequence[Frame]:
-    """The frames; a ``DataError`` where they are not as many as the dataset says, or none."""
-    info, frames = dataset.info(scene, 1), dataset.frames(scene, 1)
-    if len(frames) != info.n_frames:
-        raise DataError(f"the dataset counts {info.n_frames} frames and gives {len(frames)}")
-    if not len(frames):
-        raise DataError("the scene has no frames")
-    return frames
+def _counted_frames(dataset: Dataset, scene: str, findings: _Findings) -> Sequence[Frame] | None:
+    """The frames; None, which is a finding, where they are not as many as the dataset says, or none."""
+    try:
+        info, frames = dataset.info(scene, 1), dataset.frames(scene, 1)
+        if len(frames) != info.n_frames:
+            raise DataError(f"the dataset counts {info.n_frames} frames and gives {len(frames)}")
+        if not len(frames):
+            raise DataError("the scene has no frames")
+    except FramesMissing as error:  # nothing that is here is at fault
+        findings.add(Finding("warning", "frame", "", str(error)))
+    except (Su3dError, OSError) as error:
+        findings.add_fault("frame", "", error)
+    else:
+        return frames
+    return None
 
 
 def _positions(n_frames: int, is_sampled: bool) -> Sequence[int]:
@@ -337,10 +344,10 @@ def _fault_of_file(path: Path, name: str, decode: bool) -> str | None:
 
 def _look_at_truth(
     dataset: Dataset, scene: str, findings: _Findings
-) -> tuple[tuple[TruthVariant, ...], Float32Array | None]:
-    """What there is of every variant, and the points of the first one that is here."""
+) -> tuple[tuple[TruthVariant, ...], GroundTruth | None]:
+    """What there is of every variant, and the first one that is here."""
     rows: list[TruthVariant] = []
-    points = None
+    known = None
     for variant in getattr(dataset, "variants", ()):
         try:
             truth = dataset.ground_truth(scene, variant)
@@ -349,12 +356,12 @@ def _look_at_truth(
                 findings.add_fault("truth", "", error)
             rows.append(TruthVariant(variant, printable(str(error).removeprefix(f"{findings.scene}: "))))
             continue
-        points = truth.points if points is None else points
+        known = truth if known is None else known
         n_objects, n_classes = (len(np.unique(ids[ids != 0])) for ids in (truth.instance, truth.semantic))
         rows.append(TruthVariant(variant, None, len(truth.points), n_objects, n_classes))
-    if points is not None:
+    if known is not None:
         findings.attempt("truth", lambda: _instance_mesh(dataset, scene))
-    return tuple(rows), points
+    return tuple(rows), known
 
 
 def _instance_mesh(dataset: Dataset, scene: str) -> InstanceMesh | None:

@@ -8,13 +8,13 @@ from __future__ import annotations
 import itertools
 import zlib
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal
 
 import numpy as np
 
-from su3d_bench.core.types import Float32Array, Float64Array, Frame
+from su3d_bench.core.types import BoolArray, Float32Array, Float64Array, Frame, ObjectBoxes
 from su3d_bench.numerics.geometry import RIGID_TOLERANCE
 
 Severity = Literal["error", "warning", "note"]
@@ -216,14 +216,20 @@ def _motion(frames: Sequence[FrameFacts]) -> Iterator[Finding]:
         yield Finding("warning", "motion", "", f"the cameras are spread over {extent:.3g} m; are the poses in metres?")
 
 
-def check_truth(frames: Sequence[FrameFacts], truth_points: Float32Array) -> tuple[Meeting | None, list[Finding]]:
-    """How far frames and truth meet, and what does not; nothing is held against a truth without points."""
+def check_truth(
+    frames: Sequence[FrameFacts], truth_points: Float32Array, boxes: ObjectBoxes | None = None
+) -> tuple[Meeting | None, list[Finding]]:
+    """How far frames and truth meet, and what does not; nothing is held against a truth without points.
+
+    Of objects known by their ``boxes`` alone what is inside one of them is near, not what is near a point.
+    """
     usable = [frame for frame in frames if np.isfinite(frame.camera_to_world).all()]
     if not len(truth_points):
         return None, [Finding("error", "truth", "", "the ground truth has no points")]
     if not np.isfinite(truth_points).all():
         return None, [Finding("error", "truth", "", "the ground truth holds points that are not finite")]
-    meeting = _meeting([frame for frame in usable if len(frame.seen)], truth_points)
+    seeing = [frame for frame in usable if len(frame.seen)]
+    meeting = _meeting(seeing, _nearness_to_points(truth_points) if boxes is None else _nearness_to_boxes(boxes))
     do_meet = meeting is not None and meeting.share >= POINTS_MEETING[0]
     findings = list(_cameras(usable, truth_points, do_meet))
     if meeting is not None and not do_meet:
@@ -269,18 +275,34 @@ def _apart(frames: Sequence[FrameFacts], truth_points: Float32Array) -> str:
     return f" (the clouds do not overlap: the frames see {_box_text(seen.min(axis=0), seen.max(axis=0))})"
 
 
-def _meeting(frames: Sequence[FrameFacts], truth_points: Float32Array) -> Meeting | None:
+@dataclass(frozen=True)
+class _Nearness:
+    """Which points (N, 3) are within ``distance_m`` of a truth."""
+
+    distance_m: float
+    is_near: Callable[[Float64Array], BoolArray]
+
+
+def _nearness_to_points(truth_points: Float32Array) -> _Nearness:
     from scipy.spatial import KDTree
 
-    if not frames:
-        return None
     step = -(-len(truth_points) // SEARCHED_TRUTH_POINTS)
     tree = KDTree(truth_points[::step])
     distance_m = max(MEETING_DISTANCE_M, _spacing(tree))
+    return _Nearness(distance_m, lambda points: np.isfinite(tree.query(points, distance_upper_bound=distance_m)[0]))
+
+
+def _nearness_to_boxes(boxes: ObjectBoxes) -> _Nearness:
+    return _Nearness(MEETING_DISTANCE_M, lambda points: boxes.instance_at(points, MEETING_DISTANCE_M) > 0)
+
+
+def _meeting(frames: Sequence[FrameFacts], truth: _Nearness) -> Meeting | None:
+    if not frames:
+        return None
+    distance_m = truth.distance_m
 
     def share(pose_of: Any, factors: Float64Array) -> float:
-        distance, _ = tree.query(_placed(frames, pose_of, factors), distance_upper_bound=distance_m)
-        return float(np.isfinite(distance).mean())
+        return float(truth.is_near(_placed(frames, pose_of, factors)).mean())
 
     as_given = share(lambda facts: facts.camera_to_world, np.ones(3))
     hint = "" if as_given >= POINTS_MEETING[0] else _hint(share, as_given)

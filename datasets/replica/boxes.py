@@ -1,5 +1,7 @@
 """The oriented boxes of Replica's objects, from ``info_semantic.json`` alone, and whether the mesh agrees with them.
 
+They are a ground truth of their own where the mesh is not here.
+
 A box is given in its own axes (``abb``) and brought to the world by a rotation, a quaternion x y z w, and a
 translation. Source: habitat-sim's reader of Replica scenes, and its test, which wants every face centre of an object
 inside the object's box with 5 cm of slack.
@@ -13,12 +15,24 @@ from typing import Any
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError
-from su3d_bench.core.types import Float64Array, OrientedBox
-from su3d_bench.datasets.replica.mesh_truth import INFO_NAME, AnnotatedMesh, read_objects, shown, whole_number
+from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.core.types import Float64Array, GroundTruth, ObjectBoxes, OrientedBox
+from su3d_bench.datasets.replica.folders import replica_label_set
+from su3d_bench.datasets.replica.mesh_truth import (
+    INFO_NAME,
+    AnnotatedMesh,
+    read_object_classes,
+    read_objects,
+    shown,
+    whole_number,
+)
 from su3d_bench.numerics.geometry import rotations_of
 
 SLACK_M = 0.05
+SPACING_M = 0.05  # of the points on the sides of boxes
+LEAST_ALONG = 6  # points along one edge: the sides of the smallest thing then have 216, enough to count as an object
+MOST_POINTS = 2_000_000
+MOST_OBJECTS = 10_000  # the release has at most some hundreds in a scene
 UNIT_TOLERANCE = 1e-2  # the release writes unit quaternions in single precision
 MOST_M = 1e6  # no box of a room is as far or as large; float64 stays exact to a nanometre
 
@@ -65,6 +79,51 @@ def _numbers(values: Any, n: int, where: str) -> Float64Array:
     if unfit is not None:
         raise DataError(f"{where} holds {shown(unfit)}; expected numbers within {MOST_M:g} m")
     return np.array([float(value) for value in numbers])
+
+
+def object_boxes_of(path: Path, where: str) -> ObjectBoxes:
+    """The boxes of the objects that have a class, at least one, by instance id: that of the object, plus 1."""
+    classes, labels = read_object_classes(path, where), replica_label_set()
+    found = read_boxes(path, where)
+    boxes = {number + 1: found[number] for number in sorted(found) if classes[number] in labels.ids}
+    if not boxes:
+        raise GroundTruthMissing(f"{where}: no ground truth 'boxes'; no object of a class has a box in {INFO_NAME}")
+    if len(boxes) > MOST_OBJECTS:
+        raise DataError(f"{where}: {INFO_NAME}: {len(boxes)} objects have a box; expected at most {MOST_OBJECTS}")
+    return ObjectBoxes(boxes, {instance: classes[instance - 1] for instance in boxes}, labels)
+
+
+def box_truth(known: ObjectBoxes) -> GroundTruth:
+    """Points on the sides of the boxes, each with the class and instance of its box."""
+    most_along = max(LEAST_ALONG, int((MOST_POINTS / (6 * max(1, len(known.boxes)))) ** 0.5))
+    parts = [_on_sides(box, most_along) for box in known.boxes.values()]
+    sizes = [len(part) for part in parts]
+    classes = np.array([known.class_of_instance[instance] for instance in known.boxes], np.int32)
+    return GroundTruth(
+        points=np.concatenate([np.zeros((0, 3)), *parts]).astype(np.float32),
+        semantic=np.repeat(classes, sizes),
+        instance=np.repeat(np.array(list(known.boxes), np.int32), sizes),
+        labels=known.labels,
+        variant="boxes",
+        source=f"{INFO_NAME}, the oriented boxes of objects",
+        boxes=known,
+    )
+
+
+def _on_sides(box: OrientedBox, most_along: int) -> Float64Array:
+    """A grid (N, 3) on the six sides."""
+    n_along = np.clip(np.ceil(box.sizes / SPACING_M) + 1, LEAST_ALONG, most_along).astype(np.int64)
+    edges = [np.linspace(-0.5, 0.5, int(n)) * size for n, size in zip(n_along, box.sizes, strict=True)]
+    parts = []
+    for axis in range(3):
+        u, v = (other for other in range(3) if other != axis)
+        grid = np.stack(np.meshgrid(edges[u], edges[v], indexing="ij"), axis=-1).reshape(-1, 2)
+        for side in (-0.5, 0.5):
+            part = np.empty((len(grid), 3))
+            part[:, axis], part[:, u], part[:, v] = side * box.sizes[axis], grid[:, 0], grid[:, 1]
+            parts.append(part)
+    on_sides: Float64Array = np.concatenate(parts) @ box.rotation.T + box.centre
+    return on_sides
 
 
 def objects_outside_boxes(mesh: AnnotatedMesh, boxes: Mapping[int, OrientedBox]) -> dict[int, float]:

@@ -103,17 +103,15 @@ def _image_fault(head: bytes, tail: bytes, camera: Camera | None) -> str | None:
 
 
 def original_problems(original: Path | None, where: str) -> Iterator[str]:
-    """Faults of the scene in the original release; a scene without any of it is not at fault."""
+    """Faults of the scene in the original release; one without any of it, or with its boxes alone, has none."""
     if original is None:
         return
-    missing = [name for name in (MESH_NAME, INFO_NAME) if not (original / name).exists()]
-    for name in missing:
-        yield f"{where}: {name} is missing in {original}; copy it there"
-    if INFO_NAME in missing:
+    if not (original / INFO_NAME).exists():
+        yield f"{where}: {INFO_NAME} is missing in {original}; copy it there"
         return
     try:
         boxes = read_boxes(original / INFO_NAME, where)
-        if MESH_NAME in missing:
+        if not (original / MESH_NAME).exists():
             return
         outside = objects_outside_boxes(read_annotated_mesh(original, where), boxes)
     except DataError as error:

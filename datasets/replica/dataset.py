@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
-from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
+from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, suggest
 from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, SceneInfo, Surface
 from su3d_bench.datasets.recordings.made_rooms import read_marker
 from su3d_bench.datasets.recordings.meshes import read_surface
-from su3d_bench.datasets.replica.boxes import read_boxes
+from su3d_bench.datasets.replica.boxes import box_truth, object_boxes_of, read_boxes
 from su3d_bench.datasets.replica.checks import digest_of, original_problems, render_problems
 from su3d_bench.datasets.replica.cloud_truth import cloud_files, conceptgraphs_truth
 from su3d_bench.datasets.replica.folders import (
@@ -23,6 +24,7 @@ from su3d_bench.datasets.replica.folders import (
     ORIGINAL_URL,
     REFERENCE_CLOUD,
     RENDER_FOLDERS,
+    RENDER_URL,
     SEMANTIC_FOLDERS,
     SEMANTIC_LABEL_FOLDERS,
     RenderTree,
@@ -32,6 +34,7 @@ from su3d_bench.datasets.replica.folders import (
     find_semantic_sequence,
     no_render_tree,
     original_name,
+    unrendered_scenes,
 )
 from su3d_bench.datasets.replica.frames import (
     ReplicaFrames,
@@ -68,7 +71,7 @@ class Replica:
     reads_made_rooms = True
     scene_names = r"(room_?[0-2]|office_?[0-4])"  # those of made rooms are among them
     label_space = "replica"
-    variants: tuple[str, ...] = ("mesh-vertices", "face-corners", "conceptgraphs", "openmask3d", "ovo-51")
+    variants: tuple[str, ...] = ("mesh-vertices", "face-corners", "conceptgraphs", "openmask3d", "ovo-51", "boxes")
     Options = ReplicaOptions
 
     def __init__(self, root: Path, options: ReplicaOptions | None = None) -> None:
@@ -78,15 +81,18 @@ class Replica:
 
     @cached_property
     def tree(self) -> RenderTree:
-        """The render tree; a ``DataError`` that says how to get data where there is none."""
-        tree = find_render_tree(self.root)
-        if tree is None:
-            raise no_render_tree(self.root)
-        return tree
+        """The render tree, without scenes where there is none."""
+        return find_render_tree(self.root) or RenderTree(self.root / RENDER_FOLDERS[0], ())
 
     def scenes(self) -> Sequence[str]:
-        """The official scenes that are here, in their order, then every other scene of the render tree."""
-        return self.tree.scenes
+        """The official scenes that are here, in their order, then every other scene of the render tree.
+
+        Without a render tree those of the original release, which can be looked at; beside one they are named singly.
+        """
+        scenes = self.tree.scenes or unrendered_scenes(self.root)
+        if not scenes:
+            raise no_render_tree(self.root)
+        return scenes
 
     def places(self) -> Sequence[Path]:
         """Where the render tree is, or else would be looked for, in that order."""
@@ -95,10 +101,13 @@ class Replica:
 
     def status(self, scene: str) -> str:
         """A word on the scene from a quick look: poses and ground truth; ``info`` checks every file's presence."""
-        try:
-            n_poses = (self._folder(scene) / "traj.txt").read_bytes().rstrip().count(b"\n") + 1
-        except OSError:
-            return "traj.txt is missing"
+        frames = "no frames"
+        if self._is_rendered(scene):
+            try:
+                n_poses = (self._folder(scene) / "traj.txt").read_bytes().rstrip().count(b"\n") + 1
+            except OSError:
+                return "traj.txt is missing"
+            frames = f"{n_poses} frames"
         try:
             truth = f"ground truth in {self._original(scene)}"
         except GroundTruthMissing as error:
@@ -110,17 +119,24 @@ class Replica:
         for variant, files in self._released_truths(scene).items():
             missing = [path.name for path in files if not path.exists()]
             released += [f"{variant} without its {missing[0]}" if missing else variant] if files else []
-        return f"{n_poses} frames, {truth}" + (f"; also {', '.join(released)}" if released else "")
+        return f"{frames}, {truth}" + (f"; also {', '.join(released)}" if released else "")
 
     def info(self, scene: str, stride: int) -> SceneInfo:
         """Cheap facts and a check that the scene's frames are complete; the domain tells made scenes from scans."""
         folder = self._folder(scene)
+        if not self._is_rendered(scene):
+            return SceneInfo(self.name, scene, 0, stride, "camera")
         n_poses = len(read_trajectory(folder / "traj.txt", self._where(scene)))
         check_frames_complete(folder, n_poses, self._where(scene))
         return SceneInfo(self.name, scene, len(range(0, n_poses, stride)), stride, self._image_domain(scene))
 
     def frames(self, scene: str, stride: int) -> Sequence[Frame]:
         folder, where = self._folder(scene), self._where(scene)
+        if not self._is_rendered(scene):
+            raise FramesMissing(
+                f"{where}: no frames; expected traj.txt and results/ of NICE-SLAM's render in {folder} ({RENDER_URL}); "
+                f"what is here can be looked at: su3d-bench datasets show {where}"
+            )
         camera = read_camera(self.tree.folder / "cam_params.json", where)
         poses = read_trajectory(folder / "traj.txt", where)
         check_frames_complete(folder, len(poses), where)
@@ -128,6 +144,8 @@ class Replica:
 
     def files(self, scene: str) -> Sequence[Path]:
         folder = self._folder(scene)
+        if not self._is_rendered(scene):
+            return self._truth_files(scene)
         n_poses = len(read_trajectory(folder / "traj.txt", self._where(scene)))
         images = [folder / name(index) for index in range(n_poses) for name in (colour_name, depth_name)]
         return (self.tree.folder / "cam_params.json", folder / "traj.txt", *images, *self._truth_files(scene))
@@ -135,14 +153,16 @@ class Replica:
     def digest(self, scene: str) -> str:
         """A key of the content of every file; ``image_key`` says what it cannot see in an image."""
         folder = self._folder(scene)
-        files = (self.tree.folder / "cam_params.json", folder / "traj.txt", *self._truth_files(scene))
+        render = (self.tree.folder / "cam_params.json", folder / "traj.txt") if self._is_rendered(scene) else ()
+        files = (*render, *self._truth_files(scene))
         parts = (f"replica {READER_VERSION}", scene, self._image_domain(scene))
         return digest_of(parts, files, sorted(folder.glob("results/*")), self._where(scene))
 
     def problems(self, scene: str) -> Iterator[str]:
         """What is wrong with the scene's files, one line each; what has no entry is no fault but void."""
         self._folder(scene)
-        yield from render_problems(self.tree.folder, scene, self._where(scene))
+        if self._is_rendered(scene):
+            yield from render_problems(self.tree.folder, scene, self._where(scene))
         yield from original_problems(find_original_scene(self.root, scene), self._where(scene))
 
     def ground_truth(self, scene: str, variant: str) -> GroundTruth:
@@ -156,11 +176,16 @@ class Replica:
                 return self._cloud_truth(scene)
             case "openmask3d" | "ovo-51":
                 return self._label_file_truth(scene, variant)
+            case "boxes":
+                return box_truth(object_boxes_of(self._info(scene), self._where(scene)))
         hint = suggest(variant, self.variants) or f"; known: {', '.join(self.variants)}"
         raise GroundTruthMissing(f"{self._where(scene)}: no ground truth '{variant}'{hint}")
 
     def object_boxes(self, scene: str) -> Mapping[int, OrientedBox]:
         """Object id of the original release -> its box in the world, from ``info_semantic.json`` alone."""
+        return read_boxes(self._info(scene), self._where(scene))
+
+    def _info(self, scene: str) -> Path:
         self._folder(scene)
         original = find_original_scene(self.root, scene)
         if original is None or not (original / INFO_NAME).exists():
@@ -168,7 +193,7 @@ class Replica:
                 f"{self._where(scene)}: no boxes of objects; expected {original_name(scene)}/{INFO_NAME} of the "
                 f"original release ({ORIGINAL_URL}) in {self.root / 'replica_v1'}"
             )
-        return read_boxes(original / INFO_NAME, self._where(scene))
+        return original / INFO_NAME
 
     def instance_mesh(self, scene: str) -> InstanceMesh:
         return triangle_mesh(self._annotated_mesh(scene))
@@ -188,10 +213,19 @@ class Replica:
         return self.tree.folder / f"{scene}_mesh.ply"
 
     def _folder(self, scene: str) -> Path:
-        if scene not in self.tree.scenes:
-            hint = suggest(scene, self.tree.scenes) or f"; {self.tree.folder} has {', '.join(self.tree.scenes[:8])}"
+        """Where the scene's render is or would be; a ``DataError`` where nothing of the scene is here."""
+        if not self._is_rendered(scene) and not self._is_annotated(scene):
+            known = self.scenes()
+            hint = suggest(scene, known) or f"; {self.tree.folder} has {', '.join(known[:8])}"
             raise DataError(f"replica: no scene '{scene}'{hint}")
         return self.tree.folder / scene
+
+    def _is_annotated(self, scene: str) -> bool:
+        original = find_original_scene(self.root, scene) if re.fullmatch(r"\w[\w-]*", scene, re.ASCII) else None
+        return original is not None and any((original / name).is_file() for name in (MESH_NAME, INFO_NAME))
+
+    def _is_rendered(self, scene: str) -> bool:
+        return scene in self.tree.scenes
 
     def _image_domain(self, scene: str) -> ImageDomain:
         return "rendered-rooms" if scene in read_marker(self.tree.folder) else "camera"

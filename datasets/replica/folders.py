@@ -29,6 +29,7 @@ ORIGINAL_FOLDERS = (
     "replica",
     ".",
 )
+ORIGINAL_FILES = ("info_semantic.json", "mesh_semantic.ply")  # in the folder habitat of a scene
 # Names that users give the folder of ConceptGraphs' ground truth, whose scenes are room_0/Sequence_1/...
 SEMANTIC_FOLDERS = (
     "Replica-semantic",
@@ -107,6 +108,19 @@ def original_name(scene: str) -> str:
 def find_original_scene(root: Path, scene: str) -> Path | None:
     """The folder of the original release with ``habitat/`` in it; None where no tree below ``root`` has it."""
     return _scene_with("habitat", root, ORIGINAL_FOLDERS, scene)
+
+
+def unrendered_scenes(root: Path) -> tuple[str, ...]:
+    """The scenes of the original release that have a ``habitat/`` below ``root``, official ones first."""
+    found = {
+        child.name
+        for name in ORIGINAL_FOLDERS
+        for child in _folders(root / name)
+        if any((child / "habitat" / file).is_file() for file in ORIGINAL_FILES)
+    }
+    official = [scene for scene in OFFICIAL_SCENES if {scene, original_name(scene)} & found]
+    named = {name for scene in official for name in (scene, original_name(scene))}
+    return (*official, *sorted(found - named, key=_natural_order))
 
 
 def find_semantic_sequence(root: Path, scene: str) -> Path | None:

@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from pydantic import BaseModel, ConfigDict, field_validator
 
-from su3d_bench.core.errors import DataError, GroundTruthMissing, suggest
+from su3d_bench.core.errors import DataError, GroundTruthMissing, printable, suggest
 from su3d_bench.core.types import (
     Float32Array,
     Float64Array,
@@ -27,7 +27,6 @@ from su3d_bench.core.types import (
     Surface,
     WorldUp,
 )
-from su3d_bench.datasets.recordings.exported_frames import read_matrix
 from su3d_bench.datasets.recordings.meshes import read_surface
 from su3d_bench.datasets.recordings.pose_convention import ROTATED, Finding
 from su3d_bench.datasets.recordings.recorded_frames import (
@@ -44,8 +43,10 @@ from su3d_bench.datasets.rgbd.description import FILE_NAME, INDEX, RgbdDescripti
 from su3d_bench.datasets.rgbd.files import (
     Pose,
     camera_to_world,
+    direction_in,
     files_of,
     read_intrinsics,
+    read_pose,
     read_trajectory_file,
 )
 from su3d_bench.numerics.geometry import turn_to_z
@@ -239,11 +240,19 @@ class _Poses:
 
 def _poses(folder: Folder, description: RgbdDescription, images: list[int], where: str, place: str) -> _Poses:
     if description.pose is not None:
-        pose_of = {}
+        pose_of, contradicting = {}, []
         names = files_of(folder, description.pose, place)
         for number, name in names.items():
-            matrix = read_matrix(folder.path, name, where)
+            matrix, header = read_pose(folder.path, name, where)
             pose_of[number] = camera_to_world(matrix, description, f"{where}: {name}")
+            if direction_in(header) not in (None, description.pose_direction):
+                contradicting.append(f"{name} begins with {printable(header, 40)!r}")
+        if contradicting:
+            logger.warning(
+                "%s: the poses are read as %s, and %d of their files say otherwise (the first: %s); what they are is "
+                "told by the depth alone",
+                *(place, description.pose_direction, len(contradicting), contradicting[0]),
+            )
         return _Poses(pose_of, {}, tuple(folder.path / name for name in names.values()))
     assert description.trajectory is not None
     path, where = folder.file(description.trajectory, place), f"{where}: {description.trajectory}"

@@ -22,6 +22,8 @@ MAX_DISTANCE_M = 1e6  # of a camera from the origin
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 MATRIX_ROWS = {"kitti": (3, "the upper rows of a 4x4 matrix"), "matrix": (4, "a 4x4 matrix row by row")}
 FORMS_OF_WORDS = {8: "tum", 12: "kitti", 16: "matrix"}  # numbers a line
+HEADER = re.compile(r"[#%/\s]*[A-Za-z_](?!(?i:nf|an)\b)")  # a word, which is neither inf nor nan
+DIRECTION = re.compile(r"(world|w|cam(?:era)?|c)[\W_]*(?:2|to)[\W_]*(?:world|w|cam(?:era)?|c)", re.IGNORECASE)
 Pose = Float64Array | None  # None: tracking was lost, the matrix holds numbers that are not finite
 
 
@@ -114,6 +116,23 @@ def _open3d_log(lines: list[str], where: str) -> list[list[float]]:
             matrix += row
         matrices.append(matrix)
     return matrices
+
+
+def read_pose(folder: Path, name: str, where: str) -> tuple[Float64Array, str]:
+    """The matrix (4, 4) in a text file, and the line of words before it that some programs write; empty without one."""
+    where = f"{where}: {name}"
+    text = read_text(folder / name, where)
+    first, _, rest = text.lstrip().partition("\n")
+    is_header = HEADER.match(first) is not None and not rest.isspace() and rest != ""
+    return square((rest if is_header else text).split(), where), first.strip() if is_header else ""
+
+
+def direction_in(header: str) -> str | None:
+    """What a header says that a matrix maps; None where it does not."""
+    found = DIRECTION.search(header)
+    if found is None:
+        return None
+    return "world_to_camera" if found[1].lower().startswith("w") else "camera_to_world"
 
 
 def camera_to_world(matrix: Float64Array, description: RgbdDescription, where: str) -> Pose:

@@ -33,6 +33,7 @@ SEEN_WITHIN_M = 0.12  # a point of the truth has the colour of what a camera saw
 LEAST_DRAWN_M = 0.012
 UNSEEN = (214, 214, 210)
 SCALE_LENGTHS_M = (0.1, 0.2, 0.5, 1.0, 2.0, 5.0, 10.0, 20.0, 50.0)
+WALK_TITLE, NO_WALK_TITLE = "walk, over the ground truth in the frames' colours", "ground truth, without frames"
 WALK, START, END = "#d6246e", "#1a9850", "#111111"
 # Walks outside the truth are drawn where they are, up to this far; farther ones would leave no room for the scene.
 MOST_BEYOND_M = 10.0
@@ -50,7 +51,7 @@ class Panel:
 def draw_scene_picture(look: SceneLook, path: Path) -> None:
     """Write the picture of ``look`` as a PNG of ``WIDTH`` pixels."""
     frame_height = _frame_height(look)
-    height = HEADER + CAPTION + PANEL_HEIGHT + 2 * (CAPTION + frame_height) + MARGIN
+    height = HEADER + CAPTION + PANEL_HEIGHT + MARGIN + (2 * (CAPTION + frame_height) if look.shown else 0)
     page = Canvas(WIDTH, height)
     page.text(MARGIN, 14, _shortened(look.scene, 90), size=17, weight="bold")
     page.text(MARGIN, 46, facts_line(look), size=11, colour=GREY)
@@ -60,23 +61,26 @@ def draw_scene_picture(look: SceneLook, path: Path) -> None:
         axes = page.picture(left, HEADER + CAPTION, PANEL_WIDTH, PANEL_HEIGHT, panel.pixels)
         if panel.camera is not None:
             _draw_scale(axes, panel.camera)
-            if column == 0:
+            if column == 0 and look.shown:
                 _draw_walk(axes, panel.camera, look.poses)
     if look.truth is not None:
         _draw_legend(page, look.truth)
     else:
         _draw_reason(page, look.no_truth)
-    _draw_frames(page, look, HEADER + CAPTION + PANEL_HEIGHT, frame_height)
+    if look.shown:
+        _draw_frames(page, look, HEADER + CAPTION + PANEL_HEIGHT, frame_height)
     page.write(path)
 
 
 def facts_line(look: SceneLook) -> str:
     """The counts of the scene in one line."""
-    height, width = look.shown[0].rgb.shape[:2]
-    words = [
-        f"{look.n_frames:,} frames of {width}x{height}",
-        f"depth {look.depth_m[0]:.2f} to {look.depth_m[1]:.2f} m",
-    ]
+    words = ["no frames"]
+    if look.shown:
+        height, width = look.shown[0].rgb.shape[:2]
+        words = [
+            f"{look.n_frames:,} frames of {width}x{height}",
+            f"depth {look.depth_m[0]:.2f} to {look.depth_m[1]:.2f} m",
+        ]
     if look.truth is not None:
         counts = look.counts
         words.append(f"{counts['n_objects']} objects of {counts['n_classes']} classes")
@@ -106,7 +110,7 @@ def _panels(look: SceneLook) -> tuple[Panel, ...]:
     view = render(points, _drawn_size(points), above)
     by_class, by_instance = _class_palette(look.truth)[rows], _instance_palette(look.truth)[rows]
     return (
-        Panel("walk, over the ground truth in the frames' colours", colour(view, _seen_colours(look, points)), above),
+        Panel(WALK_TITLE if look.shown else NO_WALK_TITLE, colour(view, _seen_colours(look, points)), above),
         Panel("ground truth by class", colour(view, by_class), above),
         Panel("ground truth by instance", colour(view, by_instance), above),
     )
@@ -114,7 +118,10 @@ def _panels(look: SceneLook) -> tuple[Panel, ...]:
 
 def _camera_above(look: SceneLook, points: Float32Array) -> Camera:
     """The view from above that holds the points and the walk, as far as it stays near."""
-    bounds, places = room_bounds(points), look.poses[:, :2, 3]
+    bounds = room_bounds(points)
+    if not len(look.poses):
+        return view_cameras(bounds, PANEL_WIDTH, PANEL_HEIGHT)[0]
+    places = look.poses[:, :2, 3]
     bounds[0, :2] = np.maximum(np.minimum(bounds[0, :2], places.min(axis=0)), bounds[0, :2] - MOST_BEYOND_M)
     bounds[1, :2] = np.minimum(np.maximum(bounds[1, :2], places.max(axis=0)), bounds[1, :2] + MOST_BEYOND_M)
     return view_cameras(bounds, PANEL_WIDTH, PANEL_HEIGHT)[0]
@@ -237,6 +244,8 @@ def _draw_scale(axes: Any, camera: Camera) -> None:
 
 
 def _frame_height(look: SceneLook) -> int:
+    if not look.shown:
+        return 0
     height, width = look.shown[0].rgb.shape[:2]
     return int(np.clip(round((FRAME_WIDTH - 4) * height / width), 60, 420))
 

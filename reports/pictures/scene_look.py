@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.core.errors import DataError, GroundTruthMissing
+from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing
 from su3d_bench.core.interfaces import Dataset, SaysUp
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, GroundTruth, UInt8Array, WorldUp
 from su3d_bench.numerics.geometry import back_project, turn_to_z, valid_depth
@@ -54,10 +54,13 @@ def look_at(
 ) -> SceneLook:
     """Read every ``stride``-th frame of ``scene`` (None: ``CAMERAS`` evenly spaced ones) and its fullest truth.
 
-    A frame or a truth that is damaged is a ``DataError``; a truth that is not there is no fault.
+    A frame or a truth that is damaged is a ``DataError``; a truth that is not there is no fault, nor are frames.
     """
-    frames = dataset.frames(scene, stride or 1)
-    n_frames = dataset.info(scene, 1).n_frames
+    try:
+        frames = dataset.frames(scene, stride or 1)
+        n_frames = dataset.info(scene, 1).n_frames
+    except FramesMissing:
+        return _without_frames(dataset, scene)
     if not len(frames):
         raise DataError(f"{dataset.name}/{scene}: has no frames to show")
     positions = range(len(frames)) if stride else _evenly(len(frames), CAMERAS)
@@ -91,6 +94,25 @@ def look_at(
         truth=truth,
         no_truth=reason,
         up=up,
+    )
+
+
+def _without_frames(dataset: Dataset, scene: str) -> SceneLook:
+    """A look at the truth alone; where there is none either, ``DataError``."""
+    truth, reason = _truth(dataset, scene)
+    if truth is None:
+        raise DataError(reason)
+    none = np.zeros((0, 3))
+    return SceneLook(
+        scene=f"{dataset.name}/{scene}",
+        n_frames=0,
+        poses=np.zeros((0, 4, 4)),
+        seen=none.astype(np.float32),
+        seen_rgb=none.astype(np.uint8),
+        shown=(),
+        depth_m=(0.0, 0.0),
+        truth=truth,
+        no_truth="",
     )
 
 

@@ -90,6 +90,10 @@ class GroundTruthMissing(DataError):
     """The scene has no ground truth in the form that a protocol needs: it runs, unscored."""
 
 
+class FramesMissing(DataError):
+    """The scene has no frames here: its ground truth can be looked at, and nothing can be run on it."""
+
+
 class PredictionError(Su3dError):
     """A prediction that cannot be scored."""
 

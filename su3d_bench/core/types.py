@@ -132,6 +132,7 @@ class GroundTruth:
     ``points`` (N, 3) float32 m; ``semantic`` (N,) int32 class ids of ``labels``, 0 where unannotated;
     ``instance`` (N,) int32 ids unique in the scene, 0 where there is none; ``source`` says how it was made.
     ``evaluation_points`` (P, 3) float32 where a protocol scores points of another cloud than the labelled one.
+    ``boxes`` where the objects are known by their boxes alone; the points lie on these.
     """
 
     points: Float32Array
@@ -141,6 +142,7 @@ class GroundTruth:
     variant: str
     source: str
     evaluation_points: Float32Array | None = None
+    boxes: ObjectBoxes | None = None
 
     def __post_init__(self) -> None:
         n = len(self.points)
@@ -186,6 +188,27 @@ class OrientedBox:
         along_axes = np.abs((points - self.centre) @ self.rotation)
         distance: Float64Array = np.maximum(along_axes - self.sizes / 2, 0.0).max(axis=1, initial=0.0)
         return distance
+
+
+@dataclass(frozen=True)
+class ObjectBoxes:
+    """Objects of which only their boxes are known: ``boxes`` and class ids of ``labels``, both by instance id."""
+
+    boxes: Mapping[int, OrientedBox]
+    class_of_instance: Mapping[int, int]
+    labels: LabelSet
+
+    def instance_at(self, points: Float64Array, slack_m: float) -> Int32Array:
+        """For each of ``points`` (N, 3) the instance (N,) of the smallest box, grown by ``slack_m`` on every side, that
+        holds it; 0 where none does."""
+        found = np.zeros(len(points), np.int32)
+        left = np.arange(len(points))
+        by_size = sorted(self.boxes.items(), key=lambda pair: (float(np.prod(pair[1].sizes + 2 * slack_m)), pair[0]))
+        for instance, box in by_size:
+            is_inside = box.distance_outside(points[left]) <= slack_m
+            found[left[is_inside]] = instance
+            left = left[~is_inside]
+        return found
 
 
 @dataclass(frozen=True)

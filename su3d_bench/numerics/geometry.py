@@ -61,11 +61,7 @@ def are_rigid(matrices: Float64Array) -> BoolArray:
 
 
 def turn_to_z(axis: UpAxis) -> Float64Array:
-    """The quarter or half turn (3, 3) about x, or for x about y, that brings ``axis`` to z; exact for every number.
-
-    >>> (turn_to_z("-y") @ [1, 2, 3]).tolist()
-    [1.0, 3.0, -2.0]
-    """
+    """The quarter or half turn (3, 3) about x, or for x about y, that brings ``axis`` to z; exact for every number."""
     rows = {
         "z": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
         "-z": ((1, 0, 0), (0, -1, 0), (0, 0, -1)),

@@ -9,7 +9,7 @@ from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
-from su3d_bench.core.types import Detections, Frame, ImageDomain, InstanceMesh, PerceptionNeeds, SceneInfo
+from su3d_bench.core.types import Detections, Frame, ImageDomain, InstanceMesh, ObjectBoxes, PerceptionNeeds, SceneInfo
 from su3d_bench.perception.cache import FrameCache
 from su3d_bench.perception.embedded.naming import Namer, NamingConfig
 from su3d_bench.perception.embedded.perception import EmbeddedPerception
@@ -96,13 +96,13 @@ def build_perception(
     *,
     scene: SceneInfo,
     cache_root: Path,
-    mesh: InstanceMesh | None,
+    mesh: InstanceMesh | ObjectBoxes | None,
     encoder: Encoder | None = None,
     job_index: int = 0,
     replies: Path | None = None,
     is_offline: bool = False,
 ) -> Perception:
-    """Perception for one scene; ``mesh`` for the oracle alone.
+    """Perception for one scene; ``mesh``, or the boxes of objects, for the oracle alone.
 
     Without ``encoder`` the configured one is loaded, or the profile's own; ``job_index`` chooses among several GPUs.
     ``replies``: where those of a language model are kept (None: in the cache); ``is_offline``: only these are used.

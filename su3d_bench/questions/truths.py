@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from su3d_bench.core.errors import GroundTruthMissing
+from su3d_bench.core.errors import FramesMissing, GroundTruthMissing
 from su3d_bench.core.interfaces import Encoder, HasQueries, KnowsObjects
 from su3d_bench.core.types import GroundTruth, Instances
 from su3d_bench.metrics.protocols import ProtocolRules
@@ -26,13 +26,14 @@ from su3d_bench.questions.model import Question, new_question
 from su3d_bench.questions.reasoning.asking import BUILT_IN, MapSolver, built_in, given_answer
 from su3d_bench.questions.reasoning.generated import generate_questions
 from su3d_bench.questions.reasoning.scene_map import SceneMap, map_of
-from su3d_bench.questions.sight import sights
+from su3d_bench.questions.sight import Sight, sights
 from su3d_bench.questions.undesired import FilterConfig, undesired
 
 Refine = Callable[[Instances], RefinedNames | None]
 MIN_VERTICES = 100  # ScanNet's smallest instance that counts
 # The truth with the most classes, where it is not the first that a dataset gives.
 FULLEST = ("scannet200-vertices",)
+BOXES = "boxes"  # the truth of which the least must be here
 MOST_KEPT = 4  # scenes whose objects are kept: every method and protocol asks for the same
 _Kept = OrderedDict[tuple[int, str, str, int], tuple[Any, SceneMap]]  # with the dataset, whose id is in the key
 _KEPT: _Kept = OrderedDict()
@@ -92,9 +93,17 @@ def scene_objects(dataset: Any, scene: str, truth: GroundTruth, min_vertices: in
         while len(_KEPT) >= MOST_KEPT:
             _KEPT.popitem(last=False)
         whole = dataset.whole_objects(scene) if isinstance(dataset, KnowsObjects) else None
-        seen = sights(dataset, scene, truth, min_vertices)
+        seen = _sights(dataset, scene, truth, min_vertices)
         _KEPT[key] = dataset, known_objects(truth, min_vertices, whole, seen)
     return _KEPT[key][1]
+
+
+def _sights(dataset: Any, scene: str, truth: GroundTruth, min_vertices: int) -> Mapping[int, Sight] | None:
+    """What frames show of the objects; None where there are none, or where boxes do not tell which pixels are whose."""
+    try:
+        return None if truth.boxes is not None else sights(dataset, scene, truth, min_vertices)
+    except FramesMissing:
+        return None
 
 
 def _annotation_truth(min_vertices: int, truth: GroundTruth, refine: Refine) -> AnnotationTruth:
@@ -150,5 +159,10 @@ def fullest_truth(dataset: Any, scene: str) -> GroundTruth:
     if not dataset.variants:
         raise GroundTruthMissing(f"{dataset.name}/{scene}: the dataset has no ground truth to make questions from")
     variant = next((name for name in FULLEST if name in dataset.variants), dataset.variants[0])
-    truth: GroundTruth = dataset.ground_truth(scene, variant)
+    try:
+        truth: GroundTruth = dataset.ground_truth(scene, variant)
+    except GroundTruthMissing:
+        if BOXES not in dataset.variants:
+            raise
+        truth = dataset.ground_truth(scene, BOXES)
     return truth

@@ -27,7 +27,7 @@ from su3d_bench.core.interfaces import (
     WarmsUp,
 )
 from su3d_bench.core.timing import MethodClock, device_memory_bytes, peak_memory_bytes, start_memory_watch
-from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, Prediction, Proposals, SceneInfo
+from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, ObjectBoxes, Prediction, Proposals, SceneInfo
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import SceneScore, Truth, pack_scores, score_scene
@@ -152,8 +152,18 @@ class _Scene:
         return digest
 
     @cached_property
-    def mesh(self) -> InstanceMesh:
-        mesh: InstanceMesh = self.dataset.instance_mesh(self.job.scene_name)
+    def marked(self) -> InstanceMesh | ObjectBoxes:
+        """What perfect masks are made from: the annotated mesh, or else the boxes of objects."""
+        try:
+            mesh: InstanceMesh = self.dataset.instance_mesh(self.job.scene_name)
+        except GroundTruthMissing as error:
+            try:
+                boxes = self.truth("boxes").boxes
+            except GroundTruthMissing:
+                boxes = None
+            if boxes is None:
+                raise error from None
+            return boxes
         return mesh
 
     def truth(self, variant: str) -> GroundTruth:
@@ -178,13 +188,13 @@ class _Scene:
     def perception(self, info: SceneInfo) -> Perception:
         config = self.perception_config
         profile = resolve_profile(self.job.profile, info.image_domain, config)
-        mesh = self.mesh if profile == "oracle" else None
+        marked = self.marked if profile == "oracle" else None
         return build_perception(
             profile,
             config,
             scene=info,
             cache_root=self.job.cache_root,
-            mesh=mesh,
+            mesh=marked,
             job_index=self.job.index,
             replies=self.job.folder / "language",
             is_offline=self.job.is_offline,

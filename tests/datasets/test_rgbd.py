@@ -22,7 +22,7 @@ from su3d_bench.datasets.recordings.pose_convention import FLIP, judge_scene
 from su3d_bench.datasets.recordings.recorded_frames import read_text, square
 from su3d_bench.datasets.rgbd.dataset import Rgbd, RgbdOptions
 from su3d_bench.datasets.rgbd.description import RgbdDescription
-from su3d_bench.datasets.rgbd.files import camera_to_world, read_intrinsics, read_trajectory_file
+from su3d_bench.datasets.rgbd.files import camera_to_world, direction_in, read_intrinsics, read_trajectory_file
 from su3d_bench.datasets.rooms.dataset import RoomOptions, Rooms
 
 WIDTH, HEIGHT = 12, 8
@@ -518,3 +518,38 @@ def test_every_damaged_description_is_read_or_refused_with_one_line(tmp_path: Pa
     for copies in (truncations(content), damages(content)):
         n_read, n_refused = outcomes(read, copies, must_name="rgbd/desk: rgbd.toml")
         assert n_read > 0 and n_refused > 0
+
+
+@pytest.mark.parametrize(
+    ("header", "said"),
+    [
+        ("World2CamPose", "world_to_camera"),
+        ("# camera-to-world", "camera_to_world"),
+        ("T_w2c", "world_to_camera"),
+        ("Cam2World matrix of frame 7", "camera_to_world"),
+        ("pose", None),
+    ],
+)
+def test_a_header_before_a_pose_is_no_number_and_one_that_says_otherwise_is_named(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, header: str, said: str | None
+) -> None:
+    folder = write_scene(tmp_path)
+    plain = open_scene(tmp_path)
+    for index in range(3):
+        path = folder / f"data/frame-{index}.pose.txt"
+        path.write_text(f"{header}\n{path.read_text()}")
+    caplog.clear()
+    for frame, before in zip(open_scene(tmp_path), plain, strict=True):
+        np.testing.assert_array_equal(frame.camera_to_world, before.camera_to_world)
+    warning = (
+        "rgbd/desk: rgbd.toml: the poses are read as camera_to_world, and 3 of their files say otherwise (the first: "
+        f"frame-0.pose.txt begins with {header!r}); what they are is told by the depth alone"
+    )
+    assert (warning in caplog.text) == (said == "world_to_camera")
+    assert direction_in(header) == said
+
+
+def test_numbers_that_are_not_finite_are_no_header(tmp_path: Path) -> None:
+    folder = write_scene(tmp_path)
+    (folder / "data/frame-1.pose.txt").write_text("nan nan nan nan\n" + "-inf inf nan 0\n" * 3)
+    assert [frame.index for frame in open_scene(tmp_path)] == [0, 2]

@@ -32,12 +32,11 @@ def show(arguments: argparse.Namespace) -> int:
         look = look_at(dataset, scene, arguments.stride, lambda n_done, n: report(Event(name, "frames", n_done, n)))
         draw_scene_picture(look, path)
     if arguments.json:
-        height, width = look.shown[0].rgb.shape[:2]
         table = {
             "scene": name,
             "picture": str(path),
             "n_frames": look.n_frames,
-            "size": [width, height],
+            "size": list(look.shown[0].rgb.shape[1::-1]) if look.shown else None,
             "depth_m": list(look.depth_m),
             "up": None if look.up is None else asdict(look.up),
             "ground_truth": None if look.truth is None else {"variant": look.truth.variant, **look.counts},

@@ -13,6 +13,7 @@ from su3d_bench.core.types import (
     Frame,
     InstanceMesh,
     Int64Array,
+    ObjectBoxes,
     PerceptionNeeds,
 )
 from su3d_bench.perception.cache import FrameCache, content_key
@@ -29,9 +30,11 @@ class OraclePerception:
     profile = "oracle"
     caveat: str | None = ORACLE_CAVEAT
 
-    def __init__(self, config: OracleConfig, mesh: InstanceMesh, encoder: Encoder, cache: FrameCache) -> None:
+    def __init__(
+        self, config: OracleConfig, truth: InstanceMesh | ObjectBoxes, encoder: Encoder, cache: FrameCache
+    ) -> None:
         self.encoder = encoder
-        self.segmenter = OracleSegmenter(mesh, config)
+        self.segmenter = OracleSegmenter(truth, config)
         self._prompt = config.prompt
         self._cache = cache
         self._assembler = Assembler(encoder, cache)

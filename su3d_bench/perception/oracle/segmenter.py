@@ -1,4 +1,4 @@
-"""Perfect detections: masks projected from the annotated mesh, with noise on request."""
+"""Perfect detections: masks projected from the annotated mesh or the boxes of objects, with noise on request."""
 
 from __future__ import annotations
 
@@ -8,7 +8,8 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from su3d_bench.core.digests import package_digest
-from su3d_bench.core.types import Float32Array, Frame, InstanceMesh, Int32Array, Regions
+from su3d_bench.core.types import Float32Array, Frame, InstanceMesh, Int32Array, ObjectBoxes, Regions
+from su3d_bench.numerics.geometry import back_project
 from su3d_bench.numerics.open3d_core import compiled_open3d
 from su3d_bench.perception.cache import CACHE_SOURCES, array_digest, content_key
 from su3d_bench.perception.crops import mask_boxes
@@ -19,7 +20,14 @@ if TYPE_CHECKING:
 
 
 # What moves the regions: their key follows it.
-SOURCES = ("perception/oracle/noise.py", "perception/oracle/segmenter.py", "numerics/open3d_core.py", *CACHE_SOURCES)
+SOURCES = (
+    "core/types.py",
+    "numerics/geometry.py",
+    "numerics/open3d_core.py",
+    "perception/oracle/noise.py",
+    "perception/oracle/segmenter.py",
+    *CACHE_SOURCES,
+)
 
 
 class OracleConfig(BaseModel):
@@ -92,6 +100,22 @@ class MeshProjector:
         return instance
 
 
+class BoxProjector:
+    """Instance images of objects whose boxes are known: what a pixel measures is of the smallest box that holds it."""
+
+    def __init__(self, boxes: ObjectBoxes, config: OracleConfig) -> None:
+        self._boxes = boxes
+        self._slack_m = config.depth_tolerance_m
+
+    def instance_image(self, frame: Frame) -> Int32Array:
+        """The instance id (H, W) of every pixel, 0 where there is none."""
+        measured = np.isfinite(frame.depth_m) & (frame.depth_m > 0)
+        points = back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, measured)
+        instance = np.zeros(frame.depth_m.shape, np.int32)
+        instance[measured] = self._boxes.instance_at(points, self._slack_m)
+        return instance
+
+
 def pixel_rays(frame: Frame) -> Float32Array:
     """World rays (H, W, 6) of the pixels: origin and direction, scaled so that a hit's parameter is its depth."""
     height, width = frame.depth_m.shape
@@ -103,34 +127,46 @@ def pixel_rays(frame: Frame) -> Float32Array:
     return rays
 
 
+def _digest_of_boxes(truth: ObjectBoxes) -> str:
+    boxes = [truth.boxes[instance] for instance in sorted(truth.boxes)]
+    parts = [(box.centre, box.sizes, box.rotation.ravel()) for box in boxes]
+    rows = np.array([np.concatenate(part) for part in parts]).reshape(-1, 15)
+    return array_digest(np.array(sorted(truth.boxes), np.int64), rows)
+
+
 class OracleSegmenter:
     """Regions that are the visible parts of the true instances, named by their class, all scored 1."""
 
     name = "oracle"
 
-    def __init__(self, mesh: InstanceMesh, config: OracleConfig) -> None:
-        self._mesh = mesh
+    def __init__(self, truth: InstanceMesh | ObjectBoxes, config: OracleConfig) -> None:
+        self._truth = truth
         self._config = config
-        self._projector = MeshProjector(mesh, config)
-        names = [f"{key}={mesh.class_of_instance[key]}" for key in sorted(mesh.class_of_instance)]
-        truth = array_digest(mesh.vertices, mesh.triangles, mesh.instance_of_triangle)
+        self._projector: MeshProjector | BoxProjector
+        if isinstance(truth, InstanceMesh):
+            self._projector = MeshProjector(truth, config)
+            digest = array_digest(truth.vertices, truth.triangles, truth.instance_of_triangle)
+        else:
+            self._projector = BoxProjector(truth, config)
+            digest = _digest_of_boxes(truth)
+        names = [f"{key}={truth.class_of_instance[key]}" for key in sorted(truth.class_of_instance)]
         self.digest = content_key(
             "oracle",
             config.model_dump_json(),
             package_digest(*SOURCES),
-            truth,
-            *mesh.labels.names,
+            digest,
+            *truth.labels.names,
             *names,
         )
 
     def segment(self, frame: Frame) -> Regions:
         instance = self._projector.instance_image(frame)
         ids, counts = np.unique(instance, return_counts=True)
-        of_class = self._mesh.class_of_instance
+        of_class = self._truth.class_of_instance
         kept = [int(i) for i, n in zip(ids, counts, strict=True) if n >= self._config.min_pixels and int(i) in of_class]
-        names = [self._mesh.labels.name_of(of_class[i]) for i in kept]
+        names = [self._truth.labels.name_of(of_class[i]) for i in kept]
         masks = [instance == i for i in kept]
-        known = sorted({self._mesh.labels.name_of(c) for c in of_class.values()})
+        known = sorted({self._truth.labels.name_of(c) for c in of_class.values()})
         masks, names = disturb(masks, names, known, self._config.noise, frame.index)
         pairs = [(m, n) for m, n in zip(masks, names, strict=True) if np.count_nonzero(m) >= self._config.min_pixels]
         stacked = np.array([m for m, _ in pairs], bool).reshape(len(pairs), *instance.shape)

@@ -1,0 +1,145 @@
+"""Replica's boxes as a ground truth of their own: scenes without mesh, without frames, or without both."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from box_room import CLASSES, SIZE, pose, write_box_room, write_poses
+
+from su3d_bench.cli.main import main
+from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing
+from su3d_bench.core.types import LabelSet, ObjectBoxes, OrientedBox
+from su3d_bench.datasets.checks import inspect
+from su3d_bench.datasets.replica.dataset import Replica
+from su3d_bench.perception.oracle.segmenter import OracleConfig, OracleSegmenter
+from su3d_bench.questions.truths import questions_of
+from su3d_bench.reports.pictures.scene_look import look_at
+
+INFO = "replica_v1/room_0/habitat/info_semantic.json"
+THICK_M = 0.1
+THINGS = {7: "chair", 8: "lamp"}  # which the frames do not show
+
+
+def box(side: int) -> dict[str, object]:
+    """The flat box of one of the room's six sides, the middle of its thickness on the wall."""
+    axis, is_high = divmod(side - 1, 2)
+    centre, sizes = SIZE / 2, SIZE.copy()
+    centre[axis], sizes[axis] = is_high * SIZE[axis], THICK_M
+    half = {"rotation": [0.0, 0.0, 0.0, 1.0], "translation": [0.0, 0.0, 0.0]}
+    return {"abb": {"center": centre.tolist(), "sizes": sizes.tolist()}, "orientation": half}
+
+
+@pytest.fixture
+def root(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A scene with frames and boxes, without its mesh."""
+    write_box_room(tmp_path)
+    info = tmp_path / INFO
+    table = json.loads(info.read_text())
+    for row in table["objects"]:
+        row["oriented_bbox"] = box(row["id"])
+    ids = {row["name"]: row["id"] for row in table["classes"]}
+    for number, name in THINGS.items():
+        straight = {"rotation": [0.0, 0.0, 0.0, 1.0], "translation": [float(number) - 6.5, 0.5, 0.0]}
+        small = {"abb": {"center": [0.0, 0.0, 0.25], "sizes": [0.5, 0.5, 0.5]}, "orientation": straight}
+        table["objects"].append({"id": number, "class_id": ids[name], "oriented_bbox": small})
+    info.write_text(json.dumps(table))
+    info.with_name("mesh_semantic.ply").unlink()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path))
+    return tmp_path
+
+
+def test_boxes_are_a_truth_whose_points_lie_on_their_sides_and_whose_objects_have_classes(root: Path) -> None:
+    truth = Replica(root).ground_truth("room0", "boxes")
+    assert truth.boxes is not None and sorted(truth.boxes.boxes) == sorted(set(truth.instance)) == list(range(2, 10))
+    names = {int(i): truth.labels.name_of(int(c)) for i, c in zip(truth.instance, truth.semantic, strict=True)}
+    assert names == {number + 1: name for number, name in {**CLASSES, **THINGS}.items()}
+    for instance, known in truth.boxes.boxes.items():
+        points = truth.points[truth.instance == instance].astype(np.float64)
+        np.testing.assert_allclose(np.ptp(points, axis=0), known.sizes, atol=1e-6)
+        to_side = np.abs(np.abs((points - known.centre) @ known.rotation) - known.sizes / 2).min(axis=1)
+        assert to_side.max() < 1e-6
+
+
+def test_the_smallest_box_that_holds_a_point_has_it() -> None:
+    boxes = {
+        7: OrientedBox(np.zeros(3), np.full(3, 4.0), np.eye(3)),
+        3: OrientedBox(np.zeros(3), np.ones(3), np.eye(3)),
+    }
+    known = ObjectBoxes(boxes, {7: 1, 3: 2}, LabelSet("a", (1, 2), ("room", "chair")))
+    points = np.array([[0.4, 0, 0], [0.54, 0, 0], [0.56, 0, 0], [2.04, 0, 0], [2.06, 0, 0]])
+    assert known.instance_at(points, 0.05).tolist() == [3, 3, 7, 7, 0]
+
+
+def test_without_the_mesh_the_check_holds_frames_against_boxes(root: Path) -> None:
+    found = inspect(Replica(root), "room0")
+    assert found.findings == () and found.meeting is not None and found.meeting.share == 1.0
+    write_poses(root / "Replica" / "room0", [np.linalg.inv(pose(index)) for index in range(8)])
+    found = inspect(Replica(root), "room0")
+    assert found.meeting is not None and found.meeting.share < 0.4
+    assert any("with the poses inverted it is 100%" in finding.text for finding in found.findings)
+
+
+def test_boxes_give_perfect_masks(root: Path) -> None:
+    replica = Replica(root)
+    with pytest.raises(GroundTruthMissing):
+        replica.instance_mesh("room0")
+    boxes = replica.ground_truth("room0", "boxes").boxes
+    assert boxes is not None
+    frame = replica.frames("room0", 1)[0]
+    regions = OracleSegmenter(boxes, OracleConfig(min_pixels=10)).segment(frame)
+    assert regions.masks.sum() == frame.depth_m.size and not (regions.masks.sum(axis=0) > 1).any()
+    assert regions.names is not None and set(regions.names) <= {"wall", "floor", "ceiling"} and len(regions.names) >= 3
+    words = "run --scenes replica/room0 --profile oracle --stride 4 --no-pictures --jobs 1 --quiet --out out"
+    assert main(words.split()) == 0
+
+
+def test_questions_are_made_from_boxes(root: Path) -> None:
+    texts = {question.text for question in questions_of(Replica(root), "room0")}
+    assert {"chair", "lamp"} <= texts and not any("floor" in text for text in texts)
+
+
+def test_a_scene_without_frames_can_be_looked_at_and_not_run(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    shutil.rmtree(root / "Replica")
+    replica = Replica(root)
+    assert replica.scenes() == ("room0",) and replica.info("room0", 1).n_frames == 0
+    assert replica.status("room0").startswith("no frames, 8 boxes of objects, no mesh (")
+    with pytest.raises(FramesMissing, match=r"replica/room0: no frames; expected traj\.txt and results/"):
+        replica.frames("room0", 1)
+    look = look_at(replica, "room0")
+    assert look.shown == () and look.counts["n_objects"] == 8
+    for words in ("datasets show replica/room_0", "datasets show replica/room0 --json --out a.png", "datasets list"):
+        assert main([*words.split(), "--quiet"]) == 0
+    assert main(["datasets", "check", "replica/room0", "--quiet"]) == 0
+    assert "warning       no frames; expected traj.txt" in capsys.readouterr().out
+    assert main(["questions", "make", "--scenes", "replica/room0", "--out", "a.toml", "--quiet"]) == 0
+    assert main(["run", "--scenes", "replica/room0", "--jobs", "1", "--quiet", "--out", "out"]) == 3
+    assert "no frames; expected traj.txt and results/" in capsys.readouterr().err
+
+
+def test_beside_rendered_scenes_one_without_frames_is_reached_by_its_name_alone(root: Path) -> None:
+    shutil.copytree(root / "replica_v1" / "room_0", root / "replica_v1" / "apartment_0")
+    replica = Replica(root)
+    assert replica.scenes() == ("room0",)
+    assert len(replica.object_boxes("apartment_0")) == 8
+    for name in ("apartment_1", "../replica_v1/apartment_0", ".", ""):
+        with pytest.raises(DataError, match="no scene"):
+            replica.info(name, 1)
+
+
+def test_a_table_without_boxes_is_no_truth_and_one_of_too_many_is_refused(root: Path) -> None:
+    info = root / INFO
+    table = json.loads(info.read_text())
+    rows = [{**table["objects"][0], "id": number} for number in range(10_001)]
+    info.write_text(json.dumps({**table, "objects": rows}))
+    with pytest.raises(DataError, match="10001 objects have a box; expected at most 10000"):
+        Replica(root).ground_truth("room0", "boxes")
+    for row in table["objects"]:
+        del row["oriented_bbox"]
+    info.write_text(json.dumps(table))
+    with pytest.raises(GroundTruthMissing, match="no object of a class has a box"):
+        Replica(root).ground_truth("room0", "boxes")
