@@ -245,7 +245,7 @@ def _result(
     scored = {scene: scores[rules.name, scene] for scene in planned if (rules.name, scene) in scores}
     failed = {scene: mine[scene].error for scene in planned if mine[scene].error is not None}
     scenes = [scene for protocol, scene in scores if protocol == rules.name]
-    doubts = tuple(line for scene in scored for line in mine[scene].doubts)
+    doubts = tuple(line for scene in sorted(scored) for line in mine[scene].doubts)
     numbers = NumbersRecord(**combine(rules, scored).to_json()) if scored else None
     if numbers is not None:
         numbers = replace(numbers, warnings=(*numbers.warnings, *doubts))
