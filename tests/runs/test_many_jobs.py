@@ -118,13 +118,18 @@ def made_scene(rng: np.random.Generator, n_rows: int, has_ties: bool) -> instanc
     has_truth = rng.random(N_CLASSES) < 0.7
     has_truth[0], has_truth[-1] = True, False
     class_index = rng.integers(0, N_CLASSES, n_rows).astype(np.int32)
+    threshold_index = rng.integers(0, 10, n_rows).astype(np.int32)
+    is_true = (rng.random(n_rows) < 0.5) & has_truth[class_index]
+    n_met = np.zeros((N_CLASSES, 10), np.int64)
+    np.add.at(n_met, (class_index[is_true], threshold_index[is_true]), 1)
+    n_truth = (n_met.max(axis=1) + rng.integers(1, 4, N_CLASSES)) * has_truth
     return instance_ap.InstanceCounts(
         class_index=class_index,
-        threshold_index=rng.integers(0, 10, n_rows).astype(np.int32),
+        threshold_index=threshold_index,
         score=rng.integers(0, 5, n_rows) / 4 if has_ties else rng.random(n_rows),
-        is_true=(rng.random(n_rows) < 0.5) & has_truth[class_index],
-        n_missed=rng.integers(1, 4, (N_CLASSES, 10)) * has_truth[:, None],
-        n_truth=(n_rows + 4) * has_truth,
+        is_true=is_true,
+        n_missed=n_truth[:, None] - n_met,
+        n_truth=n_truth,
         n_small_truth=np.zeros(N_CLASSES, np.int64),
         n_predictions=np.full(N_CLASSES, n_rows),
     )
