@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,6 +16,8 @@ from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.formats.numpy_files import read_npz
 from su3d_bench.metrics.protocols import ProtocolRules
+
+MOST_NAMES = 1 << 20
 
 
 @dataclass(frozen=True)
@@ -79,13 +82,14 @@ def read_text_features(path: Path | None) -> TextFeatures | None:
     if names.ndim != 1 or names.dtype.kind != "U" or features.ndim != 2 or features.dtype.kind != "f":
         raise DataError(f"{where}: names {names.shape} {names.dtype.kind}, features {features.shape}; expected texts "
                         "(C,) and numbers (C, D)")  # fmt: skip
-    if len(names) != len(features) or not len(names) or not np.isfinite(features).all():
+    if not 0 < len(names) == len(features) <= MOST_NAMES or not np.isfinite(features).all():
         raise DataError(
-            f"{where}: {len(names)} names and features {features.shape}; expected one finite row of features a name"
+            f"{where}: {len(names)} names and features {features.shape}; expected one finite row of features a name, "
+            f"at most {MOST_NAMES}"
         )
     texts = tuple(str(name) for name in names)
     if len(set(texts)) < len(texts):
-        twice = next(text for k, text in enumerate(texts) if text in texts[:k])
+        twice = Counter(texts).most_common(1)[0][0]
         raise DataError(f"{where}: '{printable(twice, 80)}' stands there twice; give each name once")
     maker = arrays.get("encoder")
     if maker is not None and (maker.ndim != 0 or maker.dtype.kind != "U"):

@@ -13,7 +13,8 @@ from su3d_bench.core.types import Float32Array, Float64Array, Int32Array
 
 MOST_POINTS = 100_000_000  # points of one scene; the largest scans of rooms have some millions
 MOST_MASKS = 100_000  # of one scene; methods give some hundred
-ROWS_AT_ONCE = 1 << 16
+MOST_MEMBERS = 50_000_000  # points of all masks of a scene together; 600 of a large ScanNet scene have 10 million
+ROWS_AT_ONCE, VALUES_AT_ONCE = 1 << 16, 1 << 25  # 600 masks of 55,000 points
 
 
 def matrix_of(value: object, where: str, what: str = "the masks") -> NDArray[Any]:
@@ -31,13 +32,22 @@ def check_sizes(n_points: int, n_masks: int, where: str) -> None:
         raise PredictionError(f"{where}: {n_masks} masks of {n_points} points; is it damaged?")
 
 
+def check_members(n: int, where: str) -> None:
+    """Refuses masks that hold more points together than those of any scene, before they take memory."""
+    if n > MOST_MEMBERS:
+        raise PredictionError(f"{where}: the masks hold more than {MOST_MEMBERS} points together; is it damaged?")
+
+
 def column_members(matrix: NDArray[Any], where: str) -> list[Int32Array]:
     """The rows that are not zero in each column of (points, masks)."""
     n_points, n_masks = matrix.shape
     check_sizes(n_points, n_masks, where)
     parts: list[list[Int32Array]] = [[] for _ in range(n_masks)]
-    for start in range(0, n_points, ROWS_AT_ONCE):
-        part = np.ascontiguousarray((matrix[start : start + ROWS_AT_ONCE] != 0).T)
+    n = 0
+    n_rows = max(1, min(ROWS_AT_ONCE, VALUES_AT_ONCE // max(n_masks, 1)))
+    for start in range(0, n_points, n_rows):
+        part = np.ascontiguousarray((matrix[start : start + n_rows] != 0).T)
+        check_members(n := n + int(np.count_nonzero(part)), where)
         for k in range(n_masks):
             parts[k].append((np.flatnonzero(part[k]) + start).astype(np.int32))
     return [np.concatenate([np.zeros(0, np.int32), *part]) for part in parts]
@@ -59,6 +69,7 @@ def run_members(length: object, counts: object, where: str) -> Int32Array:
         raise PredictionError(
             f"{where}: run of {size} points from {start} on, of {length} points; runs count from 1 and ascend"
         )
+    check_members(int(sizes.sum()), where)
     before = np.cumsum(sizes) - sizes
     members: Int32Array = np.arange(int(sizes.sum()), dtype=np.int32)
     members += np.repeat((starts - before).astype(np.int32), sizes)

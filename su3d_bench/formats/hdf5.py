@@ -19,12 +19,12 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, reading
 from su3d_bench.core.types import Float32Array, Int32Array
+from su3d_bench.store.unpacking import Allowance
 
 FloatArray = NDArray[np.floating[Any]]
 BLOCK_BYTES = 16 << 20
 MOST_CHUNK_BYTES = 64 << 20  # chunks that h5py chooses itself stay below 1 MB
 MOST_COLUMNS = 1 << 16  # of a table whose width is not known; features have some thousand
-MOST_EXPANSION = 1032  # the most that deflate can expand a byte to
 DEFLATE, SHUFFLE = 1, 2  # H5Z_FILTER_DEFLATE and H5Z_FILTER_SHUFFLE
 # What h5py raises on damaged files; it has no base class of its own.
 LIBRARY_ERRORS = (OSError, KeyError, ValueError, RuntimeError, TypeError, AttributeError)
@@ -34,7 +34,13 @@ def read_rows(path: Path, n_columns: int, where: str) -> Float32Array:
     """The whole table (N, ``n_columns``) as float32; ``where`` begins each message."""
     with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite
         blocks = [block.astype(np.float32) for block in row_blocks(path, n_columns, where)]
-    return np.concatenate([np.zeros((0, n_columns), np.float32), *blocks])
+    table = np.empty((sum(map(len, blocks)), n_columns), np.float32)
+    start = 0
+    while blocks:  # each is let go as soon as it is copied
+        block = blocks.pop(0)
+        table[start : start + len(block)] = block
+        start += len(block)
+    return table
 
 
 def largest_column(path: Path, n_columns: int, where: str) -> Int32Array:
@@ -106,19 +112,21 @@ def _check_form(table: Any, n_columns: int, file_bytes: int, where: str) -> None
         raise DataError(f"{where}: holds values of type {str(dtype)[:40]}; expected float16, float32 or float64")
     if shape is None or len(shape) != 2 or shape[1] != n_columns:
         raise DataError(f"{where}: has the shape {str(shape)[:60]}; expected (N, {n_columns})")
-    promised = shape[0] * n_columns * dtype.itemsize
-    at_most = file_bytes if chunks is None else file_bytes * MOST_EXPANSION
-    if promised > at_most or (chunks is None and table.id.get_storage_size() != promised):
-        raise DataError(
-            f"{where}: promises {shape[0]} rows of {n_columns} values, {promised} bytes, but the file has "
-            f"{file_bytes}; it is cut short or damaged"
-        )
-    if chunks is not None:
+    unpacked = shape[0] * n_columns * dtype.itemsize
+    at_most = file_bytes if chunks is None else Allowance(file_bytes).n_bytes
+    if chunks is not None and unpacked <= at_most:
         chunk_bytes = int(np.prod([int(side) for side in chunks], dtype=object)) * dtype.itemsize
-        if len(chunks) != 2 or not 0 < chunk_bytes <= MOST_CHUNK_BYTES:
+        if not 0 < chunk_bytes <= MOST_CHUNK_BYTES:
             raise DataError(
                 f"{where}: is stored in chunks of {str(chunks)[:60]}; expected at most {MOST_CHUNK_BYTES} bytes each"
             )
+        unpacked = -(-shape[0] // chunks[0]) * -(-n_columns // chunks[1]) * chunk_bytes
+    if unpacked > at_most or (chunks is None and table.id.get_storage_size() != unpacked):
+        raise DataError(
+            f"{where}: promises {shape[0]} rows of {n_columns} values, {unpacked} bytes, but the file has "
+            f"{file_bytes}; it is cut short or damaged, or unpacks to far more than it is: save it without compression"
+        )
+    if chunks is not None:
         for code, values in _filters(table):
             if code not in (DEFLATE, SHUFFLE) or (code == SHUFFLE and values[:1] != (dtype.itemsize,)):
                 raise DataError(
@@ -138,21 +146,22 @@ def _chunked_blocks(table: Any, where: str) -> Iterator[FloatArray]:
     """One block for each row of chunks."""
     (n_rows, n_columns), (height, width) = table.shape, table.chunks
     codes = [code for code, _ in _filters(table)]
+    stored: dict[tuple[int, ...], Any] = {}  # found in one pass: asked one by one, each takes as long as all
+    table.id.chunk_iter(lambda one: stored.setdefault(tuple(one.chunk_offset), one) and None)
     for top in range(0, n_rows, height):
         block = np.empty((min(height, n_rows - top), n_columns), table.dtype)
         for left in range(0, n_columns, width):
-            chunk = _chunk(table, (top, left), codes, where)
+            chunk = _chunk(table, (top, left), stored.get((top, left)), codes, where)
             part = block[:, left : left + width]
             part[:] = chunk[: part.shape[0], : part.shape[1]]
         yield block
 
 
-def _chunk(table: Any, corner: tuple[int, int], codes: list[int], where: str) -> FloatArray:
-    """The values of the chunk whose first value is at ``corner``."""
+def _chunk(table: Any, corner: tuple[int, int], stored: Any, codes: list[int], where: str) -> FloatArray:
+    """The values of the chunk whose first value is at ``corner`` and whose bytes are where ``stored`` says."""
     n_bytes = table.chunks[0] * table.chunks[1] * table.dtype.itemsize
-    stored = table.id.get_chunk_info_by_coord(corner)
     # compression that gains nothing adds a little: zlib's bound is below a thousandth and 64 bytes
-    if stored.byte_offset is None or not 0 < stored.size <= n_bytes + n_bytes // 1000 + 64:
+    if stored is None or stored.byte_offset is None or not 0 < stored.size <= n_bytes + n_bytes // 1000 + 64:
         raise DataError(f"{where}: the values from row {corner[0]} on are missing or damaged; copy the file again")
     skipped, content = table.id.read_direct_chunk(corner)
     for index, code in reversed(list(enumerate(codes))):

@@ -23,11 +23,12 @@ from su3d_bench.formats.ply import ListColumn
 UInt16Array = NDArray[np.uint16]
 Image = TypeVar("Image", UInt8Array, UInt16Array)
 Size = tuple[int, int]  # width, height in pixels
-MAX_PIXELS = 100_000_000  # no RGB-D camera has more; a damaged header may promise 4 billion
+MAX_PIXELS = 50_000_000  # no RGB-D camera has more; a damaged header may promise 4 billion
 PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"
-MAX_BYTES = 1 << 30  # of one file; 100 million pixels of 16-bit RGB take 600 MB
+MAX_BYTES = 1 << 30  # of one file; 50 million pixels of 16-bit RGB take 300 MB
 JPEG_START, JPEG_END = b"\xff\xd8\xff", b"\xff\xd9"
 JPEG_END_WITHIN = 1024  # some writers put a little behind the end of the image
+JPEG_SCAN, MAX_SCANS = b"\xff\xda", 100  # a progressive JPEG has some ten; each goes over the whole image
 JPEG_FRAMES = {*range(0xC0, 0xD0)} - {0xC4, 0xC8, 0xCC}  # the markers that carry the size
 PORTABLE_MAP = re.compile(rb"(P[56])\s+(?:#[^\n]*\s+)*(\d{1,6})\s+(\d{1,6})\s+(\d{1,5})\s")
 
@@ -65,7 +66,11 @@ def decode_colour(content: bytes, where: str) -> UInt8Array:
         return _portable_map(content, b"P6", where)
     header = whole_png_header(content) if kind == "PNG" else None
     # Some decoders fill what a cut JPEG lacks with grey.
-    is_whole = header is not None if kind == "PNG" else JPEG_END in content[-JPEG_END_WITHIN:]
+    is_whole = (
+        header is not None
+        if kind == "PNG"
+        else JPEG_END in content[-JPEG_END_WITHIN:] and content.count(JPEG_SCAN) <= MAX_SCANS
+    )
     size = image_size(content)
     image = None
     if is_whole and size is not None and 0 < size[0] * size[1] <= MAX_PIXELS:

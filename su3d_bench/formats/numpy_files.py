@@ -20,11 +20,8 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import PredictionError, printable, reading, shown
 from su3d_bench.formats.pickles.pickle_constructors import MOST_DIMENSIONS, SIMPLE_TYPE, RefusedError, check_texts
 from su3d_bench.formats.pickles.pickles import read_pickle
+from su3d_bench.store.unpacking import Allowance, UnpackingError, allowance_of, member_bytes
 
-MOST_MEMBER = 4 << 30  # bytes; masks of a scene are some hundred MiB
-MOST_RATIO = 1032  # deflate cannot do better
-NEEDED_BY_DEFLATE = 64
-ENCRYPTED = 0x1
 # What zipfile raises on a damaged archive; RuntimeError is its answer to a compression that it does not know.
 ZIP_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError, struct.error)
 
@@ -41,23 +38,17 @@ def opened_zip(path: Path) -> Iterator[zipfile.ZipFile]:
         raise PredictionError(f"{shown(path)}: not a whole zip archive; copy the file again") from error
 
 
-def read_member(archive: zipfile.ZipFile, name: str, where: str) -> bytes:
+def read_member(archive: zipfile.ZipFile, name: str, where: str, allowance: Allowance) -> bytes:
     """The content of a member, stored or deflated, with its checksum held against it."""
     try:
         info = archive.getinfo(name)
     except KeyError as error:
         raise PredictionError(f"{where}: '{name}' is not in the archive") from error
-    packed, name = info.compress_size, printable(name, 80)
-    if archive.fp is None or packed > archive.fp.seek(0, io.SEEK_END):
-        raise PredictionError(f"{where}: '{name}' promises more bytes than the archive has; copy the file again")
-    if info.flag_bits & ENCRYPTED or info.compress_type not in {zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED}:
-        raise PredictionError(f"{where}: '{name}' is encrypted or compressed in an unusual way; write it plainly")
-    most = packed if info.compress_type == zipfile.ZIP_STORED else packed * MOST_RATIO + NEEDED_BY_DEFLATE
-    if info.file_size > min(most, MOST_MEMBER):
-        raise PredictionError(
-            f"{where}: '{name}' promises {info.file_size} bytes out of {packed}; the file is damaged or hostile"
-        )
-    content = archive.read(info)
+    name = printable(name, 80)
+    try:
+        content = member_bytes(archive, info, allowance)
+    except UnpackingError as error:
+        raise PredictionError(f"{where}: {error}") from error
     if len(content) != info.file_size:
         raise PredictionError(f"{where}: '{name}' has {len(content)} of {info.file_size} bytes; copy the file again")
     return content
@@ -143,8 +134,8 @@ def read_npz(path: Path, names: Sequence[str] | None = None) -> dict[str, NDArra
     with opened_zip(path) as archive:
         there = [name.removesuffix(".npy") for name in archive.namelist() if name.endswith(".npy")]
         chosen = [name for name in there if names is None or name in names]
-        where = shown(path)
-        members = {name: read_member(archive, f"{name}.npy", where) for name in chosen}
+        where, allowance = shown(path), allowance_of(archive)
+        members = {name: read_member(archive, f"{name}.npy", where, allowance) for name in chosen}
     return {name: npy_array(content, f"{where}: '{printable(name, 80)}'") for name, content in members.items()}
 
 

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import DataError, printable, reading
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
 from su3d_bench.store.atomic import write_bytes
+from su3d_bench.store.unpacking import Allowance, UnpackingError
 
 MOST_HEADER_BYTES = 1 << 16  # headers have some hundred
 MOST_FIELDS, MOST_VALUES = 256, 1 << 16  # of a point; histograms of features have some hundred values
@@ -173,6 +174,10 @@ def _compressed_points(content: bytes, header: Header, axes: list[Field], where:
         raise _too_short(n_packed, len(content) - at, "packed bytes", "bytes", where)
     if n_plain != promised or n_plain > n_packed * MOST_EXPANSION:
         raise _too_short(promised, n_plain, "bytes", f"bytes out of {n_packed} packed ones", where)
+    try:
+        Allowance(len(content)).spend(n_plain + header.n_points * len(AXES) * np.dtype(np.float64).itemsize)
+    except UnpackingError as error:
+        raise DataError(f"{where}: {error}") from error
     plain = _inflated(np.frombuffer(content, np.uint8, n_packed, at), n_plain)
     if plain is None:
         raise DataError(f"{where}: its compressed points are damaged; copy the file again")

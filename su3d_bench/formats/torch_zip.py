@@ -29,6 +29,7 @@ from su3d_bench.formats.pickles.pickle_constructors import (
     named,
 )
 from su3d_bench.formats.pickles.pickles import read_pickle
+from su3d_bench.store.unpacking import Allowance, allowance_of
 
 Kind = Literal["tensor", "sparse", "array", "dict", "tuple", "other"]
 ZIP_START = b"PK\x03\x04"
@@ -99,6 +100,18 @@ def torch_kind(path: Path) -> Kind | None:
     return next((kind for kind, form in ENDINGS if form.fullmatch(head + tail)), "other")
 
 
+def check_stored(path: Path) -> None:
+    """Refuses an archive of torch.save that is compressed: torch writes none, and would unpack any."""
+    with reading(shown(path)), path.open("rb") as stream:
+        is_zip = stream.read(4) == ZIP_START
+    if is_zip:
+        with opened_zip(path) as archive:
+            members, n_bytes = archive.infolist(), path.stat().st_size
+        is_stored = all(info.compress_type == zipfile.ZIP_STORED for info in members)
+        if not is_stored or sum(info.file_size for info in members) > n_bytes:
+            raise PredictionError(f"{shown(path)}: is compressed, which torch.save does not do; copy the file again")
+
+
 def read_torch(path: Path) -> object:
     """The value that ``torch.save`` wrote: tensors as read-only arrays or ``SparseTensor``, containers, plain values.
 
@@ -106,10 +119,16 @@ def read_torch(path: Path) -> object:
     """
     _check_start(path)
     with opened_zip(path) as archive:
-        content = read_member(archive, name := _pickle_name(archive, path), shown(path))
-        storages = _Storages(archive, name.removesuffix(PICKLE_NAME), path)
+        name, allowance = _pickle_name(archive, path), allowance_of(archive)
+        content = read_member(archive, name, shown(path), allowance)
+        storages = _Storages(archive, name.removesuffix(PICKLE_NAME), path, allowance)
         return read_pickle(
-            io.BytesIO(content), len(content), shown(path), constructors=constructors(), persistent=storages.find
+            io.BytesIO(content),
+            len(content),
+            shown(path),
+            n_packed=path.stat().st_size,
+            constructors=constructors(),
+            persistent=storages.find,
         )
 
 
@@ -135,13 +154,13 @@ def _pickle_name(archive: zipfile.ZipFile, path: Path) -> str:
 class _Storages:
     """The storages of an archive, each read once."""
 
-    def __init__(self, archive: zipfile.ZipFile, prefix: str, path: Path) -> None:
-        self._archive, self._prefix, self._path = archive, prefix, path
+    def __init__(self, archive: zipfile.ZipFile, prefix: str, path: Path, allowance: Allowance) -> None:
+        self._archive, self._prefix, self._path, self._allowance = archive, prefix, path, allowance
         self._contents: dict[str, bytes] = {}
-        self._n_file = path.stat().st_size
+        self._n_left = path.stat().st_size
         self._order = "<"
         if f"{prefix}byteorder" in archive.namelist():
-            order = read_member(archive, f"{prefix}byteorder", shown(path))
+            order = read_member(archive, f"{prefix}byteorder", shown(path), allowance)
             if order not in {b"little", b"big"}:
                 raise PredictionError(f"{shown(path)}: byteorder is {clip(order)}; expected little or big")
             self._order = "<" if order == b"little" else ">"
@@ -159,15 +178,19 @@ class _Storages:
         if not isinstance(name, str) or re.fullmatch(r"\d{1,9}", name) is None or type(n) is not int:
             raise RefusedError("a reference without a valid name or size")
         if name not in self._contents:
-            content = read_member(self._archive, f"{self._prefix}data/{name}", str(self._path))
-            self._contents[name] = content
-            if sum(len(content) for content in self._contents.values()) > self._n_file:
-                raise RefusedError("its storages are larger than the file; torch.save does not compress them")
+            self._contents[name] = self._read(f"{self._prefix}data/{name}")
         code = CODES.get(key[1].name.removesuffix("Storage"))
         content = self._contents[name]
         if code is not None and n * int(code[-1]) != len(content):
             raise RefusedError(f"storage {name} of {n} values has {len(content)} bytes")
         return Storage(content, code, self._order)
+
+    def _read(self, member: str) -> bytes:
+        info = self._archive.NameToInfo.get(member)
+        self._n_left -= 0 if info is None else info.file_size
+        if self._n_left < 0:
+            raise RefusedError("its storages are larger than the file; torch.save does not compress them")
+        return read_member(self._archive, member, shown(self._path), self._allowance)
 
 
 def _tensor(args: tuple[object, ...], _budget: Budget) -> object:

@@ -22,16 +22,13 @@ from su3d_bench.core.types import (
     Partition,
     starts_of,
 )
-from su3d_bench.formats.arrays import MOST_MASKS, MOST_POINTS
+from su3d_bench.formats.arrays import MOST_MASKS, MOST_POINTS, check_members
 from su3d_bench.metrics.matching.nearest import masks_of_partition
 from su3d_bench.metrics.protocols import ProtocolRules
 
 NO_SCORES = "the file has no scores: 1 for every mask"
 ONES = "the format has no scores: 1 for every object"
 Numbering = Literal["id", "index"]
-MOST_MEMBERS = (
-    200_000_000  # points of all masks of a scene together; 600 masks of a large ScanNet scene have 10 million
-)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -138,9 +135,7 @@ def vertex_masks(
     parts: list[Int32Array] = []
     n = 0
     for part in members:
-        n += len(part)
-        if n > MOST_MEMBERS:
-            raise PredictionError(f"{where}: the masks hold more than {MOST_MEMBERS} points together; is it damaged?")
+        check_members(n := n + len(part), where)
         parts.append(part)
     masks = Masks.of_sets(parts)
     try:

@@ -17,6 +17,7 @@ from su3d_bench.core.types import Float32Array, Instances
 from su3d_bench.formats.arrays import MOST_MASKS, checked_points, kind_of, without_nonfinite
 from su3d_bench.formats.pickles.pickles import read_pickle_file
 from su3d_bench.predictions.base import ONES, Reader, ScenePrediction, first_found, instances_of, named_once
+from su3d_bench.store.unpacking import Allowance, UnpackingError
 
 SUFFIX = ".pkl.gz"
 POST = f"_post{SUFFIX}"
@@ -49,8 +50,24 @@ class ConceptGraphs(Reader):
         if not isinstance(value, dict) or not isinstance(value.get("objects"), list):
             raise PredictionError(f"{where}: holds {kind_of(value)} without a list of 'objects'; expected a map")
         background = _background(value.get("bg_objects"), where)
+        _check_sum([*value["objects"], *background], file, where)
         instances, more = _instances(value["objects"], background, _class_names(value.get("class_names")), where)
         return ScenePrediction(scene, self.name, file, instances, (ONES, *remarks, *more))
+
+
+def _check_sum(entries: Sequence[object], file: Path, where: str) -> None:
+    """Refuses objects that share what they hold, which costs the file a few bytes and memory or time for each."""
+    allowance = Allowance(file.stat().st_size)
+    try:
+        for entry in entries:
+            held = [entry.get(key) for key in ("pcd_np", "clip_ft", "class_id")] if isinstance(entry, dict) else []
+            allowance.spend(4 * sum(_n_values(value) for value in held))
+    except UnpackingError as error:
+        raise PredictionError(f"{where}: {error}") from error
+
+
+def _n_values(value: object) -> int:
+    return value.size if isinstance(value, np.ndarray) else len(value) if isinstance(value, list | tuple) else 0
 
 
 def _maps(path: Path) -> list[Path]:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import PredictionError, shown
 from su3d_bench.core.types import Int32Array
 from su3d_bench.formats.arrays import (
+    check_members,
     check_sizes,
     classes_of,
     column_members,
@@ -108,11 +109,12 @@ def _instances(value: object, n_known: int | None, where: str) -> tuple[list[Int
     if not isinstance(value, list):
         raise PredictionError(f"{where}: 'ins' is {kind_of(value)}; expected a list of run lengths or a tensor")
     members: list[Int32Array] = []
-    length = None
+    length, n = None, 0
     for k, mask in enumerate(value):
         if not isinstance(mask, dict) or "length" not in mask or "counts" not in mask:
             raise PredictionError(f"{where}: mask {k} is {kind_of(mask)}; expected a dict of length and counts")
         members.append(run_members(mask["length"], mask["counts"], f"{where}: mask {k}"))
+        check_members(n := n + len(members[-1]) + len(mask["counts"]), where)  # empty runs take time, too
         if length not in {None, int(mask["length"])}:
             raise PredictionError(f"{where}: mask {k} is of {mask['length']} points, mask 0 of {length}")
         length = int(mask["length"])

@@ -14,7 +14,7 @@ import numpy as np
 
 from su3d_bench.core.errors import PredictionError, printable, reading, shown
 from su3d_bench.core.types import Int32Array
-from su3d_bench.formats.arrays import run_members
+from su3d_bench.formats.arrays import check_members, run_members
 from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.metrics.instance.average_precision import last_line_of_each_mask_file
 from su3d_bench.predictions.base import SceneFiles, ScenePrediction, VertexLabels, vertex_masks
@@ -172,7 +172,7 @@ def _plain_path(text: str, where: str) -> str:
 def _read_masks(folder: Path, lines: Sequence[Line], where: str) -> tuple[list[Int32Array], int | None]:
     """The points in the mask of each line, and of how many points all are; None without any."""
     members: list[Int32Array] = []
-    n_points = None
+    n_members, n_points = 0, None
     for line in lines:
         n, indices = _read_mask(folder, line, where)
         if n_points not in {None, n}:
@@ -181,6 +181,7 @@ def _read_masks(folder: Path, lines: Sequence[Line], where: str) -> tuple[list[I
                 f"'{printable(lines[0].file, 120)}' of {n_points}; all must have the points of the scene"
             )
         n_points = n
+        check_members(n_members := n_members + len(indices), where)
         members.append(indices)
     return members, n_points
 

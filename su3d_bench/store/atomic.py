@@ -27,6 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DAMAGE, StoreError, reading
+from su3d_bench.store.unpacking import Allowance, allowance_of, check_member, member_bytes
 
 MAGIC_1_0 = b"\x93NUMPY\x01\x00"
 SMALL_BYTES = 1 << 16  # of an array that is read whole before its header is looked at
@@ -148,11 +149,13 @@ def read_json(path: Path) -> Any:
 def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
     """The plain arrays of an .npz file; raises one of ``DAMAGE`` for anything else.
 
-    As ``numpy.load``, but a header that promises more than its member holds is damage, and no terabyte to allocate.
+    As ``numpy.load``, but a header that promises more than its member holds is damage, and no terabyte to allocate,
+    and so is an archive that unpacks to far more than it is.
     """
     held = source.getvalue() if isinstance(source, io.BytesIO) else None
     with zipfile.ZipFile(source) as archive:
-        arrays = {info.filename.removesuffix(".npy"): _array(archive, info, held) for info in archive.infolist()}
+        allowance, members = allowance_of(archive), archive.infolist()
+        arrays = {info.filename.removesuffix(".npy"): _array(archive, info, held, allowance) for info in members}
     for name, array in arrays.items():
         if array.dtype.kind == "U" and array.size:
             codes = array.reshape(-1).view(np.dtype(np.uint32).newbyteorder(array.dtype.byteorder))
@@ -161,12 +164,13 @@ def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
     return arrays
 
 
-def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, held: bytes | None) -> NDArray[Any]:
+def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, held: bytes | None, allowance: Allowance) -> NDArray[Any]:
     """``held``: the bytes of the archive where they are in memory."""
     if info.file_size <= SMALL_BYTES:
-        content = archive.read(info) if held is None else _small_member(held, info)
+        content = member_bytes(archive, info, allowance) if held is None else _small_member(held, info, allowance)
         if content.startswith(MAGIC_1_0):
             return _small_array(content, info.filename)
+    check_member(info, allowance)
     with archive.open(info) as member:
         version = np.lib.format.read_magic(member)
         if version not in ((1, 0), (2, 0)):
@@ -180,8 +184,9 @@ def _array(archive: zipfile.ZipFile, info: zipfile.ZipInfo, held: bytes | None) 
         return array
 
 
-def _small_member(held: bytes, info: zipfile.ZipInfo) -> bytes:
-    """What ``ZipFile.read`` gives, without the five objects that it makes for each member."""
+def _small_member(held: bytes, info: zipfile.ZipInfo, allowance: Allowance) -> bytes:
+    """What ``member_bytes`` gives, without the five objects that ``zipfile`` makes for each member."""
+    check_member(info, allowance)
     start = info.header_offset
     signature, flags, method, n_name, n_extra = struct.unpack_from("<4s2xHH16xHH", held, start)
     if signature != b"PK\x03\x04" or flags & 1 or method != info.compress_type:
@@ -190,8 +195,6 @@ def _small_member(held: bytes, info: zipfile.ZipInfo) -> bytes:
     packed = held[start : start + info.compress_size]
     if method == zipfile.ZIP_DEFLATED:
         packed = zlib.decompressobj(-15).decompress(packed, SMALL_BYTES + 1)
-    elif method != zipfile.ZIP_STORED:
-        raise zipfile.BadZipFile(f"{info.filename}: packed by the method {method}")
     if len(packed) != info.file_size or zlib.crc32(packed) != info.CRC:
         raise zipfile.BadZipFile(f"{info.filename}: is not whole")
     return packed

@@ -14,6 +14,7 @@ from su3d_bench.core.types import DenseFeatures, Instances, Partition, Predictio
 from su3d_bench.store.atomic import read_npz, remove_file, replacing, write_npz
 from su3d_bench.store.scratch import row_blocks
 
+MOST_TEXTS = 1 << 20  # of one field; each becomes an object of its own
 ROWS_AT_ONCE = 8192  # 16 MB of half precision at 1024 dimensions
 # Dimensions and kinds of values of each field of a stored prediction, in the order of the file.
 FIELDS = {
@@ -61,6 +62,8 @@ def prediction_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Pr
         if array.ndim != n_dimensions or array.dtype.kind != value_kind or (name == "indptr" and not array.size):
             shape = f"of shape {array.shape} {array.dtype.name}"
             raise PredictionError(f"{where}: '{name}' is an array {shape}; run the scene again")
+        if array.dtype.kind == "U" and len(array) > MOST_TEXTS:
+            raise PredictionError(f"{where}: '{name}' holds {len(array)} texts; is it damaged?")
     values: dict[str, Any] = {}
     for name in _fields_of(kind):
         value = arrays.get(name)

@@ -20,9 +20,11 @@ from su3d_bench.formats.pickles.pickle_constructors import (
     Unbuilt,
     clip,
 )
+from su3d_bench.store.unpacking import Allowance
 
 NEWEST_PROTOCOL = 5
-MOST_OPERATIONS = 10_000_000  # a map of ConceptGraphs takes less than a million
+# A map of ConceptGraphs takes less than a million, 100 for a detection of a kilobyte or more; each may make an object.
+FREE_OPERATIONS, MOST_OPERATIONS = 1_000_000, 10_000_000
 MOST_KEPT = 4 << 30  # bytes of all texts and arrays together
 MOST_INTEGER_BYTES = 32
 MOST_LINE = 1 << 20
@@ -40,6 +42,7 @@ class PickleMachine:
         self,
         stream: BinaryIO,
         n_bytes: int,
+        n_packed: int,
         constructors: Constructors,
         persistent: Callable[[object], object] | None,
         forget: frozenset[str],
@@ -50,12 +53,14 @@ class PickleMachine:
         self._frames: list[list[object]] = []  # what lies below each mark
         self._memo: dict[int, object] = {}
         self._n_kept = 0
+        self._allowance = Allowance(n_packed)
+        self._n_operations = min(MOST_OPERATIONS, max(FREE_OPERATIONS, n_packed))
         self._budget = Budget()
 
     def run(self) -> object:
         """The value that the pickle describes; ``RefusedError`` where it is damaged or more than plain data."""
         read = self._stream.read
-        for _ in range(MOST_OPERATIONS):
+        for _ in range(self._n_operations):
             code = read(1)
             self.n_read += 1
             if code == b".":
@@ -64,7 +69,7 @@ class PickleMachine:
             if operation is None:
                 raise RefusedError(f"operation 0x{code.hex()} is not read" if code else "it ends in the middle")
             operation(self)
-        raise RefusedError(f"it takes more than {MOST_OPERATIONS} operations")
+        raise RefusedError(f"it takes more than {self._n_operations} operations")
 
     def _end(self) -> object:
         if len(self._stack) != 1 or self._frames:
@@ -119,11 +124,15 @@ class PickleMachine:
                 n -= len(self._read(min(n, CHUNK)))
             return Forgotten()
         self._check_left(n)
+        self._keep(n)
+        self._budget.n_bytes += n
+        return self.take(n)
+
+    def _keep(self, n: int) -> None:
         self._n_kept += n
         if self._n_kept > MOST_KEPT:
             raise RefusedError(f"it holds more than {MOST_KEPT >> 30} GiB")
-        self._budget.n_bytes += n
-        return self.take(n)
+        self._allowance.spend(n)
 
     def _is_below_forgotten(self) -> bool:
         """Whether a list or dict is under way whose key, which lies right below it, is to be forgotten.
@@ -230,6 +239,8 @@ class PickleMachine:
 
     def text(self, n: int, encoding: str = "utf-8") -> None:
         content = self.payload(n)
+        if isinstance(content, bytes) and not content.isascii():
+            self._keep(3 * n)  # one character of four bytes gives all of them four
         try:
             self.push(content if isinstance(content, Forgotten) else content.decode(encoding, "surrogatepass"))
         except UnicodeDecodeError as error:

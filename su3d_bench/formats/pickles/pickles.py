@@ -12,6 +12,7 @@ from typing import BinaryIO, cast
 from su3d_bench.core.errors import PredictionError, printable, reading
 from su3d_bench.formats.pickles.pickle_constructors import CONSTRUCTORS, Constructors, Forgotten, Inert, RefusedError
 from su3d_bench.formats.pickles.pickle_machine import PickleMachine
+from su3d_bench.store.unpacking import UnpackingError
 
 __all__ = ["Forgotten", "Inert", "read_pickle", "read_pickle_file"]
 
@@ -35,7 +36,7 @@ def read_pickle_file(path: Path, *, forget: Iterable[str] = ()) -> object:
             return read_pickle(stream, n_bytes, where, forget=forget)
         with gzip.open(stream, "rb") as inflated:
             buffered = io.BufferedReader(cast(io.RawIOBase, inflated), INFLATED_A_READ)
-            return read_pickle(buffered, MOST_INFLATED, where, forget=forget)
+            return read_pickle(buffered, MOST_INFLATED, where, n_packed=n_bytes, forget=forget)
 
 
 def read_pickle(
@@ -43,19 +44,22 @@ def read_pickle(
     n_bytes: int,
     where: str,
     *,
+    n_packed: int | None = None,
     constructors: Constructors = CONSTRUCTORS,
     persistent: Callable[[object], object] | None = None,
     forget: Iterable[str] = (),
 ) -> object:
     """The value of the pickle that ``stream`` holds from here to its end, at most ``n_bytes`` away.
 
+    ``n_packed``: how many bytes the file has where the stream is compressed, which bound what is kept of it.
     ``constructors`` is the whole of what the pickle may name; ``persistent`` answers references to what is stored
     outside of it, which are refused without it.
     """
-    machine = PickleMachine(stream, n_bytes, constructors, persistent, frozenset(forget))
+    n_packed = n_bytes if n_packed is None else n_packed
+    machine = PickleMachine(stream, n_bytes, n_packed, constructors, persistent, frozenset(forget))
     try:
         return machine.run()
-    except RefusedError as error:
+    except (RefusedError, UnpackingError) as error:
         raise PredictionError(
             f"{where}: not read as a pickle of plain data, at byte {machine.n_read}: {error}"
         ) from error

@@ -18,7 +18,8 @@ from typing import Any
 
 from su3d_bench.core.devices import require
 from su3d_bench.core.digests import digest_bytes, digest_file
-from su3d_bench.core.errors import ConfigError, DataError, ModelMissing, StoreError
+from su3d_bench.core.errors import ConfigError, DataError, ModelMissing, PredictionError, StoreError, converted
+from su3d_bench.formats.torch_zip import check_stored
 from su3d_bench.perception.models.catalogue import FormName, ModelEntry, ModelForm, model_entry
 from su3d_bench.store.atomic import make_folder, read_json, write_json
 
@@ -258,6 +259,8 @@ def _read_safetensors(path: Path, device: str) -> Any:
 
 def _read_pickled(path: Path, device: str) -> Any:
     torch = require("torch", f"{path.name}:")
+    with converted(PredictionError, DataError):
+        check_stored(path)
     try:
         return torch.load(path, map_location=device, weights_only=True)
     except pickle.UnpicklingError as error:

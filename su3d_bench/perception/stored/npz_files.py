@@ -31,6 +31,7 @@ from su3d_bench.store.atomic import read_arrays
 _REQUIRED = ("image_size", "masks", "boxes", "scores", "names")
 _FEATURES = ("crop_ratios", "crop_features", "global_feature", "encoder")
 _OPTIONAL = ("captions", *_FEATURES)
+MAX_REGIONS = 2_000  # of one image; the bits of a mask become eight times as many bytes
 
 
 def stored_path(folder: Path, dataset: str, scene: str, frame_index: int) -> Path:
@@ -117,6 +118,8 @@ def _check_keys(arrays: Mapping[str, NDArray[Any]], where: str) -> None:
 def _check_rows(arrays: Mapping[str, NDArray[Any]], where: str) -> int:
     shapes = {"masks": 2, "boxes": 2, "scores": 1, "names": 1, "captions": 1}
     n = len(arrays["scores"]) if arrays["scores"].ndim else -1
+    if n > MAX_REGIONS:
+        raise DataError(f"{where}: has {n} detections; expected one a thing in the image, at most {MAX_REGIONS}")
     for key, n_axes in shapes.items():
         if key in arrays and (arrays[key].ndim != n_axes or len(arrays[key]) != n):
             raise DataError(f"{where}: '{key}' has shape {arrays[key].shape}; expected {n_axes} axes and {n} rows")
@@ -133,7 +136,7 @@ def _masks(arrays: Mapping[str, NDArray[Any]], frame: Frame, n: int, where: str)
     packed, n_bytes = arrays["masks"], -(-height * width // 8)
     if packed.dtype != np.uint8 or packed.shape[1] != n_bytes:
         raise DataError(f"{where}: 'masks' is {packed.shape} {packed.dtype}; expected ({n}, {n_bytes}) uint8")
-    masks = np.unpackbits(packed, axis=1, count=height * width).astype(bool).reshape(n, height, width)
+    masks = np.unpackbits(packed, axis=1, count=height * width).view(bool).reshape(n, height, width)
     empty = np.flatnonzero(~masks.any(axis=(1, 2)))
     if len(empty):
         raise DataError(f"{where}, region {int(empty[0])}: the mask is empty; leave the region out")

@@ -15,6 +15,7 @@ import io
 import json
 import re
 from collections.abc import Iterable, Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -24,7 +25,7 @@ from su3d_bench.questions.model import REASONING, Question, new_question
 
 DATASET = "scannet"
 MOST_BYTES = 256 << 20  # ScanRefer's training set has some 40 MB
-MOST_QUESTIONS = 1_000_000
+MOST_QUESTIONS = 300_000  # Sr3D+ has 114,532 sentences
 NR3D_COLUMNS = ("scan_id", "target_id", "utterance")
 OWN_FORM = "write scene, text and objects of such questions as CSV or TOML"
 # What is no set of questions with objects: the keys of its entries, whose file it is, and what to do.
@@ -137,7 +138,7 @@ def _sentences(rows: Iterable[tuple[str, Any]], keys: tuple[str, str, str], sour
 
 def _csv_rows(text: str, where: str) -> list[Any]:
     try:
-        return list(csv.DictReader(io.StringIO(text, newline=""), strict=True))
+        return list(islice(csv.DictReader(io.StringIO(text, newline=""), strict=True), MOST_QUESTIONS + 1))
     except csv.Error as error:
         raise DataError(f"{where}: not CSV ({printable(str(error), 120)})") from error
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import csv
-import io
 import re
 from pathlib import Path
 
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.datasets.recordings.recorded_frames import read_text
+from su3d_bench.formats.tables.separated import separated_rows
 from su3d_bench.questions.files.queries import MOST_BYTES
 
 COLUMN = "question_id"  # others are for the reader alone
@@ -23,7 +23,7 @@ def read_left_out(path: Path) -> frozenset[str]:
     text = read_text(path, where)
     separator = max(",;\t", key=text.partition("\n")[0].count)
     try:
-        rows = list(csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True))
+        rows = separated_rows(text, separator)
     except csv.Error as error:
         raise DataError(f"{where}: not CSV ({printable(str(error), 120)})") from error
     header = [word.strip() for word in rows[0]] if rows else []

@@ -8,7 +8,6 @@ data: anything but control characters stands in them as it is.
 from __future__ import annotations
 
 import csv
-import io
 import tomllib
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,6 +20,7 @@ import numpy as np
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.datasets.recordings.recorded_frames import read_text
+from su3d_bench.formats.tables.separated import separated_rows
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
 
 COLUMNS = ("scene", "text", "objects")
@@ -108,7 +108,7 @@ def _toml_rows(text: str, where: str) -> Iterator[QueryRow]:
 
 def _csv_rows(text: str, where: str) -> Iterator[QueryRow]:
     try:
-        rows = list(csv.reader(io.StringIO(text, newline=""), strict=True))
+        rows = separated_rows(text)
     except csv.Error as error:
         raise DataError(f"{where}: not CSV ({printable(str(error), 120)})") from error
     header = tuple(word.strip() for word in rows[0]) if rows else ()

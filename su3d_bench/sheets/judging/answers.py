@@ -6,26 +6,21 @@ Formulas are never evaluated: one that stands in the place of an answer is read 
 from __future__ import annotations
 
 import csv
-import io
-import lzma
 import unicodedata
-import zipfile
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from su3d_bench.core.errors import DataError, ModelMissing, printable, reading, suggest
-from su3d_bench.formats.numpy_files import ZIP_DAMAGE
+from su3d_bench.core.errors import DataError, printable, reading, suggest
+from su3d_bench.formats.tables.separated import separated_rows
+from su3d_bench.formats.tables.workbooks import read_workbook
 from su3d_bench.questions.model import KINDS
 from su3d_bench.reports.tables.formats import FORMULA_STARTS
 from su3d_bench.sheets.items import ANSWER_COLUMNS, ASKS, Key, KeyItem, Sheet, SheetItem
 
 MOST_BYTES = 256 << 20  # of one file: a workbook holds its pictures
-MOST_TEXT_BYTES = 32 << 20  # of a CSV file, or of all XML in a workbook: some hundred thousand answers
-MOST_MEMBERS = 50_000
-MOST_ROWS = 200_000
-MOST_COLUMNS = 64
+MOST_TEXT_BYTES = 32 << 20  # of a CSV file: some hundred thousand answers
 MOST_CHARACTERS = 1000  # of one cell that is read
 HEADER_WITHIN = 30  # rows of a worksheet above its header, which may hold instructions
 
@@ -66,12 +61,9 @@ def csv_rows(content: bytes, where: str) -> list[list[str]]:
     first = text.partition("\n")[0]
     separator = max(",;\t", key=first.count)
     try:
-        rows = list(csv.reader(io.StringIO(text, newline=""), delimiter=separator, strict=True))
+        return separated_rows(text, separator)
     except csv.Error as error:
         raise DataError(f"{where}: is no CSV ({printable(str(error), 120)}); export it again") from error
-    if len(rows) > MOST_ROWS:
-        raise DataError(f"{where}: has {len(rows)} rows; at most {MOST_ROWS} are read")
-    return rows
 
 
 def parse_csv(content: bytes, where: str) -> list[AnswerRow]:
@@ -87,61 +79,24 @@ def parse_csv(content: bytes, where: str) -> list[AnswerRow]:
 
 def parse_workbook(content: bytes, where: str) -> list[AnswerRow]:
     """The answers of every worksheet of an XLSX workbook that has their columns."""
-    try:
-        import openpyxl
-    except ImportError as error:
-        raise ModelMissing(f"{where}: a workbook needs the sheets extra: pip install 'su3d-bench[sheets]'") from error
-    _check_archive(content, where)
     answers: list[AnswerRow] = []
     has_columns = False
-    try:
-        book = openpyxl.load_workbook(io.BytesIO(content), read_only=True, data_only=False, keep_links=False)
-        for page in book.worksheets:
-            place = f"{where}: {printable(page.title, 60)}"
-            rows = enumerate(page.iter_rows(max_row=MOST_ROWS, max_col=MOST_COLUMNS, values_only=True), 1)
-            columns = None
-            for number, row in rows:
-                columns = _columns(row)
-                if columns is not None or number == HEADER_WITHIN:
-                    break
-            if columns is not None:
-                has_columns = True
-                answers += _rows(rows, columns, place)
-    except DataError:
-        raise
-    except Exception as error:  # openpyxl meets damage with errors of any kind
-        reason = printable(f"{type(error).__name__}: {error}", 120)
-        raise DataError(f"{where}: is damaged ({reason}); save the workbook as .xlsx again") from error
+    for page in read_workbook(content, where):
+        rows = iter(page.rows)
+        columns = next((found for number, row in rows if number <= HEADER_WITHIN and (found := _columns(row))), None)
+        if columns is not None:
+            has_columns = True
+            answers += _rows(rows, columns, f"{where}: {printable(page.name, 60)}")
     if not has_columns:
         raise DataError(f"{where}: no worksheet has the columns {', '.join(ANSWER_COLUMNS)}; put their names back")
     return answers
 
 
-def _check_archive(content: bytes, where: str) -> None:
-    """Refuse what would swell: sizes are those that the archive promises, beyond which zipfile never reads."""
-    try:
-        with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            members = archive.infolist()
-            n_bytes = sum(member.file_size for member in members if not member.filename.startswith("xl/media/"))
-            if len(members) > MOST_MEMBERS or n_bytes > MOST_TEXT_BYTES:
-                raise DataError(
-                    f"{where}: unpacks to {len(members)} parts and {n_bytes >> 20} MiB of text; no workbook of "
-                    f"su3d-bench sheets make does"
-                )
-            for member in members:
-                if member.filename.endswith((".xml", ".rels")) and b"<!DOCTYPE" in archive.read(member):
-                    raise DataError(f"{where}: defines entities, which no workbook needs; save it as .xlsx again")
-    except DataError:
-        raise
-    except (*ZIP_DAMAGE, OSError, OverflowError, LookupError, lzma.LZMAError) as error:
-        raise DataError(f"{where}: is no whole .xlsx file; copy it again") from error
+def _names(row: Iterable[str | None]) -> list[str]:
+    return [(cell or "").strip().lower() for cell in row]
 
 
-def _names(row: Iterable[object]) -> list[str]:
-    return [cell.strip().lower() if isinstance(cell, str) else "" for cell in row]
-
-
-def _columns(row: Sequence[object]) -> dict[str, int] | None:
+def _columns(row: Sequence[str | None]) -> dict[str, int] | None:
     """Where each column stands; None where the row is not their header."""
     names = _names(row)
     if any(names.count(name) != 1 for name in ANSWER_COLUMNS):
@@ -149,7 +104,7 @@ def _columns(row: Sequence[object]) -> dict[str, int] | None:
     return {name: names.index(name) for name in ANSWER_COLUMNS}
 
 
-def _rows(rows: Iterable[tuple[int, Sequence[object]]], columns: dict[str, int], where: str) -> Iterator[AnswerRow]:
+def _rows(rows: Iterable[tuple[int, Sequence[str | None]]], columns: dict[str, int], where: str) -> Iterator[AnswerRow]:
     for number, row in rows:
         if all(cell is None or cell == "" for cell in row):
             continue
@@ -159,9 +114,9 @@ def _rows(rows: Iterable[tuple[int, Sequence[object]]], columns: dict[str, int],
             yield AnswerRow(at, **cells)
 
 
-def cell_text(value: object, name: str, at: str) -> str:
-    """The text of a cell; what is no text, a number or a date, as the text of it."""
-    text = "" if value is None else str(value).strip()
+def cell_text(value: str | None, name: str, at: str) -> str:
+    """The text of a cell, without the mark that keeps a text from being a formula."""
+    text = (value or "").strip()
     # as files that a spreadsheet is to open have it before text that would be taken for a formula
     if text[:1] == "'" and text[1:2] in FORMULA_STARTS:
         text = text[1:]

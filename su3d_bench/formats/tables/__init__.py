@@ -1,0 +1,1 @@
+"""Tables that people fill in: rows of separated text, and worksheets."""

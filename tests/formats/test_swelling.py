@@ -1,0 +1,293 @@
+"""Small files that swell: every reader of what is packed, shared or run-length coded refuses them in little memory.
+
+Memory is measured by the peak of what is resident, beneath a limit on addresses that none may reach.
+"""
+
+from __future__ import annotations
+
+import bz2
+import csv
+import gzip
+import io
+import struct
+import zipfile
+import zlib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from bombs import MIB, Member, deflated, gzip_of, jpeg_of_scans, npy_head, npz_of_zeros, png_of_zeros, zip_of
+from damage import lacked_memory
+from memory import bounded_addresses, peak_bytes, reset_peak
+
+from su3d_bench.core.errors import DAMAGE, DataError, PredictionError, StoreError, Su3dError
+from su3d_bench.evaluation.texts import read_text_features
+from su3d_bench.formats.arrays import MOST_MEMBERS, column_members, run_members
+from su3d_bench.formats.hdf5 import read_rows
+from su3d_bench.formats.images import decode_colour, decode_depth
+from su3d_bench.formats.numpy_files import read_npz
+from su3d_bench.formats.pcd import read_pcd_points
+from su3d_bench.formats.pickles.pickles import read_pickle_file
+from su3d_bench.formats.tables.separated import separated_rows
+from su3d_bench.formats.torch_zip import read_torch
+from su3d_bench.metrics.scoring import unpack_scores
+from su3d_bench.predictions.formats import READERS
+from su3d_bench.questions.files.queries import read_query_file
+from su3d_bench.store.atomic import read_arrays
+from su3d_bench.store.predictions import prediction_arrays, prediction_from_arrays, read_prediction
+from su3d_bench.store.unpacking import FREE_BYTES, MOST_RATIO, Allowance, UnpackingError
+
+MOST_GROWN = 320 * MIB
+LARGEST_BOMB = 4 * MIB
+
+
+def refused(read: Callable[[], object], *kinds: type[Exception]) -> str:
+    """What is said by the refusal of ``kinds`` that ``read`` ends with, in little memory."""
+    with bounded_addresses(4 * MOST_GROWN):
+        before = reset_peak()
+        with pytest.raises(kinds or (Su3dError,)) as caught:
+            read()
+        grown = peak_bytes() - before
+    assert not lacked_memory(caught.value), caught.value
+    assert grown < MOST_GROWN, f"{grown >> 20} MiB: {caught.value}"
+    return str(caught.value)
+
+
+def kept(folder: Path, name: str, content: bytes) -> Path:
+    assert len(content) < LARGEST_BOMB
+    path = folder / name
+    path.write_bytes(content)
+    return path
+
+
+def bz2_npz() -> bytes:
+    """An archive of a kilobyte that holds a gibibyte, packed as ``zipfile`` unpacks without a bound."""
+    packer = bz2.BZ2Compressor()
+    parts = [packer.compress(npy_head((1 << 20, 1024)))]
+    parts += [packer.compress(bytes(64 * MIB)) for _ in range(8)]
+    return zip_of([Member("pred_masks.npy", b"".join([*parts, packer.flush()]), 1 << 17, zipfile.ZIP_BZIP2)])
+
+
+def lying_npz() -> bytes:
+    """A member that says it is small and whose stream goes on."""
+    return zip_of([Member("pred_masks.npy", deflated(npy_head((10, 10)), 1500), 228)])
+
+
+def shared_npz() -> bytes:
+    """Members that all lie in the same bytes, each of a size that might be."""
+    content = npz_of_zeros("00000", 100)
+    at = content.index(b"PK\x01\x02")
+    entry = content[at : content.index(b"PK\x05\x06")]
+    names = [f"{k:05}".encode() for k in range(500)]
+    directory = b"".join(entry.replace(b"00000", name) for name in names)
+    end = struct.pack("<HHHHLLH", 0, 0, len(names), len(names), len(directory), at, 0)
+    return content[:at] + directory + b"PK\x05\x06" + end
+
+
+NPZ = {
+    "zeros": lambda: npz_of_zeros("pred_masks", 2500),
+    "bz2": bz2_npz,
+    "lying": lying_npz,
+    "shared": shared_npz,
+}
+
+
+@pytest.mark.parametrize("kind", NPZ)
+def test_an_npz_that_swells_is_refused_by_each_of_its_readers(tmp_path: Path, kind: str) -> None:
+    content = NPZ[kind]()
+    path = kept(tmp_path, "scene0001_00.npz", content)
+    refused(lambda: read_npz(path), PredictionError)
+    refused(lambda: READERS["maskclustering"].read(tmp_path, "scene0001_00"), PredictionError)
+    refused(lambda: read_arrays(path), *DAMAGE)
+    refused(lambda: read_prediction(path), StoreError)
+    refused(lambda: unpack_scores(content), DataError)
+    refused(lambda: read_text_features(path), DataError)
+
+
+def test_what_a_file_may_unpack_to_goes_by_its_size() -> None:
+    small, large = Allowance(10), Allowance(FREE_BYTES)
+    assert (small.n_bytes, large.n_bytes) == (FREE_BYTES, MOST_RATIO * FREE_BYTES)
+    small.spend(FREE_BYTES - 1)
+    small.spend(1)
+    with pytest.raises(UnpackingError, match="unpacks to more than 128 MiB, over 100 times its size"):
+        small.spend(1)
+
+
+def test_masks_that_pack_well_are_read(tmp_path: Path) -> None:
+    masks = np.zeros((1 << 16, 600), np.bool_)
+    masks[:1000, :5] = True
+    np.savez_compressed(tmp_path / "scene0001_00.npz", pred_masks=masks, pred_score=np.ones(600))
+    assert masks.nbytes > 100 * (tmp_path / "scene0001_00.npz").stat().st_size
+    read: Any = READERS["maskclustering"].read(tmp_path, "scene0001_00").content
+    assert read.sizes[:6].tolist() == [1000] * 5 + [0]
+
+
+def test_a_torch_archive_whose_pickle_swells_is_refused(tmp_path: Path) -> None:
+    n = 1500 * MIB
+    packed = deflated(b"\x80\x02B" + struct.pack("<I", n), 1500, last=b".")
+    path = kept(tmp_path, "a.pt", zip_of([Member("a/data.pkl", packed, n + 8)]))
+    assert "unpacks to more than" in refused(lambda: read_torch(path), PredictionError)
+
+
+def test_weights_of_a_model_that_are_compressed_are_refused(tmp_path: Path) -> None:
+    pytest.importorskip("torch", reason="the models extra is not installed")
+    from su3d_bench.perception.models.files import read_weights
+
+    path = kept(tmp_path, "a.pt", zip_of([Member("a/data.pkl", deflated(b"\x80\x02", 1500), 1500 * MIB)]))
+    assert "is compressed" in refused(lambda: read_weights(path), DataError)
+
+
+@pytest.mark.parametrize(
+    ("first", "n", "byte", "told"),
+    [
+        (b"\x80\x04\x8e" + struct.pack("<Q", 1500 * MIB), 1500, 0, "unpacks to more than"),  # one payload
+        (b"\x80\x04X" + struct.pack("<I", 100 * MIB) + "\U0001f600".encode(), 102, ord("a"), "unpacks to more than"),
+        (b"\x80\x04", 64, ord("]"), "takes more than 1000000 operations"),
+        (b"\x80\x04", 64, ord("("), "takes more than 1000000 operations"),
+        (b"\x80\x04N", 64, 0x94, "takes more than 1000000 operations"),  # remembered again and again
+    ],
+)
+def test_a_gzipped_pickle_that_swells_is_refused(tmp_path: Path, first: bytes, n: int, byte: int, told: str) -> None:
+    path = kept(tmp_path, "a.pkl.gz", gzip_of(first, n, byte, b"."))
+    assert told in refused(lambda: read_pickle_file(path), PredictionError)
+
+
+def a_map_of_one_cloud(n_objects: int) -> bytes:
+    """A map whose objects are one and the same, each but a reference."""
+    cloud = np.zeros((100_000, 3), np.float64).tobytes()
+    array = b"cnumpy.core.numeric\n_frombuffer\n(B" + struct.pack("<I", len(cloud)) + cloud
+    array += (
+        b"cnumpy\ndtype\n(X\x02\x00\x00\x00f8\x89\x88tR(K\x03X\x01\x00\x00\x00<NNNtb" + b"J\xa0\x86\x01\x00K\x03\x86"
+    )
+    array += b"X\x01\x00\x00\x00CtR"
+    one = b"}X\x06\x00\x00\x00pcd_np" + array + b"sq\x01"
+    return b"\x80\x04}X\x07\x00\x00\x00objects(" + one + b"h\x01" * (n_objects - 1) + b"lsq\x02."
+
+
+def test_objects_that_share_one_cloud_are_counted_as_often_as_they_stand_there(tmp_path: Path) -> None:
+    path = tmp_path / "pcd_x.pkl.gz"
+    path.write_bytes(gzip.compress(a_map_of_one_cloud(3), 1))
+    assert len(READERS["conceptgraphs"].read(path, "pcd_x").content.points) == 300_000  # type: ignore[union-attr]
+    path.write_bytes(gzip.compress(a_map_of_one_cloud(2_000), 1))
+    said = refused(lambda: READERS["conceptgraphs"].read(path, "pcd_x"), PredictionError)
+    assert "unpacks to more than" in said
+
+
+def write_table(path: Path, shape: tuple[int, int], chunks: tuple[int, int]) -> None:
+    import h5py
+
+    with h5py.File(path, "w") as file:
+        table = file.create_dataset(path.stem, shape, "f2", chunks=chunks, compression="gzip", fillvalue=0)
+        packed = zlib.compress(bytes(chunks[0] * chunks[1] * 2), 9)
+        for top in range(0, shape[0], chunks[0]):
+            table.id.write_direct_chunk((top, 0), packed)
+
+
+def test_an_hdf5_table_that_swells_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "pc_points.h5"
+    write_table(path, (100_000_000, 3), (2_000_000, 3))
+    assert path.stat().st_size < LARGEST_BOMB
+    assert "promises 100000000 rows" in refused(lambda: read_rows(path, 3, "here"), DataError)
+
+
+def test_the_chunks_of_a_table_are_found_in_one_pass(tmp_path: Path) -> None:
+    from su3d_bench.formats import hdf5
+
+    class OneByOne:
+        """A table that counts how often it is asked for one chunk's place, which passes over all of them."""
+
+        def __init__(self, table: Any) -> None:
+            self._table, self.n_asked, self.id = table, 0, self
+            self.shape, self.chunks, self.dtype = table.shape, table.chunks, table.dtype
+
+        def __getattr__(self, name: str) -> Any:
+            self.n_asked += name == "get_chunk_info_by_coord"
+            return getattr(self._table.id, name)
+
+    path = tmp_path / "pc_points.h5"
+    write_table(path, (50, 3), (1, 3))
+    with hdf5._open_table(path, "here") as table:
+        watched = OneByOne(table)
+        assert sum(len(block) for block in hdf5._chunked_blocks(watched, "here")) == 50
+    assert watched.n_asked == 0
+
+
+@pytest.mark.parametrize(
+    ("decode", "content"),
+    [
+        (decode_colour, lambda: png_of_zeros(9900, 9900)),
+        (decode_depth, lambda: png_of_zeros(9900, 9900, 16, 0)),
+        (decode_colour, lambda: jpeg_of_scans(9900, 9900, 1)),
+        (decode_colour, lambda: jpeg_of_scans(2000, 2000, 500)),
+    ],
+    ids=["colour", "depth", "jpeg", "scans"],
+)
+def test_an_image_that_swells_is_refused_before_it_is_decoded(
+    decode: Callable[[bytes, str], object], content: Callable[[], bytes]
+) -> None:
+    made = content()
+    assert len(made) < LARGEST_BOMB
+    assert "not a readable" in refused(lambda: decode(made, "here"), DataError)
+
+
+def test_a_progressive_image_of_some_scans_is_read() -> None:
+    assert decode_colour(jpeg_of_scans(64, 48, 2), "here").shape == (48, 64, 3)
+
+
+def test_compressed_points_that_swell_are_refused(tmp_path: Path) -> None:
+    n = 50_000_000
+    packed = bytes([0, 0]) + bytes([7 << 5, 255, 0]) * (3 * n // 264 + 1)
+    lines = ["VERSION 0.7", "FIELDS x y z", "SIZE 1 1 1", "TYPE U U U", "COUNT 1 1 1", f"WIDTH {n}", "HEIGHT 1"]
+    head = "\n".join([*lines, f"POINTS {n}", "DATA binary_compressed", ""]).encode()
+    path = kept(tmp_path, "a.pcd", head + struct.pack("<II", len(packed), 3 * n) + packed)
+    assert "unpacks to more than" in refused(lambda: read_pcd_points(path), DataError)
+
+
+@pytest.mark.parametrize("n", [MOST_MEMBERS + 1, 99_999_999])
+def test_runs_of_points_have_a_bound_together(n: int, tmp_path: Path) -> None:
+    assert "points together" in refused(lambda: run_members(10**8, f"1 {n}", "here"), PredictionError)
+    for k in range(8):
+        (tmp_path / f"{k}.json").write_text(f'{{"length": 100000000, "counts": "1 {MOST_MEMBERS // 4}"}}')
+    (tmp_path / "scene0001_00.txt").write_text("".join(f"{k}.json 3 1.0\n" for k in range(8)))
+    said = refused(lambda: READERS["scannet-text"].read(tmp_path, "scene0001_00"), PredictionError)
+    assert "points together" in said
+
+
+def test_a_matrix_of_ones_has_a_bound() -> None:
+    ones = np.broadcast_to(np.ones((), np.bool_), (1 << 20, 1000))
+    assert "points together" in refused(lambda: column_members(ones, "here"), PredictionError)
+
+
+def test_rows_of_text_have_a_bound(tmp_path: Path) -> None:
+    text = "a\n" + "\n" * (3 * MIB)
+    assert "more than 200000 rows" in refused(lambda: separated_rows(text), csv.Error)
+    wide = (",".join([""] * 1000) + "\n") * 5000
+    assert "4000000 cells" in refused(lambda: separated_rows(wide), csv.Error)
+    path = kept(tmp_path, "queries.csv", text.encode())
+    assert "not CSV" in refused(lambda: read_query_file(path), DataError)
+
+
+def test_texts_of_a_prediction_have_a_bound() -> None:
+    from prediction_files import own_instances
+
+    arrays = prediction_arrays(own_instances())
+    arrays["names"] = np.full(2 << 20, "\u4e00")
+    assert "'names' holds 2097152 texts" in refused(lambda: prediction_from_arrays(arrays, "here"), PredictionError)
+
+
+def test_a_member_is_read_whole_and_with_its_checksum(tmp_path: Path) -> None:
+    values = np.arange(300_000, dtype=np.int64)
+    stream = io.BytesIO()
+    np.savez_compressed(stream, a=values)
+    path = kept(tmp_path, "a.npz", stream.getvalue())
+    np.testing.assert_array_equal(read_npz(path)["a"], values)
+    np.testing.assert_array_equal(read_arrays(path)["a"], values)
+    content = bytearray(stream.getvalue())
+    content[14] ^= 1  # of the checksum in the member's own header
+    at = content.index(b"PK\x01\x02") + 16
+    content[at] ^= 1
+    path.write_bytes(bytes(content))
+    with pytest.raises(PredictionError, match="not a whole zip archive"):
+        read_npz(path)
