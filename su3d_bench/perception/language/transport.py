@@ -1,6 +1,7 @@
 """One attempt to have a request answered by an OpenAI-compatible server, whatever that server does.
 
-An attempt ends within the total time-out, reads no more than the cap, and never shows the key. It gives a reply, or
+An attempt ends within the total time-out, reads no more than the cap, and never shows the key: each text of a server
+goes through ``key_cleaning.py`` before it is kept, told or judged, and its numbers have a bound. It gives a reply, or
 raises ``TryAgain`` (the next attempt may do better), ``GiveUp`` (this request never will), or a ``Su3dError`` (no
 request will: no server, no key, no such model).
 """
@@ -24,11 +25,13 @@ from pydantic import BaseModel, Field, ValidationError
 from su3d_bench.core.errors import ConfigError, ModelMissing, printable
 from su3d_bench.perception.language.chat import ChatRequest, Reply, n_tokens
 from su3d_bench.perception.language.config import LanguageConfig, check_address
+from su3d_bench.perception.language.key_cleaning import PLACE, Secret
 
 HOSTED = "https://api.openai.com/v1"
 STATUS_TO_TRY_AGAIN = frozenset({408, 409, 425, 429})
 NO_KEY = "none"  # servers on one's own machine ask for no key, the client library for any text
-_KEY_LIKE = re.compile(r"\b(?:sk|pk|key|gsk|hf)[-_][A-Za-z0-9_\-*]{6,}")
+LONGEST_PAUSE_S = 1e6  # that is told of what a server asks for
+MOST_TOKENS = 100_000_000  # of one request; no model reads or writes so many
 OPTIONAL_PARAMETERS = ("seed", "temperature", "max_tokens")
 
 
@@ -64,8 +67,8 @@ class _Choice(BaseModel):
 
 
 class _Usage(BaseModel):
-    prompt_tokens: int = Field(default=0, ge=0)
-    completion_tokens: int = Field(default=0, ge=0)
+    prompt_tokens: int = Field(default=0, ge=0, le=MOST_TOKENS)
+    completion_tokens: int = Field(default=0, ge=0, le=MOST_TOKENS)
 
 
 class _Completion(BaseModel):
@@ -83,6 +86,7 @@ class Transport:
         self._config = config
         self._address = _address_of(config)
         self._key = _key_of(config)
+        self._secret = Secret(self._key)
         self._lock = threading.Lock()
         self._client: Any = None
         self._dropped: tuple[str, ...] = ()
@@ -220,21 +224,16 @@ class Transport:
         except (ValueError, RecursionError, ValidationError):
             raise TryAgain(f"the server's answer is no chat completion: '{self._shown(text, 60)}'") from None
         choice = completion.choices[0]
-        answer = self._clean(choice.message.content or choice.message.refusal or "")
+        answer = self._secret.cleaned(choice.message.content or choice.message.refusal or "")
         usage = completion.usage or _Usage(prompt_tokens=request.n_input_tokens, completion_tokens=n_tokens(answer))
-        finish = printable(choice.finish_reason or "", 40)
-        model = self._shown(completion.model, 200)
+        finish, model = self._shown(choice.finish_reason or "", 40), self._shown(completion.model, 200)
+        if self._secret.is_split([answer, finish, model]):
+            finish = model = PLACE
         return Reply(answer, finish, model, usage.prompt_tokens, usage.completion_tokens, dropped)
 
-    def _clean(self, text: str) -> str:
-        """``text`` without the key, and writable as UTF-8."""
-        if self._key:
-            text = text.replace(self._key, "(key)")
-        return text.encode("utf-8", "replace").decode("utf-8")
-
     def _shown(self, text: str, limit: int = 200) -> str:
-        """``text`` fit for a message: without the key or what looks like one."""
-        return printable(_KEY_LIKE.sub("(key)", self._clean(text)), limit)
+        """What a server says, fit for a message or a record: without the key or what looks like one."""
+        return printable(self._secret.shown(text), limit)
 
 
 class _Unsupported(Exception):
@@ -280,12 +279,12 @@ def _pause_of(headers: Any) -> float | None:
     """Seconds that ``Retry-After`` asks for, given as a number or as a date."""
     value = str(headers.get("retry-after", "")).strip()[:100]
     if re.fullmatch(r"\d+(\.\d+)?", value):
-        return float(value)
+        return min(float(value), LONGEST_PAUSE_S)
     try:
         at = email.utils.parsedate_to_datetime(value)
     except (ValueError, TypeError, IndexError):
         return None
-    return max(0.0, at.timestamp() - time.time())
+    return min(max(0.0, at.timestamp() - time.time()), LONGEST_PAUSE_S)
 
 
 def _bounded(most_bytes: int, total_s: float) -> Callable[[Any], None]:

@@ -29,6 +29,8 @@ class Answered:
     wait_s: float = 0.0
     drip_s: float = 0.0
     usage: tuple[int, int] | None = (10, 5)
+    finish: str = "stop"
+    model: str | None = None
 
 
 def error(status: int, message: str = "no", code: str | None = None, **headers: str) -> Answered:
@@ -41,8 +43,10 @@ def completion(body: Body, answered: Answered) -> bytes:
         "id": "1",
         "object": "chat.completion",
         "created": 0,
-        "model": body.get("model", ""),
-        "choices": [{"index": 0, "finish_reason": "stop", "message": {"role": "assistant", "content": answered.text}}],
+        "model": body.get("model", "") if answered.model is None else answered.model,
+        "choices": [
+            {"index": 0, "finish_reason": answered.finish, "message": {"role": "assistant", "content": answered.text}}
+        ],
     }
     if answered.usage is not None:
         value["usage"] = {"prompt_tokens": answered.usage[0], "completion_tokens": answered.usage[1]}
