@@ -15,8 +15,12 @@ import zlib
 from collections.abc import Callable
 from typing import Any
 
+from bombs import MIB, Member, deflated, gzip_of, whole_member, zip_of
+
 MOST_BYTES = 4 << 20  # of a copy
 SWOLLEN = (*(1 << 16,) * 30, 32 << 20)  # zeros behind the member of an archive
+MOST_INSIDE = 64 << 20  # bytes of a packed sample that are unpacked to be damaged
+BOMBS = (1, 40, 2500)  # mebibytes that few bytes unpack to: what may be, and what may not
 NUMBERS = (
     *("0", "-0", "1", "-1", "2", "0.5", "1e-320", "1e308", "-1e308", "1e999", "nan", "NaN", "inf", "-inf", "Infinity"),
     *("127", "128", "255", "256", "65535", "65536", "2147483647", "2147483648", "-2147483649", "4294967296"),
@@ -174,12 +178,18 @@ def _places(tree: Any) -> list[tuple[Any, Any]]:
 
 
 def _gzip(content: bytes, rng: random.Random) -> bytes:
+    unpacking = zlib.decompressobj(31)
     try:
-        inside = gzip.decompress(content)
-    except (OSError, EOFError, zlib.error):
+        inside = unpacking.decompress(content, MOST_INSIDE)
+    except zlib.error:
+        return _bytes(content, rng)
+    if not unpacking.eof:
         return _bytes(content, rng)
     if rng.random() < 0.02:
         return gzip_bomb()
+    if rng.random() < 0.02:
+        at = rng.randrange(len(inside) + 1)
+        return gzip_of(inside[:at], rng.choice(BOMBS), rng.choice((0, 0x20, 0x5D, 0x94)), inside[at:])
     return gzip.compress(mutated(inside, rng), 1, mtime=0)
 
 
@@ -192,7 +202,11 @@ def gzip_bomb() -> bytes:
 def _zip(content: bytes, rng: random.Random) -> bytes:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
-            members = [(info.filename, archive.read(info), info.compress_type) for info in archive.infolist()]
+            if any(
+                info.file_size > MOST_INSIDE or info.compress_size > info.file_size + MIB for info in archive.filelist
+            ):
+                return _bytes(content, rng)  # a bomb already
+            members = [(info.filename, archive.read(info), info.compress_type) for info in archive.filelist]
     except Exception:  # noqa: BLE001 - it was damaged already, in any way
         return _bytes(content, rng)
     if not members:
@@ -200,6 +214,8 @@ def _zip(content: bytes, rng: random.Random) -> bytes:
     at = rng.randrange(len(members))
     name, inside, method = members[at]
     kind = rng.randrange(10)
+    if rng.random() < 0.05:
+        return _swollen([(one, text) for one, text, _ in members], at, rng)
     if kind < 6:
         members[at] = (name, mutated(inside, rng), method)
     elif kind == 6:
@@ -216,6 +232,50 @@ def _zip(content: bytes, rng: random.Random) -> bytes:
         for name, inside, method in members:
             archive.writestr(zipfile.ZipInfo(name), inside, method, 1)
     return out.getvalue()
+
+
+def _swollen(members: list[tuple[str, bytes]], at: int, rng: random.Random) -> bytes:
+    """An archive of which one member goes on for mebibytes, says so or not, and may be packed as nobody packs."""
+    name, inside = members[at]
+    n = rng.choice(BOMBS)
+    packed = deflated(inside, n, rng.choice((0, 0x20)))
+    promised = rng.choice((len(inside) + n * MIB, len(inside) + n * MIB, len(inside), 1 << 17))
+    method = rng.choice((zipfile.ZIP_DEFLATED,) * 4 + (zipfile.ZIP_STORED, zipfile.ZIP_BZIP2))
+    whole = [whole_member(one, text) for one, text in members]
+    whole[at] = Member(name, packed, promised, method)
+    return zip_of(whole)
+
+
+DOCTYPES = (
+    *('<!DOCTYPE a [<!ENTITY b "bb">]>', '<!DOCTYPE a SYSTEM "file:///etc/passwd">', "<!DOCTYPE a>"),
+    '<!DOCTYPE a [<!ENTITY b "bbbbbbbb"><!ENTITY c "&b;&b;&b;&b;">]>',
+)
+ENCODINGS = ("utf-8", "utf-16", "utf-16-le", "iso-8859-1", "cp1252", "utf-7", "cp037")
+TAG = re.compile(r"<[^<>]*>")
+
+
+def _xml(content: bytes, rng: random.Random) -> bytes:
+    """XML with a document type, in another encoding, with elements again and again or within each other."""
+    try:
+        text = content.decode()
+    except UnicodeDecodeError:
+        return _bytes(content, rng)
+    tags = list(TAG.finditer(text))
+    kind = rng.randrange(6)
+    if kind > 3 or not tags:
+        return _text(content, rng)
+    one = rng.choice(tags)
+    if kind == 0:
+        encoding, body = rng.choice(ENCODINGS), text.partition("?>")[2] or text
+        said = f'<?xml version="1.0" encoding="{encoding}"?>{rng.choice(DOCTYPES)}{body}'
+        return said.encode(encoding, "replace")
+    if kind < 3:
+        again = one.group() * _times(rng.choice((1, 300, 300_000)), len(one.group()))
+        text = text[: one.start()] + again + text[one.start() :]
+    else:
+        value = re.sub(r'"[^"]*"', f'"{rng.choice((*NUMBERS, *TEXTS))}"', one.group(), count=1)
+        text = text[: one.start()] + value + text[one.end() :]
+    return text.encode("utf-8", "surrogatepass")
 
 
 def _npy(content: bytes, rng: random.Random) -> bytes:
@@ -254,7 +314,11 @@ def _png(content: bytes, rng: random.Random) -> bytes:
 
 
 def _jpeg(content: bytes, rng: random.Random) -> bytes:
-    """A JPEG that says it has another size."""
+    """A JPEG that says it has another size, or says its scans again and again."""
+    scan = content.find(b"\xff\xda")
+    if scan > 0 and rng.random() < 0.1:
+        pixels = content[scan:].removesuffix(b"\xff\xd9")
+        return content[:scan] + pixels * _times(rng.choice((2, 500)), len(pixels)) + b"\xff\xd9"
     at = max(content.find(b"\xff\xc0"), content.find(b"\xff\xc2"))
     if at < 0 or rng.random() < 0.5:
         return _bytes(content, rng)
@@ -287,6 +351,7 @@ MAGICS: dict[bytes, Mutation] = {
     b"\x93NUMPY": _npy,
     b"\x89PNG": _png,
     b"\xff\xd8": _jpeg,
+    b"<": _xml,
     b"\x80\x02": _pickle,
     b"\x80\x04": _pickle,
 }

@@ -207,6 +207,7 @@ def _hdf5(**options: Any) -> Make:
 def _image(suffix: str) -> Make:
     def make(folder: Path) -> Read:
         import cv2
+        from bombs import jpeg_of_scans
 
         from su3d_bench.formats.images import decode_colour, decode_depth, image_size, read_bytes
 
@@ -214,6 +215,8 @@ def _image(suffix: str) -> Make:
         path, is_depth = folder / f"a{suffix}", suffix in (".depth.png", ".pgm")
         if suffix == ".pgm":
             path.write_bytes(b"P5\n# made\n32 24\n65535\n" + values.astype(">u2").tobytes())
+        elif suffix == ".scans.jpg":
+            path.write_bytes(jpeg_of_scans(64, 48, 3))
         else:
             cv2.imwrite(str(path), values if is_depth else np.repeat((values >> 8).astype(np.uint8)[..., None], 3, 2))
         decode = decode_depth if is_depth else decode_colour
@@ -302,7 +305,10 @@ TARGETS = (
     *(Target(f"pcd {form}", _pcd(form), ("a.pcd",)) for form in ("ascii", "binary", "binary_compressed")),
     Target("hdf5 contiguous", _hdf5(), ("*.h5",)),
     Target("hdf5 chunked", _hdf5(chunks=(16, 3), compression="gzip", shuffle=True), ("*.h5",)),
-    *(Target(f"image{suffix}", _image(suffix), ("a*",)) for suffix in (".jpg", ".png", ".depth.png", ".pgm", ".ppm")),
+    *(
+        Target(f"image{suffix}", _image(suffix), ("a*",))
+        for suffix in (".jpg", ".scans.jpg", ".png", ".depth.png", ".pgm", ".ppm")
+    ),
     *(Target(f"queries{suffix}", _queries(suffix), ("q.*",)) for suffix in (".toml", ".csv")),
     Target("questions own", _questions("q.toml", lambda test: test.toml_text(test.SET[:2])), ("q.toml",)),
     Target("questions scanrefer", _questions("q.json", lambda test: test.SCANREFER), ("q.json",)),

@@ -102,27 +102,33 @@ def _kept_replies(folder: Path) -> Read:
 
 
 def _completion(folder: Path) -> Read:
-    """What a server answered."""
+    """What a server answered that says the key back: none of it may stay."""
+    from chat_server import KEY
     from test_language_client import ask
 
     from su3d_bench.perception.language.config import LanguageConfig
+    from su3d_bench.perception.language.key_cleaning import Secret
     from su3d_bench.perception.language.transport import GiveUp, Transport, TryAgain
 
     content = {
         "model": "made",
-        "choices": [{"message": {"content": "a chair", "refusal": None}, "finish_reason": "stop"}],
+        "choices": [{"message": {"content": f"a chair {KEY}", "refusal": None}, "finish_reason": f"stop {KEY}"}],
         "usage": {"prompt_tokens": 3, "completion_tokens": 2},
     }
     path = folder / "answer.json"
     path.write_text(json.dumps(content))
     transport, request = Transport(LanguageConfig()), ask("What is that?")
+    transport._secret = Secret(KEY)
 
     def read() -> object:
         text = path.read_bytes().decode("utf-8", "replace") if path.is_file() else ""
         try:
-            return transport._reply(request, text, ())
-        except (TryAgain, GiveUp):
-            return None  # the client asks again
+            said: object = transport._reply(request, text, ())
+        except (TryAgain, GiveUp) as failed:
+            said = failed  # the client asks again
+        if KEY.lower() in f"{said!r} {said}".lower():
+            raise AssertionError(f"the key is kept: {said}")
+        return said
 
     return read
 

@@ -98,6 +98,16 @@ def _archive(name: str) -> Make:
     return make
 
 
+def _packed_masks(folder: Path) -> Read:
+    """Masks of a scene that somebody has compressed."""
+    from su3d_bench.predictions.formats import READERS
+
+    masks = np.zeros((500, 7), np.bool_)
+    masks[100:200, 3] = True
+    np.savez_compressed(folder / "scene0011_00.npz", pred_masks=masks, pred_score=np.ones(7))
+    return lambda: READERS["maskclustering"].read(folder, "scene0011_00")
+
+
 def _own_prediction(kind: str) -> Make:
     """Our own file, as a run reads it again and as others' predictions are read."""
 
@@ -214,6 +224,7 @@ TARGETS = (
     ),
     *(Target(f"archive {name}", _archive(name), (name,)) for name in ("strided.pt", "openins3d.pt", "open3dis.pth")),
     *(Target(f"archive {name}", _archive(name), (name,)) for name in ("a.npy", "a.npz")),
+    Target("archive of packed masks", _packed_masks, ("*.npz",)),
     *(Target(f"own {kind}", _own_prediction(kind), ("*",)) for kind in ("instances", "partition", "dense")),
     Target("truth as text", _truth, ("*.txt",)),
     Target("text features", _texts, ("*.npz",)),

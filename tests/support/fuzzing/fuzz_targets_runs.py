@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import atexit
 import functools
+import io
 import itertools
 import json
 import shutil
 import tempfile
+import zipfile
 from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -151,17 +153,41 @@ def _paper(folder: Path) -> Read:
 
 def _answers(name: str) -> Make:
     def make(folder: Path) -> Read:
-        from counted_sheets import workbook
+        from counted_sheets import elsewhere, sharing, workbook
         from simulated_annotators import answered, as_csv, retrieval_set
 
         from su3d_bench.sheets.judging.answers import check_answers, read_answers
 
         sheet, key = retrieval_set(4)
         rows = answered(sheet, key, {"ann": 0.0})
-        (folder / name).write_bytes(as_csv(rows).encode() if name.endswith("csv") else workbook(rows))
+        book = elsewhere(sharing(workbook(rows))) if name.startswith("moved") else workbook(rows)
+        (folder / name).write_bytes(as_csv(rows).encode() if name.endswith("csv") else book)
         return lambda: check_answers(sheet, read_answers(folder / name))
 
     return make
+
+
+def _workbook_parts(folder: Path) -> Read:
+    """A workbook that is put together of its parts, which lie where its relationships say, before it is read."""
+    from counted_sheets import elsewhere, sharing, workbook
+    from simulated_annotators import answered, retrieval_set
+
+    from su3d_bench.sheets.judging.answers import check_answers, parse_workbook
+
+    sheet, key = retrieval_set(4)
+    content = elsewhere(sharing(workbook(answered(sheet, key, {"ann": 0.0}))))
+    with zipfile.ZipFile(io.BytesIO(content)) as archive:
+        names = archive.namelist()
+        archive.extractall(folder)
+
+    def read() -> object:
+        stream = io.BytesIO()
+        with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name in names:
+                archive.writestr(name, (folder / name).read_bytes() if (folder / name).is_file() else b"")
+        return check_answers(sheet, parse_workbook(stream.getvalue(), "ann.xlsx"))
+
+    return read
 
 
 def _sheet_files(folder: Path) -> Read:
@@ -343,6 +369,8 @@ TARGETS = (
     Target("paper", _paper, ("paper.tex",), 0.15),
     Target("answers.csv", _answers("ann.csv"), ("ann.csv",)),
     Target("answers.xlsx", _answers("bob.xlsx"), ("bob.xlsx",), 0.3),
+    Target("answers moved", _answers("moved.xlsx"), ("moved.xlsx",), 0.3),
+    Target("answers in parts", _workbook_parts, ("**/*",), 0.5),
     Target("sheet files", _sheet_files, ("sheet/*.json", "key/*.json", "scores/scores.json"), 0.05),
     Target("config of a run", _config("a.toml"), ("a.toml",), 0.05),
     Target("config of methods", _method_config, ("a.toml",)),
