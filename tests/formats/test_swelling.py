@@ -277,6 +277,14 @@ def test_texts_of_a_prediction_have_a_bound() -> None:
     assert "'names' holds 2097152 texts" in refused(lambda: prediction_from_arrays(arrays, "here"), PredictionError)
 
 
+def test_masks_of_an_image_have_a_bound_in_pixels() -> None:
+    from su3d_bench.perception.stored.source import check_masks
+
+    check_masks(400, (968, 1296), "here")
+    for n, shape in ((2001, (4, 4)), (500, (968, 1296))):
+        assert f"has {n} regions" in refused(lambda n=n, shape=shape: check_masks(n, shape, "here"), DataError)  # type: ignore[misc]
+
+
 def test_a_member_is_read_whole_and_with_its_checksum(tmp_path: Path) -> None:
     values = np.arange(300_000, dtype=np.int64)
     stream = io.BytesIO()

@@ -149,7 +149,7 @@ def test_the_digest_moves_with_the_files(tmp_path: Path) -> None:
         ({"xyxy": np.full((3, 4), np.nan)}, "boxes of finite numbers"),
         ({"confidence": np.array([np.nan, 1, 1])}, "a confidence is not finite"),
         ({"confidence": None}, "'confidence' is no array of numbers"),
-        ({"confidence": np.ones(2001)}, "has 2001 detections"),
+        ({"confidence": np.ones(2001)}, "has 2001 regions"),
         ({"image_feats": np.ones((3, 8))}, r"image_feats are \(3, 8\); expected 3 rows of length 1"),
     ],
 )

@@ -116,7 +116,10 @@ def test_the_digest_moves_with_images_and_names(tmp_path: Path) -> None:
     [
         (np.zeros((60, 80), np.uint8), "frame-0040.segm.png is 80x60, the frame has width 160 and height 120"),
         (np.zeros((120, 160, 3), np.uint8), "not a label image: 8 bits, PNG colour type 2; expected one grey channel"),
-        (np.arange(120 * 160, dtype=np.uint16).reshape(120, 160), "holds 19199 values; expected one a region"),
+        (
+            np.arange(120 * 160, dtype=np.uint16).reshape(120, 160),
+            "has 19199 regions of 160x120 pixels; expected one a thing",
+        ),
     ],
 )
 def test_what_is_no_label_image_is_said(tmp_path: Path, image: np.ndarray, message: str) -> None:

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import DataError, printable
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, Regions, SceneInfo
 from su3d_bench.formats.pickles.pickles import read_pickle_file
-from su3d_bench.perception.stored.source import StoredFrame, numbered_files
+from su3d_bench.perception.stored.source import StoredFrame, check_masks, numbered_files
 
-MAX_REGIONS = 2_000  # of one image; SAM gives some hundred
 MAX_NAME_LENGTH = 100
 _SKIPPED = ("image_crops",)
 # Who made the features in the files, and of which crops: boxes and 20 px on every side.
@@ -55,8 +54,7 @@ def _frame(content: Mapping[object, object], frame: Frame, where: str) -> Stored
     height, width = frame.depth_m.shape
     scores = _numbers(content, "confidence", where).reshape(-1)
     n = len(scores)
-    if n > MAX_REGIONS:
-        raise DataError(f"{where}: has {n} detections; expected one a thing in the image")
+    check_masks(n, (height, width), where)
     if not np.isfinite(scores).all():
         raise DataError(f"{where}: a confidence is not finite")
     masks = _masks(content, n, (height, width), where)
@@ -95,7 +93,7 @@ def _masks(content: Mapping[object, object], n: int, shape: tuple[int, int], whe
             f"{where}: masks are {masks.shape}, the frame has height {shape[0]} and width {shape[1]} and {n} "
             "detections; they must be made from the images of the dataset at their own size"
         )
-    return masks.astype(bool)
+    return masks.astype(bool, copy=False)
 
 
 def _names(content: Mapping[object, object], n: int, where: str) -> tuple[str, ...]:

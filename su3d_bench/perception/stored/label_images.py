@@ -21,11 +21,10 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, Regions, SceneInfo
 from su3d_bench.formats.images import decoded, whole_png_header
 from su3d_bench.perception.crops import mask_boxes
-from su3d_bench.perception.stored.source import StoredFrame, numbered_files
+from su3d_bench.perception.stored.source import StoredFrame, check_masks, numbered_files
 
 MAX_NAMES_BYTES = 1 << 20
 MAX_NAME_LENGTH = 100
-MAX_REGIONS = 1_000  # masks take an image of memory each; no image has more things in it
 
 
 @dataclass(frozen=True)
@@ -60,9 +59,10 @@ class LabelImages:
             )
         labels = decode_labels(path, frame.depth_m.shape, f"{self._where}: {path.name}")
         values = [int(value) for value in np.unique(labels) if value > 0]
-        if len(values) > MAX_REGIONS:
-            raise DataError(f"{self._where}: {path.name} holds {len(values)} values; expected one a region")
-        masks = np.array([labels == value for value in values], bool).reshape(-1, *labels.shape)
+        check_masks(len(values), labels.shape, f"{self._where}: {path.name}")
+        masks = np.empty((len(values), *labels.shape), np.bool_)
+        for mask, value in zip(masks, values, strict=True):
+            np.equal(labels, value, out=mask)
         return LabelledRegions(
             tuple(values), masks, mask_boxes(masks), tuple(self._name_of.get(value) for value in values)
         )

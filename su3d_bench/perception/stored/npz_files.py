@@ -25,13 +25,12 @@ from numpy.typing import NDArray
 from su3d_bench.core.errors import DAMAGE, DataError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Detections, Float32Array, Frame, Regions, SceneInfo
-from su3d_bench.perception.stored.source import StoredFrame
+from su3d_bench.perception.stored.source import StoredFrame, check_masks
 from su3d_bench.store.atomic import read_arrays
 
 _REQUIRED = ("image_size", "masks", "boxes", "scores", "names")
 _FEATURES = ("crop_ratios", "crop_features", "global_feature", "encoder")
 _OPTIONAL = ("captions", *_FEATURES)
-MAX_REGIONS = 2_000  # of one image; the bits of a mask become eight times as many bytes
 
 
 def stored_path(folder: Path, dataset: str, scene: str, frame_index: int) -> Path:
@@ -118,8 +117,6 @@ def _check_keys(arrays: Mapping[str, NDArray[Any]], where: str) -> None:
 def _check_rows(arrays: Mapping[str, NDArray[Any]], where: str) -> int:
     shapes = {"masks": 2, "boxes": 2, "scores": 1, "names": 1, "captions": 1}
     n = len(arrays["scores"]) if arrays["scores"].ndim else -1
-    if n > MAX_REGIONS:
-        raise DataError(f"{where}: has {n} detections; expected one a thing in the image, at most {MAX_REGIONS}")
     for key, n_axes in shapes.items():
         if key in arrays and (arrays[key].ndim != n_axes or len(arrays[key]) != n):
             raise DataError(f"{where}: '{key}' has shape {arrays[key].shape}; expected {n_axes} axes and {n} rows")
@@ -133,6 +130,7 @@ def _masks(arrays: Mapping[str, NDArray[Any]], frame: Frame, n: int, where: str)
     size, height, width = arrays["image_size"], *frame.depth_m.shape
     if size.shape != (2,) or (int(size[0]), int(size[1])) != (height, width):
         raise DataError(f"{where}: image_size is {size.tolist()}, the frame has height {height} and width {width}")
+    check_masks(n, (height, width), where)
     packed, n_bytes = arrays["masks"], -(-height * width // 8)
     if packed.dtype != np.uint8 or packed.shape[1] != n_bytes:
         raise DataError(f"{where}: 'masks' is {packed.shape} {packed.dtype}; expected ({n}, {n_bytes}) uint8")
