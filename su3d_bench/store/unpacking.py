@@ -13,6 +13,7 @@ FREE_BYTES = 128 << 20
 MOST_RATIO = 100
 PIECE = 1 << 20
 ENCRYPTED = 0x1
+LEAST_ZIP = 22  # bytes of an archive without members
 METHODS = frozenset({zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED})  # the others unpack without a bound
 
 
@@ -38,9 +39,12 @@ class Allowance:
 
 
 def allowance_of(archive: zipfile.ZipFile) -> Allowance:
-    """What may be unpacked from a zip archive by the bytes that it really has."""
+    """What may be unpacked from a zip archive by the bytes that it really has; damage where none of them is a member."""
     assert archive.fp is not None
-    return Allowance(archive.fp.seek(0, io.SEEK_END))
+    n_bytes = archive.fp.seek(0, io.SEEK_END)
+    if not archive.infolist() and n_bytes > LEAST_ZIP + len(archive.comment):
+        raise zipfile.BadZipFile("holds bytes and names no member")
+    return Allowance(n_bytes)
 
 
 def check_member(info: zipfile.ZipInfo, allowance: Allowance) -> None:
