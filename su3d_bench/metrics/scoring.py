@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import DAMAGE, DataError, PredictionError
+from su3d_bench.core.errors import DAMAGE, DataError, PredictionError, printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
 from su3d_bench.metrics.fitness import why_not_scorable
@@ -256,6 +256,8 @@ def unpack_scores(data: bytes) -> dict[str, SceneScore]:
     try:
         arrays = read_arrays(io.BytesIO(data))
         names = [key.removesuffix("/about") for key in arrays if key.endswith("/about")]
+        if strangers := [key for key in arrays if key.rpartition("/")[0] not in names]:
+            raise DataError(f"counts: '{printable(strangers[0], 80)}' belongs to no protocol; score the scene again")
         return {name: _unpack_one(name, arrays) for name in names}
     except DAMAGE as error:
         raise DataError(f"counts: are damaged or of another version ({error}); score the scene again") from error

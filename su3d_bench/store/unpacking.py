@@ -39,7 +39,7 @@ class Allowance:
 
 
 def allowance_of(archive: zipfile.ZipFile) -> Allowance:
-    """What may be unpacked from a zip archive by the bytes that it really has; damage where none of them is a member."""
+    """What may be unpacked from a zip archive by its real bytes; damage where none of them is a member."""
     assert archive.fp is not None
     n_bytes = archive.fp.seek(0, io.SEEK_END)
     if not archive.infolist() and n_bytes > LEAST_ZIP + len(archive.comment):
