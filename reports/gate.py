@@ -8,6 +8,8 @@ from typing import Literal
 from xml.etree import ElementTree
 
 from su3d_bench.core.errors import printable
+from su3d_bench.core.printing import one_line
+from su3d_bench.reports.tables.formats import markup_free
 from su3d_bench.reports.tables.model import NOT_MEASURED
 
 
@@ -71,11 +73,11 @@ def markdown(verdict: Verdict) -> str:
         lines += ["| | where | reference | now | |", "|---|---|---|---|---|"]
         for row in rows[:MAX_ROWS]:
             cells = (_mark(row), row.where, _number(row, row.reference), _number(row, row.measured), row.text)
-            lines.append("| " + " | ".join(_cell(cell) for cell in cells) + " |")
+            lines.append("| " + " | ".join(map(markup_free, cells)) + " |")
         if len(rows) > MAX_ROWS:
             lines.append(f"| | and {len(rows) - MAX_ROWS} more | | | |")
         lines.append("")
-    return "\n".join([*lines, *(f"- {_cell(remark)}" for remark in verdict.remarks)]).rstrip("\n") + "\n"
+    return "\n".join([*lines, *(f"- {markup_free(remark)}" for remark in verdict.remarks)]).rstrip("\n") + "\n"
 
 
 def junit_xml(verdict: Verdict) -> str:
@@ -133,13 +135,6 @@ def _number(finding: Finding, value: float | None) -> str:
     return f"{100 * value:.{digits}f}"
 
 
-def _cell(text: str) -> str:
-    """Text that is no markup in a Markdown table."""
-    for character in "\\`*_{}[]<>|#":
-        text = text.replace(character, f"\\{character}")
-    return " ".join(text.split())
-
-
 def _workflow(text: str) -> str:
-    """Text as workflow commands take it: percent, carriage return and new line encoded."""
-    return text.replace("%", "%25").replace("\r", "%0D").replace("\n", "%0A")
+    """Text as workflow commands take it: on one line, percent signs encoded."""
+    return one_line(text).replace("%", "%25")

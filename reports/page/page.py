@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import base64
 import hashlib
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
+
+from su3d_bench.core.printing import json_line, plain_value
 
 HERE = Path(__file__).parent
 SCRIPTS = (  # in the order in which they run
@@ -57,8 +58,8 @@ def embedded_json(value: Any) -> str:
     >>> embedded_json({"name": "</script><!--"})
     '{"name":"\\\\u003c/script>\\\\u003c!--"}'
     """
-    text = json.dumps(value, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    return text.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+    text = json_line(plain_value(value), allow_nan=False, separators=(",", ":"))
+    return text.replace("<", "\\u003c")
 
 
 def _file(path: Path) -> str:

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 from urllib.parse import quote
 
-from su3d_bench.reports.tables.formats import csv_lines, harmless, safe
+from su3d_bench.reports.tables.formats import csv_lines, safe
 
 COLUMNS = ("item_id", "question", "reason", "answers", "truth", "scene", "methods", "text", "pictures")
 STYLE = (
@@ -25,7 +25,7 @@ def second_looks_csv(looks: Sequence[Mapping[str, Any]]) -> str:
     for look in looks:
         row = [look["item_id"], look["ask"], look["reason"], _answers(look), look["automatic"], look["scene"]]
         row += [", ".join(look["methods"]), look["text"], ", ".join(look["pictures"])]
-        rows.append([harmless(cell) for cell in row])
+        rows.append(row)
     return csv_lines(rows)
 
 

@@ -1,10 +1,15 @@
-"""Tables, and what stands between them, as Markdown, CSV and HTML; ``FORMATS`` has LaTeX too."""
+"""Tables, and what stands between them, as text, Markdown, CSV and HTML; ``FORMATS`` has LaTeX too.
+
+Each form has one function through which every text goes: ``markup_free``, ``harmless``, ``safe``, and ``escape`` of
+LaTeX.
+"""
 
 from __future__ import annotations
 
 import csv
 import html
 import io
+import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any
@@ -32,8 +37,19 @@ CSV_COLUMNS = (
     "unit",
     "mark",
 )
-# A spreadsheet takes what begins so for a formula; an apostrophe before it makes it text.
-FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r")
+# A spreadsheet takes what begins so for a formula (OWASP, "CSV Injection"); an apostrophe before it makes it text.
+FORMULA_STARTS = ("=", "+", "-", "@", "\t", "\r", "\uff1d", "\uff0b", "\uff0d", "\uff20")
+# Where the semicolon parts cells, as in half of Europe, one begins behind it.
+_CELL_WITHIN = re.compile(r"(?<=;)(?=[=+\-@])")
+_CELL_MENDED = re.compile(r"(?<=;)'(?=[=+\-@])")
+# What CommonMark takes for markup wherever it stands; links need two of the brackets beside each other, and of names
+# with underscores only the outer ones are emphasis.
+_MARKUP = re.compile(
+    r"""\\(?=[!-/:-@\[-`{-~]) | [`*|] | (?<![^\W_])_ | _(?![^\W_]) | ~(?=~) | (?<=\])[(:\[]""", re.VERBOSE
+)
+_ENTITY = re.compile(r"&(?=#?\w+;)")
+_BLOCK = re.compile(r"^(?:[-+](?=\s)|[#>]|\d{1,9}(?=[.)](?:\s|$)))")
+MOST_OF_A_CELL = 2000
 MOST_OF_A_NOTE = 7_000  # characters: it may name every scene of a data set
 STYLE = (
     "body{font:16px/1.5 system-ui,sans-serif;margin:2rem auto;max-width:70rem;padding:0 1rem;color-scheme:light dark}"
@@ -46,16 +62,28 @@ STYLE = (
 
 def markdown(parts: Sequence[Table | Prose]) -> str:
     """All ``parts``, each table with its caption above and its notes beneath; the best is in two asterisks a side."""
-    return "\n\n".join(_markdown(part) for part in parts) + "\n"
+    return _laid_out(parts, markup_free)
 
 
-def _markdown(part: Table | Prose) -> str:
+def plain(parts: Sequence[Table | Prose]) -> str:
+    """As ``markdown``, for a terminal: texts stand there as they are."""
+    return _laid_out(parts, printable)
+
+
+def _laid_out(parts: Sequence[Table | Prose], shown: Callable[[str, int], str]) -> str:
+    return "\n\n".join(_block(part, shown) for part in parts) + "\n"
+
+
+def _block(part: Table | Prose, shown: Callable[[str, int], str]) -> str:
     if isinstance(part, Prose):
-        return "\n".join(f"{'- ' if part.is_list else ''}{_pipes(line, MOST_OF_A_NOTE)}" for line in part.lines)
-    rows = [[row.title, *(_marked(cell) for cell in row.cells)] for row in part.rows]
-    lines = aligned([[_pipes(text) for text in row] for row in [[part.head, *part.columns], *rows]]) if rows else []
-    caption = _pipes(f"**{part.heading}**{part.caption}" if part.heading else part.caption)
-    notes = [f"- {_pipes(note, MOST_OF_A_NOTE)}" for note in part.notes]
+        return "\n".join(f"{'- ' if part.is_list else ''}{shown(line, MOST_OF_A_NOTE)}" for line in part.lines)
+    head = [shown(text, MOST_OF_A_CELL) for text in (part.head, *part.columns)]
+    rows = [[shown(row.title, MOST_OF_A_CELL), *(_marked(cell, shown) for cell in row.cells)] for row in part.rows]
+    lines = aligned([head, *rows]) if rows else []
+    heading = f"**{shown(part.heading, MOST_OF_A_CELL)}**" if part.heading else ""
+    gap = " " if heading and part.caption.startswith(" ") else ""
+    caption = f"{heading}{gap}{shown(part.caption, MOST_OF_A_CELL)}"
+    notes = [f"- {shown(note, MOST_OF_A_NOTE)}" for note in part.notes]
     return "\n\n".join(block for block in (caption, "\n".join(lines), "\n".join(notes)) if block)
 
 
@@ -69,19 +97,26 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     return [lines[0], rule, *lines[1:]]
 
 
-def _marked(cell: Cell) -> str:
-    return f"**{cell.text}** {cell.beside}".rstrip() if cell.is_best else cell.whole
+def _marked(cell: Cell, shown: Callable[[str, int], str]) -> str:
+    if not cell.is_best:
+        return shown(cell.whole, MOST_OF_A_CELL)
+    return f"**{shown(cell.text, MOST_OF_A_CELL)}** {shown(cell.beside, MOST_OF_A_CELL)}".rstrip()
 
 
-def _pipes(text: str, most: int = 2000) -> str:
-    """``text`` without what would end a cell or begin HTML."""
-    return printable(text, most).replace("|", "\\|").replace("<", "&lt;")
+def markup_free(text: str, most: int = MOST_OF_A_CELL) -> str:
+    r"""``text`` on one line as Markdown shows it letter for letter: no tag, link, emphasis, heading or end of a cell.
+
+    >>> markup_free("<b> [a](http://x) | *top_m=5* [1.0, 2.0]"), markup_free("# 1"), markup_free("_a_b")
+    ('&lt;b> [a]\\(http://x) \\| \\*top_m=5\\* [1.0, 2.0]', '\\# 1', '\\_a_b')
+    """
+    line = _ENTITY.sub(r"\\&", _MARKUP.sub(r"\\\g<0>", printable(text, most))).replace("<", "&lt;")
+    return _BLOCK.sub(lambda match: f"{match[0]}\\" if match[0].isdigit() else f"\\{match[0]}", line)
 
 
 def csv_text(parts: Sequence[Table | Prose]) -> str:
     """One line a cell, then one a note; measured values also in full precision, as fractions."""
     rows = [row for part in parts for row in (_note_rows("", part.lines) if isinstance(part, Prose) else _rows(part))]
-    return csv_lines([CSV_COLUMNS, *([harmless(row.get(name, "")) for name in CSV_COLUMNS] for row in rows)])
+    return csv_lines([CSV_COLUMNS, *([row.get(name, "") for name in CSV_COLUMNS] for row in rows)])
 
 
 def _rows(table: Table) -> Iterator[Mapping[str, Any]]:
@@ -108,13 +143,13 @@ def _note_rows(table: str, lines: Sequence[str]) -> Iterator[Mapping[str, Any]]:
 
 
 def csv_lines(rows: Iterable[Iterable[object]]) -> str:
-    """Rows of cells as CSV."""
+    """Rows of cells as CSV, each cell ``harmless``."""
     text = io.StringIO()
-    csv.writer(text, lineterminator="\n").writerows(rows)
+    csv.writer(text, lineterminator="\n").writerows(map(harmless, row) for row in rows)
     return text.getvalue()
 
 
-def harmless(value: str | int | float) -> str | int | float:
+def harmless(value: object) -> object:
     """A cell on one line that no spreadsheet takes for a formula.
 
     >>> harmless("=1+1"), harmless("-"), harmless(-1)
@@ -122,8 +157,23 @@ def harmless(value: str | int | float) -> str | int | float:
     """
     if not isinstance(value, str):
         return value
-    line = printable(value, 2000)
-    return f"'{line}" if line.startswith(FORMULA_STARTS) and line != "-" else line
+    return no_formula(printable(value, MOST_OF_A_CELL))
+
+
+def no_formula(text: str) -> str:
+    """``text`` as a spreadsheet takes it for text; ``meant`` gives it back."""
+    apart = _CELL_WITHIN.sub("'", text)
+    return f"'{apart}" if apart.startswith(FORMULA_STARTS) and apart != "-" else apart
+
+
+def meant(cell: str) -> str:
+    """What ``no_formula`` was given.
+
+    >>> meant("'=1+1"), meant("'chair'")
+    ('=1+1', "'chair'")
+    """
+    text = cell[1:] if cell[:1] == "'" and cell[1:2] in FORMULA_STARTS else cell
+    return _CELL_MENDED.sub("", text)
 
 
 def html_page(parts: Sequence[Table | Prose]) -> str:
@@ -166,10 +216,11 @@ def _strong(cell: Cell) -> str:
 
 def safe(text: str) -> str:
     """``text`` on one line, without what HTML would take for its own."""
-    return html.escape(printable(text, 2000))
+    return html.escape(printable(text, MOST_OF_A_CELL))
 
 
 FORMATS: Mapping[str, Callable[[Sequence[Table | Prose]], str]] = {
+    "text": plain,
     "markdown": markdown,
     "latex": latex,
     "csv": csv_text,

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer_either, formatted, remark
+from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer_tables, remark
 from su3d_bench.core.errors import EXIT_DONE
 
 
@@ -45,5 +45,5 @@ def call(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         draw_attribution(attribution, arguments.out)
         remark(f"plot: {arguments.out}", quiet=arguments.quiet)
-    answer_either(arguments, attribution, formatted(attribution_tables(attribution), arguments))
+    answer_tables(arguments, attribution, attribution_tables(attribution))
     return EXIT_DONE

@@ -7,7 +7,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_json, remark, written
+from su3d_bench.cli.common import add_verb, answer, answer_commands, answer_json, remark, written
 from su3d_bench.core.errors import EXIT_CHECK_FAILED, EXIT_DONE, ConfigError
 
 if TYPE_CHECKING:
@@ -98,10 +98,10 @@ def _check(arguments: argparse.Namespace) -> int:
     if arguments.json:
         answer_json({"passed": verdict.is_passed, **asdict(verdict)})
     else:
-        answer("\n".join(plain_lines(verdict)))
+        answer(*plain_lines(verdict))
         in_workflow = os.environ.get("GITHUB_ACTIONS") == "true"
         if in_workflow if arguments.github is None else arguments.github:
-            answer("\n".join(github_lines(verdict)))
+            answer_commands(github_lines(verdict))
     for line in verdict.remarks:
         remark(line, quiet=arguments.quiet)
     return EXIT_DONE if verdict.is_passed else EXIT_CHECK_FAILED

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import json
 import re
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.core.errors import EXIT_DONE
+from su3d_bench.core.printing import Door, json_line, one_line, stream_behind
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
 
 if TYPE_CHECKING:
@@ -24,7 +24,8 @@ if TYPE_CHECKING:
     from su3d_bench.reports.tables.model import Prose, Table
     from su3d_bench.store.run_folder import RunFolder
 
-TABLE_FORMATS = ("markdown", "latex", "csv", "html")
+MOST_OF_A_BAR = 80  # characters of its words
+TABLE_FORMATS = ("text", "markdown", "latex", "csv", "html")
 
 
 def add_verb(
@@ -100,30 +101,55 @@ def add_whose_map(parser: argparse.ArgumentParser) -> None:
 def add_table_format(parser: argparse.ArgumentParser, flag: str = "--format") -> None:
     """The form in which a verb gives its tables; the flag has another name where ``--format`` means the input's."""
     parser.add_argument(
-        flag, dest="table_format", choices=TABLE_FORMATS, default="markdown", help="of tables (default: markdown)"
+        flag,
+        dest="table_format",
+        choices=TABLE_FORMATS,
+        help="of tables (default: text where they are printed, markdown in a file)",
     )
 
 
-def formatted(parts: Sequence[Table | Prose], arguments: argparse.Namespace) -> str:
-    """The tables in the form of ``add_table_format``."""
+def formatted(parts: Sequence[Table | Prose], arguments: argparse.Namespace, *, is_file: bool = False) -> str:
+    """The tables in the form of ``add_table_format``; ``is_file`` where they are not printed."""
     from su3d_bench.reports.tables.formats import FORMATS
 
-    return FORMATS[arguments.table_format](parts)
+    return FORMATS[arguments.table_format or ("markdown" if is_file else "text")](parts)
 
 
-def answer(text: str) -> None:
-    """Print an answer to stdout."""
-    print(text.rstrip("\n"))
+def answer(*lines: str) -> None:
+    """Print an answer to stdout, a line each, whatever stands in them."""
+    print("\n".join(map(one_line, lines)))
+
+
+def answer_document(text: str) -> None:
+    """Print to stdout what is of several lines by its form, which lets none of a name's through, such as a table."""
+    answer(*text.rstrip("\n").split("\n"))
 
 
 def answer_json(value: Any) -> None:
     """Print ``value`` as JSON to stdout."""
-    answer(json.dumps(value, indent=2, ensure_ascii=False))
+    print(json_line(value, indent=2))
 
 
-def answer_either(arguments: argparse.Namespace, value: Any, text: str) -> None:
-    """Print ``value`` where ``--json`` asks for it, else ``text``."""
-    answer(json.dumps(value, indent=2, ensure_ascii=False) if arguments.json else text)
+def answer_either(arguments: argparse.Namespace, value: Any, *lines: str) -> None:
+    """Print ``value`` where ``--json`` asks for it, else ``lines``."""
+    if arguments.json:
+        answer_json(value)
+    else:
+        answer(*lines)
+
+
+def answer_tables(arguments: argparse.Namespace, value: Any, parts: Sequence[Table | Prose]) -> None:
+    """Print ``value`` where ``--json`` asks for it, else the tables."""
+    if arguments.json:
+        answer_json(value)
+    else:
+        answer_document(formatted(parts, arguments))
+
+
+def answer_commands(lines: Sequence[str]) -> None:
+    """Print commands to the machine that runs the job, which escape what they quote."""
+    for line in lines:
+        sys.stdout.write_command(line) if isinstance(sys.stdout, Door) else print(line)
 
 
 def answer_estimate(arguments: argparse.Namespace, client: ChatClient, requests: Sequence[ChatRequest]) -> int:
@@ -143,9 +169,9 @@ def written(path: Path, text: str) -> Path:
 
 
 def answer_or_write(arguments: argparse.Namespace, text: str) -> None:
-    """Print ``text``, or write it to the file that ``--out`` names."""
+    """Print the document ``text``, or write it to the file that ``--out`` names."""
     if arguments.out is None:
-        answer(text)
+        answer_document(text)
     else:
         remark(f"written: {written(arguments.out, text)}", quiet=arguments.quiet)
 
@@ -162,7 +188,7 @@ def file_name_of(text: str, default: str) -> str:
 def remark(text: str, *, quiet: bool = False) -> None:
     """Print a remark to stderr."""
     if not quiet:
-        print(text, file=sys.stderr)
+        print(one_line(text), file=sys.stderr)
 
 
 PREFIX = ("perception", "language")
@@ -227,16 +253,37 @@ def drawn_bars(*, is_quiet: bool, tells_time_left: bool = False) -> Iterator[Pro
         BarColumn,
         MofNCompleteColumn,
         Progress,
+        ProgressColumn,
+        Task,
         TextColumn,
         TimeElapsedColumn,
         TimeRemainingColumn,
     )
+    from rich.text import Text
 
-    remarks = TextColumn("{task.fields[remark]}")
+    class Description(ProgressColumn):
+        """The words of a bar, which hold names of scenes and methods: no markup, nothing that acts on a terminal."""
+
+        def render(self, task: Task) -> Text:
+            return Text(one_line(task.description)[:MOST_OF_A_BAR])
+
+    console = Console(file=stream_behind(sys.stderr))
+    remarks = TextColumn("{task.fields[remark]}", markup=False)
     time = TimeRemainingColumn() if tells_time_left else TimeElapsedColumn()
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), remarks, time)
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bars:
+    columns = (Description(), BarColumn(), MofNCompleteColumn(), remarks, time)
+    bars = Progress(*columns, console=console, transient=True, redirect_stdout=False, redirect_stderr=False)
+    with bars, _above(bars):
         yield bars
+
+
+def _above(bars: Progress) -> AbstractContextManager[None]:
+    """What is printed to stderr in the block stands above the bars."""
+    from rich.text import Text
+
+    def show(text: str) -> None:
+        bars.console.print(Text(text.removesuffix("\n")), soft_wrap=True)
+
+    return sys.stderr.through(show) if isinstance(sys.stderr, Door) else nullcontext()
 
 
 class _Board:

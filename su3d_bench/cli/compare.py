@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer_either, formatted
+from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer_tables
 from su3d_bench.core.errors import EXIT_DONE
 
 
@@ -39,5 +39,5 @@ def call(arguments: argparse.Namespace) -> int:
         protocols=arguments.protocol,
         per_class=arguments.per_class,
     ).to_json()
-    answer_either(arguments, comparison, formatted(comparison_tables(comparison), arguments))
+    answer_tables(arguments, comparison, comparison_tables(comparison))
     return EXIT_DONE

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer, formatted, remark, written
+from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer_document, formatted, remark, written
 from su3d_bench.core.errors import EXIT_DONE
 
 
@@ -91,7 +91,7 @@ def call(arguments: argparse.Namespace) -> int:
     document = result.to_json()
     if arguments.json is not None:
         written(arguments.json, json_text(document))
-    answer(formatted(evaluation_tables(document, per_class=arguments.per_class), arguments))
+    answer_document(formatted(evaluation_tables(document, per_class=arguments.per_class), arguments))
     remark(f"format: {', '.join(result.formats)}; ground truth: {result.ground_truth}", quiet=arguments.quiet)
     for line in result.remarks:
         remark(line, quiet=arguments.quiet)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
+import traceback
 from collections.abc import Sequence
 from importlib import import_module
 from typing import Any
 
 from su3d_bench import __version__
+from su3d_bench.cli.common import remark
 from su3d_bench.core.errors import (
     EXIT_DONE,
     EXIT_INTERNAL,
@@ -19,6 +20,7 @@ from su3d_bench.core.errors import (
     printable,
     suggest,
 )
+from su3d_bench.core.printing import doors
 from su3d_bench.runs.executors.local import limit_threads
 
 # Modules of this folder with ``add_parser(verbs)``, in the order of the help.
@@ -93,33 +95,43 @@ def build_parser() -> Parser:
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command line ``argv`` and return its exit code: 0 done, 1 check failed, 2 wrong input, 3 incomplete,
-    4 internal."""
+    4 internal.
+
+    Who reads the answer moves the code only where it should have been kept: a pipe whose reader has gone, or a closed
+    stdout, leaves it as it is; a stdout that refuses the answer, such as a file on a full disk, turns 0 into 2.
+    """
     words = list(sys.argv[1:] if argv is None else argv)
-    is_debug = "--debug" in words
+    with doors() as out:
+        code = _exit_code(words)
+        out.flush()
+        if out.refused is not None:
+            reason = out.refused.strerror or out.refused
+            remark(f"su3d-bench: stdout: cannot be written: {reason}; what was done is kept, its answer is not whole")
+            code = code or EXIT_WRONG_INPUT
+    return code
+
+
+def _exit_code(words: Sequence[str]) -> int:
+    """What ``words`` ask for, done; whatever goes wrong is one line on stderr, with ``--debug`` below its traceback."""
     try:
         arguments = build_parser().parse_args(words)
         if not arguments.uses_all_cores:
             limit_threads()  # before numerical libraries are loaded
         code: int = arguments.call(arguments)
-        sys.stdout.flush()
-    except BrokenPipeError:
-        # The reader of stdout, such as head, has gone; keep the interpreter from complaining at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return EXIT_DONE
-    except Su3dError as error:
-        if is_debug:
-            raise
-        print(f"su3d-bench: {error}", file=sys.stderr)
-        return error.exit_code
+        return code
     except KeyboardInterrupt:
-        print("su3d-bench: interrupted; the same command takes it up again", file=sys.stderr)
+        remark("su3d-bench: interrupted; the same command takes it up again")
         return EXIT_INTERRUPTED
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else EXIT_WRONG_INPUT if stop.code else EXIT_DONE
-    except Exception as error:
+    except Exception as error:  # noqa: BLE001 - the one place where whatever else went wrong becomes a line
+        is_debug = "--debug" in words
         if is_debug:
-            raise
+            traceback.print_exc()
+        if isinstance(error, Su3dError):
+            remark(f"su3d-bench: {error}")
+            return error.exit_code
         text = printable(f"{type(error).__name__}: {error}")
-        print(f"su3d-bench: internal error: {text}; run again with --debug for the traceback", file=sys.stderr)
+        hint = "" if is_debug else "; run again with --debug for the traceback"
+        remark(f"su3d-bench: internal error: {text}{hint}")
         return EXIT_INTERNAL
-    return code

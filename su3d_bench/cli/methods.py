@@ -8,8 +8,9 @@ import textwrap
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_verb, answer, answer_either, answer_json
+from su3d_bench.cli.common import add_verb, answer, answer_document, answer_either, answer_json
 from su3d_bench.core.errors import EXIT_DONE
+from su3d_bench.core.printing import one_line
 
 if TYPE_CHECKING:
     from su3d_bench.reports.tables.published import Figure
@@ -34,7 +35,7 @@ def call(arguments: argparse.Namespace) -> int:
     if arguments.name is not None:
         return _show(arguments)
     rows = [_about(name, registry.load("method", name)) for name in registry.names("method")]
-    answer_either(arguments, rows, "\n\n".join("\n".join(_lines(row)) for row in rows))
+    answer_either(arguments, rows, *[line for row in rows for line in ("", *_lines(row))][1:])
     return EXIT_DONE
 
 
@@ -76,14 +77,14 @@ def _show(arguments: argparse.Namespace) -> int:
         answer_json({**row, "settings": defaults, "presets": presets, "published": published})
         return EXIT_DONE
     leaves = [(("method", method.name, *path), value, _remark(method, path)) for path, value in flatten(defaults)]
-    answer("\n".join(f"# {line}" for line in _lines(row)))
-    answer("\n" + write_toml(leaves) if leaves else f"# {method.name} has no settings")
+    answer(*(f"# {line}" for line in _lines(row)))
+    answer_document("\n" + write_toml(leaves) if leaves else f"# {one_line(method.name)} has no settings")
     if presets:
-        answer("\n# presets, each a method of its own name")
-        answer("\n".join(f"# {method.name}@{name}: {_assigned(settings)}" for name, settings in presets.items()))
+        answer("", "# presets, each a method of its own name")
+        answer(*(f"# {method.name}@{name}: {_assigned(settings)}" for name, settings in presets.items()))
     if figures:
-        answer("\n# as reported, each in its own set-up; no two need be comparable")
-        answer("\n".join(f"# {line}" for figure in figures for line in _figure_lines(figure)))
+        answer("", "# as reported, each in its own set-up; no two need be comparable")
+        answer(*(f"# {line}" for figure in figures for line in _figure_lines(figure)))
     return EXIT_DONE
 
 

@@ -148,7 +148,7 @@ def call_check(arguments: argparse.Namespace) -> int:
     rows += [_absent(state) for state in states if names and not state.files]
     if not rows:
         raise ConfigError("models check: none of the models is here; su3d-bench models list names them all")
-    answer_either(arguments, rows, "\n".join(line for row in rows for line in _check_lines(row)))
+    answer_either(arguments, rows, *(line for row in rows for line in _check_lines(row)))
     return EXIT_CHECK_FAILED if any(row["problems"] for row in rows) else EXIT_DONE
 
 
@@ -190,7 +190,7 @@ def call_export(arguments: argparse.Namespace) -> int:
         f"values, cosine at least {gap.min_cosine:.9f}"
         for gap in export.parity
     ]
-    answer_either(arguments, value, "\n".join(lines))
+    answer_either(arguments, value, *lines)
     return EXIT_DONE
 
 
@@ -199,7 +199,7 @@ def call_warm(arguments: argparse.Namespace) -> int:
     lines = [f"{result.what}: loaded and first run {result.load_s:.1f} s, next run {result.run_s:.3f} s"]
     lines += [f"  {name:<10} {ms:>10.1f} ms" for name, ms in result.stages_ms.items()]
     lines.append(f"memory: {result.memory_mb:.0f} MB at most ({result.memory_of}); digest {result.digest[:12]}")
-    answer_either(arguments, asdict(result), "\n".join(lines))
+    answer_either(arguments, asdict(result), *lines)
     return EXIT_DONE
 
 

@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer_either, formatted
+from su3d_bench.cli.common import add_protocols, add_table_format, add_verb, answer_tables
 from su3d_bench.core.errors import EXIT_DONE
 
 
@@ -44,5 +44,5 @@ def call(arguments: argparse.Namespace) -> int:
         protocols=arguments.protocol,
         power=arguments.power,
     ).to_json()
-    answer_either(arguments, made, formatted(plan_tables(made), arguments))
+    answer_tables(arguments, made, plan_tables(made))
     return EXIT_DONE

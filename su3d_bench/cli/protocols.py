@@ -40,17 +40,17 @@ def call(arguments: argparse.Namespace) -> int:
             raise ConfigError(f"protocols show: name one of {', '.join(protocol_names())}")
         rules = load_protocol(arguments.name)
         value = rules.model_dump(mode="json") | {"digest": rules.digest}
-        answer_either(arguments, value, _rules_text(rules, rules_files(arguments.name)))
+        answer_either(arguments, value, *_rules_lines(rules, rules_files(arguments.name)))
         return EXIT_DONE
     rows = [load_protocol(name) for name in protocol_names()]
     fields = {"name", "version", "summary", "kind", "datasets", "headline", "ground_truth", "label_space"}
     width = max(len(rules.name) for rules in rows)
-    text = "\n".join(f"{rules.name:<{width}}  {rules.summary}" for rules in rows)
-    answer_either(arguments, [rules.model_dump(mode="json", include=fields) for rules in rows], text)
+    lines = [f"{rules.name:<{width}}  {rules.summary}" for rules in rows]
+    answer_either(arguments, [rules.model_dump(mode="json", include=fields) for rules in rows], *lines)
     return EXIT_DONE
 
 
-def _rules_text(rules: ProtocolRules, files: Sequence[Path]) -> str:
+def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
     """Every rule as a line, beneath it what the file that sets it says of it: its source, or that it is ours."""
     from su3d_bench.core.config import flatten, toml_value
     from su3d_bench.metrics.protocol_files import HEADING, remarks_of
@@ -66,9 +66,9 @@ def _rules_text(rules: ProtocolRules, files: Sequence[Path]) -> str:
     lines += [f"    {remark}" for key in remarks if key != "classes" for remark in remarks[key]]
     lines.append(f"{'digest':<28} {rules.digest}")
     if rules.classes:
-        lines.append(f"\n{len(rules.scored)} of {len(rules.classes)} classes are scored (id, name, group):")
+        lines += ["", f"{len(rules.scored)} of {len(rules.classes)} classes are scored (id, name, group):"]
         lines += [f"    {remark}" for remark in remarks.get("classes", [])]
     for entry in rules.classes:
         remark = "" if entry in rules.scored else "  (ignored)"
         lines.append(f"{entry.id:>6}  {entry.name}{f'  {entry.group}' if entry.group else ''}{remark}")
-    return "\n".join(lines)
+    return lines

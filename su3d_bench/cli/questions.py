@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer, answer_either, answer_json, formatted, remark
+from su3d_bench.cli.common import add_table_format, add_verb, answer, answer_either, answer_json, answer_tables, remark
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted, suggest
 
 if TYPE_CHECKING:
@@ -190,12 +190,12 @@ def _audit(arguments: argparse.Namespace) -> int:
     )
     counts = dict(sorted(Counter(question.kind for question in drawn).items()))
     kinds = ", ".join(f"{n} {kind}" for kind, n in counts.items())
-    text = (
-        f"{counted(len(drawn), 'question')} on {counted(len(sheets), 'sheet')} ({kinds})\n"
+    lines = (
+        f"{counted(len(drawn), 'question')} on {counted(len(sheets), 'sheet')} ({kinds})",
         f"look at {arguments.out}/sheet-*.png or index.html, write right, arguable or wrong into audit.csv, then: "
-        f"su3d-bench questions audit --score {arguments.out}/audit.csv"
+        f"su3d-bench questions audit --score {arguments.out}/audit.csv",
     )
-    answer_either(arguments, {"n": len(drawn), "kinds": counts, "sheets": [str(sheet) for sheet in sheets]}, text)
+    answer_either(arguments, {"n": len(drawn), "kinds": counts, "sheets": [str(sheet) for sheet in sheets]}, *lines)
     return EXIT_DONE
 
 
@@ -203,9 +203,5 @@ def _score(arguments: argparse.Namespace) -> int:
     from su3d_bench.sheets.judging.audit_scores import audit_json, audit_table, read_verdicts
 
     verdicts = read_verdicts(arguments.score)
-    table = audit_table(verdicts)
-    if arguments.json:
-        answer_json(audit_json(verdicts))
-    else:
-        answer(formatted([table], arguments))
+    answer_tables(arguments, audit_json(verdicts), [audit_table(verdicts)])
     return EXIT_DONE

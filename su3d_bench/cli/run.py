@@ -7,7 +7,16 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_settings, add_table_format, add_verb, answer, answer_json, formatted, remark
+from su3d_bench.cli.common import (
+    add_settings,
+    add_table_format,
+    add_verb,
+    answer,
+    answer_document,
+    answer_json,
+    formatted,
+    remark,
+)
 from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE
 
 if TYPE_CHECKING:
@@ -152,7 +161,7 @@ def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
     if arguments.json:
         answer_json(result.metrics)
     else:
-        answer(formatted(run_tables(result.metrics), arguments))
+        answer_document(formatted(run_tables(result.metrics), arguments))
     for line in result.remarks:
         remark(line, quiet=arguments.quiet)
     plan = result.plan

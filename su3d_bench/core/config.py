@@ -18,6 +18,7 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core.errors import ConfigError, suggest
+from su3d_bench.core.printing import one_line
 
 HEADER = re.compile(r"^\s*\[+\s*([^\[\]]+?)\s*\]+\s*(?:#.*)?$")
 ASSIGNMENT = re.compile(r"""^\s*((?:[\w-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[\w-]+|"[^"]*"|'[^']*'))*)\s*=""")
@@ -56,17 +57,25 @@ def toml_value(value: Any) -> str:
     if isinstance(value, float):
         return repr(value) if math.isfinite(value) else {math.inf: "inf", -math.inf: "-inf"}.get(value, "nan")
     if isinstance(value, str | Path):
-        return json.dumps(str(value), ensure_ascii=False).replace("\x7f", "\\u007f")
+        text = json.dumps(str(value), ensure_ascii=False)  # every text of JSON is one of TOML
+        return text if text.isprintable() else "".join(map(_in_toml, text))
     if isinstance(value, list | tuple):
         return "[" + ", ".join(toml_value(item) for item in value) + "]"
     raise TypeError(f"no TOML form for {type(value).__name__}")
+
+
+def _in_toml(character: str) -> str:
+    """A character of a text without what acts on a terminal that shows the file."""
+    if character.isprintable():
+        return character
+    return f"\\u{ord(character):04x}" if ord(character) <= 0xFFFF else f"\\U{ord(character):08x}"
 
 
 def write_toml(leaves: Sequence[tuple[tuple[str, ...], Any, str]]) -> str:
     """TOML text of (path, value, remark) leaves, each remark as a comment behind its value; None as a comment only."""
     tables: dict[tuple[str, ...], list[str]] = {(): []}
     for path, value, remark in leaves:
-        key = toml_key(path[-1])
+        key, remark = toml_key(path[-1]), one_line(remark)
         line = f"# {key} is not set  # {remark}" if value is None else f"{key} = {toml_value(value)}  # {remark}"
         tables.setdefault(path[:-1], []).append(line)
     blocks = []

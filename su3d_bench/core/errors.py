@@ -16,6 +16,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.core.printing import escaped
+
 # What readers raise on a damaged file, an .npz above all; RuntimeError is zipfile's, of a compression unknown to it.
 DAMAGE = (
     OSError, EOFError, ValueError, KeyError, TypeError, OverflowError, RuntimeError,
@@ -31,7 +33,7 @@ def printable(text: str, limit: int = MESSAGE_CHARACTERS) -> str:
     'room\\\\x1b[31m 0'
     """
     line = " ".join(text.split())
-    plain = "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in line)
+    plain = escaped(line)
     return plain if len(plain) <= limit else plain[: limit - 3] + "..."
 
 

@@ -24,6 +24,7 @@ from su3d_bench.core.interfaces import (
     Method,
     RegionPerception,
 )
+from su3d_bench.core.printing import one_line, plain_text
 from su3d_bench.core.timing import MethodClock, Timer, calibration_ms, memory_bytes
 from su3d_bench.core.types import (
     BoolArray,
@@ -278,7 +279,7 @@ class SceneLog(logging.Handler):
         self.warnings: list[str] = []
 
     def text(self, *last: str) -> str:
-        return "\n".join([*self.lines, *last]) + "\n"
+        return plain_text("\n".join([*self.lines, *last])) + "\n"
 
     def remarks(self) -> dict[str, list[str]]:
         """What a seal keeps of it, for a run that goes on from there."""
@@ -290,6 +291,7 @@ class SceneLog(logging.Handler):
         self.warnings[:0] = remarks.get("warnings", [])
 
     def emit(self, record: logging.LogRecord) -> None:
-        self.lines.append(f"{record.levelname.lower()}: {record.getMessage()}")
+        message = one_line(record.getMessage())
+        self.lines.append(f"{record.levelname.lower()}: {message}")
         if record.levelno >= logging.WARNING:
-            self.warnings.append(record.getMessage())
+            self.warnings.append(message)

@@ -15,7 +15,7 @@ from functools import cache, cached_property, partial
 from typing import Any
 
 from su3d_bench.core.devices import device_for
-from su3d_bench.core.errors import GroundTruthMissing, StoreError, Su3dError
+from su3d_bench.core.errors import MOST_CHARACTERS, GroundTruthMissing, StoreError, Su3dError, printable
 from su3d_bench.core.interfaces import (
     Closes,
     Method,
@@ -26,6 +26,7 @@ from su3d_bench.core.interfaces import (
     TakesTruth,
     WarmsUp,
 )
+from su3d_bench.core.printing import one_line
 from su3d_bench.core.timing import MethodClock, device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, ObjectBoxes, Prediction, Proposals, SceneInfo
 from su3d_bench.metrics.fitness import why_not_scorable
@@ -98,7 +99,7 @@ def failed_outcomes(job: SceneJob, reason: str) -> tuple[MethodOutcome, ...]:
         folder = RunFolder(job.folder).job(job.scene, part.name)
         folder.prepare()
         if "score" not in folder.seals():
-            write_text(folder.log, f"failed: {line}\n")
+            write_text(folder.log, f"failed: {one_line(line)}\n")
     return tuple(MethodOutcome(job.scene, part.name, error=line) for part in job.methods)
 
 
@@ -128,7 +129,7 @@ def _guarded(scene: _Scene, part: Part) -> MethodOutcome:
 
 def error_line(error: Exception) -> str:
     """One line for any error; one that is not ours says its type."""
-    text = " ".join(str(error).split())
+    text = printable(str(error), MOST_CHARACTERS)
     if isinstance(error, MemoryError):
         return f"out of memory ({text or 'no details'}); try fewer --jobs, or a machine with more"
     return text if isinstance(error, Su3dError) else f"{type(error).__name__}: {text}"

@@ -18,7 +18,7 @@ from su3d_bench.questions.truths import fullest_truth
 from su3d_bench.reports.pictures.items import owners_in_frame, png_bytes
 from su3d_bench.reports.pictures.tiles import Line, Mark, Photo, Plan, Shade, Tile, contact_sheet, picture_strip
 from su3d_bench.reports.sheet.audit_page import audit_page
-from su3d_bench.reports.tables.formats import csv_lines, harmless
+from su3d_bench.reports.tables.formats import csv_lines
 from su3d_bench.sheets.judging.answers import MOST_CHARACTERS
 from su3d_bench.sheets.judging.audit_scores import COLUMNS, FILE, read_verdicts
 from su3d_bench.sheets.making.drawing import at_full_size
@@ -72,7 +72,7 @@ def make_audit(
             tiles = []
     rows: list[list[str | int]]
     rows = [[k, one.scene, one.kind, one.text, one.answer, "", ""] for k, one in enumerate(questions, 1)]
-    write_text(table, csv_lines([COLUMNS, *([harmless(_short(cell)) for cell in row] for row in rows)]))
+    write_text(table, csv_lines([COLUMNS, *(map(_short, row) for row in rows)]))
     entries = [
         (k, one.scene, one.kind, one.text, [(line.text, line.shade) for line in _lines(one)], f"{PICTURES}/{name}")
         for k, (one, name) in enumerate(zip(questions, names, strict=True), 1)

@@ -196,11 +196,11 @@ def test_a_misspelt_key_in_a_file_is_named_with_its_line(capsys: pytest.CaptureF
     assert capsys.readouterr().err == "su3d-bench: run.toml:2: unknown key 'metod'; did you mean 'method'?\n"
 
 
-def test_debug_shows_the_traceback() -> None:
-    from su3d_bench.core.errors import ConfigError
-
-    with pytest.raises(ConfigError):
-        main(["run", "--debug", "--scenes", "nothing"])
+def test_debug_shows_the_traceback_above_the_line(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--debug", "--scenes", "nothing"]) == 2
+    first, *_, last = capsys.readouterr().err.splitlines()
+    assert first == "Traceback (most recent call last):"
+    assert last.startswith("su3d-bench: no scene matches 'nothing'")
 
 
 def test_an_internal_error_is_one_line_and_exit_code_4(

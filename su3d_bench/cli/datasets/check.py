@@ -33,7 +33,7 @@ def check(arguments: argparse.Namespace) -> int:
     for dataset, scene in scenes:
         inspections.append(_inspect(dataset, scene, n_threads, arguments))
         if not arguments.json:
-            answer("\n".join([*([""] if len(inspections) > 1 else []), *lines_of(inspections[-1])]))
+            answer(*([""] if len(inspections) > 1 else []), *lines_of(inspections[-1]))
     n_with_errors = sum(inspection.count("error") > 0 for inspection in inspections)
     if arguments.json:
         answer_json(
@@ -45,7 +45,7 @@ def check(arguments: argparse.Namespace) -> int:
             }
         )
     else:
-        answer(f"\n{counted(len(inspections), 'scene')}, {n_with_errors} with errors")
+        answer("", f"{counted(len(inspections), 'scene')}, {n_with_errors} with errors")
     return EXIT_CHECK_FAILED if n_with_errors else EXIT_DONE
 
 

@@ -126,7 +126,7 @@ def call_list(arguments: argparse.Namespace) -> int:
     root = data_root()
     rows = [_row(name, registry.load("dataset", name), root) for name in registry.names("dataset")]
     lines = [f"data root: {root}", *(line for row in rows for line in _lines(row))]
-    answer_either(arguments, {"data_root": str(root), "datasets": rows}, "\n".join(lines))
+    answer_either(arguments, {"data_root": str(root), "datasets": rows}, *lines)
     return EXIT_DONE
 
 
@@ -167,7 +167,7 @@ def _status(dataset: Any, scene: str) -> str:
 
 
 def _lines(row: dict[str, Any]) -> list[str]:
-    lines = [f"\n{row['name']}: {row['summary']}"]
+    lines = ["", f"{row['name']}: {row['summary']}"]
     lines += [f"  looked for in: {place}" for place in row["places"]]
     if row["error"]:
         return [*lines, f"  {row['error']}"]

@@ -69,8 +69,8 @@ def make(arguments: argparse.Namespace) -> int:
         }
         for scene in scenes
     ]
-    text = "\n".join(f"{row['scene']:<16} {row['status']:<17} {row['address']}" for row in rows)
-    answer_either(arguments, {"out": str(out), "layout": arguments.layout, "scenes": rows}, text)
+    lines = [f"{row['scene']:<16} {row['status']:<17} {row['address']}" for row in rows]
+    answer_either(arguments, {"out": str(out), "layout": arguments.layout, "scenes": rows}, *lines)
     remark(f"to use them: SU3D_DATA={out} su3d-bench run --scenes '{reader}/*'", quiet=arguments.quiet)
     return EXIT_DONE
 

@@ -39,8 +39,8 @@ def call(arguments: argparse.Namespace) -> int:
     if arguments.json:
         answer_json(asdict(board))
         return EXIT_DONE
-    text = formatted(tables(board, intervals=arguments.intervals), arguments)
-    answer_or_write(arguments, text)
+    parts = tables(board, intervals=arguments.intervals)
+    answer_or_write(arguments, formatted(parts, arguments, is_file=arguments.out is not None))
     n_entries = sum(map(len, board.boards))
     remark(f"{n_entries} entries in {len(board.boards)} rankings, {len(board.refused)} left out", quiet=arguments.quiet)
     return EXIT_DONE

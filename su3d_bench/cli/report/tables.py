@@ -66,7 +66,8 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.store.atomic import json_text
 
     tables = _tables(arguments)
-    text = json_text([asdict(table) for table in tables]) if arguments.json else formatted(tables, arguments)
+    is_file = arguments.out is not None
+    text = json_text(list(map(asdict, tables))) if arguments.json else formatted(tables, arguments, is_file=is_file)
     answer_or_write(arguments, text)
     return EXIT_DONE
 

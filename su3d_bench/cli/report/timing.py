@@ -6,7 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer_either, formatted, remark
+from su3d_bench.cli.common import add_table_format, add_verb, answer_tables, remark
 
 if TYPE_CHECKING:
     from su3d_bench.metrics.costs import UpdateTimes
@@ -58,7 +58,7 @@ def call(arguments: argparse.Namespace) -> int:
     hardware = {run.name: run.record.hardware for run in runs}
     tables = timing_tables(summaries, anytime, hardware, arguments.camera_rate)
     value = {"hardware": hardware, "methods": [asdict(summary) for summary in summaries]}
-    answer_either(arguments, value, formatted(tables, arguments))
+    answer_tables(arguments, value, tables)
     if arguments.out is not None:
         files = {
             "timing.md": markdown(tables),

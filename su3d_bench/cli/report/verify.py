@@ -35,5 +35,5 @@ def call(arguments: argparse.Namespace) -> int:
     value = {"n_cells": len(checks), "n_differing": len(differing), "differing": [*map(asdict, differing)]}
     lines = [f"{check.file}:{check.line}: {check.fault}" for check in differing]
     lines.append(f"{counted(len(checks), 'cell')} checked, {len(differing)} differ")
-    answer_either(arguments, value, "\n".join(lines))
+    answer_either(arguments, value, *lines)
     return EXIT_CHECK_FAILED if differing else EXIT_DONE

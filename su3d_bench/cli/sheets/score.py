@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer, answer_json, formatted, remark
+from su3d_bench.cli.common import add_table_format, add_verb, answer_json, answer_tables, remark
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError
 
 if TYPE_CHECKING:
@@ -96,10 +96,7 @@ def call(arguments: argparse.Namespace) -> int:
     if arguments.disputed is not None:
         write_text(arguments.disputed, disputed_csv(key, scores.second_looks))
         remark(f"written: {arguments.disputed}", quiet=arguments.quiet)
-    if arguments.json:
-        answer_json(content)
-    else:
-        answer(formatted([*sheet_tables(content), Prose((_looks_line(scores),))], arguments))
+    answer_tables(arguments, content, [*sheet_tables(content), Prose((_looks_line(scores),))])
     return EXIT_DONE
 
 

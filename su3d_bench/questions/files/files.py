@@ -1,6 +1,6 @@
 """Question sets in files: read from TOML, CSV and the forms of ScanRefer, Nr3D and SQA3D; written as TOML and CSV.
 
-A CSV is data for programs: a text that begins with ``=`` stays as it is, so open it as text in a spreadsheet.
+In a CSV a text that a spreadsheet would compute begins with ``'``, which is left out again where it is read.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from su3d_bench.core.errors import DataError, printable
 from su3d_bench.questions.files.datasets import is_foreign, read_foreign
 from su3d_bench.questions.files.queries import COLUMNS, MORE_COLUMNS, read_query_rows
 from su3d_bench.questions.model import ALL_KINDS, KINDS, REASONING, Question, new_question
+from su3d_bench.reports.tables.formats import no_formula
 from su3d_bench.store.atomic import write_text
 
 PAPER = Path(__file__).parent / "paper_queries.toml"
@@ -125,7 +126,6 @@ def csv_text(questions: Sequence[Question]) -> str:
     rows = csv.writer(text, lineterminator="\n")
     rows.writerow((*COLUMNS, *MORE_COLUMNS))
     for question in questions:
-        rows.writerow(
-            (question.scene, question.text, " ".join(map(str, question.answers or ())), question.kind, question.source)
-        )
+        objects = " ".join(map(str, question.answers or ()))
+        rows.writerow(map(no_formula, (question.scene, question.text, objects, question.kind, question.source)))
     return text.getvalue()

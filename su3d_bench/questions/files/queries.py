@@ -22,6 +22,7 @@ from su3d_bench.core.types import GroundTruth
 from su3d_bench.datasets.recordings.recorded_frames import read_text
 from su3d_bench.formats.tables.separated import separated_rows
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth, TextQuery
+from su3d_bench.reports.tables.formats import meant
 
 COLUMNS = ("scene", "text", "objects")
 MORE_COLUMNS = ("kind", "source")  # may be there, in any order behind the others
@@ -124,7 +125,7 @@ def _csv_rows(text: str, where: str) -> Iterator[QueryRow]:
         words = row[2].split()
         if not all(word.isascii() and word.isdigit() and len(word) < 11 for word in words):
             raise DataError(f"{at}: 'objects' must be instance ids with blanks between them")
-        yield _row(at, dict(zip(header, row, strict=True)), [int(word) for word in words])
+        yield _row(at, dict(zip(header, map(meant, row), strict=True)), [int(word) for word in words])
 
 
 def _row(at: str, values: Mapping[str, Any], objects: Sequence[int]) -> QueryRow:

@@ -20,6 +20,7 @@ from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
 from su3d_bench.core.errors import Su3dError
+from su3d_bench.core.printing import doors
 
 SCENE_DONE = "scene"  # label of the event that says that a unit is finished
 Unit = TypeVar("Unit")
@@ -152,7 +153,7 @@ def _receive(connection: Connection) -> tuple[str, Any] | None:
 def answer_of(work: Work[Unit, Outcome], unit: Unit, report: Report) -> tuple[str, Any]:
     """What became of ``unit`` in this process, as a message that ``unwrap`` takes elsewhere; raises nothing."""
     try:
-        with one_thread():
+        with doors(), one_thread():
             return "outcome", work(unit, report)
     except Su3dError as error:
         return "user-error", error

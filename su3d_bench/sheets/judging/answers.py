@@ -16,7 +16,7 @@ from su3d_bench.core.errors import DataError, printable, reading, suggest
 from su3d_bench.formats.tables.separated import separated_rows
 from su3d_bench.formats.tables.workbooks import read_workbook
 from su3d_bench.questions.model import KINDS
-from su3d_bench.reports.tables.formats import FORMULA_STARTS
+from su3d_bench.reports.tables.formats import meant
 from su3d_bench.sheets.items import ANSWER_COLUMNS, ASKS, Key, KeyItem, Sheet, SheetItem
 
 MOST_BYTES = 256 << 20  # of one file: a workbook holds its pictures
@@ -118,8 +118,7 @@ def cell_text(value: str | None, name: str, at: str) -> str:
     """The text of a cell, without the mark that keeps a text from being a formula."""
     text = (value or "").strip()
     # as files that a spreadsheet is to open have it before text that would be taken for a formula
-    if text[:1] == "'" and text[1:2] in FORMULA_STARTS:
-        text = text[1:]
+    text = meant(text)
     if len(text) > MOST_CHARACTERS or any(unicodedata.category(character) in ("Cc", "Cs") for character in text):
         raise DataError(f"{at}: '{name}' is too long or holds control characters: '{printable(text, 40)}'")
     return text

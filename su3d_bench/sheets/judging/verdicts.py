@@ -7,7 +7,7 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from su3d_bench.questions.files.left_out import COLUMN
-from su3d_bench.reports.tables.formats import csv_lines, harmless
+from su3d_bench.reports.tables.formats import csv_lines
 from su3d_bench.sheets.items import VERDICTS, Key
 from su3d_bench.sheets.judging.answers import Judgement
 
@@ -39,4 +39,4 @@ def disputed_csv(key: Key, looks: Iterable[SecondLook]) -> str:
     for item_id, reasons in why.items():
         item = of_item[item_id]
         rows.append((item.question_id, item.scene, item.question_kind, "; ".join(reasons), texts[item_id]))
-    return csv_lines([harmless(cell) for cell in row] for row in rows)
+    return csv_lines(rows)

@@ -13,7 +13,7 @@ import numpy as np
 from su3d_bench.core.digests import digest_bytes
 from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.reports.sheet.page import page_html
-from su3d_bench.reports.tables.formats import FORMULA_STARTS, csv_lines
+from su3d_bench.reports.tables.formats import csv_lines
 from su3d_bench.sheets.items import (
     ANSWER_COLUMNS,
     ASKS,
@@ -194,15 +194,6 @@ def table_csv(sheet: Sheet, share: AnnotatorShare) -> str:
     for item in sheet.items_of(share):
         for name in item.asks:
             ask = sheet.ask(name)
-            shown = (f"../{PICTURES}/{item.pictures[0]}", as_text(" / ".join(item.text.split("\n"))), ask.text)
+            shown = (f"../{PICTURES}/{item.pictures[0]}", " / ".join(item.text.split("\n")), ask.text)
             rows.append((sheet.id, item.id, share.name, name, "", item.check, *shown, " | ".join(ask.choices)))
     return csv_lines(rows)
-
-
-def as_text(text: str) -> str:
-    """``text`` so that a spreadsheet takes it for text.
-
-    >>> as_text("=1+1"), as_text("chair")
-    ("'=1+1", 'chair')
-    """
-    return f"'{text}" if text.startswith(FORMULA_STARTS) else text
