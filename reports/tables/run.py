@@ -6,6 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from su3d_bench.reports.tables.formats import markdown
+from su3d_bench.reports.tables.found import Found, found_table
 from su3d_bench.reports.tables.model import (
     NOT_MEASURED,
     Prose,
@@ -27,17 +28,20 @@ def markdown_table(metrics: Mapping[str, Any]) -> str:
     return markdown(run_tables(metrics))
 
 
-def run_tables(metrics: Mapping[str, Any]) -> list[Table | Prose]:
-    """One table a protocol, a row a method, what must be known beneath.
+def run_tables(metrics: Mapping[str, Any], found: Sequence[Found] = ()) -> list[Table | Prose]:
+    """One table a protocol that scored a scene or should have, a row a method, what must be known beneath.
 
-    ``metrics`` is the value of ``metrics.json``. Numbers are percentages with their 95 % interval over scenes.
+    ``metrics`` is the value of ``metrics.json``, ``found`` are the maps that nothing scored. Numbers are percentages
+    with their 95 % interval over scenes.
     """
     rows_of: dict[str, list[Mapping[str, Any]]] = {}
     for result in metrics["results"]:
         rows_of.setdefault(str(result["protocol"]), []).append(result)
-    if not rows_of:
-        return [Prose(("no protocol scores these scenes",))]
-    return [_protocol_table(rows, metrics) for rows in rows_of.values()]
+    told = [rows for rows in rows_of.values() if any(row["result"] is not None or row["failed"] for row in rows)]
+    parts: list[Table | Prose] = [_protocol_table(rows, metrics) for rows in told]
+    if not parts:
+        parts = [Prose(("no protocol scores these scenes",))]
+    return [*parts, *([found_table(found)] if found else [])]
 
 
 def headline(result: Mapping[str, Any]) -> str:

@@ -159,9 +159,9 @@ def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
     from su3d_bench.reports.tables.run import run_tables
 
     if arguments.json:
-        answer_json(result.metrics)
+        answer_json(result.metrics | ({"found": [asdict(found) for found in result.found]} if result.found else {}))
     else:
-        answer_document(formatted(run_tables(result.metrics), arguments))
+        answer_document(formatted(run_tables(result.metrics, result.found), arguments))
     for line in result.remarks:
         remark(line, quiet=arguments.quiet)
     plan = result.plan

@@ -25,8 +25,10 @@ from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.scoring import EVERY_SCENE, SceneScore, combine, combined_metrics, plain_json, unpack_scores
 from su3d_bench.perception.profiles import PerceptionConfig
+from su3d_bench.reports.tables.found import Found, Unscored, not_scored_lines
 from su3d_bench.runs.executors.choose import ELSEWHERE, run_units
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
+from su3d_bench.runs.found import found_in
 from su3d_bench.runs.job import MethodOutcome, SceneJob
 from su3d_bench.runs.plan import Plan
 from su3d_bench.runs.poses import judged
@@ -54,13 +56,17 @@ Scores = Mapping[tuple[str, str], SceneScore]
 
 @dataclass(frozen=True)
 class RunResult:
-    """A finished run: ``metrics`` as in ``metrics.json``; ``failures`` are (scene, method, line), ``remarks`` lines."""
+    """A finished run: ``metrics`` as in ``metrics.json``; ``failures`` are (scene, method, line), ``remarks`` lines.
+
+    ``found``: the maps that no protocol scored.
+    """
 
     plan: Plan
     metrics: dict[str, Any]
     outcomes: tuple[MethodOutcome, ...]
     failures: tuple[tuple[str, str, str], ...]
     remarks: tuple[str, ...]
+    found: tuple[Found, ...] = ()
 
     @property
     def is_complete(self) -> bool:
@@ -96,7 +102,9 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
         status = "incomplete" if failures else "complete"
         write_json(plan.folder.path / "run.json", plain(record(plan, outcomes, status)))
         publish(plan)
-    return RunResult(plan, metrics, outcomes, failures, _remarks(plan, outcomes))
+    without_score = _without_score(plan, outcomes)
+    found = tuple(found_in(plan.folder, without_score))
+    return RunResult(plan, metrics, outcomes, failures, _remarks(plan, outcomes, without_score), found)
 
 
 def publish(plan: Plan) -> None:
@@ -105,22 +113,33 @@ def publish(plan: Plan) -> None:
         send_records(plan.store, plan.folder.path)
 
 
-def _remarks(plan: Plan, outcomes: Sequence[MethodOutcome]) -> tuple[str, ...]:
+def _without_score(plan: Plan, outcomes: Sequence[MethodOutcome]) -> list[tuple[str, str]]:
+    """(scene, method) of what did not fail and that no protocol scored."""
+    n_protocols = {job.scene: len(job.protocols) for job in plan.jobs}
+    return [
+        (outcome.scene, outcome.method)
+        for outcome in outcomes
+        if outcome.method in plan.methods
+        and outcome.error is None
+        and len(outcome.unscored) == n_protocols[outcome.scene]
+    ]
+
+
+def _remarks(
+    plan: Plan, outcomes: Sequence[MethodOutcome], without_score: Sequence[tuple[str, str]]
+) -> tuple[str, ...]:
     """What is worth saying of scenes that did not fail: warnings, protocols left out, ceilings that are missing."""
     failed = {outcome.scene for outcome in outcomes if outcome.error is not None and outcome.method in plan.methods}
     lines = [line for outcome in outcomes for line in outcome.warnings]
-    reasons = [(outcome, protocol, why) for outcome in outcomes for protocol, why in outcome.unscored]
-    lines += [
-        f"{outcome.scene}, {outcome.method}: not scored under {protocol}: {why}" for outcome, protocol, why in reasons
-    ]
+    reasons = [Unscored(one.scene, one.method, *pair) for one in outcomes for pair in one.unscored]
+    lines += not_scored_lines(reasons)
     # A table says the caveat beneath it; what no protocol scores has no table.
-    without_table = {job.scene for job in plan.jobs if not job.protocols}
     lines += [
         f"{outcome.method}: {outcome.caveat}"
         for outcome in outcomes
-        if outcome.caveat and outcome.scene in without_table
+        if outcome.caveat and (outcome.scene, outcome.method) in without_score
     ]
-    reported = {(outcome.scene, why) for outcome, _, why in reasons}
+    reported = {(reason.scene, reason.why) for reason in reasons}
     for outcome in outcomes:
         if outcome.error is not None and outcome.scene not in failed and (outcome.scene, outcome.error) not in reported:
             lines.append(f"{outcome.scene}: no score of the truth: {outcome.error}")

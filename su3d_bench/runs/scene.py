@@ -39,6 +39,7 @@ from su3d_bench.questions.reasoning.asking import MapSolver, by_language_model
 from su3d_bench.questions.refined_names import refined_names
 from su3d_bench.questions.truths import question_truth
 from su3d_bench.reports.pictures.maps import draw_scene
+from su3d_bench.reports.tables.found import Unscored, not_scored_lines
 from su3d_bench.runs.executors.local import Report
 from su3d_bench.runs.feeding import (
     N_AHEAD,
@@ -318,7 +319,8 @@ class _Scene:
         if self.job.pictures:
             truth_to_draw = next(iter(self._truths.values()), None)
             files += draw_scene(prediction, truth_to_draw, folder.pictures, f"{self.job.scene}, {part.name}")
-        write_text(folder.log, log.text("done"))
+        reasons = [Unscored(self.job.scene, part.name, *pair) for pair in unscored.items()]
+        write_text(folder.log, log.text(*not_scored_lines(reasons), "done"))
         doubts = folder.remarks("predict").get(REMARK, ())
         remarks = {"unscored": unscored, "warnings": list(dict.fromkeys(log.warnings)), REMARK: doubts}
         folder.seal("score", key, [*files, folder.log], remarks)
