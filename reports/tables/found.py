@@ -6,6 +6,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 from su3d_bench.core.english import is_countable, plural
+from su3d_bench.core.errors import counted
 from su3d_bench.reports.tables.model import NOT_MEASURED, Table, text_table
 
 MOST_NAMES = 8  # of a scene that are shown; the rest is counted
@@ -41,8 +42,8 @@ class Unscored:
     why: str
 
 
-def found_table(rows: Sequence[Found]) -> Table:
-    """A row a scene and method."""
+def found_table(rows: Sequence[Found], run: str = "") -> Table:
+    """A row a scene and method; ``run`` is named where there are several."""
     head = ["scene", "method", "instances", "points", "smallest / median / largest (m)", "updates", "ms an update"]
     body = [
         [
@@ -58,20 +59,21 @@ def found_table(rows: Sequence[Found]) -> Table:
         for row in rows
     ]
     note = "sizes: longest edges of the instances' boxes; ms an update: the median, perception included"
-    return text_table("found", [[*head, "names"], *body], heading="Found, not scored", notes=(note,))
+    of = run and f": {run}"
+    return text_table("found", [[*head, "names"], *body], heading="Found, not scored", caption=of, notes=(note,))
 
 
 def names_text(names: Sequence[tuple[str, int]], most: int = MOST_NAMES) -> str:
     """The most frequent names with their numbers.
 
     >>> names_text((("chair", 3), ("sofa", 1), ("", 2))), names_text((("lamp", 1), ("bed", 1)), most=1)
-    ('3 chairs, sofa, 2 without a name', 'lamp and 1 more name')
+    ('3 chairs, sofa, 2 without a name', 'lamp and 1 name more')
     """
     if not names:
         return NOT_MEASURED
     shown = ", ".join(_of_name(name, n) for name, n in names[:most])
     n_more = len(names) - most
-    return f"{shown} and {n_more} more {'name' if n_more == 1 else 'names'}" if n_more > 0 else shown
+    return f"{shown} and {counted(n_more, 'name')} more" if n_more > 0 else shown
 
 
 def _of_name(name: str, n: int) -> str:

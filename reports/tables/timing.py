@@ -42,7 +42,7 @@ def timing_tables(
             )
         )
     for summary in summaries:
-        updates = f"{summary.n_updates} updates of {counted(len(summary.scenes), 'scene')}"
+        updates = f"{counted(summary.n_updates, 'update')} of {counted(len(summary.scenes), 'scene')}"
         caption = f", ms per update ({updates})"
         name = f"timing-{summary.run}-{summary.method}"
         parts.append(text_table(name, list(_stages_table(summary)), heading=summary.method, caption=caption))

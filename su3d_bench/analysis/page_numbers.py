@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +18,9 @@ from su3d_bench.metrics.costs import summarise
 from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
 from su3d_bench.reports.page.numbers import confusion_cells, series_of, summary_data
+from su3d_bench.reports.tables.found import Found, Unscored, not_scored_lines
 from su3d_bench.runs.finished import FinishedRun, read_run, read_update_times
+from su3d_bench.runs.found import found_in, without_score
 from su3d_bench.store.records import ResultRecord, plain
 
 MOST_PAIRS = 40  # pairs of methods that are compared: all of nine methods, and a few seconds
@@ -61,11 +64,13 @@ def page_numbers(
             if with_errors:
                 progress(f"{run.name}: errors of {printable(method, 80)}")
                 errors.append({"run": index, **_errors(run, method)})
+    told = {result["protocol"] for result in results if result["result"] is not None or result["failed"]}
     progress("comparisons")
     numbers = {
         "left_out": f"{n_jobs} jobs, more than {MOST_JOBS}: {LEFT_OUT}" if n_jobs > MOST_JOBS else None,
         "runs": [_about(run) for run in runs],
-        "results": results,
+        "results": [result for result in results if result["protocol"] in told],
+        "found": [{"run": index, **asdict(one)} for index, run in enumerate(runs) for one in _found(run, n_jobs)],
         "confusions": confusions,
         "errors": errors,
         "timing": timing,
@@ -98,7 +103,12 @@ def _about(run: FinishedRun) -> dict[str, Any]:
         "settings": [{"key": _dotted(path), "value": value} for path, value in run.settings.items()],
         "failed": [f"{failure.scene} {failure.method} {failure.error}" for failure in record.failed],
         "warnings": list(record.warnings),
+        "unscored": not_scored_lines(Unscored(*vars(one).values()) for one in record.unscored),
     }
+
+
+def _found(run: FinishedRun, n_jobs: int) -> Iterator[Found]:
+    return found_in(run.folder, without_score(run) if n_jobs <= MOST_JOBS else ())
 
 
 def _dotted(path: KeyPath) -> str:

@@ -14,11 +14,13 @@ from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.scoring import ProtocolResult, combine
 from su3d_bench.numerics.statistics import SignFlipTest
+from su3d_bench.reports.tables.found import found_table
 from su3d_bench.reports.tables.judged import WHO_DID
 from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
-from su3d_bench.reports.tables.model import BY_PEOPLE, Measured, Origin, is_count
+from su3d_bench.reports.tables.model import BY_PEOPLE, Measured, Origin, Table, is_count
 from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.runs.finished import FinishedRun, read_run
+from su3d_bench.runs.found import found_in, without_score
 from su3d_bench.sheets.judging.scores import FILE as SCORES_FILE
 from su3d_bench.sheets.judging.scores import LABEL_METRICS, ScoreCell, Scores, read_scores
 from su3d_bench.store.atomic import is_file
@@ -34,7 +36,7 @@ def measured_results(folders: Sequence[Path]) -> list[Measured]:
 
     A folder or file of ``scores.json`` gives what people judged.
 
-    Raises ``ConfigError`` where data, rules or encoder of two runs differ, or where nothing was scored.
+    Raises ``ConfigError`` where data, rules or encoder of two runs differ.
     """
     paths = dict.fromkeys(folders)
     runs = {str(folder): read_run(folder) for folder in paths if not is_scores(folder)}
@@ -48,9 +50,28 @@ def measured_results(folders: Sequence[Path]) -> list[Measured]:
                 refuse_unlike(Side(other, known.method), Side(run, row.method), row.protocol, common)
             first.setdefault(row.protocol, (run, row))
             measured.append(row)
+    return measured
+
+
+def refuse_unscored(measured: Sequence[Measured], paths: Sequence[Path]) -> None:
+    """A ``ConfigError`` where no row has a scene with a score."""
     if not any(row.per_scene for row in measured):
         raise ConfigError(f"{', '.join(map(str, paths))}: no scene was scored, so there is nothing for a table")
-    return measured
+
+
+def found_tables(paths: Sequence[Path], methods: Sequence[str] = (), datasets: Sequence[str] = ()) -> list[Table]:
+    """A table a run of what its methods found where nothing scores it."""
+    runs = [read_run(path) for path in dict.fromkeys(paths) if not is_scores(path)]
+    tables = []
+    for run in runs:
+        jobs = [
+            (scene, method)
+            for scene, method in without_score(run)
+            if (not methods or method in methods) and (not datasets or scene.partition("/")[0] in datasets)
+        ]
+        if found := tuple(found_in(run.folder, jobs)):
+            tables.append(found_table(found, run.name if len(runs) > 1 else ""))
+    return tables
 
 
 def is_scores(path: Path) -> bool:

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.common import add_verb, answer, answer_json, remark
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, printable, suggest
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, counted, printable, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.core.interfaces import Encoder
@@ -97,7 +97,7 @@ def call(arguments: argparse.Namespace) -> int:
     for row in rows:
         for line in row["remarks"]:
             remark(printable(f"{row['scene']}: {line}"), quiet=arguments.quiet)
-    answer(f"{len(rows)} scene{'s' if len(rows) > 1 else ''} for {arguments.to}: {arguments.out}")
+    answer(f"{counted(len(rows), 'scene')} for {arguments.to}: {arguments.out}")
     return EXIT_DONE
 
 

@@ -80,7 +80,7 @@ def _make(arguments: argparse.Namespace) -> int:
     check_form(arguments.out)
     made = _made(arguments)
     write_questions(arguments.out, made)
-    remark(f"{len(made)} questions: {arguments.out}", quiet=arguments.quiet)
+    remark(f"{counted(len(made), 'question')}: {arguments.out}", quiet=arguments.quiet)
     _answer_counts(made, arguments)
     return EXIT_DONE
 
@@ -98,7 +98,7 @@ def _made(arguments: argparse.Namespace) -> list[Question]:
         kept = [question for question in found if question.id not in left_out]
         questions = chosen(kept, arguments.per_kind)
         without = f", {len(found) - len(kept)} left out" if left_out else ""
-        remark(f"{dataset.name}/{scene}: {len(questions)} questions{without}", quiet=arguments.quiet)
+        remark(f"{dataset.name}/{scene}: {counted(len(questions), 'question')}{without}", quiet=arguments.quiet)
         made += questions
     return made
 
@@ -147,7 +147,8 @@ def _answer_counts(questions: Sequence[Question], arguments: argparse.Namespace)
     n_known = sum(question.is_known for question in questions)
     kinds = ", ".join(f"{n} {kind}" for kind, n in counts.items())
     n_scenes = len({question.scene for question in questions})
-    text = f"{len(questions)} questions on {n_scenes} scenes ({kinds}); {n_known} with known answers"
+    on = counted(n_scenes, "scene")
+    text = f"{counted(len(questions), 'question')} on {on} ({kinds}); {n_known} with known answers"
     if n_replies := sum(bool(question.reply) for question in questions):
         text += f", {n_replies} with one in words"
     content = {"n": len(questions), "n_known": n_known, "n_replies": n_replies, "kinds": dict(counts)}

@@ -17,7 +17,7 @@ from su3d_bench.cli.common import (
     chat_client,
     remark,
 )
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError, suggest
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, StoreError, counted, suggest
 
 if TYPE_CHECKING:
     from su3d_bench.core.types import Instances
@@ -179,7 +179,7 @@ def _answer(made: dict[str, NameRecords], arguments: argparse.Namespace) -> None
     for scene, records in made.items():
         changed = [name for name in records.names if name.refined != name.label]
         kept = [name for name in records.names if name.source == "label"]
-        answer(f"{scene}: {len(records.names)} instances, {len(changed)} names changed")
+        answer(f"{scene}: {counted(len(records.names), 'instance')}, {counted(len(changed), 'name')} changed")
         for name in changed:
             answer(f"  {name.id:>4}  {name.label} -> {name.refined}")
         for name in records.names:
@@ -187,4 +187,4 @@ def _answer(made: dict[str, NameRecords], arguments: argparse.Namespace) -> None
                 answer(f"  {name.id:>4}  left out: {name.left_out}")
         if kept:
             reasons = ", ".join(dict.fromkeys(name.reason for name in kept))
-            remark(f"{scene}: label n stays for {len(kept)} instances: {reasons}", quiet=arguments.quiet)
+            remark(f"{scene}: label n stays for {counted(len(kept), 'instance')}: {reasons}", quiet=arguments.quiet)

@@ -16,6 +16,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.core.english import plural
 from su3d_bench.core.printing import escaped
 
 # What readers raise on a damaged file, an .npz above all; RuntimeError is zipfile's, of a compression unknown to it.
@@ -40,10 +41,10 @@ def printable(text: str, limit: int = MESSAGE_CHARACTERS) -> str:
 def counted(n: int, noun: str) -> str:
     """A number of things.
 
-    >>> counted(1, "scene"), counted(2, "scene")
-    ('1 scene', '2 scenes')
+    >>> counted(1, "scene"), counted(2, "class")
+    ('1 scene', '2 classes')
     """
-    return f"{n} {noun}{'' if n == 1 else 's'}"
+    return f"{n} {noun if n == 1 else plural(noun)}"
 
 
 def shown(path: Path) -> str:

@@ -10,6 +10,7 @@ import numpy as np
 from su3d_bench.core.errors import printable
 from su3d_bench.core.types import Instances, Partition, Prediction
 from su3d_bench.reports.tables.found import Found
+from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.atomic import is_file
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import read_updates
@@ -37,6 +38,14 @@ def found_in(folder: RunFolder, jobs: Iterable[tuple[str, str]]) -> Iterator[Fou
                 n_updates=len(times),
                 update_ms=float(np.median(times)) if len(times) else None,
             )
+
+
+def without_score(run: FinishedRun) -> list[tuple[str, str]]:
+    """(scene, method) of what no protocol scored and did not fail."""
+    told = {(failure.scene, failure.method) for failure in run.record.failed}
+    for (method, _), result in run.results.items():
+        told |= {(scene, method) for scene in (result.result.scenes if result.result is not None else ())}
+    return [(scene, method) for scene in run.scenes for method in run.methods if (scene, method) not in told]
 
 
 def _n_instances(prediction: Prediction) -> int | None:

@@ -134,11 +134,12 @@ def _remarks(
     reasons = [Unscored(one.scene, one.method, *pair) for one in outcomes for pair in one.unscored]
     lines += not_scored_lines(reasons)
     # A table says the caveat beneath it; what no protocol scores has no table.
-    lines += [
-        f"{outcome.method}: {outcome.caveat}"
-        for outcome in outcomes
-        if outcome.caveat and (outcome.scene, outcome.method) in without_score
-    ]
+    has_table = {(one.method, one.caveat) for one in outcomes if (one.scene, one.method) not in without_score}
+    caveats: dict[str, dict[str, None]] = {}
+    for outcome in outcomes:
+        if outcome.caveat and outcome.error is None and (outcome.method, outcome.caveat) not in has_table:
+            caveats.setdefault(outcome.caveat, {})[outcome.method] = None
+    lines += [f"{', '.join(methods)}: {caveat}" for caveat, methods in caveats.items()]
     reported = {(reason.scene, reason.why) for reason in reasons}
     for outcome in outcomes:
         if outcome.error is not None and outcome.scene not in failed and (outcome.scene, outcome.error) not in reported:

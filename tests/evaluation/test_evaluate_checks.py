@@ -60,6 +60,7 @@ def test_two_lines_that_name_one_mask_file_are_told(tmp_path: Path) -> None:
     ("numbers", "line"),
     [
         ([901, 902, 902, 903], "1 of class 901, 1 of class 903; the first"),
+        ([901, 902, 902, 903, 904], "1 of class 901, 1 of class 903 and 1 class more; the first"),
         ([901, 902, 902, 903, 904, 905], "1 of class 901, 1 of class 903 and 2 classes more; the first"),
     ],
 )

@@ -77,7 +77,7 @@ def test_a_warning_of_many_scenes_stands_once() -> None:
 
 
 def test_what_was_not_measured_is_a_dash() -> None:
-    text = table(result(result=None, ceiling=None, unscored=["rooms/a"]))
+    text = table(result(result=None, ceiling=None, unscored=["rooms/a"]), result(method="other"))
     row = next(line for line in text.splitlines() if line.startswith("| opensu3d"))
     assert [cell.strip() for cell in row.strip("|").split("|")] == ["opensu3d", "-", "-", "-", "0/8", "-"]
     assert "- opensu3d is unscored on rooms/a" in text

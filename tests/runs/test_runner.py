@@ -233,7 +233,7 @@ def test_a_scene_without_truth_runs_unscored(capsys: pytest.CaptureFixture[str])
     assert run("--set", "painted.fault=no-truth") == 0
     answer = capsys.readouterr()
     assert "collector is unscored on painted/b" in answer.out
-    assert "painted/b, collector: not scored under rooms-semantic: painted/b: has no ground truth" in answer.err
+    assert "collector: not scored under rooms-semantic, rooms-instance: painted/b: has no ground truth" in answer.err
     assert (job("b") / "prediction.npz").is_file()
     before = Path("out/metrics.json").read_bytes()
     assert run("--set", "painted.fault=no-truth") == 0

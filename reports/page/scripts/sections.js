@@ -15,6 +15,13 @@ for (const one of DATA.results) {
     SIDES.push({ run: one.run, method: one.method, name: sideName(one.run, one.method), style: SIDES.length });
   }
 }
+for (const [run, { methods }] of RUNS.entries()) {
+  for (const method of methods) {  // what no protocol scored is looked at all the same
+    if (!SIDES.some((side) => side.run === run && side.method === method)) {
+      SIDES.push({ run, method, name: sideName(run, method), style: SIDES.length });
+    }
+  }
+}
 const PROTOCOLS = [...new Set(DATA.results.map((one) => one.protocol))];
 const resultsOf = (protocol) => DATA.results.filter((one) => one.protocol === protocol);
 const nameOf = (one) => sideName(one.run, one.method);
@@ -136,6 +143,27 @@ function summarySection() {
       fill(section, null, [h('h3', null, protocol), summaryTable(rows), noteList(notesOf(rows))]);
     }
     if (!PROTOCOLS.length) warn('No protocol scored these runs.');
+    if (DATA.found.length) fill(section, null, [h('h3', null, 'Found, not scored'), foundTable(DATA.found)]);
+    fill(section, null, [noteList(RUNS.flatMap((run) => run.unscored))]);
+  });
+}
+
+function foundTable(rows) {
+  const named = ([name, n]) => (n === 1 && name ? name : `${name || 'without a name'} × ${n}`);
+  return dataTable({
+    caption: 'What the maps hold; sizes are the longest edges of the boxes, ms an update is the median with perception',
+    rows,
+    columns: [
+      { label: 'Scene', value: (one) => one.scene },
+      { label: 'Method', value: nameOf },
+      { label: 'Instances', num: true, value: (one) => one.n_instances, show: (one) => countText(one.n_instances) },
+      { label: 'Points', num: true, value: (one) => one.n_points, show: (one) => countText(one.n_points) },
+      { label: 'Smallest / median / largest (m)', num: true, value: (one) => (one.extents_m ? one.extents_m[1] : null),
+        show: (one) => (one.extents_m ? one.extents_m.map((edge) => edge.toFixed(2)).join(' / ') : '–') },
+      { label: 'Updates', num: true, value: (one) => one.n_updates },
+      { label: 'ms an update', num: true, value: (one) => one.update_ms, show: (one) => msText(one.update_ms) },
+      { label: 'Names', value: (one) => one.names.slice(0, 12).map(named).join(', ') },
+    ],
   });
 }
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.cli.common import add_table_format, add_verb, answer_json, answer_or_write, formatted, remark
-from su3d_bench.core.errors import EXIT_DONE
+from su3d_bench.core.errors import EXIT_DONE, counted
 
 NAME = "leaderboard"
 
@@ -41,6 +41,6 @@ def call(arguments: argparse.Namespace) -> int:
         return EXIT_DONE
     parts = tables(board, intervals=arguments.intervals)
     answer_or_write(arguments, formatted(parts, arguments, is_file=arguments.out is not None))
-    n_entries = sum(map(len, board.boards))
-    remark(f"{n_entries} entries in {len(board.boards)} rankings, {len(board.refused)} left out", quiet=arguments.quiet)
+    entries = f"{counted(sum(map(len, board.boards)), 'entry')} in {counted(len(board.boards), 'ranking')}"
+    remark(f"{entries}, {len(board.refused)} left out", quiet=arguments.quiet)
     return EXIT_DONE

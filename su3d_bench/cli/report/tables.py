@@ -73,7 +73,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 
 def _tables(arguments: argparse.Namespace) -> list[Table]:
-    from su3d_bench.analysis.tables import choose, is_scores, measured_results
+    from su3d_bench.analysis.tables import choose, found_tables, is_scores, measured_results, refuse_unscored
     from su3d_bench.reports.tables.ablation import ablation_table
     from su3d_bench.reports.tables.judged import JUDGED, judged_table
     from su3d_bench.reports.tables.paper import Shown, paper_table, selection_tables
@@ -87,9 +87,16 @@ def _tables(arguments: argparse.Namespace) -> list[Table]:
         only_significant=arguments.significant,
     )
     with_published = bool(arguments.table) if arguments.published is None else arguments.published
-    measured = choose(measured_results(arguments.runs), arguments.methods, arguments.protocols, arguments.datasets)
+    every = measured_results(arguments.runs)
+    is_selection = bool(arguments.table or arguments.protocols or arguments.metrics)
+    found = [] if is_selection else found_tables(arguments.runs, arguments.methods, arguments.datasets)
+    if not found:
+        refuse_unscored(every, arguments.runs)
+    elif not any(row.per_scene for row in every):
+        return found
+    measured = choose(every, arguments.methods, arguments.protocols, arguments.datasets)
     if not arguments.table:
-        return selection_tables(measured, shown, with_published=with_published)
+        return [*selection_tables(measured, shown, with_published=with_published), *found]
     tables = []
     for number in dict.fromkeys(arguments.table):
         if number == "I":

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.common import add_table_format, add_verb, answer_json, answer_tables, remark
-from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted
 
 if TYPE_CHECKING:
     from su3d_bench.sheets.judging.scores import Scores
@@ -128,7 +128,7 @@ def _refuse(faults: Sequence[str], arguments: argparse.Namespace) -> None:
         if len(faults) > SHOWN_FAULTS:
             remark(f"... and {len(faults) - SHOWN_FAULTS} more")
     n = len(faults)
-    raise DataError(f"answers: {n} fault{'s' if n != 1 else ''}, listed above; nothing was scored; mend them first")
+    raise DataError(f"answers: {counted(n, 'fault')}, listed above; nothing was scored; mend them first")
 
 
 def _write(folder: Path, scores: Scores, sheet_folder: Path) -> None:

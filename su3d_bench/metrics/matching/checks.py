@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from su3d_bench.core.errors import PredictionError, printable
+from su3d_bench.core.errors import PredictionError, counted, printable
 from su3d_bench.core.types import Float32Array, Float64Array, Int32Array, Int64Array, Masks
 from su3d_bench.metrics.matching.nearest import duplicate_pairs
 from su3d_bench.metrics.protocols import ProtocolRules
@@ -108,7 +108,7 @@ def class_warnings(scene: str, rules: ProtocolRules, numbers: Int32Array | None,
     values, counts = np.unique(np.asarray(numbers)[is_dropped], return_counts=True)
     most = np.argsort(-counts, kind="stable")[:3]
     texts = [f"{counts[row]} of class {values[row]}{_known(name_of.get(int(values[row])))}" for row in most]
-    more = f" and {len(values) - 3} classes more" if len(values) > 3 else ""
+    more = f" and {counted(len(values) - 3, 'class')} more" if len(values) > 3 else ""
     first = int(np.argmax(is_dropped))
     verb = "has" if is_dropped.sum() == 1 else "have"
     return [
