@@ -28,12 +28,15 @@ def one_line(text: str) -> str:
     >>> one_line("room\\x1b[31m  0\\n::stop-commands::x"), one_line("::error::x"), one_line("a ##[group]")
     ('room\\\\x1b[31m  0\\\\n::stop-commands::x', '\\\\x3a:error::x', 'a #\\\\x23[group]')
     """
-    return _COMMAND_ANYWHERE.sub(r"#\\x23", _COMMAND_FIRST.sub(r"\1\\x3a", escaped(text)))
+    return _COMMAND_FIRST.sub(r"\1\\x3a", escaped(text))
 
 
 def escaped(text: str) -> str:
-    """``text`` with what cannot be printed (also every blank but the common one) written as its escape."""
-    return text if text.isprintable() else "".join(map(_shown, text))
+    """``text`` with what cannot be printed (also every blank but the common one) written as its escape, and what is a
+    command wherever it stands.
+    """
+    plain = text if text.isprintable() else "".join(map(_shown, text))
+    return _COMMAND_ANYWHERE.sub(r"#\\x23", plain) if "##" in plain else plain
 
 
 def plain_text(text: str) -> str:
