@@ -168,7 +168,9 @@ def write_files(whole: Path) -> None:
     Path("hostile.toml").write_text(f"scenes = [{quoted}]\n{quoted} = 1\n")
     Path("hostile.tex").write_text(f"1 % run={IN_A_PATH.split()[0]} method=a protocol=b\n{HOSTILE}")
     Path("hostile.py").write_text(METHOD_FILE)
-    Path("rules.toml").write_text(f'extends = "rooms-semantic"\nname = {quoted}\nsummary = {quoted}\n# {HOSTILE[:12]}\n')
+    Path("rules.toml").write_text(
+        f'extends = "rooms-semantic"\nname = {quoted}\nsummary = {quoted}\n# {HOSTILE[:12]}\n'
+    )
     Path("questions.toml").write_text(f"[[query]]\nscene = {quoted}\ntext = {quoted}\nobjects = [1]\n")
     Path("audit.csv").write_text(f'number,scene,kind,text,answer,verdict,remark\n1,a,b,"{HOSTILE}",c,right,d\n')
     Path("answers.csv").write_text(f'sheet_id,item_id,annotator,ask,answer\n"{HOSTILE}",1,a,b,c\n')

@@ -22,6 +22,7 @@ import jinja2
 import numpy as np
 
 from su3d_bench.core.errors import ModelMissing, Su3dError
+from su3d_bench.core.printing import doors
 from su3d_bench.perception.embedded.encoder import DIM, IMAGE_FILE, IMAGE_SIZE, TEXT_FILE, EmbeddedEncoder
 from su3d_bench.perception.embedded.text import N_IDS, N_WORDS, token_ids
 from su3d_bench.perception.embedded.training.crops import (
@@ -191,4 +192,6 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    with doors():
+        status = main()
+    sys.exit(status)

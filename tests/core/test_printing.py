@@ -1,0 +1,143 @@
+"""The door to terminals and logs: what goes through it, who goes through it, and what happens where nobody listens."""
+
+from __future__ import annotations
+
+import io
+import json
+import logging
+import re
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import su3d_bench
+from su3d_bench.cli.common import drawn_bars
+from su3d_bench.cli.main import main
+from su3d_bench.core.config import write_toml
+from su3d_bench.core.printing import Door, doors, json_line, one_line
+from su3d_bench.runs.executors.local import answer_of
+
+HOSTILE = "\x1b[2Ja\r\u202eb\x9b\n::stop-commands::x ##[error]y"
+ACTS = re.compile(r"[^\n\x20-\x7e]|^ *::|##\w*\[", re.MULTILINE)
+
+
+@pytest.mark.parametrize("text", ["::error::x", "  ::error::x", "a\n::error::x", "a\r::error::x", "a\u2028 ::error::x"])
+def test_no_line_begins_with_a_command(text: str) -> None:
+    stream = io.StringIO()
+    door = Door(stream)
+    for character in text:
+        door.write(character)
+    door.flush()
+    assert not ACTS.search(stream.getvalue()), stream.getvalue()
+    assert not one_line(text).lstrip().startswith("::")
+
+
+def test_a_text_without_anything_to_hide_stays_as_it_is() -> None:
+    stream = io.StringIO()
+    print("  a: b :: c # d ## e\n\nnaïve 日本", file=Door(stream))
+    assert stream.getvalue() == "  a: b :: c # d ## e\n\nnaïve 日本\n"
+
+
+def test_a_stream_that_lacks_a_letter_gets_its_escape() -> None:
+    held = io.BytesIO()
+    stream = io.TextIOWrapper(held, encoding="ascii")
+    door = Door(stream)
+    print("naïve", file=door)
+    door.flush()
+    assert held.getvalue() == b"na\\xefve\n"
+
+
+def test_json_reads_back_to_what_it_was() -> None:
+    value = {HOSTILE: [HOSTILE, "\U000e0041", 1.5, None, "naïve"]}
+    for form in ({}, {"indent": 2}):
+        text = json_line(value, **form)
+        assert json.loads(text) == value
+        assert all(line.isprintable() for line in text.split("\n")) and "##[" not in text
+
+
+def test_toml_reads_back_to_what_it_was() -> None:
+    text = write_toml([(("key",), f"{HOSTILE}\U000e0041", f"run.toml:1\nother = 1{HOSTILE}")])
+    assert tomllib.loads(text) == {"key": f"{HOSTILE}\U000e0041"}
+    assert text.count("\n") == 1 and text[:-1].isprintable()
+
+
+def test_logs_and_other_peoples_prints_go_through_it(capsys: pytest.CaptureFixture[str]) -> None:
+    with doors():
+        print(HOSTILE, file=sys.stderr)
+        print(HOSTILE)
+        logging.lastResort.handle(logging.makeLogRecord({"msg": HOSTILE, "levelno": 30}))  # type: ignore[union-attr]
+    said = capsys.readouterr()
+    assert said.out.count("stop-commands") == 1 and said.err.count("stop-commands") == 2
+    assert not ACTS.search(said.out + said.err)
+
+
+def test_a_worker_goes_through_it(capsys: pytest.CaptureFixture[str]) -> None:
+    def work(unit: str, report: object) -> str:
+        print(unit)
+        return unit
+
+    assert answer_of(work, HOSTILE, lambda event: None) == ("outcome", HOSTILE)
+    assert not ACTS.search(capsys.readouterr().out)
+
+
+def test_a_traceback_goes_through_it(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--debug", "--scenes", HOSTILE]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith("Traceback") and not ACTS.search(error)
+
+
+class Terminal(io.StringIO):
+    def isatty(self) -> bool:
+        return True
+
+
+def test_bars_show_names_as_they_are_and_what_is_said_meanwhile_above_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    terminal = Terminal()
+    monkeypatch.setattr(sys, "stderr", terminal)
+    monkeypatch.setenv("TERM", "xterm")
+    with doors(), drawn_bars(is_quiet=False) as bars:
+        assert bars is not None
+        bars.add_task(f"[/red]{HOSTILE}", total=2, remark="")
+        print(f"[/b]{HOSTILE}", file=sys.stderr)
+        bars.refresh()
+    drawn = terminal.getvalue()
+    assert "[/red]" in drawn and "[/b]" in drawn
+    for mark in ("\x1b[2J", "\u202e", "\x9b", "##[", "\n::stop"):
+        assert mark not in drawn
+
+
+def shell(command: str) -> subprocess.CompletedProcess[str]:
+    words = f'verb() {{ "{sys.executable}" -m su3d_bench "$@"; }}; {command}'
+    return subprocess.run(["bash", "-c", words], capture_output=True, text=True, timeout=120)
+
+
+@pytest.mark.parametrize(
+    ("command", "code", "n_lines"),
+    [
+        ("verb protocols > /dev/full", 2, 1),
+        ("verb --help > /dev/full", 2, 1),
+        ("verb models check clip-vit-h-14 > /dev/full", 1, 1),
+        ("verb protocols > /dev/full 2> /dev/full", 2, 0),
+        ("verb protocols >&-", 0, 0),
+        ("verb models check clip-vit-h-14 >&-", 1, 0),
+        ("verb protocols >&- 2>&- <&-", 0, 0),
+        ("verb protocols show scannet200-instance | head -1 > /dev/null; exit ${PIPESTATUS[0]}", 0, 0),
+        ("verb models check clip-vit-h-14 | true; exit ${PIPESTATUS[0]}", 1, 0),
+    ],
+)
+def test_who_does_not_read_the_answer_leaves_the_code_as_it_is(command: str, code: int, n_lines: int) -> None:
+    done = shell(command)
+    assert (done.returncode, done.stderr.count("\n")) == (code, n_lines), done.stderr
+    assert not n_lines or done.stderr.startswith("su3d-bench: stdout: cannot be written: No space left on device; ")
+
+
+def test_nothing_is_printed_but_through_the_door() -> None:
+    package = Path(su3d_bench.__file__).parent
+    rooms = [package, *((package / name).resolve() for name in ("datasets", "baselines", "reports"))]
+    prints = re.compile(r"\bprint\(|\bsys\.std(?:out|err)\b")
+    found = {file for room in rooms for file in room.rglob("*.py") if prints.search(file.read_text())}
+    through_it = ("cli/common.py", "core/printing.py", "perception/embedded/training/train.py")
+    assert found == {package / name for name in through_it}
