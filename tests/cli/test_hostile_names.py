@@ -18,7 +18,7 @@ from fuzz_words import verbs
 
 from su3d_bench.cli.main import main
 
-# Escapes, returns, direction marks, C1 and invisible characters, commands of GitHub, Azure and TeamCity, markup, formula.
+# Escapes, returns, direction marks, C1 and invisible characters, commands of three CI systems, markup, a formula.
 HOSTILE = (
     "=1+1\x1b[31mred\nFORGED passed\r\n::stop-commands::x\n  ::add-mask::y\n##[error]z ##vso[task]w ##teamcity[q]\u2028"
     "::error::v\x9b31m\u202egnp\u2066\u200b\ufeff\x85\x7f %0A::warning::u <script>alert(1)</script> [a](http://b) | c"
