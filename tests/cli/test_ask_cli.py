@@ -231,7 +231,7 @@ def test_labels_n_prime_by_a_model_are_asked_for_once(
     assert main(words) == 0
     said = capsys.readouterr()
     assert "10  bed -> furniture" in said.out
-    assert "label n stays for 1 instances: the model refused" in said.err
+    assert "label n stays for 1 instance: the model refused" in said.err
     records = (job.path / "refined_names.json").read_bytes()
     assert server.n_asked == 4
     assert main([*words, "--offline"]) == 0

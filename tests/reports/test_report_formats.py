@@ -12,10 +12,22 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 from measured_rows import measured, measured_instances
 
+from su3d_bench.core.errors import printable
 from su3d_bench.reports.tables.ablation import SweepRow, ablation_table
-from su3d_bench.reports.tables.formats import FORMATS, csv_text, html_page, markdown
+from su3d_bench.reports.tables.formats import (
+    FORMATS,
+    FORMULA_STARTS,
+    csv_text,
+    html_page,
+    markdown,
+    meant,
+    no_formula,
+    plain,
+)
 from su3d_bench.reports.tables.latex import escape, latex, origin_comment, printed_cells
 from su3d_bench.reports.tables.model import Cell, Origin, Prose, Table, TableRow, text_table
 from su3d_bench.reports.tables.paper import Shown, paper_table, protocol_table
@@ -96,6 +108,44 @@ def test_no_text_can_be_html() -> None:
     }  # fmt: skip
     assert page.attributes <= {"lang", "charset", "name", "content", "class", "scope"}
     assert "<script" not in markdown([hostile_table()])
+
+
+MARKUP = (
+    "[a](http://b)", "![a](http://b)", "[a][b] [a]: http://b", "<http://b>", "`code`", "*a* **b** _c_ __d__ ~~e~~",
+    "# heading", "> quote", "- item", "+ item", "1. item", "1) item", "&lt;b&gt; &#60;", "a \\* b \\\\ c", "***",
+    "a_b_c [1, 2]",
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("text", [*MARKUP, *HOSTILE])
+def test_markdown_shows_a_text_letter_for_letter(text: str) -> None:
+    markdown_it = pytest.importorskip("markdown_it")
+    page = _Page()
+    words: list[str] = []
+    page.handle_data = words.append  # type: ignore[method-assign]
+    parts = [
+        Prose((text,)),
+        Prose((text,), is_list=True),
+        Table("t", text, text, (text,), (TableRow(text, (Cell(text),)),), (text,)),
+    ]
+    page.feed(markdown_it.MarkdownIt("commonmark").enable("table").render(markdown(parts)))
+    assert page.tags <= {"p", "ul", "li", "table", "thead", "tbody", "tr", "th", "td"}
+    assert [word for line in words if (word := line.strip())] == [printable(text)] * 8
+
+
+def test_what_is_printed_has_no_escape_of_another_form() -> None:
+    assert plain([text_table("t", [("a | b", "p < 0.05"), ("_x_ & *y*", "[1.0, 2.0]")])]) == (
+        "| a | b     | p < 0.05   |\n|-----------|------------|\n| _x_ & *y* | [1.0, 2.0] |\n"
+    )
+
+
+@given(st.text())
+def test_a_text_that_a_spreadsheet_would_compute_is_read_back(text: str) -> None:
+    kept = no_formula(text)
+    assert text == "-" or not kept.startswith(FORMULA_STARTS)
+    assert not re.search(r";[=+@-]", kept)
+    if "';" not in text and not re.match(r"'[-=+@\t\r]", text) and not re.search(r";'[-=+@]", text):
+        assert meant(kept) == text
 
 
 def test_no_text_can_be_a_formula_of_a_spreadsheet() -> None:
