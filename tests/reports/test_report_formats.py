@@ -93,6 +93,10 @@ class _Page(HTMLParser):
         super().__init__()
         self.tags: set[str] = set()
         self.attributes: set[str] = set()
+        self.words: list[str] = []
+
+    def handle_data(self, data: str) -> None:
+        self.words.append(data)
 
     def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
         self.tags.add(tag)
@@ -121,16 +125,14 @@ MARKUP = (
 def test_markdown_shows_a_text_letter_for_letter(text: str) -> None:
     markdown_it = pytest.importorskip("markdown_it")
     page = _Page()
-    words: list[str] = []
-    page.handle_data = words.append  # type: ignore[method-assign]
-    parts = [
+    parts: list[Table | Prose] = [
         Prose((text,)),
         Prose((text,), is_list=True),
         Table("t", text, text, (text,), (TableRow(text, (Cell(text),)),), (text,)),
     ]
     page.feed(markdown_it.MarkdownIt("commonmark").enable("table").render(markdown(parts)))
     assert page.tags <= {"p", "ul", "li", "table", "thead", "tbody", "tr", "th", "td"}
-    assert [word for line in words if (word := line.strip())] == [printable(text)] * 8
+    assert [word for line in page.words if (word := line.strip())] == [printable(text)] * 8
 
 
 def test_what_is_printed_has_no_escape_of_another_form() -> None:
