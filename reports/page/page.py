@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from su3d_bench.core.printing import json_line, plain_value
+from su3d_bench.core.printing import escaped_json, plain_value
 
 HERE = Path(__file__).parent
 SCRIPTS = (  # in the order in which they run
@@ -58,7 +58,7 @@ def embedded_json(value: Any) -> str:
     >>> embedded_json({"name": "</script><!--"})
     '{"name":"\\\\u003c/script>\\\\u003c!--"}'
     """
-    text = json_line(plain_value(value), allow_nan=False, separators=(",", ":"))
+    text = escaped_json(plain_value(value), allow_nan=False, separators=(",", ":"))
     return text.replace("<", "\\u003c")
 
 

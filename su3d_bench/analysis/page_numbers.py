@@ -61,7 +61,7 @@ def page_numbers(
         timing += [{"run": index, **times} for method in run.methods if (times := _times(run, method)) is not None]
         for method in run.methods:
             confusions += [{"run": index, **confusion} for confusion in _confusions(run, method)]
-            if with_errors:
+            if with_errors and _is_scored(run):
                 progress(f"{run.name}: errors of {printable(method, 80)}")
                 errors.append({"run": index, **_errors(run, method)})
     told = {result["protocol"] for result in results if result["result"] is not None or result["failed"]}
@@ -74,7 +74,7 @@ def page_numbers(
         "confusions": confusions,
         "errors": errors,
         "timing": timing,
-        "comparisons": _comparisons(runs) if n_jobs <= MOST_JOBS else [],
+        "comparisons": _comparisons(runs) if n_jobs <= MOST_JOBS and any(map(_is_scored, runs)) else [],
     }
     plain: dict[str, Any] = printable_json(numbers)
     return plain
@@ -85,6 +85,10 @@ def _shown(result: ResultRecord) -> dict[str, Any]:
     if result.result is not None:
         shown["result"] = {key: value for key, value in shown["result"].items() if key not in NUMBERS_NOT_SHOWN}
     return shown | {"anytime": [plain(midway) for midway in result.anytime or ()]}
+
+
+def _is_scored(run: FinishedRun) -> bool:
+    return any(result.result is not None for result in run.results.values())
 
 
 def _about(run: FinishedRun) -> dict[str, Any]:

@@ -12,7 +12,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.core.errors import EXIT_DONE
-from su3d_bench.core.printing import Door, json_line, one_line, stream_behind
+from su3d_bench.core.printing import Door, escaped_json, one_line, stream_behind
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
 
 if TYPE_CHECKING:
@@ -127,7 +127,7 @@ def answer_document(text: str) -> None:
 
 def answer_json(value: Any) -> None:
     """Print ``value`` as JSON to stdout."""
-    print(json_line(value, indent=2))
+    print(escaped_json(value, indent=2))
 
 
 def answer_either(arguments: argparse.Namespace, value: Any, *lines: str) -> None:

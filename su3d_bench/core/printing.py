@@ -15,6 +15,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
+from pathlib import Path
 from typing import Any, TextIO
 
 # The parsers of GitHub's runner (ActionCommand.cs), Azure Pipelines (Command.cs) and TeamCity's service messages.
@@ -53,10 +54,10 @@ def plain_value(value: Any) -> Any:
     return "\n".join(map(escaped, value.split("\n"))) if isinstance(value, str) else value
 
 
-def json_line(value: Any, **form: Any) -> str:
+def escaped_json(value: Any, **form: Any) -> str:
     """JSON that reads back to just ``value`` and holds no character that acts on a terminal; ``form``: as ``dumps``.
 
-    >>> json_line({"name": "caf\\u00e9\\u202e\\x9b"})
+    >>> escaped_json({"name": "caf\\u00e9\\u202e\\x9b"})
     '{"name": "café\\\\u202e\\\\u009b"}'
     """
     text = json.dumps(value, ensure_ascii=False, **form)
@@ -152,10 +153,8 @@ class Door(io.TextIOBase):
     def _shut(self) -> None:
         """Drop all from here on, and what the interpreter would still write at its end."""
         self._is_open = False
-        with suppress(OSError, ValueError):
-            nowhere = os.open(os.devnull, os.O_WRONLY)
-            os.dup2(nowhere, self.fileno())
-            os.close(nowhere)
+        with suppress(OSError, ValueError), Path(os.devnull).open("wb") as nowhere:
+            os.dup2(nowhere.fileno(), self.fileno())
 
 
 @contextmanager

@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DAMAGE, StoreError, reading
-from su3d_bench.core.printing import json_line
+from su3d_bench.core.printing import escaped_json, json_line
 from su3d_bench.store.unpacking import Allowance, allowance_of, check_member, member_bytes
 
 MAGIC_1_0 = b"\x93NUMPY\x01\x00"
@@ -99,7 +99,7 @@ def write_text(path: Path, text: str) -> None:
 
 def json_text(value: Any) -> str:
     """JSON as every file of a run has it: two spaces, full precision, no NaN."""
-    return json_line(value, indent=2, allow_nan=False) + "\n"
+    return escaped_json(value, indent=2, allow_nan=False) + "\n"
 
 
 def write_json(path: Path, value: Any) -> None:

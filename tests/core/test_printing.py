@@ -17,7 +17,7 @@ import su3d_bench
 from su3d_bench.cli.common import drawn_bars
 from su3d_bench.cli.main import main
 from su3d_bench.core.config import write_toml
-from su3d_bench.core.printing import Door, doors, json_line, one_line
+from su3d_bench.core.printing import Door, doors, escaped_json, one_line
 from su3d_bench.runs.executors.local import answer_of
 
 HOSTILE = "\x1b[2Ja\r\u202eb\x9b\n::stop-commands::x ##[error]y"
@@ -53,7 +53,7 @@ def test_a_stream_that_lacks_a_letter_gets_its_escape() -> None:
 def test_json_reads_back_to_what_it_was() -> None:
     value = {HOSTILE: [HOSTILE, "\U000e0041", 1.5, None, "naïve"]}
     for form in ({}, {"indent": 2}):
-        text = json_line(value, **form)
+        text = escaped_json(value, **form)
         assert json.loads(text) == value
         assert all(line.isprintable() for line in text.split("\n")) and "##[" not in text
 

@@ -207,7 +207,7 @@ def test_the_verb_shows_a_set_without_its_control_characters(
     write_questions(tmp_path / "q.toml", SET)
     assert main(["questions", "show", str(tmp_path / "q.toml")]) == 0
     shown = capsys.readouterr().out
-    assert "5 questions on 1 scenes (2 instance, 1 affordance, 1 property, 1 relative); 5 with known answers" in shown
+    assert "5 questions on 1 scene (2 instance, 1 affordance, 1 property, 1 relative); 5 with known answers" in shown
     assert "\u202e" not in shown
     assert max(map(len, shown.splitlines())) < 200
     assert main(["questions", "show", "paper", "--json"]) == 0
