@@ -98,7 +98,7 @@ class Door(io.TextIOBase):
         return True
 
     def isatty(self) -> bool:
-        return self.stream is not None and self.stream.isatty()
+        return self.stream is not None and not self.stream.closed and self.stream.isatty()
 
     def fileno(self) -> int:
         if self.stream is None:
@@ -124,6 +124,11 @@ class Door(io.TextIOBase):
         with self._lock:
             self.flush()
             self._sink(line + "\n")
+
+    def end(self) -> None:
+        """Hand on what is left, and drop what a library that keeps this stream writes when the interpreter ends."""
+        self.flush()
+        self._is_open = False
 
     @contextmanager
     def through(self, sink: Callable[[str], object]) -> Iterator[None]:
@@ -168,9 +173,9 @@ def doors() -> Iterator[Door]:
     try:
         yield out
     finally:
-        out.flush()
-        err.flush()
         sys.stdout, sys.stderr = before
+        for door in {out, err}.difference(before):
+            door.end()
 
 
 def _occupy(number: int) -> None:

@@ -74,6 +74,19 @@ def test_logs_and_other_peoples_prints_go_through_it(capsys: pytest.CaptureFixtu
     assert not ACTS.search(said.out + said.err)
 
 
+def test_what_is_written_to_it_at_the_end_of_the_interpreter_is_dropped(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with doors():
+        kept = sys.stdout
+        print("said", end="")
+    kept.write("\x1b[0m\n")  # colorama's way to leave a terminal
+    assert capsys.readouterr().out == "said"
+    closed = io.StringIO()
+    closed.close()
+    assert not Door(closed).isatty()
+
+
 def test_a_worker_goes_through_it(capsys: pytest.CaptureFixture[str]) -> None:
     def work(unit: str, report: object) -> str:
         print(unit)
