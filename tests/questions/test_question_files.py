@@ -128,7 +128,7 @@ def test_one_question_of_sqa3d_with_two_answers_keeps_both_and_they_are_shown(
     assert [one.reply for one in read_questions(questions)] == ["table or desk"]
     assert main(["questions", "show", str(questions)]) == 0
     shown = capsys.readouterr().out
-    assert "1 questions on 1 scenes (1 reasoning); 0 with known answers, 1 with one in words" in shown
+    assert "1 question on 1 scene (1 reasoning); 0 with known answers, 1 with one in words" in shown
     assert 'What is in front?  -> "table or desk"' in shown
 
 
