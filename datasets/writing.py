@@ -20,6 +20,7 @@ from su3d_bench.core.errors import StoreError
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, UInt8Array
 from su3d_bench.datasets.recordings.made_rooms import MARKER, read_marker
 from su3d_bench.store.atomic import make_folder, write_bytes, write_json, write_text
+from su3d_bench.store.unfinished import clear_unfinished
 
 FRAMES_PER_SECOND = 30.0
 
@@ -158,6 +159,11 @@ def plan_scenes(layout: Layout, dataset: ScannedDataset, scenes: Sequence[str], 
                 f"{target.folder}: holds another '{target.folder.name}', made elsewhere or with other options; delete "
                 "it or choose another folder with --out"
             )
+        strange = next(
+            (place for _, place in target.apart if place.exists() and target.folder.name not in marked), None
+        )
+        if strange is not None:
+            raise StoreError(f"{strange}: is there already and was made elsewhere; choose another folder with --out")
     pending = [target for target in targets if not target.is_whole]
     if not pending:
         return []
@@ -167,8 +173,8 @@ def plan_scenes(layout: Layout, dataset: ScannedDataset, scenes: Sequence[str], 
     marker |= {"scenes": dict(sorted(marked.items()))} | layout.marker_extras(sorted(marked))
     write_json(folder / MARKER, marker)
     for target in pending:
-        for leftover in target.partial.rglob(".*.tmp"):
-            leftover.unlink(missing_ok=True)
+        for folder in (target.partial, *(path for path in target.partial.rglob("*") if path.is_dir())):
+            clear_unfinished(folder)
     return pending
 
 

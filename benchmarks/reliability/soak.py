@@ -96,7 +96,7 @@ def measure(scratch: Path) -> dict[str, float]:
     gc.collect()
     process = psutil.Process()
     files = [path for path in scratch.rglob("*") if path.is_file()]
-    unfinished = [path for path in files if path.name.endswith((".tmp", ".partial"))]
+    unfinished = [path for path in files if path.name.endswith((".unfinished", ".partial"))]
     shared = Path("/dev/shm")
     return {
         "rss_mib": round(process.memory_info().rss / 2**20, 2),

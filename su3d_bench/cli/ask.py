@@ -155,7 +155,7 @@ def _draw(
         if arguments.out is not None:
             remark(f"{arguments.out}: not drawn, for the answer names no object", quiet=arguments.quiet)
         return None
-    picture: Path = arguments.out or job.pictures / f"ask-{file_name_of(arguments.question, 'question')}.png"
+    picture: Path = arguments.out or job.picture(f"ask-{file_name_of(arguments.question, 'question')}.png")
     rows = [tuple(scene.by_id(object_id).row for object_id in ids) for ids in (reply.object_ids, reply.reference_ids)]
     names = [""] * len(instances)
     for thing in scene.objects:

@@ -177,12 +177,30 @@ def answer_or_write(arguments: argparse.Namespace, text: str) -> None:
 
 
 def file_name_of(text: str, default: str) -> str:
-    """What a picture of the answer to ``text`` is called.
+    """What a picture of the answer to ``text`` is called; no two texts have one name.
 
-    >>> file_name_of("Where is it?", "text"), file_name_of("?", "text")
-    ('where-is-it', 'text')
+    >>> file_name_of("plant on shelf", "text"), file_name_of("Where is it?", "text"), file_name_of("?", "text")
+    ('plant-on-shelf', 'where-is-it-dadf29a5', 'text-8a8de823')
     """
-    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60] or default
+    words = re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60]
+    return words if words and words.replace("-", " ") == text else f"{words or default}-{_few_digits(text)}"
+
+
+def file_name_of_scene(address: str) -> str:
+    """What a picture of a scene is called; no two addresses have one name.
+
+    >>> file_name_of_scene("replica/room0"), file_name_of_scene("mine/hall/left")
+    ('replica-room0', 'mine-hall-left-9fd32bf4')
+    """
+    if re.fullmatch(r"[A-Za-z0-9_]+/[A-Za-z0-9_.-]+", address):
+        return address.replace("/", "-")
+    return f"{re.sub(r'[^A-Za-z0-9_.-]+', '-', address).lstrip('-.')[:120]}-{_few_digits(address)}"
+
+
+def _few_digits(text: str) -> str:
+    from su3d_bench.core.digests import digest_bytes
+
+    return digest_bytes(text.encode("utf-8", "surrogatepass"))[:8]
 
 
 def remark(text: str, *, quiet: bool = False) -> None:

@@ -47,7 +47,7 @@ def call(arguments: argparse.Namespace) -> int:
         raise PredictionError(f"{job.prediction}: has {what}, so there is nothing to rank; choose another --method")
     ranking = rank(prediction, arguments.text, encoder_of(run, arguments.device))
     rows = _rows(prediction, ranking, arguments.top)
-    picture = arguments.out or job.pictures / f"query-{file_name_of(arguments.text, 'text')}.png"
+    picture = arguments.out or job.picture(f"query-{file_name_of(arguments.text, 'text')}.png")
     lines = [f"{row['rank']}. {row['name']}  {row['similarity']:.3f}" for row in rows]
     draw_heat_map(prediction, ranking.similarity, picture, f'{arguments.scene}: "{arguments.text}"', lines)
     if arguments.json:

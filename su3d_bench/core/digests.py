@@ -5,7 +5,6 @@ from __future__ import annotations
 import ast
 import hashlib
 import json
-import os
 import subprocess
 import sys
 import tomllib
@@ -101,9 +100,7 @@ class _KeptDigests:
         if self._is_changed:
             with suppress(OSError):
                 self._place.parent.mkdir(exist_ok=True)
-                written = self._place.with_suffix(f".{os.getpid()}")
-                written.write_text(json.dumps(self._kept))
-                written.replace(self._place)
+                self._place.write_text(json.dumps(self._kept))  # half of it is no JSON, and made anew
 
     def digest(self, path: Path) -> str:
         state = path.stat()

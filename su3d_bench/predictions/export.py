@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
 import re
-import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -36,6 +34,7 @@ from su3d_bench.metrics.protocols import ProtocolRules
 from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
 from su3d_bench.predictions.openlex3d import CLOUD, EMBEDDINGS, INDEX
 from su3d_bench.store.atomic import make_folder, write_text
+from su3d_bench.store.unfinished import become, unfinished_folder
 
 MASKS_FOLDER = "pred_mask"
 ROWS_AT_ONCE = 1 << 14
@@ -53,16 +52,12 @@ def whole_folder(out: Path) -> Iterator[Path]:
         raise StoreError(f"{out}: is there already; choose another folder with --out, or remove it")
     out = out.absolute()
     make_folder(out.parent)
-    filled = out.with_name(f".{out.name}.{os.getpid()}.tmp")
-    shutil.rmtree(filled, ignore_errors=True)  # of a process of this number that was killed
-    make_folder(filled)
     try:
-        yield filled
-        os.replace(filled, out)
+        with unfinished_folder(out) as filled:
+            yield filled
+            become(filled, out)
     except OSError as error:
         raise StoreError(f"cannot write {out}: {error.strerror or error}") from error
-    finally:
-        shutil.rmtree(filled, ignore_errors=True)
 
 
 def file_name(scene: str) -> str:

@@ -15,6 +15,7 @@ from su3d_bench.formats.arrays import kind_of
 from su3d_bench.formats.numpy_files import npy_header_of, npz_names, read_npz
 from su3d_bench.predictions.base import Reader, ScenePrediction
 from su3d_bench.store.predictions import features_beside, prediction_from_arrays
+from su3d_bench.store.run_folder import JOBS, scene_of_folder
 
 FILE = "prediction.npz"
 FLOATS = ("f2", "f4", "f8")
@@ -109,6 +110,6 @@ def _files(path: Path) -> dict[str, Path]:
 def _scene_of(file: Path) -> str:
     """``dataset/scene`` where the file lies in a run folder, else the name of the file."""
     folder = file.absolute().parent.parent
-    if folder.parent.name == "scenes":
-        return folder.name.replace(".", "/", 1)
+    if folder.parent.name == JOBS:
+        return scene_of_folder(folder.name)
     return file.stem

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,7 +25,7 @@ from su3d_bench.core.config import (
 )
 from su3d_bench.core.devices import device_for
 from su3d_bench.core.digests import code_digest, digest_json
-from su3d_bench.core.errors import ConfigError, StoreError, suggest
+from su3d_bench.core.errors import ConfigError, StoreError, printable, suggest
 from su3d_bench.core.interfaces import HasPresets, IsSystem
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
@@ -64,6 +64,11 @@ class NamedMethod:
     base: str
     name: str
     settings: tuple[Setting, ...]
+
+    @property
+    def essence(self) -> tuple[Any, ...]:
+        """What it is, however it was written."""
+        return self.target, [(entry.path, entry.value) for entry in self.settings]
 
 
 def named_method(text: str) -> NamedMethod:
@@ -140,8 +145,12 @@ def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | s
     if config.profile not in PROFILES:
         hint = suggest(config.profile, PROFILES) or "; known: " + ", ".join(PROFILES)
         raise ConfigError(f"unknown profile '{config.profile}'{hint}")
-    methods = {method.name: method for method in map(named_method, _method_targets(config.methods))}
-    datasets = {str(registry.load("dataset", target).name): target for target in dataset_targets(config.scenes)}
+    named_methods = [named_method(text) for text in _method_targets(config.methods)]
+    _check_one_a_name("--methods", [(method.name, method.essence) for method in named_methods])
+    methods = {method.name: method for method in named_methods}
+    named_datasets = [(str(registry.load("dataset", target).name), target) for target in dataset_targets(config.scenes)]
+    _check_one_a_name("--scenes", named_datasets)
+    datasets = dict(named_datasets)
     settings += read_assignments(assignments, [*{method.base for method in methods.values()}, *methods], list(datasets))
     _check_sections("method", settings, {method.base: method.target for method in methods.values()}, list(methods))
     _check_sections("dataset", settings, datasets)
@@ -162,6 +171,8 @@ def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | s
         )
     store = out if isinstance(out, str) else None
     folder = _folder(out, config, parts)
+    if store is None:
+        RunFolder(folder).refuse_other_content()
     named = os.environ.get("SU3D_DATA") or ""
     with data_place(named) if is_url(named) else nullcontext(DataPlace(data_root())) as place:
         chosen, notes = expand_scenes(config.scenes, parts.datasets, place.root)
@@ -180,6 +191,19 @@ def make_plan(settings: Settings, assignments: Sequence[str] = (), out: Path | s
     except StoreError as error:
         raise StoreError(str(error).replace(str(folder), str(store or folder))) from error
     return plan
+
+
+def _check_one_a_name(flag: str, named: Iterable[tuple[str, Any]]) -> None:
+    """A ``ConfigError`` where a name cannot be that of a folder, or two things that differ share one."""
+    found: dict[str, Any] = {}
+    for name, value in named:
+        is_plain = name.isprintable() and "/" not in name and len(name) <= MOST_CHARACTERS
+        if not name or name.startswith(".") or not is_plain:
+            raise ConfigError(
+                f"{flag}: '{printable(name, 80)}' cannot be the name of a folder; call it by letters and digits"
+            )
+        if found.setdefault(name, value) != value:
+            raise ConfigError(f"{flag}: two different ones are called '{name}'; give one of them another name")
 
 
 @dataclass(frozen=True)
@@ -234,7 +258,9 @@ def protocols_of_run(wanted: Sequence[str], targets: Sequence[str]) -> dict[str,
     """Dataset target -> protocols that score it: those asked for that fit it, or its own where none is asked for."""
     if not wanted:
         return {target: tuple(protocols_for(registry.load("dataset", target).name)) for target in targets}
-    rules = [load_protocol(name) for name in dict.fromkeys(wanted)]
+    wanted = list(dict.fromkeys(wanted))
+    rules = [load_protocol(name) for name in wanted]
+    _check_one_a_name("--protocols", [(rule.name, rule) for rule in rules])
     truths = {target: TruthFacts.of_dataset(registry.load("dataset", target)) for target in targets}
     for rule in rules:
         reasons = [reason for truth in truths.values() if (reason := why_not_truth(rule, truth)) is not None]
@@ -293,4 +319,6 @@ def _refuse_other_runs(plan: Plan) -> None:
         for part in job.methods:
             if (job.dataset, part) not in keys:
                 keys[job.dataset, part] = config_key(job, part, build_method(part))
-            refuse_other_run(plan.folder.job(job.scene, part.name), keys[job.dataset, part], FIELDS_KNOWN_LATER)
+            folder = plan.folder.job(job.scene, part.name)
+            folder.refuse_links()
+            refuse_other_run(folder, keys[job.dataset, part], FIELDS_KNOWN_LATER)

@@ -52,7 +52,8 @@ def make_audit(
     in the table that would be replaced.
     """
     table = out / FILE
-    if table.is_file() and any(row.verdict for row in read_verdicts(table)):
+    earlier = read_verdicts(table) if table.is_file() else []
+    if any(row.verdict for row in earlier):
         raise StoreError(f"{printable(str(table), 200)}: holds verdicts; choose another --out, or remove it")
     make_folder(out / PICTURES)
     photographer: _Photographer | None = None
@@ -64,10 +65,10 @@ def make_audit(
             photographer = _Photographer(question.scene, *dataset_of(question.scene))
             progress(question.scene)
         tiles.append(_tile(k + 1, question, photographer))
-        names.append(f"{k + 1:03d}.png")
+        names.append(_picture_name(k + 1))
         write_bytes(out / PICTURES / names[-1], png_bytes(picture_strip(tiles[-1], STRIP), is_true=True))
         if len(tiles) == per_sheet or k == len(questions) - 1:
-            sheets.append(out / f"sheet-{len(sheets) + 1:02d}.png")
+            sheets.append(out / _sheet_name(len(sheets) + 1))
             write_bytes(sheets[-1], png_bytes(contact_sheet(tiles), is_true=True))
             tiles = []
     rows: list[list[str | int]]
@@ -78,11 +79,20 @@ def make_audit(
         for k, (one, name) in enumerate(zip(questions, names, strict=True), 1)
     ]
     write_text(out / "index.html", audit_page(entries))
-    kept = {*(path.name for path in sheets), *names}
-    for old in (*out.glob("sheet-[0-9]*.png"), *(out / PICTURES).glob("[0-9]*.png")):
-        if old.name not in kept:
-            remove_file(old)
+    for k in range(1, len(earlier) + 1):  # of the audit that stood here; a sheet has one question at least
+        if k > len(names):
+            remove_file(out / PICTURES / _picture_name(k))
+        if k > len(sheets):
+            remove_file(out / _sheet_name(k))
     return sheets
+
+
+def _picture_name(number: int) -> str:
+    return f"{number:03d}.png"
+
+
+def _sheet_name(number: int) -> str:
+    return f"sheet-{number:02d}.png"
 
 
 def _short(cell: str | int) -> str | int:

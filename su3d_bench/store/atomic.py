@@ -1,18 +1,16 @@
 """Files that are whole or absent, however a process ends: written under a temporary name, then renamed.
 
 Those of a run, those of caches that several processes fill at once, and arrays out of files that may be damaged, of
-which no more is believed than they hold.
+which no more is believed than they hold. How unfinished files are named and cleared: ``store.unfinished``.
 """
 
 from __future__ import annotations
 
 import errno
-import fcntl
 import io
 import json
 import math
 import os
-import secrets
 import struct
 import sys
 import zipfile
@@ -28,6 +26,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DAMAGE, StoreError, reading
 from su3d_bench.core.printing import escaped_json, json_line
+from su3d_bench.store.unfinished import SHARED, beside, clear_unfinished, new_file, own_file
 from su3d_bench.store.unpacking import Allowance, allowance_of, check_member, member_bytes
 
 MAGIC_1_0 = b"\x93NUMPY\x01\x00"
@@ -53,30 +52,37 @@ def write_error(path: Path, error: OSError) -> StoreError:
 
 
 def make_folder(path: Path) -> None:
-    """Make ``path`` and its parents."""
+    """Make ``path`` and its parents, and clear from it what killed processes left unfinished."""
     try:
         path.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise write_error(path, error) from error
+    clear_unfinished(path)
 
 
 @contextmanager
 def replacing(path: Path) -> Iterator[IO[bytes]]:
     """A stream whose bytes take the place of ``path`` at the end, whole or not at all."""
-    # Machines that share a disk may have processes of one number.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    unfinished = None
     try:
-        with temporary.open("wb") as stream:
+        unfinished, handle = new_file(path)
+        with _stream(unfinished, handle) as stream:
             yield stream
             stream.flush()
             os.fsync(stream.fileno())
-        os.replace(temporary, path)
+            os.replace(unfinished, path)
     except BaseException as error:
-        with suppress(OSError):  # a read-only disk refuses even to remove what is not there
-            temporary.unlink(missing_ok=True)
+        if unfinished is not None:
+            with suppress(OSError):  # a read-only disk refuses even to remove what is not there
+                unfinished.unlink(missing_ok=True)
         if isinstance(error, OSError):
             raise write_error(path, error) from error
         raise
+
+
+def _stream(place: Path, handle: int) -> IO[bytes]:
+    """The open file ``handle`` as a stream that knows its name, for whoever writes files by name."""
+    return open(place, "r+b", opener=lambda *_: handle)
 
 
 def write_bytes(path: Path, content: bytes) -> None:
@@ -229,15 +235,16 @@ def _header_1_0(content: bytes) -> tuple[tuple[int, ...], bool, np.dtype[Any]]:
 def filling(path: Path) -> Iterator[IO[bytes] | None]:
     """A stream whose bytes become ``path`` at the end; None where another process is writing that file just now.
 
-    The unfinished file has one name, and its writer holds a lock that dies with it: what a killed process leaves is
-    taken over by the next that writes the same file. Raises ``OSError`` where the disk refuses.
+    All processes write it under one name, so that they meet. Raises ``OSError`` where the disk refuses.
     """
-    unfinished = path.with_name(f".{path.name}.tmp")
     path.parent.mkdir(parents=True, exist_ok=True)
-    with os.fdopen(os.open(unfinished, os.O_RDWR | os.O_CREAT, 0o666), "r+b") as stream:
-        if not _is_ours(stream, unfinished):
-            yield None
-            return
+    clear_unfinished(path.parent)
+    unfinished = beside(path, SHARED)
+    handle = own_file(unfinished, os.O_RDWR | os.O_CREAT)
+    if handle is None:
+        yield None
+        return
+    with _stream(unfinished, handle) as stream:
         try:
             stream.truncate(0)
             yield stream
@@ -247,12 +254,3 @@ def filling(path: Path) -> Iterator[IO[bytes] | None]:
             with suppress(OSError):
                 unfinished.unlink(missing_ok=True)
             raise
-
-
-def _is_ours(stream: IO[bytes], unfinished: Path) -> bool:
-    """Whether the lock is ours and the file is still unfinished: its last writer may have renamed it meanwhile."""
-    try:
-        fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return os.path.samestat(os.fstat(stream.fileno()), unfinished.stat())
-    except (BlockingIOError, FileNotFoundError):
-        return False

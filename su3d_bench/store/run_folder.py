@@ -7,9 +7,8 @@ step run anew; a step sealed under another key is refused, naming the field that
 
 from __future__ import annotations
 
-import errno
-import fcntl
 import os
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
@@ -19,15 +18,52 @@ from typing import Any
 from pydantic import ValidationError
 
 from su3d_bench.core.digests import digest_file
-from su3d_bench.core.errors import StoreError
-from su3d_bench.store.atomic import make_folder, read_json, remove_file, write_error, write_json
+from su3d_bench.core.errors import StoreError, shown
+from su3d_bench.store.atomic import make_folder, read_json, write_error, write_json
 from su3d_bench.store.predictions import features_beside
 from su3d_bench.store.records import SCHEMA, SealRecord, checked, plain
+from su3d_bench.store.unfinished import LOCK_FILE, clear_unfinished, hold_folder, is_unfinished
 
-# What a lock on a folder itself gets from network disks, which lock files that are open for writing only: flock(2).
-NO_FOLDER_LOCKS = (errno.EBADF, errno.EINVAL, errno.ENOTSUP, errno.ENOSYS)
-LOCK_FILE = ".lock"
+JOBS = "scenes"
 WRITTEN_BY_ALL = ("language", "language/images")  # where all jobs of a run write; a job clears its own folders
+MARKS = ("run.toml", "run.json")  # by which a folder is known for a run's; the first is the first that a run writes
+BEFORE_MARKS = (JOBS, "language", LOCK_FILE)  # what a run may hold of which a power cut took them
+# What a folder's name says otherwise, so that each scene has a folder of its own; "." ends the dataset's name.
+_ESCAPES = {"%": "%25", "/": "%2F", ".": "%2E"}
+_ESCAPED = re.compile("|".join(_ESCAPES.values()))
+
+
+def folder_of_scene(address: str) -> str:
+    """The name of the folder of a scene, ``<dataset>/<scene>``; no two scenes have one.
+
+    >>> folder_of_scene("rooms/living0"), folder_of_scene("mine/hall/left_1.5")
+    ('rooms.living0', 'mine.hall%2Fleft_1.5')
+    """
+    dataset, _, scene = address.partition("/")
+    return f"{_escaped(dataset, '%.')}.{_escaped(scene, '%/')}"
+
+
+def scene_of_folder(name: str) -> str:
+    """The address of the scene whose folder has this name.
+
+    >>> scene_of_folder("rooms.living0"), scene_of_folder("mine.hall%2Fleft_1.5")
+    ('rooms/living0', 'mine/hall/left_1.5')
+    """
+    plain_of = {escape: character for character, escape in _ESCAPES.items()}
+    return "/".join(_ESCAPED.sub(lambda found: plain_of[found[0]], part) for part in name.split(".", 1))
+
+
+def _escaped(text: str, characters: str) -> str:
+    return "".join(_ESCAPES[one] if one in characters else one for one in text)
+
+
+def refuse_links(top: Path, place: Path) -> None:
+    """A ``StoreError`` where a folder below ``top`` on the way to ``place``, or that itself, is a link elsewhere."""
+    for folder in (place, *place.parents):
+        if folder == top:
+            return
+        if folder.is_symlink():
+            raise StoreError(f"{shown(folder)}: is a link, and a run writes into folders of its own alone; remove it")
 
 
 @dataclass(frozen=True)
@@ -38,47 +74,38 @@ class RunFolder:
 
     def job(self, scene: str, method: str) -> JobFolder:
         """The folder of one scene (``<dataset>/<scene>``) under one method."""
-        return JobFolder(self.path / "scenes" / scene.replace("/", ".", 1).replace("/", "_") / method)
+        return JobFolder(self.path / JOBS / folder_of_scene(scene) / method)
+
+    def refuse_other_content(self) -> None:
+        """A ``StoreError`` where the folder holds something and is no run's."""
+        try:
+            names = sorted(os.listdir(self.path))
+        except OSError:  # whoever writes there says more
+            return
+        strangers = [name for name in names if name not in BEFORE_MARKS and not is_unfinished(name)]
+        if strangers and not any(name in MARKS for name in names):
+            raise StoreError(
+                f"{shown(self.path)}: holds '{strangers[0]}' and is no folder of a run; choose a new folder with --out"
+            )
 
     @contextmanager
     def locked(self) -> Iterator[None]:
         """Hold the folder against a second run; the lock dies with the process and leaves no file behind."""
         make_folder(self.path)
-        handle = _lock(self.path)
         try:
-            for folder in (self.path, *(self.path / name for name in WRITTEN_BY_ALL)):
-                _clear_half_written(folder)
+            handle = hold_folder(self.path)
+        except BlockingIOError as error:
+            message = f"{self.path}: another run is writing here; wait for it or choose another folder with --out"
+            raise StoreError(message) from error
+        except OSError as error:
+            raise write_error(self.path, error) from error
+        try:
+            for folder in (self.path / name for name in WRITTEN_BY_ALL):
+                refuse_links(self.path, folder)
+                clear_unfinished(folder)
             yield
         finally:
             os.close(handle)
-
-
-def _lock(folder: Path) -> int:
-    """An open file that holds the lock of ``folder``; a ``StoreError`` where another process has it."""
-    handle = -1
-    try:
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError as error:
-            if error.errno not in NO_FOLDER_LOCKS:
-                raise
-            os.close(handle)
-            handle = os.open(folder / LOCK_FILE, os.O_RDWR | os.O_CREAT, 0o666)
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except OSError as error:
-        if handle >= 0:
-            os.close(handle)
-        if isinstance(error, BlockingIOError):
-            message = f"{folder}: another run is writing here; wait for it or choose another folder with --out"
-            raise StoreError(message) from error
-        raise write_error(folder, error) from error
-    return handle
-
-
-def _clear_half_written(folder: Path) -> None:
-    for leftover in folder.glob(".*.tmp"):
-        remove_file(leftover)
 
 
 @dataclass(frozen=True)
@@ -119,11 +146,20 @@ class JobFolder:
     def done(self) -> Path:
         return self.path / "done.json"
 
+    def refuse_links(self) -> None:
+        """A ``StoreError`` where writing into the job's folders would write elsewhere."""
+        refuse_links(self.path.parents[2], self.pictures)
+
+    def picture(self, name: str) -> Path:
+        """Where a picture of this name goes."""
+        self.refuse_links()
+        return self.pictures / name
+
     def prepare(self) -> None:
-        """Make the folder and clear what a killed run left half written."""
+        """Make the folder and clear what a killed run left unfinished."""
+        self.refuse_links()
         make_folder(self.path)
-        for folder in (self.path, self.pictures):
-            _clear_half_written(folder)
+        clear_unfinished(self.pictures)
 
     def seals(self) -> dict[str, SealRecord]:
         """The sealed steps; nothing where ``done.json`` is missing or damaged."""

@@ -102,7 +102,7 @@ def test_frames_of_a_killed_make_are_taken_over(name: str, tmp_path: Path) -> No
     with pytest.raises(KeyboardInterrupt):
         write_scene(LAYOUTS[name], Stage(dies_at=3), ROOM, tmp_path)
     assert scenes(name, tmp_path) == []
-    next(tmp_path.rglob(".*.partial")).joinpath(".half.1.tmp").write_bytes(b"half")
+    next(tmp_path.rglob(".*.partial")).joinpath(".half.0123456789ab.unfinished").write_bytes(b"half")
     again = Stage()
     write_scene(LAYOUTS[name], again, ROOM, tmp_path)
     assert set(again.rendered) - {0} == {3, 4}  # the first is asked for the size of the images
@@ -241,4 +241,4 @@ def test_a_full_disk_is_one_line(name: str, tmp_path: Path, monkeypatch: pytest.
         monkeypatch.setattr(os, "fsync", full)
         with pytest.raises(StoreError, match=r"^cannot write .*scene9007_00\.sens: "):
             finish_scene(layout, Stage(), target)
-    assert not [path for path in files_below(tmp_path) if path.endswith(".tmp")]
+    assert not [path for path in files_below(tmp_path) if path.endswith(".unfinished")]

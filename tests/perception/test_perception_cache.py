@@ -167,7 +167,7 @@ def test_a_damaged_cache_is_mended_without_a_change_of_the_answer(tmp_path: Path
 
 def test_no_temporary_files_stay_behind(tmp_path: Path) -> None:
     perception(tmp_path, CountingEncoder()).detect(still_life(), PerceptionNeeds(), Timer())
-    assert not list(tmp_path.rglob("*.tmp"))
+    assert not list(tmp_path.rglob("*.unfinished"))
 
 
 def test_a_cache_that_cannot_be_written_is_an_error_and_off_it_is_not_touched(tmp_path: Path) -> None:

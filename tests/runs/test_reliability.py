@@ -287,7 +287,7 @@ def test_any_damage_to_a_stored_array_is_a_typed_error(tmp_path: Path) -> None:
 
 def test_a_cache_file_is_whole_or_absent_and_a_killed_writer_leaves_nothing_to_pile_up(tmp_path: Path) -> None:
     path = tmp_path / "entry.npz"
-    (tmp_path / ".entry.npz.tmp").write_bytes(b"left by a killed process, and longer")
+    (tmp_path / ".entry.npz.000000000000.unfinished").write_bytes(b"left by a killed process, and longer")
     with filling(path) as stream:
         assert stream is not None
         stream.write(b"whole")

@@ -353,7 +353,7 @@ def test_killed_at_any_moment_and_taken_up_again_it_gives_the_same_bytes() -> No
             shutil.rmtree("out/scenes/painted.a", ignore_errors=True)
     finish(in_process(*slow))
     assert Path("out/metrics.json").read_bytes() == expected
-    assert not list(Path("out").rglob("*.tmp"))
+    assert not list(Path("out").rglob("*.unfinished"))
 
 
 def finish(command: list[str]) -> None:

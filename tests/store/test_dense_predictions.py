@@ -295,7 +295,7 @@ def test_a_run_of_both_is_scored_resumed_and_mended(in_folder: Path, capsys: pyt
     beside.write_bytes(whole[:-1] + bytes([whole[-1] ^ 1]))
     assert run() == 0
     assert beside.read_bytes() == whole
-    (job / ".prediction.features.npy.123.tmp").write_bytes(b"half")
+    (job / ".prediction.features.npy.0123456789ab.unfinished").write_bytes(b"half")
     beside.unlink()
     assert run() == 0
     assert beside.read_bytes() == whole

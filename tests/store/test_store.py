@@ -166,7 +166,7 @@ def test_predicting_anew_breaks_the_seal_of_the_score(tmp_path: Path) -> None:
 
 def test_what_a_killed_run_left_half_written_is_cleared(tmp_path: Path) -> None:
     job = sealed_job(tmp_path)
-    leftover = job.path / ".prediction.npz.123.tmp"
+    leftover = job.path / ".prediction.npz.0123456789ab.unfinished"
     leftover.write_bytes(b"half")
     job.prepare()
     assert not leftover.exists()

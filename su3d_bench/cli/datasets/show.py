@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import re
 from dataclasses import asdict
 from pathlib import Path
 
-from su3d_bench.cli.common import answer, answer_json, progress
+from su3d_bench.cli.common import answer, answer_json, file_name_of_scene, progress
 from su3d_bench.cli.datasets.check import chosen_scenes, up_text
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, printable, printable_json
 from su3d_bench.reports.pictures.scene import draw_scene_picture, facts_line
@@ -25,7 +24,7 @@ def show(arguments: argparse.Namespace) -> int:
         raise ConfigError(f"datasets show {arguments.scene}: {len(scenes)} scenes match ({names}, ...); name one")
     dataset, scene = scenes[0]
     name = f"{dataset.name}/{scene}"
-    path = arguments.out or Path(re.sub(r"[^A-Za-z0-9_.-]+", "-", name).lstrip("-.") + ".png")
+    path = arguments.out or Path(f"{file_name_of_scene(name)}.png")
     if path.suffix.lower() != ".png" or path.is_dir():
         raise ConfigError(f"--out {path}: the picture is a PNG; expected a file name that ends in .png")
     with progress(1, is_quiet=arguments.quiet, last_step="drawing") as report:

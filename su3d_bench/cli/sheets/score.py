@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from su3d_bench.cli.common import add_table_format, add_verb, answer_json, answer_tables, remark
+from su3d_bench.cli.common import add_table_format, add_verb, answer_json, answer_tables, remark, written
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, DataError, counted
 
 if TYPE_CHECKING:
@@ -63,7 +63,6 @@ def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.sheets.judging.answers import check_answers, check_key, read_answers
     from su3d_bench.sheets.judging.scores import score
     from su3d_bench.sheets.judging.verdicts import disputed_csv
-    from su3d_bench.store.atomic import write_text
 
     key_file = arguments.key / KEY_FILE if arguments.key.is_dir() else arguments.key
     key = read_key(key_file)
@@ -94,8 +93,8 @@ def call(arguments: argparse.Namespace) -> int:
         _write(arguments.out, scores, sheet_file.parent)
         remark(f"written: {arguments.out}", quiet=arguments.quiet)
     if arguments.disputed is not None:
-        write_text(arguments.disputed, disputed_csv(key, scores.second_looks))
-        remark(f"written: {arguments.disputed}", quiet=arguments.quiet)
+        path = written(arguments.disputed, disputed_csv(key, scores.second_looks))
+        remark(f"written: {path}", quiet=arguments.quiet)
     answer_tables(arguments, content, [*sheet_tables(content), Prose((_looks_line(scores),))])
     return EXIT_DONE
 

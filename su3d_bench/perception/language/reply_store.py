@@ -7,7 +7,6 @@ same at the same time the first to finish is kept, and both get its reply.
 from __future__ import annotations
 
 import dataclasses
-import fcntl
 import json
 import os
 from collections.abc import Iterator
@@ -18,11 +17,13 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from su3d_bench.core.digests import digest_json
-from su3d_bench.core.errors import StoreError
 from su3d_bench.perception.language.chat import ChatRequest, Reply
-from su3d_bench.store.atomic import json_text, make_folder, write_bytes, write_text
+from su3d_bench.store.atomic import json_text, make_folder, write_bytes, write_error, write_text
+from su3d_bench.store.run_folder import refuse_links
+from su3d_bench.store.unfinished import hold_folder
 
 SCHEMA = 1
+IMAGES = "images"
 MOST_ENTRY_BYTES = 200_000_000  # twice the largest answer that a configuration can allow
 
 
@@ -54,6 +55,7 @@ class ReplyStore:
 
     def save(self, request: ChatRequest, reply: Reply, server: str, *, replace: bool = False) -> Reply:
         """The reply that is kept: ``reply``, or the one that another process stored meanwhile unless ``replace``."""
+        refuse_links(self.folder.parent, self.folder / IMAGES)
         make_folder(self.folder)
         with self._locked():
             earlier = None if replace else self.load(request.key)
@@ -74,9 +76,9 @@ class ReplyStore:
 
     def _save_images(self, request: ChatRequest) -> None:
         if request.images:
-            make_folder(self.folder / "images")
+            make_folder(self.folder / IMAGES)
         for image in request.images:
-            path = self.folder / "images" / f"{image.digest}.png"
+            path = self.folder / IMAGES / f"{image.digest}.png"
             if not path.is_file():
                 write_bytes(path, image.png)
 
@@ -84,11 +86,10 @@ class ReplyStore:
     def _locked(self) -> Iterator[None]:
         """Hold the folder against other threads and processes; the lock leaves no file behind."""
         try:
-            handle = os.open(self.folder, os.O_RDONLY)
+            handle = hold_folder(self.folder, waits=True)
         except OSError as error:
-            raise StoreError(f"cannot write {self.folder}: {error.strerror or error}") from error
+            raise write_error(self.folder, error) from error
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX)
             yield
         finally:
             os.close(handle)

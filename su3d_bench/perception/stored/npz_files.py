@@ -26,7 +26,7 @@ from su3d_bench.core.errors import DAMAGE, DataError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Detections, Float32Array, Frame, Regions, SceneInfo
 from su3d_bench.perception.stored.source import StoredFrame, check_masks
-from su3d_bench.store.atomic import read_arrays
+from su3d_bench.store.atomic import make_folder, read_arrays, replacing
 
 _REQUIRED = ("image_size", "masks", "boxes", "scores", "names")
 _FEATURES = ("crop_ratios", "crop_features", "global_feature", "encoder")
@@ -71,8 +71,9 @@ def write_stored(path: Path, detections: Detections, encoder: Encoder | None) ->
         arrays["crop_features"] = detections.crop_features
         arrays["global_feature"] = detections.global_feature
         arrays["encoder"] = np.array(encoder.digest)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    np.savez_compressed(path, allow_pickle=False, **arrays)
+    make_folder(path.parent)
+    with replacing(path) as stream:
+        np.savez_compressed(stream, allow_pickle=False, **arrays)
 
 
 def read_stored(path: Path, frame: Frame, encoder: Encoder) -> StoredFrame:

@@ -19,7 +19,7 @@ from su3d_bench.questions.files.datasets import is_foreign, read_foreign
 from su3d_bench.questions.files.queries import COLUMNS, MORE_COLUMNS, read_query_rows
 from su3d_bench.questions.model import ALL_KINDS, KINDS, REASONING, Question, new_question
 from su3d_bench.reports.tables.formats import no_formula
-from su3d_bench.store.atomic import write_text
+from su3d_bench.store.atomic import make_folder, write_text
 
 PAPER = Path(__file__).parent / "paper_queries.toml"
 PAGE = "opensu3d.github.io"
@@ -106,6 +106,7 @@ def check_form(path: Path) -> None:
 def write_questions(path: Path, questions: Sequence[Question]) -> None:
     """Write a set as ``read_questions`` reads it, TOML or CSV by the file's name; answers in words are not kept."""
     check_form(path)
+    make_folder(path.parent)
     write_text(path, csv_text(questions) if path.suffix.lower() == ".csv" else toml_text(questions))
 
 

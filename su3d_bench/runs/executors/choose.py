@@ -9,6 +9,7 @@ from typing import Any
 from su3d_bench.core.config import RunConfig, parse_value
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.runs.executors.local import Outcome, Report, Unit, Work, run_inline, run_processes
+from su3d_bench.store.run_folder import refuse_links
 
 # The options of executors on other machines; a value other than the default is refused elsewhere.
 USED_BY = {
@@ -80,4 +81,5 @@ def run_units(
     from su3d_bench.runs.executors.slurm import run_slurm
 
     at, parameters = folder.absolute() / "slurm", slurm_parameters(config)
+    refuse_links(at.parent, at)
     return run_slurm(work, units, report, jobs=n_workers, config=config, folder=at, parameters=parameters, lost=lost)

@@ -7,7 +7,6 @@ files. A job gets the real files of its scene alone.
 from __future__ import annotations
 
 import re
-import tempfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -17,6 +16,7 @@ from su3d_bench.core.errors import ConfigError
 from su3d_bench.runs.job import Part, build_dataset
 from su3d_bench.runs.remote.folder import RemoteFolder
 from su3d_bench.store.atomic import make_folder
+from su3d_bench.store.scratch import TemporaryFolder
 
 MOST_SHARED_BYTES = 1 << 26  # label tables and camera files; the largest has 1 MB
 
@@ -54,12 +54,12 @@ def data_place(url: str) -> Iterator[DataPlace]:
     sizes = RemoteFolder(url).files()
     if not sizes:
         raise ConfigError(f"SU3D_DATA={url}: holds no file; name the folder that holds the datasets")
-    with tempfile.TemporaryDirectory(prefix="su3d-outline-") as folder:
+    with TemporaryFolder("su3d-outline-") as folder:
         for below in {str(Path(name).parent) for name in sizes}:
-            make_folder(Path(folder, below))
+            make_folder(folder / below)
         for name in sizes:
-            Path(folder, name).touch()
-        yield DataPlace(Path(folder), url, sizes)
+            (folder / name).touch()
+        yield DataPlace(folder, url, sizes)
 
 
 def files_of_scenes(sizes: Mapping[str, int], scenes: Sequence[str]) -> dict[str, dict[str, int]]:

@@ -6,14 +6,13 @@ is a ``StoreError`` that names the store.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError, printable
-from su3d_bench.store.atomic import make_folder
+from su3d_bench.store.atomic import make_folder, replacing
 
 AT_ONCE = 256  # small files that one request to the driver asks for; it fetches them side by side
 BUCKETS = ("s3", "s3a", "gs", "gcs", "abfs", "abfss", "az", "oss")  # have no folders, and to make one makes a bucket
@@ -72,10 +71,8 @@ class RemoteFolder:
         for name, size in sizes.items():
             target = into / name
             make_folder(target.parent)
-            partial = target.with_name(f".{target.name}.{os.getpid()}.tmp")
-            with self._telling(f"{name} cannot be copied to {into}"):
-                self._driver.get_file(f"{self._root}/{name}", str(partial))
-                os.replace(partial, target)
+            with replacing(target) as stream, self._telling(f"{name} cannot be copied to {into}"):
+                self._driver.get_file(f"{self._root}/{name}", str(stream.name))
             if target.stat().st_size != size:
                 raise StoreError(
                     f"{self.url}: {name} has {target.stat().st_size} bytes here and {size} there; try again"

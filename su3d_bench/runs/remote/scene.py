@@ -21,6 +21,7 @@ from su3d_bench.runs.scene import failed_outcomes, run_scene
 from su3d_bench.store.atomic import make_folder, write_bytes
 from su3d_bench.store.run_folder import RunFolder
 from su3d_bench.store.scratch import TemporaryFolder
+from su3d_bench.store.unfinished import is_unfinished
 
 CACHE_ROOT = "~/.cache/su3d-bench/cache"
 SEAL = "done.json"
@@ -81,7 +82,7 @@ def _stored(store: RemoteFolder, job: SceneJob) -> Iterator[None]:
 
 def _stamps(folder: Path) -> dict[str, tuple[int, int]]:
     """Inode and time of every file, which a file that is written again does not keep."""
-    paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and not path.name.endswith(".tmp")]
+    paths = [path for path in sorted(folder.rglob("*")) if path.is_file() and not is_unfinished(path.name)]
     stats = {path.relative_to(folder).as_posix(): path.stat() for path in paths}
     return {name: (about.st_ino, about.st_mtime_ns) for name, about in stats.items()}
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -11,19 +12,21 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.digests import digest_bytes
-from su3d_bench.core.errors import ConfigError, printable
+from su3d_bench.core.errors import ConfigError, DataError, printable
 from su3d_bench.reports.sheet.page import page_html
 from su3d_bench.reports.tables.formats import csv_lines
 from su3d_bench.sheets.items import (
     ANSWER_COLUMNS,
     ASKS,
     PICTURES,
+    SHEET_FILE,
     AnnotatorShare,
     Key,
     KeyItem,
     Sheet,
     SheetKind,
     new_item,
+    read_sheet,
     sheet_id_of,
     write_key,
     write_sheet,
@@ -33,6 +36,7 @@ from su3d_bench.sheets.making.workbook import workbook_bytes
 from su3d_bench.store.atomic import make_folder, remove_file, write_bytes, write_text
 
 MOST_ANNOTATORS = 100
+PICTURE_NAME = re.compile(r"item-[0-9]{4,}\.png")
 PAGE, WORKBOOK, TABLE = "sheet.html", "sheet.xlsx", "sheet.csv"
 TITLES = {
     "retrieval": "Is the outlined object what is asked for?",
@@ -150,9 +154,8 @@ def write_sheets(made: MadeSheets, folder: Path, key_folder: Path) -> list[Path]
         raise ConfigError(f"--key {printable(str(key_folder), 200)}: lies where the sheets are; keep the key apart")
     for path in (folder, key_folder, folder / PICTURES):
         make_folder(path)
-    for old in (folder / PICTURES).glob("item-*.png"):
-        if old.name not in made.pictures:
-            remove_file(old)
+    for name in _pictures_of_set(folder) - made.pictures.keys():
+        remove_file(folder / PICTURES / name)
     for name, content in made.pictures.items():
         write_bytes(folder / PICTURES / name, content)
     written = []
@@ -166,6 +169,15 @@ def write_sheets(made: MadeSheets, folder: Path, key_folder: Path) -> list[Path]
     write_sheet(folder, made.sheet)
     write_key(key_folder, made.key)
     return written
+
+
+def _pictures_of_set(folder: Path) -> set[str]:
+    """Names of the pictures of the set that stands in ``folder``; none where there is none that can be read."""
+    try:
+        sheet = read_sheet(folder / SHEET_FILE)
+    except DataError:
+        return set()
+    return {name for item in sheet.items for name in item.pictures if PICTURE_NAME.fullmatch(name)}
 
 
 def page_data(made: MadeSheets, share: AnnotatorShare) -> dict[str, Any]:

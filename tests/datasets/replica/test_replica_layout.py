@@ -114,7 +114,7 @@ def test_a_killed_make_leaves_no_scene_and_the_next_takes_up_its_frames(tmp_path
         Replica(tmp_path).scenes()
     stray = next(iter((tmp_path / "Replica").glob(".room7.*.partial/results")), None)
     if stray is not None:
-        (stray / ".frame000004.jpg.1.tmp").write_bytes(b"half")
+        (stray / ".frame000004.jpg.0123456789ab.unfinished").write_bytes(b"half")
     again = Stage()
     write_scene(again, "room7", tmp_path)
     assert sorted(set(again.rendered) - {0}) == list(range(max(dies_at, 1), N_FRAMES))
@@ -133,7 +133,7 @@ def test_a_make_killed_between_two_moves_is_finished_by_the_next(
     replace = os.replace
 
     def dying_replace(source: Path, target: Path) -> None:
-        if not Path(source).name.endswith(".tmp"):
+        if not Path(source).name.endswith(".unfinished"):
             if len(moved) == n_moves:
                 raise KeyboardInterrupt
             moved.append(target)
@@ -202,7 +202,7 @@ def test_a_full_disk_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(StoreError, match=r"cannot write .*frame000000\.jpg: the disk is full; free some space"):
         write_frames(LAYOUT, Stage(), targets[0], range(N_FRAMES))
-    assert not [name for name in files_below(tmp_path) if name.endswith(".tmp")]
+    assert not [name for name in files_below(tmp_path) if name.endswith(".unfinished")]
 
 
 def test_a_folder_that_cannot_be_written_is_one_line(tmp_path: Path) -> None:

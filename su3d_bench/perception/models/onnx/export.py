@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import tempfile
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -16,6 +15,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import StoreError
 from su3d_bench.store.atomic import make_folder
+from su3d_bench.store.unfinished import unfinished_folder
 
 # 17 has LayerNormalization as one operator; newer ones bring nothing that our towers use.
 OPSET = 17
@@ -68,8 +68,8 @@ def export_onnx(
     import torch
 
     make_folder(path.parent)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
-        draft = Path(folder) / path.name
+    with unfinished_folder(path) as folder:
+        draft = folder / path.name
         with _slow_attention(torch), torch.no_grad(), warnings.catch_warnings():
             # The exporter warns of its own age and of every shape that it takes as constant; parity is what counts.
             warnings.simplefilter("ignore")
