@@ -9,7 +9,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 from types import ModuleType
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, Literal
 
 from su3d_bench.core.errors import EXIT_DONE
 from su3d_bench.core.printing import Door, escaped_json, one_line, stream_behind
@@ -176,21 +176,25 @@ def answer_or_write(arguments: argparse.Namespace, text: str) -> None:
         remark(f"written: {written(arguments.out, text)}", quiet=arguments.quiet)
 
 
-def file_name_of(text: str, default: str) -> str:
-    """What a picture of the answer to ``text`` is called; no two texts have one name.
+def file_name_of(text: str, kind: Literal["text", "question"]) -> str:
+    """What a picture of the answer to ``text`` is called; no two texts of a kind have one name.
 
-    >>> file_name_of("plant on shelf", "text"), file_name_of("Where is it?", "text"), file_name_of("?", "text")
-    ('plant-on-shelf', 'where-is-it-dadf29a5', 'text-8a8de823')
+    >>> file_name_of("plant on shelf", "text"), file_name_of("Where is it?", "question")
+    ('plant-on-shelf', 'where-is-it')
+    >>> file_name_of("Plant on shelf", "text"), file_name_of("?", "question")
+    ('plant-on-shelf-c4a4222c', 'question-8a8de823')
     """
-    words = re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60]
-    return words if words and words.replace("-", " ") == text else f"{words or default}-{_few_digits(text)}"
+    name = re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:60]
+    words = name.replace("-", " ")
+    is_plain = bool(name) and text == (words if kind == "text" else f"{words.capitalize()}?")
+    return name if is_plain else f"{name or kind}-{_few_digits(text)}"
 
 
 def file_name_of_scene(address: str) -> str:
     """What a picture of a scene is called; no two addresses have one name.
 
     >>> file_name_of_scene("replica/room0"), file_name_of_scene("mine/hall/left")
-    ('replica-room0', 'mine-hall-left-9fd32bf4')
+    ('replica-room0', 'mine-hall-left-f6ee616f')
     """
     if re.fullmatch(r"[A-Za-z0-9_]+/[A-Za-z0-9_.-]+", address):
         return address.replace("/", "-")

@@ -105,7 +105,7 @@ def records_of(
 
 def write_records(job: JobFolder, records: NameRecords) -> Path:
     """Write the file beside the map; its path."""
-    job.refuse_links()
+    job.prepare()
     path = job.path / FILE_NAME
     write_json(path, records.model_dump(mode="json"))
     return path

@@ -321,3 +321,19 @@ def test_hostile_names_are_drawn_as_text(tmp_path: Path) -> None:
     path = tmp_path / "picture.png"
     draw_reasoning(made_map(), SpokenOf((0, 1, 2), (3,)), names, path, "$x_{$", ["$\\bad$" * 200])
     assert path.read_bytes().startswith(b"\x89PNG")
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_nothing_is_written_through_a_link_in_place_of_a_jobs_folder(
+    job: JobFolder, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    elsewhere = tmp_path / "elsewhere"
+    job.path.rename(elsewhere)
+    job.path.symlink_to(elsewhere)
+    before = {path: path.read_bytes() for path in elsewhere.rglob("*") if path.is_file()}
+    for words in (["refine", "runs/made"], ["ask", SCENE, "Where is the bed?"]):
+        assert main(words) == 2
+        assert capsys.readouterr().err == (
+            f"su3d-bench: {job.path}: is a link, and a run writes into folders of its own alone; remove it\n"
+        )
+    assert {path: path.read_bytes() for path in elsewhere.rglob("*") if path.is_file()} == before

@@ -24,21 +24,21 @@ CASES: dict[str, tuple[list[str], int, str]] = {
         "sweep/metrics.json",
     ),
     "evaluate": (
-        ["out/scenes/rooms.living0/opensu3d", "--dataset", "rooms", "--protocol", "rooms-instance"],
+        ["out/scenes/rooms.living0/opensu3d", "--dataset", "rooms", "--protocol", "rooms-instance", "--json", "e.json"],
         0,
         "rooms-instance",
     ),
     "check": (["--learn", "out", "--out", "reference.json"], 0, "reference.json"),
     "compare": (["out:opensu3d", "out:oracle"], 0, "rooms-instance"),
     "plan": (["out"], 2, "1 scene is scored"),  # one tells nothing of how differences vary
-    "attribute": (["out", "--method", "opensu3d"], 0, "rooms-instance"),
+    "attribute": (["out", "--method", "opensu3d", "--out", "errors.png"], 0, "errors.png"),
     "report tables": (["out", "--format", "latex", "--out", "tables.tex"], 0, "tables.tex"),
-    "report timing": (["out"], 0, "opensu3d"),
+    "report timing": (["out", "--out", "timing"], 0, "timing/timing.md"),
     "report html": (["out", "--no-maps", "--out", "page.html"], 0, "page.html"),
-    "report leaderboard": (["."], 0, "opensu3d"),
+    "report leaderboard": (["out", "--out", "board.md"], 0, "board.md"),
     "report verify": (["tables.tex"], 0, ""),
     "sheets make": (["out", "--kind", "retrieval", "--per-kind", "1", "--jobs", "1", "--out", "sheets"], 0, "sheets"),
-    "sheets score": (["--key", "sheets-key"], 0, ""),
+    "sheets score": (["--key", "sheets-key", "--out", "scores"], 0, "scores/scores.json"),
     "sheets pictures": (["out", "--what", "labels", "--out", "labels.png"], 0, "labels.png"),
     "query": ([SCENE, "plant on shelf", "--run", "out"], 0, "opensu3d"),
     "questions": (["show", "paper"], 0, "904 questions on 13 scenes"),
@@ -62,6 +62,30 @@ CASES: dict[str, tuple[list[str], int, str]] = {
 }
 
 
+# Where each verb that leaves files writes one, in a folder in which an earlier process may have been killed.
+PLACES = {
+    "run": ("out", "out/scenes/rooms.living0/opensu3d"),
+    "ablate": ("sweep",),
+    "evaluate": (".",),
+    "check": (".",),
+    "attribute": (".",),
+    "report tables": (".",),
+    "report timing": ("timing",),
+    "report html": (".",),
+    "report leaderboard": (".",),
+    "sheets make": ("sheets", "sheets/pictures", "sheets/annotator-1", "sheets-key"),
+    "sheets score": ("scores",),
+    "sheets pictures": (".",),
+    "query": ("out/scenes/rooms.living0/opensu3d/pictures",),
+    "ask": ("out/scenes/rooms.living0/opensu3d/pictures",),
+    "refine": ("out/scenes/rooms.living0/opensu3d",),
+    "datasets show": (".",),
+    "datasets make": ("made",),
+    "export": (".",),
+}
+LEFT_BY_A_KILLED_PROCESS = ".half.0123456789ab.unfinished"
+
+
 @pytest.fixture(scope="module", autouse=True)
 def _place(tmp_path_factory: pytest.TempPathFactory, rooms_data: Path) -> Iterator[None]:
     """A folder where each verb works on what those before it left."""
@@ -81,6 +105,11 @@ def test_every_verb_of_the_parser_has_its_case() -> None:
 @pytest.mark.parametrize("verb", CASES)
 def test_the_verb_does_its_work(verb: str, capsys: pytest.CaptureFixture[str]) -> None:
     words, code, left = CASES[verb]
+    half = [Path(place, LEFT_BY_A_KILLED_PROCESS) for place in PLACES.get(verb, ())]
+    for path in half:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("half")
     assert main([*verb.split(), *words]) == code, capsys.readouterr().err
     answer = capsys.readouterr()
     assert left in answer.out + answer.err or Path(left).exists(), answer.out + answer.err
+    assert not [path for path in half if path.exists()], "what a killed process left goes"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -274,6 +275,28 @@ def test_a_folder_is_filled_whole_or_not_at_all(tmp_path: Path) -> None:
     with whole_folder(tmp_path / "empty") as folder:
         (folder / "y").write_text("2")
     assert (tmp_path / "empty/y").read_text() == "2"
+
+
+def test_all_files_of_an_export_are_on_the_disk_before_it_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done: list[tuple[str, str]] = []
+    replace, sync = os.replace, os.fsync
+
+    def noting_sync(handle: int) -> None:
+        done.append(("sync", Path(os.readlink(f"/proc/self/fd/{handle}")).name))
+        sync(handle)
+
+    def noting_replace(source: Path, target: Path) -> None:
+        done.append(("rename", Path(target).name))
+        replace(source, target)
+
+    with whole_folder(tmp_path / "out") as folder:
+        write_openlex(a_map([[0, 1], [2]]), folder / "s")
+        monkeypatch.setattr(os, "fsync", noting_sync)
+        monkeypatch.setattr(os, "replace", noting_replace)
+    at = done.index(("rename", "out"))
+    assert {("sync", name) for name in ("point_cloud.pcd", "index.npy", "embeddings.npy", "s")} <= set(done[:at])
 
 
 def test_a_disk_that_refuses_is_one_line(tmp_path: Path) -> None:

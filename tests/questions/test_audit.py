@@ -229,6 +229,17 @@ def test_a_second_audit_leaves_nothing_of_the_first(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.rglob("*.png")) == ["001.png", "sheet-01.png"]
 
 
+def test_an_audit_leaves_other_pictures_alone(tmp_path: Path) -> None:
+    theirs = [tmp_path / name for name in ("sheet-07.png", "pictures/20260101.png", "pictures/031.png")]
+    theirs[1].parent.mkdir()
+    for path in theirs:
+        path.write_bytes(b"theirs")
+    words = ["questions", "audit", "--scenes", f"{PAINTED}/a", "--out", str(tmp_path), "--quiet", "--n", "2"]
+    for _ in range(2):
+        assert main(words) == 0
+    assert all(path.read_bytes() == b"theirs" for path in theirs)
+
+
 def test_hostile_texts_are_escaped_on_the_page_and_read_back(tmp_path: Path) -> None:
     one = replace(plain("painted/a", "count", 0), text=HOSTILE, answer='=HYPERLINK("x")')
     dataset = Painted(Path(), Painted.Options())

@@ -392,3 +392,75 @@ def test_the_second_of_two_runs_on_one_folder_is_refused() -> None:
     assert run("--set", "painted.frame_ms=200") == 2
     process.kill()
     process.wait()
+
+
+def test_a_folder_of_somebody_else_is_refused_and_left_alone(capsys: pytest.CaptureFixture[str]) -> None:
+    Path("out").mkdir()
+    Path("out/.notes.tmp").write_text("theirs")
+    assert run() == 2
+    assert capsys.readouterr().err == (
+        "su3d-bench: out: holds '.notes.tmp' and is no folder of a run; choose a new folder with --out\n"
+    )
+    assert [path.name for path in Path("out").iterdir()] == [".notes.tmp"]
+
+
+def test_a_run_takes_an_empty_folder_and_its_own_and_deletes_nothing_that_is_not_its(tmp_path: Path) -> None:
+    Path("out").mkdir()
+    Path("out/.run.toml.0123456789ab.unfinished").write_text("killed before its first file")
+    assert run(scenes="a") == 0
+    Path("out/.notes.tmp").write_text("theirs")
+    Path("out/scenes/painted.a/collector/.notes.tmp").write_text("theirs")
+    assert run(scenes="a") == 0
+    assert {path.name for path in Path("out").rglob(".*")} == {".notes.tmp"}
+    assert len(list(Path("out").rglob(".notes.tmp"))) == 2
+
+
+def test_scenes_whose_names_differ_in_a_slash_have_a_map_each(capsys: pytest.CaptureFixture[str]) -> None:
+    twins = ["run", "--scenes", f"{SCENES}/twins.py:Twins/*", *words()[3:]]
+    assert main(twins) == 0
+    folders = sorted(path.name for path in Path("out/scenes").iterdir())
+    assert folders == ["twins.a%252Fb", "twins.a%2Fb", "twins.a_b"]
+    maps = {path.read_bytes() for path in Path("out/scenes").glob("*/collector/prediction.npz")}
+    assert len(maps) == 3
+    assert main(twins) == 0
+    capsys.readouterr()
+    assert (
+        main(["export", "out", "--to", "scannet", "--scenes", "twins/a/b", "--method", "collector", "--out", "x"]) == 2
+    )
+    assert "scene 'a/b': cannot be the name of a file" in capsys.readouterr().err
+
+
+def test_a_scene_is_exported_under_its_own_name(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["run", "--scenes", f"{SCENES}/twins.py:Twins/a_b", *words()[3:]]) == 0
+    capsys.readouterr()
+    assert main(["export", "out", "--to", "openlex3d", "--method", "collector", "--out", "x"]) == 0
+    assert [path.name for path in Path("x/twins").iterdir()] == ["a_b"]
+
+
+@pytest.mark.parametrize(
+    ("more", "line"),
+    [
+        (["--methods", f"{SCENES}/twins.py:SlashCollector"], "'../elsewhere' cannot be the name of a folder"),
+        (["--methods", COLLECTOR, f"{SCENES}/./painted.py:Collector"], "different ones are called 'collector'"),
+        (
+            ["--scenes", f"{PAINTED}/a", f"{SCENES}/./painted.py:Painted/b"],
+            "two different ones are called 'pai",
+        ),
+        (["--protocols", "one/mine.toml", "two/mine.toml"], "two different ones are called 'mine'"),
+    ],
+)
+def test_two_things_of_one_name_are_refused_before_any_work(
+    more: list[str], line: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for folder, voxel in (("one", "0.05"), ("two", "0.06")):
+        Path(folder).mkdir()
+        text = f'extends = "rooms-semantic"\nname = "mine"\n[transfer]\nevaluation_voxel_m = {voxel}\n'
+        Path(folder, "mine.toml").write_text(text)
+    assert main([*words(), *more]) == 2
+    assert line in capsys.readouterr().err
+    assert not Path("out").exists()
+
+
+def test_a_protocol_named_twice_counts_once() -> None:
+    assert main([*words(scenes="a"), "--protocols", "rooms-semantic", "rooms-semantic"]) == 0
+    assert [one["protocol"] for one in metrics()["results"]] == ["rooms-semantic"]

@@ -390,6 +390,15 @@ def test_pictures_of_an_older_set_do_not_stay(tmp_path: Path) -> None:
     assert len(list((tmp_path / "out" / "pictures").iterdir())) == 2
 
 
+def test_pictures_of_somebody_else_stay(tmp_path: Path) -> None:
+    theirs = tmp_path / "out/pictures/item-9999.png"
+    theirs.parent.mkdir(parents=True)
+    theirs.write_bytes(b"theirs")
+    for texts in (TEXTS, TEXTS[:2]):
+        write_sheets(made("retrieval", texts), tmp_path / "out", tmp_path / "key")
+    assert theirs.read_bytes() == b"theirs"
+
+
 def test_scenes_drawn_in_processes_give_the_pictures_in_order(source: RunSource, folder: Path) -> None:
     drafts = [
         replace(one, scene="painted/a", methods=("collector",), rows=(k,), similarity=np.arange(4.0))

@@ -1,0 +1,207 @@
+"""What is being written: its name, its lock, and who may clear what a killed process left."""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from subprocess import PIPE
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from su3d_bench.core.errors import StoreError
+from su3d_bench.perception.language.chat import ChatRequest
+from su3d_bench.perception.language.reply_store import ReplyStore
+from su3d_bench.store.atomic import make_folder, replacing, write_text
+from su3d_bench.store.run_folder import RunFolder, folder_of_scene, scene_of_folder
+from su3d_bench.store.unfinished import clear_unfinished, is_unfinished, unfinished_folder
+
+LEFT = ".page.html.0123456789ab.unfinished"
+WRITERS = {
+    "a file": "with replacing(place / 'page.html') as stream:\n stream.write(b'half'); stream.flush(); wait()",
+    "a shared file": "with filling(place / 'entry.npz') as stream:\n stream.write(b'half'); stream.flush(); wait()",
+    "a folder": "with whole_folder(place / 'x') as folder:\n (folder / 'half').write_text('x'); wait()",
+}
+
+
+@contextmanager
+def writer(kind: str, place: Path) -> Iterator[subprocess.Popen[str]]:
+    """A process that is in the midst of writing."""
+    code = (
+        "import sys; from pathlib import Path\nfrom su3d_bench.store.atomic import filling, replacing\n"
+        "from su3d_bench.predictions.export import whole_folder\nplace = Path(sys.argv[1])\n"
+        f"def wait():\n print('writing', flush=True); sys.stdin.read()\n{WRITERS[kind]}"
+    )
+    with subprocess.Popen([sys.executable, "-c", code, str(place)], stdin=PIPE, stdout=PIPE, text=True) as process:
+        assert process.stdout is not None
+        assert process.stdout.readline() == "writing\n"
+        try:
+            yield process
+        finally:
+            process.kill()
+
+
+def names(folder: Path) -> list[str]:
+    return sorted(path.name for path in folder.iterdir())
+
+
+@pytest.mark.parametrize("kind", WRITERS)
+def test_what_a_killed_writer_left_goes_with_the_next_and_what_a_living_one_writes_stays(
+    kind: str, tmp_path: Path
+) -> None:
+    with writer(kind, tmp_path) as process:
+        (left,) = names(tmp_path)
+        assert is_unfinished(left)
+        make_folder(tmp_path)
+        assert names(tmp_path) == [left], "its writer lives"
+        process.kill()
+        process.wait()
+        assert names(tmp_path) == [left]
+        make_folder(tmp_path)
+        assert names(tmp_path) == []
+
+
+def test_a_run_goes_on_in_a_folder_in_which_exports_were_killed(tmp_path: Path) -> None:
+    for _ in range(3):
+        with writer("a folder", tmp_path) as process:
+            process.kill()
+            process.wait()
+        assert len(names(tmp_path)) == 1, "the one before was cleared"
+    with RunFolder(tmp_path).locked():
+        assert names(tmp_path) == []
+
+
+def test_only_our_own_names_are_cleared(tmp_path: Path) -> None:
+    (tmp_path / "kept").write_text("kept")
+    for name in (".notes.tmp", ".page.html.123.tmp", ".x.unfinished", "page.html.0123456789ab.unfinished"):
+        (tmp_path / name).write_text("somebody's")
+    (tmp_path / ".link.0123456789ab.unfinished").symlink_to(tmp_path / "kept")
+    os.mkfifo(tmp_path / ".pipe.0123456789ab.unfinished")
+    before = names(tmp_path)
+    (tmp_path / LEFT).write_text("half")
+    (tmp_path / ".x.0123456789ab.unfinished").mkdir()
+    clear_unfinished(tmp_path)
+    assert names(tmp_path) == before
+
+
+def test_a_disk_without_locks_is_written_and_nothing_is_cleared_there(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def without_locks(handle: int, operation: int) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr(fcntl, "flock", without_locks)
+    (tmp_path / LEFT).write_text("half, or of somebody who writes it now")
+    write_text(tmp_path / "page.html", "whole")
+    with unfinished_folder(tmp_path / "x") as folder:
+        assert folder.is_dir()
+    make_folder(tmp_path)
+    assert names(tmp_path) == [LEFT, "page.html"]
+
+
+def test_a_folder_is_held_by_a_file_where_folders_have_no_locks(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock = fcntl.flock
+
+    def of_files_alone(handle: int, operation: int) -> None:
+        if os.path.isdir(f"/proc/self/fd/{handle}"):
+            raise OSError(errno.EBADF, "Bad file descriptor")
+        lock(handle, operation)
+
+    monkeypatch.setattr(fcntl, "flock", of_files_alone)
+    with unfinished_folder(tmp_path / "x") as folder:
+        clear_unfinished(tmp_path)
+        assert folder.is_dir()
+    (tmp_path / ".x.0123456789ab.unfinished").mkdir()
+    clear_unfinished(tmp_path)
+    assert names(tmp_path) == []
+
+
+def test_a_file_cleared_in_the_moment_before_its_lock_is_made_again(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    lock, n_cleared = fcntl.flock, 0
+
+    def cleared_first(handle: int, operation: int) -> None:
+        nonlocal n_cleared
+        if n_cleared < 2:
+            n_cleared += 1
+            Path(f"/proc/self/fd/{handle}").resolve().unlink()
+        lock(handle, operation)
+
+    monkeypatch.setattr(fcntl, "flock", cleared_first)
+    write_text(tmp_path / "page.html", "whole")
+    assert n_cleared == 2
+    assert names(tmp_path) == ["page.html"]
+
+
+@pytest.mark.parametrize("name", ["x" * 240, "\N{GREEK SMALL LETTER ALPHA}" * 120])
+def test_the_longest_names_can_be_written(name: str, tmp_path: Path) -> None:
+    with replacing(tmp_path / name) as stream:
+        (place,) = tmp_path.iterdir()
+        assert is_unfinished(place.name)
+        stream.write(b"whole")
+    assert names(tmp_path) == [name]
+
+
+ADDRESSES = st.tuples(
+    st.text("ab._%/-", min_size=1).filter(lambda text: "/" not in text), st.text("ab._%/-", min_size=1)
+).map("/".join)
+
+
+@given(ADDRESSES)
+def test_a_scene_is_known_by_its_folder(address: str) -> None:
+    name = folder_of_scene(address)
+    assert "/" not in name
+    assert scene_of_folder(name) == address
+
+
+def test_folders_of_ordinary_scenes_keep_their_names() -> None:
+    for address in ("rooms/living0", "scannet/scene0011_00", "painted/a_b", "mine/left 1.5"):
+        assert folder_of_scene(address) == address.replace("/", ".")
+
+
+@pytest.mark.parametrize("part", ["scenes", "scenes/rooms.a", "scenes/rooms.a/m", "scenes/rooms.a/m/pictures"])
+def test_nothing_of_a_job_is_written_through_a_link(part: str, tmp_path: Path) -> None:
+    job = RunFolder(tmp_path / "run").job("rooms/a", "m")
+    (tmp_path / "elsewhere").mkdir()
+    link = tmp_path / "run" / part
+    link.parent.mkdir(parents=True)
+    link.symlink_to(tmp_path / "elsewhere")
+    for write in (job.prepare, lambda: job.picture("query-x.png")):
+        with pytest.raises(StoreError, match=f"{link}: is a link, and a run writes into folders of its own alone"):
+            write()
+    assert not list((tmp_path / "elsewhere").iterdir())
+
+
+@pytest.mark.parametrize("part", ["language", "language/images"])
+def test_replies_are_not_kept_through_a_link(part: str, tmp_path: Path) -> None:
+    (tmp_path / "elsewhere").mkdir()
+    (tmp_path / "run").mkdir()
+    (tmp_path / "elsewhere" / LEFT).write_text("half")
+    link = tmp_path / "run" / part
+    link.parent.mkdir(exist_ok=True)
+    link.symlink_to(tmp_path / "elsewhere")
+    store = ReplyStore(tmp_path / "run/language")
+    request = ChatRequest.__new__(ChatRequest)  # its content is not looked at before the folder is
+    with pytest.raises(StoreError, match="is a link"):
+        store.save(request, None, "server")  # type: ignore[arg-type]
+    with pytest.raises(StoreError, match="is a link"), RunFolder(tmp_path / "run").locked():
+        pass
+    assert names(tmp_path / "elsewhere") == [LEFT]
+
+
+def test_a_run_may_lie_behind_a_link(tmp_path: Path) -> None:
+    (tmp_path / "large").mkdir()
+    (tmp_path / "run").symlink_to(tmp_path / "large")
+    with RunFolder(tmp_path / "run").locked():
+        RunFolder(tmp_path / "run").job("rooms/a", "m").prepare()
+    assert (tmp_path / "large/scenes/rooms.a/m").is_dir()
