@@ -11,6 +11,7 @@ import csv
 import io
 import json
 import os
+import signal
 import sys
 import time
 from collections.abc import Sequence
@@ -34,30 +35,38 @@ SUBJECTS = {
         "--set", "painted.n_frames=4", *(f"{name}.stride=1" for name in METHODS),
     ),
 }  # fmt: skip
+# The method ``command``; ``command.command`` follows once there is a prediction that the program can leave.
+SUBJECTS["program"] = (
+    *RUN, "--scenes", *(f"{SCENES}/kill_subject.py:Painted/{scene}" for scene in "ab"),
+    "--methods", "command", "--set", "painted.n_frames=2",
+)  # fmt: skip
 EXECUTORS = {
     "inline": ("--jobs", "1"),
     "processes": ("--jobs", "2"),
     "ray": ("--executor", "ray", "--jobs", "2"),
 }
+OF_A_PROGRAM = ("info: program: ", "info: the program took ")
 TIMES = ("_ms", "rss_bytes")
 COMPLETE, INCOMPLETE = 0, 3  # exit codes of the command
 
 
-class Run:
-    """One run of the command in a process group of its own."""
+class Forked:
+    """The command line ``words``, carried out in the folder ``at`` by a process group of its own."""
 
-    def __init__(self, folder: Path, request: Sequence[str], log: Path | None = None) -> None:
-        self._log = log or folder.with_suffix(".log")
-        words = [*request, "--out", str(folder)]
+    def __init__(self, words: Sequence[str], log: Path, at: Path | None = None) -> None:
+        self._log = log
         self.started = time.monotonic()
         self.pid = os.fork()
         if self.pid == 0:
-            self._be_the_command(words)
+            self._be_the_command(list(words), at)
 
-    def _be_the_command(self, words: list[str]) -> None:
+    def _be_the_command(self, words: list[str], at: Path | None) -> None:
         code = 4
         try:
             os.setsid()
+            signal.signal(signal.SIGINT, signal.default_int_handler)  # a shell's background jobs ignore it
+            if at is not None:
+                os.chdir(at)
             log = os.open(self._log, os.O_WRONLY | os.O_CREAT | os.O_TRUNC)
             os.dup2(log, 1)
             os.dup2(log, 2)
@@ -66,6 +75,8 @@ class Run:
             code = main(words)
             sys.stdout.flush()
             sys.stderr.flush()
+        except KeyboardInterrupt:  # in the moment before or after the command
+            code = 130
         finally:
             os._exit(code)
 
@@ -82,6 +93,13 @@ class Run:
         return self._log.read_text(errors="replace")[-2000:]
 
 
+class Run(Forked):
+    """A run into ``folder``, carried out beside it."""
+
+    def __init__(self, folder: Path, request: Sequence[str], log: Path | None = None) -> None:
+        super().__init__((*request, "--out", str(folder)), log or folder.with_suffix(".log"), folder.parent)
+
+
 def outcome(folder: Path) -> dict[str, Any]:
     """What every file of a run folder holds, without what a clock or a meter put there."""
     return {
@@ -89,8 +107,16 @@ def outcome(folder: Path) -> dict[str, Any]:
     }
 
 
+def program_of(ready: Path) -> str:
+    """The setting by which the method ``command`` starts another program's other program and leaves ``ready``."""
+    words = [sys.executable, str(SCENES / "kill_program.py"), "{output}", str(ready)]
+    return f"command.command={json.dumps(words)}"
+
+
 def _timeless(path: Path) -> Any:
     content = path.read_bytes()
+    if path.name == "log.txt":
+        return [line for line in content.decode().splitlines() if not line.startswith(OF_A_PROGRAM)]
     if path.name == "updates.csv":
         rows = list(csv.DictReader(io.StringIO(content.decode())))
         return [{name: value for name, value in row.items() if not name.endswith(TIMES)} for row in rows]
@@ -99,6 +125,9 @@ def _timeless(path: Path) -> Any:
         for step in record["steps"].values():
             step["files"].pop("updates.csv", None)
             step["remarks"].pop("costs", None)
+            if path.parent.name == "command":  # its log tells times and folders
+                step["files"].pop("log.txt", None)
+                step["remarks"].pop("log", None)
         return record
     return content
 

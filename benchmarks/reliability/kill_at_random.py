@@ -1,14 +1,18 @@
-"""Runs killed with signal 9 at random moments, their last written files spoilt as by a power cut, then taken up again.
+"""Runs and verbs killed at random moments, last written files spoilt as by a power cut, then taken up again.
 
     python benchmarks kill_at_random --kills 200
-    python benchmarks kill_at_random --kills 20 --seed 7 --executors processes
+    python benchmarks kill_at_random --kills 20 --seed 7 --only processes export
 
-A run of two methods on three tiny painted scenes (``--subject opensu3d``: OpenSU3D and two baselines) is started,
-killed at a moment drawn evenly from the time that a whole run takes, and half of the time each file of the second
-before the kill is cut short, emptied, filled with zeros or taken back. Half of the runs that take it up again are
-killed too. After every kill nothing that a seal vouches for may differ from the undisturbed run and the folder may not
-stay locked; in the end every file must have the bytes of the undisturbed run, columns of times aside, and no
-unfinished file may be left.
+A run of two methods on three tiny painted scenes (``--subject opensu3d``: OpenSU3D and two baselines) is started and
+killed, with signal 9 or with what terminals, schedulers and users send, at a moment drawn evenly from the time that a
+whole run takes; after half of the kills with signal 9 each file of the second before is cut short, emptied, filled with
+zeros or taken back. Half of the runs that take it up again are killed too. After every kill nothing that a seal vouches
+for may differ from the undisturbed run and the folder may not stay locked; in the end every file must have the bytes of
+the undisturbed run, columns of times aside. So are runs of a program of somebody else that starts another program
+(``program``, ``programs`` in workers), and ``export``, ``sheets make``, ``sheets score`` and ``report html``.
+
+Three things are counted and must be none: faults; orphans, processes that still work for what was killed seconds ago;
+and leftovers, files and folders that nothing finished owns once the same command was let go to its end.
 
 Each run is a process forked from one that has its modules loaded, so that the kills strike the work, not the start.
 ``group`` kills a run and all its workers, ``driver`` leaves workers behind for the next run to meet, ``worker`` kills
@@ -18,8 +22,6 @@ one worker of a run. With ray, the workers are those of a cluster that is starte
 from __future__ import annotations
 
 import argparse
-import collections
-import contextlib
 import os
 import random
 import shutil
@@ -29,80 +31,44 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 
-from forked_runs import COMPLETE, EXECUTORS, INCOMPLETE, SUBJECTS, Run, false_seals, load_modules, outcome
+from forked_runs import (
+    COMPLETE,
+    EXECUTORS,
+    INCOMPLETE,
+    SUBJECTS,
+    Run,
+    false_seals,
+    load_modules,
+    outcome,
+    program_of,
+)
+from killed_verbs import VERBS, load_verbs, try_verbs
+from killing import SIGNALS, Tally, check_end, clear_leftovers, cut_power, end_of, end_orphans, kill, workers_below
 from measured import write_measured
 
-VICTIMS = {"inline": ("group",), "processes": ("group", "driver", "worker"), "ray": ("driver", "worker")}
-SHARES = {"inline": 12, "processes": 5, "ray": 3}  # of the kills: a run in workers takes many times as long
-A_WORKER = ("spawn_main", "ray::_on_node")  # in the command lines of workers
-LAST_SECOND_NS = 1_000_000_000
-PAGE = 4096
-COLUMNS = ("kills", "of a group", "of a driver", "of a worker", "power cuts", "files spoilt", "compared")
+# What is run, and by which executor; ``--subject`` names what the first three run.
+RUNS = {
+    "inline": (None, "inline"),
+    "processes": (None, "processes"),
+    "ray": (None, "ray"),
+    "program": ("program", "inline"),
+    "programs": ("program", "processes"),
+}
+VICTIMS = {"inline": ("group", "driver"), "processes": ("group", "driver", "worker"), "ray": ("driver", "worker")}
+# Of the kills: a run in workers takes many times as long.
+SHARES = dict.fromkeys(VERBS, 2) | {"inline": 8, "processes": 3, "ray": 2, "program": 4, "programs": 2}
+COLUMNS = (
+    "kills", "of a group", "of a driver", "of a worker", "SIGKILL", "SIGTERM", "SIGHUP", "SIGINT", "power cuts",
+    "files spoilt", "compared",
+)  # fmt: skip
+COUNTED = ("faults", "orphans", "leftovers")
 NOTE = (
-    "compared: runs that were taken up again to their end, whose files had the bytes of the undisturbed run; a fault "
-    "is a file that differs, a half-written one taken for whole, a lock that stayed, a traceback, or a file left over."
+    "compared: what was taken up again to its end and had the bytes of the undisturbed one; a fault is a file that "
+    "differs, a half-written one taken for whole, a lock that stayed, a traceback or another end than the signal's; an "
+    "orphan is a process that works on 5 s after its run was killed, a leftover a file or folder that nothing owns."
 )
-
-
-@dataclass
-class Tally:
-    """What was done and what came of it; ``faults`` must stay empty."""
-
-    done: collections.Counter[str] = field(default_factory=collections.Counter)
-    faults: list[str] = field(default_factory=list)
-
-
-def workers_below(pid: int) -> list[int]:
-    import psutil
-
-    with contextlib.suppress(psutil.NoSuchProcess):
-        children = psutil.Process(pid).children(recursive=True)
-        return [one.pid for one in children if any(mark in " ".join(one.cmdline()) for mark in A_WORKER)]
-    return []
-
-
-def kill(run: Run, victim: str, workers: Sequence[int], moments: random.Random) -> bool:
-    """Kill ``victim`` of ``run``; whether it was there."""
-    if run.has_ended():
-        return False
-    if victim == "worker":
-        if not workers:
-            return False
-        with contextlib.suppress(ProcessLookupError):
-            os.kill(moments.choice(workers), signal.SIGKILL)
-    elif victim == "driver":
-        os.kill(run.pid, signal.SIGKILL)
-    else:
-        os.killpg(run.pid, signal.SIGKILL)
-    return True
-
-
-def cut_power(roots: Sequence[Path], moments: random.Random) -> int:
-    """Spoil the files of the last second as an unlucky file system would; how many were."""
-    since = time.time_ns() - LAST_SECOND_NS
-    spoilt = 0
-    for path in sorted(path for root in roots for path in root.rglob("*") if path.is_file()):
-        if path.stat().st_mtime_ns < since:
-            continue
-        content = path.read_bytes()
-        way = moments.choice(("whole", "cut", "empty", "zeros", "tail", "undone"))
-        at = moments.randrange(len(content) + 1)
-        if way == "whole":
-            continue
-        spoilt += 1
-        if way == "undone":  # the bytes reached the disk in part, the new name did not
-            path.rename(path.with_name(f".{path.name}.tmp"))
-        elif way == "cut":
-            path.write_bytes(content[:at])
-        elif way == "tail":  # whole pages that were promised but not written
-            kept = at // PAGE * PAGE
-            path.write_bytes(content[:kept] + bytes(len(content) - kept))
-        else:
-            path.write_bytes(b"" if way == "empty" else bytes(len(content)))
-    return spoilt
 
 
 class Cluster:
@@ -123,12 +89,18 @@ class Cluster:
         self.address = next(line.strip() for line in said if line.startswith("127.") or line[:1].isdigit())
         self.pid = self._process.pid
 
+    def processes(self) -> list[int]:
+        """All processes that are of the cluster, and end with it."""
+        import psutil
+
+        return [one.pid for one in psutil.Process(self.pid).children(recursive=True)]
+
     def close(self) -> None:
         self._process.communicate("")
 
 
 class Trial:
-    """One executor: its undisturbed run, and as many killed ones as are asked for."""
+    """Runs of one kind: the undisturbed one, and as many killed ones as are asked for."""
 
     def __init__(
         self, scratch: Path, subject: str, executor: str, cluster: Cluster | None, seed: str, tally: Tally
@@ -137,11 +109,13 @@ class Trial:
         if cluster is not None:
             self._request += ("--ray-address", cluster.address)
         self._cluster = cluster
-        moments = random.Random(f"{seed} {executor}")
-        self._scratch, self._executor, self._moments, self._tally = scratch, executor, moments, tally
-        self._cache = scratch / "cache"
+        self._scratch, self._executor, self._tally = scratch, executor, tally
+        self._moments = random.Random(f"{seed} {tally.name}")
+        self._cache, self._temporary = scratch / "cache", scratch.parent / "temporary"
         os.environ["SU3D_CACHE"] = str(self._cache)
-        whole = scratch / f"whole-{executor}"
+        if subject == "program":
+            self._request += ("--set", program_of(self._ready()))
+        whole = scratch / "whole"
         run = Run(whole, self._request)
         if run.finish() != COMPLETE:
             raise SystemExit(f"the undisturbed run failed: {run.said()}")
@@ -153,6 +127,14 @@ class Trial:
         if outcome(scratch / "timed") != self.expected:
             raise SystemExit("two undisturbed runs differ; nothing can be said of killed ones")
         shutil.rmtree(scratch / "timed")
+        self._kept = {path.name for path in self._temporary.iterdir()}  # as a cluster keeps
+
+    def _ready(self) -> Path:
+        """A map for the program to leave."""
+        run = Run(self._scratch / "light", (*SUBJECTS["light"], *EXECUTORS["inline"]))
+        if run.finish() != COMPLETE:
+            raise SystemExit(f"the run before those of a program failed: {run.said()}")
+        return self._scratch / "light/scenes/painted.a/collector/prediction.npz"
 
     def kills(self, n: int) -> None:
         """Episodes until ``n`` kills struck."""
@@ -168,40 +150,36 @@ class Trial:
             self._take_up(folder)
 
     def _kill_one(self, folder: Path) -> bool:
-        victim = self._moments.choice(VICTIMS[self._executor])
+        victim, sent = self._moments.choice(VICTIMS[self._executor]), self._moments.choice(SIGNALS)
         run = Run(folder, self._request)
         time.sleep(self._moments.uniform(0, self._whole_s))
         above = run.pid if self._cluster is None else self._cluster.pid
-        was_hit = kill(run, victim, workers_below(above) if victim == "worker" else (), self._moments)
-        if was_hit and victim == "driver":
-            run.finish()
-            return self._count("driver", spoilt=None)  # its workers may live on for a moment: the next run meets them
-        code = run.finish()
+        was_hit = kill(run, victim, sent, workers_below(above) if victim == "worker" else (), self._moments)
+        code = end_of(run, self._tally) if was_hit else run.finish()
         if not was_hit:
             self._tally.done["nobody there"] += 1
             if code != COMPLETE:
-                self._fault(f"a run that nobody killed ended with {code}: {run.said()}")
+                self._tally.fault(f"a run that nobody killed ended with {code}: {run.said()}")
             return False
-        if victim == "worker" and code not in (COMPLETE, INCOMPLETE):
-            self._fault(f"a run whose worker was killed ended with {code}: {run.said()}")
-        if victim == "worker" and "Traceback" in run.said():
-            self._fault(f"a run whose worker was killed showed a traceback: {run.said()}")
-        spoilt = cut_power([folder, self._cache], self._moments) if self._moments.random() < 0.5 else None
+        if victim == "worker" or sent != signal.SIGKILL:
+            check_end(run, code, sent, (COMPLETE, INCOMPLETE), self._tally)
+        if victim == "driver" and sent == signal.SIGKILL:
+            self._tally.kill(victim, sent, None)  # its workers may live on for a moment: the next run meets them
+            return True
+        self._end_orphans()
+        is_cut = sent == signal.SIGKILL and self._moments.random() < 0.5
+        spoilt = cut_power([folder, self._cache], self._moments) if is_cut else None
         if folder.is_dir():
             for name in false_seals(folder, self.expected):
-                self._fault(f"taken for whole after the kill of a {victim}: {name}")
+                self._tally.fault(f"taken for whole after the kill of a {victim}: {name}")
             self._lock(folder)
-        return self._count(victim, spoilt)
-
-    def _count(self, victim: str, spoilt: int | None) -> bool:
-        self._tally.done["kills"] += 1
-        self._tally.done[f"of a {victim}"] += 1
-        if spoilt is not None:
-            self._tally.done["power cuts"] += 1
-            self._tally.done["files spoilt"] += spoilt
-        if self._tally.done["kills"] % 10 == 0:
-            print(f"{self._executor}: {dict(self._tally.done)}", flush=True)
+        self._tally.kill(victim, sent, spoilt)
         return True
+
+    def _end_orphans(self) -> None:
+        spared = () if self._cluster is None else (self._cluster.pid, *self._cluster.processes())
+        for place in (self._scratch, self._temporary):
+            end_orphans(place, self._tally, spared)
 
     def _lock(self, folder: Path) -> None:
         from su3d_bench.core.errors import StoreError
@@ -211,62 +189,73 @@ class Trial:
             with RunFolder(folder).locked():
                 pass
         except StoreError as error:
-            self._fault(f"a lock stayed: {error}")
+            self._tally.fault(f"a lock stayed: {error}")
 
     def _take_up(self, folder: Path) -> None:
         run = Run(folder, self._request)
         code = run.finish()
         self._tally.done["compared"] += 1
+        self._end_orphans()
         if code != COMPLETE:
-            self._fault(f"taken up again it ended with {code}: {run.said()}")
+            self._tally.fault(f"taken up again it ended with {code}: {run.said()}")
             return
         found = outcome(folder)
         for name in sorted(found.keys() | self.expected.keys()):
-            if found.get(name) != self.expected.get(name):
-                state = (
-                    "is missing" if name not in found else "is left over" if name not in self.expected else "differs"
-                )
-                self._fault(f"taken up again: {name} {state}")
+            if name not in self.expected:
+                self._tally.leftover(name)
+            elif name not in found or found[name] != self.expected[name]:
+                self._tally.fault(f"taken up again: {name} {'differs' if name in found else 'is missing'}")
         for path in self._cache.rglob("*"):
             if path.is_file() and path.suffix != ".npz":
-                self._fault(f"left in the cache: {path.name}")
-
-    def _fault(self, line: str) -> None:
-        self._tally.faults.append(f"{self._executor}: {line}")
-        print(f"FAULT {self._tally.faults[-1]}", flush=True)
+                self._tally.leftover(f"in the cache: {path.name}")
+        clear_leftovers(self._temporary, self._kept, self._tally)
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--kills", type=int, default=200, help="in all; most are of runs inline (default: 200)")
     parser.add_argument("--seed", default="0")
-    parser.add_argument("--executors", nargs="+", choices=list(EXECUTORS), default=list(EXECUTORS))
-    parser.add_argument("--subject", choices=list(SUBJECTS), default="light", help="what runs (default: light)")
+    parser.add_argument("--only", nargs="+", choices=list(SHARES), default=list(SHARES), help="what is killed")
+    parser.add_argument(
+        "--subject", choices=("light", "opensu3d"), default="light", help="what most runs run (default: light)"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="write the table there too")
     given = parser.parse_args(arguments)
     load_modules(given.subject)
     started = time.monotonic()
-    tallies = {}
-    with tempfile.TemporaryDirectory(prefix="su3d-kills-") as scratch:
-        for executor in given.executors:
-            n = round(given.kills * SHARES[executor] / sum(SHARES[one] for one in given.executors))
-            tallies[executor] = Tally()
-            try_executor(Path(scratch) / executor, given.subject, executor, max(n, 1), given.seed, tallies[executor])
-            print(f"{executor}: {dict(tallies[executor].done)}, {len(tallies[executor].faults)} faults", flush=True)
+    tallies = {name: Tally(name) for name in given.only}
+    n_shares = sum(SHARES[name] for name in tallies)
+    counts = {name: max(1, round(given.kills * SHARES[name] / n_shares)) for name in tallies}
+    with tempfile.TemporaryDirectory(prefix="su3d-kills-") as place:
+        scratch = Path(place)
+        (scratch / "temporary").mkdir()
+        os.environ["TMPDIR"] = tempfile.tempdir = str(scratch / "temporary")
+        for name, (subject, _) in RUNS.items():
+            if name in tallies:
+                try_runs(scratch / name, subject or given.subject, counts[name], given.seed, tallies[name])
+        of_verbs = {name: counts[name] for name in VERBS if name in tallies}
+        if of_verbs:
+            load_verbs()
+            try_verbs(scratch, of_verbs, given.seed, tallies)
     rows = [
-        [name, *(str(tally.done[what]) for what in COLUMNS), str(len(tally.faults))] for name, tally in tallies.items()
+        [name, *(str(tally.done[what]) for what in COLUMNS), *(str(len(getattr(tally, what))) for what in COUNTED)]
+        for name, tally in tallies.items()
     ]
-    n_faults = sum(len(tally.faults) for tally in tallies.values())
-    print(f"{n_faults} faults in {time.monotonic() - started:.0f} s")
+    for row in rows:
+        print("  ".join(row))
+    totals = {what: sum(len(getattr(tally, what)) for tally in tallies.values()) for what in COUNTED}
+    print(f"{', '.join(f'{n} {what}' for what, n in totals.items())} in {time.monotonic() - started:.0f} s")
     if given.json is not None:
         command = f"python benchmarks kill_at_random --kills {given.kills} --seed {given.seed}"
-        command += f" --executors {' '.join(given.executors)} --subject {given.subject}"
-        write_measured(given.json, "Runs killed at random", command, ["executor", *COLUMNS, "faults"], rows, [NOTE])
-    return 1 if n_faults else 0
+        command += f" --only {' '.join(given.only)} --subject {given.subject}"
+        columns = ["killed", *COLUMNS, *COUNTED]
+        write_measured(given.json, "Runs and verbs killed at random", command, columns, rows, [NOTE])
+    return 0 if all(tally.is_clean for tally in tallies.values()) else 1
 
 
-def try_executor(scratch: Path, subject: str, executor: str, n: int, seed: str, tally: Tally) -> None:
+def try_runs(scratch: Path, subject: str, n: int, seed: str, tally: Tally) -> None:
     scratch.mkdir()
+    executor = RUNS[tally.name][1]
     cluster = Cluster() if executor == "ray" else None
     try:
         Trial(scratch, subject, executor, cluster, seed, tally).kills(n)

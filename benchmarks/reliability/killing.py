@@ -1,0 +1,169 @@
+"""How processes are killed on purpose, and what is counted afterwards: faults, orphaned processes, leftovers."""
+
+from __future__ import annotations
+
+import collections
+import contextlib
+import os
+import random
+import shutil
+import signal
+import time
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from forked_runs import Forked
+
+# The one that nothing can answer, and what a terminal, a scheduler and a user send.
+SIGNALS = (signal.SIGKILL, signal.SIGKILL, signal.SIGTERM, signal.SIGHUP, signal.SIGINT)
+A_WORKER = ("spawn_main", "ray::_on_node")  # in the command lines of workers
+GRACE_S = 5.0  # in which what a killed process started must have ended
+MOST_S = 120.0  # in which a process that got a signal it can answer must have ended
+LAST_SECOND_NS = 1_000_000_000
+PAGE = 4096
+
+
+@dataclass
+class Tally:
+    """What was done and what came of it; ``faults``, ``orphans`` and ``leftovers`` must stay empty."""
+
+    name: str
+    done: collections.Counter[str] = field(default_factory=collections.Counter)
+    faults: list[str] = field(default_factory=list)
+    orphans: list[str] = field(default_factory=list)
+    leftovers: list[str] = field(default_factory=list)
+
+    def fault(self, line: str) -> None:
+        self._note("FAULT", self.faults, line)
+
+    def orphan(self, line: str) -> None:
+        self._note("ORPHAN", self.orphans, line)
+
+    def leftover(self, line: str) -> None:
+        self._note("LEFTOVER", self.leftovers, line)
+
+    def _note(self, kind: str, lines: list[str], line: str) -> None:
+        lines.append(f"{self.name}: {line}")
+        print(f"{kind} {lines[-1]}", flush=True)
+
+    def kill(self, victim: str, sent: signal.Signals, spoilt: int | None) -> None:
+        """Count one that struck; ``spoilt`` files where the power was cut too."""
+        self.done["kills"] += 1
+        self.done[f"of a {victim}"] += 1
+        self.done[sent.name] += 1
+        if spoilt is not None:
+            self.done["power cuts"] += 1
+            self.done["files spoilt"] += spoilt
+        if self.done["kills"] % 10 == 0:
+            print(f"{self.name}: {dict(self.done)}", flush=True)
+
+    @property
+    def is_clean(self) -> bool:
+        return not (self.faults or self.orphans or self.leftovers)
+
+
+def workers_below(pid: int) -> list[int]:
+    import psutil
+
+    with contextlib.suppress(psutil.NoSuchProcess):
+        children = psutil.Process(pid).children(recursive=True)
+        return [one.pid for one in children if any(mark in " ".join(one.cmdline()) for mark in A_WORKER)]
+    return []
+
+
+def kill(run: Forked, victim: str, sent: signal.Signals, workers: Sequence[int], moments: random.Random) -> bool:
+    """Send a signal to ``victim`` of ``run``; whether it was there."""
+    if run.has_ended():
+        return False
+    if victim == "worker" and not workers:
+        return False
+    try:
+        if victim == "group":
+            os.killpg(run.pid, sent)
+        else:
+            os.kill(moments.choice(workers) if victim == "worker" else run.pid, sent)
+    except ProcessLookupError:  # not a group yet, or a worker no more
+        return False
+    return True
+
+
+def end_of(run: Forked, tally: Tally) -> int:
+    """The exit code of what got a signal; one that goes on for ever is a fault, and ended."""
+    limit = time.monotonic() + MOST_S
+    while not run.has_ended():
+        if time.monotonic() > limit:
+            tally.fault(f"goes on {MOST_S:.0f} s after the signal: {run.said()}")
+            os.killpg(run.pid, signal.SIGKILL)
+            break
+        time.sleep(0.01)
+    return run.finish()
+
+
+def check_end(run: Forked, code: int, sent: signal.Signals, usual: Collection[int], tally: Tally) -> None:
+    """That who got ``sent`` ended by it, or as ever (``usual``), and without a traceback."""
+    if code not in (-sent, 128 + sent, *usual):
+        tally.fault(f"ended with {code} after {sent.name}: {run.said()}")
+    if "Traceback" in run.said():
+        tally.fault(f"showed a traceback after {sent.name}: {run.said()}")
+
+
+def end_orphans(place: Path, tally: Tally, spared: Collection[int] = ()) -> None:
+    """Count, and end, the processes that work below ``place``, once those that are ending have had the time to."""
+    limit = time.monotonic() + GRACE_S
+    while (found := _working_below(place, spared)) and time.monotonic() < limit:
+        time.sleep(0.05)
+    for pid, words in found:
+        tally.orphan(f"still runs after {GRACE_S:.0f} s: {words}")
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
+
+
+def _working_below(place: Path, spared: Collection[int]) -> list[tuple[int, str]]:
+    """Processes but this one whose folder, or a word of whose command line, is below ``place``."""
+    import psutil
+
+    found = []
+    for process in psutil.process_iter():
+        with contextlib.suppress(psutil.Error, OSError):
+            if process.pid in (os.getpid(), *spared) or process.status() == psutil.STATUS_ZOMBIE:
+                continue
+            words = process.cmdline()
+            if any(str(place) in text for text in (os.readlink(f"/proc/{process.pid}/cwd"), *words)):
+                found.append((process.pid, " ".join(words)[-200:]))
+    return found
+
+
+def clear_leftovers(folder: Path, known: Collection[str], tally: Tally) -> None:
+    """Count, and remove, what is in ``folder`` under other names than those of ``known``."""
+    for path in sorted(folder.iterdir()) if folder.is_dir() else ():
+        if path.name not in known:
+            tally.leftover(f"in {folder.name}: {path.name}")
+            shutil.rmtree(path) if path.is_dir() and not path.is_symlink() else path.unlink()
+
+
+def cut_power(roots: Sequence[Path], moments: random.Random) -> int:
+    """Spoil the files of the last second as an unlucky file system would; how many were."""
+    from su3d_bench.store.unfinished import beside
+
+    since = time.time_ns() - LAST_SECOND_NS
+    spoilt = 0
+    for path in sorted(path for root in roots for path in root.rglob("*") if path.is_file()):
+        if path.stat().st_mtime_ns < since:
+            continue
+        content = path.read_bytes()
+        way = moments.choice(("whole", "cut", "empty", "zeros", "tail", "undone"))
+        at = moments.randrange(len(content) + 1)
+        if way == "whole":
+            continue
+        spoilt += 1
+        if way == "undone":  # the bytes reached the disk in part, the new name did not
+            path.rename(beside(path))
+        elif way == "cut":
+            path.write_bytes(content[:at])
+        elif way == "tail":  # whole pages that were promised but not written
+            kept = at // PAGE * PAGE
+            path.write_bytes(content[:kept] + bytes(len(content) - kept))
+        else:
+            path.write_bytes(b"" if way == "empty" else bytes(len(content)))
+    return spoilt
