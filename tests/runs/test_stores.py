@@ -163,6 +163,12 @@ def test_files_are_told_apart_by_the_scene_that_they_are_named_after() -> None:
     assert list(files_of_scenes(sizes, ["room0"])["room0"]) == [names[8], names[6], names[7]]
 
 
+def test_scenes_that_differ_in_separators_alone_have_all_files_that_may_be_theirs() -> None:
+    sizes = {"mine/a_b.ply": 1, "mine/a-b/depth.png": 2, "mine/c.ply": 3}
+    both = {"mine/a_b.ply": 1, "mine/a-b/depth.png": 2}
+    assert files_of_scenes(sizes, ["a_b", "a-b", "c"]) == {"a_b": both, "a-b": both, "c": {"mine/c.ply": 3}}
+
+
 @pytest.mark.parametrize("name", ["scenes/../../evil", "scenes/a\\b", "scenes/a\x1b[2J", "scenes//x"])
 def test_a_name_that_leads_out_of_the_store_is_refused(
     name: str, store: Any, tmp_path: Path, monkeypatch: pytest.MonkeyPatch

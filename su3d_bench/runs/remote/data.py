@@ -69,7 +69,9 @@ def files_of_scenes(sizes: Mapping[str, int], scenes: Sequence[str]) -> dict[str
     itself is separated: ``room0_mesh.ply`` and ``room_0/`` are of ``room0``. Files of no scene count where they are
     beside scenes, in the same folder of the root, and are small.
     """
-    of_key = {_key(scene): scene for scene in scenes}
+    of_key: dict[str, list[str]] = {}
+    for scene in scenes:
+        of_key.setdefault(_key(scene), []).append(scene)
     owners = {name: _owner(name, of_key) for name in sizes}
     tops = {_top(name) for name, owner in owners.items() if owner is not None}
     shared = {
@@ -79,8 +81,8 @@ def files_of_scenes(sizes: Mapping[str, int], scenes: Sequence[str]) -> dict[str
     }
     files: dict[str, dict[str, int]] = {scene: dict(shared) for scene in scenes}
     for name, owner in owners.items():
-        if owner is not None:
-            files[owner][name] = sizes[name]
+        for scene in of_key.get(owner or "", ()):  # those whose names differ in separators alone get each other's too
+            files[scene][name] = sizes[name]
     return files
 
 
@@ -88,11 +90,11 @@ def _top(name: str) -> str:
     return name.partition("/")[0] if "/" in name else ""
 
 
-def _owner(name: str, of_key: Mapping[str, str]) -> str | None:
+def _owner(name: str, of_key: Mapping[str, Sequence[str]]) -> str | None:
     for part in name.split("/"):
         for key in _keys(part):
             if key in of_key:
-                return of_key[key]
+                return key
     return None
 
 
