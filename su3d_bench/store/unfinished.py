@@ -139,14 +139,15 @@ def become(place: Path, path: Path) -> None:
     """Give the whole folder at ``place`` the name ``path`` once all of it is on the disk."""
     for above, _, names in os.walk(place, topdown=False):
         for name in names:
-            _bring_to_disk(Path(above, name))
+            bring_to_disk(Path(above, name))
         with suppress(OSError):  # not every disk brings folders to itself by request
-            _bring_to_disk(Path(above))
+            bring_to_disk(Path(above))
     os.replace(place, path)
     (path / LOCK_FILE).unlink(missing_ok=True)
 
 
-def _bring_to_disk(path: Path) -> None:
+def bring_to_disk(path: Path) -> None:
+    """Wait until what was written into the file or folder ``path`` is on its disk."""
     handle = os.open(path, os.O_RDONLY | os.O_NOFOLLOW)
     try:
         os.fsync(handle)

@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import re
 import shlex
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 from painted import colour_perception
 from places import SCENES
 
+from su3d_bench.cli.common import file_name_of, file_name_of_scene
 from su3d_bench.cli.main import build_parser, main
 from su3d_bench.core.errors import EXIT_INTERNAL
 from su3d_bench.reports.tables.formats import FORMATS
@@ -270,6 +272,17 @@ def test_json_answers_are_the_metrics_file(capsys: pytest.CaptureFixture[str]) -
     answer = capsys.readouterr()
     assert answer.out == Path("out/metrics.json").read_text()
     assert answer.err == ""
+
+
+def test_pictures_of_different_texts_and_scenes_have_different_names() -> None:
+    texts = ["red sofa", "Red sofa", "red-sofa", "red sofa?", " red sofa", "\u690d\u7269", "?", "", "a" * 70, "a" * 71]
+    for names in ([file_name_of(text, "text") for text in texts], [file_name_of(text, "question") for text in texts]):
+        assert len(set(names)) == len(texts)
+        assert all(re.fullmatch(r"[a-z0-9-]+", name) for name in names)
+    assert file_name_of("red sofa", "text") == file_name_of("Red sofa?", "question") == "red-sofa"
+    addresses = ["a/b", "a-b/c", "a/b-c", "a/b/c", "../a/b", "a/b c"]
+    assert len({file_name_of_scene(address) for address in addresses}) == len(addresses)
+    assert file_name_of_scene("replica/room0") == "replica-room0"
 
 
 def test_a_query_ranks_the_map_and_draws_it(

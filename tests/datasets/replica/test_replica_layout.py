@@ -43,6 +43,17 @@ def test_the_tree_is_that_of_replica_and_nothing_else(tmp_path: Path) -> None:
     assert Replica(tmp_path).scenes() == ("room7",)
 
 
+def test_a_folder_of_somebody_else_in_the_place_of_the_truth_is_refused_and_left_alone(tmp_path: Path) -> None:
+    write_scene(Stage(), "room7", tmp_path / "made")
+    theirs = next((tmp_path / "made").rglob(MESH_NAME)).relative_to(tmp_path / "made")
+    place = tmp_path / "out" / theirs
+    place.parent.mkdir(parents=True)
+    place.write_bytes(b"theirs")
+    with pytest.raises(StoreError, match="is there already and was made elsewhere; choose another folder with --out"):
+        write_scene(Stage(), "room7", tmp_path / "out")
+    assert place.read_bytes() == b"theirs"
+
+
 def test_frames_come_back_with_equal_poses_depth_within_half_a_step_and_near_colours(tmp_path: Path) -> None:
     stage = Stage()
     write_scene(stage, "room7", tmp_path)

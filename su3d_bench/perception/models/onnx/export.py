@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from su3d_bench.core.errors import StoreError
 from su3d_bench.store.atomic import make_folder
-from su3d_bench.store.unfinished import unfinished_folder
+from su3d_bench.store.unfinished import bring_to_disk, unfinished_folder
 
 # 17 has LayerNormalization as one operator; newer ones bring nothing that our towers use.
 OPSET = 17
@@ -97,6 +97,7 @@ def _settle(draft: Path, path: Path) -> list[Path]:
     size = sum(file.stat().st_size for file in draft.parent.iterdir())
     try:
         if size < LARGEST_SINGLE_FILE:
+            bring_to_disk(draft)
             os.replace(draft, path)
             data.unlink(missing_ok=True)
             return [path]
@@ -106,6 +107,8 @@ def _settle(draft: Path, path: Path) -> list[Path]:
         onnx.save_model(
             model, str(settled / path.name), save_as_external_data=True, location=data.name, size_threshold=1024
         )
+        for file in (settled / data.name, settled / path.name):
+            bring_to_disk(file)
         os.replace(settled / data.name, data)
         os.replace(settled / path.name, path)
     except OSError as error:
