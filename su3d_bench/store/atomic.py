@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DAMAGE, StoreError, reading
-from su3d_bench.core.printing import escaped_json, json_line
+from su3d_bench.core.printing import escaped_json
 from su3d_bench.store.unfinished import SHARED, beside, clear_unfinished, new_file, own_file
 from su3d_bench.store.unpacking import Allowance, allowance_of, check_member, member_bytes
 
