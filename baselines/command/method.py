@@ -16,7 +16,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from su3d_bench.baselines.command.frames import ColourFormat, FrameFolder
 from su3d_bench.baselines.command.prediction import as_prediction, class_names, read_output
-from su3d_bench.baselines.command.process import ContainerWatch, Finished, TreeWatch, Watch, run_program
+from su3d_bench.baselines.command.process import ContainerWatch, Finished, Leaving, TreeWatch, run_program
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError, printable
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
@@ -34,7 +34,6 @@ INSIDE = {"frames": "/su3d/frames", "output": "/su3d/output", "work": "/su3d/wor
 PLACEHOLDER = re.compile(r"\{(\w*)\}")
 PLACEHOLDERS = ("frames", "output", "scene", "dataset", "seed")
 MOUNT = re.compile(r"(?P<here>/[^:]*):(?P<there>/[^:]*)")
-STOP_S = 60.0  # for `docker kill`
 
 
 class CommandConfig(BaseModel):
@@ -206,15 +205,14 @@ class Command:
         environment = {name: os.environ[name] for name in self.config.pass_variables if name in os.environ}
         logger.info("program: %s", printable(shlex.join(words)))
 
-        def watch_of(pid: int) -> Watch:
-            return TreeWatch(pid) if container is None else ContainerWatch(container, id_file, self._end_container)
-
         done = run_program(
             words,
             folder=folders["work"],
             environment=environment,
             timeout_s=self.config.timeout_s,
-            watch_of=watch_of,
+            watch_of=TreeWatch if container is None else lambda pid: ContainerWatch(id_file),
+            # `docker run` may end before its container does: ending the client is not enough.
+            leaving=Leaving(() if container is None else ("docker", "kill", container), folders["frames"].parent),
         )
         self._record(done)
         last = _last_line(done.stderr)
@@ -248,11 +246,6 @@ class Command:
             if name in os.environ and name not in ENVIRONMENT:  # the container has a PATH and a HOME of its own
                 words += ["--env", name]
         return [*words, self.config.image]
-
-    def _end_container(self, container: str) -> None:
-        environment = {name: os.environ[name] for name in self.config.pass_variables if name in os.environ}
-        # `docker run` may end before its container does: ending the client is not enough.
-        run_program(["docker", "kill", container], folder=Path("/"), environment=environment, timeout_s=STOP_S)
 
     def _record(self, done: Finished) -> None:
         self.finish_costs = {"program_s": round(done.wall_s, 3)}

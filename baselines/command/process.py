@@ -2,20 +2,27 @@
 
 from __future__ import annotations
 
+import json
 import os
+import select
 import signal
 import subprocess
+import sys
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from threading import Thread
 from typing import IO, Any
 
+from su3d_bench.baselines.command import supervisor
+from su3d_bench.baselines.command.supervisor import AFTERWARDS_S, DONE, END, STOP
 from su3d_bench.core.errors import ConfigError
 
+SUPERVISOR = Path(supervisor.__file__)
+ENDING_S = supervisor.ENDING_S + AFTERWARDS_S + 5.0  # for the supervisor to end the program, and a container
 KEPT_CHARACTERS = 100_000  # of each stream, from its end: a log that a person still reads
 GRACE_S = 5.0  # between asking a program to stop and ending it
 MOST_WAIT_S = 0.2  # between two looks at a program; the first ones follow each other faster
@@ -57,8 +64,8 @@ class Watch:
     def look(self) -> None:
         """Note what is held now."""
 
-    def end(self, *, was_stopped: bool) -> None:
-        """End what is left running; ``was_stopped``: the program did not end by itself."""
+    def end(self) -> None:
+        """End what was seen and is left running."""
 
 
 class TreeWatch(Watch):
@@ -93,10 +100,11 @@ class TreeWatch(Watch):
             peak = max(peak, _own_peak_bytes(process.pid))
         self.peak_bytes = max(peak, together) or None
 
-    def end(self, *, was_stopped: bool) -> None:
+    def end(self) -> None:
+        # Where the system has no orphans that can be adopted, or the supervisor was killed.
         for process in self._seen.values():
             try:
-                if process != self._root and process.is_running():
+                if process.is_running():
                     process.kill()
             except self._errors:
                 continue
@@ -116,10 +124,8 @@ class ContainerWatch(Watch):
 
     source = "not measured: the cgroup cannot be read here"
 
-    def __init__(self, name: str, id_file: Path, end: Callable[[str], None], cgroups: Path = CGROUPS) -> None:
-        self._name = name
+    def __init__(self, id_file: Path, cgroups: Path = CGROUPS) -> None:
         self._id_file = id_file
-        self._end = end
         self._cgroups = cgroups
 
     def look(self) -> None:
@@ -136,10 +142,6 @@ class ContainerWatch(Watch):
                 continue
             self.source = "the container's cgroup"
             return
-
-    def end(self, *, was_stopped: bool) -> None:
-        if was_stopped:  # otherwise docker has removed it
-            self._end(self._name)
 
 
 class _Tail(Thread):
@@ -172,6 +174,116 @@ class _Tail(Thread):
         return f"[{n_dropped} bytes before are left out]\n{text}" if n_dropped else text
 
 
+class _Supervised:
+    """A program under its supervisor, ``supervisor.py``, which ends it when this process does, however that comes."""
+
+    def __init__(self, words: Sequence[str], folder: Path, environment: Mapping[str, str], leaving: Leaving) -> None:
+        self.exit_code: int | None = None
+        orders, self._orders = os.pipe()
+        self._answers, answers = os.pipe()
+        try:
+            self._process = subprocess.Popen(
+                [sys.executable, "-I", "-S", str(SUPERVISOR), str(orders), str(answers)],
+                pass_fds=(orders, answers),
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                start_new_session=True,  # what ends this process's group leaves the supervisor to do its work
+            )
+        except OSError as error:
+            self._close_pipes()
+            raise ConfigError(f"'{sys.executable}' cannot be started: {error.strerror}") from error
+        except BaseException:
+            self._close_pipes()
+            raise
+        finally:
+            os.close(orders)
+            os.close(answers)
+        self._said = b""
+        assert self._process.stdout is not None and self._process.stderr is not None
+        self.streams: tuple[IO[bytes], IO[bytes]] = (self._process.stdout, self._process.stderr)
+        try:
+            self.pid = self._started(words, folder, environment, leaving)
+        except BaseException:
+            self.close()
+            raise
+
+    def _started(
+        self, words: Sequence[str], folder: Path, environment: Mapping[str, str], leaving: Leaving
+    ) -> int:
+        order = {
+            "words": list(words),
+            "folder": str(folder),
+            "environment": dict(environment),
+            "scratch": str(leaving.scratch or ""),
+            "afterwards": list(leaving.words),
+        }
+        with suppress(BrokenPipeError), open(self._orders, "wb", closefd=False) as pipe:
+            pipe.write(json.dumps(order).encode() + b"\n")
+        answer = self._answer(None) or {"error": "its supervisor was ended"}
+        if "error" in answer:
+            raise ConfigError(f"'{words[0]}' cannot be started: {answer['error']}")
+        return int(answer["pid"])
+
+    def has_ended(self, wait_s: float) -> bool:
+        """Whether the program has ended, at the latest after ``wait_s``."""
+        if self.exit_code is None and (answer := self._answer(wait_s)) is not None:
+            # A supervisor that was killed has no answer, and the system has ended the program after it.
+            self.exit_code = int(answer.get("exit_code", -signal.SIGKILL))
+        return self.exit_code is not None
+
+    def stop(self) -> None:
+        """Ask the program to stop."""
+        self._order(STOP)
+
+    def end(self) -> None:
+        """End the program and all that it started."""
+        if self.exit_code is None:
+            self._order(END)
+            self.has_ended(ENDING_S)
+        self._order(DONE)
+
+    def close(self) -> None:
+        self._close_pipes()
+        for stream in self.streams:
+            stream.close()
+        with suppress(subprocess.TimeoutExpired):
+            self._process.wait(GRACE_S)
+
+    def _close_pipes(self) -> None:
+        os.close(self._orders)
+        os.close(self._answers)
+
+    def _order(self, order: bytes) -> None:
+        with suppress(BrokenPipeError):
+            os.write(self._orders, order)
+
+    def _answer(self, wait_s: float | None) -> dict[str, Any] | None:
+        """The next answer, empty where no supervisor is left to give one; None where none came within ``wait_s``."""
+        until = None if wait_s is None else time.monotonic() + wait_s
+        while b"\n" not in self._said:
+            left_s = None if until is None else max(until - time.monotonic(), 0.0)
+            if not select.select([self._answers], [], [], left_s)[0]:
+                return None
+            if not (chunk := os.read(self._answers, 4096)):
+                return {}
+            self._said += chunk
+        line, _, self._said = self._said.partition(b"\n")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+
+@dataclass(frozen=True)
+class Leaving:
+    """What the supervisor does where a program does not end by itself.
+
+    ``words`` are run wherever it is ended; ``scratch`` is removed where this process is gone and cannot do it.
+    """
+
+    words: Sequence[str] = ()
+    scratch: Path | None = None
+
+
 def run_program(
     words: Sequence[str],
     *,
@@ -179,70 +291,40 @@ def run_program(
     environment: Mapping[str, str],
     timeout_s: float,
     watch_of: Callable[[int], Watch] = TreeWatch,
+    leaving: Leaving | None = None,
 ) -> Finished:
     """Run ``words`` in ``folder`` until it ends or ``timeout_s`` is over; nothing that it started outlives the call.
 
-    ``watch_of`` makes the watch of a process id. A program that cannot be started is a ``ConfigError``.
+    Nor this process, however that ends. ``watch_of`` makes the watch of a process id. A program that cannot be started
+    is a ``ConfigError``.
     """
     start = time.perf_counter()
-    with _started(words, folder, environment) as process:
-        assert process.stdout is not None and process.stderr is not None
-        tails = [_Tail(process.stdout), _Tail(process.stderr)]
+    with closing(_Supervised(words, folder, environment, leaving or Leaving())) as program:
+        tails = [_Tail(stream) for stream in program.streams]
         for tail in tails:
             tail.start()
-        watch = watch_of(process.pid)
+        watch = watch_of(program.pid)
         is_timed_out = False
         try:
-            is_timed_out = not _ends_within(process, watch, start, timeout_s)
+            is_timed_out = not _ends_within(program, watch, start, timeout_s)
             wall_s = time.perf_counter() - start
             if is_timed_out:
-                _signal_group(process, signal.SIGTERM)
-                _ends_within(process, watch, time.perf_counter(), GRACE_S)
+                program.stop()
+                _ends_within(program, watch, time.perf_counter(), GRACE_S)
         finally:
-            was_stopped = process.returncode is None or is_timed_out
-            _signal_group(process, signal.SIGKILL)
-            watch.end(was_stopped=was_stopped)
-            process.wait()
+            program.end()
+            watch.end()
         stdout, stderr = (tail.text() for tail in tails)
-    return Finished(process.returncode, is_timed_out, wall_s, watch.peak_bytes, watch.source, stdout, stderr)
+    exit_code = -signal.SIGKILL if program.exit_code is None else program.exit_code
+    return Finished(exit_code, is_timed_out, wall_s, watch.peak_bytes, watch.source, stdout, stderr)
 
 
-@contextmanager
-def _started(words: Sequence[str], folder: Path, environment: Mapping[str, str]) -> Iterator[subprocess.Popen[bytes]]:
-    try:
-        process = subprocess.Popen(
-            list(words),
-            cwd=folder,
-            env=dict(environment),
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            start_new_session=True,  # a process group of its own, which can be ended as a whole
-        )
-    except (OSError, ValueError) as error:
-        reason = getattr(error, "strerror", None) or str(error)
-        raise ConfigError(f"'{words[0]}' cannot be started: {reason}") from error
-    try:
-        yield process
-    finally:
-        for stream in (process.stdout, process.stderr):
-            if stream is not None:
-                stream.close()
-
-
-def _ends_within(process: subprocess.Popen[bytes], watch: Watch, start: float, limit_s: float) -> bool:
-    while process.poll() is None:
+def _ends_within(program: _Supervised, watch: Watch, start: float, limit_s: float) -> bool:
+    wait_s = 0.0
+    while not program.has_ended(wait_s):
         watch.look()
         elapsed_s = time.perf_counter() - start
         if elapsed_s >= limit_s:
             return False
-        time.sleep(min(0.01 + elapsed_s / 20, MOST_WAIT_S, limit_s - elapsed_s))
+        wait_s = min(0.01 + elapsed_s / 20, MOST_WAIT_S, limit_s - elapsed_s)
     return True
-
-
-def _signal_group(process: subprocess.Popen[bytes], number: signal.Signals) -> None:
-    # The group outlives its leader while any of its members runs, so that its number cannot be another's.
-    try:
-        os.killpg(process.pid, number)
-    except (ProcessLookupError, PermissionError):
-        return

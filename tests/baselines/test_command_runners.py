@@ -118,7 +118,7 @@ def test_a_containers_peak_is_what_its_cgroup_says(tmp_path: Path, place: str) -
     for identity, peak in (("abc123", ""), ("../../etc", "99"), ("abc123", "123456\n")):
         (tmp_path / "id").write_text(identity)
         (tmp_path / place).write_text(peak)
-        watch = ContainerWatch("name", tmp_path / "id", lambda name: None, cgroups=tmp_path)
+        watch = ContainerWatch(tmp_path / "id", cgroups=tmp_path)
         watch.look()
         told.append((watch.peak_bytes, watch.source))
     unread = (None, "not measured: the cgroup cannot be read here")
