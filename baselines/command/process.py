@@ -208,9 +208,7 @@ class _Supervised:
             self.close()
             raise
 
-    def _started(
-        self, words: Sequence[str], folder: Path, environment: Mapping[str, str], leaving: Leaving
-    ) -> int:
+    def _started(self, words: Sequence[str], folder: Path, environment: Mapping[str, str], leaving: Leaving) -> int:
         order = {
             "words": list(words),
             "folder": str(folder),

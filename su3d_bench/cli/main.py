@@ -11,6 +11,7 @@ from typing import Any
 
 from su3d_bench import __version__
 from su3d_bench.cli.common import remark
+from su3d_bench.core.endings import Ended, ending_in_order
 from su3d_bench.core.errors import (
     EXIT_DONE,
     EXIT_INTERNAL,
@@ -117,11 +118,13 @@ def _exit_code(words: Sequence[str]) -> int:
         arguments = build_parser().parse_args(words)
         if not arguments.uses_all_cores:
             limit_threads()  # before numerical libraries are loaded
-        code: int = arguments.call(arguments)
+        with ending_in_order():
+            code: int = arguments.call(arguments)
         return code
-    except KeyboardInterrupt:
-        remark("su3d-bench: interrupted; the same command takes it up again")
-        return EXIT_INTERRUPTED
+    except KeyboardInterrupt as end:
+        how = f"ended by {end}" if isinstance(end, Ended) else "interrupted"
+        remark(f"su3d-bench: {how}; the same command takes it up again")
+        return end.exit_code if isinstance(end, Ended) else EXIT_INTERRUPTED
     except SystemExit as stop:
         return stop.code if isinstance(stop.code, int) else EXIT_WRONG_INPUT if stop.code else EXIT_DONE
     except Exception as error:  # noqa: BLE001 - the one place where whatever else went wrong becomes a line

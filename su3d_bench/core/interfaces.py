@@ -348,7 +348,7 @@ class HasOwnPerception(Protocol):
 
 @runtime_checkable
 class Closes(Protocol):
-    """Gives back what it holds, called when the prediction is written."""
+    """Gives back what it holds, called when the prediction is written or could not be."""
 
     def close(self) -> None: ...
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cache, partial
 from operator import attrgetter
@@ -50,6 +50,7 @@ from su3d_bench.store.records import (
     plain,
 )
 from su3d_bench.store.run_folder import JobFolder
+from su3d_bench.store.scratch import remove_abandoned
 
 Scores = Mapping[tuple[str, str], SceneScore]
 
@@ -80,7 +81,7 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
     """
     if plan.data is None:  # else each worker looks at the data that it fetches
         plan = replace(plan, jobs=judged(plan.jobs))
-    with plan.folder.locked():
+    with plan.folder.locked(), _without_abandoned():
         metrics_file = plan.folder.path / "metrics.json"
         remove_file(metrics_file)  # what stands there may be of another plan
         write_text(plan.folder.path / "run.toml", write_toml(resolved_values(plan)))
@@ -105,6 +106,16 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
     without_score = _without_score(plan, outcomes)
     found = tuple(found_in(plan.folder, without_score))
     return RunResult(plan, metrics, outcomes, failures, _remarks(plan, outcomes, without_score), found)
+
+
+@contextmanager
+def _without_abandoned() -> Iterator[None]:
+    """Temporary folders go that a killed run has left, and those of workers that are killed in the block."""
+    remove_abandoned()
+    try:
+        yield
+    finally:
+        remove_abandoned()
 
 
 def publish(plan: Plan) -> None:

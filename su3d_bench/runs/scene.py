@@ -9,7 +9,8 @@ from __future__ import annotations
 import logging
 import math
 import traceback
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache, cached_property, partial
 from typing import Any
@@ -91,6 +92,16 @@ def _warm_up(part: Part, device: str) -> None:
         if isinstance(scratch, TakesDevice):
             scratch.receive_device(device)
         warm_up(scratch)
+
+
+@contextmanager
+def _closed_at_the_end(method: Method, clock: MethodClock) -> Iterator[None]:
+    try:
+        yield
+    finally:
+        if isinstance(method, Closes):
+            with clock.running("close"):
+                method.close()
 
 
 def failed_outcomes(job: SceneJob, reason: str) -> tuple[MethodOutcome, ...]:
@@ -263,17 +274,15 @@ class _Scene:
         feeding = Feeding(self.job.scene, method, perception, self.report, clock)
         shares = self.job.anytime if method.needs.frames else ()
         is_rendered = isinstance(self.dataset, RendersFrames) and self.dataset.renders_frames
-        with clock.running("start"):
-            method.start(info)
-        with ReadAhead(frames, n, n_ahead=0 if is_rendered else N_AHEAD) as ahead:
-            for share in shares:
-                feeding.up_to(math.ceil(share * n), ahead, n)
-                feeding.write_map(folder.anytime(share))
-            feeding.up_to(n, ahead, n)
-        feeding.write_map(folder.prediction)
-        if isinstance(method, Closes):
-            with clock.running("close"):
-                method.close()
+        with _closed_at_the_end(method, clock):
+            with clock.running("start"):
+                method.start(info)
+            with ReadAhead(frames, n, n_ahead=0 if is_rendered else N_AHEAD) as ahead:
+                for share in shares:
+                    feeding.up_to(math.ceil(share * n), ahead, n)
+                    feeding.write_map(folder.anytime(share))
+                feeding.up_to(n, ahead, n)
+            feeding.write_map(folder.prediction)
         write_text(folder.updates, feeding.updates_text())
         files = [folder.prediction, folder.updates, *map(folder.anytime, shares)]
         costs = {

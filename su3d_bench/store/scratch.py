@@ -5,7 +5,9 @@ from __future__ import annotations
 import fcntl
 import mmap
 import os
+import re
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from contextlib import suppress
@@ -111,19 +113,24 @@ def release_pages(table: NDArray[Any]) -> None:
 
 
 HELD = ".held"  # a file in each folder that its process keeps locked; the lock ends with the process
+OWN_NAME = re.compile(r"su3d-[a-z]+-[a-z0-9_]{8}")  # what ``tempfile.mkdtemp`` makes of a prefix of ours
 
 
 class TemporaryFolder:
-    """The folder ``path``, below the system's folder for temporary files, until ``close`` or the end of a block."""
+    """The folder ``path``, below the system's folder for temporary files, until ``close`` or the end of a block.
+
+    ``prefix`` is ``su3d-``, a word and a hyphen.
+    """
 
     def __init__(self, prefix: str) -> None:
+        remove_abandoned()
         try:
-            _remove_abandoned(prefix)
-            self.path = Path(tempfile.mkdtemp(prefix=prefix))
-            unheld = self.path / f"{HELD}.new"
-            self._lock = os.open(unheld, os.O_RDWR | os.O_CREAT, 0o600)
-            fcntl.flock(self._lock, fcntl.LOCK_EX)
-            unheld.rename(self.path / HELD)  # from here on others know the folder; until here they leave it alone
+            held = None
+            while held is None:
+                self.path = Path(tempfile.mkdtemp(prefix=prefix))
+                assert OWN_NAME.fullmatch(self.path.name)
+                held = _hold(self.path)
+            self._lock = held
         except OSError as error:
             where = f" below {tempfile.tempdir}" if tempfile.tempdir else ""
             reason = error.strerror or str(error)
@@ -147,12 +154,45 @@ class TemporaryFolder:
         self.close()
 
 
-def _remove_abandoned(prefix: str) -> None:
-    for held in Path(tempfile.gettempdir()).glob(f"{prefix}*/{HELD}"):
-        with suppress(OSError):  # in use, gone meanwhile, or somebody else's
-            lock = os.open(held, os.O_RDWR | os.O_NOFOLLOW)
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                shutil.rmtree(held.parent, ignore_errors=True)
-            finally:
-                os.close(lock)
+def _hold(folder: Path) -> int | None:
+    """The lock of a folder that was made just now; None where somebody took it for abandoned before it was held."""
+    try:
+        lock = os.open(folder / HELD, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+    except FileNotFoundError:
+        return None
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if os.path.samestat(os.fstat(lock), (folder / HELD).stat()):
+            return lock
+    except FileNotFoundError:
+        pass
+    except BaseException:
+        os.close(lock)
+        raise
+    os.close(lock)
+    return None
+
+
+def remove_abandoned() -> None:
+    """Remove the temporary folders of processes that were killed."""
+    with suppress(OSError):  # no such place, or a closed one: whoever makes a folder there says so
+        for folder in Path(tempfile.gettempdir()).iterdir():
+            if OWN_NAME.fullmatch(folder.name):
+                with suppress(OSError):  # in use, gone meanwhile, or somebody else's
+                    _remove_unheld(folder)
+
+
+def _remove_unheld(folder: Path) -> None:
+    about = folder.lstat()
+    if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid():
+        return
+    try:
+        lock = os.open(folder / HELD, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except FileNotFoundError:
+        folder.rmdir()  # made and never held; one that holds anything is somebody else's
+        return
+    try:
+        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        shutil.rmtree(folder, ignore_errors=True)
+    finally:
+        os.close(lock)

@@ -299,18 +299,31 @@ def test_the_temporary_folder_of_a_killed_process_goes_when_the_next_is_made(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    (tmp_path / "su3d-test-of-another-kind").mkdir()
+    (tmp_path / "su3d-scene-kitchen1").mkdir()
+    (tmp_path / "su3d-scene-kitchen1" / "drawing").touch()
+    (tmp_path / "su3d-scene-unheld_0").mkdir()
+    others = {"su3d-test-of-another-kind", "su3d-scene-kitchen1"}
+    left = abandoned(tmp_path)
+    with TemporaryFolder("su3d-test-") as first, TemporaryFolder("su3d-other-") as second:
+        assert first.is_dir() and second.is_dir()
+        assert not left.exists()
+    assert {path.name for path in tmp_path.iterdir()} == others
+    left = abandoned(tmp_path)
+    assert run(scenes="a", out=str(tmp_path / "out")) == 0
+    assert not left.exists()
+
+
+def abandoned(folder: Path) -> Path:
+    """The temporary folder of a process that was killed."""
     code = (
         "import os, signal; from su3d_bench.store.scratch import TemporaryFolder\n"
         "folder = TemporaryFolder('su3d-test-'); (folder.path / 'large').write_text('x')\n"
         "os.kill(os.getpid(), signal.SIGKILL)"
     )
-    subprocess.run([sys.executable, "-c", code], env=os.environ | {"TMPDIR": str(tmp_path)}, check=False)
-    (left,) = tmp_path.glob("su3d-test-*/large")
-    (tmp_path / "su3d-test-of-another-kind").mkdir()
-    with TemporaryFolder("su3d-test-") as first, TemporaryFolder("su3d-test-") as second:
-        assert first.is_dir() and second.is_dir()
-        assert not left.parent.exists()
-    assert [path.name for path in tmp_path.iterdir()] == ["su3d-test-of-another-kind"]
+    subprocess.run([sys.executable, "-c", code], env=os.environ | {"TMPDIR": str(folder)}, check=False)
+    (left,) = folder.glob("su3d-test-*/large")
+    return left.parent
 
 
 KERNEL = """

@@ -11,6 +11,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 import traceback
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -19,9 +20,12 @@ from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
+from su3d_bench.core.endings import Ended, ending_in_order
 from su3d_bench.core.errors import Su3dError
 from su3d_bench.core.printing import doors
 
+ENDING_S = 20.0  # for a worker to let go of what it holds; Slurm waits 30 s before it ends what it asked to end
+FOR_THE_PARENT = frozenset({signal.SIGINT, signal.SIGHUP})  # a terminal sends them to both; the parent decides
 SCENE_DONE = "scene"  # label of the event that says that a unit is finished
 Unit = TypeVar("Unit")
 Outcome = TypeVar("Outcome")
@@ -113,11 +117,21 @@ def run_processes(
                 ready.close()
                 yield lost(unit, _cause(process.exitcode)) if message is None else unwrap(message)
     finally:
-        for _, process in running.values():
-            process.terminate()
-        for connection, (_, process) in running.items():
-            process.join()
+        _end([process for _, process in running.values()])
+        for connection in running:
             connection.close()
+
+
+def _end(processes: Sequence[BaseProcess]) -> None:
+    """Have workers let go of what they hold, and end those that do not come to it."""
+    for process in processes:
+        process.terminate()
+    until = time.monotonic() + ENDING_S
+    for process in processes:
+        process.join(max(until - time.monotonic(), 0.0))
+        if process.is_alive():
+            process.kill()
+            process.join()
 
 
 def _start(work: Work[Unit, Outcome], unit: Unit) -> tuple[Connection, BaseProcess]:
@@ -126,7 +140,7 @@ def _start(work: Work[Unit, Outcome], unit: Unit) -> tuple[Connection, BaseProce
     before = {name: os.environ.get(name) for name in ONE_THREAD}
     limit_threads()
     # A worker that still imports would answer an interrupt with a traceback; it inherits that none reaches it yet.
-    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, FOR_THE_PARENT)
     try:
         process = context.Process(target=_worker, args=(work, unit, theirs), daemon=True)
         process.start()
@@ -151,12 +165,14 @@ def _receive(connection: Connection) -> tuple[str, Any] | None:
 
 
 def answer_of(work: Work[Unit, Outcome], unit: Unit, report: Report) -> tuple[str, Any]:
-    """What became of ``unit`` in this process, as a message that ``unwrap`` takes elsewhere; raises nothing."""
+    """What became of ``unit`` in this process, as a message that ``unwrap`` takes elsewhere; raises ``Ended`` alone."""
     try:
         with doors(), one_thread():
             return "outcome", work(unit, report)
     except Su3dError as error:
         return "user-error", error
+    except Ended:
+        raise
     except BaseException:  # noqa: BLE001 - ``unwrap`` raises it again, with its traceback
         return "internal-error", traceback.format_exc()
 
@@ -180,15 +196,24 @@ def _cause(exit_code: int | None) -> str:
 
 
 def _worker(work: Work[Unit, Outcome], unit: Unit, connection: Connection) -> None:
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent decides what an interrupt means
-    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
-    threading.Thread(target=_die_with_parent, daemon=True).start()
-    connection.send(answer_of(work, unit, lambda event: connection.send(("event", event))))
-    connection.close()
+    for number in FOR_THE_PARENT:
+        signal.signal(number, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, FOR_THE_PARENT)
+    try:
+        with ending_in_order():
+            threading.Thread(target=_end_with_parent, daemon=True).start()
+            connection.send(answer_of(work, unit, lambda event: connection.send(("event", event))))
+            connection.close()
+    except Ended as end:  # all is let go of; the parent is told how it came
+        signal.signal(end.number, signal.SIG_DFL)
+        os.kill(os.getpid(), end.number)
 
 
-def _die_with_parent() -> None:
+def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
-    assert parent is not None
+    main = threading.main_thread().ident
+    assert parent is not None and main is not None
     parent.join()
+    signal.pthread_kill(main, signal.SIGTERM)
+    time.sleep(ENDING_S)
     os._exit(1)

@@ -50,6 +50,9 @@ class KeptPerception(ColourPerception):
         super().__init__()
         self._cache = FrameCache(cache_root)
 
+    def regions(self) -> None:
+        """For a method that has its own perception."""
+
     def detect(self, frame: Frame, needs: PerceptionNeeds, timer: StageTimer) -> Detections:
         key = content_key(self.digest, self._cache.frame_digest(frame, with_pose=False))
         found = super().detect(frame, needs, timer)
