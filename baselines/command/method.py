@@ -15,12 +15,20 @@ from typing import Annotated, Literal, Self
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from su3d_bench.baselines.command.frames import ColourFormat, FrameFolder
+from su3d_bench.baselines.command.placeholders import (
+    PLACEHOLDER,
+    PLACEHOLDERS,
+    check_placeholders,
+    variable_of,
+    words_of,
+)
 from su3d_bench.baselines.command.prediction import as_prediction, class_names, read_output
 from su3d_bench.baselines.command.process import ContainerWatch, Finished, Leaving, TreeWatch, run_program
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, Su3dError, printable
 from su3d_bench.core.interfaces import MethodAbout, SceneTools, StageTimer
 from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, Prediction, SceneInfo, Surface
+from su3d_bench.store.atomic import is_file
 from su3d_bench.store.scratch import TemporaryFolder
 
 logger = logging.getLogger(__name__)
@@ -31,16 +39,15 @@ Name = Annotated[str, Field(pattern=r"^([^-\s]\S*)?$")]  # no option in the plac
 # What a program finds in its environment unless more is allowed: enough to start it, no credentials.
 ENVIRONMENT = ("PATH", "HOME", "LANG", "LC_ALL", "TZ", "CUDA_VISIBLE_DEVICES", "LD_LIBRARY_PATH")
 INSIDE = {"frames": "/su3d/frames", "output": "/su3d/output", "work": "/su3d/work"}  # of a container
-PLACEHOLDER = re.compile(r"\{(\w*)\}")
-PLACEHOLDERS = ("frames", "output", "scene", "dataset", "seed")
 MOUNT = re.compile(r"(?P<here>/[^:]*):(?P<there>/[^:]*)")
 
 
 class CommandConfig(BaseModel):
     """What is run and where; docs/command-method.md says it with examples.
 
-    - ``command``: words, or one line that is split as a shell splits it; {frames}, {output}, {scene}, {dataset} and
-      {seed} stand for themselves in either. ``shell``: the line goes to /bin/sh instead
+    - ``command``: words, or one line that is split as a shell splits it; {frames}, {output}, {work}, {scene}, {dataset}
+      and {seed} stand for themselves in either, and are in the environment as SU3D_FRAMES and so on. ``shell``: the
+      line goes to /bin/sh instead, and gets them from there
     - ``runner``: plain, docker (with ``image``, ``gpus`` as docker has them, ``network``) or conda (with
       ``environment``, a name or a folder). ``mounts``: more folders for the container, HERE:THERE, read-only
     - ``pass_variables``: the environment variables that the program gets, of those that are set
@@ -69,10 +76,7 @@ class CommandConfig(BaseModel):
     def _fits_together(self) -> Self:
         if self.shell and not isinstance(self.command, str):
             raise ValueError("shell = true takes the command as one line; a list of words needs no shell")
-        unknown = [name for word in self.words for name in PLACEHOLDER.findall(word) if name and name not in INSIDE]
-        unknown = [name for name in unknown if name not in PLACEHOLDERS]
-        if unknown and not self.shell:  # a shell has braces of its own
-            raise ValueError(f"'{{{unknown[0]}}}' stands for nothing; known: {{{'}, {'.join(PLACEHOLDERS)}}}")
+        check_placeholders(self.command, is_shell=self.shell)
         needed = {"docker": ("image", self.image), "conda": ("environment", self.environment)}.get(self.runner)
         if needed is not None and not needed[1]:
             raise ValueError(f"runner '{self.runner}' needs {needed[0]}")
@@ -137,7 +141,7 @@ class Command:
         """Digest of each file that the command names, so that another version of a program is another run."""
         if self.config.runner == "docker":
             return {}  # its words are files of the image
-        words = shlex.split(self.config.command) if isinstance(self.config.command, str) else self.config.command
+        words = words_of(self.config.command)
         files = {word: _program_file(word) for word in words}
         return {f"file {word}": digest_file(path) for word, path in files.items() if path is not None}
 
@@ -194,15 +198,17 @@ class Command:
 
     def _run(self, folders: Mapping[str, Path]) -> None:
         container = f"su3d-{uuid.uuid4().hex[:16]}" if self.config.runner == "docker" else None
-        words = self._filled({name: INSIDE[name] if container else str(path) for name, path in folders.items()})
+        places = {name: INSIDE[name] if container else str(path) for name, path in folders.items()}
+        words = self._filled(places)
+        told = {variable_of(name): value for name, value in self._values(places).items()}
         id_file = folders["frames"].parent / "container"
         id_file.unlink(missing_ok=True)
         if container is not None:
-            words = [*self._docker_words(container, id_file, folders), *words]
+            words = [*self._docker_words(container, id_file, folders, told), *words]
         elif self.config.runner == "conda":
             kind = "--prefix" if "/" in self.config.environment else "--name"
             words = ["conda", "run", "--no-capture-output", kind, self.config.environment, *words]
-        environment = {name: os.environ[name] for name in self.config.pass_variables if name in os.environ}
+        environment = {name: os.environ[name] for name in self.config.pass_variables if name in os.environ} | told
         logger.info("program: %s", printable(shlex.join(words)))
 
         done = run_program(
@@ -222,18 +228,24 @@ class Command:
             how = f"exit code {done.exit_code}" if done.exit_code > 0 else f"was ended by signal {-done.exit_code}"
             raise PredictionError(f"{how}{last}")
 
-    def _filled(self, folders: Mapping[str, str]) -> list[str]:
+    def _values(self, folders: Mapping[str, str]) -> dict[str, str]:
         assert self._scene is not None
-        values = {"scene": self._scene.scene, "dataset": self._scene.dataset, "seed": str(self._scene.seed), **folders}
-        if self.config.shell:  # scenes have names that a shell might take for more
-            values = {name: shlex.quote(value) for name, value in values.items()}
+        own = {"scene": self._scene.scene, "dataset": self._scene.dataset, "seed": str(self._scene.seed)}
+        return {name: (own | dict(folders))[name] for name in PLACEHOLDERS}
+
+    def _filled(self, folders: Mapping[str, str]) -> list[str]:
+        values = self._values(folders)
+        if self.config.shell:  # what a scene is called never stands where a shell reads commands
+            values = {name: f'"${variable_of(name)}"' for name in values}
         words = [PLACEHOLDER.sub(lambda match: values.get(match[1], match[0]), word) for word in self.config.words]
         if self.config.runner == "docker":
             return words
         # The program runs in a folder of its own: files that were named from here must be found from there.
-        return [str(Path(w).absolute()) if (k or "/" in w) and Path(w).is_file() else w for k, w in enumerate(words)]
+        return [str(Path(w).absolute()) if (k or "/" in w) and is_file(Path(w)) else w for k, w in enumerate(words)]
 
-    def _docker_words(self, container: str, id_file: Path, folders: Mapping[str, Path]) -> list[str]:
+    def _docker_words(
+        self, container: str, id_file: Path, folders: Mapping[str, Path], told: Mapping[str, str]
+    ) -> list[str]:
         mounts = [f"{folders[name]}:{INSIDE[name]}{':ro' if name == 'frames' else ''}" for name in INSIDE]
         mounts += [f"{mount}:ro" for mount in self.config.mounts]
         words = ["docker", "run", "--rm", "--init", "--name", container, "--cidfile", str(id_file)]
@@ -242,9 +254,10 @@ class Command:
         words += ["--gpus", self.config.gpus] if self.config.gpus else []
         for mount in mounts:
             words += ["--volume", mount]
-        for name in self.config.pass_variables:
-            if name in os.environ and name not in ENVIRONMENT:  # the container has a PATH and a HOME of its own
-                words += ["--env", name]
+        # The container has a PATH and a HOME of its own.
+        passed = [name for name in self.config.pass_variables if name in os.environ and name not in ENVIRONMENT]
+        for name in [*passed, *told]:
+            words += ["--env", name]
         return [*words, self.config.image]
 
     def _record(self, done: Finished) -> None:
@@ -264,13 +277,10 @@ def _program_file(word: str) -> Path | None:
     if PLACEHOLDER.search(word):
         return None
     path = Path(word).expanduser()
-    if not path.is_file() and "/" not in word:
+    if not is_file(path) and "/" not in word:
         program = shutil.which(word)
         path = Path(program) if program else path
-    try:
-        return path if path.is_file() else None
-    except OSError:
-        return None
+    return path if is_file(path) else None
 
 
 def _last_line(stderr: str) -> str:

@@ -19,6 +19,7 @@ from places import SCENES
 
 from su3d_bench.baselines.command.frames import FrameFolder, write_mesh
 from su3d_bench.baselines.command.method import Command, CommandConfig
+from su3d_bench.baselines.command.placeholders import check_placeholders
 from su3d_bench.baselines.command.prediction import as_prediction, class_names
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, PredictionError
@@ -213,6 +214,71 @@ def test_a_line_is_split_into_words_and_a_shell_reads_it_only_when_asked(tmp_pat
         assert len(one.finish().scores) == 2  # type: ignore[union-attr]
         one.close()
     assert CommandConfig(command="a 'b c' {output}").words == ("a", "b c", "{output}")
+
+
+HOSTILE = "x$(touch P)`touch P`'; touch P; '\"; touch P #\n&& touch P"
+SHOWN = "import sys; open(sys.argv[1] + '/../shown', 'w').write(repr(sys.argv[2:]))"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "RUN {output} {scene}",
+        'false $SU3D_SCENE; RUN {output} "$SU3D_SCENE"',
+        "# don't be afraid of {scene}\nRUN {output} {scene}",
+        'RUN "$SU3D_OUTPUT" `true {scene}` {scene} # {scene}',
+        """sh -c '"$@" "$SU3D_OUTPUT" "$SU3D_SCENE"' sh RUN""",
+        'for s in {scene}; do RUN {output} "$s"; done',
+    ],
+)
+def test_a_shell_gets_what_a_scene_is_called_as_a_value_alone(tmp_path: Path, line: str) -> None:
+    line = line.replace("RUN", f"'{sys.executable}' '{program(tmp_path, SHOWN)}'")
+    one = fed(Command(CommandConfig(command=line, shell=True)), scene=replace(SCENE, scene=HOSTILE))
+    with pytest.raises(PredictionError, match="it ended without an error and left nothing"):
+        one.finish()
+    assert one._scratch is not None
+    assert (one._scratch.path / "shown").read_text() == repr([HOSTILE])
+    assert not list((one._scratch.path / "work").iterdir())
+    one.close()
+
+
+@pytest.mark.parametrize(
+    ("line", "place"),
+    [
+        ('a "{scene}"', "within quotes"),
+        ("a '{scene}'", "within quotes"),
+        ('a "x \\" {output}/y"', "within quotes"),
+        ("a 'x \\' {output} 'y {seed}'", "within quotes"),
+        ('a "$(b {scene})"', "within quotes"),
+        ("a ${scene}", "behind a $"),
+        ("a \\{scene}", "behind a \\"),
+        ("sh <<E\nb {scene}\nE", "in or after a here-document"),
+    ],
+)
+def test_a_placeholder_that_a_shell_would_read_as_commands_is_refused(line: str, place: str) -> None:
+    with pytest.raises(ValueError, match="where a shell would read its value as commands; write ") as caught:
+        check_placeholders(line, is_shell=True)
+    assert f"}}' stands {place}," in str(caught.value)
+
+
+@pytest.mark.parametrize("line", ["a \\'{scene}", "a 'b'{scene}'c'", 'a "b"\\"{scene}', "awk '{print}' {scene}"])
+def test_a_placeholder_beside_quotes_is_a_word(line: str) -> None:
+    check_placeholders(line, is_shell=True)
+
+
+def test_words_behind_the_program_of_an_interpreter_are_its_arguments() -> None:
+    for words in (
+        ["bash", "-c", 'a "$1"', "a", "{scene}"],
+        ["python", "run.py", "-c", "{scene}"],
+        ["mine", "-c", "{scene}"],
+    ):
+        check_placeholders(words, is_shell=False)
+
+
+def test_a_shells_line_that_no_other_can_split_is_one_that_runs(tmp_path: Path) -> None:
+    one = fed(Command(CommandConfig(command="true # it's " + "x" * 300 + " {output}", shell=True)))
+    assert one.inputs
+    assert "left nothing" in refused(one)
 
 
 def test_a_file_named_from_here_is_found_from_the_programs_own_folder(

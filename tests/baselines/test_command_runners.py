@@ -95,7 +95,8 @@ def test_docker_gets_read_only_frames_no_network_and_the_paths_inside(
     volumes = [words[i + 1] for i, word in enumerate(words) if word == "--volume"]
     assert volumes[0].endswith("/frames:/su3d/frames:ro")
     assert volumes[3] == "/data/weights:/weights:ro"
-    assert [words[i + 1] for i, word in enumerate(words) if word == "--env"] == ["MY_MODEL"]
+    told = [words[i + 1] for i, word in enumerate(words) if word == "--env"]
+    assert told == ["MY_MODEL", *(f"SU3D_{name}" for name in ("FRAMES", "OUTPUT", "WORK", "SCENE", "DATASET", "SEED"))]
     assert words[words.index("--network") + 1] == "none"
     assert words[words.index("--user") + 1] == f"{os.getuid()}:{os.getgid()}"
     assert words[words.index("--gpus") + 1] == "all"
@@ -143,6 +144,11 @@ def test_conda_runs_the_command_in_the_environment(
         ({"command": ["a", "{frame}"]}, "'{frame}' stands for nothing; known: {frames}"),
         ({"command": ["a"], "shell": True}, "shell = true takes the command as one line"),
         ({"command": "a 'b"}, "No closing quotation"),
+        ({"command": 'a "{scene}"', "shell": True}, '; write {scene} outside of quotes, or "$SU3D_SCENE"'),
+        ({"command": "sh -c 'a {scene}'", "shell": True}, "'{scene}' stands within quotes, where a shell would read"),
+        ({"command": "bash -c 'a {scene}'"}, "'{scene}' stands within a program for 'bash'"),
+        ({"command": ["env", "A=b", "/bin/bash", "-o", "pipefail", "-lc", "a {scene}"]}, "SU3D_SCENE there"),
+        ({"command": ["python3.11", "-I", "-cprint('{scene}')"]}, "a program for 'python3.11'"),
         ({"command": ["a"], "runner": "docker"}, "runner 'docker' needs image"),
         ({"command": ["a"], "runner": "conda"}, "runner 'conda' needs environment"),
         ({"command": ["a"], "image": "x"}, "belong to runner 'docker'"),

@@ -54,7 +54,7 @@ class Started:
         environment = os.environ | {"TMPDIR": str(self.scratch), "SU3D_CACHE": str(place / "cache")}
         self.log = place / "log"
         with self.log.open("wb") as log:
-            streams = {"stdin": subprocess.DEVNULL, "stdout": log, "stderr": log} | how
+            streams: dict[str, Any] = {"stdin": subprocess.DEVNULL, "stdout": log, "stderr": log} | how
             self.run = subprocess.Popen(words, env=environment, **streams)
         try:
             wait_until(lambda: self.run.poll() is not None or len(list(self.marks.iterdir())) >= n_programs)

@@ -51,7 +51,12 @@ def method(tmp_path: Path, text: str, *words: str, surface: Surface | None = SUR
     return fed(Command(CommandConfig(command=command, **config)), surface)
 
 
-def fed(one: Command, surface: Surface | None = SURFACE, shots: Sequence[Frame] | None = None) -> Command:
+def fed(
+    one: Command,
+    surface: Surface | None = SURFACE,
+    shots: Sequence[Frame] | None = None,
+    scene: SceneInfo = SCENE,
+) -> Command:
     def give() -> Surface:
         if surface is None:
             raise DataError("rooms/a b: the dataset has no mesh")
@@ -59,7 +64,7 @@ def fed(one: Command, surface: Surface | None = SURFACE, shots: Sequence[Frame] 
 
     shots = frames() if shots is None else shots
     one.receive_tools(SceneTools(shots, None, give))  # type: ignore[arg-type]
-    one.start(SCENE)
+    one.start(scene)
     for frame in shots:
         one.update(frame, no_detections(frame, one.needs), Timer())
     return one
