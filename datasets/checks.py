@@ -19,6 +19,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, Su3dError, printable
+from su3d_bench.core.files import opened
 from su3d_bench.core.interfaces import Dataset, HasProblems, SaysUp
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, WorldUp
 from su3d_bench.datasets.checks_of_frames import (
@@ -332,7 +333,7 @@ def _fault_of_file(path: Path, name: str, decode: bool) -> str | None:
             is_depth = path.suffix.lower() == ".pgm" or content[24:26] == b"\x10\x00"  # a PNG of one channel, 16 bits
             (decode_depth if is_depth else decode_colour)(content, name)
             return None
-        with path.open("rb") as stream:
+        with opened(path) as stream:
             return None if stream.read(1) else f"{name} is empty; copy the file again"
     except FileNotFoundError:
         return f"{name} is missing; copy the file again"

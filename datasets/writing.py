@@ -17,6 +17,7 @@ from typing import Any, Protocol
 
 from su3d_bench.core.digests import digest_json
 from su3d_bench.core.errors import StoreError
+from su3d_bench.core.files import file_text
 from su3d_bench.core.types import Float32Array, Float64Array, Frame, Int32Array, UInt8Array
 from su3d_bench.datasets.recordings.made_rooms import MARKER, read_marker
 from su3d_bench.store.atomic import make_folder, write_bytes, write_json, write_text
@@ -180,7 +181,7 @@ def plan_scenes(layout: Layout, dataset: ScannedDataset, scenes: Sequence[str], 
 
 def write_shared_text(path: Path, text: str, complaint: str) -> None:
     """Write a file that all scenes share; where it is there with another content, a ``StoreError`` that says so."""
-    if path.exists() and path.read_text(encoding="utf-8", errors="replace") != text:
+    if path.exists() and file_text(path, errors="replace") != text:
         raise StoreError(f"{path}: {complaint}, and all scenes of a folder share one; choose another folder with --out")
     write_text(path, text)
 

@@ -20,6 +20,7 @@ from typing import IO, Any
 from su3d_bench.baselines.command import supervisor
 from su3d_bench.baselines.command.supervisor import AFTERWARDS_S, DONE, END, STOP
 from su3d_bench.core.errors import ConfigError
+from su3d_bench.core.files import file_text
 
 SUPERVISOR = Path(supervisor.__file__)
 ENDING_S = supervisor.ENDING_S + AFTERWARDS_S + 5.0  # for the supervisor to end the program, and a container
@@ -113,7 +114,7 @@ class TreeWatch(Watch):
 def _own_peak_bytes(pid: int) -> int:
     """The peak of one process since it began its program, which no sample can miss; 0 where it is not told."""
     try:
-        lines = Path(f"/proc/{pid}/status").read_text().splitlines()
+        lines = file_text(Path(f"/proc/{pid}/status")).splitlines()
     except OSError:
         return 0
     return next((int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM:")), 0)
@@ -130,14 +131,14 @@ class ContainerWatch(Watch):
 
     def look(self) -> None:
         try:
-            identity = self._id_file.read_text().strip()
+            identity = file_text(self._id_file).strip()
         except OSError:
             return
         if not identity.isalnum():
             return
         for pattern in PEAK_FILES:
             try:
-                self.peak_bytes = int((self._cgroups / pattern.format(id=identity)).read_text())
+                self.peak_bytes = int(file_text(self._cgroups / pattern.format(id=identity)))
             except (OSError, ValueError):
                 continue
             self.source = "the container's cgroup"

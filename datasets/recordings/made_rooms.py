@@ -6,6 +6,7 @@ import json
 from pathlib import Path
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files import file_text
 
 MARKER = "rooms.json"  # in the folder of the scenes
 
@@ -16,7 +17,7 @@ def read_marker(folder: Path) -> dict[str, str]:
     if not path.is_file():
         return {}
     try:
-        scenes = json.loads(path.read_text(encoding="utf-8"))["scenes"]
+        scenes = json.loads(file_text(path))["scenes"]
         return {str(scene): str(key) for scene, key in scenes.items()}
     except (OSError, ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise DataError(

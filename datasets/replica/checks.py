@@ -12,6 +12,7 @@ from pathlib import Path
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files import opened
 from su3d_bench.datasets.recordings.recorded_frames import reading
 from su3d_bench.datasets.replica.boxes import SLACK_M, objects_outside_boxes, read_boxes
 from su3d_bench.datasets.replica.frames import (
@@ -76,7 +77,7 @@ def _image_problems(folder: Path, n_frames: int, camera: Camera | None, where: s
     for index in range(n_frames):
         for name in (colour_name(index), depth_name(index)):
             try:
-                with (folder / name).open("rb") as file:
+                with opened(folder / name) as file:
                     head = file.read(HEAD_BYTES[0])
                     if image_size(head) is None:
                         head += file.read(HEAD_BYTES[1])
@@ -143,7 +144,7 @@ def image_key(path: Path) -> str:
     other pixels of the same checksum (one in 2**32) and size, and damage amid a PNG, which the reader of frames
     refuses because the checksum of the chunk fails.
     """
-    with path.open("rb") as file:
+    with opened(path) as file:
         head = file.read(PNG_HEAD_BYTES)
         key = hashlib.sha256(head)
         size = file.seek(0, 2)

@@ -10,6 +10,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict
 
 from su3d_bench.core.errors import DataError, FramesMissing, GroundTruthMissing, suggest
+from su3d_bench.core.files import file_bytes
 from su3d_bench.core.types import Frame, GroundTruth, ImageDomain, InstanceMesh, OrientedBox, SceneInfo, Surface
 from su3d_bench.datasets.recordings.made_rooms import read_marker
 from su3d_bench.datasets.recordings.meshes import read_surface
@@ -104,7 +105,7 @@ class Replica:
         frames = "no frames"
         if self._is_rendered(scene):
             try:
-                n_poses = (self._folder(scene) / "traj.txt").read_bytes().rstrip().count(b"\n") + 1
+                n_poses = file_bytes(self._folder(scene) / "traj.txt").rstrip().count(b"\n") + 1
             except OSError:
                 return "traj.txt is missing"
             frames = f"{n_poses} frames"

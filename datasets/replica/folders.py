@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files import file_text
 from su3d_bench.core.types import LabelSet
 
 LABEL_SPACE = "replica"
@@ -161,5 +162,5 @@ def no_render_tree(root: Path) -> DataError:
 @cache
 def replica_label_set() -> LabelSet:
     """The 101 classes, ids 1 to 101; 0 is void and no class."""
-    rows = json.loads(Path(__file__).with_name("labels.json").read_text(encoding="utf-8"))
+    rows = json.loads(file_text(Path(__file__).with_name("labels.json")))
     return LabelSet(LABEL_SPACE, tuple(int(row["id"]) for row in rows), tuple(str(row["name"]) for row in rows))

@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files import file_bytes, file_text
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.recordings.recorded_frames import (
     Folder,
@@ -47,7 +48,7 @@ def read_camera(path: Path, where: str) -> Camera:
     """The camera of ``cam_params.json``; ``where`` begins each message."""
     where = f"{where}: {path.name}"
     try:
-        content = parsed_json(path.read_bytes(), where)
+        content = parsed_json(file_bytes(path), where)
     except OSError as error:
         raise DataError(f"{where} cannot be read: {error.strerror}; it belongs into {path.parent}") from error
     table = content.get("camera") if isinstance(content, dict) else None
@@ -82,7 +83,7 @@ def read_trajectory(path: Path, where: str) -> Float64Array:
 def trajectory_lines(path: Path, where: str) -> list[str]:
     """The lines of ``traj.txt``, at least one."""
     try:
-        lines = path.read_text(encoding="utf-8").rstrip().splitlines()
+        lines = file_text(path).rstrip().splitlines()
     except OSError as error:
         raise DataError(f"{where}: traj.txt cannot be read: {error.strerror}; expected it in {path.parent}") from error
     except UnicodeDecodeError as error:

@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import DataError, reading
+from su3d_bench.core.files import opened
 from su3d_bench.core.types import Float32Array, GroundTruth, Int32Array
 from su3d_bench.datasets.recordings.meshes import vertex_positions
 from su3d_bench.datasets.replica.folders import replica_label_set
@@ -124,7 +125,7 @@ def _labels_of_mesh(path: Path, meshes: Sequence[LabelledMesh], where: str) -> t
 def _n_vertices(mesh: LabelledMesh, where: str) -> int:
     """As the header says it; ``_vertices`` reads and checks the chosen mesh."""
     where = f"{where}: {mesh.name}"
-    with reading(where, DataError), mesh.path.open("rb") as file:
+    with reading(where, DataError), opened(mesh.path) as file:
         header = read_header(file.read(MAX_HEADER_BYTES), where)
     return next((element.n_rows for element in header.elements if element.name == "vertex"), 0)
 
@@ -139,7 +140,7 @@ def read_whole_numbers(path: Path, at_most: int, where: str) -> tuple[Int32Array
     A line may be of any length: one without end is cut at ``BLOCK_BYTES``.
     """
     values, n_lines = array("i"), 0
-    with reading(where, DataError), path.open("rb") as file:
+    with reading(where, DataError), opened(path) as file:
         while line := file.readline(BLOCK_BYTES):
             n_lines += 1
             word = line.strip()

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from su3d_bench.core.files import file_text
+from su3d_bench.core.toml import parse_toml
 
 
 @dataclass(frozen=True)
@@ -25,7 +27,7 @@ class RoomClass:
     called: Mapping[str, str]
 
 
-_TABLE: Mapping[str, Any] = tomllib.loads(Path(__file__).with_name("classes.toml").read_text(encoding="utf-8"))
+_TABLE: Mapping[str, Any] = parse_toml(file_text(Path(__file__).with_name("classes.toml")))
 COLOUR_RGB: Mapping[str, tuple[int, int, int]] = {name: tuple(rgb) for name, rgb in _TABLE["colours"].items()}
 COLOURS = tuple(COLOUR_RGB)
 MATERIALS: tuple[str, ...] = tuple(_TABLE["materials"])

@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files import file_text
 from su3d_bench.datasets.recordings.made_rooms import read_marker
 from su3d_bench.datasets.scannet.labels import FIRST_TABLE_NAME, TABLE_NAME
 
@@ -107,7 +108,7 @@ def _is_scan(folder: Path, rooms: Mapping[str, str]) -> bool:
 @cache
 def split_scenes(split: str) -> tuple[str, ...]:
     """The scans of an official split in the order of its list: Tasks/Benchmark/scannetv2_<split>.txt of ScanNet."""
-    return tuple((Path(__file__).parent / "splits" / f"scannetv2_{split}.txt").read_text(encoding="utf-8").split())
+    return tuple(file_text(Path(__file__).parent / "splits" / f"scannetv2_{split}.txt").split())
 
 
 def no_scans(root: Path) -> DataError:

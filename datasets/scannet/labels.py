@@ -15,6 +15,7 @@ from functools import cache
 from pathlib import Path
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files import file_text
 from su3d_bench.core.types import LabelSet
 from su3d_bench.datasets.recordings.recorded_frames import read_text
 
@@ -42,7 +43,7 @@ class LabelTable:
 @cache
 def _known_classes() -> dict[str, dict[int, str]]:
     """NYU40 by the names of nyu40class, those of the benchmark's 20 classes as the benchmark has them; ScanNet200."""
-    tables = json.loads(Path(__file__).with_name("labels.json").read_text(encoding="utf-8"))
+    tables = json.loads(file_text(Path(__file__).with_name("labels.json")))
     return {name: {int(row["id"]): str(row["name"]) for row in rows} for name, rows in tables.items()}
 
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from su3d_bench.core.digests import digest_bytes, digest_file
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files import opened
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.recordings.exported_frames import (
     EXPORT_AGAIN,
@@ -265,7 +266,7 @@ def describe_recording(folder: Path, scene: str, where: str, kind: SourceKind) -
     path = place / layout.pose if form == "python" and layout is not None else place
     with reading(where):
         if form == "sens":
-            with path.open("rb") as stream:
+            with opened(path) as stream:
                 _, n_frames, _ = parse_header(stream.read(MAX_HEADER_BYTES), f"{where}: {path.name}")
             return f"{n_frames} frames"
         if form == "cpp":

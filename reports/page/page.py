@@ -8,6 +8,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.core.files import file_text
 from su3d_bench.core.printing import escaped_json, plain_value
 
 HERE = Path(__file__).parent
@@ -63,7 +64,7 @@ def embedded_json(value: Any) -> str:
 
 
 def _file(path: Path) -> str:
-    return path.read_text(encoding="utf-8")
+    return file_text(path)
 
 
 def _digest(text: str) -> str:

@@ -11,6 +11,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.core.files import file_text
 from su3d_bench.reports.page.page import rendered
 
 HERE = Path(__file__).parent
@@ -18,7 +19,7 @@ HERE = Path(__file__).parent
 
 def page_html(title: str, data: Mapping[str, Any]) -> str:
     """The page of one annotator; ``data``: id, annotator, columns, asks and items, pictures in base 64."""
-    script = (HERE / "page.js").read_text(encoding="utf-8")
+    script = file_text(HERE / "page.js")
     names = {"sheet": data["id"], "annotator": data["annotator"]}
     return rendered(HERE, script, title=title, data=json_in_html(data), **names)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from decimal import Decimal
 from functools import cache
@@ -12,6 +11,8 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core.errors import ConfigError, printable, reading, suggest
+from su3d_bench.core.files import file_bytes
+from su3d_bench.core.toml import parse_toml
 
 FILE = Path(__file__).resolve().parent / "published.toml"
 MOST_BYTES = 1 << 20
@@ -96,12 +97,12 @@ def read_published(path: Path = FILE) -> tuple[Figure, ...]:
     """Every figure of a file such as ``published.toml``; ``ConfigError`` with one line where it is not of that form."""
     shown = printable(path.name, 100)
     with reading(shown, ConfigError):
-        content = path.read_bytes()
+        content = file_bytes(path)
     if len(content) > MOST_BYTES:
         raise ConfigError(f"{shown}: has {len(content)} bytes; expected at most {MOST_BYTES}")
     try:
-        table = tomllib.loads(content.decode("utf-8"))
-    except (ValueError, RecursionError) as error:
+        table = parse_toml(content.decode("utf-8"))
+    except ValueError as error:
         raise ConfigError(f"{shown}: is no TOML: {printable(str(error), 200)}") from error
     try:
         # as a Python value, not through JSON: a number that is no text must stay a number, to be refused

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from su3d_bench.analysis.sides import Side, refuse_unlike, rules_of
 from su3d_bench.core.errors import ConfigError, Su3dError, printable, reading, suggest
+from su3d_bench.core.files import file_bytes
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.scoring import ProtocolResult, combine
@@ -332,7 +333,7 @@ def _read_from(folder: Path, name: str) -> Path | None:
 def _source_text(file: Path) -> str:
     shown = printable(str(file), 200)
     with reading(shown, ConfigError):
-        content = file.read_bytes()
+        content = file_bytes(file)
     if len(content) > MOST_SOURCE_BYTES:
         raise ConfigError(f"{shown}: has {len(content)} bytes; a paper's source has at most {MOST_SOURCE_BYTES}")
     return content.decode("utf-8", "replace")

@@ -18,9 +18,11 @@ from typing import Annotated, Any, Literal, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from su3d_bench.core.errors import ConfigError, suggest
+from su3d_bench.core.files import file_text
 from su3d_bench.core.printing import one_line
+from su3d_bench.core.toml import parse_toml
 
-HEADER = re.compile(r"^\s*\[+\s*([^\[\]]+?)\s*\]+\s*(?:#.*)?$")
+HEADER = re.compile(r"^\s*\[+([^\[\]]+)\]+\s*(?:#.*)?$")
 ASSIGNMENT = re.compile(r"""^\s*((?:[\w-]+|"[^"]*"|'[^']*')(?:\s*\.\s*(?:[\w-]+|"[^"]*"|'[^']*'))*)\s*=""")
 KEY = re.compile(r"""[\w-]+|"[^"]*"|'[^']*'""")
 BARE_KEY = re.compile(r"^[A-Za-z0-9_-]+$")
@@ -167,19 +169,17 @@ class Settings:
 def read_file(path: Path) -> Settings:
     """The settings of a TOML file; a syntax error names file and line."""
     try:
-        text = path.read_text(encoding="utf-8")
+        text = file_text(path)
     except OSError as error:
         raise ConfigError(f"{path}: cannot read the configuration: {error.strerror}") from error
     except UnicodeDecodeError as error:
         raise ConfigError(f"{path}: not a UTF-8 text file; a configuration is TOML") from error
     try:
-        table = tomllib.loads(text)
+        table = parse_toml(text)
     except tomllib.TOMLDecodeError as error:
         reason, _, place = str(error).partition(" (at ")
         line = place.split(",")[0].removeprefix("line ") if place.startswith("line ") else str(text.count("\n") + 1)
         raise ConfigError(f"{path}:{line}: not valid TOML: {reason[:1].lower()}{reason[1:]}") from error
-    except (RecursionError, ValueError) as error:  # the depth of nested tables, integers of thousands of digits
-        raise ConfigError(f"{path}: not valid TOML: nested or numbered beyond what a setting needs") from error
     lines = key_lines(text)
     return Settings(tuple(Setting(leaf, value, f"{path}:{_line(lines, leaf)}") for leaf, value in flatten(table)))
 
@@ -247,8 +247,8 @@ def _full_path(text: str, path: KeyPath, methods: Sequence[str], datasets: Seque
 def parse_value(text: str) -> Any:
     """A value in TOML, and plain text where it is not."""
     try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except (ValueError, RecursionError):  # no TOML, thousands of digits, nested thousands deep
+        return parse_toml(f"value = {text}")["value"]
+    except ValueError:
         return text.strip()
 
 

@@ -16,6 +16,8 @@ from importlib.util import cache_from_source
 from pathlib import Path
 from typing import Any, Self
 
+from su3d_bench.core.files import file_bytes, file_text, opened
+
 PACKAGE_ROOT = Path(__file__).resolve().parents[1]
 # What shows numbers and moves none; everything else of the package counts, in whatever folder it stands.
 ONLY_SHOWN = ("analysis", "cli", "reports", "sheets")
@@ -37,7 +39,7 @@ def digest_json(value: Any) -> str:
 
 def digest_file(path: Path) -> str:
     """SHA-256 of a file's content."""
-    with path.open("rb") as stream:
+    with opened(path) as stream:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
@@ -92,7 +94,7 @@ class _KeptDigests:
 
     def __enter__(self) -> Self:
         with suppress(OSError, ValueError, RecursionError):
-            kept = json.loads(self._place.read_text())
+            kept = json.loads(file_text(self._place))
             self._kept = kept if isinstance(kept, dict) else {}
         return self
 
@@ -115,7 +117,7 @@ class _KeptDigests:
 
 def source_digest(path: Path) -> str:
     """SHA-256 of what a source file means to the program; of its bytes where it is no Python or TOML that parses."""
-    content = path.read_bytes()
+    content = file_bytes(path)
     with suppress(SyntaxError, ValueError):
         if path.suffix == ".py":
             return digest_bytes(_syntax(content).encode())

@@ -27,6 +27,7 @@ from su3d_bench.core.errors import (
     shown,
     suggest,
 )
+from su3d_bench.core.files import file_bytes
 from su3d_bench.core.types import GroundTruth, Int64Array
 from su3d_bench.datasets.openlex3d import FACE_CORNERS, VISIBLE, OpenLexRelease
 from su3d_bench.evaluation.request import Request
@@ -301,7 +302,7 @@ def read_values(path: Path) -> Int64Array:
     """One value a point of a scene: a class id, or class id * 1000 + instance."""
     where = shown(path)
     with converted(PredictionError, DataError), reading(where, DataError):
-        values = integer_lines(path.read_bytes(), where).astype(np.int64)
+        values = integer_lines(file_bytes(path), where).astype(np.int64)
     if not 0 < len(values) <= MOST_POINTS:
         raise DataError(f"{where}: has {len(values)} values; expected one a point of the scene")
     is_wrong = (values < 0) | (values > LARGEST_VALUE)

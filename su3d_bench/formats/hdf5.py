@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, reading
+from su3d_bench.core.files import regular
 from su3d_bench.core.types import Float32Array, Int32Array
 from su3d_bench.store.unpacking import Allowance
 
@@ -90,9 +91,9 @@ def _open_table(path: Path, where: str) -> Iterator[Any]:
 
     name = path.stem
     with reading(where, DataError):
-        path.stat()
+        regular_path = regular(path)
     try:
-        with h5py.File(path, "r", locking="best-effort") as file:
+        with h5py.File(regular_path, "r", locking="best-effort") as file:
             link = file.get(name, getlink=True) if name in file else None
             if link is not None and not isinstance(link, h5py.HardLink):
                 raise DataError(f"{where}: '{name}' is a link; expected the data itself in this file")

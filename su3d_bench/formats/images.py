@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files import file_bytes
 from su3d_bench.core.types import Float32Array, Int32Array, UInt8Array
 from su3d_bench.formats.ply import ListColumn
 
@@ -41,7 +42,7 @@ def read_bytes(path: Path, where: str, advice: str = "copy the file again", most
             raise DataError(f"{where} is not a file and cannot be read; {advice}")
         if status.st_size > most:
             raise DataError(f"{where} has {status.st_size} bytes; no such file has more than {most >> 20} MiB")
-        return path.read_bytes()
+        return file_bytes(path)
     except FileNotFoundError as error:
         raise DataError(f"{where} is missing; {advice}") from error
     except OSError as error:

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, printable, reading, shown
+from su3d_bench.core.files import file_bytes, opened
 from su3d_bench.formats.pickles.pickle_constructors import MOST_DIMENSIONS, SIMPLE_TYPE, RefusedError, check_texts
 from su3d_bench.formats.pickles.pickles import read_pickle
 from su3d_bench.store.unpacking import Allowance, UnpackingError, allowance_of, member_bytes
@@ -30,7 +31,7 @@ ZIP_DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, ValueError, RuntimeError
 def opened_zip(path: Path) -> Iterator[zipfile.ZipFile]:
     """The archive at ``path``; damage, inside the block too, is a ``PredictionError`` that names the file."""
     try:
-        with zipfile.ZipFile(path) as archive:
+        with opened(path) as stream, zipfile.ZipFile(stream) as archive:
             yield archive
     except OSError as error:
         raise PredictionError(f"{shown(path)}: cannot be read: {error.strerror or 'wrong offsets'}") from error
@@ -98,7 +99,7 @@ def npy_header(content: bytes) -> NpyHeader | None:
 def npy_header_of(path: Path) -> NpyHeader | None:
     """``npy_header`` of a file; None where it cannot be read."""
     try:
-        with path.open("rb") as stream:
+        with opened(path) as stream:
             return npy_header(stream.read(MOST_HEADER))
     except OSError:
         return None
@@ -170,4 +171,4 @@ def _header(content: bytes, where: str) -> NpyHeader:
 
 def _content(path: Path) -> bytes:
     with reading(shown(path)):
-        return path.read_bytes()
+        return file_bytes(path)

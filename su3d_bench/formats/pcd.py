@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, printable, reading
+from su3d_bench.core.files import file_bytes
 from su3d_bench.core.types import Float32Array, Float64Array, UInt8Array
 from su3d_bench.store.atomic import write_bytes
 from su3d_bench.store.unpacking import Allowance, UnpackingError
@@ -63,7 +64,7 @@ def read_pcd_points(path: Path, where: str | None = None) -> Float64Array:
     """
     where = where or str(path)
     with reading(where, DataError):
-        content = path.read_bytes()
+        content = file_bytes(path)
     header = read_header(content, where)
     axes = [next((field for field in header.fields if field.name == axis), None) for axis in AXES]
     coordinates = [field for field in axes if field is not None and field.count == 1]

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, reading
+from su3d_bench.core.files import file_bytes
 from su3d_bench.core.types import Int64Array
 from su3d_bench.formats.ply_parts import (
     NAMES_OF_TYPES,
@@ -85,7 +86,7 @@ def read_ply(path: Path, where: str | None = None) -> PlyFile:
     """
     where = where or str(path)
     with reading(where, DataError):
-        content = path.read_bytes()
+        content = file_bytes(path)
     header = read_header(content, where)
     body = TextBody(content, header, where) if header.format == "ascii" else BinaryBody(content, header)
     at, elements = body.start, []

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files import opened_text
 from su3d_bench.core.types import Float32Array, Float64Array
 from su3d_bench.numerics.geometry import are_rigid
 
@@ -45,7 +46,7 @@ def _values(line: str, where: str) -> list[float]:
 def read_first_pose(path: Path, where: str) -> Float32Array:
     """The camera-to-world matrix (4, 4) in the first line, in single precision as the original reads it."""
     try:
-        with path.open(encoding="utf-8") as file:
+        with opened_text(path) as file:
             line = file.readline(MAX_LINE)
     except OSError as error:
         raise DataError(f"{where} cannot be read: {error.strerror}; it belongs to the ground-truth cloud") from error

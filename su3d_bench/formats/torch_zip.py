@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, reading, shown
+from su3d_bench.core.files import opened
 from su3d_bench.formats.numpy_files import opened_zip, read_member
 from su3d_bench.formats.pickles.pickle_constructors import (
     CONSTRUCTORS,
@@ -84,7 +85,7 @@ class Storage:
 def torch_kind(path: Path) -> Kind | None:
     """What a file of ``torch.save`` holds, from the ends of its pickle; None where it is no such file."""
     try:
-        with path.open("rb") as stream, opened_zip(path) as archive:
+        with opened(path) as stream, opened_zip(path) as archive:
             if stream.read(4) != ZIP_START:
                 return None
             info = archive.getinfo(_pickle_name(archive, path))
@@ -133,7 +134,7 @@ def read_torch(path: Path) -> object:
 
 
 def _check_start(path: Path) -> None:
-    with reading(shown(path)), path.open("rb") as stream:
+    with reading(shown(path)), opened(path) as stream:
         start = stream.read(4)
     if start != ZIP_START:
         raise PredictionError(

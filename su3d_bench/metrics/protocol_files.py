@@ -4,13 +4,14 @@ comments say of a rule: its source, or that it is ours."""
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import ConfigError, suggest
+from su3d_bench.core.files import file_text
+from su3d_bench.core.toml import parse_toml
 
 RULES = Path(__file__).parent / "rules"
 _TABLE_PREFIX = "classes."  # rules/classes.<name>.toml holds a class table, not a protocol
@@ -98,7 +99,7 @@ def _entries(files: Sequence[Path], table: Any) -> list[dict[str, Any]]:
 
 def _read_toml(path: Path) -> dict[str, Any]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        return parse_toml(file_text(path))
     except OSError as error:
         raise ConfigError(f"{path}: cannot be read ({error.strerror})") from error
     except (ValueError, RecursionError) as error:  # no TOML, no UTF-8, thousands of digits, nested thousands deep
@@ -108,7 +109,7 @@ def _read_toml(path: Path) -> dict[str, Any]:
 def line_of(files: Sequence[Path], key: str) -> str:
     """``path:line`` of the first line that sets ``key``, or the first file alone."""
     for path in files:
-        for number, line in enumerate(path.read_text(encoding="utf-8").splitlines(), start=1):
+        for number, line in enumerate(file_text(path).splitlines(), start=1):
             if re.match(rf"\s*{re.escape(key)}\s*=", line):
                 return f"{path}:{number}"
     return str(files[0])
@@ -134,7 +135,7 @@ def read_remarks(file: Path) -> dict[str, list[str]]:
 
     remarks: dict[str, list[str]] = {}
     section, waiting, has_key = "", list[str](), False
-    for line in file.read_text(encoding="utf-8").splitlines():
+    for line in file_text(file).splitlines():
         match = _COMMENT.match(line)
         comment = [match[1]] if match is not None else []
         key, header = _KEY.match(line), _SECTION.match(line)

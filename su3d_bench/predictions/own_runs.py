@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import PredictionError, printable, shown
+from su3d_bench.core.files import regular
 from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.formats.arrays import kind_of
 from su3d_bench.formats.numpy_files import npy_header_of, npz_names, read_npz
@@ -64,7 +65,7 @@ def _mapped_features(file: Path) -> NDArray[Any]:
         )
     if n_rows == 0 or n_columns == 0:
         return np.zeros((n_rows, n_columns), np.dtype(header.code))
-    return np.memmap(file, np.dtype(header.code), "r", header.start, (n_rows, n_columns))
+    return np.memmap(regular(file), np.dtype(header.code), "r", header.start, (n_rows, n_columns))
 
 
 def _check_points(where: str, content: Prediction) -> None:

@@ -13,6 +13,7 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.errors import PredictionError, printable, reading, shown
+from su3d_bench.core.files import file_bytes, opened
 from su3d_bench.core.types import Int32Array
 from su3d_bench.formats.arrays import check_members, run_members
 from su3d_bench.formats.text_integers import integer_lines
@@ -51,7 +52,7 @@ class TextFiles(SceneFiles):
         files = self.scenes(path).values() if path.is_dir() or path.suffix == ".txt" else ()
         for file in list(files)[:MOST_LOOKED_AT]:
             try:
-                with file.open("rb") as stream:
+                with opened(file) as stream:
                     lines.append(stream.readline(MOST_FIRST_LINE).decode("utf-8", "replace").rstrip("\r\n"))
             except OSError:
                 continue
@@ -237,4 +238,4 @@ def _number(word: str) -> float | None:
 
 def _content(file: Path, where: str) -> bytes:
     with reading(where):
-        return file.read_bytes()
+        return file_bytes(file)

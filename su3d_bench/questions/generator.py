@@ -9,7 +9,6 @@ are of a kind of their own.
 from __future__ import annotations
 
 import hashlib
-import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -19,6 +18,8 @@ from pathlib import Path
 import numpy as np
 
 from su3d_bench.core.english import last_word, with_article, words
+from su3d_bench.core.files import file_text
+from su3d_bench.core.toml import parse_toml
 from su3d_bench.numerics.relations import RELATIONS
 from su3d_bench.questions.known_objects import is_called
 from su3d_bench.questions.looks import LEAD, SIZES, Looks, measure_of
@@ -92,7 +93,7 @@ def right_by_name(question: Question, objects: SceneMap) -> float:
 @cache
 def _table(section: str) -> Mapping[str, tuple[str, ...]]:
     """``names``: a class -> its other names; ``uses``: what things are for -> every class that serves."""
-    table = tomllib.loads(Path(__file__).with_name("words.toml").read_text(encoding="utf-8"))
+    table = parse_toml(file_text(Path(__file__).with_name("words.toml")))
     return {phrase: tuple(entries) for phrase, entries in table[section].items()}
 
 

@@ -15,6 +15,7 @@ from pydantic import ValidationError
 
 from su3d_bench.core.config import KeyPath, Settings, flatten, read_file, resolve, toml_value
 from su3d_bench.core.errors import ConfigError, DataError, PredictionError, StoreError, printable, suggest
+from su3d_bench.core.files import file_bytes
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.types import Prediction
 from su3d_bench.metrics.costs import UpdateTimes
@@ -150,7 +151,7 @@ class FinishedRun:
             if not is_file(file):
                 continue
             try:
-                of_scene = unpack_scores(file.read_bytes())
+                of_scene = unpack_scores(file_bytes(file))
             except DataError as error:
                 raise DataError(f"{printable(scene, 120)}: {method}: {error}") from error
             for protocol, score in of_scene.items():

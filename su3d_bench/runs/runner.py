@@ -19,6 +19,7 @@ from typing import Any
 from su3d_bench.core.config import KeyPath, flatten, write_toml
 from su3d_bench.core.digests import code_digest, git_state, package_versions
 from su3d_bench.core.errors import StoreError
+from su3d_bench.core.files import file_bytes
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.core.timing import hardware_line, processor_digest
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
@@ -252,7 +253,7 @@ def _read_scores(plan: Plan, outcomes: Sequence[MethodOutcome], file_of: Callabl
     for outcome in outcomes:
         file = file_of(plan.folder.job(outcome.scene, outcome.method))
         if outcome.error is None and file.is_file():
-            scores |= {(name, outcome.scene): score for name, score in unpack_scores(file.read_bytes()).items()}
+            scores |= {(name, outcome.scene): score for name, score in unpack_scores(file_bytes(file)).items()}
     return scores
 
 

@@ -15,6 +15,7 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from su3d_bench.core.digests import digest_json
 from su3d_bench.core.errors import DataError, printable, reading
+from su3d_bench.core.files import file_bytes
 from su3d_bench.store.atomic import write_json
 
 SCHEMA = 1
@@ -288,7 +289,7 @@ def read_record(path: Path, kind: type[Read], schema: int, maker: str, again: st
     with reading(where, DataError):
         if path.stat().st_size > MOST_BYTES:
             raise DataError(f"{where}: has more than {MOST_BYTES >> 20} MiB; it is no file of su3d-bench {maker}")
-        content = path.read_bytes()
+        content = file_bytes(path)
     try:
         record = TypeAdapter(kind).validate_json(content, strict=True)
     except ValidationError as error:

@@ -16,7 +16,7 @@ import sys
 import zipfile
 import zlib
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager, nullcontext, suppress
 from functools import lru_cache
 from pathlib import Path
 from typing import IO, Any
@@ -25,6 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DAMAGE, StoreError, reading
+from su3d_bench.core.files import file_text, opened
 from su3d_bench.core.printing import escaped_json
 from su3d_bench.store.unfinished import SHARED, beside, clear_unfinished, new_file, own_file
 from su3d_bench.store.unpacking import Allowance, allowance_of, check_member, member_bytes
@@ -148,7 +149,7 @@ def read_json(path: Path) -> Any:
     """The value of a JSON file; a missing or damaged file is a ``StoreError``."""
     try:
         with reading(str(path), StoreError):
-            return json.loads(path.read_text(encoding="utf-8"))
+            return json.loads(file_text(path))
     except (ValueError, RecursionError) as error:
         raise StoreError(f"{path}: not readable as JSON; run the same command again to mend it") from error
 
@@ -160,7 +161,8 @@ def read_arrays(source: Path | IO[bytes]) -> dict[str, NDArray[Any]]:
     and so is an archive that unpacks to far more than it is.
     """
     held = source.getvalue() if isinstance(source, io.BytesIO) else None
-    with zipfile.ZipFile(source) as archive:
+    whole = opened(source) if isinstance(source, Path) else nullcontext(source)
+    with whole as stream, zipfile.ZipFile(stream) as archive:
         allowance, members = allowance_of(archive), archive.infolist()
         arrays = {info.filename.removesuffix(".npy"): _array(archive, info, held, allowance) for info in members}
     for name, array in arrays.items():

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DAMAGE, PredictionError, StoreError
+from su3d_bench.core.files import regular
 from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.store.atomic import read_npz, remove_file, replacing, write_npz
 from su3d_bench.store.scratch import row_blocks
@@ -113,7 +114,7 @@ def read_prediction(path: Path) -> Prediction:
 
 def _mapped_rows(path: Path) -> NDArray[Any]:
     try:
-        table: NDArray[Any] = np.lib.format.open_memmap(path, mode="r")
+        table: NDArray[Any] = np.lib.format.open_memmap(regular(path), mode="r")
     except DAMAGE as error:
         raise StoreError(f"{path}: not a readable .npy file ({error}); delete it and run again") from error
     if table.ndim != 2 or table.dtype.kind != "f":

@@ -17,6 +17,7 @@ import numpy as np
 from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
 from su3d_bench.core.errors import DataError, StoreError, printable
+from su3d_bench.core.files import opened_text
 from su3d_bench.core.types import Float64Array
 from su3d_bench.store.atomic import read_json
 
@@ -285,7 +286,7 @@ def updates_text(rows: Sequence[Mapping[str, float | int]]) -> str:
 def read_updates(file: Path, where: str) -> dict[str, Float64Array]:
     """The columns (N,) of an ``updates.csv``, none where no update was timed; ``where`` begins a ``DataError``."""
     try:
-        with file.open(newline="", encoding="utf-8") as stream:
+        with opened_text(file, newline="") as stream:
             reader = csv.reader(stream)
             header = next(reader, [])
             rows = [row for row, _ in zip(reader, range(MOST_UPDATES), strict=False)]

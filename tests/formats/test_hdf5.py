@@ -141,7 +141,7 @@ def stored(content: bytes) -> Any:
         (lambda path: write(path.parent, name="points"), "has no dataset 'pc_points'"),
         (lambda path: path.write_bytes(b"not this format" * 100), "not a readable HDF5 file"),
         (lambda path: path.write_bytes(b""), "not a readable HDF5 file"),
-        (lambda path: path.mkdir(), "not a readable HDF5 file"),
+        (lambda path: path.mkdir(), "cannot be read: Is a directory"),
         (lambda path: None, "cannot be read: No such file or directory"),
         (written(ROWS[:, :2]), "has the shape (40, 2); expected (N, 3)"),
         (written(ROWS[:, 0]), "has the shape (40,); expected (N, 3)"),

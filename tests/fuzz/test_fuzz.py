@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import math
 import random
-from collections.abc import Callable
+import re
+from collections.abc import Callable, Iterable
 from functools import partial
 from pathlib import Path
 
 import pytest
 from fuzz_mutations import MOST_BYTES, _json, _text, mutated
 from fuzz_targets import TARGETS
-from fuzzing import MOST_ADDRESSES_BYTES, BadMessage, Input, Read, Sample, Target, every_one_of
+from fuzzing import ENDLESS, MOST_ADDRESSES_BYTES, BadMessage, Input, Read, Sample, Target, every_one_of
 from memory import bounded_addresses
 
 from su3d_bench.core.errors import DataError
@@ -36,6 +37,26 @@ def test_a_reader_meets_damage_with_nothing_but_typed_errors_soon_and_in_little_
     n = math.ceil(N_INPUTS * TARGETS[name].weight / WEIGHT)
     faults = [(index, fault) for index, fault in enumerate(faults_of(TARGETS[name], tmp_path / "sample", n)) if fault]
     assert not faults, f"python benchmarks fuzz --only '{name}' --first {faults[0][0]} --inputs 1: {faults[0][1]}"
+
+
+@pytest.mark.parametrize("name", TARGETS)
+def test_no_reader_waits_for_a_pipe_or_reads_a_device(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("SU3D_DATA", str(tmp_path / "data"))
+    sample = Sample(TARGETS[name], tmp_path / "sample")
+    with bounded_addresses(MOST_ADDRESSES_BYTES):
+        sample.read()
+        for file in one_of_each_kind(sample.whole):
+            for shape in ENDLESS:
+                assert sample.meet(Input(0, file, None, shape)).fault is None, f"{file} is a {shape}"
+
+
+def one_of_each_kind(files: Iterable[str]) -> list[str]:
+    """Of files whose names differ in digits alone, the first; at most 12."""
+    kinds = {re.sub(r"\d+", "0", file): file for file in sorted(files, reverse=True)}
+    return sorted(kinds.values())[:12]
 
 
 # What the harness itself finds

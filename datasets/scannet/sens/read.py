@@ -8,7 +8,6 @@ held against the size of the file first. Source: ScanNet, SensReader/c++/sensorD
 from __future__ import annotations
 
 import os
-import stat
 import struct
 import zlib
 from collections.abc import Iterator, Sequence
@@ -21,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, reading
+from su3d_bench.core.files import opened
 from su3d_bench.core.types import Float64Array, Int64Array, UInt8Array
 from su3d_bench.datasets.recordings.source import SensorPair
 from su3d_bench.datasets.scannet.sens.header import COUNT, MAX_FRAMES, MAX_HEADER_BYTES, SensHeader, parse_header
@@ -157,15 +157,11 @@ def _opened(path: Path, where: str) -> Iterator[int]:
     """A descriptor of the file; what goes wrong with it is a ``DataError``."""
     with reading(where, DataError):
         try:
-            handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)  # a pipe would be waited for
+            stream = opened(path)
         except FileNotFoundError as error:
             raise DataError(f"{where} is missing; copy the recording into {path.parent}") from error
-        try:
-            if not stat.S_ISREG(os.fstat(handle).st_mode):
-                raise DataError(f"{where} is not a file; copy the recording there")
-            yield handle
-        finally:
-            os.close(handle)
+        with stream:
+            yield stream.fileno()
 
 
 def _check_promise(n_frames: int, n_left: int, where: str) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
@@ -11,6 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files import file_text
+from su3d_bench.core.toml import parse_toml
 
 ROOM_NAME, SCAN_NAME = re.compile(r"([a-z]+)(\d{1,2})"), re.compile(r"scene9(\d)(\d\d)_00")
 # The columns of scannetv2-labels.combined.tsv in the order of the release.
@@ -33,7 +34,7 @@ class Category:
 
 @cache
 def _facts() -> Mapping[str, Any]:
-    return tomllib.loads(Path(__file__).with_name("categories.toml").read_text(encoding="utf-8"))
+    return parse_toml(file_text(Path(__file__).with_name("categories.toml")))
 
 
 @cache

@@ -11,6 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from su3d_bench.core.files import file_bytes
 from su3d_bench.core.types import Float64Array, Frame
 from su3d_bench.datasets.scannet.writing.layout import DEPTH_SHIFT, SENSOR_NAME, ScannetLayout, intrinsics_4x4, size_of
 from su3d_bench.datasets.writing import ScannedDataset, SceneTarget
@@ -62,7 +63,7 @@ class CppExportLayout(ScannetLayout):
         if target.has_frames:
             return
         camera = intrinsics_4x4(dataset.intrinsics)
-        width, height = size_of((target.partial / self.frame_names(0)[0]).read_bytes())
+        width, height = size_of(file_bytes(target.partial / self.frame_names(0)[0]))
         facts = {"m_versionNumber": "4", "m_sensorName": SENSOR_NAME}
         facts |= {f"m_{sensor}{side}": str(n) for sensor in ("color", "depth")
                   for side, n in (("Width", width), ("Height", height))}  # fmt: skip

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from su3d_bench.core.files import file_bytes
 from su3d_bench.core.types import Float64Array, Frame
 from su3d_bench.datasets.scannet.labels import TABLE_NAME
 from su3d_bench.datasets.scannet.sens.header import SensHeader
@@ -90,8 +91,8 @@ class SensLayout(ScannetLayout):
         if not target.has_frames:
             n_frames = len(dataset.frames(target.scene, 1))
             pieces = [target.partial / name for index in range(n_frames) for name in self.frame_names(index)]
-            header = sens_header(dataset.intrinsics, size_of(pieces[0].read_bytes()[FRAME_RECORD.itemsize :]))
-            records = (piece.read_bytes() for piece in pieces)
+            header = sens_header(dataset.intrinsics, size_of(file_bytes(pieces[0])[FRAME_RECORD.itemsize :]))
+            records = (file_bytes(piece) for piece in pieces)
             write_sens(target.partial / target.frames, header, records, np.zeros(0, MOTION_RECORD))
         if (target.partial / PIECES).exists():
             shutil.rmtree(target.partial / PIECES)

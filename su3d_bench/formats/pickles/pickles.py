@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import BinaryIO, cast
 
 from su3d_bench.core.errors import PredictionError, printable, reading
+from su3d_bench.core.files import opened
 from su3d_bench.formats.pickles.pickle_constructors import CONSTRUCTORS, Constructors, Forgotten, Inert, RefusedError
 from su3d_bench.formats.pickles.pickle_machine import PickleMachine
 from su3d_bench.store.unpacking import UnpackingError
@@ -28,7 +29,7 @@ def read_pickle_file(path: Path, *, forget: Iterable[str] = ()) -> object:
     become ``Inert``. Raises ``PredictionError`` for whatever is damaged or not plain data.
     """
     where = printable(str(path), 300)
-    with reading(where), path.open("rb") as stream:
+    with reading(where), opened(path) as stream:
         is_gzip = stream.read(2) == GZIP_START
         n_bytes = stream.seek(0, io.SEEK_END)
         stream.seek(0)

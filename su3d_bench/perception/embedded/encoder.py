@@ -15,6 +15,7 @@ import numpy as np
 
 from su3d_bench.core.devices import require
 from su3d_bench.core.errors import ModelMissing
+from su3d_bench.core.files import file_bytes
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.perception.embedded.text import TOKENIZER_VERSION, token_ids
 from su3d_bench.perception.models.encoders.image_transform import check_image
@@ -85,7 +86,7 @@ class EmbeddedEncoder:
         versions += "" if kind == "cpu" else f"/torch on {kind}"
         content = hashlib.sha256(versions.encode())
         for name in (IMAGE_FILE, TEXT_FILE):
-            content.update(hashlib.sha256(self._path(name).read_bytes()).digest())
+            content.update(hashlib.sha256(file_bytes(self._path(name))).digest())
         return content.hexdigest()
 
     def encode_images(self, images: Sequence[UInt8Array]) -> Float32Array:

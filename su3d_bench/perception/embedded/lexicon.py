@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from su3d_bench.core.files import file_text
+from su3d_bench.core.toml import parse_toml
+
 Words = Mapping[str, tuple[str, ...]]
-_TABLE: Mapping[str, Any] = tomllib.loads(Path(__file__).with_name("lexicon.toml").read_text(encoding="utf-8"))
+_TABLE: Mapping[str, Any] = parse_toml(file_text(Path(__file__).with_name("lexicon.toml")))
 
 
 def _words(section: str) -> Words:

@@ -17,6 +17,8 @@ from typing import Any
 from pydantic import TypeAdapter
 
 from su3d_bench.core.digests import digest_json
+from su3d_bench.core.errors import StoreError
+from su3d_bench.core.files import file_text
 from su3d_bench.perception.language.chat import ChatRequest, Reply
 from su3d_bench.store.atomic import json_text, make_folder, write_bytes, write_error, write_text
 from su3d_bench.store.run_folder import refuse_links
@@ -45,7 +47,7 @@ class ReplyStore:
         try:
             if not path.is_file() or path.stat().st_size > MOST_ENTRY_BYTES:
                 return None
-            entry: Any = json.loads(path.read_text(encoding="utf-8"))
+            entry: Any = json.loads(file_text(path))
             digests = digest_json(entry["request"]), digest_json(entry["reply"])
             if entry["schema"] != SCHEMA or digests != (key, entry["reply_sha256"]):
                 return None

@@ -19,6 +19,7 @@ from typing import Any
 from su3d_bench.core.devices import require
 from su3d_bench.core.digests import digest_bytes, digest_file
 from su3d_bench.core.errors import ConfigError, DataError, ModelMissing, PredictionError, StoreError, converted
+from su3d_bench.core.files import file_text, regular
 from su3d_bench.formats.torch_zip import check_stored
 from su3d_bench.perception.models.catalogue import FormName, ModelEntry, ModelForm, model_entry
 from su3d_bench.store.atomic import make_folder, read_json, write_json
@@ -147,7 +148,7 @@ def _snapshots(folder: Path) -> Iterator[Path]:
     """The snapshot that ``main`` stands for; where that is not known, the only one."""
     snapshots = folder / "snapshots"
     try:
-        revision = (folder / "refs" / "main").read_text(encoding="ascii").strip()
+        revision = file_text(folder / "refs" / "main").strip()
     except (OSError, UnicodeDecodeError):
         revision = ""
     if revision.isalnum() and (snapshots / revision).is_dir():
@@ -250,8 +251,8 @@ def _read_safetensors(path: Path, device: str) -> Any:
     safetensors, torch = (require(package, f"{path.name}:") for package in ("safetensors", "torch"))
     try:
         if device != "meta":
-            return require("safetensors.torch", f"{path.name}:").load_file(str(path), device=device)
-        with safetensors.safe_open(str(path), framework="pt") as file:
+            return require("safetensors.torch", f"{path.name}:").load_file(str(regular(path)), device=device)
+        with safetensors.safe_open(str(regular(path)), framework="pt") as file:
             return {name: torch.empty(file.get_slice(name).get_shape(), device="meta") for name in file.keys()}  # noqa: SIM118
     except (safetensors.SafetensorError, OSError, ValueError, RuntimeError) as error:
         raise DataError(f"{path}: not readable as safetensors: {bounded(error)}; fetch it anew") from error
@@ -262,7 +263,7 @@ def _read_pickled(path: Path, device: str) -> Any:
     with converted(PredictionError, DataError):
         check_stored(path)
     try:
-        return torch.load(path, map_location=device, weights_only=True)
+        return torch.load(regular(path), map_location=device, weights_only=True)
     except pickle.UnpicklingError as error:
         raise DataError(
             f"{path}: holds more than plain tensors, which is refused because it can run code; use the model's "
@@ -282,7 +283,7 @@ def read_settings(path: Path) -> dict[str, Any]:
     """The table in a JSON file of a model's folder, of bounded size; raises ``DataError`` for anything else."""
     check_settings_size(path)
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(file_text(path))
     except OSError as error:
         raise DataError(f"{path}: cannot be read ({error.strerror}); fetch it from where the weights come") from error
     except (ValueError, RecursionError) as error:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import json
 import re
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError
+from su3d_bench.core.files import file_bytes, file_text
+from su3d_bench.core.toml import parse_toml
 from su3d_bench.core.types import BoolArray, Float32Array, Frame, Regions, SceneInfo
 from su3d_bench.formats.images import decoded, whole_png_header
 from su3d_bench.perception.crops import mask_boxes
@@ -79,7 +80,7 @@ def decode_labels(path: Path, shape: tuple[int, ...], where: str) -> NDArray[Any
     import cv2
 
     try:
-        content = path.read_bytes()
+        content = file_bytes(path)
     except OSError as error:
         raise DataError(f"{where} cannot be read: {error.strerror}") from error
     header = whole_png_header(content)
@@ -105,8 +106,8 @@ def read_names(path: Path, where: str) -> dict[int, str]:
     try:
         if path.stat().st_size > MAX_NAMES_BYTES:
             raise DataError(f"{where} has {path.stat().st_size} bytes; expected a table of names")
-        text = path.read_text(encoding="utf-8")
-        table = json.loads(text) if path.suffix == ".json" else tomllib.loads(text)
+        text = file_text(path)
+        table = json.loads(text) if path.suffix == ".json" else parse_toml(text)
     except OSError as error:
         raise DataError(f"{where} cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:

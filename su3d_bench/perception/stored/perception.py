@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from su3d_bench.core.files import file_bytes
 from su3d_bench.core.interfaces import Encoder, RegionPerception, StageTimer
 from su3d_bench.core.types import Detections, Frame, PerceptionNeeds, Regions
 from su3d_bench.perception.cache import FrameCache, content_key
@@ -61,5 +62,5 @@ def content_digest(files: Iterable[Path]) -> str:
     """A digest of the names and contents of ``files``, in their order."""
     hasher = hashlib.sha256()
     for path in files:
-        hasher.update(path.name.encode() + b"\0" + hashlib.sha256(path.read_bytes()).digest())
+        hasher.update(path.name.encode() + b"\0" + hashlib.sha256(file_bytes(path)).digest())
     return hasher.hexdigest()

@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import DataError, printable
+from su3d_bench.core.files import file_bytes, opened
 from su3d_bench.questions.files.queries import MOST_OBJECTS_ID, is_text
 from su3d_bench.questions.model import REASONING, Question, new_question
 
@@ -50,7 +51,7 @@ def is_foreign(path: Path) -> bool:
         return True
     if suffix not in (".csv", ".txt") or not path.is_file():
         return False
-    with path.open("rb") as file:
+    with opened(path) as file:
         line = file.read(_FIRST_BYTES).partition(b"\n")[0].decode("utf-8", "replace")
     if suffix == ".txt":
         return _is_scene(line.strip())
@@ -115,7 +116,7 @@ def _text_of(path: Path, where: str) -> str:
         size = path.stat().st_size
         if size > MOST_BYTES:
             raise DataError(f"{where}: has {size} bytes; expected at most {MOST_BYTES}")
-        return path.read_bytes().decode("utf-8-sig")
+        return file_bytes(path).decode("utf-8-sig")
     except OSError as error:
         raise DataError(f"{where}: cannot be read: {error.strerror or error}") from error
     except UnicodeDecodeError as error:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import csv
 import io
-import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,6 +14,8 @@ from typing import Any
 
 from su3d_bench.core.config import toml_value
 from su3d_bench.core.errors import DataError, printable
+from su3d_bench.core.files import file_text
+from su3d_bench.core.toml import parse_toml
 from su3d_bench.questions.files.datasets import is_foreign, read_foreign
 from su3d_bench.questions.files.queries import COLUMNS, MORE_COLUMNS, read_query_rows
 from su3d_bench.questions.model import ALL_KINDS, KINDS, REASONING, Question, new_question
@@ -94,7 +95,7 @@ def figure_texts(figure: str) -> tuple[str, ...]:
 
 
 def _paper() -> dict[str, Any]:
-    return tomllib.loads(PAPER.read_text(encoding="utf-8"))
+    return parse_toml(file_text(PAPER))
 
 
 def check_form(path: Path) -> None:

@@ -8,7 +8,6 @@ data: anything but control characters stands in them as it is.
 from __future__ import annotations
 
 import csv
-import tomllib
 import unicodedata
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from su3d_bench.core.errors import DataError, printable
+from su3d_bench.core.toml import parse_toml
 from su3d_bench.core.types import GroundTruth
 from su3d_bench.datasets.recordings.recorded_frames import read_text
 from su3d_bench.formats.tables.separated import separated_rows
@@ -91,8 +91,8 @@ def query_truth(truth: GroundTruth, queries: tuple[TextQuery, ...], where: str) 
 
 def _toml_rows(text: str, where: str) -> Iterator[QueryRow]:
     try:
-        content = tomllib.loads(text)
-    except (ValueError, RecursionError) as error:  # no TOML, or an integer of thousands of digits
+        content = parse_toml(text)
+    except ValueError as error:
         raise DataError(f"{where}: not TOML ({printable(str(error), 120)})") from error
     tables = content.get("query")
     if set(content) != {"query"} or not isinstance(tables, list):

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from su3d_bench.core.errors import DataError, printable, reading, suggest
+from su3d_bench.core.files import file_bytes
 from su3d_bench.formats.tables.separated import separated_rows
 from su3d_bench.formats.tables.workbooks import read_workbook
 from su3d_bench.questions.model import KINDS
@@ -48,7 +49,7 @@ def read_answers(path: Path) -> list[AnswerRow]:
         size = path.stat().st_size
         if size > (MOST_TEXT_BYTES if suffix == ".csv" else MOST_BYTES):
             raise DataError(f"{where}: has {size >> 20} MiB; a file of answers is smaller")
-        content = path.read_bytes()
+        content = file_bytes(path)
     return parse_csv(content, where) if suffix == ".csv" else parse_workbook(content, where)
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from su3d_bench.core.errors import DataError, printable, reading, suggest
+from su3d_bench.core.files import file_bytes
 from su3d_bench.numerics.statistics import share_interval
 from su3d_bench.reports.tables.model import Cell, Table, TableRow, bracketed, percent
 from su3d_bench.sheets.items import ARGUABLE, RIGHT, VERDICTS, WRONG
@@ -43,7 +44,7 @@ def read_verdicts(path: Path) -> list[Verdict]:
     with reading(where, DataError):
         if path.stat().st_size > MOST_TEXT_BYTES:
             raise DataError(f"{where}: has {path.stat().st_size >> 20} MiB; an audit is smaller")
-        rows = csv_rows(path.read_bytes(), where)
+        rows = csv_rows(file_bytes(path), where)
     header = [name.strip().lower() for name in rows[0]] if rows else []
     missing = [name for name in COLUMNS if header.count(name) != 1]
     if missing:

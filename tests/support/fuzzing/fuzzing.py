@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import random
 import shutil
 import signal
@@ -23,7 +24,8 @@ MOST_SECONDS = 20.0  # one read of a small file; generous, for a busy machine
 MOST_GROWN_BYTES = 256 << 20  # how far the peak of resident memory may stand above what was there before the read
 MOST_ADDRESSES_BYTES = 2 << 30  # how much address space a read may reserve
 MOST_CHARACTERS = 1000  # of a message, the names of files in it
-SHAPES = ("missing", "folder", "loop")  # a file that is not there, or is none
+ENDLESS = {"pipe": "a pipe", "device": "a device"}  # what is waited for, and what has no end
+SHAPES = ("missing", "folder", "loop", *ENDLESS)  # a file that is not there, or is none
 Read = Callable[[], object]
 Make = Callable[[Path], Read]
 
@@ -109,6 +111,10 @@ class Sample:
             path.mkdir()
         elif shape == "loop":
             path.symlink_to(path.name)
+        elif shape == "pipe":
+            os.mkfifo(path)
+        elif shape == "device":
+            path.symlink_to("/dev/zero")
         elif content is not None:
             path.write_bytes(content)
 

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 
 from su3d_bench.core import registry
+from su3d_bench.core.files import file_text, regular
 from su3d_bench.core.types import Float32Array, Frame, Int32Array, Int64Array, Regions, UInt8Array
 from su3d_bench.perception.crops import crop_window, mask_boxes
 from su3d_bench.perception.embedded.captions import CropTruth, Neighbour
@@ -78,12 +79,12 @@ def make_crops(scenes: Sequence[str], frames_per_room: int, seed: int, folder: P
 
 def read_crops(scenes: Sequence[str], folder: Path) -> CropSet:
     """The crops of ``scenes`` from the files that ``make_crops`` left in ``folder``."""
-    facts = [json.loads(_facts_path(folder, scene).read_text()) for scene in scenes]
+    facts = [json.loads(file_text(_facts_path(folder, scene))) for scene in scenes]
     rows = [row for of_scene in facts for row in of_scene]
     pixels = np.empty((len(rows), IMAGE_SIZE, IMAGE_SIZE, 3), np.uint8)
     start = 0
     for scene, of_scene in zip(scenes, facts, strict=True):
-        pixels[start : start + len(of_scene)] = np.load(_pixels_path(folder, scene))
+        pixels[start : start + len(of_scene)] = np.load(regular(_pixels_path(folder, scene)))
         start += len(of_scene)
     return CropSet(
         pixels,

@@ -22,6 +22,7 @@ import jinja2
 import numpy as np
 
 from su3d_bench.core.errors import ModelMissing, Su3dError
+from su3d_bench.core.files import file_bytes, file_text
 from su3d_bench.core.printing import doors
 from su3d_bench.perception.embedded.encoder import DIM, IMAGE_FILE, IMAGE_SIZE, TEXT_FILE, EmbeddedEncoder
 from su3d_bench.perception.embedded.text import N_IDS, N_WORDS, token_ids
@@ -125,7 +126,7 @@ def _write_card(
     figures: Sequence[Figure],
     difference: float,
 ) -> None:
-    files = {name: (order.out / name).read_bytes() for name in (IMAGE_FILE, TEXT_FILE)}
+    files = {name: file_bytes(order.out / name) for name in (IMAGE_FILE, TEXT_FILE)}
     card = {
         "name": EmbeddedEncoder.name,
         "digest": EmbeddedEncoder(order.out).digest,
@@ -157,7 +158,7 @@ def _write_card(
         "largest_difference_from_torch": difference,
     }
     (order.out / CARD_JSON).write_text(json.dumps(card, indent=1) + "\n")
-    template = (Path(__file__).parent / "model_card.md.j2").read_text()
+    template = file_text(Path(__file__).parent / "model_card.md.j2")
     environment = jinja2.Environment(undefined=jinja2.StrictUndefined, keep_trailing_newline=True)
     text = environment.from_string(template).render(card, program=PROGRAM, card_json=CARD_JSON)
     (order.out / CARD_TEXT).write_text(text)

@@ -11,6 +11,7 @@ import numpy as np
 
 from su3d_bench.core.devices import make_deterministic, require
 from su3d_bench.core.errors import DataError, ModelMissing
+from su3d_bench.core.files import file_text
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.perception.cache import content_key
@@ -149,7 +150,7 @@ def read_word_list(path: Path | None) -> tuple[str, ...]:
     try:
         if path.stat().st_size > MAX_LIST_BYTES:
             raise DataError(f"{path}: has {path.stat().st_size} bytes; expected a list of words, one a line")
-        words = listed_words(path.read_text(encoding="utf-8"))
+        words = listed_words(file_text(path))
     except OSError as error:
         raise DataError(f"{path}: the list of words cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:

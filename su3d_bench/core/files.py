@@ -1,0 +1,65 @@
+"""The door through which files are read: a regular file, or an ``OSError`` at once.
+
+A pipe in the place of a file is waited for, for ever, and a device such as ``/dev/zero`` has no end. Nothing outside of
+this module opens a file for reading.
+"""
+
+from __future__ import annotations
+
+import errno
+import io
+import os
+import stat
+from pathlib import Path
+from typing import IO
+
+KINDS = (
+    (stat.S_ISFIFO, "a pipe"),
+    (stat.S_ISCHR, "a device"),
+    (stat.S_ISBLK, "a device"),
+    (stat.S_ISSOCK, "a socket"),
+)
+
+
+def regular(path: Path) -> Path:
+    """``path``, for a library that opens files itself; an ``OSError`` where no regular file is there."""
+    _refuse_others(os.stat(path).st_mode, path)
+    return path
+
+
+def opened(path: Path) -> IO[bytes]:
+    """The content of ``path`` as a stream; an ``OSError`` where no regular file is there."""
+    regular(path)  # a device may act on being opened
+    handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)
+    try:
+        _refuse_others(os.fstat(handle).st_mode, path)  # what was opened may have taken the place of what was looked at
+        return os.fdopen(handle, "rb")
+    except BaseException:
+        os.close(handle)
+        raise
+
+
+def opened_text(path: Path, *, errors: str = "strict", newline: str | None = None) -> IO[str]:
+    """The UTF-8 text in ``path`` as a stream; ``newline`` as ``open`` has it."""
+    return io.TextIOWrapper(opened(path), "utf-8", errors, newline)
+
+
+def file_bytes(path: Path) -> bytes:
+    """The content of ``path``."""
+    with opened(path) as stream:
+        return stream.read()
+
+
+def file_text(path: Path, *, errors: str = "strict") -> str:
+    """The UTF-8 text in ``path``, its line ends as ``\\n``."""
+    with opened_text(path, errors=errors) as stream:
+        return stream.read()
+
+
+def _refuse_others(mode: int, path: Path) -> None:
+    if stat.S_ISREG(mode):
+        return
+    if stat.S_ISDIR(mode):
+        raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR), str(path))
+    kind = next((name for is_kind, name in KINDS if is_kind(mode)), "something else")
+    raise OSError(errno.EINVAL, f"{kind} stands where a file should be", str(path))
