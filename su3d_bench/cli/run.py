@@ -141,7 +141,10 @@ def settings_of(arguments: argparse.Namespace) -> Settings:
 def carry_out(plan: Plan, arguments: argparse.Namespace) -> int:
     from su3d_bench.cli.common import progress
     from su3d_bench.runs.runner import run_plan
+    from su3d_bench.store.caches import why_slow
 
+    if (line := why_slow()) is not None:
+        remark(f"su3d-bench: {line}", quiet=arguments.quiet)
     with progress(len(plan.jobs), is_quiet=arguments.quiet) as report:
         result = run_plan(plan, report)
     _answer_result(result, arguments)
