@@ -27,7 +27,7 @@ def regular(path: Path) -> Path:
     return path
 
 
-def opened(path: Path) -> IO[bytes]:
+def opened(path: Path) -> io.BufferedReader:
     """The content of ``path`` as a stream; an ``OSError`` where no regular file is there."""
     regular(path)  # a device may act on being opened
     handle = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK | os.O_NOCTTY)

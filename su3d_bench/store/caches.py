@@ -29,8 +29,8 @@ def why_slow() -> str | None:
         return None
     tried = ", ".join(map(shown, folders))
     return (
-        f"compiled code cannot be kept in any of {tried}: every scene compiles it again, which takes longer than many a "
-        "scene; set NUMBA_CACHE_DIR to a folder that can be written"
+        f"compiled code cannot be kept in any of {tried}: every scene compiles it again, which takes longer than "
+        "many a scene; set NUMBA_CACHE_DIR to a folder that can be written"
     )
 
 

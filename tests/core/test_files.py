@@ -47,7 +47,7 @@ def test_what_is_no_regular_file_is_refused_at_once(kind: str, reason: str, tmp_
         path.mkdir()
     for read in (regular, opened, opened_text, file_bytes, file_text):
         with pytest.raises(OSError) as caught:
-            read(path)  # type: ignore[operator]
+            read(path)
         assert caught.value.strerror == reason
 
 
