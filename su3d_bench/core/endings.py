@@ -37,14 +37,14 @@ def ending_in_order() -> Iterator[None]:
 
     One that is ignored, as after ``nohup``, stays so. In another thread than the main one the block changes nothing.
     """
-    heard_s = -DEAF_S
+    heard_s, ended = -DEAF_S, 0
 
     def raise_ended(number: int, frame: FrameType | None) -> None:
-        nonlocal heard_s
+        nonlocal heard_s, ended
         if number == signal.SIGHUP:
             _let_go_of_terminals()
         if time.monotonic() - heard_s >= DEAF_S:
-            heard_s = time.monotonic()
+            heard_s, ended = time.monotonic(), number
             raise Ended(number)
 
     if threading.current_thread() is not threading.main_thread():
@@ -52,6 +52,24 @@ def ending_in_order() -> Iterator[None]:
         return
     heard = [number for number in ENDING if signal.getsignal(number) != signal.SIG_IGN]
     before = {number: signal.signal(number, raise_ended) for number in heard}
+    try:
+        yield
+    except KeyboardInterrupt as interrupt:
+        if ended and not isinstance(interrupt, Ended):  # Ray takes what a handler raises for a Ctrl-C
+            raise Ended(ended) from interrupt
+        raise
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
+@contextmanager
+def kept_handlers() -> Iterator[None]:
+    """What hears the signals of ``ENDING`` before the block hears them after it, whatever a library puts there."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in ENDING}
     try:
         yield
     finally:

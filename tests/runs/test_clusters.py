@@ -86,6 +86,17 @@ def workers_of(node: Any) -> list[psutil.Process]:
     )
 
 
+def test_a_run_on_a_cluster_that_is_asked_to_end_ends_in_order(cluster: Any) -> None:
+    where = ("--executor", "ray", "--ray-address", cluster.address, "--set", "painted.frame_ms=5000")
+    command = [sys.executable, str(SCENES / "painted_cli.py"), *words(*where, out="ended")]
+    driver = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    workers_of(cluster.doomed)
+    driver.send_signal(signal.SIGTERM)
+    _, said = driver.communicate(timeout=WHILE_LOADED_S)
+    assert (driver.returncode, said) == (143, "su3d-bench: ended by SIGTERM; the same command takes it up again\n")
+    assert json.loads(Path("ended/run.json").read_text())["status"] == "interrupted"
+
+
 def test_a_machine_that_dies_in_mid_run_costs_no_scene_and_no_byte(cluster: Any) -> None:
     assert run("--jobs", "1", out="inline") == 0
     command = [sys.executable, str(SCENES / "painted_cli.py"), *words("--executor", "ray", out="ray")]

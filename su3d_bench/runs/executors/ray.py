@@ -14,6 +14,7 @@ from typing import Any
 
 from su3d_bench.core.config import RunConfig
 from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, package_versions
+from su3d_bench.core.endings import kept_handlers
 from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError
 from su3d_bench.runs.executors.local import Outcome, Report, Unit, Work, answer_of, limit_threads, unwrap
 
@@ -109,7 +110,8 @@ def _connected(config: RunConfig) -> Iterator[Any]:
 
 def _connect(ray: Any, address: str) -> None:
     try:
-        ray.init(address=address, log_to_driver=False, logging_level="error")
+        with kept_handlers():  # Ray's own would end the process as if a check had failed
+            ray.init(address=address, log_to_driver=False, logging_level="error")
     except (ConnectionError, RuntimeError, ValueError, OSError, TimeoutError) as error:
         line = " ".join(str(error).split())[:300]
         raise ConfigError(
