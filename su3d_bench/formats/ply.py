@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from su3d_bench.core.errors import DataError, reading
-from su3d_bench.core.files import file_bytes
+from su3d_bench.core.files import file_bytes, opened
 from su3d_bench.core.types import Int64Array
 from su3d_bench.formats.ply_parts import (
     NAMES_OF_TYPES,
@@ -106,7 +106,7 @@ def first_rows(path: Path, name: str) -> dict[str, AnyArray]:
     Empty where the element is not the first of a binary file or has lists. Raises as ``read_ply`` does.
     """
     where = str(path)
-    with reading(where, DataError), path.open("rb") as file:
+    with reading(where, DataError), opened(path) as file:
         content = file.read(FIRST_BYTES)
     header = read_header(content, where)
     promise = header.elements[0] if header.elements else None

@@ -71,9 +71,12 @@ class TimedRegions:
     """Perception on demand, its time told apart from that of the method that asks for it."""
 
     def __init__(self, regions: RegionPerception, clock: MethodClock) -> None:
-        self.dim = regions.dim
         self._regions = regions
         self._clock = clock
+
+    @property
+    def dim(self) -> int:
+        return self._regions.dim
 
     def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
         with self._clock.perception():
