@@ -34,7 +34,8 @@ from su3d_bench.core.types import (
 class RegionPerception(Protocol):
     """Perception on demand, for methods that choose themselves where in an image to look."""
 
-    dim: int
+    @property
+    def dim(self) -> int: ...
 
     def mask_at(self, frame: Frame, points: Int64Array) -> tuple[BoolArray, float]:
         """The mask (H, W) of what lies under the pixels ``points`` (P, 2), x y, and how sure the segmenter is of it."""

@@ -103,7 +103,7 @@ def torch_kind(path: Path) -> Kind | None:
 
 def check_stored(path: Path) -> None:
     """Refuses an archive of torch.save that is compressed: torch writes none, and would unpack any."""
-    with reading(shown(path)), path.open("rb") as stream:
+    with reading(shown(path)), opened(path) as stream:
         is_zip = stream.read(4) == ZIP_START
     if is_zip:
         with opened_zip(path) as archive:
