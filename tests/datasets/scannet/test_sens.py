@@ -403,7 +403,7 @@ def test_a_missing_file_a_folder_and_a_pipe_are_data_errors(tmp_path: Path) -> N
     os.mkfifo(tmp_path / "pipe.sens")
     for name in ("folder.sens", "pipe.sens"):
         with pytest.raises(
-            DataError, match=rf"{name} : cannot be read: (Is a directory|a pipe stands where a file should be)"
+            DataError, match=rf"{name}: cannot be read: (Is a directory|a pipe stands where a file should be)"
         ):
             SensFile(tmp_path / name, WHERE)
 
