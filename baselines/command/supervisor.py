@@ -31,6 +31,9 @@ PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36  # linux/prctl.h
 
 
 def main(orders: int, answers: int) -> None:
+    # A child of nobody: Ray ends the children of a worker that it ends, and others end whole trees of processes.
+    if os.fork() > 0:
+        os._exit(0)
     # Whoever ends all processes of a job, a closed terminal among them, would leave the program without its supervisor.
     # Handlers, for a signal that is ignored would be ignored by the program too.
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
