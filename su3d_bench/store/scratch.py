@@ -142,8 +142,8 @@ class TemporaryFolder:
         """Remove the folder; once is enough, twice is no fault."""
         if self._lock >= 0:
             shutil.rmtree(self.path, ignore_errors=True)
-            os.close(self._lock)
-            self._lock = -1
+            lock, self._lock = self._lock, -1  # first, so that an interrupt here closes nothing twice
+            os.close(lock)
 
     def __enter__(self) -> Path:
         return self.path

@@ -63,9 +63,6 @@ class KeptPerception(ColourPerception):
             raise AssertionError("the perception cache answered with masks of another frame")
         return found
 
-    def regions(self) -> None:
-        """Nothing: a program of somebody else has perception of its own."""
-
 
 def kept_perception(*_: Any, cache_root: Path, **__: Any) -> KeptPerception:
     return KeptPerception(cache_root)
