@@ -297,6 +297,14 @@ class Replica:
             self._mesh = scene, read_annotated_mesh(self._original(scene), self._where(scene))
         return self._mesh[1]
 
+    def _instead(self, scene: str) -> str:
+        """A clause on what scores the scene without its mesh; empty where nothing does."""
+        try:
+            object_boxes_of(self._info(scene), self._where(scene))
+        except DataError:
+            return ""
+        return "; the protocol replica-boxes scores it by the boxes of its objects"
+
     def _original(self, scene: str) -> Path:
         """The scene's folder in the original release, with both files of the truth."""
         original, where = find_original_scene(self.root, scene), self._where(scene)
@@ -307,5 +315,6 @@ class Replica:
             )
         for name in (MESH_NAME, INFO_NAME):
             if not (original / name).exists():
-                raise GroundTruthMissing(f"{where}: no ground truth; {original / name} is missing")
+                reason = f"{original / name} is missing{self._instead(scene)}"
+                raise GroundTruthMissing(f"{where}: no ground truth; {reason}")
         return original

@@ -254,7 +254,7 @@ def _rules(name: str | None, dataset: Any) -> ProtocolRules:
 
 
 def _has_masks(rules: ProtocolRules) -> bool:
-    return rules.vocabulary is not None and rules.confidence is not None
+    return rules.names_masks and rules.confidence is not None
 
 
 def _encoder(content: Content, source: Source, rules: ProtocolRules, texts: Path | None) -> Encoder | None:

@@ -209,7 +209,8 @@ def _form(rules: ProtocolRules, kept: SceneOutcomes, file_confidences: bool) -> 
         warnings=(),
     )
     lines = [*_scene_warnings(kept), *_confidence_warnings(rules, evaluation, file_confidences), *kept.warnings]
-    lines += [line for line in result.warnings if CONSTANT_CONFIDENCE not in line]  # said above, for all scenes at once
+    # of kind 'instance' said above, for all scenes at once
+    lines += [line for line in result.warnings if not (rules.needs_instances and CONSTANT_CONFIDENCE in line)]
     return replace(evaluation, warnings=tuple(_once(lines)))
 
 

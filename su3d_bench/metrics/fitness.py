@@ -90,7 +90,7 @@ class ContentFacts:
 
 def why_not_truth(rules: ProtocolRules, truth: TruthFacts) -> str | None:
     """Why no prediction at all can be scored under a protocol against a truth."""
-    if rules.is_judged and not truth.has_points:
+    if (rules.is_judged or rules.needs_boxes) and not truth.has_points:
         return "needs the objects of a dataset; name one with --dataset"
     if rules.needs_instances and not truth.has_instances:
         return "needs instances, the ground truth holds class ids alone (expected class id * 1000 + instance)"
@@ -144,7 +144,7 @@ def why_not_map(rules: ProtocolRules, content: ContentFacts) -> str | None:
 
 def _why_not_named(rules: ProtocolRules, content: ContentFacts) -> str | None:
     """Why masks cannot get the classes that a protocol of classes asks for."""
-    if rules.class_agnostic is not None or rules.needs_own_points or not content.n:
+    if rules.class_agnostic is not None or (rules.needs_own_points and not rules.vocabulary) or not content.n:
         return None
     if not content.has_labels and content.n_dimensions is None:
         is_map = content.has_own_points

@@ -20,12 +20,13 @@ from su3d_bench.metrics.protocol_files import line_of, protocol_names, read_cont
 ValuesOfMetric = Mapping[str, tuple[str, ...]]
 CATEGORIES = ("synonyms", "depictions", "vis_sim", "clutter", "missing", "incorrect")
 AP_NAMES = ("AP", "AP50", "AP25")
+BOX_AXES = Literal["truth", "world"]
 _CURVE_FIELDS = ("min_region_size", "thresholds", "confidence")
 _NEEDS_QUESTIONS = "questions: kinds 'retrieval' and 'reasoning' need them, and min_region_size"
-_ONLY_CURVES = "min_region_size, thresholds and confidence belong to kind 'instance' or 'queries'"
+_ONLY_CURVES = "min_region_size, thresholds and confidence belong to kind 'instance', 'boxes' or 'queries'"
 # The fields that not every kind has, and what is said where one is missing or out of place.
 _OWN_FIELDS = {
-    "classes": "classes: needed where labels count, that is under kinds 'semantic' and 'instance'",
+    "classes": "classes: needed where labels count, that is under kinds 'semantic', 'instance' and 'boxes'",
     "class_agnostic": "class_agnostic: belongs to kind 'instance'",
     "void": "void: belongs to kind 'instance'",
     "vocabulary": "vocabulary: belongs to protocols that choose among classes, and these need it",
@@ -38,6 +39,7 @@ _OWN_FIELDS = {
     "synonyms": "synonyms: kind 'annotation' and generated questions need a table, others take none",
     "merging": "merging: kind 'annotation' needs it, others take none",
     "answers": "answers: kind 'reasoning' needs it, others take none",
+    "box_axes": "box_axes: kind 'boxes' needs it, others take none",
 }
 
 
@@ -98,12 +100,12 @@ class ProtocolRules(_Strict):
     """One evaluation, complete: the same rules and the same prediction give the same number.
 
     ``kind``: ``semantic`` (a class a point), ``instance`` (masks with a class), ``queries`` (masks ranked for each
-    text), ``categories`` (how near a point's label comes to those of its object), or what people are asked otherwise:
-    ``retrieval`` (the first mask of each text), ``annotation`` (names and shapes of masks), ``reasoning`` (questions
-    that boxes settle). ``questions`` are those of the ``dataset`` itself or ``generated`` from the truth, ``per_kind``
-    of each kind at most; ``synonyms`` names the table of other names of classes. Protocols that are not ``by_default``
-    run where they are named. ``classes`` is the label set in
-    the order of the original; ``ignore`` names classes that are known but not scored, and for ``categories`` labels
+    text), ``boxes`` (with a class), ``categories`` (how near a point's label comes to those of its object), or what
+    people are asked otherwise: ``retrieval`` (the first mask of each text), ``annotation`` (names and shapes of masks),
+    ``reasoning`` (questions that boxes settle). ``questions`` are those of the ``dataset`` itself or ``generated`` from
+    the truth, ``per_kind`` of each kind at most; ``synonyms`` names the table of other names of classes. Protocols that
+    are not ``by_default`` run where they are named. ``classes`` is the label set in the order of the original;
+    ``ignore`` names classes that are known but not scored, and for ``categories`` labels
     whose objects are not. ``vocabulary``: the classifier chooses among ``all`` classes, the ``scored`` ones, or those
     scored ones that the ``scene``'s ground truth contains. ``prompt`` has ``{}`` for the class name, which
     ``prompt_names`` may replace; of several ``prompts`` the mean feature counts. ``confidence``: ``ones`` for every
@@ -113,16 +115,19 @@ class ProtocolRules(_Strict):
     rest is void), all ``annotated`` ones, ``numbered``, where a number alone tells an object, whatever its class, or
     ``everything``, with the points that nobody annotated as one more. ``void``: masks on it are ``false-positives``;
     where absent, they are dropped at every threshold that their share of void is above, as in ScanNet's script.
+    ``box_axes``: the box of an instance is the smallest around its points along the axes of the ``truth``'s box that it
+    is held against, or along those of the ``world``.
     """
 
     name: str
     version: Annotated[int, Field(ge=1)]
     summary: str
-    kind: Literal["semantic", "instance", "queries", "categories", "retrieval", "annotation", "reasoning"]
+    kind: Literal["semantic", "instance", "boxes", "queries", "categories", "retrieval", "annotation", "reasoning"]
     metric: Literal[
         "conceptgraphs",
         "scannet",
         "hovsg",
+        "votenet",
         "query-ap",
         "openlex3d-topn",
         "openlex3d-ranking",
@@ -154,6 +159,7 @@ class ProtocolRules(_Strict):
     synonyms: Literal["lexicon"] | None = None
     merging: MergeRules | None = None
     answers: AnswerRules | None = None
+    box_axes: BOX_AXES | None = None
     aggregate: Literal["pooled", "scene-mean"] = "pooled"
     headline: Annotated[tuple[str, ...], Field(min_length=1)]
     not_comparable_with: tuple[str, ...] = ()
@@ -165,6 +171,7 @@ class ProtocolRules(_Strict):
     takes_dense: ClassVar[bool] = False  # a map with one feature a point
     goes_by_names: ClassVar[bool] = False  # of instances, without features
     needs_own_points: ClassVar[bool] = False  # objects are found by the points of the map itself
+    needs_boxes: ClassVar[bool] = False  # in the truth
     is_judged: ClassVar[bool] = False  # its counts are how many were judged and how many are right
     names_points: ClassVar[bool] = False  # a class for every point
     needs_instances: ClassVar[bool] = False  # in the truth and in the prediction
@@ -308,6 +315,29 @@ class InstanceRules(ProtocolRules):
         return ("classes",) if self.class_agnostic == "scored" else ()
 
 
+class BoxRules(ProtocolRules):
+    """Boxes with a class."""
+
+    values_of_metric: ClassVar[ValuesOfMetric] = {
+        "votenet": ("AP25", "AP50", "centroid", "class", "recall25", "recall50", "precision25", "precision50")
+    }
+    needs_own_points = True
+    needs_boxes = True
+    confidences = ("ones", "prediction")
+    needs = ("classes", "vocabulary", "box_axes")
+    takes = _CURVE_FIELDS
+
+    def _check_metric(self) -> None:
+        super()._check_metric()
+        if self.thresholds != (0.25, 0.5):
+            raise ValueError("thresholds: kind 'boxes' takes [0.25, 0.5]")
+
+    def _check_transfer(self) -> None:
+        super()._check_transfer()
+        if self.transfer.cap_m is not None or self.transfer.evaluation_voxel_m > 0:
+            raise ValueError("transfer.cap_m: kind 'boxes' transfers nothing; it takes no cap_m, no evaluation_voxel_m")
+
+
 class QueryRules(ProtocolRules):
     """Masks ranked for each text."""
 
@@ -387,6 +417,7 @@ class ReasoningRules(_JudgedRules):
 RULES_OF_KIND: dict[str, type[ProtocolRules]] = {
     "semantic": SemanticRules,
     "instance": InstanceRules,
+    "boxes": BoxRules,
     "queries": QueryRules,
     "categories": CategoryRules,
     "retrieval": RetrievalRules,

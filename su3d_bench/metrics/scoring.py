@@ -19,6 +19,7 @@ from su3d_bench.core.errors import DAMAGE, DataError, PredictionError, printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, Partition, Prediction
 from su3d_bench.metrics.fitness import why_not_scorable
+from su3d_bench.metrics.instance.box_score import BoxMetric
 from su3d_bench.metrics.instance.score import InstanceMetric
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.metric import MOST_COUNTED, Counts, Metric, SceneScore, scene_mean
@@ -49,6 +50,7 @@ Truth = GroundTruth | OpenLexTruth | QueryTruth | QuestionTruth
 METRICS: dict[str, type[Metric[Any]]] = {
     "semantic": SemanticMetric,
     "instance": InstanceMetric,
+    "boxes": BoxMetric,
     "queries": QueryMetric,
     "categories": CategoriesMetric,
     "retrieval": RetrievalMetric,

@@ -185,6 +185,17 @@ class _Scene:
         return self._truths[variant]
 
     @cached_property
+    def first_truth(self) -> GroundTruth:
+        """The first variant that is here, which methods that take the truth are told."""
+        missing = list[GroundTruthMissing]()
+        for variant in self.dataset.variants:
+            try:
+                return self.truth(variant)
+            except GroundTruthMissing as error:
+                missing.append(error)
+        raise missing[0]
+
+    @cached_property
     def perception_config(self) -> PerceptionConfig:
         config: PerceptionConfig = PerceptionConfig.model_validate_json(self.job.perception)
         return config
@@ -266,7 +277,7 @@ class _Scene:
         if isinstance(method, TakesTruth):
             if not self.dataset.variants:
                 raise GroundTruthMissing(f"{self.job.scene}: {method.name} needs ground truth, the dataset has none")
-            truth = self.truth(self.dataset.variants[0])
+            truth = self.first_truth
             with clock.running("start"):
                 method.receive_truth(truth)
         _warm_up(part, device)
@@ -364,7 +375,7 @@ class _Scene:
         """``prediction``; that of a method that was told the truth is told anew where ``truth`` names its classes
         otherwise than the truth that it was told: a dataset may have two sets of labels."""
         method = build_method(part)
-        if not isinstance(method, TakesTruth) or truth.labels == self.truth(self.dataset.variants[0]).labels:
+        if not isinstance(method, TakesTruth) or truth.labels == self.first_truth.labels:
             return prediction
         method.receive_truth(truth)
         renamed: Prediction = method.finish()

@@ -42,7 +42,7 @@ NAMES = {
     "replica-ovo51", "rooms-instance", "rooms-semantic", "scannet-instance",
     "scannet-semantic", "scannet200-instance", "scannet200-semantic", "rooms-retrieval", "replica-retrieval",
     "scannet-retrieval", "rooms-annotation", "replica-annotation", "scannet-annotation", "rooms-reasoning",
-    "replica-reasoning", "scannet-reasoning",
+    "replica-reasoning", "scannet-reasoning", "replica-boxes",
 }  # fmt: skip
 
 

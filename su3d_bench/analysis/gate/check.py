@@ -22,9 +22,11 @@ from su3d_bench.store.records import NumbersRecord
 
 _SHARES = ("recall", "precision", "IoU", "F1", "F1-conceptgraphs", "mPrecision", "mF1", "mF1-conceptgraphs", "pAcc")
 _OF_QUESTIONS = ("instance", "affordance", "property", "relative", "all", "answer", "objects")
+_OF_BOXES = ("centroid", "class", "recall25", "recall50", "precision25", "precision50")
 _OF_LABELS = ("label n", "label n'", "well-merged", "well-merged n'")
+_JUDGED = (*_OF_QUESTIONS, *_OF_LABELS)
 HIGHER_IS_BETTER = frozenset(
-    {"AP", "AP50", "AP25", "mAcc", "mIoU", "F-mIoU", "synonyms", "overall", *_SHARES, *_OF_QUESTIONS, *_OF_LABELS}
+    {"AP", "AP50", "AP25", "mAcc", "mIoU", "F-mIoU", "synonyms", "overall", *_SHARES, *_OF_BOXES, *_JUDGED}
 )
 
 

@@ -121,6 +121,36 @@ def test_a_scene_without_frames_can_be_looked_at_and_not_run(root: Path, capsys:
     assert "no frames; expected traj.txt and results/" in capsys.readouterr().err
 
 
+def test_a_scene_without_its_mesh_is_scored_by_its_boxes(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    words = ["run", "--scenes", "replica/room0", "--methods", "oracle", "--no-pictures", "--jobs", "1"]
+    assert main([*words, "--out", "by-default"]) == 0
+    told = capsys.readouterr()
+    assert "the protocol replica-boxes scores it by the boxes of its objects" in told.out + told.err
+    assert main([*words, "--protocols", "replica-boxes", "--out", "out"]) == 0
+    assert "replica-boxes" in capsys.readouterr().out
+    (result,) = json.loads(Path("out/metrics.json").read_text())["results"]
+    assert (result["protocol"], result["kind"], result["n_planned"]) == ("replica-boxes", "boxes", 1)
+    assert set(result["result"]["metrics"].values()) == {1.0} and set(result["ceiling"].values()) == {1.0}
+    assert set(result["result"]["per_class"]["chair"].values()) == {1.0}
+    table = "evaluate out --dataset replica --protocol replica-boxes --per-class --json a.json".split()
+    assert main([*table, "--quiet"]) == 0
+    scored = json.loads(Path("a.json").read_text())["protocols"]["replica-boxes"]
+    assert scored["metrics"] == {name.lower(): 1.0 for name in result["result"]["metrics"]} == scored["ceiling"]
+    # a lamp of half a metre whose true box stands a quarter aside: an IoU of a third
+    info = Path(INFO)
+    told_otherwise = json.loads(info.read_text())
+    straight = next(row for row in told_otherwise["objects"] if row["id"] == 8)["oriented_bbox"]["orientation"]
+    straight["translation"][0] += 0.25
+    info.write_text(json.dumps(told_otherwise))
+    assert main([*table, "--quiet"]) == 0
+    moved = json.loads(Path("a.json").read_text())["protocols"]["replica-boxes"]
+    assert (moved["metrics"]["ap25"], moved["metrics"]["ap50"], moved["metrics"]["centroid"]) == (1.0, 0.5, 1.0)
+    assert moved["per_class"]["lamp"]["ap50"] == 0.0
+    for verb in ("tables", "html"):
+        assert main(["report", verb, "out"]) == 0
+    assert "| oracle | 100.0 | 100.0 | 100.0    | 100.0 |" in capsys.readouterr().out
+
+
 def test_beside_rendered_scenes_one_without_frames_is_reached_by_its_name_alone(root: Path) -> None:
     shutil.copytree(root / "replica_v1" / "room_0", root / "replica_v1" / "apartment_0")
     replica = Replica(root)

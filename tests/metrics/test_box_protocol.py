@@ -1,0 +1,421 @@
+"""Protocols of kind ``boxes``: overlaps known in closed form, counts by hand, and another program for each number."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from su3d_bench.core.errors import ConfigError, DataError
+from su3d_bench.core.types import Float64Array, GroundTruth, Instances, LabelSet, ObjectBoxes, OrientedBox
+from su3d_bench.datasets.replica.boxes import box_truth
+from su3d_bench.metrics.fitness import ContentFacts, TruthFacts, why_not_content, why_not_truth
+from su3d_bench.metrics.instance.box_counts import THRESHOLDS, BoxCounts, count_boxes
+from su3d_bench.metrics.instance.box_overlap import box_iou, shared_volume, smallest_box
+from su3d_bench.metrics.metric import SceneScore
+from su3d_bench.metrics.protocols import ProtocolRules, load_protocol, read_protocol
+from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores
+
+RULES = load_protocol("replica-boxes")
+IDS = {entry.name: entry.id for entry in RULES.classes}
+WALL = 93
+Problem = tuple[np.ndarray, list[int], list[int], list[float]]  # IoU, true classes, predicted ones, confidences
+LABELS = LabelSet("replica", (*IDS.values(), WALL), (*IDS, "wall"))
+
+
+def turn(*degrees: float) -> Float64Array:
+    """The rotation about z, then y, then x by so many degrees."""
+    whole = np.eye(3)
+    for axis, angle in zip((2, 1, 0), np.radians(degrees), strict=False):
+        u, v = (axis + 1) % 3, (axis + 2) % 3
+        one = np.eye(3)
+        one[[u, v], [u, v]] = np.cos(angle)
+        one[u, v], one[v, u] = -np.sin(angle), np.sin(angle)
+        whole = one @ whole
+    return whole
+
+
+def box(centre: tuple[float, ...], sizes: tuple[float, ...], rotation: Float64Array | None = None) -> OrientedBox:
+    return OrientedBox(np.array(centre), np.array(sizes), np.eye(3) if rotation is None else rotation)
+
+
+# ---- overlaps
+
+UNIT = box((0, 0, 0), (1, 1, 1))
+OCTAGON = 2 * (math.sqrt(2) - 1)  # a unit square and itself turned by 45 degrees share a regular octagon
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "shared"),
+    [
+        (UNIT, UNIT, 1.0),
+        (UNIT, box((0.5, 0, 0), (1, 1, 1)), 0.5),
+        (UNIT, box((0.5, 0.5, 0.5), (1, 1, 1)), 0.125),
+        (UNIT, box((1, 0, 0), (1, 1, 1)), 0.0),
+        (UNIT, box((5, 0, 0), (1, 1, 1), turn(30)), 0.0),
+        (UNIT, box((0, 0, 0), (0.5, 0.2, 0.1), turn(20, 30, 40)), 0.01),
+        (UNIT, box((0, 0, 0), (9, 9, 9), turn(20, 30, 40)), 1.0),
+        (UNIT, box((0, 0, 0), (1, 1, 1), turn(90)), 1.0),
+        (UNIT, box((0, 0, 0), (1, 1, 1), turn(45)), OCTAGON),
+        (UNIT, box((0, 0, 0.75), (1, 1, 1), turn(45)), OCTAGON / 4),
+        (box((3, 4, 5), (1, 1, 1), turn(10)), box((3, 4, 5), (1, 1, 1), turn(55)), OCTAGON),
+        # a long bar along the diagonal of the xy plane: a hexagonal slice of width w is sqrt(2) w - w^2 / 2 of a square
+        (UNIT, box((0, 0, 0), (9, 0.2, 9), turn(45)), math.sqrt(2) * 0.2 - 0.02),
+        (UNIT, box((0, 0, 0), (1, 1, 0), turn(45)), 0.0),
+    ],
+)
+def test_the_shared_volume_of_boxes_is_that_of_the_formula(
+    first: OrientedBox, second: OrientedBox, shared: float
+) -> None:
+    for one, other in ((first, second), (second, first)):
+        assert shared_volume(one, other) == pytest.approx(shared, abs=1e-12)
+        either = float(np.prod(one.sizes) + np.prod(other.sizes)) - shared
+        assert box_iou(one, other) == pytest.approx(shared / either, abs=1e-12)
+
+
+def test_a_corner_cut_across_the_diagonal_of_space_has_its_volume() -> None:
+    """A half space whose border leaves the cube's corner at t along each edge cuts off t^3 / 6."""
+    normal = np.ones(3) / math.sqrt(3)
+    first = np.array([1.0, -1.0, 0.0]) / math.sqrt(2)
+    axes = np.stack([first, np.cross(normal, first), normal], axis=1)
+    for t in (0.1, 0.5, 1.0):
+        border = (1.5 - t) / math.sqrt(3)
+        beyond = OrientedBox(normal * (border + 10), np.array([40.0, 40.0, 20.0]), axes)
+        assert shared_volume(UNIT, beyond) == pytest.approx(t**3 / 6, abs=1e-12)
+
+
+def test_the_shared_volume_of_random_boxes_is_that_of_the_hull_of_their_half_spaces() -> None:
+    from scipy.optimize import linprog
+    from scipy.spatial import ConvexHull, HalfspaceIntersection
+
+    rng = np.random.default_rng(4)
+    n_met = 0
+    for _ in range(150):
+        pair = [
+            OrientedBox(rng.uniform(-0.7, 0.7, 3), rng.uniform(0.3, 2, 3), turn(*rng.uniform(-180, 180, 3)))
+            for _ in range(2)
+        ]
+        sides = np.concatenate(
+            [
+                np.column_stack([s * one.rotation.T, -s * one.rotation.T @ one.centre - one.sizes / 2])
+                for one in pair
+                for s in (1, -1)
+            ]
+        )
+        inner = linprog(
+            [0, 0, 0, -1],
+            A_ub=np.column_stack([sides[:, :3], np.ones(12)]),
+            b_ub=-sides[:, 3],
+            bounds=[(None, None)] * 4,
+        )
+        expected = 0.0
+        if inner.x[3] > 1e-9:
+            expected = ConvexHull(HalfspaceIntersection(sides, inner.x[:3]).intersections).volume
+            n_met += 1
+        assert shared_volume(*pair) == pytest.approx(expected, abs=1e-9)
+        assert shared_volume(*pair) == pytest.approx(shared_volume(*pair[::-1]), abs=1e-12)
+    assert n_met > 100
+
+
+def test_the_smallest_box_of_the_corners_of_a_box_is_the_box() -> None:
+    turned = box((1, 2, 3), (0.5, 1, 2), turn(20, 30, 40))
+    found = smallest_box(turned.corners, turned.rotation)
+    np.testing.assert_allclose(found.centre, turned.centre, atol=1e-12)
+    np.testing.assert_allclose(found.sizes, turned.sizes, atol=1e-12)
+
+
+# ---- counts and curves
+
+
+def counted(
+    iou: list[list[float]], true: list[int], called: list[int], scores: list[float], n_classes: int = 2
+) -> BoxCounts:
+    table = np.array(iou, float).reshape(len(called), len(true))
+    return count_boxes(table, table > 0, np.array(true, int), np.array(called, int), np.array(scores), n_classes)
+
+
+def values(*counts: BoxCounts, rules: ProtocolRules | None = None) -> dict[str, float]:
+    rules = rules or RULES.model_copy(update={"classes": RULES.classes[: len(counts[0].n_truth)]})
+    return metric_of(rules).combine(list(counts))
+
+
+def test_of_two_instances_on_one_box_the_more_confident_one_is_right() -> None:
+    both = values(counted([[0.9], [0.6]], [0], [0, 0], [0.4, 0.8]))
+    assert (both["AP25"], both["AP50"], both["recall50"], both["precision50"]) == (1.0, 1.0, 1.0, 0.5)
+    # the more confident one is too loose for 0.5 and takes its place in the curve as a wrong one
+    loose = values(counted([[0.9], [0.4]], [0], [0, 0], [0.4, 0.8]))
+    assert (loose["AP25"], loose["AP50"], loose["recall50"]) == (1.0, 0.5, 1.0)
+
+
+def test_an_instance_whose_best_box_is_taken_is_wrong_though_another_is_free() -> None:
+    found = values(counted([[0.9, 0.0], [0.7, 0.6]], [0, 0], [0, 0], [0.9, 0.8]))
+    assert (found["AP50"], found["recall50"], found["precision50"], found["centroid"]) == (0.5, 0.5, 0.5, 1.0)
+
+
+def test_an_iou_must_be_above_its_threshold() -> None:
+    found = values(counted([[0.5]], [0], [0], [1.0]))
+    assert (found["AP25"], found["AP50"]) == (1.0, 0.0)
+    assert values(counted([[0.25]], [0], [0], [1.0]))["AP25"] == 0.0
+
+
+def test_instances_of_one_confidence_enter_the_curve_together_in_whatever_order() -> None:
+    rows, true = [[0.9, 0.0], [0.0, 0.0], [0.0, 0.8]], [0, 0]
+    for order in ([0, 1, 2], [1, 0, 2], [2, 1, 0]):
+        found = values(counted([rows[k] for k in order], true, [0, 0, 0], [1.0] * 3))
+        assert found["AP50"] == pytest.approx(2 / 3) and found["recall50"] == 1.0
+
+
+def test_the_area_is_under_the_envelope() -> None:
+    """Right, wrong, right of three boxes: precision 1 up to a third, then 2/3 up to two thirds."""
+    found = values(counted([[0.9, 0, 0], [0, 0, 0], [0, 0.9, 0]], [0, 0, 0], [0, 0, 0], [0.9, 0.8, 0.7]))
+    assert found["AP50"] == pytest.approx(1 / 3 + 2 / 3 / 3)
+
+
+def test_a_missing_class_counts_nothing_and_one_that_nobody_predicts_counts_zero() -> None:
+    found = values(counted([[0.9, 0.0]], [0, 1], [0], [1.0], 3))
+    assert (found["AP50"], found["recall50"], found["precision50"], found["centroid"]) == (0.5, 0.5, 1.0, 0.5)
+    # an instance of a class without a box lowers precision alone
+    wrong = values(counted([[0.9, 0.0], [0.0, 0.0]], [0, 1], [0, 2], [1.0, 1.0], 3))
+    assert (wrong["AP50"], wrong["precision50"]) == (0.5, 0.5)
+
+
+def test_an_empty_map_scores_zero_and_a_scene_without_boxes_nothing() -> None:
+    empty = values(counted([], [0, 1], [], []))
+    assert {empty[name] for name in ("AP25", "AP50", "centroid", "recall25", "recall50")} == {0.0}
+    assert all(math.isnan(empty[name]) for name in ("class", "precision25", "precision50"))
+    nothing = values(counted([[]], [], [0], [1.0]))
+    assert nothing["precision50"] == 0.0
+    assert all(math.isnan(nothing[name]) for name in ("AP25", "AP50", "centroid", "class", "recall25"))
+
+
+def test_the_class_is_that_of_the_best_instance_on_a_box() -> None:
+    assert values(counted([[0.3], [0.9]], [0], [1, 0], [0.9, 0.5]))["class"] == 0.0
+    assert values(counted([[0.2], [0.9]], [0], [1, 0], [0.9, 0.5]))["class"] == 1.0  # the first finds nothing
+    assert values(counted([[0.3], [0.9]], [0], [1, 0], [0.5, 0.5]))["class"] == 1.0  # of equals the nearer
+    assert values(counted([[0.9]], [0], [-1], [0.5]))["class"] == 0.0  # of none of the classes
+
+
+def plain_ap(rows: list[tuple[float, bool]], n_truth: int) -> float:
+    """The area under the envelope, one vertex a confidence, in plain loops."""
+    points = [(0.0, 1.0)]
+    for confidence in sorted({score for score, _ in rows}, reverse=True):
+        taken = [is_true for score, is_true in rows if score >= confidence]
+        points.append((sum(taken) / n_truth, sum(taken) / len(taken)))
+    return sum(
+        (here[0] - before[0]) * max(p for _, p in points[i + 1 :]) for i, (before, here) in enumerate(pairwise(points))
+    )
+
+
+def plain_values(scenes: list[Problem], n_classes: int) -> dict[str, float]:
+    """All numbers of scenes (iou, true, called, scores) in plain loops over one box and instance at a time."""
+    answer, n_true, n_rows = dict[str, float](), dict.fromkeys(THRESHOLDS, 0), 0
+    for threshold in THRESHOLDS:
+        areas, recalls = [], []
+        for c in range(n_classes):
+            rows, n_truth = [], 0
+            for iou, true, called, scores in scenes:
+                columns = [g for g, each in enumerate(true) if each == c]
+                n_truth += len(columns)
+                taken = set()
+                for k in sorted((k for k, each in enumerate(called) if each == c), key=lambda k: -scores[k]):
+                    best = max(columns, key=lambda g: iou[k, g], default=None)
+                    is_true = best is not None and iou[k, best] > threshold and best not in taken
+                    taken |= {best} if is_true else set()
+                    rows.append((scores[k], is_true))
+            n_true[threshold] += sum(is_true for _, is_true in rows)
+            n_rows += len(rows)
+            if n_truth:
+                areas.append(plain_ap(rows, n_truth))
+                recalls.append(sum(is_true for _, is_true in rows) / n_truth)
+        place = f"{100 * threshold:.0f}"
+        answer[f"AP{place}"], answer[f"recall{place}"] = float(np.mean(areas)), float(np.mean(recalls))
+    n_rows //= len(THRESHOLDS)
+    answer |= {f"precision{100 * t:.0f}": n_true[t] / n_rows for t in THRESHOLDS}
+    located = named = centred = n_boxes = 0
+    for iou, true, called, scores in scenes:
+        for g, c in enumerate(true):
+            n_boxes += 1
+            centred += any(iou[k, g] > 0 and called[k] == c for k in range(len(called)))
+            on = [k for k in range(len(called)) if iou[k].argmax() == g and iou[k, g] > 0.25]
+            if on:
+                located += 1
+                named += called[max(on, key=lambda k: (scores[k], iou[k, g]))] == c
+    return answer | {"centroid": centred / n_boxes, "class": named / located}
+
+
+def random_scenes(rng: np.random.Generator, n_classes: int) -> list[Problem]:
+    scenes = []
+    for _ in range(rng.integers(1, 5)):
+        k, g = rng.integers(1, 12), rng.integers(1, 8)
+        iou = rng.uniform(0, 1, (k, g)) * (rng.uniform(size=(k, g)) < 0.5)
+        called = rng.integers(-1, n_classes, k).tolist()
+        scenes.append((iou, rng.integers(0, n_classes, g).tolist(), called, (rng.integers(0, 6, k) / 5).tolist()))
+    return scenes
+
+
+def test_the_numbers_of_random_problems_are_those_of_plain_loops() -> None:
+    rng = np.random.default_rng(8)
+    n_compared = 0
+    for _ in range(200):
+        scenes = random_scenes(rng, 3)
+        counts = [counted(iou.tolist(), true, called, scores, 3) for iou, true, called, scores in scenes]
+        if sum(len(one.score) for one in counts) and sum(one.n_located.sum() for one in counts):
+            expected, found = plain_values(scenes, 3), values(*counts)
+            assert found.keys() == expected.keys()
+            for name, value in expected.items():
+                assert found[name] == pytest.approx(value, abs=1e-12), name
+            n_compared += 1
+        for one in counts:
+            BoxCounts.checked({name: getattr(one, name) for name in BoxCounts.arrays})
+    assert n_compared > 150
+
+
+def test_scenes_drawn_several_times_count_as_so_many_scenes() -> None:
+    rng = np.random.default_rng(3)
+    rules = RULES.model_copy(update={"classes": RULES.classes[:3]})
+    for _ in range(20):
+        scenes = [counted(iou.tolist(), true, called, scores, 3) for iou, true, called, scores in random_scenes(rng, 3)]
+        weights = rng.integers(0, 3, (4, len(scenes)))
+        weights[0] = 1
+        drawn = metric_of(rules).resampled(scenes, weights)
+        classes = metric_of(rules).resampled_classes(scenes, weights)
+        for r, row in enumerate(weights):
+            repeated = [scene for scene, n in zip(scenes, row, strict=True) for _ in range(n)]
+            if repeated:
+                pooled = metric_of(rules).pooled(repeated)
+                np.testing.assert_allclose([drawn[name][r] for name in pooled.values], list(pooled.values.values()))
+                for name, columns in classes.items():
+                    known = [pooled.classes[name][column] for column in columns]
+                    np.testing.assert_allclose([column[r] for column in columns.values()], known)
+
+
+# ---- scenes
+
+
+def truth_of(*objects: tuple[str, OrientedBox]) -> GroundTruth:
+    ids = {**IDS, "wall": WALL}
+    boxes = {k + 1: one for k, (_, one) in enumerate(objects)}
+    return box_truth(ObjectBoxes(boxes, {k + 1: ids[name] for k, (name, _) in enumerate(objects)}, LABELS))
+
+
+def map_of(*instances: tuple[str, OrientedBox, float]) -> Instances:
+    """A map whose instances are the corners of boxes."""
+    points = np.concatenate([np.zeros((0, 3)), *(one.corners for _, one, _ in instances)]).astype(np.float32)
+    masks = [np.arange(8 * k, 8 * k + 8) for k in range(len(instances))]
+    scores = np.array([score for _, _, score in instances])
+    return Instances.of(points, masks, scores, labels=tuple(name for name, _, _ in instances))
+
+
+CHAIR, SOFA = box((0, 0, 0), (1, 1, 1), turn(30, 20, 10)), box((4, 0, 0), (2, 1, 1), turn(-50))
+
+
+def score_of(truth: GroundTruth, prediction: Instances, rules: ProtocolRules = RULES) -> SceneScore:
+    return score_scene(rules, truth, prediction, None)
+
+
+def test_perfect_instances_score_one_however_their_objects_are_turned() -> None:
+    truth = truth_of(("chair", CHAIR), ("sofa", SOFA), ("wall", box((0, 9, 0), (9, 0.1, 3))))
+    result = combine(RULES, {"a": score_of(truth, map_of(("chair", CHAIR, 0.9), ("sofa", SOFA, 0.3)))})
+    assert set(result.metrics.values()) == {1.0}
+    assert set(result.per_class["chair"].values()) == {1.0} and math.isnan(result.per_class["lamp"]["AP25"])
+    assert all(math.isnan(share) for share in result.coverage.values())
+
+
+def test_along_the_axes_of_the_world_a_turned_object_has_the_iou_of_the_formula() -> None:
+    """A cube turned by 45 degrees about z fills half of its straight box."""
+    turned = box((1, 2, 3), (1, 1, 1), turn(45))
+    truth, prediction = truth_of(("chair", turned)), map_of(("chair", turned, 1.0))
+    along_truth, along_world = (
+        combine(rules, {"a": score_of(truth, prediction, rules)}).metrics
+        for rules in (RULES, RULES.model_copy(update={"box_axes": "world"}))
+    )
+    assert (along_truth["AP50"], along_world["AP25"]) == (1.0, 1.0)
+    flat = truth_of(("chair", box((1, 2, 3), (1, 1, 0.98), turn(45))))  # now below a half
+    assert combine(RULES, {"a": score_of(flat, prediction)}).metrics["AP50"] == 1.0
+    rules = RULES.model_copy(update={"box_axes": "world"})
+    assert combine(rules, {"a": score_of(flat, prediction, rules)}).metrics["AP50"] == 0.0
+
+
+def test_a_centroid_beside_its_box_a_class_beside_its_object_and_few_points_are_told() -> None:
+    truth = truth_of(("chair", CHAIR), ("sofa", SOFA))
+    beside = map_of(("chair", box((1.2, 0, 0), (1, 1, 1)), 1.0), ("table", SOFA, 0.5))
+    metrics = combine(RULES, {"a": score_of(truth, beside)}).metrics
+    assert (metrics["centroid"], metrics["class"], metrics["AP25"], metrics["precision25"]) == (0.0, 0.0, 0.0, 0.0)
+    few = Instances.of(CHAIR.corners[:4].astype(np.float32), [np.arange(4)], labels=("chair",))
+    counts = score_of(truth, few).counts
+    assert isinstance(counts, BoxCounts) and not len(counts.score)
+
+
+def test_labels_outside_the_classes_and_an_empty_map_are_scored() -> None:
+    truth = truth_of(("chair", CHAIR))
+    for prediction in (map_of(("unicorn", CHAIR, 1.0)), map_of()):
+        metrics = combine(RULES, {"a": score_of(truth, prediction)}).metrics
+        assert (metrics["AP25"], metrics["centroid"]) == (0.0, 0.0)
+
+
+def test_scenes_together_have_intervals_and_one_confidence_a_warning() -> None:
+    truth = truth_of(("chair", CHAIR), ("sofa", SOFA))
+    both = map_of(("chair", CHAIR, 1.0), ("sofa", SOFA, 1.0))
+    scenes = {name: score_of(truth, both if name != "c" else map_of(("chair", CHAIR, 1.0))) for name in "abc"}
+    result = combine(RULES, scenes)
+    assert result.metrics["AP50"] == pytest.approx((1 + 2 / 3) / 2)
+    assert result.intervals["AP50"] is not None and result.intervals["AP50"][1] <= 1.0
+    assert any("every confidence is 1" in line for line in result.warnings)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"n_truth": np.zeros(48, np.int64)}, "'is_true' of class"),
+        ({"n_centred": np.full(48, 9)}, "'n_centred' of class 0 counts 9 boxes where at most 0 can be"),
+        ({"n_named": np.full(48, 9)}, "'n_named' of class 0 counts 9 boxes where at most 0 can be"),
+        ({"n_located": np.full(48, 9)}, "'n_located' of class 0 counts 9 boxes where at most 0 can be"),
+        ({"class_index": np.array([48], np.int32)}, "'class_index' counts beyond the 48 classes"),
+        ({"score": np.array([math.nan])}, "'score' has values that are NaN or infinite"),
+        ({"is_true": np.array([[False, True]])}, "'is_true' of class"),
+        ({"is_true": np.array([[True]])}, "'is_true' has 1 thresholds of 2"),
+    ],
+)
+def test_counts_that_contradict_themselves_are_refused(change: dict[str, np.ndarray], message: str) -> None:
+    score = score_of(truth_of(("chair", CHAIR)), map_of(("chair", CHAIR, 1.0)))
+    assert unpack_scores(pack_scores({RULES.name: score}))[RULES.name].n_predictions == 1
+    assert isinstance(score.counts, BoxCounts)
+    forged = replace(score, counts=replace(score.counts, **change))
+    with pytest.raises(DataError, match=r"counts: .*; score the scene again") as caught:
+        unpack_scores(pack_scores({RULES.name: forged}))
+    assert message in str(caught.value)
+
+
+def test_boxes_are_scored_against_datasets_that_have_them_and_by_maps_with_classes() -> None:
+    replica = TruthFacts("replica", "replica", ("mesh-vertices", "boxes"))
+    assert why_not_truth(RULES, replica) is None
+    assert why_not_truth(RULES, replace(replica, variants=("mesh-vertices",)))
+    assert "name one with --dataset" in str(why_not_truth(RULES, replace(replica, has_points=False)))
+    assert "points of its own" in str(why_not_content(RULES, ContentFacts("vertex-masks", 1, has_labels=True)))
+    assert "needs classes" in str(why_not_content(RULES, ContentFacts("instances", 1)))
+    assert "one feature a point" in str(why_not_content(RULES, ContentFacts("dense", 1, 8)))
+    assert why_not_content(RULES, ContentFacts("instances", 1, 8)) is None
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ('box_axes = "own"', "box_axes"),
+        ("thresholds = [0.25, 0.5, 0.75]", "kind 'boxes' takes [0.25, 0.5]"),
+        ("[transfer]\ncap_m = 0.05", "kind 'boxes' transfers nothing"),
+        ('class_agnostic = "scored"', "class_agnostic: belongs to kind 'instance'"),
+    ],
+)
+def test_rules_that_boxes_do_not_have_are_refused(tmp_path: Path, line: str, message: str) -> None:
+    path = tmp_path / "mine.toml"
+    path.write_text(f'extends = "replica-boxes"\nname = "mine"\n{line}\n')
+    with pytest.raises(ConfigError) as caught:
+        read_protocol(path)
+    assert message in str(caught.value)
+    path.write_text('extends = "replica-openmask3d"\nname = "mine"\nbox_axes = "truth"\n')
+    with pytest.raises(ConfigError, match="box_axes: kind 'boxes' needs it, others take none"):
+        read_protocol(path)
