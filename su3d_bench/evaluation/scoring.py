@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 
 import numpy as np
@@ -97,7 +98,8 @@ class Scoring:
                 raise PredictionError(f"{where}: {name}: {reason}")
             self.tally.leave_out(name, reason)
         if not self.tally.rules:
-            first, *others = dict.fromkeys(reasons.values())
+            # the one that most of them have says most: files that are missing for one alone may be nobody's
+            (first, _), *others = Counter(reasons.values()).most_common()
             more = f" (and {len(others)} more reasons)" if others else ""
             raise PredictionError(f"{where}: none of {len(reasons)} protocols can score it: {first}{more}")
         if self._first is None and not _is_empty(prediction.content):

@@ -99,7 +99,9 @@ def test_class_ids_are_those_of_the_original(name: str, case: str, oracle: str) 
 @pytest.mark.parametrize("name", sorted(NAMES))
 def test_instance_protocols_use_the_original_thresholds_and_size(name: str) -> None:
     rules = load_protocol(name)
-    if rules.kind in ("instance", "queries"):
+    if rules.kind == "boxes":
+        assert (rules.thresholds, rules.min_region_size) == ((0.25, 0.5), 5)
+    elif rules.kind in ("instance", "queries"):
         n_points = MIN_REGION_SIZE if rules.kind == "instance" and name != "opensun3d-challenge" else 1
         assert (rules.thresholds, rules.min_region_size) == (THRESHOLDS, n_points)
     else:
@@ -188,13 +190,14 @@ def test_a_rule_that_a_file_leaves_out_asks_for_nothing() -> None:
         "by_default": True, "class_agnostic": None, "void": None, "ignore": (), "ignore_rule": "exact", "prompts": (),
         "prompt_names": {}, "encoder": None, "min_region_size": None, "thresholds": (), "confidence": None,
         "top_k": None, "questions": None, "per_kind": None, "synonyms": None, "merging": None, "answers": None,
-        "aggregate": "pooled", "not_comparable_with": (),
+        "box_axes": None, "aggregate": "pooled", "not_comparable_with": (),
     }  # fmt: skip
 
 
 KINDS = {
     "semantic": {"takes_dense", "names_points", "takes_votes", "ignores_classes"},
     "instance": {"needs_instances", "ignores_classes"},
+    "boxes": {"needs_own_points", "needs_boxes", "ignores_classes"},
     "queries": {"needs_own_points", "ignores_classes"},
     "categories": {"takes_dense", "needs_own_points"},
     "retrieval": {"is_judged", "needs_own_points", "ignores_classes"},
