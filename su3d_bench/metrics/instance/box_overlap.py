@@ -20,8 +20,8 @@ def smallest_box(points: Float64Array, rotation: Float64Array) -> OrientedBox:
     >>> smallest_box(np.array([[0.0, 0, 0], [2, 1, 0]]), np.eye(3)).sizes.tolist()
     [2.0, 1.0, 0.0]
     """
-    along_axes = points @ rotation
-    low, high = along_axes.min(axis=0), along_axes.max(axis=0)
+    along_axes = rotation.T @ points.T  # (3, N): each axis in one piece, which takes a fraction of the time of (N, 3)
+    low, high = along_axes.min(axis=1), along_axes.max(axis=1)
     return OrientedBox(rotation @ ((low + high) / 2), high - low, rotation)
 
 
