@@ -23,7 +23,9 @@ from su3d_bench.store.atomic import filling, read_arrays
 Arrays = dict[str, NDArray[Any]]
 
 # What moves an entry on its way into the cache and out of it: keys of what is kept there follow it.
-CACHE_SOURCES = ("perception/cache.py", "perception/crops.py", "store/atomic.py", "store/unpacking.py")
+CACHE_SOURCES = (
+    "perception/cache.py", "perception/crops.py", "store/atomic.py", "store/unfinished.py", "store/unpacking.py",
+)  # fmt: skip
 # Moves every key: raise it when the format of an entry changes.
 CACHE_VERSION = "1"
 _CHECKSUM = "checksum"

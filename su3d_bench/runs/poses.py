@@ -37,7 +37,7 @@ class _Remarks:
 
 def judged(jobs: Sequence[SceneJob]) -> tuple[SceneJob, ...]:
     """The jobs with what is to be said of their poses; ``PosesContradicted`` where one of them must not be run."""
-    with _unheard(), ThreadPoolExecutor(min(len(jobs), os.cpu_count() or 1)) as threads:
+    with _unheard(), ThreadPoolExecutor(os.cpu_count()) as threads:
         remarks = list(threads.map(_remarks, jobs))
     pairs = list(zip(jobs, remarks, strict=True))
     wrong = [said.lines[0] for job, said in pairs if said.is_wrong and not job.accepts_poses]

@@ -20,7 +20,7 @@ from su3d_bench.core.config import KeyPath, flatten, write_toml
 from su3d_bench.core.digests import code_digest, git_state, package_versions
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.files import file_bytes
-from su3d_bench.core.registry import CEILING_METHOD
+from su3d_bench.core.registry import CEILING_METHOD, DATASETS
 from su3d_bench.core.timing import hardware_line, processor_digest
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
@@ -81,7 +81,7 @@ def run_plan(plan: Plan, report: Report) -> RunResult:
     ``PosesContradicted``, before anything is written, where the depth of a recording contradicts its poses.
     """
     if plan.data is None:  # else each worker looks at the data that it fetches
-        plan = replace(plan, jobs=judged(plan.jobs))
+        plan = replace(plan, jobs=_judged(plan.jobs))
     with plan.folder.locked(), _without_abandoned():
         metrics_file = plan.folder.path / "metrics.json"
         remove_file(metrics_file)  # what stands there may be of another plan
@@ -117,6 +117,13 @@ def _without_abandoned() -> Iterator[None]:
         yield
     finally:
         remove_abandoned()
+
+
+def _judged(jobs: Sequence[SceneJob]) -> tuple[SceneJob, ...]:
+    """The jobs, judged where the program itself reads the data: a reader of somebody else's may end the process that it
+    runs in, so that the scene's worker looks at these."""
+    known = {job.scene: job for job in judged([job for job in jobs if job.dataset.target in DATASETS])}
+    return tuple(known.get(job.scene, job) for job in jobs)
 
 
 def publish(plan: Plan) -> None:

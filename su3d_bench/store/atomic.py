@@ -83,7 +83,7 @@ def replacing(path: Path) -> Iterator[IO[bytes]]:
 
 def _stream(place: Path, handle: int) -> IO[bytes]:
     """The open file ``handle`` as a stream that knows its name, for whoever writes files by name."""
-    return open(place, "r+b", opener=lambda *_: handle)
+    return open(place, "wb", opener=lambda *_: handle)
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -33,9 +33,10 @@ def reader(name: str, root: Path) -> Any:
 
 
 def scenes(name: str, root: Path) -> list[str]:
-    """What the adapter finds; nothing where it says that there is no scene."""
+    """The scenes with frames that the adapter finds; nothing where it says that there is none."""
     try:
-        return list(reader(name, root).scenes())
+        dataset = reader(name, root)
+        return [scene for scene in dataset.scenes() if dataset.info(scene, 1).n_frames]
     except DataError as error:
         if ": no s" not in str(error):  # no scene, no scan, no sequence
             raise

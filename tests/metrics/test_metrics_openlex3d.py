@@ -431,8 +431,8 @@ def test_resampled_means_are_those_of_the_drawn_scenes(seed: int) -> None:
 @pytest.mark.parametrize("aggregate", ["scene-mean", "pooled"])
 def test_a_result_over_scenes_has_its_mean_and_an_interval_around_it(aggregate: str) -> None:
     rules = TOPN.model_copy(update={"aggregate": aggregate})
-    scores = {f"s{seed}": score_scene(rules, lex_truth(seed), noisy(seed), ENCODER) for seed in range(4)}
-    result = combine_scenes(rules, unpack_scores(pack_scores(scores)))
+    packed = [pack_scores({rules.name: score_scene(rules, lex_truth(k), noisy(k), ENCODER)}) for k in range(4)]
+    result = combine_scenes(rules, {f"s{k}": unpack_scores(one)[rules.name] for k, one in enumerate(packed)})
     interval = result.intervals["synonyms"]
     assert result.metrics == (result.scene_mean if aggregate == "scene-mean" else result.pooled)
     assert interval is not None

@@ -405,6 +405,7 @@ CONTROLS = {
     ("compare", "select", "A"),
     ("compare", "select", "B"),
     ("compare", "button", "Swap"),
+    ("summary", "summary", "3 more remarks"),
     ("provenance", "summary", "Rules and data"),
     ("provenance", "summary", "Settings"),
     ("provenance", "input", "Filter settings"),

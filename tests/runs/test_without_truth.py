@@ -46,7 +46,7 @@ def test_what_was_found_stands_in_place_of_dashes(capsys: pytest.CaptureFixture[
         f"collector, collector@noise_m=0.3: {why}"
     ]
     log = next(Path("out").glob("scenes/*/collector/log.txt")).read_text()
-    assert log.count("\n") == 2 and f"collector: {why}\n" in log
+    assert log.count("\n") == 3 and f"collector: {why}\n" in log
 
 
 def test_tables_page_and_json_say_it_too(capsys: pytest.CaptureFixture[str]) -> None:
