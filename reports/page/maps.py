@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import base64
 import json
+import math
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -49,14 +50,23 @@ class Cloud:
 
 
 def thinned(points: Float32Array, most: int) -> Cloud:
-    """At most ``most`` of ``points``, one of each cell of the least spacing at which so few are left."""
-    spacing = LEAST_SPACING_M
-    rows = _first_of_cells(points, spacing)
-    while len(rows) > most:
-        spacing *= COARSER
-        rows = _first_of_cells(points, spacing)
-    order = np.argsort(_curve(points[rows], spacing), kind="stable")
-    return Cloud(rows[order], points[rows[order]], spacing)
+    """At most ``most`` of ``points``, one of each cell, at the least spacing of those that are tried."""
+
+    def spacing(n_steps: int) -> float:
+        return LEAST_SPACING_M * COARSER**n_steps
+
+    n_steps, rows = 0, _first_of_cells(points, spacing(0))
+    if len(rows) > most:
+        # Points lie on surfaces: their cells are as the inverse square of the spacing.
+        n_steps = max(1, round(math.log(len(rows) / most) / (2 * math.log(COARSER))))
+        rows = _first_of_cells(points, spacing(n_steps))
+        while len(rows) > most:
+            n_steps += 1
+            rows = _first_of_cells(points, spacing(n_steps))
+        while n_steps > 1 and len(finer := _first_of_cells(points, spacing(n_steps - 1))) <= most:
+            n_steps, rows = n_steps - 1, finer
+    order = np.argsort(_curve(points[rows], spacing(n_steps)), kind="stable")
+    return Cloud(rows[order], points[rows[order]], spacing(n_steps))
 
 
 def _first_of_cells(points: Float32Array, spacing_m: float) -> Int64Array:

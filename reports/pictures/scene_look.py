@@ -63,8 +63,8 @@ def look_at(
         return _without_frames(dataset, scene)
     if not len(frames):
         raise DataError(f"{dataset.name}/{scene}: has no frames to show")
-    positions = range(len(frames)) if stride else _evenly(len(frames), CAMERAS)
-    is_shown = set(_evenly(len(positions), SHOWN_FRAMES))
+    positions = range(len(frames)) if stride else evenly(len(frames), CAMERAS)
+    is_shown = set(evenly(len(positions), SHOWN_FRAMES))
     poses, shown, points, colours, ranges = [], [], [], [], []
     for k, position in enumerate(positions):
         progress(k, len(positions))
@@ -72,7 +72,7 @@ def look_at(
         poses.append(frame.camera_to_world)
         if k in is_shown:
             shown.append(frame)
-        pixels = _chosen_pixels(frame, max(1, SEEN_POINTS // len(positions)))
+        pixels = chosen_pixels(frame, len(positions))
         points.append(back_project(frame.depth_m, frame.intrinsics, frame.camera_to_world, pixels).astype(np.float32))
         colours.append(frame.rgb[pixels])
         depth = frame.depth_m[pixels]
@@ -116,12 +116,14 @@ def _without_frames(dataset: Dataset, scene: str) -> SceneLook:
     )
 
 
-def _evenly(n: int, most: int) -> Sequence[int]:
+def evenly(n: int, most: int) -> Sequence[int]:
+    """At most ``most`` of the numbers below ``n``, as far from one another as can be."""
     return sorted({int(place) for place in np.linspace(0, n - 1, min(n, most))})
 
 
-def _chosen_pixels(frame: Frame, most: int) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """At most about ``most`` pixels with a depth, spread over the image."""
+def chosen_pixels(frame: Frame, n_frames: int) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
+    """Pixels (H, W) with a depth, spread over the image: about one frame's share of ``SEEN_POINTS``."""
+    most = max(1, SEEN_POINTS // n_frames)
     is_valid = valid_depth(frame.depth_m, 0.0, np.inf)
     step = int(np.ceil(np.sqrt(max(1.0, is_valid.sum() / most))))
     chosen = np.zeros_like(is_valid)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import base64
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -13,7 +14,16 @@ import numpy as np
 
 from su3d_bench.core.errors import Su3dError, printable, printable_json
 from su3d_bench.core.interfaces import Encoder
-from su3d_bench.core.types import DenseFeatures, Frame, GroundTruth, Instances, Int64Array, Prediction
+from su3d_bench.core.types import (
+    DenseFeatures,
+    Float32Array,
+    Frame,
+    GroundTruth,
+    Instances,
+    Int64Array,
+    Prediction,
+    UInt8Array,
+)
 from su3d_bench.metrics.matching.labelling import (
     candidate_classes,
     class_index_of_ids,
@@ -24,6 +34,7 @@ from su3d_bench.metrics.matching.labelling import (
 from su3d_bench.metrics.metric import n_predictions, present
 from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
 from su3d_bench.metrics.semantic.score import has_feature
+from su3d_bench.numerics.geometry import back_project
 from su3d_bench.reports.page.maps import (
     Cloud,
     box_in_view,
@@ -36,9 +47,10 @@ from su3d_bench.reports.page.maps import (
     point_owners,
     thinned,
 )
-from su3d_bench.reports.pictures.scene_look import SceneLook, look_at
+from su3d_bench.reports.pictures.scene_look import chosen_pixels, evenly
 from su3d_bench.runs.finished import FinishedRun, OtherDataError
 from su3d_bench.store.predictions import read_prediction
+from su3d_bench.store.records import read_updates
 
 QUERIES = (
     "somewhere to sit",
@@ -54,6 +66,7 @@ MOST_POINTS, LEAST_POINTS = 60_000, 3_000  # of one map: what a phone draws at o
 BYTES_A_POINT = 6.0  # in the page, measured on the rooms: position, colour, owner and truth, deflated, in base64
 SHARE_OF_POINTS = 0.6  # of the page; the rest is for instances, pictures and tables
 THUMBNAILS = 14  # frames of a scene that are shown
+MORE_FRAMES = 16  # that are read for the colours of what no thumbnail shows
 THUMBNAIL_WIDTH, JPEG_QUALITY = 240, 62
 MOST_VIEWS = 12  # frames of an instance that are named
 MOST_CAPTION = 240  # characters
@@ -136,10 +149,12 @@ class _Scene:
         self._maps = maps
         self._known = known
         self._remarks: list[str] = []
+        self._frame_of: dict[int, Frame | None] = {}
 
     def page(self, most_points: int) -> PageScene:
         read = {key[:1] + key[3:]: self._read(key) for key in self._maps}
-        frames = self._thumbnail_frames([a_map for a_map in read.values() if isinstance(a_map, Instances)])
+        chosen = self._chosen_frames([a_map for a_map in read.values() if isinstance(a_map, Instances)])
+        frames = {index: frame for index in sorted(chosen) if (frame := self._frame(index)) is not None}
         made = []
         for index, run, scene, method in self._maps:
             prediction = read[index, method]
@@ -177,25 +192,37 @@ class _Scene:
         return None
 
     @cached_property
-    def _look(self) -> SceneLook | None:
-        if self._dataset is None:
+    def _sequence(self) -> Sequence[Frame]:
+        frames = None
+        if self._dataset is not None:
+            frames = self._had("no views", lambda: self._dataset.frames(self._scene.partition("/")[2], 1))
+        return () if frames is None else frames
+
+    def _frame(self, index: int) -> Frame | None:
+        """Frame ``index`` of the full sequence, read once; None where it is not there."""
+        if index not in self._frame_of:
+            frames = self._sequence
+            frame = self._had("no views", lambda: frames[index]) if 0 <= index < len(frames) else None
+            self._frame_of[index] = frame if frame is not None and frame.index == index else None
+        return self._frame_of[index]
+
+    @cached_property
+    def _seen(self) -> tuple[Float32Array, UInt8Array] | None:
+        """Points (n, 3) m and colours (n, 3) of what the methods saw: in the frames shown, and in more."""
+        fed = sorted({index for _, run, scene, method in self._maps for index in _fed_frames(run, scene, method)})
+        fed = fed or list(range(len(self._sequence)))
+        for place in evenly(len(fed), MORE_FRAMES):
+            self._frame(fed[place])
+        read = [frame for frame in self._frame_of.values() if frame is not None]
+        if not read:
             return None
-        return self._had("no colours", lambda: look_at(self._dataset, self._scene.partition("/")[2]))
+        seen = [(frame, chosen_pixels(frame, len(read))) for frame in read]
+        points = [back_project(one.depth_m, one.intrinsics, one.camera_to_world, pixels) for one, pixels in seen]
+        return np.concatenate(points).astype(np.float32), np.concatenate([frame.rgb[pixels] for frame, pixels in seen])
 
-    def _thumbnail_frames(self, maps: Sequence[Instances]) -> dict[int, Frame]:
-        if self._dataset is None:
-            return {}
-        chosen = frame_cover([_frames_of(a_map, k) for a_map in maps for k in range(len(a_map))], THUMBNAILS)
-        frame_of = {}
-
-        def look() -> None:
-            frames = self._dataset.frames(self._scene.partition("/")[2], 1)
-            for index in sorted(chosen):
-                if 0 <= index < len(frames) and (frame := frames[index]).index == index:
-                    frame_of[index] = frame
-
-        self._had("no views", look)
-        return frame_of
+    def _chosen_frames(self, maps: Sequence[Instances]) -> Sequence[int]:
+        """The frames that are shown: as few as can be that show every instance, from those that the maps name."""
+        return frame_cover([_frames_of(a_map, k) for a_map in maps for k in range(len(a_map))], THUMBNAILS)
 
     def _rules(self, run: FinishedRun) -> ProtocolRules | None:
         """The rules whose classes the map is shown in: of points before those of instances."""
@@ -215,8 +242,7 @@ class _Scene:
         rules = self._rules(run)
         truth = None if rules is None else self._truth(rules)
         planes: dict[str, Any] = {"owner": index_plane(point_owners(prediction, cloud.rows))}
-        look = self._look
-        colours = None if look is None else nearest_colours(cloud.points, look.seen, look.seen_rgb)
+        colours = None if self._seen is None else nearest_colours(cloud.points, *self._seen)
         if colours is not None:
             planes["colour"] = colour_plane(colours)
         about: dict[str, Any] = {"protocol": None, "classes": [], "instances": [], "queries": []}
@@ -265,6 +291,14 @@ class _Scene:
             return None
         texts = self._had("no similarities", lambda: self._known.encoder(run)[1])
         return cosines(features, texts) if texts is not None and texts.shape[1] == features.shape[1] else None
+
+
+def _fed_frames(run: FinishedRun, scene: str, method: str) -> list[int]:
+    """The frames that a method was given, as its table of updates says; none where it says nothing that can be read."""
+    updates = run.folder.job(scene, method).updates
+    with suppress(Su3dError, OSError):
+        return [int(index) for index in read_updates(updates, updates.name).get("frame", ())]
+    return []
 
 
 def _frames_of(instances: Instances, k: int) -> list[int]:

@@ -127,7 +127,9 @@ class Overlaps:
 
 def measure_overlaps(truth: Int64Array, predicted: LabelledMasks, rules: ScoringRules) -> Overlaps:
     """The overlaps of one scene; ``truth`` (N,) is label * 1000 + instance, 0 where void."""
-    values, segment_of_point, sizes = np.unique(truth, return_inverse=True, return_counts=True)
+    values = np.unique(truth)
+    segment_of_point = np.searchsorted(values, truth)
+    sizes = np.bincount(segment_of_point, minlength=len(values))
     is_instance = np.isin(values // INSTANCES_PER_CLASS, rules.class_ids) & (sizes >= rules.min_region_size)
     instances = np.flatnonzero(is_instance)
     class_of_instance = (values[instances] // INSTANCES_PER_CLASS).astype(np.int64)

@@ -83,9 +83,11 @@ def _most_frequent(key: Int64Array, value: Int64Array, n_keys: int) -> Int64Arra
     [4, -1, 9]
     """
     answer = np.full(n_keys, -1, np.int64)
-    pairs, n = np.unique(np.stack([key, value], axis=1), axis=0, return_counts=True)
-    order = np.lexsort((-pairs[:, 1], n))  # the most frequent last, of equals the lowest value last
-    answer[pairs[order, 0]] = pairs[order, 1]
+    values = np.unique(value)
+    pairs, n = np.unique(key * len(values) + np.searchsorted(values, value), return_counts=True)
+    keys, places = np.divmod(pairs, max(1, len(values)))
+    order = np.lexsort((-places, n))  # the most frequent last, of equals the lowest value last
+    answer[keys[order]] = values[places[order]]
     return answer
 
 

@@ -171,7 +171,7 @@ def encoder_warning(rules: ProtocolRules, prediction: Prediction, encoder: Encod
 def class_index_of_ids(rules: ProtocolRules, ids: Sequence[int] | np.ndarray) -> Int64Array:
     """The class index of each class id, -1 for ids that are none of the protocol's classes."""
     values = np.asarray(ids, np.int64)
-    index_of = {entry.id: index for index, entry in enumerate(rules.classes)}
-    distinct, inverse = np.unique(values, return_inverse=True)
-    table = np.array([index_of.get(int(value), -1) for value in distinct], np.int64)
-    return table[inverse]
+    known = np.array([*(entry.id for entry in rules.classes), np.iinfo(np.int64).max], np.int64)
+    order = np.argsort(known)
+    place = order[np.searchsorted(known, values, sorter=order)]
+    return np.where((known[place] == values) & (place < len(rules.classes)), place, -1)
