@@ -41,6 +41,7 @@ VERBS = (
     "refine",
     "datasets.list",
     "methods",
+    "new",
     "models",
     "protocols",
     "export",

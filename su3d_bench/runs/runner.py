@@ -223,11 +223,11 @@ def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> MetricsRecord:
     for outcome in outcomes:
         by_method.setdefault(outcome.method, []).append(outcome)
     perfect = _read_scores(plan, by_method.get(CEILING_METHOD, ()), attrgetter("counts"))
-    rules = _rules(plan)
+    rules = {rule.name: rule for rule in _rules(plan)}
 
     @cache
     def ceiling(protocol: str, scenes: tuple[str, ...]) -> Any:
-        return _metrics_over(scenes, load_protocol(protocol), perfect)
+        return _metrics_over(scenes, rules[protocol], perfect)
 
     results = {}
     for method in plan.methods:
@@ -237,7 +237,7 @@ def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> MetricsRecord:
             share: _read_scores(plan, mine, partial(JobFolder.anytime_counts, share=share))
             for share in sorted(set(plan.config.anytime))
         }
-        for rule in rules:
+        for rule in rules.values():
             result = _result(plan, method, rule, mine, scores, early)
             scored = tuple(result.result.scenes) if result.result else ()
             results[rule.name, method] = replace(result, ceiling=ceiling(rule.name, scored))
@@ -246,7 +246,7 @@ def summarise(plan: Plan, outcomes: Sequence[MethodOutcome]) -> MetricsRecord:
         limit=plan.config.limit,
         seed=plan.config.seed,
         scenes=tuple(job.scene for job in plan.jobs),
-        results=tuple(results[rule.name, method] for rule in rules for method in plan.methods),
+        results=tuple(results[name, method] for name in rules for method in plan.methods),
     )
 
 

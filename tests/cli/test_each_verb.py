@@ -58,6 +58,7 @@ CASES: dict[str, tuple[list[str], int, str]] = {
     "models export": (["clip-vit-h-14", "--out", "exported"], 2, "clip-vit-h-14"),
     "models warm": (["--profile", "embedded"], 0, ""),
     "protocols": (["show", "rooms-semantic"], 0, "rooms-semantic"),
+    "new": (["method", "my_method.py"], 0, "my_method.py"),
     "export": (["out", "--to", "openlex3d", "--method", "opensu3d", "--out", "exported"], 0, "exported"),
 }
 

@@ -1,0 +1,52 @@
+"""``su3d-bench new``: a method, a dataset or a protocol of one's own that runs as it stands."""
+
+from __future__ import annotations
+
+import argparse
+import re
+from pathlib import Path
+from typing import Any
+
+from su3d_bench.cli.common import add_verb, answer_either
+from su3d_bench.core.errors import EXIT_DONE, ConfigError
+
+SUFFIX = {"method": ".py", "dataset": ".py", "protocol": ".toml"}
+# What to type next; {at} is how the file is named to the command line.
+NEXT = {
+    "method": ("methods check {at}", "run --scenes rooms/living0 --methods {at}"),
+    "dataset": ("datasets check '{at}/*'", "run --scenes '{at}/*' --profile oracle"),
+    "protocol": ("protocols show {at}", "run --scenes rooms/living0 --protocols {at}"),
+}
+
+
+def add_parser(verbs: Any) -> None:
+    parser = add_verb(
+        verbs,
+        "new",
+        "Write a method, a dataset or a protocol that runs as it stands, to begin from.",
+        ("su3d-bench new method my_method.py", "su3d-bench new dataset data/my_rooms.py"),
+        call,
+    )
+    parser.add_argument("what", choices=tuple(SUFFIX))
+    parser.add_argument("file", type=Path, metavar="FILE", help="to write; its name becomes the name in it")
+
+
+def call(arguments: argparse.Namespace) -> int:
+    from su3d_bench.cli.common import written
+
+    what, file = arguments.what, arguments.file
+    if file.suffix != SUFFIX[what]:
+        raise ConfigError(f"new {what}: {file} must end in {SUFFIX[what]}, such as my_{what}{SUFFIX[what]}")
+    words = re.findall(r"[A-Za-z0-9]+", file.stem)
+    if not words or words[0][0].isdigit():
+        raise ConfigError(f"new {what}: no name can be made of '{file.stem}'; such as: my_{what}{SUFFIX[what]}")
+    if file.exists():
+        raise ConfigError(f"new {what}: {file} is there already; name another file, nothing is overwritten")
+    name, class_name = "-".join(words).lower(), "".join(word[0].upper() + word[1:] for word in words)
+    template = (Path(__file__).parent / f"my_{what}{SUFFIX[what]}").read_text(encoding="utf-8")
+    text = template.replace(f"My{what.capitalize()}", class_name).replace(f"my-{what}", name)
+    written(file, text)
+    at = str(file) if what == "protocol" else f"{file}:{class_name}"
+    commands = [f"su3d-bench {command.format(at=at)}" for command in NEXT[what]]
+    answer_either(arguments, {"file": str(file), "next": commands}, "\n  ".join([f"{file}; then:", *commands]))
+    return EXIT_DONE
