@@ -135,6 +135,11 @@ def _exit_code(words: Sequence[str]) -> int:
         if isinstance(error, Su3dError):
             remark(f"su3d-bench: {error}")
             return error.exit_code
+        from su3d_bench.runs.plug_ins import error_line, own_line
+
+        if own_line(error):  # the mistake is in somebody's own method or dataset
+            remark(f"su3d-bench: {error_line(error)}")
+            return EXIT_WRONG_INPUT
         text = printable(f"{type(error).__name__}: {error}")
         hint = "" if is_debug else "; run again with --debug for the traceback"
         remark(f"su3d-bench: internal error: {text}{hint}")

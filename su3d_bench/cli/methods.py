@@ -6,10 +6,11 @@ import argparse
 import json
 import textwrap
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from su3d_bench.cli.common import add_verb, answer, answer_document, answer_either, answer_json
-from su3d_bench.core.errors import EXIT_DONE
+from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted
 from su3d_bench.core.printing import one_line
 
 if TYPE_CHECKING:
@@ -23,19 +24,38 @@ def add_parser(verbs: Any) -> None:
         verbs,
         "methods",
         "List the methods that can be run; with a name, its settings and what papers report of it.",
-        ("su3d-bench methods", "su3d-bench methods opensu3d"),
+        ("su3d-bench methods opensu3d", "su3d-bench methods check oracle"),
         call,
     )
-    parser.add_argument("name", nargs="?", help="show the settings of this method and its published figures")
+    parser.add_argument("name", nargs="?", help="show the settings of this method and its published figures; or: check")
+    parser.add_argument("tried", nargs="?", metavar="METHOD", help="with check: the method that is tried on two frames")
 
 
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.core import registry
 
+    if arguments.name == "check":
+        return _check(arguments)
+    if arguments.tried is not None:
+        raise ConfigError(f"methods {arguments.name} {arguments.tried}: name one method, or: methods check METHOD")
     if arguments.name is not None:
         return _show(arguments)
     rows = [_about(name, registry.load("method", name)) for name in registry.names("method")]
     answer_either(arguments, rows, *[line for row in rows for line in ("", *_lines(row))][1:])
+    return EXIT_DONE
+
+
+def _check(arguments: argparse.Namespace) -> int:
+    from su3d_bench.runs.trial import try_method
+
+    if arguments.tried is None:
+        raise ConfigError("methods check: name the method, such as my_method.py:MyMethod")
+    trial = try_method(arguments.tried)
+    made = f"{trial.kind} of {counted(trial.n_points, 'point')}"
+    made += "" if trial.n_instances is None else f", {counted(trial.n_instances, 'instance')}"
+    features = "with features" if trial.has_features else "without features"
+    text = f"{trial.method}: two frames of {trial.scene} gave {made}, {features}: nothing found wrong"
+    answer_either(arguments, asdict(trial), text)
     return EXIT_DONE
 
 

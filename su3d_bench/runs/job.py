@@ -18,6 +18,7 @@ from su3d_bench.metrics.protocols import load_protocol
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
 from su3d_bench.questions.reasoning.language_solver import answers_digest
 from su3d_bench.questions.refined_names import refined_digest
+from su3d_bench.runs.plug_ins import checked_dataset, checked_method
 from su3d_bench.store.run_folder import JobFolder
 
 # Settings of perception that move no number, or whose part that does is in perception's digest.
@@ -138,13 +139,13 @@ def part_of(kind: str, target: str, settings: Settings) -> Part:
 def build_dataset(part: Part, data_root: Path) -> Any:
     """The dataset of ``part``, reading below ``data_root``."""
     dataset_class = registry.load("dataset", part.target)
-    return dataset_class(data_root, dataset_class.Options.model_validate_json(part.options))
+    return checked_dataset(dataset_class(data_root, dataset_class.Options.model_validate_json(part.options)))
 
 
 def build_method(part: Part) -> Any:
     """A fresh method of ``part``."""
     method_class = registry.load("method", part.target)
-    return method_class(method_class.Config.model_validate_json(part.options))
+    return checked_method(method_class(method_class.Config.model_validate_json(part.options)))
 
 
 TRUE_PROPOSALS_CAVEAT = "proposals from the ground truth; a ceiling, not a result"

@@ -16,7 +16,7 @@ from functools import cache, cached_property, partial
 from typing import Any
 
 from su3d_bench.core.devices import device_for
-from su3d_bench.core.errors import MOST_CHARACTERS, GroundTruthMissing, StoreError, Su3dError, printable
+from su3d_bench.core.errors import GroundTruthMissing, StoreError
 from su3d_bench.core.interfaces import (
     Closes,
     Method,
@@ -64,6 +64,7 @@ from su3d_bench.runs.job import (
     refuse_other_run,
     stride_of,
 )
+from su3d_bench.runs.plug_ins import error_line
 from su3d_bench.runs.poses import REMARK, PosesContradicted, judged
 from su3d_bench.store.atomic import write_bytes, write_text
 from su3d_bench.store.predictions import read_prediction
@@ -137,14 +138,6 @@ def _guarded(scene: _Scene, part: Part) -> MethodOutcome:
     if outcome.error is not None:
         write_text(folder.log, log.text())
     return outcome
-
-
-def error_line(error: Exception) -> str:
-    """One line for any error; one that is not ours says its type."""
-    text = printable(str(error), MOST_CHARACTERS)
-    if isinstance(error, MemoryError):
-        return f"out of memory ({text or 'no details'}); try fewer --jobs, or a machine with more"
-    return text if isinstance(error, Su3dError) else f"{type(error).__name__}: {text}"
 
 
 class _Scene:

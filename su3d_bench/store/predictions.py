@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from su3d_bench.core.errors import DAMAGE, PredictionError, StoreError
+from su3d_bench.core.errors import DAMAGE, PredictionError, StoreError, counted
 from su3d_bench.core.files import regular
 from su3d_bench.core.types import DenseFeatures, Instances, Partition, Prediction
 from su3d_bench.store.atomic import read_npz, remove_file, replacing, write_npz
@@ -58,13 +58,11 @@ def prediction_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Pr
     kind = kinds.get(str(arrays.get("kind")))
     if kind is None:
         raise PredictionError(f"{where}: holds no 'kind' out of {', '.join(kinds)}; it is not a prediction")
+    if fault := array_fault(arrays):
+        raise PredictionError(f"{where}: {fault}; run the scene again")
     for name in (name for name in FIELDS if name in arrays):
-        array, (n_dimensions, value_kind) = arrays[name], FIELDS[name]
-        if array.ndim != n_dimensions or array.dtype.kind != value_kind or (name == "indptr" and not array.size):
-            shape = f"of shape {array.shape} {array.dtype.name}"
-            raise PredictionError(f"{where}: '{name}' is an array {shape}; run the scene again")
-        if array.dtype.kind == "U" and len(array) > MOST_TEXTS:
-            raise PredictionError(f"{where}: '{name}' holds {len(array)} texts; is it damaged?")
+        if arrays[name].dtype.kind == "U" and len(arrays[name]) > MOST_TEXTS:
+            raise PredictionError(f"{where}: '{name}' holds {len(arrays[name])} texts; is it damaged?")
     values: dict[str, Any] = {}
     for name in _fields_of(kind):
         value = arrays.get(name)
@@ -75,6 +73,17 @@ def prediction_from_arrays(arrays: Mapping[str, NDArray[Any]], where: str) -> Pr
         raise PredictionError(f"{where}: lacks '{missing[0]}'; write it again with su3d-bench run")
     prediction: Prediction = kind(**values)
     return prediction
+
+
+def array_fault(arrays: Mapping[str, NDArray[Any]]) -> str | None:
+    """Which array of a prediction has another shape or kind of values than it must, and what it must have."""
+    kinds = {"f": "floats", "i": "integers", "U": "texts"}
+    for name in (name for name in FIELDS if name in arrays):
+        array, (n_dimensions, kind) = np.asarray(arrays[name]), FIELDS[name]
+        if array.ndim != n_dimensions or array.dtype.kind != kind or (name == "indptr" and not array.size):
+            wanted = f"{kinds[kind]} in {counted(n_dimensions, 'dimension')}"
+            return f"'{name}' is an array of shape {array.shape} {array.dtype.name}, not {wanted}"
+    return None
 
 
 def features_beside(path: Path) -> Path:

@@ -210,12 +210,9 @@ def test_an_internal_error_is_one_line_and_exit_code_4(
 ) -> None:
     from su3d_bench.core import registry
 
-    def fail(kind: str) -> list[str]:
-        raise RuntimeError("a mistake\nof ours")
-
-    monkeypatch.setattr(registry, "names", fail)
+    monkeypatch.setattr(registry, "BUILT_IN", {})
     assert main(["methods"]) == EXIT_INTERNAL
-    line = "su3d-bench: internal error: RuntimeError: a mistake of ours; run again with --debug for the traceback\n"
+    line = "su3d-bench: internal error: KeyError: 'method'; run again with --debug for the traceback\n"
     assert capsys.readouterr().err == line
 
 

@@ -194,7 +194,7 @@ def test_other_protocols_score_the_same_predictions_again(monkeypatch: pytest.Mo
         ("depth-size", "painted/b: frame 2: depth is 32x23 and colour is 32x24; both must have one size"),
         ("empty-depth", "painted/b frame 2: depth is empty, no pixel is above 0 m"),
         ("unknown-class", "painted/b: class id 777 is unknown; the label set ends at 101"),
-        ("crash", "painted/b: ZeroDivisionError: a mistake in a plug-in"),
+        ("crash", "painted/b: painted.py:93: ZeroDivisionError: a mistake in a plug-in"),
     ],
 )
 def test_a_scene_that_fails_leaves_the_others_unharmed(
