@@ -61,6 +61,7 @@ CASES: dict[str, list[list[str]]] = {
     "datasets check": [["tum/*", "--quick"], ["tum/*", "--quick", "--json"]],
     "datasets show": [["tum/*", "--out", "out/room.png"]],
     "datasets make": [["rooms", "--layout", "tum", "--scenes", HOSTILE, "--out", "out/made"]],
+    "new": [["method", "hostile_method.py"]],
     "methods": [["hostile.py:Loud"], ["hostile.py:Loud", "--json"]],
     "models list": [["--set", f"perception.models.folder={HOSTILE}"]],
     "models check": [[HOSTILE]],

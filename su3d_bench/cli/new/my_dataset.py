@@ -56,31 +56,33 @@ class MyDataset:
     def instance_mesh(self, scene: str) -> InstanceMesh:
         """The annotated surface, for perfect masks: here a small triangle at each point."""
         points, instance = self._surface(scene)
-        corners = points[:, None] + np.array([[0, 0, 0], [0.02, 0, 0], [0, 0.02, 0]], np.float32)
+        corners = points[:, None] + np.array([[0, 0, 0], [0.02, 0, 0], [0, 0, 0.02]], np.float32)
         triangles = np.arange(3 * len(points), dtype=np.int32).reshape(-1, 3)
         classes = {k + 1: class_id for k, class_id in enumerate(LABELS.ids)}
         return InstanceMesh(corners.reshape(-1, 3), triangles, instance, classes, LABELS)
 
     def _frame(self, scene: str, index: int) -> Frame:
-        """Depth in metres along the optical axis, 0 where there is none; cameras look along z, x right, y down."""
-        camera_to_world = np.eye(4)
+        """Depth in metres along the optical axis, 0 where there is none. Cameras have x right, y down, z forward; the
+        world has z up, and these look along its y.
+        """
+        camera_to_world = np.array([[1.0, 0, 0, 0], [0, 0, 1, 0], [0, -1, 0, 0], [0, 0, 0, 1]])
         camera_to_world[0, 3] = 0.006 * index - 0.24
         x, y = np.meshgrid((np.arange(320) - 159.5) / 200.0, (np.arange(240) - 119.5) / 200.0)
         which, depth_m = np.full((240, 320), 2), np.full((240, 320), WALL_M[scene], np.float32)
-        for k, (centre_m, z_m) in enumerate(THINGS_M):
-            is_seen = np.maximum(np.abs(x * z_m + camera_to_world[0, 3] - centre_m), np.abs(y * z_m)) < 0.2
-            which[is_seen], depth_m[is_seen] = k, z_m
+        for k, (centre_m, far_m) in enumerate(THINGS_M):
+            is_seen = np.maximum(np.abs(x * far_m + camera_to_world[0, 3] - centre_m), np.abs(y * far_m)) < 0.2
+            which[is_seen], depth_m[is_seen] = k, far_m
         stripe = np.floor((x * depth_m + camera_to_world[0, 3]) * 10) % 2 * 20  # painted on everything, each 10 cm
         rgb = COLOURS[which] + stripe[..., None].astype(np.uint8)
         return Frame(index, index / 30, rgb, depth_m, camera_to_world, INTRINSICS)
 
     def _surface(self, scene: str) -> tuple[np.ndarray, np.ndarray]:
         """Points (N, 3) every centimetre of the two things and the wall, and whose each is (N,), from 1."""
-        squares = [(centre_m, z_m, 0.2) for centre_m, z_m in THINGS_M] + [(0.0, WALL_M[scene], 2.2)]
+        squares = [(centre_m, far_m, 0.2) for centre_m, far_m in THINGS_M] + [(0.0, WALL_M[scene], 2.2)]
         clouds = []
-        for centre_m, z_m, half_m in squares:
+        for centre_m, far_m, half_m in squares:
             steps = np.arange(-half_m, half_m, 0.01)
-            x, y = (grid.ravel() for grid in np.meshgrid(steps + centre_m, steps))
-            clouds.append(np.stack([x, y, np.full(len(x), z_m)], axis=1))
+            x, z = (grid.ravel() for grid in np.meshgrid(steps + centre_m, steps))
+            clouds.append(np.stack([x, np.full(len(x), far_m), z], axis=1))
         instance = np.repeat([1, 2, 3], [len(cloud) for cloud in clouds])
         return np.concatenate(clouds).astype(np.float32), instance.astype(np.int32)
