@@ -37,7 +37,7 @@ def call(arguments: argparse.Namespace) -> int:
     if arguments.name == "check":
         return _check(arguments)
     if arguments.tried is not None:
-        raise ConfigError(f"methods {arguments.name} {arguments.tried}: name one method, or: methods check METHOD")
+        raise ConfigError(f"methods: unknown argument '{arguments.tried}'; name one method, or: methods check METHOD")
     if arguments.name is not None:
         return _show(arguments)
     rows = [_about(name, registry.load("method", name)) for name in registry.names("method")]

@@ -187,4 +187,4 @@ def test_a_truth_that_is_missing_leaves_the_scene_unscored(root: Path, capsys: p
     assert "- opensu3d is unscored on replica/bathroom0" in answer.out
     assert "| replica/bathroom0 | opensu3d | 14 " in answer.out.partition("**Found, not scored**")[2]
     remark = remarks_of(answer.err)[0]
-    assert remark.startswith("opensu3d: not scored under rooms-semantic: replica/bathroom0: no")
+    assert remark.startswith("opensu3d, oracle: not scored under rooms-semantic: replica/bathroom0: no")

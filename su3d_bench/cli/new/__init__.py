@@ -33,6 +33,7 @@ def add_parser(verbs: Any) -> None:
 
 def call(arguments: argparse.Namespace) -> int:
     from su3d_bench.cli.common import written
+    from su3d_bench.core.files import file_text
 
     what, file = arguments.what, arguments.file
     if file.suffix != SUFFIX[what]:
@@ -43,7 +44,7 @@ def call(arguments: argparse.Namespace) -> int:
     if file.exists():
         raise ConfigError(f"new {what}: {file} is there already; name another file, nothing is overwritten")
     name, class_name = "-".join(words).lower(), "".join(word[0].upper() + word[1:] for word in words)
-    template = (Path(__file__).parent / f"my_{what}{SUFFIX[what]}").read_text(encoding="utf-8")
+    template = file_text(Path(__file__).parent / f"my_{what}{SUFFIX[what]}")
     text = template.replace(f"My{what.capitalize()}", class_name).replace(f"my-{what}", name)
     written(file, text)
     at = str(file) if what == "protocol" else f"{file}:{class_name}"
