@@ -9,6 +9,7 @@ import time
 import pytest
 
 from su3d_bench.core.errors import StoreError
+from su3d_bench.runs.executors import ray
 from su3d_bench.runs.executors.local import ONE_THREAD, Event, Report, run_inline, run_processes
 
 
@@ -98,3 +99,11 @@ def test_inline_holds_loaded_libraries_to_one_thread_and_lets_go() -> None:
     assert set(counts) == {1}
     assert cv2.getNumThreads() == before
     assert sys.modules["cv2"] is cv2
+
+
+def test_a_task_of_ray_that_is_asked_to_end_says_so_and_is_no_failure() -> None:
+    def work(unit: str, report: Report) -> None:
+        os.kill(os.getpid(), signal.SIGTERM)
+        signal.pause()
+
+    assert ray._on_node(work, "a", {}) == (ray.ENDED, "SIGTERM")

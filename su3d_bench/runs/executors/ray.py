@@ -14,11 +14,12 @@ from typing import Any
 
 from su3d_bench.core.config import RunConfig
 from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, package_versions
-from su3d_bench.core.endings import kept_handlers
+from su3d_bench.core.endings import Ended, ending_in_order, kept_handlers
 from su3d_bench.core.errors import ConfigError, ModelMissing, StoreError
 from su3d_bench.runs.executors.local import Outcome, Report, Unit, Work, answer_of, limit_threads, unwrap
 
 CONNECT_S = 5.0  # a machine of a cluster in one network answers within milliseconds
+ENDED = "ended"  # the kind of answer of a worker that was asked to end
 MOST_AT_ONCE = 1000  # each pending task costs the driver memory, and each wait a look at all of them
 
 
@@ -60,7 +61,8 @@ def _answer(ray: Any, reference: Any) -> tuple[Any, str | None]:
     """What a task answered, or a clause that says how the task was lost."""
     errors = ray.exceptions
     try:
-        return ray.get(reference), None
+        answer = ray.get(reference)
+        return answer, f"the worker was ended by {answer[1]}" if answer[0] == ENDED else None
     except errors.RayTaskError as error:  # the task itself raises nothing, so it could not even begin
         last = str(error).strip().splitlines()[-1]
         raise ConfigError(
@@ -82,7 +84,11 @@ def _on_node(work: Work[Unit, Outcome], unit: Unit, versions: dict[str, str]) ->
         if own.get(name) != versions[name]:
             message = f"{socket.gethostname()}: has {name} {own.get(name)}, the run {versions[name]}; install the same"
             return "user-error", StoreError(message)
-    return answer_of(work, unit, lambda event: None)
+    try:
+        with ending_in_order():  # where Ray's own handler would leave the work as if it had failed
+            return answer_of(work, unit, lambda event: None)
+    except Ended as end:
+        return ENDED, str(end)
 
 
 def _versions() -> dict[str, str]:
