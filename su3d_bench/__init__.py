@@ -23,7 +23,7 @@ if TYPE_CHECKING:
         PerceptionNeeds,
         SceneInfo,
     )
-    from su3d_bench.metrics.protocols import load_protocol
+    from su3d_bench.metrics.protocols.loading import load_protocol
     from su3d_bench.metrics.scoring import combine, score_scene
     from su3d_bench.store.predictions import read_prediction
 
@@ -50,7 +50,7 @@ __all__ = [
 _ELSEWHERE = {
     "Timer": "core.timing",
     "combine": "metrics.scoring",
-    "load_protocol": "metrics.protocols",
+    "load_protocol": "metrics.protocols.loading",
     "read_prediction": "store.predictions",
     "score_scene": "metrics.scoring",
 }

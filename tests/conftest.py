@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
@@ -40,6 +40,20 @@ def rooms_data(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = (base.parent if "PYTEST_XDIST_WORKER" in os.environ else base) / "rooms-data"
     folder.mkdir(exist_ok=True)
     return folder
+
+
+@pytest.fixture
+def data_to_spoil(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[Path], Path]:
+    """Copies a folder of data to ``data``, where a test may spoil it, and makes it the data root; its path."""
+
+    def copied(whole: Path) -> Path:
+        shutil.copytree(whole, tmp_path / "data")
+        monkeypatch.chdir(tmp_path)
+        monkeypatch.setenv("SU3D_DATA", "data")
+        monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
+        return tmp_path / "data"
+
+    return copied
 
 
 @pytest.fixture(scope="module")

@@ -43,7 +43,7 @@ MOUNT = re.compile(r"(?P<here>/[^:]*):(?P<there>/[^:]*)")
 
 
 class CommandConfig(BaseModel):
-    """What is run and where; docs/command-method.md says it with examples.
+    """What is run and where; docs/methods/command-method.md says it with examples.
 
     - ``command``: words, or one line that is split as a shell splits it; {frames}, {output}, {work}, {scene}, {dataset}
       and {seed} stand for themselves in either, and are in the environment as SU3D_FRAMES and so on. ``shell``: the

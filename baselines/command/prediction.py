@@ -10,7 +10,7 @@ import numpy as np
 from su3d_bench.core.errors import PredictionError, printable
 from su3d_bench.core.types import Instances, Prediction, Surface
 from su3d_bench.metrics.matching.nearest import masks_of_partition, select
-from su3d_bench.metrics.protocols import load_protocol, protocols_for
+from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for
 from su3d_bench.predictions.base import Content, ScenePrediction, VertexLabels, VertexMasks
 
 

@@ -1,8 +1,8 @@
-"""``docs/performance.md``: a table a group of ``make bench``, what scripts measured, then whole runs.
+"""``docs/running/performance.md``: a table a group of ``make bench``, what scripts measured, then whole runs.
 
-``python benchmarks write_performance build/bench.json docs/performance.md [--rooms RUN] [--corridors RUN ...]``: the
-runs are those of ``make bench-methods``; without them their sections stay as the page has them, and so does the list of
-marks, which is written by hand.
+``python benchmarks write_performance build/bench.json docs/running/performance.md [--rooms RUN] [--corridors RUN]``:
+the runs are those of ``make bench-methods``; without them their sections stay as the page has them, and so does the
+list of marks, which is written by hand.
 """
 
 from __future__ import annotations

@@ -45,7 +45,7 @@ _TEXTS = ("test_metrics_queries", "test_metrics_openlex3d")
 _QUESTIONS = ("test_annotation_protocol", "test_retrieval_protocol", "questions/test_reasoning_solver")
 _PROTOCOLS = ("test_protocols", "test_metrics_scoring", "evaluation/test_evaluate")
 # Of each module, or of all in a folder, the tests that must notice: the quick ones first. Names without a folder stand
-# in tests/metrics.
+# in tests/metrics or below.
 GUARDS: dict[str, tuple[str, ...]] = {
     "metrics/instance/": (*_CURVES, *_SCORES),
     "metrics/semantic/": ("test_metrics_semantic", "test_metrics_undefined", "test_metrics_hovsg", *_SCORES),
@@ -58,8 +58,7 @@ GUARDS: dict[str, tuple[str, ...]] = {
     "metrics/attribution/": ("analysis/test_attribution", "analysis/test_attribution_runs"),
     "metrics/costs.py": ("reports/test_timing_report",),
     "metrics/fitness.py": _PROTOCOLS,
-    "metrics/protocols.py": _PROTOCOLS,
-    "metrics/protocol_files.py": _PROTOCOLS,
+    "metrics/protocols/": _PROTOCOLS,
     "metrics/metric.py": ("test_metrics_undefined", *_SCORES, "analysis/test_compare_pairs"),
     "metrics/scoring.py": ("test_metrics_undefined", *_SCORES),
     "numerics/statistics.py": (
@@ -83,7 +82,13 @@ def guards_of(module: str) -> tuple[str, ...]:
     """The test files that must notice a fault in a module of the package."""
     inside = module.removeprefix(f"{PACKAGE}/")
     row = max((one for one in GUARDS if inside == one or (one.endswith("/") and inside.startswith(one))), key=len)
-    return tuple(f"tests/{name if '/' in name else f'metrics/{name}'}.py" for name in dict.fromkeys(GUARDS[row]))
+    return tuple(_test_file(name) for name in dict.fromkeys(GUARDS[row]))
+
+
+def _test_file(name: str) -> str:
+    tests = ROOT / "tests"
+    path = tests / f"{name}.py" if "/" in name else next((tests / "metrics").rglob(f"{name}.py"))
+    return str(path.relative_to(ROOT))
 
 
 def modules_of(wanted: Sequence[str]) -> list[str]:

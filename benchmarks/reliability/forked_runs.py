@@ -164,7 +164,7 @@ def load_modules(subject: str) -> None:
     limit_threads()
     import su3d_bench.cli.main
     import su3d_bench.reports.tables.run
-    import su3d_bench.runs.plan
+    import su3d_bench.runs.planning.plan
     import su3d_bench.runs.runner
 
     if subject == "opensu3d":

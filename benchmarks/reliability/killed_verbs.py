@@ -82,6 +82,7 @@ class VerbTrial:
         self._moments = random.Random(f"{seed} {name}")
         self._place, self._log, self._temporary = scratch / "place", scratch / "log", scratch.parent / "temporary"
         scratch.mkdir()
+        self._kept = {path.name for path in self._temporary.iterdir()}  # as Ray keeps of a cluster that has ended
         found = [self._undisturbed() for _ in range(2)]
         if found[0] != found[1]:
             raise SystemExit(f"two undisturbed ones of {name} differ; nothing can be said of killed ones")
@@ -147,7 +148,7 @@ class VerbTrial:
                 self._tally.leftover(name)
             elif name not in found or found[name] != self._expected[name]:
                 self._tally.fault(f"given again: {name} {'differs' if name in found else 'is missing'}")
-        clear_leftovers(self._temporary, (), self._tally)
+        clear_leftovers(self._temporary, self._kept, self._tally)
 
 
 def everything(folder: Path) -> dict[str, Any]:

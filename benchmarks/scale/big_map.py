@@ -25,7 +25,7 @@ from wall import view
 
 from su3d_bench.core.timing import Timer, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Detections, Float32Array, Float64Array, GroundTruth, Int32Array, LabelSet, SceneInfo
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.opensu3d.pipeline import OpenSU3D
 from su3d_bench.opensu3d.tracking import View, record_of
@@ -113,7 +113,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--points", type=int, default=20_000_000)
     parser.add_argument("--instances", type=int, default=5_000)
-    parser.add_argument("--json", type=Path, help="write the table for docs/performance.md")
+    parser.add_argument("--json", type=Path, help="write the table for docs/running/performance.md")
     arguments = parser.parse_args()
     rows: Rows = []
     method = OpenSU3D()

@@ -38,7 +38,7 @@ from su3d_bench.core.types import (
     SceneInfo,
     UInt8Array,
 )
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.runs.feeding import warm_up
 from su3d_bench.store.predictions import read_prediction, write_prediction
@@ -165,7 +165,7 @@ def main() -> None:
     parser.add_argument("--dimensions", type=int, default=1024)
     parser.add_argument("--features-in", nargs="+", default=["disk", "memory"], choices=("disk", "memory"))
     parser.add_argument("--folder", type=Path, help="where the prediction is written; it must exist and is kept")
-    parser.add_argument("--json", type=Path, help="write the table for docs/performance.md")
+    parser.add_argument("--json", type=Path, help="write the table for docs/running/performance.md")
     parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.here:

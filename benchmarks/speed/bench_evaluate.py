@@ -25,7 +25,7 @@ from su3d_bench.metrics.instance.average_precision import (
     count_class,
     per_scene,
 )
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 
 N_SCENES, N_POINTS, N_MASKS, N_INSTANCES = 8, 200_000, 150, 90
 PROTOCOL = "replica-openmask3d"

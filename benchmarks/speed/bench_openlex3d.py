@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from su3d_bench.core.types import Float32Array, Partition, UInt8Array
 from su3d_bench.metrics.matching.nearest import nearest
 from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels, OpenLexTruth
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 
 N_OBJECTS, N_PROMPTS, DIM = 200, 3407, 1024  # a scene of Replica, the longest prompt list, ViT-H-14

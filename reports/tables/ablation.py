@@ -10,7 +10,7 @@ import numpy as np
 from su3d_bench.core.errors import ConfigError, counted
 from su3d_bench.numerics.statistics import holm, sign_flip_test
 from su3d_bench.reports.tables.model import Cell, Measured, Table, TableRow, signed
-from su3d_bench.reports.tables.paper import (
+from su3d_bench.reports.tables.papers.paper import (
     LAYOUTS,
     LEVEL,
     Layout,
@@ -23,7 +23,7 @@ from su3d_bench.reports.tables.paper import (
     run_notes,
     units,
 )
-from su3d_bench.reports.tables.published import figures_of
+from su3d_bench.reports.tables.papers.published import figures_of
 
 # Table I: all of it in OpenMask3D's set-up, as the paper's text has it.
 SIDES = (Layout(LAYOUTS["II"].metrics, "replica-openmask3d-semantic"), LAYOUTS["III"])

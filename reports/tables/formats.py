@@ -15,8 +15,8 @@ from dataclasses import asdict
 from typing import Any
 
 from su3d_bench.core.errors import printable
-from su3d_bench.reports.tables.latex import latex
 from su3d_bench.reports.tables.model import Cell, Prose, Table, blocks_of
+from su3d_bench.reports.tables.papers.latex import latex
 
 CSV_COLUMNS = (
     "table",

@@ -21,8 +21,8 @@ from su3d_bench.reports.tables.model import (
     signed,
     text_table,
 )
-from su3d_bench.reports.tables.paper import PAPER_SCENES, Shown, other_setup, protocol_table, reported_rows
-from su3d_bench.reports.tables.published import Figure, PaperTable, figures_of
+from su3d_bench.reports.tables.papers.paper import PAPER_SCENES, Shown, other_setup, protocol_table, reported_rows
+from su3d_bench.reports.tables.papers.published import Figure, PaperTable, figures_of
 
 REFINED = "refined label (n')"
 PAPER_MODEL = "gpt-4-1106-preview"  # that of labels n' and of reasoning

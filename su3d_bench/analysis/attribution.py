@@ -22,7 +22,8 @@ from su3d_bench.core.types import GroundTruth, Prediction
 from su3d_bench.metrics.attribution.arrays import EXPLAINED
 from su3d_bench.metrics.fitness import why_not_scorable
 from su3d_bench.metrics.metric import Counts
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import SceneScore, metric_of, plain_json
 from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.store.predictions import read_prediction

@@ -27,7 +27,8 @@ from su3d_bench.analysis.sides import (
 from su3d_bench.core.errors import ConfigError, counted, printable
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.metric import SceneScore
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.score import ANSWERED_BY, REFINED_BY, RELATIVE, said_by
 from su3d_bench.metrics.scoring import plain_json
 from su3d_bench.numerics.statistics import (

@@ -17,7 +17,7 @@ import numpy as np
 from su3d_bench.analysis.recomputed import rules_of_run, why_not_counted
 from su3d_bench.core.errors import ConfigError, Su3dError, counted, printable
 from su3d_bench.core.registry import CEILING_METHOD
-from su3d_bench.metrics.protocol_files import protocol_names
+from su3d_bench.metrics.protocols.files import protocol_names
 from su3d_bench.metrics.scoring import combine
 from su3d_bench.numerics.statistics import Interval, rank_intervals
 from su3d_bench.reports.tables.model import (

@@ -32,7 +32,8 @@ from su3d_bench.metrics.matching.labelling import (
     scored_classes,
 )
 from su3d_bench.metrics.metric import n_predictions, present
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.numerics.geometry import back_project
 from su3d_bench.reports.page.maps import (

@@ -15,7 +15,7 @@ from su3d_bench.analysis.sides import Side
 from su3d_bench.core.config import KeyPath
 from su3d_bench.core.errors import Su3dError, printable, printable_json
 from su3d_bench.metrics.costs import summarise
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, concatenate
 from su3d_bench.reports.page.numbers import confusion_cells, series_of, summary_data
 from su3d_bench.reports.tables.found import Found, Unscored, not_scored_lines

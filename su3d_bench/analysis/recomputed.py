@@ -8,8 +8,9 @@ from typing import Any
 
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError, Su3dError, printable
-from su3d_bench.metrics.protocol_files import protocol_names
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.protocols.files import protocol_names
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import ProtocolResult, SceneScore, combine
 from su3d_bench.runs.finished import FinishedRun
 from su3d_bench.store.atomic import is_file

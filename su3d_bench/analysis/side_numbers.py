@@ -11,7 +11,7 @@ import numpy as np
 from su3d_bench.analysis.sides import Side
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.metric import Counts, SceneScore
-from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import ProtocolResult, combine, metric_of
 from su3d_bench.numerics.statistics import leave_one_out
 

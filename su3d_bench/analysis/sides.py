@@ -8,7 +8,8 @@ from pathlib import Path
 
 from su3d_bench.core.config import MOVES_NO_NUMBER
 from su3d_bench.core.errors import ConfigError, printable
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import SceneScore, metric_of
 from su3d_bench.runs.finished import FinishedRun, read_run
 

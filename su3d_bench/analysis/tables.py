@@ -17,8 +17,8 @@ from su3d_bench.metrics.scoring import ProtocolResult, combine
 from su3d_bench.numerics.statistics import SignFlipTest
 from su3d_bench.reports.tables.found import found_table
 from su3d_bench.reports.tables.judged import WHO_DID
-from su3d_bench.reports.tables.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.model import BY_PEOPLE, Measured, Origin, Table, is_count
+from su3d_bench.reports.tables.papers.latex import PrintedCell, printed_cells
 from su3d_bench.reports.tables.timing import AnytimePoint
 from su3d_bench.runs.finished import FinishedRun, read_run
 from su3d_bench.runs.found import found_in, without_score

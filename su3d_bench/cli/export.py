@@ -15,7 +15,7 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError, PredictionError, coun
 
 if TYPE_CHECKING:
     from su3d_bench.core.interfaces import Encoder
-    from su3d_bench.metrics.protocols import ProtocolRules
+    from su3d_bench.metrics.protocols.model import ProtocolRules
     from su3d_bench.predictions.base import Content, Reader
     from su3d_bench.predictions.export import LabelledMasks
 
@@ -171,7 +171,7 @@ def _maps_of_run(path: Path) -> dict[str, list[Path]]:
 
 def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> list[Source]:
     """The sources that a pattern matches, all without patterns; a scene without a dataset takes that of its pattern."""
-    from su3d_bench.runs.scenes import split_address
+    from su3d_bench.runs.planning.scenes import split_address
 
     if not patterns:
         return list(sources)
@@ -194,7 +194,7 @@ def chosen(sources: Sequence[Source], patterns: Sequence[str], path: Path) -> li
 def _names(addresses: Sequence[str], *, is_flat: bool) -> list[str]:
     """The name of each scene's files: its address, or in a flat folder its last part, which must tell scenes apart."""
     from su3d_bench.predictions.export import file_name
-    from su3d_bench.runs.scenes import split_address
+    from su3d_bench.runs.planning.scenes import split_address
 
     names = []
     for address in addresses:
@@ -238,7 +238,7 @@ def _scene_of(source: Source, *, is_quiet: bool) -> tuple[Any, str]:
 def _rules(name: str | None, dataset: Any) -> ProtocolRules:
     """The protocol of ``name``, or the dataset's only one of instances with classes."""
     from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
-    from su3d_bench.metrics.protocols import load_protocol, protocols_for
+    from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for
 
     fitting = {rules.name: rules for rules in map(load_protocol, protocols_for(dataset.name)) if _has_masks(rules)}
     if name is None:

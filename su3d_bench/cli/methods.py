@@ -14,7 +14,7 @@ from su3d_bench.core.errors import EXIT_DONE, ConfigError, counted
 from su3d_bench.core.printing import one_line
 
 if TYPE_CHECKING:
-    from su3d_bench.reports.tables.published import Figure
+    from su3d_bench.reports.tables.papers.published import Figure
 
 WIDTH = 118
 
@@ -85,7 +85,7 @@ def _summary(method: Any) -> str:
 def _show(arguments: argparse.Namespace) -> int:
     from su3d_bench.core import registry
     from su3d_bench.core.config import flatten, write_toml
-    from su3d_bench.reports.tables.published import figures_of
+    from su3d_bench.reports.tables.papers.published import figures_of
 
     method = registry.load("method", arguments.name)
     defaults = method.Config().model_dump(mode="json")

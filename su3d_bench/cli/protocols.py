@@ -11,7 +11,7 @@ from su3d_bench.cli.common import add_verb, answer_either
 from su3d_bench.core.errors import EXIT_DONE, ConfigError, suggest
 
 if TYPE_CHECKING:
-    from su3d_bench.metrics.protocols import ProtocolRules
+    from su3d_bench.metrics.protocols.model import ProtocolRules
 
 ACTIONS = ("list", "show")
 
@@ -29,8 +29,8 @@ def add_parser(verbs: Any) -> None:
 
 
 def call(arguments: argparse.Namespace) -> int:
-    from su3d_bench.metrics.protocol_files import protocol_names, rules_files
-    from su3d_bench.metrics.protocols import load_protocol
+    from su3d_bench.metrics.protocols.files import protocol_names, rules_files
+    from su3d_bench.metrics.protocols.loading import load_protocol
 
     if arguments.action not in ACTIONS:
         hint = suggest(arguments.action, ACTIONS) or "; known: list, show NAME"
@@ -53,8 +53,8 @@ def call(arguments: argparse.Namespace) -> int:
 def _rules_lines(rules: ProtocolRules, files: Sequence[Path]) -> list[str]:
     """Every rule as a line, beneath it what the file that sets it says of it: its source, or that it is ours."""
     from su3d_bench.core.config import flatten, toml_value
-    from su3d_bench.metrics.protocol_files import HEADING, remarks_of
-    from su3d_bench.metrics.protocols import not_comparable_with
+    from su3d_bench.metrics.protocols.files import HEADING, remarks_of
+    from su3d_bench.metrics.protocols.loading import not_comparable_with
 
     remarks = remarks_of(files)
     shown = rules.model_dump(mode="json", exclude={"classes"}) | {"not_comparable_with": not_comparable_with(rules)}

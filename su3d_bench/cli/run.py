@@ -21,7 +21,7 @@ from su3d_bench.core.errors import EXIT_DONE, EXIT_INCOMPLETE
 
 if TYPE_CHECKING:
     from su3d_bench.core.config import KeyPath, Settings
-    from su3d_bench.runs.plan import Plan
+    from su3d_bench.runs.planning.plan import Plan
     from su3d_bench.runs.runner import RunResult
 
 
@@ -100,7 +100,7 @@ def run_place(text: str) -> Path | str:
 
 
 def add_executor_flags(parser: argparse.ArgumentParser) -> None:
-    """The flags that say where the scenes run; docs/clusters.md has more on them."""
+    """The flags that say where the scenes run; docs/running/clusters.md has more on them."""
     parser.add_argument(
         "--executor", metavar="WHERE", help="inline, processes, ray or slurm (default: processes, inline for one job)"
     )
@@ -121,7 +121,7 @@ def call(arguments: argparse.Namespace) -> int:
 
 def plan_of(arguments: argparse.Namespace) -> Plan:
     """The plan of what was asked for, in a process that leaves the cores to the scenes side by side."""
-    from su3d_bench.runs.plan import make_plan
+    from su3d_bench.runs.planning.plan import make_plan
 
     return make_plan(settings_of(arguments), arguments.set, arguments.out)
 
@@ -173,7 +173,7 @@ def _answer_result(result: RunResult, arguments: argparse.Namespace) -> None:
 
 
 def show_plan(plan: Plan, arguments: argparse.Namespace) -> int:
-    from su3d_bench.runs.estimate import estimate
+    from su3d_bench.runs.planning.estimate import estimate
 
     rows = estimate(plan)
     if arguments.json:

@@ -13,7 +13,7 @@ from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
 from su3d_bench.metrics.matching.checks import MaskFacts
 from su3d_bench.metrics.metric import SceneScore
-from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import ProtocolResult, combine, combined_metrics, metric_of, plain_json
 
 SCHEMA = 1

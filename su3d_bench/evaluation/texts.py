@@ -15,7 +15,7 @@ from su3d_bench.core.errors import DataError, PredictionError, converted, printa
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float32Array, UInt8Array
 from su3d_bench.formats.numpy_files import read_npz
-from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.protocols.model import ProtocolRules
 
 MOST_NAMES = 1 << 20
 

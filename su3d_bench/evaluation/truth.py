@@ -37,14 +37,14 @@ from su3d_bench.formats.text_integers import integer_lines
 from su3d_bench.metrics.fitness import ID_LISTS, LARGEST_NYU40_ID, TruthFacts, list_of_ids, why_not_truth
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
-from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import Truth
 from su3d_bench.predictions.base import scene_files
 from su3d_bench.predictions.scenes import Match, Source, match_scenes, planned_scenes
 from su3d_bench.questions.files.queries import VARIANT as QUERY_OBJECTS
 from su3d_bench.questions.files.queries import query_truth, read_query_file
 from su3d_bench.questions.truths import question_truth
-from su3d_bench.runs.scenes import data_root
+from su3d_bench.runs.planning.scenes import data_root
 
 NOT_MEANT = "is not meant for"
 LARGEST_VALUE = 10_000 * INSTANCES_PER_CLASS  # as the instance metric has it

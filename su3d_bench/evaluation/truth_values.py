@@ -17,7 +17,7 @@ from su3d_bench.evaluation.request import ValuesForm
 from su3d_bench.metrics.fitness import LARGEST_NYU40_ID
 from su3d_bench.metrics.instance.average_precision import INSTANCES_PER_CLASS
 from su3d_bench.metrics.instance.score import OBJECT
-from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.protocols.model import ProtocolRules
 
 LARGEST_LABEL = 1357  # of scannetv2-labels.combined.tsv, the longest list of classes that is known here
 FORMS: dict[ValuesForm, str] = {

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from su3d_bench.core.types import Instances, Partition, Prediction
 from su3d_bench.metrics.matching.labelling import has_every_label
 from su3d_bench.metrics.open_vocabulary.score import NEEDS_FEATURES
-from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.score import labels_n
 
 LARGEST_NYU40_ID = 40

@@ -14,7 +14,7 @@ from su3d_bench.core.errors import DataError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import BoolArray, Float64Array, Instances, Int64Array, Prediction
 from su3d_bench.metrics.matching.nearest import n_farther
-from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.numerics.statistics import nan_mean
 
 MOST_COUNTED = 1 << 53  # numbers beyond it are not whole any more where ratios are formed

@@ -26,7 +26,7 @@ from su3d_bench.metrics.metric import MOST_COUNTED, Counts, Metric, SceneScore, 
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
 from su3d_bench.metrics.open_vocabulary.score import CategoriesMetric, QueryMetric
-from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.score import AnnotationMetric, ReasoningMetric, RetrievalMetric
 from su3d_bench.metrics.questions.truths import AnnotationTruth, ReasoningTruth, RetrievalTruth
 from su3d_bench.metrics.semantic.score import SemanticMetric

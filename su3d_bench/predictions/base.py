@@ -24,7 +24,7 @@ from su3d_bench.core.types import (
 )
 from su3d_bench.formats.arrays import MOST_MASKS, MOST_POINTS, check_members
 from su3d_bench.metrics.matching.nearest import masks_of_partition
-from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.protocols.model import ProtocolRules
 
 NO_SCORES = "the file has no scores: 1 for every mask"
 ONES = "the format has no scores: 1 for every object"

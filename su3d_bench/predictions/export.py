@@ -30,7 +30,7 @@ from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import (
     encoder_warning,
 )
-from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.predictions.base import Content, VertexLabels, VertexMasks
 from su3d_bench.predictions.openlex3d import CLOUD, EMBEDDINGS, INDEX
 from su3d_bench.store.atomic import make_folder, write_text

@@ -21,7 +21,7 @@ from su3d_bench.core.types import Prediction
 from su3d_bench.metrics.costs import UpdateTimes
 from su3d_bench.metrics.scoring import SceneScore, unpack_scores
 from su3d_bench.runs.job import build_dataset, part_of
-from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets
+from su3d_bench.runs.planning.scenes import cache_root, data_root, dataset_targets
 from su3d_bench.store.atomic import is_file
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.records import (

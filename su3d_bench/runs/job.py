@@ -14,7 +14,7 @@ from su3d_bench.core.digests import NUMERIC_PACKAGES, code_digest, digest_json, 
 from su3d_bench.core.errors import StoreError
 from su3d_bench.core.interfaces import HasCaveat, HasInputs, HasOwnPerception, Method, ReadsMadeRooms
 from su3d_bench.core.types import SceneInfo
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.perception.profiles import Perception, PerceptionConfig
 from su3d_bench.questions.reasoning.language_solver import answers_digest
 from su3d_bench.questions.refined_names import refined_digest

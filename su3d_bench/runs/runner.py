@@ -23,7 +23,8 @@ from su3d_bench.core.files import file_bytes
 from su3d_bench.core.registry import CEILING_METHOD, DATASETS
 from su3d_bench.core.timing import hardware_line, processor_digest
 from su3d_bench.metrics.instance.score import CONSTANT_CONFIDENCE
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import EVERY_SCENE, SceneScore, combine, combined_metrics, plain_json, unpack_scores
 from su3d_bench.perception.profiles import PerceptionConfig
 from su3d_bench.reports.tables.found import Found, Unscored, not_scored_lines
@@ -31,12 +32,12 @@ from su3d_bench.runs.executors.choose import ELSEWHERE, run_units
 from su3d_bench.runs.executors.local import SCENE_DONE, Event, Report
 from su3d_bench.runs.found import found_in
 from su3d_bench.runs.job import MethodOutcome, SceneJob
-from su3d_bench.runs.plan import Plan
-from su3d_bench.runs.poses import judged
+from su3d_bench.runs.planning.plan import Plan
+from su3d_bench.runs.planning.poses import judged
+from su3d_bench.runs.planning.scenes import cache_root
 from su3d_bench.runs.remote.scene import DistantJob, failed_distant, fetch_results, run_distant_scene, send_records
 from su3d_bench.runs.resume import FinishedScenes
 from su3d_bench.runs.scene import failed_outcomes, run_scene
-from su3d_bench.runs.scenes import cache_root
 from su3d_bench.store.atomic import remove_file, write_json, write_text
 from su3d_bench.store.records import (
     FailureRecord,

@@ -31,7 +31,8 @@ from su3d_bench.core.printing import one_line
 from su3d_bench.core.timing import MethodClock, device_memory_bytes, peak_memory_bytes, start_memory_watch
 from su3d_bench.core.types import Frame, GroundTruth, InstanceMesh, ObjectBoxes, Prediction, Proposals, SceneInfo
 from su3d_bench.metrics.fitness import why_not_scorable
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import SceneScore, Truth, pack_scores, score_scene
 from su3d_bench.perception.language.client import ChatClient
 from su3d_bench.perception.language.reply_store import ReplyStore
@@ -64,8 +65,8 @@ from su3d_bench.runs.job import (
     refuse_other_run,
     stride_of,
 )
+from su3d_bench.runs.planning.poses import REMARK, PosesContradicted, judged
 from su3d_bench.runs.plug_ins import error_line
-from su3d_bench.runs.poses import REMARK, PosesContradicted, judged
 from su3d_bench.store.atomic import write_bytes, write_text
 from su3d_bench.store.predictions import read_prediction
 from su3d_bench.store.run_folder import JobFolder, RunFolder

@@ -11,7 +11,7 @@ from su3d_bench.core.config import KeyPath, Setting, Settings
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.core.types import DenseFeatures
 from su3d_bench.metrics.metric import n_predictions
-from su3d_bench.runs.plan import make_plan
+from su3d_bench.runs.planning.plan import make_plan
 from su3d_bench.runs.runner import run_plan
 from su3d_bench.store.predictions import read_prediction
 

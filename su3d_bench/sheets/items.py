@@ -7,7 +7,7 @@ for a number.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal, Protocol, TypeVar
 
@@ -184,12 +184,32 @@ class KeyItem(_Strict):
     automatic: Mapping[str, str]
 
 
+@dataclass(frozen=True, kw_only=True)
+class JudgedRun:
+    """How the run that is judged was made.
+
+    ``answered_by``: who gave the answers of reasoning sheets, or labels n'; ``profile``, ``encoder``, ``limit`` and
+    ``changed`` (method -> settings other than its own) are those of the run; ``remarks``: what must stand beside its
+    numbers.
+    """
+
+    answered_by: str = ""
+    profile: str = ""
+    encoder: str = ""
+    limit: int = 0
+    changed: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    remarks: tuple[str, ...] = ()
+    schema_version: int = SCHEMA
+
+    def how_it_was_made(self) -> dict[str, Any]:
+        """These fields, for what is made of the same run."""
+        return {one.name: getattr(self, one.name) for one in fields(JudgedRun)}
+
+
 @dataclass(frozen=True)
-class Key(_Strict):
+class Key(JudgedRun, _Strict):
     """What the maintainer keeps: ``sheet_id`` ties it to its sheet, ``run`` names the run folder, ``run_digest`` its
-    code; ``answered_by``: who gave the answers of reasoning sheets, or labels n'; ``profile``, ``encoder``, ``limit``
-    and ``changed`` (method -> settings other than its own) are those of the run; ``remarks``: what must stand beside
-    its numbers."""
+    code."""
 
     sheet_id: str
     kind: SheetKind
@@ -198,13 +218,6 @@ class Key(_Strict):
     methods: tuple[str, ...]
     automatic_rule: str
     items: tuple[KeyItem, ...]
-    answered_by: str = ""
-    profile: str = ""
-    encoder: str = ""
-    limit: int = 0
-    changed: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    remarks: tuple[str, ...] = ()
-    schema_version: int = SCHEMA
 
 
 def new_item(

@@ -25,8 +25,8 @@ from su3d_bench.metrics.attribution.arrays import EXPLAINED as EXPLAINED_KINDS
 from su3d_bench.metrics.attribution.arrays import scored_masks, scored_points
 from su3d_bench.metrics.attribution.masks import count_masks
 from su3d_bench.metrics.attribution.points import CAUSES, LabelledPoints, causes_of, mend_points, object_of_mask
-from su3d_bench.metrics.protocol_files import protocol_names
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.files import protocol_names
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import score_scene
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.reports.tables.attribution import MEANINGS

@@ -26,7 +26,7 @@ from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError, StoreError
 from su3d_bench.core.types import Float64Array
 from su3d_bench.metrics.instance import average_precision as instance_ap
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import SceneScore, metric_of, pack_scores
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.numerics.statistics import MAX_EXACT_PAIRS, SignFlipTest, sign_flip_test

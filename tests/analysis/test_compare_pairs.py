@@ -17,7 +17,7 @@ from su3d_bench.analysis.sides import Side
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import DataError
 from su3d_bench.metrics.metric import SceneScore
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.runs import scene as scene_run
 

@@ -21,7 +21,7 @@ from su3d_bench.analysis.gate.reference import Reference, Value, learn, read_ref
 from su3d_bench.cli.main import main
 from su3d_bench.core.digests import digest_file
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, pack_scores, unpack_scores
 from su3d_bench.metrics.semantic.confusion import SemanticCounts
 from su3d_bench.reports.gate import Finding, Verdict, github_lines, junit_xml, markdown, plain_lines

@@ -19,7 +19,7 @@ from su3d_bench.analysis.comparison import compare
 from su3d_bench.analysis.planning import plan
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import SceneScore, combine, pack_scores
 from su3d_bench.numerics.power import scenes_needed, variance_of
 from su3d_bench.numerics.statistics import sign_flip_test, t_quantile

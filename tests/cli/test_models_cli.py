@@ -17,7 +17,7 @@ from su3d_bench.cli.main import build_parser, main
 from su3d_bench.core.errors import ModelMissing, PredictionError
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.evaluation.texts import encoder_for
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.perception.models.catalogue import MODELS
 from su3d_bench.perception.models.config import ModelsConfig
 from su3d_bench.perception.models.loading import load_encoder

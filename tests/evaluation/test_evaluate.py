@@ -31,7 +31,7 @@ from su3d_bench.core.errors import ConfigError, DataError, PredictionError
 from su3d_bench.evaluation.evaluate import Request, evaluate
 from su3d_bench.evaluation.request import ValuesForm
 from su3d_bench.metrics.instance.average_precision import THRESHOLDS, combine, per_scene
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.predictions.formats import READERS
 from su3d_bench.predictions.scenes import Source, match_scenes
 
@@ -274,7 +274,7 @@ def test_an_empty_first_scene_decides_nothing(tmp_path: Path) -> None:
 
 
 def test_a_protocol_of_the_user_counts_missing_scenes(tmp_path: Path) -> None:
-    from su3d_bench.metrics.protocol_files import rules_file
+    from su3d_bench.metrics.protocols.files import rules_file
 
     text = rules_file("scannet-instance").read_text().replace('name = "scannet-instance"', 'name = "mine"')
     (tmp_path / "mine.toml").write_text(text)

@@ -27,7 +27,7 @@ from su3d_bench.metrics.instance.average_precision import (
 )
 from su3d_bench.metrics.instance.precision_recall import dot
 from su3d_bench.metrics.instance.score import NO_OBJECT, covered_objects
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 
 INSTANCE_CASES = sorted(p.stem for p in CASES.glob("inst*.json")) + sorted(p.stem for p in CASES.glob("replica*.json"))
 

@@ -16,7 +16,8 @@ from su3d_bench.metrics.instance import average_precision as instance_ap
 from su3d_bench.metrics.instance.average_precision import InstanceCounts
 from su3d_bench.metrics.instance.resampling import resampled_ap
 from su3d_bench.metrics.metric import Arrays, Counts, SceneScore, Values, present, scene_mean
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, metric_of, plain_json
 from su3d_bench.metrics.semantic.confusion import (
     SemanticCounts,

@@ -16,7 +16,7 @@ from scored_room import ENCODER, ID, room
 from su3d_bench.core.errors import PredictionError, StoreError
 from su3d_bench.core.types import DenseFeatures, Instances, Partition
 from su3d_bench.metrics.matching.nearest import masks_of, transfer_masks
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 from su3d_bench.predictions.base import VertexLabels, VertexMasks, vertex_masks
 from su3d_bench.predictions.export import (

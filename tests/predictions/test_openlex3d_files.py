@@ -28,7 +28,7 @@ from su3d_bench.datasets.replica.mesh_truth import AnnotatedMesh
 from su3d_bench.formats.ply import ListColumn
 from su3d_bench.metrics.open_vocabulary.openlex3d import ObjectLabels
 from su3d_bench.metrics.open_vocabulary.query_ap import TextQuery
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 
 WHERE = "replica/room0: file"

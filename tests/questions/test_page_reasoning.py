@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from places import CASES
 
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.score import are_objects_right, is_answer_right
 from su3d_bench.metrics.questions.truths import TrueAnswer
 from su3d_bench.perception.language.chat import ChatRequest, Reply

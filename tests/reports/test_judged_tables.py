@@ -15,9 +15,9 @@ from su3d_bench.analysis.tables import check_paper, measured_results
 from su3d_bench.cli.main import main
 from su3d_bench.core.errors import ConfigError
 from su3d_bench.reports.tables.judged import KINDS, judged_table, sheet_tables
-from su3d_bench.reports.tables.latex import latex
 from su3d_bench.reports.tables.model import Measured
-from su3d_bench.reports.tables.paper import Shown
+from su3d_bench.reports.tables.papers.latex import latex
+from su3d_bench.reports.tables.papers.paper import Shown
 from su3d_bench.sheets.judging.answers import check_answers
 from su3d_bench.sheets.judging.scores import score, write_scores
 

@@ -8,8 +8,8 @@ from pathlib import Path
 import pytest
 
 from su3d_bench.core.errors import ConfigError
-from su3d_bench.metrics.protocols import load_protocol
-from su3d_bench.reports.tables.published import FILE, Figure, figures_of, published, read_published
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.reports.tables.papers.published import FILE, Figure, figures_of, published, read_published
 
 WHOLE = """
 [[figure]]

@@ -28,10 +28,10 @@ from su3d_bench.reports.tables.formats import (
     no_formula,
     plain,
 )
-from su3d_bench.reports.tables.latex import escape, latex, origin_comment, printed_cells
 from su3d_bench.reports.tables.model import Cell, Origin, Prose, Table, TableRow, text_table
-from su3d_bench.reports.tables.paper import Shown, paper_table, protocol_table
-from su3d_bench.reports.tables.published import Figure
+from su3d_bench.reports.tables.papers.latex import escape, latex, origin_comment, printed_cells
+from su3d_bench.reports.tables.papers.paper import Shown, paper_table, protocol_table
+from su3d_bench.reports.tables.papers.published import Figure
 
 HOSTILE = (
     "\\input{/etc/passwd}",

@@ -15,7 +15,7 @@ from painted import colour_perception
 
 from su3d_bench.cli.main import main
 from su3d_bench.core.types import Instances
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.questions.model import question_id
 from su3d_bench.runs import finished as finished_run
 from su3d_bench.runs import scene as scene_run

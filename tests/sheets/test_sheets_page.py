@@ -142,8 +142,8 @@ def test_what_is_kept_and_is_no_answer_is_passed_over(tmp_path: Path, browser: C
     kept = {"answers": {first: {"retrieval": "<b>"}, second: {"retrieval": "wrong"}, "x": 1}, "history": [7], "at": 1e9}
     browser.run("localStorage.clear()")
     place = f"su3d-bench sheet {both.sheet.id} annotator-1"
-    browser.run(f"localStorage.setItem({json.dumps(place)}, {json.dumps(json.dumps(kept))})")
-    browser.reload(until=f"{COUNT}.startsWith('1 of 4 answered')")
+    keep = f"localStorage.setItem({json.dumps(place)}, {json.dumps(json.dumps(kept))})"
+    browser.reload(until=f"{COUNT}.startsWith('1 of 4 answered')", keep=keep)
     assert shown(browser).startswith("1 of 4 answered")
     browser.run("localStorage.clear()")
 

@@ -23,7 +23,7 @@ from su3d_bench.store.records import (
     read_record,
 )
 
-PAGE = ROOT / "docs/run-folder.md"
+PAGE = ROOT / "docs/running/run-folder.md"
 DESCRIBED = (
     records.RunRecord,
     records.ProtocolRecord,

@@ -76,8 +76,8 @@ def _tables(arguments: argparse.Namespace) -> list[Table]:
     from su3d_bench.analysis.tables import choose, found_tables, is_scores, measured_results, refuse_unscored
     from su3d_bench.reports.tables.ablation import ablation_table
     from su3d_bench.reports.tables.judged import JUDGED, judged_table
-    from su3d_bench.reports.tables.paper import Shown, paper_table, selection_tables
-    from su3d_bench.runs.ablation import read_rows
+    from su3d_bench.reports.tables.papers.paper import Shown, paper_table, selection_tables
+    from su3d_bench.runs.planning.ablation import read_rows
 
     shown = Shown(
         metrics=tuple(arguments.metrics),

@@ -28,7 +28,7 @@ from su3d_bench.metrics.attribution.points import LabelledPoints
 from su3d_bench.metrics.instance.score import masks_on_truth
 from su3d_bench.metrics.matching import nearest as transfer
 from su3d_bench.metrics.matching.labelling import class_index_of_ids
-from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.score import call_points, transfer_votes
 
 

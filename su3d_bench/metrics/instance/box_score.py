@@ -21,7 +21,7 @@ from su3d_bench.metrics.matching.labelling import (
     scored_classes,
 )
 from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, Values, present
-from su3d_bench.metrics.protocols import BOX_AXES
+from su3d_bench.metrics.protocols.model import BOX_AXES
 from su3d_bench.numerics.statistics import row_means
 
 _REACH = 3**0.5  # a box around points within r of a place, along whatever axes, is within this many r of it

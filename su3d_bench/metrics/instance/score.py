@@ -24,7 +24,7 @@ from su3d_bench.metrics.matching.labelling import (
     scored_classes,
 )
 from su3d_bench.metrics.metric import C, Metric, Pooled, SceneScore, Values, n_predictions, present
-from su3d_bench.metrics.protocols import AP_NAMES, ProtocolRules, TransferRules
+from su3d_bench.metrics.protocols.model import AP_NAMES, ProtocolRules, TransferRules
 
 IntArray = NDArray[np.integer[Any]]
 
@@ -183,7 +183,7 @@ def encode_without_classes(rules: ProtocolRules, semantic: IntArray, instance: I
     objects come by their number. ``everything``: the same, for the original takes values modulo 1000, and nothing is
     void, for points without an instance are one more, of the value 1000.
 
-    >>> from su3d_bench.metrics.protocols import load_protocol
+    >>> from su3d_bench.metrics.protocols.loading import load_protocol
     >>> semantic, instance = np.array([0, 1, 5, 2, 5]), np.array([0, 1, 1, 3, 2])  # 1 is the wall
     >>> names = ("open3dis", "segment3d", "maskclustering")
     >>> each = [load_protocol(f"class-agnostic-{name}") for name in names]

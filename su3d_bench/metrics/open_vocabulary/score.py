@@ -29,7 +29,7 @@ from su3d_bench.metrics.open_vocabulary import object_means, openlex3d, query_ap
 from su3d_bench.metrics.open_vocabulary.object_means import ObjectCounts
 from su3d_bench.metrics.open_vocabulary.openlex3d import OpenLexTruth
 from su3d_bench.metrics.open_vocabulary.query_ap import QueryTruth
-from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.semantic.score import has_feature
 from su3d_bench.numerics.geometry import voxel_coordinates
 from su3d_bench.store.scratch import release_pages

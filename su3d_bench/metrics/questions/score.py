@@ -14,7 +14,7 @@ from su3d_bench.core.types import BoolArray, Float64Array, GroundTruth, Instance
 from su3d_bench.metrics.instance.score import NO_OBJECT, Covered, covered_objects, score_of_masks
 from su3d_bench.metrics.matching.labelling import cosines, device_of, encoder_warning, text_features
 from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, n_predictions
-from su3d_bench.metrics.protocols import AnswerRules, MergeRules, ProtocolRules
+from su3d_bench.metrics.protocols.model import AnswerRules, MergeRules, ProtocolRules
 from su3d_bench.metrics.questions import shares
 from su3d_bench.metrics.questions.shares import ShareCounts, share_counts
 from su3d_bench.metrics.questions.truths import (

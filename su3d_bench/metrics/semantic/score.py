@@ -19,7 +19,7 @@ from su3d_bench.metrics.matching.labelling import (
     scored_classes,
 )
 from su3d_bench.metrics.metric import Metric, Pooled, SceneScore, Values, present
-from su3d_bench.metrics.protocols import ClassEntry, ProtocolRules
+from su3d_bench.metrics.protocols.model import ClassEntry, ProtocolRules
 from su3d_bench.metrics.semantic import confusion as semantic
 from su3d_bench.metrics.semantic.confusion import SemanticCounts, SemanticMetrics
 from su3d_bench.numerics.geometry import voxel_coordinates

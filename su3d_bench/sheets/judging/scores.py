@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 from collections import Counter, defaultdict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass
 from itertools import combinations
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
@@ -26,7 +26,18 @@ from su3d_bench.numerics.statistics import (
     sign_flip_test,
 )
 from su3d_bench.questions.model import ALL_KINDS
-from su3d_bench.sheets.items import ARGUABLE, CANNOT_TELL, MERGES, RIGHT, Key, KeyItem, Sheet, SheetKind, read_record
+from su3d_bench.sheets.items import (
+    ARGUABLE,
+    CANNOT_TELL,
+    MERGES,
+    RIGHT,
+    JudgedRun,
+    Key,
+    KeyItem,
+    Sheet,
+    SheetKind,
+    read_record,
+)
 from su3d_bench.sheets.judging.agreement import Agreement, agreement, cohen_kappa
 from su3d_bench.sheets.judging.answers import LABELS, Judgement
 from su3d_bench.sheets.judging.verdicts import WHOLE, whole_verdicts
@@ -134,7 +145,7 @@ class SecondLook:
 
 
 @dataclass(frozen=True)
-class Scores:
+class Scores(JudgedRun):
     """All that is known of a set; ``annotators``: name -> number of judgements, ``silent`` those without any."""
 
     sheet_id: str
@@ -151,13 +162,6 @@ class Scores:
     agreements: tuple[AskAgreement, ...]
     confusions: tuple[Confusion, ...]
     second_looks: tuple[SecondLook, ...]
-    answered_by: str = ""
-    profile: str = ""
-    encoder: str = ""
-    limit: int = 0
-    changed: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
-    remarks: tuple[str, ...] = ()
-    schema_version: int = SCHEMA
 
 
 def score(sheet: Sheet, key: Key, judgements: Sequence[Judgement], silent: Sequence[str] = ()) -> Scores:
@@ -190,12 +194,7 @@ def score(sheet: Sheet, key: Key, judgements: Sequence[Judgement], silent: Seque
         agreements=tuple(AskAgreement(what, agreement(items)) for what, items in ratings.items()),
         confusions=tuple(confusion for what in ratings if (confusion := _confusion(sheet, what, given)) is not None),
         second_looks=tuple(_second_looks(sheet, keys, judgements)),
-        answered_by=key.answered_by,
-        profile=key.profile,
-        encoder=key.encoder,
-        limit=key.limit,
-        changed=key.changed,
-        remarks=key.remarks,
+        **key.how_it_was_made(),
     )
 
 

@@ -12,7 +12,7 @@ from su3d_bench.core.errors import ConfigError, printable
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float64Array, GroundTruth, Instances
 from su3d_bench.metrics.instance.score import Covered
-from su3d_bench.metrics.protocols import ProtocolRules
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.score import (
     are_objects_right,
     is_answer_right,

@@ -21,8 +21,9 @@ from su3d_bench.core.errors import (
 from su3d_bench.core.types import Frame, GroundTruth, Instances
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
 from su3d_bench.metrics.instance.score import Covered, covered_objects
-from su3d_bench.metrics.protocol_files import protocol_names
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.protocols.files import protocol_names
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.questions.truths import RefinedNames
 from su3d_bench.questions.reasoning.scene_map import SceneMap, map_of
 from su3d_bench.questions.refined_names import refined_names

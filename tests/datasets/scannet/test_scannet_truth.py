@@ -41,7 +41,7 @@ from su3d_bench.datasets.scannet.truth import (
     truth_names,
 )
 from su3d_bench.metrics.instance.average_precision import encode_ground_truth
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 
 WHERE = f"scannet/{SCAN}"
 # 24 vertices in four rows of six. Segment 7 holds the first two columns, 12 the next two, 19 the last two;

@@ -6,12 +6,12 @@ import base64
 import codecs
 import html
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from urllib.parse import quote
 
 import pytest
-from chat_server import Answered, ChatServer, chat_server, error, quick_config
+from chat_server import Answered, ChatServer, error, quick_config
 
 from su3d_bench.core.errors import Su3dError
 from su3d_bench.perception.language.chat import ChatRequest
@@ -59,18 +59,10 @@ DRESSES: dict[str, Callable[[str], str]] = {
 }
 
 
-@pytest.fixture(scope="module")
-def shared() -> Iterator[ChatServer]:
-    with chat_server() as server:
-        yield server
-
-
 @pytest.fixture
-def server(shared: ChatServer, monkeypatch: pytest.MonkeyPatch) -> ChatServer:
-    pytest.importorskip("openai", reason="the models extra is not installed")
+def server(chat: ChatServer, monkeypatch: pytest.MonkeyPatch) -> ChatServer:
     monkeypatch.setenv("SU3D_TEST_KEY", KEY)
-    shared.script.clear()
-    return shared
+    return chat
 
 
 def request(text: str) -> ChatRequest:

@@ -182,7 +182,7 @@ def _evaluated(folder: Path) -> Read:
     from cli_calls import called
     from evaluated_text import feature_scene, write_texts
 
-    from su3d_bench.metrics.protocols import load_protocol
+    from su3d_bench.metrics.protocols.loading import load_protocol
 
     feature_scene(folder)
     names = [entry.name for entry in load_protocol("scannet-instance").classes]

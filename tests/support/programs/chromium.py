@@ -115,14 +115,16 @@ class Chromium:
         """Open a file, as a person does who double-clicks on it."""
         self._arrive("Page.navigate", {"url": path.resolve().as_uri()})
 
-    def reload(self, until: str) -> None:
+    def reload(self, until: str, keep: str = "0") -> None:
         """Load the page again until an expression is true of it.
 
         Unlike ``open`` in the same process, which has what the page has just kept; and again, for what a page keeps
-        is on its way to the browser's store when the page goes on, and a reload may come before it.
+        is on its way to the browser's store when the page goes on, and a reload may come before it. ``keep``: what is
+        run before each load, since a browser whose store opens late forgets what was kept before.
         """
 
         def is_so() -> bool:
+            self.run(keep)
             self._arrive("Page.reload", {})
             return bool(self.run(until))
 

@@ -9,7 +9,7 @@ import numpy as np
 
 from su3d_bench.core.interfaces import Encoder
 from su3d_bench.core.types import Float32Array, GroundTruth, Instances, LabelSet, Prediction, UInt8Array
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import SceneScore, combine, score_scene
 
 SEMANTIC = ("rooms-semantic", "replica-mesh-ex6")

@@ -16,7 +16,7 @@ from su3d_bench.core.types import DenseFeatures, GroundTruth, Instances, LabelSe
 from su3d_bench.metrics.instance.average_precision import combine as combine_counts
 from su3d_bench.metrics.instance.average_precision import per_scene
 from su3d_bench.metrics.instance.score import encode_without_classes
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.scoring import combine, score_scene
 
 NAMES = ("class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d")

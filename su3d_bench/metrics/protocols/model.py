@@ -1,21 +1,14 @@
-"""Named, versioned evaluations: everything that moves a number, as a file of ``rules/`` says it.
-
-A protocol is chosen by name, or by the path of a TOML file of the same form. Unknown keys and wrong values are errors
-of one line that name the file and the key.
-"""
+"""Everything that moves a number of an evaluation, and what the kinds of evaluation need and take of it."""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
-from functools import lru_cache
-from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, Self
+from collections.abc import Mapping
+from typing import Annotated, ClassVar, Literal, Self
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from su3d_bench.core.errors import ConfigError, suggest
-from su3d_bench.metrics.protocol_files import line_of, protocol_names, read_content, rules_file
+from su3d_bench.core.errors import suggest
 
 ValuesOfMetric = Mapping[str, tuple[str, ...]]
 CATEGORIES = ("synonyms", "depictions", "vis_sim", "clutter", "missing", "incorrect")
@@ -93,7 +86,7 @@ class AnswerRules(_Strict):
     distance_share: Annotated[float, Field(ge=0)]
 
 
-_SECTIONS: dict[str, type[BaseModel]] = {"transfer": TransferRules, "merging": MergeRules, "answers": AnswerRules}
+SECTIONS: dict[str, type[BaseModel]] = {"transfer": TransferRules, "merging": MergeRules, "answers": AnswerRules}
 
 
 class ProtocolRules(_Strict):
@@ -424,65 +417,3 @@ RULES_OF_KIND: dict[str, type[ProtocolRules]] = {
     "annotation": AnnotationRules,
     "reasoning": ReasoningRules,
 }
-
-
-def protocols_for(dataset: str) -> list[str]:
-    """The protocols under which a dataset is scored unless others are named."""
-    known = map(load_protocol, protocol_names())
-    return [rules.name for rules in known if rules.by_default and dataset in rules.datasets]
-
-
-def not_comparable_with(rules: ProtocolRules) -> list[str]:
-    """Protocols whose numbers must not stand beside those of ``rules``: it names them, or they name it."""
-    naming = [name for name in protocol_names() if rules.name in load_protocol(name).not_comparable_with]
-    return sorted({*rules.not_comparable_with, *naming})
-
-
-@lru_cache(maxsize=64)
-def load_protocol(name: str) -> ProtocolRules:
-    """The rules called ``name``, or those in the file ``name`` when it ends in ``.toml``."""
-    known = protocol_names()
-    if name in known:
-        return read_protocol(rules_file(name))
-    if name.endswith(".toml"):
-        rules = read_protocol(Path(name))
-        if rules.name in known:
-            raise ConfigError(f"{name}: the protocol name '{rules.name}' is built in; choose another name")
-        return rules
-    raise ConfigError(f"unknown protocol '{name}'{suggest(name, known) or '; known: ' + ', '.join(known)}")
-
-
-def read_protocol(path: Path) -> ProtocolRules:
-    """The rules in a TOML file and in those that it extends."""
-    content = read_content(path)
-    try:
-        rules = RULES_OF_KIND.get(str(content.values.get("kind")), ProtocolRules)
-        return rules.model_validate(_with_tuples(content.values))
-    except ValidationError as error:
-        raise ConfigError(_first_line(content.files, error)) from error
-
-
-def _with_tuples(value: Any) -> Any:
-    """TOML knows lists alone; the strict model wants its tuples."""
-    if isinstance(value, list):
-        return tuple(_with_tuples(item) for item in value)
-    if isinstance(value, dict):
-        return {key: _with_tuples(item) for key, item in value.items()}
-    return value
-
-
-def _first_line(files: Sequence[Path], error: ValidationError) -> str:
-    """The first complaint as one line with the file, the line and, for an unknown key, the likely one."""
-    # a misspelt key is both unknown and, under its right name, missing: the first says more
-    first = min(error.errors(), key=lambda complaint: complaint["type"] != "extra_forbidden")
-    key = ".".join(str(part) for part in first["loc"])
-    if first["type"] == "extra_forbidden":
-        last = str(first["loc"][-1])
-        fields = _SECTIONS.get(key.partition(".")[0], ProtocolRules).model_fields
-        return f"{line_of(files, last)}: unknown key '{key}'{suggest(last, fields)}"
-    if first["type"] == "missing":
-        return f"{files[0]}: the key '{key}' is missing"
-    message = first["msg"].removeprefix("Value error, ")
-    where = line_of(files, str(first["loc"][-1]) if first["loc"] else message.split(":")[0])
-    message = message[0].lower() + message[1:]
-    return f"{where}: {key}: {message}, not {first['input']!r}" if key else f"{where}: {message}"

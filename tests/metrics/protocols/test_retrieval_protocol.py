@@ -17,8 +17,8 @@ from su3d_bench.core.types import Partition
 from su3d_bench.evaluation.scoring import facts_of, score_on_objects
 from su3d_bench.metrics.fitness import why_not_content, why_not_scorable
 from su3d_bench.metrics.instance.score import covered_objects
-from su3d_bench.metrics.protocol_files import rules_file
-from su3d_bench.metrics.protocols import load_protocol, protocols_for, read_protocol
+from su3d_bench.metrics.protocols.files import rules_file
+from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for, read_protocol
 from su3d_bench.metrics.questions import shares
 from su3d_bench.metrics.questions.score import are_objects_right, first_instances, is_answer_right
 from su3d_bench.metrics.questions.shares import ShareCounts
@@ -29,7 +29,7 @@ from su3d_bench.predictions.base import vertex_masks
 from su3d_bench.questions import truths
 from su3d_bench.questions.sight import Sight
 from su3d_bench.questions.truths import question_truth
-from su3d_bench.runs.plan import protocols_of_run
+from su3d_bench.runs.planning.plan import protocols_of_run
 
 RULES = load_protocol("rooms-retrieval")
 REASONING = load_protocol("rooms-reasoning")

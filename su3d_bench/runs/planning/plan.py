@@ -29,7 +29,7 @@ from su3d_bench.core.errors import ConfigError, StoreError, printable, suggest
 from su3d_bench.core.interfaces import HasPresets, IsSystem
 from su3d_bench.core.registry import CEILING_METHOD
 from su3d_bench.metrics.fitness import TruthFacts, why_not_truth
-from su3d_bench.metrics.protocols import load_protocol, protocols_for
+from su3d_bench.metrics.protocols.loading import load_protocol, protocols_for
 from su3d_bench.perception.profiles import PROFILES, PerceptionConfig, check_models
 from su3d_bench.runs.executors.choose import ELSEWHERE, check_execution
 from su3d_bench.runs.job import (
@@ -42,10 +42,10 @@ from su3d_bench.runs.job import (
     part_of,
     refuse_other_run,
 )
+from su3d_bench.runs.planning.scenes import cache_root, data_root, dataset_targets, expand_scenes
 from su3d_bench.runs.remote.data import DataPlace, RemoteData, data_place
 from su3d_bench.runs.remote.folder import is_url
 from su3d_bench.runs.remote.scene import fetch_seals, mirror_of
-from su3d_bench.runs.scenes import cache_root, data_root, dataset_targets, expand_scenes
 from su3d_bench.store.run_folder import RunFolder
 
 MOST_CHARACTERS = 120  # the name is a folder's name too

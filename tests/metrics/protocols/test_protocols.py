@@ -30,8 +30,9 @@ from su3d_bench.metrics.fitness import (
     why_not_truth,
 )
 from su3d_bench.metrics.instance.average_precision import MIN_REGION_SIZE, THRESHOLDS
-from su3d_bench.metrics.protocol_files import HEADING, RULES, protocol_names, read_remarks, remarks_of
-from su3d_bench.metrics.protocols import RULES_OF_KIND, ProtocolRules, load_protocol, not_comparable_with, protocols_for
+from su3d_bench.metrics.protocols.files import HEADING, RULES, protocol_names, read_remarks, remarks_of
+from su3d_bench.metrics.protocols.loading import load_protocol, not_comparable_with, protocols_for
+from su3d_bench.metrics.protocols.model import RULES_OF_KIND, ProtocolRules
 
 NAMES = {
     "class-agnostic-maskclustering", "class-agnostic-open3dis", "class-agnostic-segment3d", "openlex3d-queries",

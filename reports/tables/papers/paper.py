@@ -9,8 +9,8 @@ from functools import partial
 import numpy as np
 
 from su3d_bench.core.errors import ConfigError, counted, printable, suggest
-from su3d_bench.metrics.protocol_files import protocol_names
-from su3d_bench.metrics.protocols import load_protocol
+from su3d_bench.metrics.protocols.files import protocol_names
+from su3d_bench.metrics.protocols.loading import load_protocol
 from su3d_bench.metrics.questions.score import RELATIVE, said_by
 from su3d_bench.numerics.statistics import SignFlipTest, holm, sign_flip_test
 from su3d_bench.reports.tables.model import (
@@ -28,7 +28,7 @@ from su3d_bench.reports.tables.model import (
     percent,
     some,
 )
-from su3d_bench.reports.tables.published import Figure, PaperTable, figures_of
+from su3d_bench.reports.tables.papers.published import Figure, PaperTable, figures_of
 
 LEVEL = 0.05
 PAPER_PROFILE = "paper"

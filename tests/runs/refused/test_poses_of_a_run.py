@@ -16,8 +16,8 @@ from su3d_bench.core.config import Setting, Settings, write_toml
 from su3d_bench.core.types import Float64Array
 from su3d_bench.datasets.recordings import pose_convention
 from su3d_bench.numerics.geometry import turn_to_z
-from su3d_bench.runs import poses
-from su3d_bench.runs.plan import make_plan
+from su3d_bench.runs.planning import poses
+from su3d_bench.runs.planning.plan import make_plan
 from su3d_bench.runs.scene import run_scene
 
 MAKE = "datasets make rooms --layout replica --scenes bathroom0 office0 --workers 1 --quiet"
@@ -35,13 +35,9 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def root(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def root(whole: Path, data_to_spoil: Callable[[Path], Path]) -> Path:
     """A copy of the rooms that a test may spoil."""
-    shutil.copytree(whole, tmp_path / "data")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SU3D_DATA", "data")
-    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "data"
+    return data_to_spoil(whole)
 
 
 def spoil(root: Path, change: Callable[[Float64Array], Float64Array], scene: str = "bathroom0") -> None:

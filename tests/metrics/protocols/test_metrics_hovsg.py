@@ -15,7 +15,8 @@ from scored_room import ENCODER, ID, LABELS, OneHotEncoder, instances, noisy, no
 
 from su3d_bench.core.types import DenseFeatures, Float32Array, GroundTruth, Instances, LabelSet, Partition, UInt8Array
 from su3d_bench.metrics.matching.labelling import text_features
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, pack_scores, score_scene, unpack_scores
 from su3d_bench.metrics.semantic.confusion import confusion_matrix, hovsg_metrics, per_scene
 

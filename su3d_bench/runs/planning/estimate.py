@@ -9,7 +9,7 @@ from typing import Any
 
 from su3d_bench.core.errors import DataError
 from su3d_bench.runs.job import Part, SceneJob, build_dataset, build_method, stride_of
-from su3d_bench.runs.plan import Plan
+from su3d_bench.runs.planning.plan import Plan
 from su3d_bench.store.records import read_updates
 
 # Where no earlier run says better: an update of opensu3d under the embedded profile at 640x480, and reading, scoring

@@ -17,7 +17,8 @@ from su3d_bench.metrics.fitness import ContentFacts, TruthFacts, why_not_content
 from su3d_bench.metrics.instance.box_counts import THRESHOLDS, BoxCounts, count_boxes
 from su3d_bench.metrics.instance.box_overlap import box_iou, shared_volume, smallest_box
 from su3d_bench.metrics.metric import SceneScore
-from su3d_bench.metrics.protocols import ProtocolRules, load_protocol, read_protocol
+from su3d_bench.metrics.protocols.loading import load_protocol, read_protocol
+from su3d_bench.metrics.protocols.model import ProtocolRules
 from su3d_bench.metrics.scoring import combine, metric_of, pack_scores, score_scene, unpack_scores
 
 RULES = load_protocol("replica-boxes")

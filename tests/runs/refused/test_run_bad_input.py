@@ -40,13 +40,9 @@ def clean_scene(whole: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[s
 
 
 @pytest.fixture
-def root(whole: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def root(whole: Path, data_to_spoil: Callable[[Path], Path]) -> Path:
     """A copy of the rooms that a test may spoil."""
-    shutil.copytree(whole, tmp_path / "data")
-    monkeypatch.chdir(tmp_path)
-    monkeypatch.setenv("SU3D_DATA", "data")
-    monkeypatch.setenv("SU3D_CACHE", str(tmp_path / "cache"))
-    return tmp_path / "data"
+    return data_to_spoil(whole)
 
 
 def scores_of_office(out: Path) -> dict[str, float]:

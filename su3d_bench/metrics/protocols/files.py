@@ -13,7 +13,7 @@ from su3d_bench.core.errors import ConfigError, suggest
 from su3d_bench.core.files import file_text
 from su3d_bench.core.toml import parse_toml
 
-RULES = Path(__file__).parent / "rules"
+RULES = Path(__file__).parents[1] / "rules"
 _TABLE_PREFIX = "classes."  # rules/classes.<name>.toml holds a class table, not a protocol
 HEADING = ""  # stands for the comments above the first rule of a file
 _KEY = re.compile(r"(\w+)\s*=")
@@ -131,7 +131,7 @@ def read_remarks(file: Path) -> dict[str, list[str]]:
     A comment ``no cap_m ...`` speaks of the rule that it names; comments with no rule after them belong to their
     section.
     """
-    from su3d_bench.metrics.protocols import ProtocolRules, TransferRules
+    from su3d_bench.metrics.protocols.model import ProtocolRules, TransferRules
 
     remarks: dict[str, list[str]] = {}
     section, waiting, has_key = "", list[str](), False
